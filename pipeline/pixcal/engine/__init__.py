@@ -1,0 +1,1 @@
+"""How work is planned in memory and run: the only importer of dask."""

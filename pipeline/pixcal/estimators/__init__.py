@@ -1,0 +1,1 @@
+"""From samples to fringe parameters: scout, sweep, gauge, combination of sets."""

@@ -1,0 +1,105 @@
+"""An acquisition: the directory that a bench writes, described by ``acquisition.yaml``.
+
+The layout is fixed by the interface (schema ``pixcal/acquisition/1``).
+"""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from pixcal.model.config import parse, quantity, read_yaml
+from pixcal.model.errors import InputError
+
+SCHEMA = "pixcal/acquisition/1"
+
+
+@dataclass(frozen=True)
+class Detector:
+    """The detector as declared by its owner."""
+
+    pitch_um: float = quantity(unit="um", above=0, high=1000, doc="pixel pitch")
+    gain_e_per_adu: float = quantity(unit="e-/ADU", above=0, high=1e6, doc="conversion gain")
+    read_noise_e: float = quantity(unit="e-", low=0, high=1e6, doc="read noise, rms")
+    name: str = quantity("", doc="free text")
+    full_well_e: float | None = quantity(None, unit="e-", above=0, doc="full well")
+    saturation_adu: float | None = quantity(
+        None, unit="ADU", above=0, doc="samples at or above this level are saturated"
+    )
+
+
+@dataclass(frozen=True)
+class Optics:
+    """The bench's nominal optics."""
+
+    wavelength_nm: float = quantity(unit="nm", above=0, high=1e6, doc="laser wavelength")
+    distance_mm: float = quantity(unit="mm", above=0, high=1e7, doc="fibres to detector, nominal")
+    frame_period_s: float | None = quantity(
+        None, unit="s", above=0, doc="used where the headers hold no time stamps"
+    )
+
+
+@dataclass(frozen=True)
+class FringeSet:
+    """One scan of the fringes of one pair of fibres."""
+
+    name: str = quantity(doc="letters, digits, '-' and '_'")
+    files: tuple[str, ...] = quantity(doc="globs relative to acquisition.yaml")
+    baseline_mm: tuple[float, float] = quantity(
+        unit="mm", low=-1e4, high=1e4, doc="fibre B minus fibre A along x and y"
+    )
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", self.name):
+            raise InputError(f"name: {self.name!r:.80} is not made of letters, digits, '-' and '_'")
+        if not self.files:
+            raise InputError("files: the list is empty")
+        if self.baseline_mm == (0.0, 0.0):
+            raise InputError("baseline_mm: both components are zero, so there are no fringes")
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Globs of the frames of each kind."""
+
+    bias: tuple[str, ...] = quantity((), doc="no light, shortest exposure")
+    dark: tuple[str, ...] = quantity((), doc="no light, any exposure times")
+    flat: tuple[str, ...] = quantity((), doc="uniform light, any exposure times")
+    fringes: tuple[FringeSet, ...] = quantity((), doc="the fringe sets")
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """Contents of ``acquisition.yaml``."""
+
+    schema: str = quantity(choices=(SCHEMA,))
+    detector: Detector = quantity()
+    optics: Optics = quantity()
+    frames: Frames = quantity()
+
+    def __post_init__(self) -> None:
+        names = [s.name for s in self.frames.fringes]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"frames.fringes: two sets are named {name!r}")
+        kinds = (self.frames.bias, self.frames.dark, self.frames.flat, self.frames.fringes)
+        if not any(kinds):
+            raise InputError("frames: no files are listed")
+
+
+def load_acquisition(path: Path) -> Acquisition:
+    """Read an acquisition description.
+
+    Parameters
+    ----------
+    path : Path
+        The directory, or the YAML file itself.
+
+    Raises
+    ------
+    InputError
+        If it is missing or any key is unknown, missing or out of range.
+    """
+    file = path / "acquisition.yaml" if path.is_dir() else path
+    if not file.exists():
+        raise InputError(f"{file}: not found; an acquisition is a directory with acquisition.yaml")
+    return parse(Acquisition, read_yaml(file), str(file))

@@ -1,0 +1,17 @@
+"""Errors that a user can mend: one line that names the file, the key or the option."""
+
+
+class PixcalError(Exception):
+    """Anything that the command line reports without a traceback."""
+
+
+class InputError(PixcalError):
+    """A file, key or option is wrong; the message says which and what mends it (exit code 2)."""
+
+
+class DamagedError(InputError):
+    """Something that pixcal wrote is missing or altered; the message names it."""
+
+
+class PlanError(InputError):
+    """The work does not fit the memory allowed; the message holds both numbers."""

@@ -1,0 +1,1 @@
+"""Figures and pages: the only importer of matplotlib and jinja2."""

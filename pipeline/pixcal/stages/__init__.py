@@ -1,0 +1,1 @@
+"""The commands' bodies: each reads artefacts, writes one, and can be called from a notebook."""
