@@ -120,7 +120,7 @@ def _run_distributed(
     progress: Progress,
     done: Callable[[int, R], None] | None,
 ) -> list[R]:
-    from distributed import Client, as_completed  # noqa: PLC0415 (starts threads on import)
+    from distributed import Client, as_completed  # starts threads on import
 
     try:
         client = Client(runtime.cluster, timeout="10s", set_as_default=False)
