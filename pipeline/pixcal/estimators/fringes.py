@@ -1,0 +1,206 @@
+"""What a set's fringes look like: frame parameters, the local fringe vector, smooth phasors."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from pixcal.model.errors import InputError
+
+F64 = NDArray[np.float64]
+C128 = NDArray[np.complex128]
+
+MIN_FRINGES = 1.5
+"""Fewest fringes across a window for their vector to be told from the illumination."""
+
+
+@dataclass(frozen=True)
+class FrameParameters:
+    """What changes from frame to frame.
+
+    Attributes
+    ----------
+    g : (t, 3) float64
+        (B, A cos phi, A sin phi) at the reference point.
+    dk : (t, 2) float64
+        Change of the fringe vector along x and y (rad/px); all zero when it is held.
+    reference : (float, float)
+        Point (y, x) where ``g`` holds, in pixels.
+    """
+
+    g: F64
+    dk: F64
+    reference: tuple[float, float]
+
+    @property
+    def moving(self) -> bool:
+        """Whether the fringe vector is free in each frame."""
+        return bool(np.any(self.dk != 0))
+
+    def at(self, y: float, x: float) -> F64:
+        """Frame parameters (t, 3) at another point: the phase turned by dk times the distance."""
+        turn = self.dk[:, 0] * (x - self.reference[1]) + self.dk[:, 1] * (y - self.reference[0])
+        phasor = (self.g[:, 1] + 1j * self.g[:, 2]) * np.exp(1j * turn)
+        return np.stack([self.g[:, 0], phasor.real, phasor.imag], axis=1)
+
+    @property
+    def B(self) -> F64:
+        """Mean intensity of each frame."""
+        return self.g[:, 0]
+
+    @property
+    def A(self) -> F64:
+        """Fringe amplitude of each frame."""
+        return np.hypot(self.g[:, 1], self.g[:, 2])
+
+    @property
+    def phi(self) -> F64:
+        """Phase of each frame (rad, in ±pi)."""
+        return np.arctan2(self.g[:, 2], self.g[:, 1])
+
+
+def grid(shape: tuple[int, int]) -> tuple[F64, F64]:
+    """Pixel coordinates (y, 1) and (1, x) relative to the centre of a tile."""
+    ny, nx = shape
+    y = np.arange(ny, dtype=float)[:, None] - (ny - 1) / 2
+    x = np.arange(nx, dtype=float)[None, :] - (nx - 1) / 2
+    return y, x
+
+
+def find_fringe_vector(
+    maps: F64, good: NDArray[np.bool_], nominal: tuple[float, float]
+) -> tuple[float, float]:
+    """Fringe vector of a tile, from maps that hold fringes of any amplitude and phase.
+
+    The highest peak of the summed power spectra, refined on the continuous spectrum; its sign is
+    that of the nominal vector.
+
+    Parameters
+    ----------
+    maps : (n, y, x) float64
+        Maps without their mean light (ratios to the mean map).
+    good : (y, x) bool
+        Pixels to use.
+    nominal : (float, float)
+        Fringe vector (kx, ky) of the bench's nominal geometry, rad/px.
+
+    Returns
+    -------
+    (float, float)
+        (kx, ky) in rad/px.
+
+    Raises
+    ------
+    InputError
+        If no peak stands out: the frames hold no fringes, or fewer than `MIN_FRINGES`.
+    """
+    shape = maps.shape[1:]
+    window = np.hanning(shape[0] + 2)[1:-1, None] * np.hanning(shape[1] + 2)[None, 1:-1]
+    weight = window * good
+    y, x = grid((shape[0], shape[1]))
+    # A plane is taken off each map: what is left of the illumination must not win.
+    basis = np.stack(np.broadcast_arrays(1.0, x, y), axis=-1).reshape(-1, 3) * weight.reshape(-1, 1)
+    flat = np.where(good, maps, 0.0).reshape(len(maps), -1) * weight.reshape(1, -1)
+    coefficients = np.linalg.lstsq(basis, flat.T, rcond=None)[0]
+    light = (flat - (basis @ coefficients).T).reshape(maps.shape)
+
+    size = [2 * n for n in shape]
+    power = (np.abs(np.fft.fft2(light, s=size)) ** 2).sum(axis=0)
+    fy, fx = np.meshgrid(*(np.fft.fftfreq(n) for n in size), indexing="ij")
+    fringes_across = np.hypot(fy * shape[0], fx * shape[1])
+    allowed = fringes_across >= MIN_FRINGES
+    # Nominal positions are good to some 10 %: the peak there wins unless it is no peak at all.
+    near = np.hypot(2 * np.pi * fx - nominal[0], 2 * np.pi * fy - nominal[1])
+    reach = 0.25 * np.hypot(*nominal) + 2 * np.pi * 1.5 / min(shape)
+    floor = np.median(power[allowed]) if allowed.any() else np.inf
+    peak = None
+    for region in (allowed & (near < reach), allowed):
+        if region.any():
+            candidate = int(np.argmax(np.where(region, power, -1)))
+            if power.flat[candidate] > 50 * floor:
+                peak = candidate
+                break
+    if peak is None:
+        raise InputError(
+            "no fringes found: the frames are constant in phase or without contrast, or the "
+            f"fringes are wider than the window of {shape[1]} x {shape[0]} px allows"
+        )
+
+    def minus_power(k: F64) -> float:
+        phasor = np.exp(-1j * k[0] * x) * np.exp(-1j * k[1] * y)
+        return -float((np.abs((light * phasor).sum(axis=(1, 2))) ** 2).sum())
+
+    start = 2 * np.pi * np.array([fx.flat[peak], fy.flat[peak]])
+    scale = -minus_power(start)
+    found = minimize(
+        lambda k: minus_power(k) / scale,
+        start,
+        method="Nelder-Mead",
+        options={
+            "initial_simplex": start + np.array([[0, 0], [0.3, 0], [0, 0.3]]) / min(shape),
+            "xatol": 1e-7,
+            "fatol": 1e-12,
+        },
+    ).x
+    sign = 1.0 if found @ np.array(nominal) >= 0 else -1.0
+    return float(sign * found[0]), float(sign * found[1])
+
+
+def polynomial_basis(shape: tuple[int, int], degree: int) -> F64:
+    """Terms x^i y^j, i + j up to ``degree``, on coordinates scaled to ±1: (y * x, terms)."""
+    y, x = grid(shape)
+    y, x = y / max(1.0, shape[0] / 2), x / max(1.0, shape[1] / 2)
+    terms = [x**i * y**j for n in range(degree + 1) for i in range(n, -1, -1) for j in (n - i,)]
+    return np.stack([np.broadcast_to(t, shape).ravel() for t in terms], axis=1)
+
+
+def smooth_phasor(
+    phasor: C128, good: NDArray[np.bool_], k: tuple[float, float], degree: int = 3
+) -> tuple[C128, tuple[float, float]]:
+    """Smooth version of a phasor map alpha exp(i psi) / iota.
+
+    The fringe vector is first corrected by the mean phase step from pixel to pixel, then a complex
+    polynomial is fitted to the map turned back by it, leaving outliers out.
+
+    Parameters
+    ----------
+    phasor : (y, x) complex128
+        Visibility times exp(i psi), noisy.
+    good : (y, x) bool
+        Pixels to use.
+    k : (float, float)
+        Fringe vector (kx, ky) to start from, rad/px.
+    degree : int
+        Of the polynomial; lowered for tiles of few pixels.
+
+    Returns
+    -------
+    smooth : (y, x) complex128
+        The polynomial times exp(i k r), on every pixel.
+    k : (float, float)
+        The local fringe vector.
+    """
+    shape = (phasor.shape[0], phasor.shape[1])
+    y, x = grid(shape)
+    kx, ky = k
+    turned = np.where(good, phasor, 0) * np.exp(-1j * (kx * x + ky * y))
+    if shape[1] > 1:
+        kx += float(np.angle((turned[:, 1:] * turned[:, :-1].conj()).sum()))
+    if shape[0] > 1:
+        ky += float(np.angle((turned[1:] * turned[:-1].conj()).sum()))
+    carrier = np.exp(1j * (kx * x + ky * y))
+    turned = (np.where(good, phasor, 0) * carrier.conj()).ravel()
+    use = good.ravel().copy()
+    while degree > 0 and min(shape) < 4 * (degree + 1):
+        degree -= 1
+    basis = polynomial_basis(shape, degree)
+    fit = np.zeros(basis.shape[1], complex)
+    for _ in range(3):
+        if use.sum() < 2 * basis.shape[1]:
+            basis, fit = basis[:, :1], np.array([turned[use].mean() if use.any() else 0.0])
+            break
+        fit = np.linalg.lstsq(basis[use], turned[use], rcond=None)[0]
+        rest = np.abs(turned - basis @ fit)
+        use = good.ravel() & (rest <= 5 * np.median(rest[use]) + 1e-12)
+    return (basis @ fit).reshape(shape) * carrier, (kx, ky)

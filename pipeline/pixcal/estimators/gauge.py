@@ -1,0 +1,86 @@
+"""The freedom that free intensities leave, and how it is fixed.
+
+The data do not change when theta -> Q theta and g -> Q^-T g (physics note, section 2). Of Q's nine
+numbers, four turn up in the phase map, as fringes at the fringe frequency and twice it: with
+z = alpha exp(i psi), the change z' = z + b conj(z) + c iota moves the phase by
+
+    Im(b exp(-2 i psi)) + Im(c (iota / alpha) exp(-i psi))
+
+They are chosen so that the phase map holds none of these fringes.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+C128 = NDArray[np.complex128]
+
+MODES = ("1", "x", "y", "cos(psi)*iota/alpha", "sin(psi)*iota/alpha", "cos(2*psi)", "sin(2*psi)")
+"""Modes that a free intensity and amplitude in each frame leave open (7)."""
+
+
+def fringe_modes(psi: F64, ratio: F64) -> list[F64]:
+    """The four fringe-frequency modes of the phase map.
+
+    Parameters
+    ----------
+    psi : (...) float64
+        Phase of the fringes (rad).
+    ratio : (...) float64
+        iota / alpha.
+    """
+    return [ratio * np.cos(psi), ratio * np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)]
+
+
+def gauge_matrix(tiles: list[tuple[F64, NDArray[np.bool_], C128]]) -> F64:
+    """Change of theta that takes the fringe-frequency modes out of the phase maps.
+
+    Parameters
+    ----------
+    tiles : list of (theta, good, smooth)
+        For each tile: theta (3, y, x), the pixels to use (y, x), and the smooth phasor
+        alpha exp(i psi) / iota (y, x) about which the modes are taken.
+
+    Returns
+    -------
+    (3, 3) float64
+        Q: the mended parameters are ``Q @ theta``, the mended frames ``g @ inv(Q)``.
+    """
+    rows, rights, light_rows, light_rights = [], [], [], []
+    for theta, good, smooth in tiles:
+        iota, z = theta[0], theta[2] + 1j * theta[1]
+        y, x = np.nonzero(good)
+        s, n = smooth[good], len(y)
+        if n < 30:
+            continue
+        rest = np.angle(z[good] * s.conj())
+        ux, uy = (x - x.mean()) / (np.ptp(x) + 1), (y - y.mean()) / (np.ptp(y) + 1)
+        own = np.stack([np.ones(n), ux, uy, ux * ux, ux * uy, uy * uy], axis=1)
+        psi, ratio = np.angle(s), 1 / np.abs(s)
+        modes = np.stack(fringe_modes(psi, ratio), axis=1)
+        light = np.stack([np.cos(psi), np.sin(psi)], axis=1)
+        level = iota[good] / np.median(iota[good])
+        # Each tile has its own smooth phase and light: take them off before the tiles are joined.
+        q, _ = np.linalg.qr(own)
+        rows.append(modes - q @ (q.T @ modes))
+        rights.append(rest - q @ (q.T @ rest))
+        light_rows.append(light - q @ (q.T @ light))
+        light_rights.append(level - q @ (q.T @ level))
+    matrix = np.eye(3)
+    if not rows:
+        return matrix
+    cos1, sin1, cos2, sin2 = np.linalg.lstsq(
+        np.concatenate(rows), np.concatenate(rights), rcond=None
+    )[0]
+    light_cos, light_sin = np.linalg.lstsq(
+        np.concatenate(light_rows), np.concatenate(light_rights), rcond=None
+    )[0]
+    # Im(c e^-i psi) = c_i cos - c_r sin and Im(b e^-2i psi) = b_i cos 2 - b_r sin 2, taken off z.
+    c, b = complex(-sin1, cos1), complex(-sin2, cos2)
+    # theta = (iota, Im z, Re z); z -= b conj(z) + c iota.
+    matrix[1] += [-c.imag, b.real, -b.imag]
+    matrix[2] += [-c.real, -b.imag, -b.real]
+    # Fringes of the mean light: level ~ light_cos cos psi + light_sin sin psi, psi's of |z|/iota = V.
+    visibility = float(np.median(np.concatenate([np.abs(s[good]) for _, good, s in tiles])))
+    matrix[0] += [0.0, -light_sin / visibility, -light_cos / visibility]
+    return matrix

@@ -1,0 +1,396 @@
+"""Frame parameters of a set, from a few tiles spread over the detector.
+
+The first look takes some hundred frames spread over the run: their samples are a matrix of rank
+three, and any three vectors that span it are turned into (iota, alpha sin psi, alpha cos psi) with
+the help of the fringe vector and the gauge (physics note, sections 2 and 3). With the pixels of
+these tiles known, every frame is then solved by itself, block after block.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.fringes import (
+    FrameParameters,
+    find_fringe_vector,
+    grid,
+    smooth_phasor,
+)
+from pixcal.estimators.gauge import gauge_matrix
+from pixcal.kernels.bilinear import N_SUMS, frame_sums, solve_pixels, sweep_block
+from pixcal.model.errors import InputError
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+MIN_FRAMES = 6
+"""Three unknowns a pixel, and as many again to tell whether they fit."""
+
+
+@dataclass(frozen=True)
+class Coding:
+    """Electrons of a stored code: ``scale * code + offset``; ``fill`` marks a sample of no weight."""
+
+    scale: float
+    offset: float
+    fill: int
+
+
+@dataclass
+class Tile:
+    """A part of the window.
+
+    Attributes
+    ----------
+    y, x : (int, int)
+        First pixel and the one after the last, along each axis.
+    read, shot : (y, x) float32
+        Variance of a sample: ``shot * model + read`` (e-²).
+    good : (y, x) bool
+        Pixels to learn from.
+    """
+
+    y: tuple[int, int]
+    x: tuple[int, int]
+    read: F32
+    shot: F32
+    good: NDArray[np.bool_]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(y, x) size."""
+        return self.y[1] - self.y[0], self.x[1] - self.x[0]
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Centre (y, x) in pixels of the window."""
+        return (self.y[0] + self.y[1] - 1) / 2, (self.x[0] + self.x[1] - 1) / 2
+
+
+@dataclass
+class Scout:
+    """Frame parameters from a few tiles.
+
+    Parameters
+    ----------
+    tiles : sequence of Tile
+        The first is the one whose fringe vector is sought.
+    coding : Coding
+        Of the stored samples.
+    nominal : (float, float)
+        Nominal fringe vector (kx, ky), rad/px.
+    reference : (float, float)
+        Point (y, x) at which the frame parameters hold.
+    """
+
+    tiles: Sequence[Tile]
+    coding: Coding
+    nominal: tuple[float, float]
+    reference: tuple[float, float]
+    k: tuple[float, float] = (0.0, 0.0)
+    moving: bool = False
+    moving_significance: float = 0.0
+    theta: list[F64] = field(default_factory=list)
+
+    def prime(self, codes: Sequence[NDArray[np.uint16]]) -> FrameParameters:
+        """Learn the pixels of the tiles from frames spread over the run.
+
+        Parameters
+        ----------
+        codes : sequence of (t, y, x) arrays
+            The same frames for each tile.
+
+        Returns
+        -------
+        FrameParameters
+            Of these frames.
+
+        Raises
+        ------
+        InputError
+            If there are too few frames or good pixels, no fringes, or the phase does not change.
+        """
+        n_frames = codes[0].shape[0]
+        if n_frames < MIN_FRAMES:
+            raise InputError(f"{n_frames} frames: at least {MIN_FRAMES} are needed")
+        if sum(int(t.good.sum()) for t in self.tiles) < 30:
+            raise InputError("fewer than 30 good pixels are left to find the fringes with")
+        g = self._subspace(codes)
+        frames = FrameParameters(g, np.zeros((n_frames, 2)), self.reference)
+        for _ in range(3):
+            frames = self._refine(codes, frames)
+        significance = self._motion_significance(codes, frames)
+        self.moving_significance = significance
+        # Six standard deviations of what frames without motion would show.
+        self.moving = significance > 1 + 6 / np.sqrt(n_frames)
+        if self.moving:
+            for _ in range(8):
+                frames = self._refine(codes, frames)
+        return frames
+
+    def solve(
+        self, codes: Sequence[NDArray[np.uint16]], start: FrameParameters | None = None
+    ) -> FrameParameters:
+        """Parameters of further frames, the pixels of the tiles being known.
+
+        Parameters
+        ----------
+        codes : sequence of (t, y, x) arrays
+            The same frames for each tile.
+        start : FrameParameters, optional
+            Where to start; else from an unweighted fit.
+        """
+        if start is None:
+            matrix, right = np.zeros((3, 3)), 0.0
+            for tile, theta, block in zip(self.tiles, self.theta, codes, strict=True):
+                design = np.where(tile.good, theta, 0.0).reshape(3, -1)
+                matrix = matrix + design @ design.T
+                right = right + self._electrons(block, tile.good) @ design.T
+            g = np.linalg.solve(matrix, np.asarray(right).T).T
+            start = FrameParameters(g, np.zeros((len(g), 2)), self.reference)
+        frames = start
+        for _ in range(3 if self.moving else 2):
+            frames, _, _ = self._frame_step(codes, frames, self.moving)
+        return frames
+
+    def _electrons(self, codes: NDArray[np.uint16], good: NDArray[np.bool_]) -> F64:
+        """Samples (t, p) in electrons, zero where without weight."""
+        flat = codes.reshape(len(codes), -1)
+        use = good.ravel() & (flat != self.coding.fill)
+        return np.where(use, self.coding.scale * flat + self.coding.offset, 0.0)
+
+    def _subspace(self, codes: Sequence[NDArray[np.uint16]]) -> F64:
+        """First frame parameters: rank three, then turned by means of the fringe vector."""
+        gram: F64 = np.zeros((len(codes[0]), len(codes[0])))
+        for tile, block in zip(self.tiles, codes, strict=True):
+            electrons = self._electrons(block, tile.good).astype(np.float32)
+            gram += electrons @ electrons.T
+        values, vectors = np.linalg.eigh(gram)
+        if values[-3] <= 0 or values[-3] < 1e-12 * values[-1]:
+            raise InputError("the frames do not differ: the phase was not scanned")
+        g = vectors[:, -3:][:, ::-1]
+        first, block = self.tiles[0], codes[0]
+        maps = (g.T @ self._electrons(block, first.good)).reshape(3, *first.shape)
+        mean = np.where(first.good & (np.abs(maps[0]) > 0), maps[0], 1.0)
+        ratios = np.where(first.good, maps[1:] / mean, 0.0)
+        # A third map that is only noise must not drown the fringes of the second.
+        self.k = find_fringe_vector(ratios, first.good, self.nominal)
+        y, x = grid(first.shape)
+        target = np.exp(1j * (self.k[0] * x + self.k[1] * y))[first.good]
+        span = np.stack([m[first.good] for m in maps], axis=1)
+        level = np.median(np.abs(span[:, 0]))
+        fringe = np.linalg.lstsq(span / level, target, rcond=None)[0]
+        light = np.linalg.lstsq(span / level, np.ones(len(span)), rcond=None)[0]
+        mix = np.stack([light, fringe.imag, fringe.real])
+        if not np.linalg.cond(mix) < 1e6:
+            raise InputError("the frames do not differ enough: the phase was scanned too little")
+        g = g @ np.linalg.inv(mix)
+        return np.asarray(g / self._norm(g))
+
+    @staticmethod
+    def _norm(g: F64) -> F64:
+        """Scales that make the mean of B and the mean of A equal to 1."""
+        amplitude = np.hypot(g[:, 1], g[:, 2]).mean()
+        return np.array([g[:, 0].mean(), amplitude, amplitude])
+
+    def _refine(
+        self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters
+    ) -> FrameParameters:
+        """One turn: pixels from frames, gauge, frames from pixels."""
+        thetas, smooths = [], []
+        for tile, block in zip(self.tiles, codes, strict=True):
+            theta, smooth = fit_tile(tile, [block], self.coding, frames, self.k)
+            thetas.append(theta)
+            smooths.append(smooth)
+        goods = [
+            t.good & np.isfinite(theta).all(axis=0) & (theta[0] > 0)
+            for t, theta in zip(self.tiles, thetas, strict=True)
+        ]
+        q = gauge_matrix(list(zip(thetas, goods, smooths, strict=True)))
+        g = frames.g @ np.linalg.inv(q)
+        norm = self._norm(g)
+        self.theta = [
+            np.where(good, np.einsum("i,ij,jyx->iyx", norm, q, theta), 0.0)
+            for theta, good in zip(thetas, goods, strict=True)
+        ]
+        for tile, good in zip(self.tiles, goods, strict=True):
+            tile.good &= good
+        frames = FrameParameters(g / norm, frames.dk, self.reference)
+        frames, _, _ = self._frame_step(codes, frames, self.moving)
+        return frames
+
+    def _frame_step(
+        self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters, moving: bool
+    ) -> tuple[FrameParameters, F64, F64]:
+        """One Gauss-Newton step of every frame; also returns steps and normal matrices (t, 5, 5)."""
+        n = len(frames.g)
+        packed, right = np.zeros((n, 15)), np.zeros((n, 5))
+        g, dk = frames.g.astype(np.float32), frames.dk.astype(np.float32)
+        for tile, theta, block in zip(self.tiles, self.theta, codes, strict=True):
+            yy, xx = np.nonzero(tile.good)
+            frame_sums(
+                np.ascontiguousarray(block[:, yy, xx]),
+                self.coding.scale,
+                self.coding.offset,
+                self.coding.fill,
+                g,
+                dk,
+                (yy + tile.y[0] - self.reference[0]).astype(np.float32),
+                (xx + tile.x[0] - self.reference[1]).astype(np.float32),
+                theta[:, yy, xx].astype(np.float32),
+                tile.read[yy, xx],
+                tile.shot[yy, xx],
+                packed,
+                right,
+            )
+        normal = np.zeros((n, 5, 5))
+        upper = np.triu_indices(5)
+        normal[:, upper[0], upper[1]] = packed
+        normal[:, upper[1], upper[0]] = packed
+        size = 5 if moving else 3
+        step = np.zeros((n, 5))
+        solved = np.linalg.solve(normal[:, :size, :size], right[:, :size, None])
+        step[:, :size] = solved[..., 0]
+        # The kernel saw float32 parameters: the step is from those.
+        moved = FrameParameters(
+            g.astype(float) + step[:, :3], dk.astype(float) + step[:, 3:], frames.reference
+        )
+        return moved, step, normal
+
+    def _motion_significance(
+        self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters
+    ) -> float:
+        """Mean of dk' C^-1 dk / 2 over frames, in units of the noise: 1 without motion."""
+        _, step, normal = self._frame_step(codes, frames, moving=True)
+        covariance = np.linalg.inv(normal)[:, 3:, 3:]
+        dk = step[:, 3:]
+        dk = dk - dk.mean(axis=0)
+        size = np.einsum("ti,tij,tj->t", dk, np.linalg.inv(covariance), dk).mean() / 2
+        noise = [
+            residual_chi2(tile, block, self.coding, frames, theta)
+            for tile, block, theta in zip(self.tiles, codes, self.theta, strict=True)
+        ]
+        return float(size / np.median(noise))
+
+
+def residual_chi2(
+    tile: Tile,
+    codes: NDArray[np.uint16],
+    coding: Coding,
+    frames: FrameParameters,
+    theta: F64,
+) -> float:
+    """Median over a tile's pixels of the reduced chi-square."""
+    sums = accumulate(tile, [codes], coding, frames, theta.astype(np.float32))
+    _, _, chi2 = solve_pixels(sums)
+    reduced = chi2 / np.maximum(sums[10] - 3, 1)
+    return float(np.median(reduced[tile.good]))
+
+
+def accumulate(
+    tile: Tile,
+    blocks: Sequence[NDArray[np.uint16]],
+    coding: Coding,
+    frames: FrameParameters,
+    theta: F32,
+    sums: F64 | None = None,
+    variance: tuple[F32, F32] | None = None,
+) -> F64:
+    """Weighted sums of a tile over blocks of frames that follow one another.
+
+    Parameters
+    ----------
+    tile : Tile
+    blocks : sequence of (t, y, x) arrays
+        Stored codes; together as many frames as ``frames`` holds.
+    coding : Coding
+    frames : FrameParameters
+    theta : (3, y, x) float32
+        Start model.
+    sums : (N_SUMS, y, x) float64, optional
+        Sums to add to.
+    variance : (read, shot), optional
+        Instead of the tile's own.
+    """
+    sums = np.zeros((N_SUMS, *tile.shape)) if sums is None else sums
+    read, shot = variance or (tile.read, tile.shot)
+    g = frames.at(*tile.centre).astype(np.float32)
+    dk = frames.dk.astype(np.float32)
+    start = 0
+    for block in blocks:
+        for first in range(0, len(block), 64):
+            part = block[first : first + 64]
+            at = slice(start + first, start + first + len(part))
+            sweep_block(
+                part,
+                coding.scale,
+                coding.offset,
+                coding.fill,
+                g[at],
+                dk[at],
+                -(tile.shape[0] - 1) / 2,
+                -(tile.shape[1] - 1) / 2,
+                theta,
+                read,
+                shot,
+                sums,
+            )
+        start += len(block)
+    return sums
+
+
+def start_model(
+    tile: Tile,
+    blocks: Sequence[NDArray[np.uint16]],
+    coding: Coding,
+    frames: FrameParameters,
+    k: tuple[float, float],
+) -> tuple[F32, NDArray[np.complex128]]:
+    """Smooth model of a tile, for weights that do not know the pixel's own noise.
+
+    The phase and the visibility are smooth over the tile; the level is the pixel's own, known to a
+    part in a thousand, and only scales all the weights of that pixel together.
+
+    Parameters
+    ----------
+    tile, blocks, coding, frames
+        As in `accumulate`.
+    k : (float, float)
+        Fringe vector near the tile, rad/px.
+
+    Returns
+    -------
+    theta : (3, y, x) float32
+        The model.
+    smooth : (y, x) complex128
+        The smooth phasor alpha exp(i psi) / iota.
+    """
+    nothing = np.zeros((3, *tile.shape), np.float32)
+    even = (np.ones(tile.shape, np.float32), np.zeros(tile.shape, np.float32))
+    sums = accumulate(tile, blocks, coding, frames, nothing, variance=even)
+    theta, _, _ = solve_pixels(sums)
+    iota = theta[0]
+    usable = np.isfinite(iota) & (iota > 0)
+    good = tile.good & usable
+    level = float(np.median(iota[good])) if good.any() else 1.0
+    iota = np.where(usable, iota, level)
+    phasor = np.where(usable, theta[2] + 1j * theta[1], 0.0) / iota
+    smooth, _ = smooth_phasor(phasor, good, k)
+    model = np.stack([iota, iota * smooth.imag, iota * smooth.real])
+    return model.astype(np.float32), smooth
+
+
+def fit_tile(
+    tile: Tile,
+    blocks: Sequence[NDArray[np.uint16]],
+    coding: Coding,
+    frames: FrameParameters,
+    k: tuple[float, float],
+) -> tuple[F64, NDArray[np.complex128]]:
+    """Weighted fit of every pixel of a tile: theta (3, y, x) and the smooth phasor (y, x)."""
+    model, smooth = start_model(tile, blocks, coding, frames, k)
+    sums = accumulate(tile, blocks, coding, frames, model)
+    step, _, _ = solve_pixels(sums)
+    return model + step, smooth

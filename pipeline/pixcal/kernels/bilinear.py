@@ -1,0 +1,310 @@
+"""Compiled sums of the bilinear fringe model.
+
+The model (paper, equation 2; physics note, section 2) is linear in the pixel's parameters when the
+frame's are known, and the other way round::
+
+    I[t, p] = theta[p] . g[t]     theta = (iota, alpha sin psi, alpha cos psi)
+                                  g     = (B, A cos phi, A sin phi)
+
+A frame whose fringe vector moved by dk turns its phase by ``dk . r``. Samples are stored codes
+``electrons = scale * code + offset``; a sample's variance is ``shot * model + read``: it comes from
+the model, never from the noisy sample (physics note, section 3).
+
+Sums are taken of the residual to a start model, so that float32 keeps its digits for the noise.
+"""
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+N_SUMS = 11
+"""Sums kept for each pixel: 6 normal, 3 right-hand, weighted square of the residual, samples."""
+
+_FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _sweep_row(
+    codes: Any, row: int, scale: float, offset: float, fill: float, g: Any,
+    t0: Any, t1: Any, t2: Any, read: Any, shot: Any,
+    n00: Any, n01: Any, n02: Any, n11: Any, n12: Any, n22: Any,
+    b0: Any, b1: Any, b2: Any, rr: Any,
+) -> None:  # fmt: skip
+    # One array a sum and no more arrays than these: with them LLVM proves that none overlap and
+    # vectorises over i; one more and it gives up (6 times slower).
+    one, zero = np.float32(1), np.float32(0)
+    for t in range(codes.shape[0]):
+        a0, a1, a2 = g[t, 0], g[t, 1], g[t, 2]
+        for i in range(codes.shape[2]):
+            code = np.float32(codes[t, row, i])
+            model = t0[i] * a0 + t1[i] * a1 + t2[i] * a2
+            w = (one if code != fill else zero) / (shot[i] * max(model, zero) + read[i])
+            r = scale * code + offset - model
+            wr, w0, w1 = w * r, w * a0, w * a1
+            n00[i] += w0 * a0
+            n01[i] += w0 * a1
+            n02[i] += w0 * a2
+            n11[i] += w1 * a1
+            n12[i] += w1 * a2
+            n22[i] += w * a2 * a2
+            b0[i] += wr * a0
+            b1[i] += wr * a1
+            b2[i] += wr * a2
+            rr[i] += wr * r
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _sweep_row_moving(
+    codes: Any, row: int, scale: float, offset: float, fill: float, g: Any,
+    dk: Any, y: float, x0: float,
+    t0: Any, t1: Any, t2: Any, read: Any, shot: Any,
+    n00: Any, n01: Any, n02: Any, n11: Any, n12: Any, n22: Any,
+    b0: Any, b1: Any, b2: Any, rr: Any,
+) -> None:  # fmt: skip
+    one, zero, half = np.float32(1), np.float32(0), np.float32(0.5)
+    for t in range(codes.shape[0]):
+        a0, c1, c2 = g[t, 0], g[t, 1], g[t, 2]
+        kx = dk[t, 0]
+        u0 = dk[t, 1] * y + kx * x0
+        for i in range(codes.shape[2]):
+            u = kx * np.float32(i) + u0
+            co = one - half * u * u
+            a1 = c1 * co - c2 * u
+            a2 = c2 * co + c1 * u
+            code = np.float32(codes[t, row, i])
+            model = t0[i] * a0 + t1[i] * a1 + t2[i] * a2
+            w = (one if code != fill else zero) / (shot[i] * max(model, zero) + read[i])
+            r = scale * code + offset - model
+            wr, w0, w1 = w * r, w * a0, w * a1
+            n00[i] += w0 * a0
+            n01[i] += w0 * a1
+            n02[i] += w0 * a2
+            n11[i] += w1 * a1
+            n12[i] += w1 * a2
+            n22[i] += w * a2 * a2
+            b0[i] += wr * a0
+            b1[i] += wr * a1
+            b2[i] += wr * a2
+            rr[i] += wr * r
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _count_row(codes: Any, row: int, fill: int, count: Any) -> None:
+    for t in range(codes.shape[0]):
+        for i in range(codes.shape[2]):
+            count[i] += np.float32(codes[t, row, i] != fill)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def sweep_block(
+    codes: Any,
+    scale: float,
+    offset: float,
+    fill: int,
+    g: F32,
+    dk: F32,
+    y0: float,
+    x0: float,
+    theta: F32,
+    read: F32,
+    shot: F32,
+    sums: F64,
+) -> None:
+    """Add a block of frames to the weighted sums of every pixel of a tile.
+
+    Parameters
+    ----------
+    codes : (t, y, x) array of unsigned integers
+        Stored samples; ``fill`` marks one without weight. At most some 100 frames, so that the
+        float32 sums of the block keep their precision; blocks are added in float64.
+    scale, offset : float
+        Electrons of a code.
+    g : (t, 3) float32
+        Frame parameters at the tile's centre.
+    dk : (t, 2) float32
+        Change of the fringe vector (x, y) in rad/px; used to second order inside the tile.
+    y0, x0 : float
+        Coordinates of the tile's first pixel relative to its centre.
+    theta : (3, y, x) float32
+        Start model, in electrons.
+    read, shot : (y, x) float32
+        Variance of a sample, ``shot * model + read`` (e-²).
+    sums : (N_SUMS, y, x) float64
+        Added to: normal sums 00, 01, 02, 11, 12, 22, right-hand sums 0 to 2 (of the residual to
+        the start model), weighted square of that residual, number of samples.
+    """
+    ny, nx = codes.shape[1], codes.shape[2]
+    p = [np.empty(nx, np.float32) for _ in range(11)]
+    moving = bool(np.any(dk != 0))
+    s, o, f = np.float32(scale), np.float32(offset), np.float32(fill)
+    for row in range(ny):
+        for k in range(11):
+            p[k][:] = np.float32(0)
+        t0, t1, t2 = theta[0, row], theta[1, row], theta[2, row]
+        if moving:
+            _sweep_row_moving(
+                codes, row, s, o, f, g, dk, np.float32(y0 + row), np.float32(x0),
+                t0, t1, t2, read[row], shot[row],
+                p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9],
+            )  # fmt: skip
+        else:
+            _sweep_row(
+                codes, row, s, o, f, g, t0, t1, t2, read[row], shot[row],
+                p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9],
+            )  # fmt: skip
+        _count_row(codes, row, fill, p[10])
+        for k in range(11):
+            for i in range(nx):
+                sums[k, row, i] += p[k][i]
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def frame_sums(
+    codes: Any,
+    scale: float,
+    offset: float,
+    fill: int,
+    g: F32,
+    dk: F32,
+    y: F32,
+    x: F32,
+    theta: F32,
+    read: F32,
+    shot: F32,
+    normal: F64,
+    right: F64,
+) -> None:
+    """Add scattered pixels to the weighted sums of every frame, for g and the fringe vector.
+
+    Parameters
+    ----------
+    codes : (t, p) array of unsigned integers
+        Stored samples of p pixels.
+    g, dk : (t, 3), (t, 2) float32
+        Current frame parameters; the sums are of the residual to them.
+    y, x : (p,) float32
+        Pixel coordinates relative to the point where ``g`` holds.
+    theta, read, shot : (3, p), (p,), (p,) float32
+        As in `sweep_block`.
+    normal : (t, 15) float64
+        Added to: upper triangle, row by row, of the normal matrix for (g0, g1, g2, dkx, dky).
+    right : (t, 5) float64
+        Added to: right-hand sides.
+    """
+    s, o = np.float32(scale), np.float32(offset)
+    one, zero, two, half = np.float32(1), np.float32(0), np.float32(2), np.float32(0.5)
+    sixth, fourth = np.float32(1 / 6), np.float32(1 / 24)
+    fifth, tenth = np.float32(1 / 120), np.float32(1 / 720)
+    eighth, turn_length = np.float32(0.125), np.float32(2 * np.pi)
+    f = np.float32(fill)
+    n = codes.shape[1]
+    for t in range(codes.shape[0]):
+        g0, c1, c2 = g[t, 0], g[t, 1], g[t, 2]
+        kx, ky = dk[t, 0], dk[t, 1]
+        for start in range(0, n, 4096):
+            q00 = q01 = q02 = q0x = q0y = zero
+            q11 = q12 = q1x = q1y = q22 = q2x = q2y = qxx = qxy = qyy = zero
+            r0 = r1 = r2 = rx = ry = zero
+            for i in range(start, min(start + 4096, n)):
+                # cos and sin of any u by halving it three times: calls would not vectorise.
+                u = kx * x[i] + ky * y[i]
+                u = (u - turn_length * np.rint(u / turn_length)) * eighth
+                v = u * u
+                si = u * (one - v * (sixth - v * fifth))
+                co = one - v * (half - v * (fourth - v * tenth))
+                si, co = two * si * co, one - two * si * si
+                si, co = two * si * co, one - two * si * si
+                si, co = two * si * co, one - two * si * si
+                h0 = theta[0, i]
+                h1 = theta[1, i] * co + theta[2, i] * si
+                h2 = theta[2, i] * co - theta[1, i] * si
+                model = h0 * g0 + h1 * c1 + h2 * c2
+                turn = h2 * c1 - h1 * c2
+                hx, hy = turn * x[i], turn * y[i]
+                code = np.float32(codes[t, i])
+                w = (one if code != f else zero) / (shot[i] * max(model, zero) + read[i])
+                wr = w * (s * code + o - model)
+                q00 += w * h0 * h0
+                q01 += w * h0 * h1
+                q02 += w * h0 * h2
+                q0x += w * h0 * hx
+                q0y += w * h0 * hy
+                q11 += w * h1 * h1
+                q12 += w * h1 * h2
+                q1x += w * h1 * hx
+                q1y += w * h1 * hy
+                q22 += w * h2 * h2
+                q2x += w * h2 * hx
+                q2y += w * h2 * hy
+                qxx += w * hx * hx
+                qxy += w * hx * hy
+                qyy += w * hy * hy
+                r0 += wr * h0
+                r1 += wr * h1
+                r2 += wr * h2
+                rx += wr * hx
+                ry += wr * hy
+            normal[t, 0] += q00
+            normal[t, 1] += q01
+            normal[t, 2] += q02
+            normal[t, 3] += q0x
+            normal[t, 4] += q0y
+            normal[t, 5] += q11
+            normal[t, 6] += q12
+            normal[t, 7] += q1x
+            normal[t, 8] += q1y
+            normal[t, 9] += q22
+            normal[t, 10] += q2x
+            normal[t, 11] += q2y
+            normal[t, 12] += qxx
+            normal[t, 13] += qxy
+            normal[t, 14] += qyy
+            right[t, 0] += r0
+            right[t, 1] += r1
+            right[t, 2] += r2
+            right[t, 3] += rx
+            right[t, 4] += ry
+
+
+def solve_pixels(sums: F64) -> tuple[F64, F64, F64]:
+    """Solve the pixels' 3 x 3 systems.
+
+    Parameters
+    ----------
+    sums : (N_SUMS, ...) float64
+        From `sweep_block`.
+
+    Returns
+    -------
+    step : (3, ...) float64
+        Correction to the start model; NaN where the system cannot be solved.
+    covariance : (6, ...) float64
+        Upper triangle of the covariance of theta (00, 01, 02, 11, 12, 22).
+    chi2 : (...) float64
+        Weighted square of the residual that remains.
+    """
+    a, b, c, d, e, f = sums[:6]
+    r0, r1, r2 = sums[6:9]
+    i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
+    i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
+    det = a * i00 + b * i01 + c * i02
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Without three different phases the matrix is singular up to rounding.
+        good = (det > 1e-9 * a * d * f) & np.isfinite(det)
+        inverse = np.where(good, 1 / det, np.nan)
+    covariance = np.stack([i00, i01, i02, i11, i12, i22]) * inverse
+    v = covariance
+    step = np.stack(
+        [
+            v[0] * r0 + v[1] * r1 + v[2] * r2,
+            v[1] * r0 + v[3] * r1 + v[4] * r2,
+            v[2] * r0 + v[4] * r1 + v[5] * r2,
+        ]
+    )
+    chi2 = sums[9] - (step[0] * r0 + step[1] * r1 + step[2] * r2)
+    return step, covariance, chi2
