@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import dask
@@ -48,6 +48,10 @@ class Runtime:
         if self.cluster == "sync":
             return 1
         return self.workers or len(os.sched_getaffinity(0))
+
+    def with_workers(self, workers: int) -> "Runtime":
+        """The same with another number of local workers, as a memory plan asks for."""
+        return replace(self, workers=workers)
 
 
 def run_tasks(

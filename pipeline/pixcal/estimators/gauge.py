@@ -80,7 +80,7 @@ def gauge_matrix(tiles: list[tuple[F64, NDArray[np.bool_], C128]]) -> F64:
     # theta = (iota, Im z, Re z); z -= b conj(z) + c iota.
     matrix[1] += [-c.imag, b.real, -b.imag]
     matrix[2] += [-c.real, -b.imag, -b.real]
-    # Fringes of the mean light: level ~ light_cos cos psi + light_sin sin psi, psi's of |z|/iota = V.
+    # Fringes of the mean light, light_cos cos psi + light_sin sin psi, with |z| / iota = V.
     visibility = float(np.median(np.concatenate([np.abs(s[good]) for _, good, s in tiles])))
     matrix[0] += [0.0, -light_sin / visibility, -light_cos / visibility]
     return matrix

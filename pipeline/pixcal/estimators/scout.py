@@ -31,7 +31,7 @@ MIN_FRAMES = 6
 
 @dataclass(frozen=True)
 class Coding:
-    """Electrons of a stored code: ``scale * code + offset``; ``fill`` marks a sample of no weight."""
+    """Electrons of a code: ``scale * code + offset``; ``fill`` marks a sample without weight."""
 
     scale: float
     offset: float
@@ -143,12 +143,13 @@ class Scout:
             Where to start; else from an unweighted fit.
         """
         if start is None:
-            matrix, right = np.zeros((3, 3)), 0.0
+            matrix: F64 = np.zeros((3, 3))
+            right: F64 = np.zeros((len(codes[0]), 3))
             for tile, theta, block in zip(self.tiles, self.theta, codes, strict=True):
                 design = np.where(tile.good, theta, 0.0).reshape(3, -1)
                 matrix = matrix + design @ design.T
                 right = right + self._electrons(block, tile.good) @ design.T
-            g = np.linalg.solve(matrix, np.asarray(right).T).T
+            g = np.asarray(np.linalg.solve(matrix, right.T).T, dtype=np.float64)
             start = FrameParameters(g, np.zeros((len(g), 2)), self.reference)
         frames = start
         for _ in range(3 if self.moving else 2):
@@ -224,7 +225,7 @@ class Scout:
     def _frame_step(
         self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters, moving: bool
     ) -> tuple[FrameParameters, F64, F64]:
-        """One Gauss-Newton step of every frame; also returns steps and normal matrices (t, 5, 5)."""
+        """One Gauss-Newton step of every frame; its size and normal matrices (t, 5, 5) too."""
         n = len(frames.g)
         packed, right = np.zeros((n, 15)), np.zeros((n, 5))
         g, dk = frames.g.astype(np.float32), frames.dk.astype(np.float32)
@@ -376,7 +377,7 @@ def start_model(
     good = tile.good & usable
     level = float(np.median(iota[good])) if good.any() else 1.0
     iota = np.where(usable, iota, level)
-    phasor = np.where(usable, theta[2] + 1j * theta[1], 0.0) / iota
+    phasor = np.asarray(np.where(usable, theta[2] + 1j * theta[1], 0.0) / iota, complex)
     smooth, _ = smooth_phasor(phasor, good, k)
     model = np.stack([iota, iota * smooth.imag, iota * smooth.real])
     return model.astype(np.float32), smooth

@@ -1,0 +1,79 @@
+"""Batches of frames on a regular grid of time, for the Allan deviation."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+DEFAULT_FRAMES = 500
+"""Frames of a batch in a long run (paper, section 4.3)."""
+
+MIN_FRAMES = 8
+"""Fewest frames of a batch: each pixel has three unknowns."""
+
+WANTED = 24
+"""Batches wanted of a run too short for `DEFAULT_FRAMES`."""
+
+
+@dataclass(frozen=True)
+class Batches:
+    """Batches of equal duration.
+
+    Attributes
+    ----------
+    frames : int
+        Frames of a full batch.
+    period_s : float
+        Time from frame to frame.
+    ranges : tuple of (int, int)
+        First frame and the one after the last of each batch; empty for a gap.
+    time : (batch,) float64
+        Centre of each batch, seconds from the first frame.
+    note : str
+        What a reader should know, or "".
+    """
+
+    frames: int
+    period_s: float
+    ranges: tuple[tuple[int, int], ...]
+    time: NDArray[np.float64]
+    note: str = ""
+
+    @property
+    def count(self) -> NDArray[np.int32]:
+        """Frames in each batch."""
+        return np.array([b - a for a, b in self.ranges], dtype=np.int32)
+
+
+def plan_batches(time_s: NDArray[np.float64], frames: int | None = None) -> Batches:
+    """Divide a run into batches.
+
+    Frames fall into slots of the median period, so that a pause of the camera shows as slots
+    without frames, and every batch spans the same time.
+
+    Parameters
+    ----------
+    time_s : (t,) float64
+        Time of each frame, not decreasing.
+    frames : int, optional
+        Frames of a batch; by default 500, or what leaves some 24 batches of a shorter run.
+    """
+    n = len(time_s)
+    length = frames or max(MIN_FRAMES, min(DEFAULT_FRAMES, n // WANTED))
+    steps = np.diff(time_s)
+    period = float(np.median(steps)) if n > 1 else 1.0
+    note = ""
+    if period > 0 and time_s[-1] - time_s[0] < 20 * n * period:
+        # Slots are counted from frame to frame: a period that is off by little does not add up.
+        slots = np.concatenate([[0], np.cumsum(np.maximum(1, np.rint(steps / period)))])
+    else:
+        slots, period = np.arange(n, dtype=float), period if period > 0 else 1.0
+        note = "time stamps do not follow a regular pace: batches count frames, not seconds"
+    n_batches = int((slots[-1] + 1) // length) if n else 0
+    edges = np.searchsorted(slots, np.arange(n_batches + 1) * length)
+    ranges = tuple((int(a), int(b)) for a, b in pairwise(edges))
+    # A batch with few frames left has other noise than the rest: it counts as a gap.
+    ranges = tuple((a, b) if b - a >= 0.75 * length else (a, a) for a, b in ranges)
+    centre = np.asarray((np.arange(n_batches) + 0.5) * length * period, dtype=np.float64)
+    return Batches(length, period, ranges, centre, note)

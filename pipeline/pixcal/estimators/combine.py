@@ -1,0 +1,75 @@
+"""From projections on fringe axes to (delta_x, delta_y): weighted least squares at every pixel."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+
+def axes_span_plane(axes: Sequence[tuple[float, float]]) -> bool:
+    """Whether unit vectors (x, y) differ enough to give both components (by 10 degrees)."""
+    a = np.asarray(axes, float)
+    return (
+        len(a) > 1 and float(np.linalg.svd(a.T @ a / len(a))[1][-1]) > 0.5 * np.sin(0.17) ** 2 / 2
+    )
+
+
+def combine_sets(
+    axes: Sequence[tuple[float, float]], delta: F64, sigma: F64
+) -> tuple[F64, F64, F64]:
+    """Solve ``delta[s] = axes[s] . (delta_x, delta_y)`` at every pixel, weighted by 1 / sigma².
+
+    Parameters
+    ----------
+    axes : sequence of (float, float)
+        Unit vector (x, y) of each set's fringe axis.
+    delta, sigma : (s, ...) float64
+        Projections and their 1-sigma errors, px; a set that is NaN at a pixel does not count there.
+
+    Returns
+    -------
+    xy : (2, ...) float64
+        delta_x and delta_y, px; NaN where the sets left do not give both.
+    sigma_xy : (2, ...) float64
+        Their errors.
+    chi2 : (...) float64
+        Disagreement of the sets, for ``sets - 2`` degrees of freedom (0 with two).
+    """
+    a = np.asarray(axes, float).reshape(len(delta), 2, *([1] * (delta.ndim - 1)))
+    good = np.isfinite(delta) & np.isfinite(sigma) & (sigma > 0)
+    w = np.where(good, 1 / np.where(good, sigma, 1.0) ** 2, 0.0)
+    d = np.where(good, delta, 0.0)
+    xx, xy, yy = (
+        (w * a[:, 0] ** 2).sum(0),
+        (w * a[:, 0] * a[:, 1]).sum(0),
+        (w * a[:, 1] ** 2).sum(0),
+    )
+    rx, ry = (w * a[:, 0] * d).sum(0), (w * a[:, 1] * d).sum(0)
+    det = xx * yy - xy * xy
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(det > 0.005 * (xx + yy) ** 2, 1 / det, np.nan)
+        x, y = (yy * rx - xy * ry) * inverse, (xx * ry - xy * rx) * inverse
+        sigma_xy = np.sqrt(np.stack([yy, xx]) * inverse)
+    rest = d - a[:, 0] * x - a[:, 1] * y
+    return np.stack([x, y]), sigma_xy, (w * rest**2).sum(0)
+
+
+def combine_parallel(
+    axes: Sequence[tuple[float, float]], delta: F64, sigma: F64
+) -> tuple[F64, F64, F64]:
+    """Weighted mean of sets whose axes are the same; arguments and results as `combine_sets`.
+
+    The sign of each set follows the first axis.
+    """
+    a = np.asarray(axes, float)
+    sign = np.sign(a @ a[0]).reshape(-1, *([1] * (delta.ndim - 1)))
+    good = np.isfinite(delta) & np.isfinite(sigma) & (sigma > 0)
+    w = np.where(good, 1 / np.where(good, sigma, 1.0) ** 2, 0.0)
+    d = np.where(good, sign * delta, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        total = w.sum(0)
+        mean = np.where(total > 0, (w * d).sum(0) / total, np.nan)
+        error = np.where(total > 0, 1 / np.sqrt(total), np.nan)
+    return mean, error, (w * (d - mean) ** 2).sum(0)

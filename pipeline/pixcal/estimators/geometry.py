@@ -1,0 +1,138 @@
+"""From phases to the fringes' geometry: planes of tiles, unwrapped, and what is fitted to them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.fringes import grid, smooth_phasor
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TilePlane:
+    """Smooth phase of a tile: ``phase + kx * (x - cx) + ky * (y - cy)``.
+
+    Attributes
+    ----------
+    centre : (float, float)
+        (cy, cx) in pixels of the window.
+    phase : float
+        At the centre, rad, relative to the carrier; known up to turns until unwrapped.
+    kx, ky : float
+        Local fringe vector minus the carrier, rad/px.
+    sigma : float
+        1-sigma error of ``phase``; infinite without good pixels.
+    ratio : float
+        Median of iota / alpha.
+    """
+
+    centre: tuple[float, float]
+    phase: float
+    kx: float
+    ky: float
+    sigma: float
+    ratio: float
+
+    def on(self, shape: tuple[int, int]) -> F64:
+        """The plane on the tile's pixels."""
+        y, x = grid(shape)
+        return np.asarray(self.phase + self.kx * x + self.ky * y)
+
+
+def tile_plane(
+    phase: F32, sigma: F32, ratio: F32, good: NDArray[np.bool_], centre: tuple[float, float]
+) -> TilePlane:
+    """Plane through a tile's phases.
+
+    Parameters
+    ----------
+    phase, sigma : (y, x) float32
+        Phase relative to the carrier and its error, rad.
+    ratio : (y, x) float32
+        iota / alpha.
+    good : (y, x) bool
+        Pixels to use.
+    centre : (float, float)
+        Of the tile, (y, x) in pixels of the window.
+    """
+    if not good.any():
+        return TilePlane(centre, 0.0, 0.0, 0.0, np.inf, 1.0)
+    phasor = np.asarray(np.where(good, np.exp(1j * np.where(good, phase, 0.0)), 0.0), complex)
+    smooth, (kx, ky) = smooth_phasor(phasor, good, (0.0, 0.0), degree=0)
+    y, x = grid((phase.shape[0], phase.shape[1]))
+    rest = np.angle(phasor[good] * smooth[good].conj())
+    basis = np.stack(np.broadcast_arrays(1.0, x, y), axis=-1)[good]
+    if len(rest) >= 12:
+        step = np.linalg.lstsq(basis, rest, rcond=None)[0]
+    else:
+        step = np.array([rest.mean(), 0.0, 0.0])
+    at_centre = float(np.angle(smooth.ravel()[0]) - kx * x.ravel()[0] - ky * y.ravel()[0])
+    error = float(np.median(sigma[good]) / np.sqrt(good.sum()))
+    return TilePlane(
+        centre,
+        float(np.angle(np.exp(1j * (at_centre + step[0])))),
+        kx + float(step[1]),
+        ky + float(step[2]),
+        error,
+        float(np.median(ratio[good])),
+    )
+
+
+def unwrap(planes: Sequence[TilePlane], grid_shape: tuple[int, int]) -> list[TilePlane]:
+    """Add whole turns so that neighbouring tiles agree where they meet.
+
+    Each tile is joined to an unwrapped neighbour whose plane, followed to the common border from
+    both sides, leaves the least doubt; outwards from the best tile.
+
+    Parameters
+    ----------
+    planes : sequence of TilePlane
+        Row by row.
+    grid_shape : (int, int)
+        Rows and columns of tiles.
+    """
+    rows, columns = grid_shape
+    table = np.array(planes, dtype=object).reshape(rows, columns)
+    result = table.copy()
+    usable = np.array([np.isfinite(p.sigma) for p in planes]).reshape(rows, columns)
+    done = np.zeros((rows, columns), bool)
+    if not usable.any():
+        return list(planes)
+    distance = np.hypot(
+        *np.ogrid[-(rows // 2) : rows - rows // 2, -(columns // 2) : columns - columns // 2]
+    )
+    seed = np.unravel_index(int(np.argmin(np.where(usable, distance, np.inf))), (rows, columns))
+    queue = [(int(seed[0]), int(seed[1]))]
+    done[seed] = True
+    while queue:
+        i, j = queue.pop(0)
+        here = result[i, j]
+        for ni, nj in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
+            if not (0 <= ni < rows and 0 <= nj < columns) or done[ni, nj] or not usable[ni, nj]:
+                continue
+            there = table[ni, nj]
+            dy, dx = there.centre[0] - here.centre[0], there.centre[1] - here.centre[1]
+            expected = here.phase + (here.kx + there.kx) / 2 * dx + (here.ky + there.ky) / 2 * dy
+            turns = np.rint((expected - there.phase) / (2 * np.pi))
+            result[ni, nj] = TilePlane(
+                there.centre,
+                float(there.phase + 2 * np.pi * turns),
+                there.kx,
+                there.ky,
+                there.sigma,
+                there.ratio,
+            )
+            done[ni, nj] = True
+            queue.append((ni, nj))
+    # Islands that no good tile joins keep their own turn.
+    return list(result.ravel())
+
+
+def unwrapped_phase(phase: F32, plane: TilePlane) -> F64:
+    """A tile's phases (y, x), rad, on the turn of its plane."""
+    smooth = plane.on((phase.shape[0], phase.shape[1]))
+    return np.asarray(smooth + np.angle(np.exp(1j * (phase - smooth))))

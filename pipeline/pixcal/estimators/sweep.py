@@ -1,0 +1,215 @@
+"""The one pass over the cube: every pixel's parameters, its error, and those of every batch."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.batches import Batches
+from pixcal.estimators.fringes import FrameParameters, grid
+from pixcal.estimators.scout import Coding, Tile, accumulate, start_model
+from pixcal.kernels.bilinear import N_SUMS, solve_pixels
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+BOUND_PIXELS = 24
+"""Pixels of each tile for which the Cramér-Rao bound is worked out."""
+
+
+@dataclass(frozen=True)
+class TileMaps:
+    """What the sweep of a tile gives.
+
+    Attributes
+    ----------
+    iota, alpha : (y, x) float32
+        Mean and amplitude (e-) at B = A = 1.
+    phase : (y, x) float32
+        Phase (rad, in ±pi) relative to the carrier ``k . (r - reference)``.
+    sigma : (y, x) float32
+        1-sigma error of the phase (rad) that the noise model predicts.
+    chi2 : (y, x) float32
+        Reduced chi-square.
+    count : (y, x) float32
+        Samples with weight.
+    batch_phase, batch_sigma : (batch, y, x) float32
+        Phase of each batch relative to that of all frames, and its error (rad); NaN in gaps.
+    bound : (n,) float64
+        Cramér-Rao bound of the phase (rad) for some of the good pixels.
+    """
+
+    iota: F32
+    alpha: F32
+    phase: F32
+    sigma: F32
+    chi2: F32
+    count: F32
+    batch_phase: F32
+    batch_sigma: F32
+    bound: F64
+
+
+def frames_to_prime(frames: FrameParameters, block: int) -> int:
+    """Frames, a multiple of ``block``, after which a pixel's system is well conditioned."""
+    n = len(frames.g)
+    for stop in range(block, n, block):
+        g = frames.g[:stop]
+        scale = np.sqrt((g**2).mean(axis=0))
+        if np.linalg.cond((g / scale).T @ (g / scale)) < 50:
+            return stop
+    return n
+
+
+def sweep_tile(
+    tile: Tile,
+    blocks: Iterable[NDArray[np.uint16]],
+    coding: Coding,
+    frames: FrameParameters,
+    k: tuple[float, float],
+    batches: Batches,
+    prime: int,
+) -> TileMaps:
+    """Fit a tile, taking its samples block after block.
+
+    Parameters
+    ----------
+    tile : Tile
+    blocks : iterable of (t, y, x) arrays
+        Stored codes in the order of time; together as many frames as ``frames`` holds. The first
+        ``prime`` frames are held until the start model is made from them.
+    coding : Coding
+    frames : FrameParameters
+    k : (float, float)
+        Carrier (kx, ky), rad/px.
+    batches : Batches
+    prime : int
+        From `frames_to_prime`.
+    """
+    held: list[NDArray[np.uint16]] = []
+    model: F32 | None = None
+    n_held, position = 0, 0
+    sums = _BatchSums(tile, coding, frames, batches)
+    for block in blocks:
+        if model is None:
+            held.append(block.copy())
+            n_held += len(block)
+            if n_held < prime and n_held < len(frames.g):
+                continue
+            first = FrameParameters(frames.g[:n_held], frames.dk[:n_held], frames.reference)
+            model, _ = start_model(tile, held, coding, first, k)
+            for part in held:
+                sums.add(part, position, model)
+                position += len(part)
+            held = []
+        else:
+            sums.add(block, position, model)
+            position += len(block)
+    if model is None or position != len(frames.g):
+        raise ValueError(f"{position} frames given, {len(frames.g)} expected")
+    return sums.finish(model, k)
+
+
+class _BatchSums:
+    """Sums of the whole run and of the batch at hand."""
+
+    def __init__(
+        self, tile: Tile, coding: Coding, frames: FrameParameters, batches: Batches
+    ) -> None:
+        self.tile, self.coding, self.frames, self.batches = tile, coding, frames, batches
+        self.total: F64 = np.zeros((N_SUMS, *tile.shape))
+        self.part: F64 = np.zeros((N_SUMS, *tile.shape))
+        shape = (len(batches.ranges), *tile.shape)
+        self.phasor = np.full(shape, np.nan, np.complex64)
+        self.sigma = np.full(shape, np.nan, np.float32)
+        # Where the sums are cut: at the ends of batches (those of gaps do not cut).
+        self.ends = {b: n for n, (a, b) in enumerate(batches.ranges) if b > a}
+        self.cuts = sorted({a for a, b in batches.ranges if b > a} | set(self.ends))
+
+    def add(self, block: NDArray[np.uint16], position: int, model: F32) -> None:
+        stop = position + len(block)
+        cuts = [c for c in self.cuts if position < c < stop]
+        for a, b in zip([position, *cuts], [*cuts, stop], strict=True):
+            at = slice(a, b)
+            part = FrameParameters(self.frames.g[at], self.frames.dk[at], self.frames.reference)
+            inside = block[a - position : b - position]
+            accumulate(self.tile, [inside], self.coding, part, model, self.part)
+            if b in self.ends:
+                self._close(model, self.ends[b])
+            elif b in self.cuts:
+                self._close(model, None)
+
+    def _close(self, model: F32, batch: int | None) -> None:
+        self.total += self.part
+        if batch is not None:
+            theta, covariance, _ = solve_pixels(self.part)
+            theta += model
+            self.phasor[batch] = theta[2] + 1j * theta[1]
+            self.sigma[batch] = phase_sigma(theta, covariance)
+        self.part[:] = 0
+
+    def finish(self, model: F32, k: tuple[float, float]) -> TileMaps:
+        self._close(model, None)
+        step, covariance, chi2 = solve_pixels(self.total)
+        theta = model + step
+        z = theta[2] + 1j * theta[1]
+        y, x = grid(self.tile.shape)
+        cy, cx = self.tile.centre
+        ry, rx = self.frames.reference
+        carrier = np.exp(1j * (k[0] * (x + cx - rx) + k[1] * (y + cy - ry)))
+        count = self.total[10]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reduced = np.where(count > 3, chi2 / (count - 3), np.nan)
+        return TileMaps(
+            iota=theta[0].astype(np.float32),
+            alpha=np.abs(z).astype(np.float32),
+            phase=np.angle(z * carrier.conj()).astype(np.float32),
+            sigma=phase_sigma(theta, covariance).astype(np.float32),
+            chi2=reduced.astype(np.float32),
+            count=count.astype(np.float32),
+            batch_phase=np.angle(self.phasor * z.conj()[None]).astype(np.float32),
+            batch_sigma=self.sigma,
+            bound=phase_bound(self.tile, theta, self.frames),
+        )
+
+
+def phase_sigma(theta: F64, covariance: F64) -> F64:
+    """Error of the phase (rad) from the covariance of theta.
+
+    Parameters
+    ----------
+    theta : (3, ...) float64
+    covariance : (6, ...) float64
+        As from `pixcal.kernels.bilinear.solve_pixels`.
+    """
+    s, c = theta[1], theta[2]
+    power = s * s + c * c
+    with np.errstate(divide="ignore", invalid="ignore"):
+        variance = c * c * covariance[3] - 2 * c * s * covariance[4] + s * s * covariance[5]
+        return np.asarray(np.sqrt(variance) / power)
+
+
+def phase_bound(tile: Tile, theta: F64, frames: FrameParameters) -> F64:
+    """Cramér-Rao bound of the phase (rad) for some pixels of a tile.
+
+    For known frame parameters and Gaussian noise of the variance that the pixel's own fitted model
+    gives, without the approximations of the sweep's weights (physics note, section 3).
+    """
+    usable = tile.good & np.isfinite(theta).all(axis=0)
+    where = np.flatnonzero(usable)
+    if not len(where):
+        return np.zeros(0)
+    picked = where[np.linspace(0, len(where) - 1, min(BOUND_PIXELS, len(where))).astype(int)]
+    bounds = []
+    for y, x in zip(*np.unravel_index(picked, tile.shape), strict=True):
+        own = theta[:, y, x]
+        g = frames.at(y + tile.y[0], x + tile.x[0])
+        variance = tile.shot[y, x] * np.maximum(g @ own, 0) + tile.read[y, x]
+        information = g.T @ (g / variance[:, None])
+        gradient = np.array([0.0, own[2], -own[1]]) / (own[1] ** 2 + own[2] ** 2)
+        try:
+            bounds.append(np.sqrt(gradient @ np.linalg.solve(information, gradient)))
+        except np.linalg.LinAlgError:
+            continue
+    return np.array(bounds)

@@ -1,0 +1,103 @@
+"""One fringe set of ``RUN/reduce`` as the estimators want it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.scout import Coding, Tile
+from pixcal.storage.cube import ArrayReader, CachedReader
+
+
+@dataclass
+class ReducedSet:
+    """A reduced cube and what is needed to weight its samples.
+
+    Parameters
+    ----------
+    folder : Path
+        ``RUN/reduce/reduced.zarr/<set name>``.
+    """
+
+    folder: Path
+
+    @cached_property
+    def signal(self) -> CachedReader:
+        """Stored codes (time, y, x)."""
+        return CachedReader(self.folder / "signal")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(y, x) size of the window."""
+        return self.signal.shape[1], self.signal.shape[2]
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return self.signal.shape[0]
+
+    @property
+    def block(self) -> int:
+        """Frames of a chunk."""
+        return self.signal.chunks[0]
+
+    @property
+    def n_blocks(self) -> int:
+        """Chunks along time."""
+        return -(-self.n_frames // self.block)
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of tiles (columns of chunks)."""
+        (_, cy, cx), (ny, nx) = self.signal.chunks, self.shape
+        return -(-ny // cy), -(-nx // cx)
+
+    @property
+    def coding(self) -> Coding:
+        """Electrons of the stored codes."""
+        attrs = self.signal.attrs
+        return Coding(
+            float(attrs["scale_factor"]), float(attrs["add_offset"]), int(attrs["_FillValue"])
+        )
+
+    def time_s(self) -> NDArray[np.float64]:
+        """Time of each frame, s."""
+        return ArrayReader(self.folder / "time").read().astype(float)
+
+    def ranges(self, tile: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
+        """((y0, y1), (x0, x1)) of a tile, given its row and column."""
+        (_, cy, cx), (ny, nx) = self.signal.chunks, self.shape
+        i, j = tile
+        return (i * cy, min((i + 1) * cy, ny)), (j * cx, min((j + 1) * cx, nx))
+
+    def tile(self, tile: tuple[int, int]) -> Tile:
+        """Variance and good pixels of a tile."""
+        y, x = self.ranges(tile)
+        return Tile(
+            y,
+            x,
+            ArrayReader(self.folder / "read_variance").read(y, x).astype(np.float32),
+            ArrayReader(self.folder / "shot_factor").read(y, x).astype(np.float32),
+            self.mask(tile) == 0,
+        )
+
+    def mask(self, tile: tuple[int, int]) -> NDArray[np.uint8]:
+        """Flags of a tile's pixels."""
+        y, x = self.ranges(tile)
+        return ArrayReader(self.folder / "mask").read(y, x).astype(np.uint8)
+
+    def codes(self, tile: tuple[int, int], block: int, *, keep: bool = False) -> NDArray[np.uint16]:
+        """Codes (t, y, x) of one block of frames of a tile."""
+        index = (block, *tile)
+        chunk = self.signal.keep(index) if keep else self.signal.read_chunk(index)
+        y, x = self.ranges(tile)
+        n = min(self.block, self.n_frames - block * self.block)
+        return np.ascontiguousarray(chunk[:n, : y[1] - y[0], : x[1] - x[0]])
+
+    def blocks(self, tile: tuple[int, int]) -> Iterator[NDArray[np.uint16]]:
+        """Codes of a tile, block after block."""
+        for block in range(self.n_blocks):
+            yield self.codes(tile, block)
