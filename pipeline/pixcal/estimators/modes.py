@@ -10,56 +10,81 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.fringes import grid
-from pixcal.estimators.gauge import MODES, fringe_modes
+from pixcal.estimators.gauge import FRINGE_MODES, fringe_modes
 from pixcal.estimators.geometry import TilePlane
+from pixcal.estimators.models import FringeShape
 
 F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class ModeBasis:
-    """The modes of a set's phase map.
+    """The modes of a set's phase map: those of the fringes' shape, then those of the gauge.
 
     Attributes
     ----------
+    shape : FringeShape
+        Present shape of the fringes.
     k : (float, float)
-        Carrier (kx, ky), rad/px.
+        Carrier (kx, ky), rad/px, that measured phases are relative to.
     reference : (float, float)
         Point (y, x) where the carrier's phase is zero.
-    scale : float
-        Length, px, that the linear modes are divided by.
     """
 
+    shape: FringeShape
     k: tuple[float, float]
     reference: tuple[float, float]
-    scale: float
 
     @property
     def names(self) -> tuple[str, ...]:
         """Names of the modes, in the order of `on`."""
-        return MODES
+        return (*self.shape.names, *FRINGE_MODES)
 
-    def on(self, plane: TilePlane, shape: tuple[int, int]) -> F64:
-        """The modes on a tile: (mode, y, x).
+    def on(self, plane: TilePlane, size: tuple[int, int]) -> tuple[F64, F64]:
+        """The modes (mode, y, x) on a tile, and the shape's phase relative to the carrier (y, x).
 
         Parameters
         ----------
         plane : TilePlane
             Smooth phase of the tile relative to the carrier.
-        shape : (int, int)
+        size : (int, int)
             Of the tile.
         """
-        y, x = grid(shape)
-        y = y + plane.centre[0] - self.reference[0]
-        x = x + plane.centre[1] - self.reference[1]
-        psi = self.k[0] * x + self.k[1] * y + plane.on(shape)
-        linear = [np.ones(shape), x / self.scale, y / self.scale]
-        return np.stack(
-            [
-                np.broadcast_to(m, shape)
-                for m in (*linear, *fringe_modes(psi, np.asarray(plane.ratio)))
-            ]
-        )
+        y, x = grid(size)
+        y, x = y + plane.centre[0], x + plane.centre[1]
+        carrier = self.k[0] * (x - self.reference[1]) + self.k[1] * (y - self.reference[0])
+        gauge = fringe_modes(carrier + plane.on(size), np.asarray(plane.ratio))
+        modes = np.concatenate([self.shape.modes(y, x), np.stack(gauge)])
+        return modes, self.shape.phase(y, x) - carrier
+
+    def solve(self, normal: F64, right: F64, spread: float) -> F64:
+        """Coefficients (mode, n) of maps from their sums, with what the shape knows beforehand.
+
+        Parameters
+        ----------
+        normal : (mode, mode) float64
+        right : (mode, n) float64
+            The first map is the whole run's; the prior's offset acts on it alone, the others are
+            differences from it.
+        spread : float
+            Variance of the map over that of its noise: true offsets act as noise here.
+        """
+        precision = self._precision(spread)
+        offset = np.zeros(len(precision))
+        offset[: len(self.shape.names)] = self.shape.prior_offset
+        right = right.copy()
+        right[:, 0] -= precision * offset
+        return solve_modes(normal + np.diag(precision), right)
+
+    def covariance(self, normal: F64, spread: float) -> F64:
+        """Covariance of the coefficients."""
+        n = normal / spread + np.diag(self._precision(1.0))
+        scale = np.sqrt(np.maximum(np.diag(n), np.finfo(float).tiny))
+        return np.asarray(np.linalg.pinv(n / np.outer(scale, scale)) / np.outer(scale, scale))
+
+    def _precision(self, spread: float) -> F64:
+        known = self.shape.precision * spread
+        return np.concatenate([known, np.zeros(len(FRINGE_MODES))])
 
 
 def mode_sums(modes: F64, weight: F64, maps: F64) -> tuple[F64, F64]:
@@ -82,7 +107,7 @@ def mode_sums(modes: F64, weight: F64, maps: F64) -> tuple[F64, F64]:
 def solve_modes(normal: F64, right: F64) -> F64:
     """Coefficients (mode, n); modes that the window cannot tell apart share what they explain."""
     scale = np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
-    coefficients = np.linalg.lstsq(
-        normal / np.outer(scale, scale), right / scale[:, None], rcond=1e-10
-    )[0]
-    return np.asarray(coefficients / scale[:, None])
+    unit = normal / np.outer(scale, scale)
+    return np.asarray(
+        np.linalg.lstsq(unit, right / scale[:, None], rcond=1e-12)[0] / scale[:, None]
+    )

@@ -55,6 +55,11 @@ class ReducedSet:
         (_, cy, cx), (ny, nx) = self.signal.chunks, self.shape
         return -(-ny // cy), -(-nx // cx)
 
+    def tiles(self) -> list[tuple[int, int]]:
+        """Row and column of every tile, row by row."""
+        rows, columns = self.grid
+        return [(i, j) for i in range(rows) for j in range(columns)]
+
     @property
     def coding(self) -> Coding:
         """Electrons of the stored codes."""

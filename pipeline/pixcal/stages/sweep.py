@@ -145,7 +145,7 @@ def _sweep_set(
     held = 2 * min(prime, source.n_frames) + 6 * source.block
     per_task = cy * cx * (held + 900 + 32 * len(batches.ranges))
     plan = make_plan(f"the fit of {name}", per_task, CACHE_BYTES, runtime)
-    tiles = [t for t in product(*map(range, source.grid)) if f"{name}:{t[0]},{t[1]}" not in done]
+    tiles = [t for t in source.tiles() if f"{name}:{t[0]},{t[1]}" not in done]
     carrier = (float(facts["k"][0]), float(facts["k"][1]))
     run_tasks(
         partial(_sweep_task, source, writers, frames, carrier, batches, prime),
