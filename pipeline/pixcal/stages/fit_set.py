@@ -250,13 +250,14 @@ def _describe(
     kx, ky = shape.vector((ny - 1) / 2, (nx - 1) / 2)
     k = float(np.hypot(kx, ky))
     ratio = np.median([p.ratio for p in planes if np.isfinite(p.sigma)] or [np.nan])
+    own = len(shape.names)
     origin = float(shape.phase(np.zeros(1), np.zeros(1))[0])
     return {
         "frames": source.n_frames,
         "pixels": int(good.size),
         "pixels_masked": int((~good).sum()),
         "interfringe_px": 2 * np.pi / k,
-        "geometry": shape.facts(fitted.covariance),
+        "geometry": shape.facts(fitted.covariance[:own, :own]),
         "kx": kx,
         "ky": ky,
         "nominal_kx": facts["nominal_k"][0],
