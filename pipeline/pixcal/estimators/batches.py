@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 DEFAULT_FRAMES = 500
 """Frames of a batch in a long run (paper, section 4.3)."""
 
-MIN_FRAMES = 8
-"""Fewest frames of a batch: each pixel has three unknowns."""
+MIN_FRAMES = 16
+"""Fewest frames of a batch: each pixel has three unknowns of its own there."""
 
 WANTED = 24
 """Batches wanted of a run too short for `DEFAULT_FRAMES`."""

@@ -1,0 +1,258 @@
+"""From a reduced run to the offset maps."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from pixcal.engine.run import Runtime
+from pixcal.model.errors import DamagedError, InputError
+from pixcal.model.flags import PixelFlag
+from pixcal.stages import fit
+from pixcal.storage.cube import ArrayReader, write_array
+from pixcal.storage.products import read_map
+
+SETS = {"vertical": "delta_x", "horizontal": "delta_y"}
+
+
+@pytest.fixture(scope="module")
+def fitted(make_bench, write_reduced, tmp_path_factory):
+    """A bench with everything free on a window of four uneven tiles, fitted once."""
+    bench = make_bench(
+        shape=(137, 150), frames=170, laser_noise=0.02, visibility_noise=0.03, response=0.02
+    )
+    run = write_reduced(bench, tmp_path_factory.mktemp("fit") / "run")
+    fit.run(run, fit.Config(), Runtime())
+    return bench, run, json.loads((run / "products" / "fit.json").read_text())
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_maps_are_at_the_bound_and_their_errors_honest(fitted, name):
+    bench, run, result = fitted
+    data, sigma, mask, _ = read_map(run / "products" / f"{SETS[name]}.fits")
+    truth = bench.delta_x if name == "vertical" else bench.delta_y
+    error = bench.without_modes(data - truth, name)
+    bound = bench.bound(name)
+    # 20 550 pixels: the rms is known to half a percent.
+    assert np.nanstd(error) / bound < 1.03
+    assert 0.97 < np.nanstd(error / sigma) < 1.03
+    assert result["sets"][name]["crb_median_px"] == pytest.approx(bound, rel=0.02)
+    assert result["sets"][name]["sigma_median_px"] == pytest.approx(bound, rel=0.03)
+    assert not mask.any()
+
+
+def test_the_error_holds_no_fringes(fitted):
+    """Power at the fringe frequency and twice it is what noise alone gives."""
+    bench, run, _ = fitted
+    data, *_ = read_map(run / "products" / "delta_x.fits")
+    error = bench.without_modes(data - bench.delta_x, "vertical")
+    k = bench.wave_number("vertical")
+    x = np.arange(bench.shape[1])
+    for harmonic in (1, 2):
+        amplitude = np.abs((error * np.exp(-1j * harmonic * k * x)).mean())
+        # 1e-3 chance of a noise amplitude above this.
+        assert amplitude < 2.7 * error.std() / np.sqrt(error.size)
+
+
+def test_fit_json_says_what_the_interface_promises(fitted):
+    bench, _, result = fitted
+    for name in SETS:
+        facts = result["sets"][name]
+        assert facts["model"] == "paraxial"
+        assert facts["frames"] == bench.frames
+        # The exact paths are longer than the distance by (B / 2 D)² / 2, some 1e-4.
+        length = np.hypot(*bench.sets[name])
+        exact = 5.0 * np.sqrt(1 + (length / 2 / bench.distance) ** 2)
+        assert facts["interfringe_px"] == pytest.approx(exact, rel=1e-5)
+        assert facts["chi2_reduced"] == pytest.approx(1.0, abs=0.01)
+        assert facts["passes"] == 1.0
+        assert facts["removed_modes"][:3] == ["1", "x", "y"]
+        assert len(facts["removed_modes"]) == 7
+        across = "ky" if name == "vertical" else "kx"
+        geometry = facts["geometry"]
+        assert abs(geometry[f"{across}_rad_per_px"]) < 4 * geometry[f"{across}_sigma"]
+
+
+def test_products_follow_the_interface(fitted):
+    _, run, result = fitted
+    with fits.open(run / "products" / "delta_x.fits", checksum=True) as hdus:
+        hdus.verify("exception")
+        assert hdus[0].data.dtype == np.dtype(">f4")
+        assert hdus["SIGMA"].data.shape == hdus["MASK"].data.shape == hdus[0].data.shape
+        assert hdus["MASK"].data.dtype == np.uint8
+        header = hdus[0].header
+        assert header["INDIGEST"] == result["input"]
+        assert header["M1_4"] == "cos(psi)*iota/alpha"
+        assert header["CREATOR"].startswith("pixcal")
+    assert not (run / "products" / "delta_fringe.fits").exists()
+
+
+def test_batches_average_to_the_whole(fitted):
+    _, run, result = fitted
+    group = run / "fit" / "fit.zarr" / "vertical"
+    delta = ArrayReader(group / "delta").read()
+    batches = ArrayReader(group / "batch_delta").read()
+    sigma = ArrayReader(group / "batch_sigma").read()
+    assert len(batches) == bench_batches(result)
+    mean = (batches / sigma**2).sum(axis=0) / (1 / sigma**2).sum(axis=0)
+    whole = ArrayReader(group / "sigma").read()
+    # Each batch fits its own level and contrast: that costs the mean a part of its precision.
+    assert np.std((mean - delta) / whole) < 0.5
+    spread = batches.std(axis=0, ddof=1).mean()
+    assert spread == pytest.approx(np.sqrt((sigma**2).mean()), rel=0.05)
+
+
+def bench_batches(result):
+    facts = result["sets"]["vertical"]
+    return facts["frames"] // facts["batch_frames"]
+
+
+@pytest.mark.parametrize(
+    "runtime", [Runtime("sync"), Runtime("threads", workers=3), Runtime("processes", workers=2)]
+)
+def test_the_same_bits_however_it_runs(fitted, tmp_path, runtime):
+    _, run, _ = fitted
+    again = tmp_path / "run"
+    for part in ("ingest", "reduce"):
+        shutil.copytree(run / part, again / part)
+    fit.run(again, fit.Config(), runtime)
+    for name in SETS.values():
+        with fits.open(run / "products" / f"{name}.fits") as a:
+            with fits.open(again / "products" / f"{name}.fits") as b:
+                for n in range(3):
+                    np.testing.assert_array_equal(a[n].data, b[n].data)
+
+
+def test_up_to_date_work_is_skipped_and_another_model_sweeps_no_more(fitted, tmp_path):
+    _, run, _ = fitted
+    again = tmp_path / "run"
+    shutil.copytree(run, again)
+    first = fit.run(again, fit.Config(), Runtime())
+    before = (again / "fit" / "manifest.json").stat().st_mtime_ns
+    assert fit.run(again, fit.Config(), Runtime()) == first
+    assert (again / "fit" / "manifest.json").stat().st_mtime_ns == before
+    swept = (again / "sweep" / "manifest.json").stat().st_mtime_ns
+    other = fit.run(again, fit.Config(model="hyperbolic"), Runtime())
+    assert other.summary["sets"]["vertical"]["model"] == "hyperbolic"
+    assert (again / "sweep" / "manifest.json").stat().st_mtime_ns == swept
+
+
+def test_a_killed_fit_resumes_to_the_same_bits(fitted, tmp_path, monkeypatch):
+    _, run, _ = fitted
+    again = tmp_path / "run"
+    for part in ("ingest", "reduce"):
+        shutil.copytree(run / part, again / part)
+    from pixcal.stages import sweep
+
+    calls = []
+
+    def breaking(*arguments):
+        calls.append(arguments[-1])
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(*arguments)
+
+    real = sweep._sweep_task
+    monkeypatch.setattr(sweep, "_sweep_task", breaking)
+    with pytest.raises(KeyboardInterrupt):
+        fit.run(again, fit.Config(), Runtime("sync"))
+    assert not (again / "sweep").exists()
+    fit.run(again, fit.Config(), Runtime("sync"))
+    # Two tiles were noted as done before the kill; none of them is done again.
+    assert sorted(calls[3:6]).count(calls[0]) <= 1
+    assert len(calls) == 3 + 2 + 4
+    a, *_ = read_map(run / "products" / "delta_y.fits")
+    b, *_ = read_map(again / "products" / "delta_y.fits")
+    np.testing.assert_array_equal(a, b)
+
+
+def test_a_damaged_chunk_is_named(fitted, tmp_path):
+    _, run, _ = fitted
+    again = tmp_path / "run"
+    for part in ("ingest", "reduce"):
+        shutil.copytree(run / part, again / part)
+    chunk = again / "reduce" / "reduced.zarr" / "horizontal" / "signal" / "c" / "1" / "0" / "1"
+    raw = bytearray(chunk.read_bytes())
+    raw[len(raw) // 2] ^= 4
+    chunk.write_bytes(raw)
+    with pytest.raises(DamagedError, match="c/1/0/1"):
+        fit.run(again, fit.Config(), Runtime())
+
+
+def test_masked_pixels_are_nan_with_their_flag(make_bench, write_reduced, tmp_path):
+    bench = make_bench(shape=(40, 45), frames=100, sets={"only": (4.0, 4.0)}, interfringe=6.0)
+    run = write_reduced(bench, tmp_path / "run")
+    group = run / "reduce" / "reduced.zarr" / "only"
+    mask = np.zeros(bench.shape, np.uint8)
+    mask[3, 4], mask[10, 11] = PixelFlag.HOT, PixelFlag.DEAD
+    shutil.rmtree(group / "mask")
+    write_array(group / "mask", mask, dims=("y", "x"), chunks=(128, 128))
+    fit.run(run, fit.Config(), Runtime())
+    data, sigma, flags, header = read_map(run / "products" / "delta_fringe.fits")
+    np.testing.assert_array_equal(flags, mask)
+    np.testing.assert_array_equal(np.isnan(data), mask > 0)
+    np.testing.assert_array_equal(np.isnan(sigma), mask > 0)
+    assert header["NSETS"] == 1
+    truth = (bench.delta_x + bench.delta_y) / np.sqrt(2)
+    error = bench.without_modes(data - truth, "only")
+    assert np.nanstd(error) / bench.bound("only", 31) < 1.07
+
+
+def test_hyperbolic_fringes_are_seen_and_fitted(make_bench, write_reduced, tmp_path):
+    """Fibres 18 mm aside and 10 mm farther than nominal, baseline 5 % longer."""
+    bench = make_bench(
+        shape=(120, 140), frames=150, distance=410.0, offset=(18.0, -18.0),
+        sets={"vertical": (6.3, 0.0), "horizontal": (0.0, 6.3)}, interfringe=None,
+    )  # fmt: skip
+    run = write_reduced(bench, tmp_path / "run")
+    config = run / "ingest" / "acquisition.json"
+    acquisition = json.loads(config.read_text())
+    for number, nominal in enumerate(([6.0, 0.0], [0.0, 6.0])):
+        acquisition["frames"]["fringes"][number]["baseline_mm"] = nominal
+    config.write_text(json.dumps(acquisition))
+    fit.run(run, fit.Config(), Runtime())
+    result = json.loads((run / "products" / "fit.json").read_text())
+    for name, product in SETS.items():
+        facts = result["sets"][name]
+        assert facts["model"] == "hyperbolic"
+        for axis, wanted in (("x", 18.0), ("y", -18.0)):
+            middle = (bench.shape[1 if axis == "x" else 0] - 1) / 2 * bench.pitch
+            value = facts["geometry"][f"centre_{axis}_mm"] - middle
+            assert abs(value - wanted) < 4 * facts["geometry"][f"centre_{axis}_sigma_mm"]
+        data, sigma, _, _ = read_map(run / "products" / f"{product}.fits")
+        truth = bench.delta_x if name == "vertical" else bench.delta_y
+        error = bench.without_modes(data - truth, name, quadratic=True)
+        assert np.nanstd(error) / bench.bound(name) < 1.03
+        assert 0.97 < np.nanstd(error / sigma) < 1.03
+    fit.run(run, fit.Config(model="paraxial"), Runtime())
+    data, *_ = read_map(run / "products" / "delta_x.fits")
+    crest = bench.without_modes(data - bench.delta_x, "vertical")
+    assert np.nanstd(crest) / bench.bound("vertical") > 1.5
+
+
+def test_three_sets_are_consistent(make_bench, write_reduced, tmp_path):
+    bench = make_bench(
+        shape=(50, 55), frames=120,
+        sets={"a": (6.0, 0.0), "b": (0.0, 6.0), "c": (4.0, 4.0)}, interfringe=None,
+    )  # fmt: skip
+    run = write_reduced(bench, tmp_path / "run")
+    fit.run(run, fit.Config(), Runtime())
+    result = json.loads((run / "products" / "fit.json").read_text())
+    # The sets' own removed modes differ: what one set lost, another keeps; some chi-square is left.
+    assert 0.8 < result["sets_chi2_reduced"] < 1.3
+    data, sigma, _, _ = read_map(run / "products" / "delta_x.fits")
+    assert np.nanmedian(sigma) < result["sets"]["a"]["sigma_median_px"]
+
+
+def test_no_fringes_is_an_input_error_that_names_the_set(make_bench, write_reduced, tmp_path):
+    run = write_reduced(make_bench(frames=60, visibility=1e-9), tmp_path / "run")
+    with pytest.raises(InputError, match="'vertical'"):
+        fit.run(run, fit.Config(), Runtime())
+
+
+def test_reduce_must_come_first(tmp_path):
+    (tmp_path / "run").mkdir()
+    with pytest.raises(InputError, match="pixcal reduce"):
+        fit.run(tmp_path / "run", fit.Config(), Runtime())
