@@ -38,6 +38,14 @@ class Optics:
     )
 
 
+def _check_globs(key: str, globs: tuple[str, ...]) -> None:
+    for number, glob in enumerate(globs):
+        if not glob.isprintable() or not glob.strip() or Path(glob).is_absolute():
+            raise InputError(
+                f"{key}[{number}]: {glob!r:.80} is not a glob relative to acquisition.yaml"
+            )
+
+
 @dataclass(frozen=True)
 class FringeSet:
     """One scan of the fringes of one pair of fibres."""
@@ -53,6 +61,7 @@ class FringeSet:
             raise InputError(f"name: {self.name!r:.80} is not made of letters, digits, '-' and '_'")
         if not self.files:
             raise InputError("files: the list is empty")
+        _check_globs("files", self.files)
         if self.baseline_mm == (0.0, 0.0):
             raise InputError("baseline_mm: both components are zero, so there are no fringes")
 
@@ -65,6 +74,11 @@ class Frames:
     dark: tuple[str, ...] = quantity((), doc="no light, any exposure times")
     flat: tuple[str, ...] = quantity((), doc="uniform light, any exposure times")
     fringes: tuple[FringeSet, ...] = quantity((), doc="the fringe sets")
+
+    def __post_init__(self) -> None:
+        _check_globs("bias", self.bias)
+        _check_globs("dark", self.dark)
+        _check_globs("flat", self.flat)
 
 
 @dataclass(frozen=True)

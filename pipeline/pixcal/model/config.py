@@ -6,6 +6,7 @@ them with `quantity`. What is read back can be written out again by `to_plain`.
 
 import dataclasses
 import math
+import re
 import types
 import typing
 from pathlib import Path
@@ -61,7 +62,11 @@ def quantity(
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """Plain YAML only: no tags, no aliases, no key twice."""
+    """Plain YAML only: no tags, no aliases, no key twice.
+
+    Bare words mean what YAML 1.2 says: PyYAML by itself would read ``010`` as 8, ``1:30`` as 90,
+    ``no`` as false and ``4e2`` as text.
+    """
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         event: Any = self.peek_event()  # type: ignore[no-untyped-call]
@@ -69,7 +74,7 @@ class _StrictLoader(yaml.SafeLoader):
         if isinstance(event, yaml.AliasEvent):
             raise yaml.YAMLError(f"aliases are not allowed (line {line})")
         if getattr(event, "tag", None) is not None:
-            raise yaml.YAMLError(f"tags are not allowed (line {line}: {event.tag})")
+            raise yaml.YAMLError(f"tags are not allowed (line {line}: {event.tag:.80})")
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
@@ -79,9 +84,23 @@ class _StrictLoader(yaml.SafeLoader):
             if not isinstance(key, str):
                 raise yaml.YAMLError(f"line {key_node.start_mark.line + 1}: keys must be words")
             if key in seen:
-                raise yaml.YAMLError(f"line {key_node.start_mark.line + 1}: key {key!r} twice")
+                raise yaml.YAMLError(f"line {key_node.start_mark.line + 1}: key {key!r:.80} twice")
             seen.add(key)
         return super().construct_mapping(node, deep=deep)
+
+
+_StrictLoader.yaml_implicit_resolvers = {}
+for _tag, _pattern in {
+    "null": r"~|null|Null|NULL|",
+    "bool": r"true|True|TRUE|false|False|FALSE",
+    "int": r"[-+]?[0-9]+",
+    "float": r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
+}.items():
+    _StrictLoader.add_implicit_resolver(
+        f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), None
+    )
+_StrictLoader.add_constructor("tag:yaml.org,2002:int", lambda _loader, node: int(node.value))
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -101,8 +120,10 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: cannot be read ({reason})") from error
     try:
         data = yaml.load(text, Loader=_StrictLoader)  # noqa: S506 (a SafeLoader, made stricter)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        reason = " ".join(str(error).split()) or "nested too deeply"
+    except RecursionError as error:
+        raise InputError(f"{path}: not a configuration: nested too deeply") from error
+    except (yaml.YAMLError, ValueError) as error:
+        reason = " ".join(str(error).split())
         raise InputError(f"{path}: not valid YAML: {reason}") from error
     if not isinstance(data, dict):
         raise InputError(f"{path}: expected keys and values at the top level")
@@ -136,7 +157,7 @@ def parse(cls: type[T], data: Any, where: str, *, key: str = "") -> T:
     for name in data:
         if name not in fields:
             known = ", ".join(fields)
-            raise InputError(f"{place}: unknown key {name!r}; the keys here are {known}")
+            raise InputError(f"{place}: unknown key {name!r:.80}; the keys here are {known}")
     values: dict[str, Any] = {}
     for name, field in fields.items():
         path = f"{key}.{name}" if key else name
@@ -205,7 +226,7 @@ def _value(hint: Any, value: Any, where: str, key: str, meta: Any) -> Any:
             raise InputError(f"{place}: expected text, found {_kind(value)}")
         choices = meta.get("choices")
         if choices and value not in choices:
-            raise InputError(f"{place}: {value!r} is not one of {', '.join(choices)}")
+            raise InputError(f"{place}: {value!r:.80} is not one of {', '.join(choices)}")
         return value
     if hint in (int, float):
         return _number(hint, value, place, meta)

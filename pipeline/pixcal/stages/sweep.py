@@ -21,7 +21,7 @@ from pixcal.estimators.scout import Scout
 from pixcal.estimators.sweep import BOUND_PIXELS, frames_to_prime, sweep_tile
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse, quantity
-from pixcal.model.errors import InputError
+from pixcal.model.errors import DamagedError, InputError
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import (
     Build,
@@ -98,6 +98,8 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
                 sets[fringe_set.name] = _sweep_set(
                     made, source, fringe_set.name, nominal, config, runtime
                 )
+            except DamagedError:
+                raise
             except InputError as error:
                 raise InputError(f"{run_dir}: fringe set {fringe_set.name!r}: {error}") from error
         made.summary = {"sets": sets}
