@@ -1,0 +1,380 @@
+"""Ingest: the FITS frames of an acquisition into checksummed cubes, each frame read once.
+
+Everything that can be told from headers and file lengths is checked before any data are read. The
+frames then go through memory in blocks of 64 frames and bands of rows, which are whole chunks: no
+chunk is written twice, and a run that was cut short goes on with the blocks that are missing.
+"""
+
+import errno
+import hashlib
+import shutil
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.engine.plan import Plan, make_plan
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.model.acquisition import Acquisition, load_acquisition
+from pixcal.model.config import quantity, to_plain
+from pixcal.model.errors import InputError
+from pixcal.storage.artefact import (
+    Build,
+    Manifest,
+    artefact_key,
+    build,
+    lock,
+    read_manifest,
+    up_to_date,
+    write_json,
+)
+from pixcal.storage.cube import CHUNK, INDEX, ArrayWriter, create_array, create_group
+from pixcal.storage.fits_in import FrameFile, inspect
+from pixcal.storage.fits_rows import read_rows, unpack, unpack_bytes
+from pixcal.storage.frames import Frame, columns, tabulate
+from pixcal.storage.sources import SourceFile, find_sources, fingerprint
+
+STAGE = "ingest"
+FORMAT = 1
+
+_BAND_ROWS = (512, 384, 256, 128)
+"""Heights of a band, the first that fits the memory: whole chunks, and long reads."""
+
+_DTYPES = tuple(map(np.dtype, ("u1", "i1", "u2", "i2", "u4", "i4", "f4")))
+_FILES_A_TASK = 32
+_BYTES_A_FRAME = 4096
+
+
+@dataclass(frozen=True)
+class Config:
+    """How to ingest.
+
+    Attributes
+    ----------
+    overwrite : bool
+        Replace what was ingested from another acquisition; no part of the result.
+    """
+
+    overwrite: bool = quantity(False, doc="replace an ingest of another acquisition")
+
+
+def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
+    """Make ``RUN/ingest`` from an acquisition, unless it is up to date.
+
+    Parameters
+    ----------
+    acquisition : Path
+        Directory with ``acquisition.yaml``, or that file.
+    out : Path
+        The run directory.
+    config : Config
+        Options.
+    runtime : Runtime
+        How to run.
+
+    Returns
+    -------
+    Manifest
+        Its ``inputs`` hold the fingerprint of the files of each array; its ``summary`` the shape,
+        type and content digest of each array, and ``warnings``.
+
+    Raises
+    ------
+    InputError
+        Naming the file, key or option that is wrong.
+    """
+    described = load_acquisition(acquisition)
+    description = acquisition / "acquisition.yaml" if acquisition.is_dir() else acquisition
+    sources = find_sources(described.frames, description)
+    plain = {"acquisition": to_plain(described)}
+    inputs = {array: fingerprint(files) for array, files in sources.items()}
+    with lock(out):
+        done = up_to_date(out, STAGE, artefact_key(STAGE, FORMAT, plain, inputs))
+        if done is not None:
+            return done
+        if not config.overwrite:
+            _refuse_other(out, plain, inputs)
+        tables, warnings = _check(described, sources, runtime)
+        try:
+            with build(out, STAGE, FORMAT, plain, inputs) as made:
+                _fill(made, tables, runtime)
+                _close(made, described, sources, tables, warnings)
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+                raise
+            raise InputError(
+                f"{out}: the disk is full; free some space and run again, it goes on from there"
+            ) from error
+    manifest = read_manifest(out / STAGE)
+    assert manifest is not None
+    return manifest
+
+
+def _refuse_other(out: Path, plain: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
+    """Refuse to replace an ingest of another acquisition, saying what is different."""
+    old = read_manifest(out / STAGE)
+    if old is None:
+        return
+    arrays = sorted(inputs.keys() | old.inputs.keys())
+    other = [f"the files of {a}" for a in arrays if inputs.get(a) != old.inputs.get(a)]
+    if old.config != plain:
+        other.insert(0, "acquisition.yaml")
+    raise InputError(
+        f"{out / STAGE}: made from another acquisition ({', '.join(other) or 'format'} changed "
+        "since); choose another --out, or replace it with --overwrite"
+    )
+
+
+# What the headers say
+
+
+def _check(
+    described: Acquisition, sources: Mapping[str, Sequence[SourceFile]], runtime: Runtime
+) -> tuple[dict[str, list[Frame]], list[str]]:
+    """Headers of all files, checked: the table of frames of each array, and warnings."""
+    listed = [source for files in sources.values() for source in files]
+    batches = [listed[n : n + _FILES_A_TASK] for n in range(0, len(listed), _FILES_A_TASK)]
+    results = run_tasks(_inspect_batch, batches, runtime, label="headers")
+    answers = [answer for batch in results for answer in batch]
+    problems = [answer for answer in answers if isinstance(answer, str)]
+    if problems:
+        more = f" ({len(problems) - 1} more files are bad)" if len(problems) > 1 else ""
+        raise InputError(problems[0] + more)
+    files = iter(answer for answer in answers if isinstance(answer, FrameFile))
+    by_array = {array: [next(files) for _ in listed] for array, listed in sources.items()}
+    _check_shapes(by_array)
+    tables, warnings = {}, []
+    for array, its_files in by_array.items():
+        _common_dtype(array, its_files)
+        frames, odd = tabulate(array, its_files, described.optics.frame_period_s)
+        tables[array] = frames
+        warnings += odd
+    return tables, warnings
+
+
+def _inspect_batch(batch: Sequence[SourceFile]) -> list[FrameFile | str]:
+    """What each file holds, or what is wrong with it."""
+    answers: list[FrameFile | str] = []
+    for source in batch:
+        try:
+            answers.append(inspect(source))
+        except InputError as error:
+            answers.append(str(error))
+    return answers
+
+
+def _check_shapes(by_array: Mapping[str, Sequence[FrameFile]]) -> None:
+    """Refuse frames of another size than that of most files."""
+    files = [file for its_files in by_array.values() for file in its_files]
+    usual = Counter(file.shape[1:] for file in files).most_common(1)[0][0]
+    odd = next((file for file in files if file.shape[1:] != usual), None)
+    if odd is not None:
+        other = next(file for file in files if file.shape[1:] == usual)
+        sizes = [f"{nx} × {ny}" for ny, nx in (odd.shape[1:], usual)]
+        raise InputError(
+            f"{odd.source.path}: frames of {sizes[0]} pixels (x × y), where those of "
+            f"{other.source.name} and of most files have {sizes[1]}; all frames of an acquisition "
+            "have one size"
+        )
+
+
+def _common_dtype(array: str, files: Sequence[FrameFile]) -> np.dtype[Any]:
+    """Smallest type that holds the samples of all files of an array."""
+    first: dict[np.dtype[Any], FrameFile] = {}
+    for file in files:
+        first.setdefault(file.coding.dtype, file)
+    dtype = np.result_type(*first)
+    if dtype not in _DTYPES:
+        a, *_, b = first.items()
+        raise InputError(
+            f"{b[1].source.path}: {b[0]} samples, where {a[1].source.name} of the same array "
+            f"{array} has {a[0]}; no 32-bit type holds both, convert one"
+        )
+    return dtype
+
+
+# Memory and tasks
+
+
+def _plan(tables: Mapping[str, Sequence[Frame]], runtime: Runtime) -> tuple[int, Plan]:
+    """Rows of a band, and the memory: rather lower bands than fewer workers."""
+    shared = _BYTES_A_FRAME * sum(map(len, tables.values()))
+    rows, need = 0, 0
+    for rows in _BAND_ROWS:
+        need = max(_task_bytes(array, frames, rows) for array, frames in tables.items())
+        if Plan(need, shared, runtime.n_workers).total <= runtime.memory:
+            break
+    return rows, make_plan("ingest", need, shared, runtime)
+
+
+def _task_bytes(array: str, frames: Sequence[Frame], rows: int) -> int:
+    """Peak of one task: the band, one frame's samples in conversion, chunks in compression."""
+    files = _files(frames)
+    _, ny, nx = files[0].shape
+    band = min(rows, ny) * nx
+    dtype = _common_dtype(array, files)
+    converted = any(not f.coding.exact or f.coding.dtype != dtype for f in files)
+    conversion = band * (np.dtype("f8").itemsize + 3 * dtype.itemsize) if converted else 0
+    chunk = CHUNK[0] * CHUNK[1] * CHUNK[2] * dtype.itemsize
+    reading = max(conversion, *(unpack_bytes(f) for f in files), 4 * chunk)
+    return min(CHUNK[0], len(frames)) * band * dtype.itemsize + reading
+
+
+def _files(frames: Sequence[Frame]) -> list[FrameFile]:
+    return [file for file, _ in groupby(frame.file for frame in frames)]
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """A task: some frames, from a border of chunks on, in bands of rows."""
+
+    step: str
+    writer: ArrayWriter
+    start: int
+    frames: Sequence[Frame]
+    bands: Sequence[tuple[int, int]]
+    scratch: Path
+
+
+def _pieces(
+    array: str, frames: Sequence[Frame], writer: ArrayWriter, rows: int, scratch: Path
+) -> Iterator[_Piece]:
+    """Tasks of an array.
+
+    Plain files: one block of 64 frames in one band each. Compressed files can only be read whole,
+    so that all bands of their block are one task, and blocks that share a file as well.
+    """
+    ny = frames[0].file.shape[1]
+    bands = [(y0, min(y0 + rows, ny)) for y0 in range(0, ny, rows)]
+    borders = [0]
+    for t in range(CHUNK[0], len(frames), CHUNK[0]):
+        if frames[t].plane == 0 or frames[t].file.container == "plain":
+            borders.append(t)
+    for start, stop in zip(borders, [*borders[1:], len(frames)], strict=True):
+        part = frames[start:stop]
+        packed = any(frame.file.container != "plain" for frame in part)
+        for group in [bands] if packed else [[band] for band in bands]:
+            step = f"{array} {start}:{stop} {group[0][0]}:{group[-1][1]}"
+            yield _Piece(step, writer, start, part, group, scratch)
+
+
+def _fill(made: Build, tables: Mapping[str, Sequence[Frame]], runtime: Runtime) -> None:
+    """Write all blocks that an earlier run has not written."""
+    rows, plan = _plan(tables, runtime)
+    scratch = made.folder / "scratch"
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir()
+    journal = made.journal()
+    todo: list[_Piece] = []
+    for array, frames in tables.items():
+        writer = _create(made.folder, array, frames)
+        pieces = _pieces(array, frames, writer, rows, scratch)
+        todo += [piece for piece in pieces if piece.step not in journal]
+    run_tasks(
+        _write_piece,
+        todo,
+        runtime.with_workers(plan.workers),
+        label="ingest",
+        done=lambda number, _: made.note(todo[number].step),
+    )
+    scratch.rmdir()
+
+
+def _create(folder: Path, array: str, frames: Sequence[Frame]) -> ArrayWriter:
+    create_group(folder / "raw.zarr")
+    if "/" in array:
+        create_group(folder / "raw.zarr" / array.split("/")[0])
+    shape = (len(frames), *frames[0].file.shape[1:])
+    dtype = _common_dtype(array, _files(frames))
+    return create_array(folder / "raw.zarr" / array, shape, dtype, attrs={"units": "adu"})
+
+
+def _write_piece(piece: _Piece) -> None:
+    """Read the frames of a task, block by block and band by band, and write their chunks."""
+    nx = piece.frames[0].file.shape[2]
+    rows = max(y1 - y0 for y0, y1 in piece.bands)
+    count = min(CHUNK[0], len(piece.frames))
+    buffer = np.empty((count, rows, nx), piece.writer.dtype)
+    with TemporaryDirectory(dir=piece.scratch) as scratch:
+        unpacked: dict[str, FrameFile] = {}
+        for t in range(0, len(piece.frames), CHUNK[0]):
+            block = piece.frames[t : t + CHUNK[0]]
+            unpacked = _unpack_block(block, unpacked, Path(scratch, str(t)))
+            for y0, y1 in piece.bands:
+                out = buffer[: len(block), : y1 - y0]
+                _read_band(block, unpacked, (y0, y1), out)
+                piece.writer.write((piece.start + t, y0, 0), out)
+
+
+def _unpack_block(
+    block: Sequence[Frame], unpacked: Mapping[str, FrameFile], scratch: Path
+) -> dict[str, FrameFile]:
+    """Unpack the compressed files of a block, dropping those that only earlier ones needed."""
+    scratch.mkdir()
+    wanted = {f.source.name: f for f in _files(block) if f.container != "plain"}
+    for name in unpacked.keys() - wanted.keys():
+        unpacked[name].source.path.unlink()
+    return {
+        name: unpacked.get(name) or unpack(file, scratch / str(number))
+        for number, (name, file) in enumerate(wanted.items())
+    }
+
+
+def _read_band(
+    block: Sequence[Frame],
+    unpacked: Mapping[str, FrameFile],
+    rows: tuple[int, int],
+    out: NDArray[Any],
+) -> None:
+    at = 0
+    for file, group in groupby(block, key=lambda frame: frame.file):
+        planes = [frame.plane for frame in group]
+        source = unpacked.get(file.source.name, file)
+        read_rows(source, planes, rows, out[at : at + len(planes)])
+        at += len(planes)
+
+
+# The end
+
+
+def _close(
+    made: Build,
+    described: Acquisition,
+    sources: Mapping[str, Sequence[SourceFile]],
+    tables: Mapping[str, Sequence[Frame]],
+    warnings: list[str],
+) -> None:
+    """Check that nothing is missing or was changed meanwhile, and write the tables."""
+    try:
+        for files in sources.values():
+            for source in files:
+                source.check_unchanged()
+        arrays = {
+            array: _finish(_create(made.folder, array, frames)) | {"files": len(_files(frames))}
+            for array, frames in tables.items()
+        }
+    except InputError:
+        # What was read cannot be trusted: the next run begins again.
+        shutil.rmtree(made.folder)
+        raise
+    write_json(made.folder / "acquisition.json", to_plain(described))
+    write_json(made.folder / "frames.json", {a: columns(f) for a, f in tables.items()})
+    made.summary.update(arrays=arrays, warnings=warnings)
+
+
+def _finish(writer: ArrayWriter) -> dict[str, Any]:
+    """Close an array: its shape, type, and the digest of its content."""
+    writer.finish()
+    content = hashlib.sha256(repr((writer.shape, writer.dtype.str)).encode())
+    content.update(np.load(writer.path / INDEX).tobytes())
+    return {
+        "shape": list(writer.shape),
+        "dtype": writer.dtype.name,
+        "digest": content.hexdigest()[:32],
+    }

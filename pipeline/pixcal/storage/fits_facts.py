@@ -1,0 +1,86 @@
+"""Facts in FITS headers: numbers, exposure time, temperature, time stamp.
+
+What describes a frame may be missing or written in any way, and is then None; what the data cannot
+be read without (`integer`) is an error.
+"""
+
+import math
+from datetime import UTC, datetime
+from typing import Any
+
+from astropy.io import fits
+
+_EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE")
+_TEMPERATURE_KEYS = ("CCD-TEMP", "DET-TEMP", "TEMPERAT", "CCDTEMP", "TEMP")
+_ABSOLUTE_ZERO_C = -273.15
+_MJD_EPOCH = datetime(1858, 11, 17, tzinfo=UTC)
+_SECONDS_A_DAY = 86400.0
+
+
+def integer(header: fits.Header, key: str, default: int | None = None) -> int:
+    """Whole number of a key; ValueError when it is something else."""
+    found = header.get(key, default)
+    if isinstance(found, bool) or not isinstance(found, int):
+        raise ValueError(f"header key {key} is missing or not a whole number")
+    return found
+
+
+def value(header: fits.Header, key: str, default: Any = None) -> Any:
+    """Value of a key; None when its card does not parse."""
+    try:
+        return header.get(key, default)
+    except fits.VerifyError:
+        return None
+
+
+def number(header: fits.Header, key: str, default: float | None = None) -> float | None:
+    """Finite number of a key; None when it is something else."""
+    found = value(header, key, default)
+    try:
+        result = math.nan if isinstance(found, bool) else float(found)
+    except (ValueError, TypeError):
+        return None
+    return result if math.isfinite(result) else None
+
+
+def exposure_s(headers: tuple[fits.Header, ...]) -> float | None:
+    """Exposure time (s) from EXPTIME, else EXPOSURE."""
+    for key in _EXPOSURE_KEYS:
+        for header in headers:
+            time = number(header, key)
+            if time is not None and time >= 0:
+                return time
+    return None
+
+
+def temperature_c(headers: tuple[fits.Header, ...]) -> float | None:
+    """Temperature in degrees Celsius; in kelvin in the header where its comment says so."""
+    for key in _TEMPERATURE_KEYS:
+        for header in headers:
+            degrees = number(header, key)
+            if degrees is not None:
+                comment = header.comments[key].lower()
+                kelvin = "[k]" in comment or "kelvin" in comment
+                return degrees + _ABSOLUTE_ZERO_C if kelvin else degrees
+    return None
+
+
+def time_stamp_mjd(headers: tuple[fits.Header, ...]) -> float | None:
+    """Time stamp from MJD-OBS, else from DATE-OBS when it holds the time of day."""
+    for header in headers:
+        mjd = number(header, "MJD-OBS")
+        if mjd is not None:
+            return mjd
+    for header in headers:
+        text, clock = value(header, "DATE-OBS"), value(header, "TIME-OBS")
+        if isinstance(text, str) and "T" not in text and isinstance(clock, str):
+            text = f"{text}T{clock}"
+        if isinstance(text, str) and "T" in text:
+            try:
+                moment = datetime.fromisoformat(text.strip())
+            except ValueError:
+                continue
+            if moment.tzinfo is None:
+                moment = moment.replace(tzinfo=UTC)
+            return (moment - _MJD_EPOCH).total_seconds() / _SECONDS_A_DAY
+    return None

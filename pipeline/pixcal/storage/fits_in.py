@@ -1,0 +1,307 @@
+"""What a FITS file of a bench holds, read from its header and held against its length.
+
+Nothing is taken from the data here: all files of an acquisition can be checked in seconds before
+hours of reading begin. The samples are read by `pixcal.storage.fits_rows`.
+"""
+
+import gzip
+import io
+import math
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from astropy.io import fits
+
+from pixcal.model.errors import InputError
+from pixcal.storage.fits_facts import (
+    exposure_s,
+    integer,
+    number,
+    temperature_c,
+    time_stamp_mjd,
+)
+from pixcal.storage.sources import SourceFile, unreadable
+
+Container = Literal["plain", "gzip", "tiles"]
+_Stream = io.BufferedReader | gzip.GzipFile
+
+_BLOCK = 2880
+_MAX_HEADER = 400 * _BLOCK
+_GZIP_MAGIC = b"\x1f\x8b"
+
+# FITS 4.0, section 5.2.5 and table 11: the offsets that make signed integers of unsigned ones.
+_EXACT = {
+    (8, 0): "u1",
+    (8, -128): "i1",
+    (16, 0): "i2",
+    (16, 1 << 15): "u2",
+    (32, 0): "i4",
+    (32, 1 << 31): "u4",
+    (-32, 0): "f4",
+}
+_STORED = {8: "u1", 16: "i2", 32: "i4", -32: "f4"}
+
+
+@dataclass(frozen=True)
+class Coding:
+    """How samples are coded: value = bscale × stored + bzero.
+
+    Attributes
+    ----------
+    bitpix : int
+        FITS code of the stored type.
+    bscale, bzero : float
+        Slope and offset (ADU).
+    blank : int or None
+        Stored integer that stands for a missing sample.
+    """
+
+    bitpix: int
+    bscale: float = 1.0
+    bzero: float = 0.0
+    blank: int | None = None
+
+    @property
+    def exact(self) -> bool:
+        """Whether the values are a native type, at most with the sign bit turned."""
+        plain = self.bscale == 1 and self.blank is None
+        return plain and (self.bitpix, self.bzero) in _EXACT
+
+    @property
+    def stored(self) -> np.dtype[Any]:
+        """Type of the stored samples, in native byte order."""
+        return np.dtype(_STORED[self.bitpix])
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of the values: float32 where they are scaled or may be missing (NaN)."""
+        return np.dtype(_EXACT[self.bitpix, int(self.bzero)] if self.exact else "f4")
+
+
+@dataclass(frozen=True)
+class FrameFile:
+    """A FITS file with one frame or a cube of frames.
+
+    Attributes
+    ----------
+    source : SourceFile
+        The file.
+    container : {"plain", "gzip", "tiles"}
+        ``tiles``: an image compressed by tiles, in a binary table.
+    hdu : int
+        Number of the header and data unit that holds the image.
+    offset : int
+        Byte where its data begin (once decompressed, for ``gzip``).
+    shape : tuple of int
+        (planes, y, x).
+    coding : Coding
+        How the samples are stored.
+    tile : tuple of int
+        (planes, rows) of a compressed tile; (1, 1) for other containers.
+    mjd : float or None
+        Time stamp of the first plane (modified Julian date, days).
+    exptime_s, temperature_c : float or None
+        Exposure time (s) and detector temperature (degrees Celsius).
+    """
+
+    source: SourceFile
+    container: Container
+    hdu: int
+    offset: int
+    shape: tuple[int, int, int]
+    coding: Coding
+    tile: tuple[int, int] = (1, 1)
+    mjd: float | None = None
+    exptime_s: float | None = None
+    temperature_c: float | None = None
+
+    @property
+    def data_bytes(self) -> int:
+        """Bytes of the image's samples, uncompressed."""
+        return math.prod(self.shape) * self.coding.stored.itemsize
+
+
+def inspect(source: SourceFile) -> FrameFile:
+    """Read a file's header and hold it against the file's length.
+
+    The image is the first header and data unit with 2-D or 3-D data. A ``.gz`` whose last bytes
+    do not agree with the header is decompressed to see whether it is whole.
+
+    Raises
+    ------
+    InputError
+        Naming the file: not FITS, cut short, no image, other dimensions or types than frames have.
+    """
+    with source.open() as handle:
+        try:
+            packed = handle.read(2) == _GZIP_MAGIC
+            handle.seek(0)
+            if not packed:
+                return _inspect_stream(source, io.BufferedReader(handle), "plain")
+            with gzip.GzipFile(fileobj=handle) as stream:
+                found = _inspect_stream(source, stream, "gzip")
+            _check_gzip_length(found, handle)
+            return found
+        except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+            raise damaged_gzip(source.path, error) from error
+        except (fits.VerifyError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise InputError(f"{source.path}: {reason}") from error
+        except OSError as error:
+            raise unreadable(source.path, error) from error
+
+
+def damaged_gzip(path: Path, error: Exception) -> InputError:
+    """The InputError for a gzip file that is cut or altered."""
+    reason = "cut short" if isinstance(error, EOFError) else " ".join(str(error).split())
+    return InputError(f"{path}: damaged gzip file ({reason}); copy it again, or remove it")
+
+
+def _inspect_stream(source: SourceFile, stream: _Stream, container: Container) -> FrameFile:
+    header, primary, hdu = _first_image(stream)
+    offset = stream.tell()
+    tiled = _is_tiled(header)
+    if tiled and container == "gzip":
+        raise ValueError("compressed by tiles and by gzip as well; unpack it with gunzip")
+    prefix = "Z" if tiled else ""
+    headers = (header, primary)
+    file = FrameFile(
+        source,
+        "tiles" if tiled else container,
+        hdu,
+        offset,
+        _frames_shape(_axes(header, prefix)),
+        _coding(header, prefix),
+        tile=_tile(header) if tiled else (1, 1),
+        mjd=time_stamp_mjd(headers),
+        exptime_s=exposure_s(headers),
+        temperature_c=temperature_c(headers),
+    )
+    needed = offset + (_data_bytes(header) if tiled else file.data_bytes)
+    if file.container != "gzip" and source.size < needed:
+        raise ValueError(
+            f"cut short: {source.size} bytes where its header calls for {needed}; copy it again, "
+            "or remove it"
+        )
+    return file
+
+
+def _first_image(stream: _Stream) -> tuple[fits.Header, fits.Header, int]:
+    """Header of the first image with data, primary header, and number of the former.
+
+    The stream is left where the image's data begin.
+    """
+    primary = header = _read_header(stream, b"SIMPLE")
+    if primary is None:
+        raise ValueError("not a FITS file; remove it, or narrow the glob that lists it")
+    hdu = 0
+    while header is not None:
+        if _is_tiled(header) or _is_image(header):
+            return header, primary, hdu
+        padded = -(-_data_bytes(header) // _BLOCK) * _BLOCK
+        stream.seek(stream.tell() + padded)
+        header = _read_header(stream, b"XTENSION")
+        hdu += 1
+    raise ValueError("holds no image; remove it, or narrow the glob that lists it")
+
+
+def _read_header(stream: _Stream, first: bytes) -> fits.Header | None:
+    """Next header, or None where none begins with the keyword ``first``."""
+    text = bytearray()
+    while True:
+        block = stream.read(_BLOCK)
+        if not text and not block.startswith(first):
+            return None
+        if len(block) < _BLOCK or len(text) > _MAX_HEADER:
+            raise ValueError("header cut short or damaged; copy it again, or remove it")
+        text += block
+        if any(block[n : n + 80].rstrip(b" \0") == b"END" for n in range(0, _BLOCK, 80)):
+            return fits.Header.fromstring(text.decode("latin-1"))
+
+
+def _is_tiled(header: fits.Header) -> bool:
+    return header.get("XTENSION") == "BINTABLE" and header.get("ZIMAGE") is True
+
+
+def _is_image(header: fits.Header) -> bool:
+    kind = "SIMPLE" in header or header.get("XTENSION") == "IMAGE"
+    axes = _axes(header)
+    return kind and len(axes) > 0 and 0 not in axes
+
+
+def _axes(header: fits.Header, prefix: str = "") -> list[int]:
+    """Lengths of the axes, fastest first."""
+    count = integer(header, f"{prefix}NAXIS")
+    axes = [integer(header, f"{prefix}NAXIS{n + 1}") for n in range(count)]
+    if min(axes, default=0) < 0:
+        raise ValueError("header key NAXISn is negative")
+    return axes
+
+
+def _data_bytes(header: fits.Header) -> int:
+    axes = _axes(header)
+    samples = math.prod(axes) if axes else 0
+    groups, extra = integer(header, "GCOUNT", 1), integer(header, "PCOUNT", 0)
+    return abs(integer(header, "BITPIX")) // 8 * groups * (extra + samples)
+
+
+def _frames_shape(axes: list[int]) -> tuple[int, int, int]:
+    """(planes, y, x) of a frame or a cube; axes of length 1 after the second are dropped."""
+    later = [n for n in axes[2:] if n != 1]
+    if len(axes) < 2 or len(later) > 1:
+        lengths = " × ".join(map(str, axes))
+        raise ValueError(
+            f"{len(axes)}-D data ({lengths}); a file holds one 2-D frame, or a cube with time as "
+            "NAXIS3"
+        )
+    return (later[0] if later else 1, axes[1], axes[0])
+
+
+def _tile(header: fits.Header) -> tuple[int, int]:
+    """(planes, rows) of a compressed tile; a row where nothing is said (FITS 4.0, 10.1.1)."""
+    lengths = [
+        min(integer(header, f"ZTILE{n + 1}", 1), length)
+        for n, length in enumerate(_axes(header, "Z"))
+    ]
+    return max(1, math.prod(lengths[2:])), max(1, lengths[1])
+
+
+def _coding(header: fits.Header, prefix: str) -> Coding:
+    bitpix = integer(header, f"{prefix}BITPIX")
+    if bitpix not in _STORED:
+        raise ValueError(
+            f"BITPIX {bitpix}; frames are 8-, 16- or 32-bit integers or 32-bit floats: convert it"
+        )
+    scale, zero = number(header, "BSCALE", 1.0), number(header, "BZERO", 0.0)
+    if scale is None or zero is None:
+        raise ValueError("header key BSCALE or BZERO is not a number")
+    # Only integers have a BLANK; ZBLANK is the name that compressors give it.
+    key = "BLANK" if "BLANK" in header else "ZBLANK"
+    blank = integer(header, key) if bitpix > 0 and key in header else None
+    return Coding(bitpix, scale, zero, blank)
+
+
+def _check_gzip_length(file: FrameFile, handle: io.FileIO) -> None:
+    """Hold the length in the last four bytes against the header; decompress where in doubt.
+
+    Those bytes are the uncompressed length modulo 2^32 (RFC 1952), and anything at all in a file
+    that was cut. Files of several members, or with later extensions, may be whole all the same.
+    """
+    handle.seek(-4, io.SEEK_END)
+    length = int.from_bytes(handle.read(4), "little")
+    needed = file.offset + file.data_bytes
+    if length in (needed % 2**32, -(-needed // _BLOCK) * _BLOCK % 2**32):
+        return
+    handle.seek(0)
+    held = 0
+    with gzip.GzipFile(fileobj=handle) as stream:
+        while part := stream.read(1 << 20):
+            held += len(part)
+    if held < needed:
+        raise ValueError(
+            f"cut short: {held} bytes once unpacked where its header calls for {needed}; copy it "
+            "again, or remove it"
+        )

@@ -1,0 +1,139 @@
+"""Writing FITS images piece by piece, from several tasks.
+
+A file is written under another name (hidden, ``.aside``) and takes its own when it is complete and
+on the disk: a file that exists is whole.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+Cards = Mapping[str, Any]
+"""Header keywords: a value, or (value, comment)."""
+
+BLOCK = 2880
+COMPRESSED = ".fits.fz"
+_SIGN = np.uint16(0x8000)
+
+
+@dataclass(frozen=True)
+class FrameWriter:
+    """A FITS image that is written in pieces, from any thread or process that sees the folder.
+
+    Attributes
+    ----------
+    path : Path
+        Name of the file once it is complete.
+    shape : tuple of int
+        (y, x), or (time, y, x) for a cube.
+    dtype : str
+        ``uint16`` (through BZERO), ``uint8`` or ``float32``.
+    data_at : int
+        Byte where the data begin.
+    """
+
+    path: Path
+    shape: tuple[int, ...]
+    dtype: str
+    data_at: int
+
+    @classmethod
+    def create(
+        cls, path: Path, shape: tuple[int, ...], dtype: str, cards: Cards | None = None
+    ) -> "FrameWriter":
+        """Write the header and take the room on the disk.
+
+        Raises
+        ------
+        OSError
+            If the folder cannot be written, or the disk has no room for the file.
+        """
+        header = _header(shape, dtype, cards or {}).tostring(padding=True).encode("ascii")
+        writer = cls(path, shape, dtype, len(header))
+        with _aside(path).open("wb") as file:
+            file.write(header)
+            file.flush()
+            os.posix_fallocate(file.fileno(), 0, writer.file_bytes)
+        return writer
+
+    @property
+    def data_bytes(self) -> int:
+        """Bytes of the samples."""
+        return int(np.prod(self.shape, dtype=np.int64)) * np.dtype(self.dtype).itemsize
+
+    @property
+    def file_bytes(self) -> int:
+        """Bytes of the file: header and data, each filled up to whole blocks."""
+        return self.data_at + -(-self.data_bytes // BLOCK) * BLOCK
+
+    def write_rows(self, row: int, data: NDArray[Any], plane: int = 0) -> None:
+        """Write some whole rows of one plane; different rows may be written at the same time.
+
+        Parameters
+        ----------
+        row : int
+            The first of them.
+        data : ndarray, shape (rows, x)
+            Of the file's type.
+        plane : int
+            Frame of a cube.
+        """
+        ny, nx = self.shape[-2:]
+        if data.dtype != self.dtype or data.shape[1] != nx or row + data.shape[0] > ny:
+            raise ValueError(f"{self.path}: {data.dtype} {data.shape} at row {row} does not fit")
+        stored = data ^ _SIGN if self.dtype == "uint16" else data
+        body = stored.astype(stored.dtype.newbyteorder(">"), order="C").data.cast("B")
+        at = self.data_at + (plane * ny + row) * nx * data.itemsize
+        with _aside(self.path).open("r+b", buffering=0) as file:
+            while body:
+                done = os.pwrite(file.fileno(), body, at)
+                body, at = body[done:], at + done
+
+    def finish(self) -> Path:
+        """Put the file in place, once all rows are written."""
+        _settle(_aside(self.path), self.path)
+        return self.path
+
+    def finish_compressed(self) -> Path:
+        """Put the file in place tile-compressed (RICE, lossless for integers), as ``.fits.fz``."""
+        aside, packed = _aside(self.path), self.path.with_name(self.path.stem + COMPRESSED)
+        with fits.open(aside, memmap=False) as file:
+            image = file[0]
+            tile = (1,) * (len(self.shape) - 2) + (min(16, self.shape[-2]), self.shape[-1])
+            fits.CompImageHDU(
+                image.data, image.header, compression_type="RICE_1", tile_shape=tile
+            ).writeto(_aside(packed), overwrite=True)
+        _settle(_aside(packed), packed)
+        aside.unlink()
+        return packed
+
+
+def _header(shape: tuple[int, ...], dtype: str, cards: Cards) -> fits.Header:
+    header = fits.Header()
+    header["SIMPLE"] = (True, "conforms to FITS standard")
+    header["BITPIX"] = ({"uint16": 16, "uint8": 8, "float32": -32}[dtype], "array data type")
+    header["NAXIS"] = len(shape)
+    for number, length in enumerate(reversed(shape), start=1):
+        header[f"NAXIS{number}"] = length
+    if dtype == "uint16":
+        header["BSCALE"] = 1
+        header["BZERO"] = (32768, "unsigned 16-bit samples")
+    for key, card in cards.items():
+        header[key] = card
+    return header
+
+
+def _aside(path: Path) -> Path:
+    return path.with_name(f".{path.name}.aside")
+
+
+def _settle(aside: Path, path: Path) -> None:
+    with aside.open("rb") as file:
+        os.fsync(file.fileno())
+    aside.replace(path)

@@ -1,0 +1,194 @@
+"""Samples of FITS frames: bands of rows of some planes, straight from the byte where they are.
+
+Only plain files can be read so. Compressed ones are first unpacked, once, by `unpack`.
+"""
+
+import gzip
+import io
+import sys
+import zlib
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from pixcal.model.errors import InputError
+from pixcal.storage.fits_in import Coding, FrameFile, damaged_gzip
+from pixcal.storage.sources import SourceFile, unreadable
+
+_PIECE = 1 << 20
+_TILE_PIECE = 8 << 20
+
+
+def read_rows(
+    file: FrameFile, planes: Sequence[int], rows: tuple[int, int], out: NDArray[Any]
+) -> None:
+    """Read rows of some planes of a plain file, each byte once.
+
+    Parameters
+    ----------
+    file : FrameFile
+        A file in the container ``plain``.
+    planes : sequence of int
+        Numbers of the planes.
+    rows : tuple of int
+        First row, and the one after the last.
+    out : ndarray (plane, y, x)
+        Filled with the values (ADU); each plane of it contiguous, of the file's type or one
+        that holds it.
+
+    Raises
+    ------
+    InputError
+        If the file was changed, or ends too early.
+    """
+    _, ny, nx = file.shape
+    coding = file.coding
+    direct = coding.exact and out.dtype == coding.dtype
+    stored = np.empty(out.shape[1:], coding.stored) if not direct else None
+    with file.source.open() as handle:
+        for plane, target in zip(planes, out, strict=True):
+            raw = target.view(coding.stored) if stored is None else stored
+            start = file.offset + (plane * ny + rows[0]) * nx * coding.stored.itemsize
+            _read_exactly(handle, start, raw, file.source.path)
+            if sys.byteorder == "little":
+                raw.byteswap(inplace=True)
+            if coding.exact:
+                _turn_sign(raw, coding)
+            if stored is not None:
+                target[...] = raw.view(coding.dtype) if coding.exact else _scale(raw, coding)
+
+
+def _read_exactly(handle: io.FileIO, start: int, raw: NDArray[Any], path: Path) -> None:
+    view = raw.data.cast("B")
+    read = 0
+    try:
+        handle.seek(start)
+        while read < len(view):
+            count = handle.readinto(view[read:])
+            if not count:
+                raise InputError(f"{path}: cut short while it was being read; copy it again")
+            read += count
+    except OSError as error:
+        raise unreadable(path, error) from error
+
+
+def _turn_sign(raw: NDArray[Any], coding: Coding) -> None:
+    """Apply the BZERO that makes unsigned integers of signed ones (and the reverse), in place."""
+    if coding.bzero:
+        bits = raw.view(f"u{raw.itemsize}")
+        bits ^= bits.dtype.type(1 << (8 * raw.itemsize - 1))
+
+
+def _scale(raw: NDArray[Any], coding: Coding) -> NDArray[np.float32]:
+    values = raw.astype(np.float64)
+    values *= coding.bscale
+    values += coding.bzero
+    if coding.blank is not None:
+        values[raw == coding.blank] = np.nan
+    return values.astype(np.float32)
+
+
+def unpack(file: FrameFile, target: Path) -> FrameFile:
+    """Write the image of a compressed file as bare big-endian samples, reading the file once.
+
+    Parameters
+    ----------
+    file : FrameFile
+        A file in the container ``gzip`` or ``tiles``.
+    target : Path
+        Scratch file to make.
+
+    Returns
+    -------
+    FrameFile
+        The same image in the scratch file, in the container ``plain``.
+
+    Raises
+    ------
+    InputError
+        Naming the compressed file when it is damaged, cut short, or was changed.
+    """
+    with file.source.open() as handle, target.open("wb") as out:
+        if file.container == "gzip":
+            _unpack_gzip(file, handle, out)
+        else:
+            _unpack_tiles(file, out)
+    facts = target.stat()
+    if facts.st_size != file.data_bytes:
+        raise InputError(
+            f"{file.source.path}: {facts.st_size} bytes once unpacked where its header calls for "
+            f"{file.data_bytes}; copy it again, or remove it"
+        )
+    source = SourceFile(target, file.source.name, facts.st_size, facts.st_mtime_ns)
+    return replace(file, source=source, container="plain", offset=0)
+
+
+def unpack_bytes(file: FrameFile) -> int:
+    """Memory that `unpack` takes for a file, in bytes (measured, see the tests)."""
+    if file.container == "plain":
+        return 0
+    if file.container == "gzip":
+        return 4 * _PIECE
+    # Decoders hold a whole tile several times; HCOMPRESS, the hungriest, 7 times.
+    planes, rows = _tiles_at_once(file)
+    row_bytes = file.shape[2] * file.coding.stored.itemsize
+    return (16 << 20) + 8 * min(planes, file.shape[0]) * min(rows, file.shape[1]) * row_bytes
+
+
+def _unpack_gzip(file: FrameFile, handle: io.FileIO, out: BinaryIO) -> None:
+    left = file.data_bytes
+    try:
+        with gzip.GzipFile(fileobj=handle) as stream:
+            stream.seek(file.offset)
+            # To the end, beyond the image too: the checksum stands there.
+            while part := stream.read(_PIECE):
+                out.write(part[:left])
+                left -= min(left, len(part))
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise damaged_gzip(file.source.path, error) from error
+
+
+def _tiles_at_once(file: FrameFile) -> tuple[int, int]:
+    """(planes, rows) decoded at once: whole tiles, some MiB of them."""
+    planes, rows = file.tile
+    tile_bytes = planes * rows * file.shape[2] * file.coding.stored.itemsize
+    return planes, rows * max(1, _TILE_PIECE // tile_bytes)
+
+
+def _unpack_tiles(file: FrameFile, out: BinaryIO) -> None:
+    _, ny, nx = file.shape
+    big_endian = file.coding.stored.newbyteorder(">")
+    for t0, y0, piece in _decoded(file):
+        for plane, rows in enumerate(piece, start=t0):
+            out.seek((plane * ny + y0) * nx * big_endian.itemsize)
+            out.write(rows.astype(big_endian).data)
+
+
+def _decoded(file: FrameFile) -> Iterator[tuple[int, int, NDArray[Any]]]:
+    """Plane, row and (plane, y, x) stored samples of each piece of an image in tiles."""
+    n, ny, nx = file.shape
+    step_planes, step_rows = _tiles_at_once(file)
+    # Without memmap: mapped pages would count as memory until the file is closed.
+    options = {"do_not_scale_image_data": True, "memmap": False}
+    try:
+        with fits.open(file.source.path, **options) as hdus:
+            section = hdus[file.hdu].section
+            for t0, y0 in product(range(0, n, step_planes), range(0, ny, step_rows)):
+                t1, y1 = min(t0 + step_planes, n), min(y0 + step_rows, ny)
+                times = [slice(t0, t1) if m > 1 else slice(None) for m in section.shape[:-2]]
+                piece = section[(*times, slice(y0, y1))].reshape(t1 - t0, y1 - y0, nx)
+                if piece.dtype != file.coding.stored:
+                    raise ValueError(f"decoded as {piece.dtype}")
+                yield t0, y0, piece
+    except Exception as error:  # the decoders raise a dozen kinds, all of which mean one thing
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"{file.source.path}: its tiles cannot be decoded ({reason}); copy it again, or "
+            "remove it"
+        ) from error

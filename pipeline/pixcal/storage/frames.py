@@ -1,0 +1,154 @@
+"""The table of the frames of an array: their order, their times, the facts of their headers."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
+
+from pixcal.storage.fits_in import FrameFile
+
+TimeSource = Literal["header", "frame_period_s", "exptime_s", "number"]
+
+_SECONDS_A_DAY = 86400.0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of an array.
+
+    Attributes
+    ----------
+    file : FrameFile
+        Where it is.
+    plane : int
+        Its number in a cube, else 0.
+    mjd : float or None
+        Modified Julian date (days), None when unknown.
+    time_s : float
+        Seconds since the array's first frame (its number where no time is known).
+    time_source : str
+        ``header``; ``frame_period_s`` or ``exptime_s``: added up from there; ``number``.
+    """
+
+    file: FrameFile
+    plane: int
+    mjd: float | None
+    time_s: float
+    time_source: TimeSource
+
+
+def natural_key(name: str) -> tuple[list[tuple[int, str]], str]:
+    """Key that sorts ``frame2`` before ``frame10``."""
+    parts = [
+        (int(part), "") if part.isdecimal() else (-1, part.casefold())
+        for part in re.split(r"(\d+)", name)
+        if part
+    ]
+    return parts, name
+
+
+def tabulate(
+    array: str, files: Sequence[FrameFile], frame_period_s: float | None
+) -> tuple[list[Frame], list[str]]:
+    """Put the frames of an array in order and give each its time.
+
+    Ordered by time stamp where every file has one, else by natural file name. The later planes of
+    a cube follow its time stamp by ``frame_period_s``, else by its exposure time.
+
+    Parameters
+    ----------
+    array : str
+        Name of the array, for the warnings.
+    files : sequence of FrameFile
+        At least one.
+    frame_period_s : float or None
+        From one frame to the next (s).
+
+    Returns
+    -------
+    list of Frame
+        In the order of time.
+    list of str
+        Sentences on what is odd about the times.
+    """
+    ordered, stamped, warnings = _order(files)
+    steps = [frame_period_s or file.exptime_s for file in ordered]
+    if stamped and any(f.shape[0] > 1 and not s for f, s in zip(ordered, steps, strict=True)):
+        stamped = False
+        warnings.append(
+            "a cube has neither EXPTIME nor is optics.frame_period_s given, so frames are numbered"
+        )
+    if stamped:
+        step_source: TimeSource = "frame_period_s" if frame_period_s else "exptime_s"
+        frames = _stamped_frames(ordered, [step or 0.0 for step in steps], step_source)
+        if any(b.time_s < a.time_s for a, b in pairwise(frames)):
+            warnings.append(f"a cube lasts beyond the next file's time stamp by its {step_source}")
+    else:
+        frames = _counted_frames(ordered, frame_period_s)
+    return frames, [f"{array}: {sentence}" for sentence in warnings]
+
+
+def columns(frames: Sequence[Frame]) -> dict[str, list[Any]]:
+    """The table as ``frames.json`` holds it: columns of equal length."""
+    return {
+        "file": [f.file.source.name for f in frames],
+        "plane": [f.plane for f in frames],
+        "mjd": [f.mjd for f in frames],
+        "exptime_s": [f.file.exptime_s for f in frames],
+        "temperature_c": [f.file.temperature_c for f in frames],
+        "time_s": [f.time_s for f in frames],
+        "time_source": [f.time_source for f in frames],
+    }
+
+
+def _order(files: Sequence[FrameFile]) -> tuple[list[FrameFile], bool, list[str]]:
+    """Files in order, whether by their time stamps, and what is odd about these."""
+    named = sorted(files, key=lambda file: natural_key(file.source.name))
+    stamps = [file.mjd for file in named if file.mjd is not None]
+    if not stamps:
+        return named, False, []
+    if len(stamps) < len(named):
+        without = next(file.source.name for file in named if file.mjd is None)
+        missing = f"{len(named) - len(stamps)} of {len(named)} files"
+        return named, False, [f"{missing} have no time stamp ({without}); ordered by file name"]
+    if len(named) > 1 and len(set(stamps)) == 1:
+        return named, False, ["all files have the same time stamp; ordered by file name"]
+    warnings = []
+    ordered = sorted(named, key=lambda file: file.mjd or 0.0)
+    late = next((b for a, b in pairwise(named) if (b.mjd or 0.0) < (a.mjd or 0.0)), None)
+    if late is not None:
+        warnings.append(
+            f"time stamps do not follow the file names ({late.source.name}); ordered by time"
+        )
+    twins = [(a, b) for a, b in pairwise(ordered) if a.mjd == b.mjd]
+    if twins:
+        a, b = (file.source.name for file in twins[0])
+        warnings.append(
+            f"{len(twins)} time stamps are the same as the one before ({a} and {b}); "
+            "ordered by file name among themselves"
+        )
+    return ordered, True, warnings
+
+
+def _stamped_frames(
+    files: Sequence[FrameFile], steps: Sequence[float], step_source: TimeSource
+) -> list[Frame]:
+    first = files[0].mjd or 0.0
+    frames = []
+    for file, step in zip(files, steps, strict=True):
+        start = file.mjd or 0.0
+        for plane in range(file.shape[0]):
+            mjd = start + plane * step / _SECONDS_A_DAY
+            time_s = (start - first) * _SECONDS_A_DAY + plane * step
+            frames.append(Frame(file, plane, mjd, time_s, step_source if plane else "header"))
+    return frames
+
+
+def _counted_frames(files: Sequence[FrameFile], frame_period_s: float | None) -> list[Frame]:
+    planes = [(file, plane) for file in files for plane in range(file.shape[0])]
+    source: TimeSource = "frame_period_s" if frame_period_s else "number"
+    return [
+        Frame(file, plane, None if plane else file.mjd, n * (frame_period_s or 1.0), source)
+        for n, (file, plane) in enumerate(planes)
+    ]

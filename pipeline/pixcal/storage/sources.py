@@ -1,0 +1,163 @@
+"""The files of an acquisition: which there are, and whether they are still the same."""
+
+import glob
+import io
+import os
+import stat
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+from pixcal.model.acquisition import Frames
+from pixcal.model.errors import InputError
+from pixcal.storage.artefact import digest
+
+
+@dataclass(frozen=True)
+class SourceFile:
+    """A file as it was found.
+
+    Attributes
+    ----------
+    path : Path
+        Where it is.
+    name : str
+        Relative to the acquisition's folder, with ``/``.
+    size : int
+        Bytes.
+    mtime_ns : int
+        Time of the last change (ns since 1970).
+    """
+
+    path: Path
+    name: str
+    size: int
+    mtime_ns: int
+
+    def open(self) -> io.FileIO:
+        """Open the file for unbuffered reading, if it is still the one that was found.
+
+        Raises
+        ------
+        InputError
+            If it is gone, cannot be read, or was changed.
+        """
+        try:
+            handle = self.path.open("rb", buffering=0)
+        except OSError as error:
+            raise unreadable(self.path, error) from error
+        try:
+            self._compare(os.fstat(handle.fileno()))
+        except BaseException:
+            handle.close()
+            raise
+        return handle
+
+    def check_unchanged(self) -> None:
+        """Raise InputError if the file is gone or is not as it was found."""
+        try:
+            self._compare(self.path.stat())
+        except OSError as error:
+            raise unreadable(self.path, error) from error
+
+    def _compare(self, now: os.stat_result) -> None:
+        if (now.st_size, now.st_mtime_ns) != (self.size, self.mtime_ns):
+            raise InputError(
+                f"{self.path}: changed while it was being read; wait until the acquisition is "
+                "complete and run again"
+            )
+
+
+def unreadable(path: Path, error: OSError) -> InputError:
+    """The InputError that tells why a file cannot be read."""
+    reason = error.strerror or " ".join(str(error).split())
+    return InputError(f"{path}: cannot be read ({reason}); restore the file or its permissions")
+
+
+def fingerprint(sources: Sequence[SourceFile]) -> str:
+    """Digest of the names, sizes and times of change of a set of files."""
+    return digest([(s.name, s.size, s.mtime_ns) for s in sources])
+
+
+def find_sources(frames: Frames, description: Path) -> dict[str, tuple[SourceFile, ...]]:
+    """Files of each array of an acquisition, by the array's name (``fringes/<set>`` for a set).
+
+    Parameters
+    ----------
+    frames : Frames
+        Globs of each kind.
+    description : Path
+        The ``acquisition.yaml`` that they are relative to.
+
+    Returns
+    -------
+    dict
+        Sorted by name; kinds without globs are absent.
+
+    Raises
+    ------
+    InputError
+        If a glob leaves the folder or matches nothing, a file is empty or unreadable, or one file
+        is listed twice under two names or for two kinds.
+    """
+    found: dict[str, tuple[SourceFile, ...]] = {}
+    seen: dict[tuple[int, int], tuple[str, str]] = {}
+    for array, key, globs in _globs(frames):
+        if not globs:
+            continue
+        names: set[str] = set()
+        for number, pattern in enumerate(globs):
+            names |= _matches(pattern, description, f"{description}: {key}[{number}]")
+        found[array] = tuple(_source(description.parent, name, key, seen) for name in sorted(names))
+    return found
+
+
+def _globs(frames: Frames) -> list[tuple[str, str, tuple[str, ...]]]:
+    """Array name, key in the description, and globs of each kind."""
+    kinds = [(kind, f"frames.{kind}", getattr(frames, kind)) for kind in ("bias", "dark", "flat")]
+    sets = [
+        (f"fringes/{s.name}", f"frames.fringes[{number}].files", s.files)
+        for number, s in enumerate(frames.fringes)
+    ]
+    return kinds + sets
+
+
+def _matches(pattern: str, description: Path, place: str) -> set[str]:
+    if ".." in PurePosixPath(pattern).parts:
+        raise InputError(
+            f"{place}: {pattern!r} leaves the folder of the acquisition; write it without '..' "
+            "(a symbolic link may lead elsewhere)"
+        )
+    folder = description.parent
+    # Not Path.glob, which takes hidden files too, such as the '._…' that some systems leave.
+    matches = glob.glob(pattern, root_dir=folder, recursive=True)  # noqa: PTH207
+    names = {os.path.normpath(name) for name in matches}
+    names = {name for name in names if not (folder / name).is_dir()}
+    if not names:
+        raise InputError(
+            f"{place}: {pattern!r} matches no file in {folder}; correct it, or remove it from the "
+            "list"
+        )
+    return names
+
+
+def _source(
+    folder: Path, name: str, key: str, seen: dict[tuple[int, int], tuple[str, str]]
+) -> SourceFile:
+    path = folder / name
+    try:
+        facts = path.stat()
+    except OSError as error:
+        raise unreadable(path, error) from error
+    if not stat.S_ISREG(facts.st_mode):
+        raise InputError(f"{path}: not a regular file; remove it or narrow {key}")
+    if facts.st_size == 0:
+        raise InputError(f"{path}: empty (0 bytes); copy it again, or remove it")
+    # By device and inode, so that a link under another name is the same frame too.
+    other = seen.setdefault((facts.st_dev, facts.st_ino), (name, key))
+    if other != (name, key):
+        raise InputError(
+            f"{path}: the file is listed twice, by {key} and as {other[0]} by {other[1]}; "
+            "a frame can be used only once"
+        )
+    return SourceFile(path, name, facts.st_size, facts.st_mtime_ns)

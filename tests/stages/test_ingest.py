@@ -1,0 +1,386 @@
+"""Ingest: exact values, whatever the files, the tiling, the workers or the interruptions."""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from pixcal.engine.run import Runtime
+from pixcal.model.errors import InputError, PlanError
+from pixcal.stages import ingest
+from pixcal.storage import fits_rows
+from pixcal.storage.cube import ArrayReader, ArrayWriter
+
+YAML = """\
+schema: pixcal/acquisition/1
+detector: {{pitch_um: 4.4, gain_e_per_adu: 1.0, read_noise_e: 16.0}}
+optics: {{wavelength_nm: 632.8, distance_mm: 400.0, frame_period_s: {period}}}
+frames:
+  bias: {bias}
+  flat: {flat}
+  fringes:
+    - {{name: vertical, files: {vertical}, baseline_mm: [6.0, 0.0]}}
+"""
+SYNC = Runtime(cluster="sync")
+
+
+def describe(folder: Path, period: float | None = 0.14, **globs: list[str]) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    text = YAML.format(
+        period="null" if period is None else period,
+        bias=json.dumps(globs.get("bias", []), ensure_ascii=False),
+        flat=json.dumps(globs.get("flat", []), ensure_ascii=False),
+        vertical=json.dumps(globs.get("vertical", ["v/*"]), ensure_ascii=False),
+    )
+    (folder / "acquisition.yaml").write_text(text, encoding="utf-8")
+    return folder
+
+
+def noise(shape: tuple[int, ...], seed: int = 0) -> NDArray[np.uint16]:
+    return np.random.default_rng(seed).integers(0, 65536, shape, "u2")
+
+
+def save(path: Path, data: NDArray[Any], **cards: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    hdu = fits.CompImageHDU(data) if path.suffix == ".fz" else fits.PrimaryHDU(data)
+    for key, value in cards.items():
+        hdu.header[key.replace("_", "-")] = value
+    hdu.writeto(path, overwrite=True)
+
+
+def save_frames(folder: Path, data: NDArray[Any], name: str = "f{}.fits") -> None:
+    for number, frame in enumerate(data):
+        save(folder / name.format(number), frame, EXPTIME=0.1)
+
+
+def read(out: Path, array: str = "fringes/vertical") -> NDArray[Any]:
+    return ArrayReader(out / "ingest/raw.zarr" / array).read()
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.fixture
+def acquisition(tmp_path: Path) -> Path:
+    """70 frames of 67 × 131, in a folder with a space and a letter beyond ASCII."""
+    folder = describe(tmp_path / "Aufnahme für März", bias=["bias 1/*.fits"])
+    save_frames(folder / "v", noise((70, 67, 131)))
+    save_frames(folder / "bias 1", noise((3, 67, 131), 1), "é{}.fits")
+    return folder
+
+
+def test_artefact(acquisition: Path, tmp_path: Path) -> None:
+    manifest = ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+    np.testing.assert_array_equal(read(tmp_path / "run"), noise((70, 67, 131)))
+    np.testing.assert_array_equal(read(tmp_path / "run", "bias"), noise((3, 67, 131), 1))
+    folder = tmp_path / "run/ingest"
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "acquisition.json",
+        "frames.json",
+        "manifest.json",
+        "raw.zarr",
+    ]
+    frames = json.loads((folder / "frames.json").read_text())
+    assert set(frames) == {"bias", "fringes/vertical"}
+    table = frames["fringes/vertical"]
+    assert table["file"] == [f"v/f{n}.fits" for n in range(70)]
+    assert table["time_s"] == pytest.approx(np.arange(70) * 0.14)
+    assert table["exptime_s"] == [0.1] * 70
+    assert {len(column) for column in table.values()} == {70}
+    assert set(manifest.inputs) == {"bias", "fringes/vertical"}
+    arrays = manifest.summary["arrays"]
+    assert arrays["fringes/vertical"]["shape"] == [70, 67, 131]
+    assert arrays["fringes/vertical"]["dtype"] == "uint16"
+    assert arrays["fringes/vertical"]["digest"] != arrays["bias"]["digest"]
+    assert manifest.summary["warnings"] == []
+    group = zarr.open_group(folder / "raw.zarr", mode="r")
+    np.testing.assert_array_equal(group["fringes"]["vertical"][65:], noise((70, 67, 131))[65:])
+
+
+@pytest.mark.parametrize("shape", [(1, 7, 5), (64, 128, 128), (65, 129, 127), (3, 600, 40)])
+def test_sizes(tmp_path: Path, shape: tuple[int, int, int]) -> None:
+    folder = describe(tmp_path / "acq")
+    save_frames(folder / "v", noise(shape))
+    ingest.run(folder, tmp_path / "run", ingest.Config(), SYNC)
+    np.testing.assert_array_equal(read(tmp_path / "run"), noise(shape))
+
+
+@pytest.mark.parametrize("cluster", ["threads", "processes"])
+def test_workers_and_bands_do_not_matter(
+    tmp_path: Path, cluster: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = describe(tmp_path / "acq")
+    save_frames(folder / "v", noise((5, 700, 1000)))
+    ingest.run(folder, tmp_path / "one", ingest.Config(), SYNC)
+    monkeypatch.setattr(ingest, "_BAND_ROWS", (256,))
+    two = Runtime(cluster=cluster, workers=2)
+    ingest.run(folder, tmp_path / "two", ingest.Config(), two)
+    assert tree(tmp_path / "one/ingest") == tree(tmp_path / "two/ingest")
+
+
+def test_memory_too_small_is_refused_with_both_numbers(acquisition: Path, tmp_path: Path) -> None:
+    with pytest.raises(PlanError, match=r"needs \d+ MiB, 100 MiB are allowed"):
+        ingest.run(acquisition, tmp_path / "r", ingest.Config(), Runtime(memory=100 << 20))
+
+
+@pytest.mark.parametrize("name", ["c{}.fits", "c{}.fits.gz", "c{}.fz"])
+def test_cubes_that_straddle_blocks(tmp_path: Path, name: str) -> None:
+    """Cubes of 10, 50, 70 and 40 planes, ordered by time stamp against their names."""
+    data = noise((170, 11, 13))
+    folder = describe(tmp_path / "acq", period=None)
+    for n, (a, b) in enumerate(pairwise([0, 10, 60, 130, 170])):
+        stamp = 60000 + a / 86400
+        save(folder / "v" / name.format(9 - n), data[a:b], MJD_OBS=stamp, EXPTIME=1.0)
+    manifest = ingest.run(folder, tmp_path / "run", ingest.Config(), Runtime(workers=2))
+    np.testing.assert_array_equal(read(tmp_path / "run"), data)
+    table = json.loads((tmp_path / "run/ingest/frames.json").read_text())["fringes/vertical"]
+    assert table["time_s"] == pytest.approx(np.arange(170), abs=1e-5)
+    assert table["plane"][58:62] == [48, 49, 0, 1]
+    assert table["time_source"][9:12] == ["exptime_s", "header", "exptime_s"]
+    assert "do not follow the file names" in manifest.summary["warnings"][0]
+
+
+def test_mixed_containers_and_types(tmp_path: Path) -> None:
+    folder = describe(tmp_path / "acq")
+    data = noise((66, 67, 31))
+    for n, frame in enumerate(data):
+        frame = frame if n % 2 else (frame // 2).astype("i2")
+        save(folder / f"v/f{n}{('.fits', '.fits.gz', '.fz')[n % 3]}", frame)
+    ingest.run(folder, tmp_path / "run", ingest.Config(), Runtime(workers=2))
+    found = read(tmp_path / "run")
+    assert found.dtype == np.int32
+    np.testing.assert_array_equal(found[1::2], data[1::2])
+    np.testing.assert_array_equal(found[::2], data[::2] // 2)
+
+
+def test_types_without_a_common_one(tmp_path: Path) -> None:
+    folder = describe(tmp_path / "acq")
+    save(folder / "v/a.fits", np.zeros((7, 5), "i4"))
+    save(folder / "v/b.fits", np.zeros((7, 5), "f4"))
+    with pytest.raises(InputError, match=r"b\.fits: float32 .*a\.fits .*int32"):
+        ingest.run(folder, tmp_path / "run", ingest.Config(), SYNC)
+
+
+def test_not_a_number_stays(tmp_path: Path) -> None:
+    data = noise((3, 7, 5)).astype("f4")
+    data[1, 2, 3], data[2, 0, 0] = np.nan, np.inf
+    folder = describe(tmp_path / "acq")
+    save_frames(folder / "v", data)
+    ingest.run(folder, tmp_path / "run", ingest.Config(), SYNC)
+    np.testing.assert_array_equal(read(tmp_path / "run"), data)
+
+
+@pytest.mark.parametrize("name", ["f{}.fits", "f{}.fits.gz"])
+def test_every_frame_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    folder = describe(tmp_path / "acq")
+    save_frames(folder / "v", noise((70, 300, 20)), name)
+    read_bytes, unpacked = [], []
+    monkeypatch.setattr(fits_rows, "_read_exactly", counted(fits_rows._read_exactly, read_bytes))
+    monkeypatch.setattr(ingest, "unpack", counted(ingest.unpack, unpacked))
+    ingest.run(folder, tmp_path / "run", ingest.Config(), SYNC)
+    assert sum(call[2].nbytes for call in read_bytes) == 70 * 300 * 20 * 2
+    assert len(unpacked) == (70 if name.endswith("gz") else 0)
+    assert not list(tmp_path.rglob("scratch*"))
+
+
+def counted(function: Callable[..., Any], calls: list[Any]) -> Callable[..., Any]:
+    def call(*args: Any) -> Any:
+        calls.append(args)
+        return function(*args)
+
+    return call
+
+
+# Skipped, resumed, refused
+
+
+def test_up_to_date_is_skipped(
+    acquisition: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+    monkeypatch.setattr(ingest, "run_tasks", None)
+    moved = acquisition.rename(tmp_path / "moved")
+    assert ingest.run(moved, tmp_path / "run", ingest.Config(overwrite=True), SYNC) == first
+
+
+@pytest.mark.parametrize("name", ["f{}.fits", "f{}.fits.gz"])
+def test_resumed_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    folder = describe(tmp_path / "acq")
+    save_frames(folder / "v", noise((150, 20, 140)), name)
+    ingest.run(folder, tmp_path / "whole", ingest.Config(), SYNC)
+    write = ArrayWriter.write
+    written: list[tuple[int, ...]] = []
+
+    def killed(self: ArrayWriter, start: tuple[int, ...], data: NDArray[Any]) -> None:
+        if len(written) == 1:
+            # In the middle of the block: one chunk is there, and another is half written.
+            write(self, start, data[:, :, :128])
+            (self.path / "c/1/0/.1.aside").write_bytes(b"half")
+            raise KeyboardInterrupt
+        written.append(tuple(start))
+        write(self, start, data)
+
+    monkeypatch.setattr(ArrayWriter, "write", killed)
+    with pytest.raises(KeyboardInterrupt):
+        ingest.run(folder, tmp_path / "run", ingest.Config(), SYNC)
+    assert not (tmp_path / "run/ingest").exists()
+
+    def resumed(self: ArrayWriter, start: tuple[int, ...], data: NDArray[Any]) -> None:
+        written.append(tuple(start))
+        write(self, start, data)
+
+    monkeypatch.setattr(ArrayWriter, "write", resumed)
+    ingest.run(folder, tmp_path / "run", ingest.Config(), SYNC)
+    assert written == [(0, 0, 0), (64, 0, 0), (128, 0, 0)]
+    assert tree(tmp_path / "whole/ingest") == tree(tmp_path / "run/ingest")
+    assert not list((tmp_path / "run/.partial").iterdir())
+
+
+def test_another_acquisition_is_refused(acquisition: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    first = ingest.run(acquisition, run, ingest.Config(), SYNC)
+    save(acquisition / "v/f7.fits", np.zeros((67, 131), "u2"))
+    with pytest.raises(InputError) as caught:
+        ingest.run(acquisition, run, ingest.Config(), SYNC)
+    for word in (str(run / "ingest"), "fringes/vertical", "--out", "--overwrite"):
+        assert word in str(caught.value)
+    assert "acquisition.yaml" not in str(caught.value)
+    assert "bias" not in str(caught.value)
+    second = ingest.run(acquisition, run, ingest.Config(overwrite=True), SYNC)
+    assert not read(run)[7].any()
+    digests = [m.summary["arrays"]["fringes/vertical"]["digest"] for m in (first, second)]
+    assert digests[0] != digests[1]
+    describe(acquisition, period=0.15, bias=["bias 1/*.fits"])
+    with pytest.raises(InputError, match=r"acquisition \(acquisition\.yaml changed"):
+        ingest.run(acquisition, run, ingest.Config(), SYNC)
+
+
+def test_file_changed_while_read(
+    acquisition: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write = ArrayWriter.write
+
+    def disturbed(self: ArrayWriter, start: tuple[int, ...], data: NDArray[Any]) -> None:
+        write(self, start, data)
+        os.utime(acquisition / "v/f3.fits", (1, 1))
+
+    monkeypatch.setattr(ArrayWriter, "write", disturbed)
+    with pytest.raises(InputError, match=r"v/f3\.fits: changed while it was being read"):
+        ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+    assert not (tmp_path / "run/ingest").exists()
+
+
+def test_chunk_that_vanished_does_not_block_the_next_run(
+    acquisition: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish = ArrayWriter.finish
+
+    def vanished(self: ArrayWriter) -> None:
+        (self.path / "c/0/0/0").unlink()
+        finish(self)
+
+    monkeypatch.setattr(ArrayWriter, "finish", vanished)
+    with pytest.raises(InputError, match="chunk missing"):
+        ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+    monkeypatch.setattr(ArrayWriter, "finish", finish)
+    ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+    np.testing.assert_array_equal(read(tmp_path / "run"), noise((70, 67, 131)))
+
+
+def test_full_disk_is_told(
+    acquisition: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ArrayWriter, "write", full)
+    with pytest.raises(InputError, match="run: the disk is full"):
+        ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+
+
+# Bad files, found before anything is read
+
+
+@pytest.fixture
+def nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise AssertionError("data were read")
+
+    monkeypatch.setattr(ingest, "_write_piece", refuse)
+
+
+def refused(acquisition: Path, out: Path) -> str:
+    with pytest.raises(InputError) as caught:
+        ingest.run(acquisition, out, ingest.Config(), Runtime(workers=2))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.usefixtures("nothing_is_read")
+def test_bad_files_are_named_first(acquisition: Path, tmp_path: Path) -> None:
+    path = acquisition / "v/f69.fits"
+    path.write_bytes(path.read_bytes()[:9000])
+    assert f"{path}: cut short: 9000 bytes" in refused(acquisition, tmp_path / "run")
+    other = acquisition / "v/f8.fits"
+    other.write_text("not an image")
+    message = refused(acquisition, tmp_path / "run")
+    assert "(1 more files are bad)" in message
+
+
+@pytest.mark.usefixtures("nothing_is_read")
+def test_frames_of_another_size(acquisition: Path, tmp_path: Path) -> None:
+    save(acquisition / "bias 1/é1.fits", noise((67, 130)))
+    message = refused(acquisition, tmp_path / "run")
+    for word in ("bias 1/é1.fits", "130 × 67", "131 × 67"):
+        assert word in message
+
+
+@pytest.mark.usefixtures("nothing_is_read")
+def test_missing_acquisition(tmp_path: Path) -> None:
+    assert "acquisition.yaml" in refused(tmp_path / "none", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+PEAK = """
+import resource, sys
+from pathlib import Path
+from pixcal.engine.run import Runtime
+from pixcal.stages import ingest
+ingest.run(Path(sys.argv[1]), Path(sys.argv[2]), ingest.Config(), Runtime(workers=2, memory=MEMORY))
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+"""
+
+
+def test_peak_memory_keeps_to_what_is_allowed(tmp_path: Path) -> None:
+    """A set larger than the memory allowed goes through it, frame by frame and as a cube."""
+    memory = 440 << 20
+    folder = describe(tmp_path / "acq")
+    cube = folder / "v/a.fits"
+    cube.parent.mkdir(parents=True)
+    header = fits.Header({"SIMPLE": True, "BITPIX": 16, "NAXIS": 3})
+    header.update({"NAXIS1": 1024, "NAXIS2": 1024, "NAXIS3": 224})
+    with cube.open("wb") as file:
+        file.write(header.tostring().encode())
+        file.truncate(file.tell() + 224 * 1024 * 1024 * 2)
+    save(folder / "v/b.fits", noise((1024, 1024)).astype("i2"))
+    code = PEAK.replace("MEMORY", str(memory))
+    result = subprocess.run(
+        [sys.executable, "-c", code, str(folder), str(tmp_path / "run")],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert int(result.stdout) < memory < cube.stat().st_size
