@@ -25,6 +25,8 @@ from pixcal.model.errors import InputError
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+MAX_PIXELS = 40_000
+"""Pixels that frames are solved with: their noise then adds some 1e-4 to a map's variance."""
 MIN_FRAMES = 6
 """Three unknowns a pixel, and as many again to tell whether they fit."""
 
@@ -146,9 +148,10 @@ class Scout:
             matrix: F64 = np.zeros((3, 3))
             right: F64 = np.zeros((len(codes[0]), 3))
             for tile, theta, block in zip(self.tiles, self.theta, codes, strict=True):
-                design = np.where(tile.good, theta, 0.0).reshape(3, -1)
+                picked = self._picked(tile)
+                design = theta.reshape(3, -1)[:, picked]
                 matrix = matrix + design @ design.T
-                right = right + self._electrons(block, tile.good) @ design.T
+                right = right + self._electrons(block, picked) @ design.T
             g = np.asarray(np.linalg.solve(matrix, right.T).T, dtype=np.float64)
             start = FrameParameters(g, np.zeros((len(g), 2)), self.reference)
         frames = start
@@ -156,24 +159,32 @@ class Scout:
             frames, _, _ = self._frame_step(codes, frames, self.moving)
         return frames
 
-    def _electrons(self, codes: NDArray[np.uint16], good: NDArray[np.bool_]) -> F64:
+    def _picked(self, tile: Tile) -> NDArray[np.intp]:
+        """Flat numbers of the good pixels that frames are solved with, evenly taken."""
+        good = np.flatnonzero(tile.good)
+        wanted = max(1, MAX_PIXELS // len(self.tiles))
+        return good[:: max(1, -(-len(good) // wanted))]
+
+    def _electrons(self, codes: NDArray[np.uint16], picked: NDArray[np.intp]) -> F32:
         """Samples (t, p) in electrons, zero where without weight."""
-        flat = codes.reshape(len(codes), -1)
-        use = good.ravel() & (flat != self.coding.fill)
-        return np.where(use, self.coding.scale * flat + self.coding.offset, 0.0)
+        flat = np.take(codes.reshape(len(codes), -1), picked, axis=1)
+        electrons = flat * np.float32(self.coding.scale) + np.float32(self.coding.offset)
+        electrons[flat == self.coding.fill] = 0
+        return np.asarray(electrons, np.float32)
 
     def _subspace(self, codes: Sequence[NDArray[np.uint16]]) -> F64:
         """First frame parameters: rank three, then turned by means of the fringe vector."""
         gram: F64 = np.zeros((len(codes[0]), len(codes[0])))
         for tile, block in zip(self.tiles, codes, strict=True):
-            electrons = self._electrons(block, tile.good).astype(np.float32)
+            electrons = self._electrons(block, self._picked(tile))
             gram += electrons @ electrons.T
         values, vectors = np.linalg.eigh(gram)
         if values[-3] <= 0 or values[-3] < 1e-12 * values[-1]:
             raise InputError("the frames do not differ: the phase was not scanned")
         g = vectors[:, -3:][:, ::-1]
         first, block = self.tiles[0], codes[0]
-        maps = (g.T @ self._electrons(block, first.good)).reshape(3, *first.shape)
+        every = np.arange(first.good.size)
+        maps = (g.T @ self._electrons(block, every)).reshape(3, *first.shape)
         mean = np.where(first.good & (np.abs(maps[0]) > 0), maps[0], 1.0)
         ratios = np.where(first.good, maps[1:] / mean, 0.0)
         # A third map that is only noise must not drown the fringes of the second.
@@ -230,9 +241,10 @@ class Scout:
         packed, right = np.zeros((n, 15)), np.zeros((n, 5))
         g, dk = frames.g.astype(np.float32), frames.dk.astype(np.float32)
         for tile, theta, block in zip(self.tiles, self.theta, codes, strict=True):
-            yy, xx = np.nonzero(tile.good)
+            picked = self._picked(tile)
+            yy, xx = np.divmod(picked, tile.shape[1])
             frame_sums(
-                np.ascontiguousarray(block[:, yy, xx]),
+                np.take(block.reshape(n, -1), picked, axis=1),
                 self.coding.scale,
                 self.coding.offset,
                 self.coding.fill,
