@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 import dask
 from dask.callbacks import Callback
+from threadpoolctl import threadpool_limits
 
 from pixcal.engine.progress import Progress
 from pixcal.model.errors import InputError
@@ -54,6 +55,26 @@ class Runtime:
         return replace(self, workers=workers)
 
 
+def one_blas_thread() -> threadpool_limits:
+    """Context in which BLAS does not start threads of its own.
+
+    Tasks already fill the cores; and the last bits of a product must not depend on how many
+    threads shared it.
+    """
+    return threadpool_limits(limits=1, user_api="blas")
+
+
+class _InWorker:
+    """A task for another process, where nobody else limits BLAS."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+
+    def __call__(self, item: Any) -> Any:
+        with one_blas_thread():
+            return self.function(item)
+
+
 def run_tasks(
     function: Callable[..., R],
     items: Sequence[Any],
@@ -81,7 +102,7 @@ def run_tasks(
     list
         Results in the order of the items.
     """
-    with Progress(label, len(items), quiet=runtime.quiet) as progress:
+    with Progress(label, len(items), quiet=runtime.quiet) as progress, one_blas_thread():
         if "://" in runtime.cluster:
             return _run_distributed(function, items, runtime, progress, done)
         if runtime.cluster == "sync" or (len(items) == 1 and runtime.cluster == "threads"):
@@ -102,6 +123,8 @@ def _run_local(
     progress: Progress,
     done: Callable[[int, R], None] | None,
 ) -> list[R]:
+    if runtime.cluster == "processes":
+        function = _InWorker(function)
     names = [f"task-{n}" for n in range(len(items))]
     graph = {name: (function, item) for name, item in zip(names, items, strict=True)}
     number = {name: n for n, name in enumerate(names)}
@@ -131,7 +154,7 @@ def _run_distributed(
     except (OSError, TimeoutError, ValueError) as error:
         raise InputError(f"--cluster {runtime.cluster}: no Dask scheduler answers there") from error
     with client:
-        futures = client.map(function, items, pure=False)
+        futures = client.map(_InWorker(function), items, pure=False)
         number = {future.key: n for n, future in enumerate(futures)}
         results: dict[int, R] = {}
         for future in as_completed(futures):

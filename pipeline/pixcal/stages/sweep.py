@@ -14,7 +14,7 @@ import numpy as np
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.progress import Progress
-from pixcal.engine.run import Runtime, run_tasks
+from pixcal.engine.run import Runtime, one_blas_thread, run_tasks
 from pixcal.estimators.batches import Batches, plan_batches
 from pixcal.estimators.fringes import FrameParameters
 from pixcal.estimators.scout import Scout
@@ -131,7 +131,9 @@ def _sweep_set(
     create_group(folder)
     done = made.journal()
     if f"{name}:scout" not in done:
-        write_json(folder / "scout.json", _scout_set(source, nominal, folder, runtime, name))
+        with one_blas_thread():
+            found = _scout_set(source, nominal, folder, runtime, name)
+        write_json(folder / "scout.json", found)
         made.note(f"{name}:scout")
     facts: dict[str, Any] = read_json(folder / "scout.json")
     frames = read_frames(folder)

@@ -1,0 +1,216 @@
+"""Optical path difference of two fibres on a detector, exact and paraxial.
+
+Positions are ``r = (x p, y p, 0)``: pixel coordinates x (column) and y (row), offsets included,
+times the pitch p. The origin is pixel (0, 0) of whatever grid x and y count; the geometry is given
+from the same origin, in millimetres. With fibre A at minus half the baseline and fibre B at plus
+half of it about their centre, the phase is ``psi = 2 pi / lambda (|r - s_A| - |r - s_B|)``, which
+grows along the baseline: its paraxial gradient is ``K = 2 pi / lambda p b / D`` rad/px.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+PARAMETERS = ("centre_x", "centre_y", "distance", "baseline_x", "baseline_y", "baseline_z")
+"""Parameters of `phase_jacobian`, in its order; all in mm."""
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Two fibre tips in front of a detector; lengths in mm.
+
+    Centre, separation and distance are the parameters, not the two points, because those are
+    what the data tell apart (physics note, section 4).
+
+    Attributes
+    ----------
+    wavelength, pitch : float
+        Laser wavelength and pixel pitch.
+    centre_x, centre_y : float
+        Foot of the fibres' midpoint on the detector plane, from pixel (0, 0).
+    distance : float
+        From the midpoint to the detector plane.
+    baseline_x, baseline_y, baseline_z : float
+        Fibre B minus fibre A; z is the tilt of the baseline, positive away from the detector.
+    """
+
+    wavelength: float
+    pitch: float
+    centre_x: float
+    centre_y: float
+    distance: float
+    baseline_x: float
+    baseline_y: float
+    baseline_z: float = 0.0
+
+    @property
+    def wavenumber(self) -> float:
+        """2 pi / wavelength, in rad/mm."""
+        return 2 * np.pi / self.wavelength
+
+    def vector(self) -> Array:
+        """The parameters (mm) in the order of `PARAMETERS`."""
+        return np.array([getattr(self, name) for name in PARAMETERS])
+
+    def with_vector(self, values: ArrayLike) -> "Geometry":
+        """This geometry with other parameters, given in the order of `PARAMETERS`."""
+        numbers = np.asarray(values, float).tolist()
+        return replace(self, **dict(zip(PARAMETERS, numbers, strict=True)))
+
+
+def phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
+    """Exact fringe phase, good to 1e-9 rad.
+
+    The difference of the two paths (paper, eq. 3) loses seven digits when taken as written; this
+    is ``(s_A - s_B)·(s_A + s_B - 2 r) / (|r - s_A| + |r - s_B|)`` (physics note, section 1).
+
+    Parameters
+    ----------
+    x, y : array_like
+        Pixel coordinates, px; broadcast against each other.
+    geometry : Geometry
+        From the same origin.
+
+    Returns
+    -------
+    ndarray of float64
+        psi in rad, of the broadcast shape.
+    """
+    xs, ys = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+    out = np.empty(xs.shape)
+    _phase(
+        xs.ravel(), ys.ravel(), geometry.wavenumber, geometry.pitch, geometry.vector(), out.ravel()
+    )
+    return out
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _phase(
+    x: Array, y: Array, wavenumber: float, pitch: float, parameters: Array, out: Array
+) -> None:
+    cx, cy, d, bx, by, bz = parameters
+    for n in range(x.size):
+        qx, qy = x[n] * pitch - cx, y[n] * pitch - cy
+        ax, ay, az = qx + 0.5 * bx, qy + 0.5 * by, 0.5 * bz - d
+        ex, ey, ez = qx - 0.5 * bx, qy - 0.5 * by, -0.5 * bz - d
+        paths = np.sqrt(ax * ax + ay * ay + az * az) + np.sqrt(ex * ex + ey * ey + ez * ez)
+        out[n] = wavenumber * 2.0 * (bx * qx + by * qy - bz * d) / paths
+
+
+def opd(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
+    """Exact optical path difference in mm; parameters as `phase`."""
+    return phase(x, y, geometry) / geometry.wavenumber
+
+
+def paraxial_vector(geometry: Geometry) -> tuple[float, float]:
+    """Fringe vector (kx, ky) in rad/px of the straight-fringe limit (paper, eq. 4)."""
+    scale = geometry.wavenumber * geometry.pitch / geometry.distance
+    return scale * geometry.baseline_x, scale * geometry.baseline_y
+
+
+def paraxial_phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
+    """Phase of straight fringes (paper, eq. 4), zero at the foot of the fibres' centre.
+
+    Parameters and result as `phase`; the tilt of the baseline is left out, as in the paper.
+    """
+    kx, ky = paraxial_vector(geometry)
+    xs, ys = np.asarray(x, float), np.asarray(y, float)
+    result: Array = kx * (xs - geometry.centre_x / geometry.pitch) + ky * (
+        ys - geometry.centre_y / geometry.pitch
+    )
+    return result
+
+
+def interfringe(geometry: Geometry) -> float:
+    """Spatial period of the fringes in px, in the paraxial limit."""
+    return float(2 * np.pi / np.hypot(*paraxial_vector(geometry)))
+
+
+def fringe_vector(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[Array, Array]:
+    """Local fringe vector: the exact gradient of `phase` with respect to x and y, in rad/px."""
+    path = _Paths(x, y, geometry)
+    scale = geometry.wavenumber * geometry.pitch
+    kx = scale * path.quotient(2 * geometry.baseline_x, path.ua[0] + path.ub[0])
+    ky = scale * path.quotient(2 * geometry.baseline_y, path.ua[1] + path.ub[1])
+    return kx, ky
+
+
+def phase_jacobian(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
+    """Derivative of `phase` with respect to the geometry.
+
+    Parameters
+    ----------
+    x, y : array_like
+        Pixel coordinates, px.
+
+    Returns
+    -------
+    ndarray of float64
+        Broadcast shape + (6,): rad/mm, last axis in the order of `PARAMETERS`.
+    """
+    path = _Paths(x, y, geometry)
+    bx, by, bz = geometry.baseline_x, geometry.baseline_y, geometry.baseline_z
+    (ax, ay, az), (ex, ey, ez) = path.ua, path.ub
+    qx, qy, qz = path.q
+    columns = (
+        path.quotient(-2 * bx, -(ax + ex)),
+        path.quotient(-2 * by, -(ay + ey)),
+        path.quotient(-2 * bz, -(az + ez)),
+        path.quotient(2 * qx, (ax - ex) / 2),
+        path.quotient(2 * qy, (ay - ey) / 2),
+        path.quotient(2 * qz, (az - ez) / 2),
+    )
+    return geometry.wavenumber * np.stack(columns, axis=-1)
+
+
+class _Paths:
+    """OPD as a quotient ``2 b·q / (|q + b/2| + |q - b/2|)``, q from the fibres' centre, and the
+    unit vectors of both paths: what its derivatives are made of, free of cancellation."""
+
+    def __init__(self, x: ArrayLike, y: ArrayLike, geometry: Geometry) -> None:
+        xs, ys = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        b = np.array([geometry.baseline_x, geometry.baseline_y, geometry.baseline_z])
+        q = np.stack(
+            [
+                xs * geometry.pitch - geometry.centre_x,
+                ys * geometry.pitch - geometry.centre_y,
+                np.full(xs.shape, -geometry.distance),
+            ]
+        )
+        half = (b / 2).reshape((3,) + (1,) * xs.ndim)
+        to_a, to_b = q + half, q - half
+        rho_a, rho_b = np.sqrt((to_a**2).sum(0)), np.sqrt((to_b**2).sum(0))
+        self.q: Array = q
+        self.ua: Array = to_a / rho_a
+        self.ub: Array = to_b / rho_b
+        self.sum: Array = rho_a + rho_b
+        self.opd: Array = 2 * np.tensordot(b, q, axes=1) / self.sum
+
+    def quotient(self, numerator: Any, paths: Any) -> Array:
+        """Derivative of the OPD from those of its numerator and of the sum of the paths."""
+        result: Array = (numerator - self.opd * paths) / self.sum
+        return result
+
+
+def gaussian_beam(x: ArrayLike, y: ArrayLike, centre: tuple[float, float], radius: float) -> Array:
+    """Intensity of a Gaussian beam relative to its peak.
+
+    Parameters
+    ----------
+    x, y : array_like
+        Pixel coordinates, px.
+    centre : tuple of float
+        Peak (x, y), px.
+    radius : float
+        Where the intensity has fallen to 1/e², px.
+    """
+    # A product of two exponentials: with x a row and y a column only their sides are computed.
+    across = np.exp(-2 * ((np.asarray(x, float) - centre[0]) / radius) ** 2)
+    along = np.exp(-2 * ((np.asarray(y, float) - centre[1]) / radius) ** 2)
+    result: Array = along * across
+    return result

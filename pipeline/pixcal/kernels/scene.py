@@ -1,0 +1,235 @@
+"""What a bench looks like: its detector, its light and its frames, as arrays for `synthesis`."""
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.kernels import optics
+from pixcal.kernels.synthesis import BLOCK_ROWS, Float32, Stream, fill_normal, generator, turns
+from pixcal.model.bench import Bench, SimulatedDetector
+from pixcal.model.flags import PixelFlag
+
+TILE = (64, 256)
+"""Rows and columns of the chip that share a generator. Another number would be another chip."""
+
+Rows = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class DetectorMaps:
+    """The truth of the pixels of some rows of the window, each of shape (y, x)."""
+
+    delta_x: Float32
+    """Offset along x, px."""
+    delta_y: Float32
+    """Offset along y, px."""
+    response: Float32
+    """Relative, mean 1."""
+    bias: Float32
+    """ADU."""
+    dark_rate: Float32
+    """e-/s."""
+    mask: NDArray[np.uint8]
+    """`PixelFlag.HOT` and `PixelFlag.DEAD`."""
+
+
+def detector_maps(detector: SimulatedDetector, rows: Rows) -> DetectorMaps:
+    """The detector's maps for rows of the window (first, one after the last)."""
+    (row, column), width = detector.origin, detector.shape[1]
+    y0, y1, x0, x1 = row + rows[0], row + rows[1], column, column + width
+    maps = DetectorMaps(
+        *(
+            np.empty((y1 - y0, width), np.uint8 if field.name == "mask" else np.float32)
+            for field in fields(DetectorMaps)
+        )
+    )
+    for ty in range(y0 // TILE[0], -(-y1 // TILE[0])):
+        for tx in range(x0 // TILE[1], -(-x1 // TILE[1])):
+            top, left = ty * TILE[0], tx * TILE[1]
+            part_y, part_x = (
+                slice(max(y0, top), min(y1, top + TILE[0])),
+                slice(max(x0, left), min(x1, left + TILE[1])),
+            )
+            tile = _chip_tile(detector, ty, tx)
+            inside = _shift(part_y, top), _shift(part_x, left)
+            window = _shift(part_y, y0), _shift(part_x, x0)
+            for field in fields(DetectorMaps):
+                getattr(maps, field.name)[window] = getattr(tile, field.name)[inside]
+    return maps
+
+
+def _shift(part: slice, by: int) -> slice:
+    return slice(part.start - by, part.stop - by)
+
+
+def _chip_tile(d: SimulatedDetector, ty: int, tx: int) -> DetectorMaps:
+    """Maps of one tile of the chip, drawn whole so that every window sees the same pixels."""
+
+    def normal(stream: Stream, rms: float) -> Float32:
+        values = np.empty(TILE, np.float32)
+        fill_normal(generator(d.seed, stream, ty, tx), values)
+        return values * np.float32(rms)
+
+    rng = generator(d.seed, Stream.DEFECT, ty, tx)
+    chance = rng.random(TILE)
+    dead, hot = chance < d.dead_fraction, chance >= 1 - d.hot_fraction
+    response = np.maximum(1 + normal(Stream.RESPONSE, d.prnu_rms), 0)
+    response[dead] = 0
+    dark = np.full(TILE, d.dark_e_s, np.float32)
+    dark[hot] += d.hot_rate_e_s * (0.5 + 0.5 * rng.standard_exponential(np.count_nonzero(hot)))
+    columns = generator(d.seed, Stream.BIAS_COLUMN, tx).standard_normal(TILE[1])
+    column_bias = (d.bias_adu + d.bias_column_rms_adu * columns).astype(np.float32)
+    stitch_x, stitch_y = _stitches(d, ty, tx)
+    return DetectorMaps(
+        delta_x=normal(Stream.DELTA_X, d.delta_rms_px) + stitch_x,
+        delta_y=normal(Stream.DELTA_Y, d.delta_rms_px) + stitch_y,
+        response=response,
+        bias=normal(Stream.BIAS, d.bias_pixel_rms_adu) + column_bias,
+        dark_rate=dark,
+        mask=np.where(dead, PixelFlag.DEAD, np.where(hot, PixelFlag.HOT, 0)).astype(np.uint8),
+    )
+
+
+def _stitches(d: SimulatedDetector, ty: int, tx: int) -> tuple[Float32, Float32]:
+    """Offsets (dx, dy) in px of the stitching blocks under a tile of the chip."""
+    y = np.arange(ty * TILE[0], (ty + 1) * TILE[0]) // d.stitch_px[0]
+    x = np.arange(tx * TILE[1], (tx + 1) * TILE[1]) // d.stitch_px[1]
+    # One row of blocks has one generator; drawing along it gives every tile the same numbers.
+    drawn = {
+        int(block): generator(d.seed, Stream.STITCH, int(block)).standard_normal((x[-1] + 1, 2))
+        for block in np.unique(y)
+    }
+    shifts = np.stack([drawn[int(block)][x] for block in y]).astype(np.float32)
+    shifts *= np.float32(d.stitch_rms_px)
+    return shifts[..., 0], shifts[..., 1]
+
+
+def geometry(bench: Bench, number: int) -> optics.Geometry:
+    """True geometry of a fringe set, from the first pixel of the window."""
+    d, o, scan = bench.detector, bench.optics, bench.frames.fringes[number]
+    pitch = d.pitch_um * 1e-3
+    offset = o.offset_mm if scan.offset_mm is None else scan.offset_mm
+    return optics.Geometry(
+        wavelength=o.wavelength_nm * 1e-6,
+        pitch=pitch,
+        centre_x=d.chip_centre_px[0] * pitch + offset[0],
+        centre_y=d.chip_centre_px[1] * pitch + offset[1],
+        distance=o.distance_mm,
+        baseline_x=scan.baseline_mm[0],
+        baseline_y=scan.baseline_mm[1],
+        baseline_z=scan.baseline_z_mm,
+    )
+
+
+def fibre_light(
+    bench: Bench, number: int, rows: Rows
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Light of fibres A and B alone on rows of the window, in units of the peak of A, (y, x).
+
+    Gaussian beams, taken at the centres of the pixels of the perfect grid.
+    """
+    g, o = geometry(bench, number), bench.optics
+    x = np.arange(bench.detector.shape[1])
+    y = np.arange(*rows)[:, None]
+    light = []
+    for side, pointing in ((-0.5, o.pointing_a_mm), (0.5, o.pointing_b_mm)):
+        peak = (
+            (g.centre_x + side * g.baseline_x + pointing[0]) / g.pitch,
+            (g.centre_y + side * g.baseline_y + pointing[1]) / g.pitch,
+        )
+        light.append(optics.gaussian_beam(x, y, peak, o.beam_radius_mm / g.pitch))
+    return light[0], o.power_ratio * light[1]
+
+
+def electrons_per_unit(bench: Bench, number: int) -> float:
+    """Electrons for one unit of `fibre_light`: makes the brightest fringe of the window peak_e."""
+    ny = bench.detector.shape[0]
+    brightest = 0.0
+    for row in range(0, ny, BLOCK_ROWS):
+        a, b = fibre_light(bench, number, (row, min(row + BLOCK_ROWS, ny)))
+        bright = a + b + 2 * bench.optics.visibility * np.sqrt(a * b)
+        brightest = max(brightest, float(bright.max()))
+    return bench.frames.fringes[number].peak_e / brightest
+
+
+@dataclass(frozen=True)
+class LightMaps:
+    """Response to the fringes of rows of the window, as `synthesis.illuminate` takes it; e-."""
+
+    iota: Float32
+    alpha_sin: Float32
+    alpha_cos: Float32
+
+
+def light_maps(
+    bench: Bench, number: int, rows: Rows, maps: DetectorMaps, electrons: float
+) -> LightMaps:
+    """Mean and fringe amplitude of a set, through the pixels' response and at their offsets.
+
+    Parameters
+    ----------
+    bench : Bench
+    number : int
+        Of the fringe set.
+    rows : tuple of int
+        First row of the window and the one after the last.
+    maps : DetectorMaps
+        Of the same rows.
+    electrons : float
+        From `electrons_per_unit`.
+    """
+    a, b = fibre_light(bench, number, rows)
+    x = np.arange(bench.detector.shape[1]) + maps.delta_x.astype(np.float64)
+    y = np.arange(*rows)[:, None] + maps.delta_y.astype(np.float64)
+    psi = optics.phase(x, y, geometry(bench, number))
+    iota = electrons * maps.response * (a + b)
+    alpha = electrons * maps.response * 2 * bench.optics.visibility * np.sqrt(a * b)
+    return LightMaps(
+        iota.astype(np.float32),
+        (alpha * np.sin(psi)).astype(np.float32),
+        (alpha * np.cos(psi)).astype(np.float32),
+    )
+
+
+@dataclass(frozen=True)
+class FrameStates:
+    """What changes from frame to frame of a fringe set; arrays over its frames."""
+
+    phi: NDArray[np.float64]
+    """Phase, rad."""
+    level: NDArray[np.float64]
+    """B, mean 1."""
+    amplitude: NDArray[np.float64]
+    """A, mean 1."""
+    dkx: NDArray[np.float64]
+    """Change of the fringe vector along x, rad/px, about the window's centre."""
+    dky: NDArray[np.float64]
+    """Change of the fringe vector along y, rad/px."""
+
+    def turns(self, frame: int, shape: tuple[int, int], rows: Rows) -> tuple[Float32, Float32]:
+        """Phase of a frame along columns and rows, as `synthesis.illuminate` takes it."""
+        x = np.arange(shape[1]) - (shape[1] - 1) / 2
+        y = np.arange(*rows) - (shape[0] - 1) / 2
+        return turns(self.dkx[frame] * x), turns(self.phi[frame] + self.dky[frame] * y)
+
+
+def frame_states(bench: Bench, number: int) -> FrameStates:
+    """Draw the frames of a set; more frames leave the first ones as they are."""
+    scan = bench.frames.fringes[number]
+    ny, nx = bench.detector.shape
+
+    def rng(stream: Stream) -> np.random.Generator:
+        return generator(bench.seed, stream, number)
+
+    if scan.phase_law == "ramp":
+        phi = np.mod(scan.phase_step_rad * np.arange(scan.count), 2 * np.pi)
+    else:
+        phi = 2 * np.pi * rng(Stream.PHASE).random(scan.count)
+    noise = rng(Stream.LASER).standard_normal(scan.count)
+    level = np.maximum(1 + bench.optics.laser_noise_rms * noise, 0)
+    jitter = scan.visibility_jitter_rms * rng(Stream.VISIBILITY).standard_normal(scan.count)
+    # Two fibres cannot interfere by more than all of their light.
+    contrast = np.clip(1 + jitter, 0, 1 / bench.optics.visibility)
+    tilt = scan.vector_jitter_rad * rng(Stream.VECTOR).standard_normal((scan.count, 2))
+    return FrameStates(phi, level, level * contrast, tilt[:, 0] / nx, tilt[:, 1] / ny)

@@ -1,0 +1,243 @@
+"""From light to samples, compiled; and random numbers keyed by what they are for.
+
+A frame is made in separate steps, each over arrays (y, x) of the rows at hand, so that an effect
+can act between any two: `illuminate` (light and pixel response: mean electrons), `collect`
+(charge: dark current, shot noise, full well), `read_out` (gain, bias, read noise, converter).
+
+Random numbers come from `numpy.random.Generator` (PCG64), one for each (purpose, place): noise for
+each frame and block of `BLOCK_ROWS` rows of the window, maps of the chip for each tile of it. So
+nothing depends on how the work is cut or who does it.
+
+Measured on one core (AMD EPYC, Zen 5), 64 x 8320 samples: 3 to 4 ns a normal when the generator is
+called in compiled code (8 through NumPy), 0.5 ns for shot noise out of it, 9 ns a sample in all.
+"""
+
+import math
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Float32 = NDArray[np.float32]
+
+BLOCK_ROWS = 64
+"""Rows of the window that share a noise generator. Another number would be other noise."""
+
+EXACT_BELOW = 16.0
+"""Mean (e-) below which the Poisson quantile is found by summing the distribution."""
+
+
+class Stream(IntEnum):
+    """What random numbers are for; a number is never reused."""
+
+    DELTA_X = 1
+    DELTA_Y = 2
+    RESPONSE = 3
+    BIAS = 4
+    BIAS_COLUMN = 5
+    DEFECT = 6
+    STITCH = 7
+    PHASE = 8
+    LASER = 9
+    VISIBILITY = 10
+    VECTOR = 11
+    NOISE = 12
+
+
+def generator(seed: int, stream: Stream, *key: int) -> np.random.Generator:
+    """The random generator of one purpose and place; the same whoever asks, in whatever order."""
+    sequence = np.random.SeedSequence(seed, spawn_key=(int(stream), *key))
+    return np.random.Generator(np.random.PCG64(sequence))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def fill_normal(rng: np.random.Generator, out: Float32) -> None:
+    """Fill a 2-D array with standard normals: those of ``rng.standard_normal``, rounded."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = rng.standard_normal()
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def illuminate(
+    iota: Float32,
+    alpha_sin: Float32,
+    alpha_cos: Float32,
+    level: float,
+    amplitude: float,
+    column_turn: NDArray[np.float32],
+    row_turn: NDArray[np.float32],
+    out: Float32,
+) -> None:
+    """Mean electrons from the light: ``B iota + A alpha sin(psi + phi)`` (physics note, section 1).
+
+    Parameters
+    ----------
+    iota, alpha_sin, alpha_cos : ndarray of float32, shape (y, x)
+        e-; alpha times sin psi and cos psi.
+    level, amplitude : float
+        B and A of the frame.
+    column_turn, row_turn : ndarray of float32, shape (2, x) and (2, y)
+        cos and sin of the frame's phase: phi and what grows along y in the rows, what grows along
+        x in the columns.
+    out : ndarray of float32, shape (y, x)
+        e-.
+    """
+    b, a = np.float32(level), np.float32(amplitude)
+    for i in range(out.shape[0]):
+        row_cos, row_sin = a * row_turn[0, i], a * row_turn[1, i]
+        for j in range(out.shape[1]):
+            c = row_cos * column_turn[0, j] - row_sin * column_turn[1, j]
+            s = row_sin * column_turn[0, j] + row_cos * column_turn[1, j]
+            out[i, j] = b * iota[i, j] + alpha_sin[i, j] * c + alpha_cos[i, j] * s
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def collect(
+    light: Float32, dark: Float32, normal: Float32, shot: bool, full_well: float, out: Float32
+) -> None:
+    """Charge of each pixel: whole electrons when there is shot noise.
+
+    The Poisson variate is the quantile of its distribution at the probability of a standard normal
+    w, so that the same random numbers serve every level. From `EXACT_BELOW` up the quantile is
+    Giles' expansion in 1/sqrt(mean) to second order (ACM TOMS 42(1), 6, 2016, function Q_N2),
+    rounded down: there its distribution function is within 2e-5 of the exact one, mean, variance
+    and skewness within 1e-8, 1.1e-4 and 2e-4 of theirs (computed at mean 16, falling fast above it;
+    the tests repeat it). Below, it is exact.
+
+    Parameters
+    ----------
+    light, dark : ndarray of float32, shape (y, x)
+        Mean electrons from light and from dark current.
+    normal : ndarray of float32, shape (y, x)
+        Standard normals.
+    shot : bool
+        False: the charge is its mean.
+    full_well : float
+        Charge is clipped here, e-.
+    out : ndarray of float32, shape (y, x)
+        e-.
+    """
+    well, least = np.float32(full_well), np.float32(EXACT_BELOW)
+    if not shot:
+        for i in range(out.shape[0]):
+            for j in range(out.shape[1]):
+                out[i, j] = min(max(light[i, j] + dark[i, j], np.float32(0)), well)
+        return
+    for i in range(out.shape[0]):
+        faint = 0
+        for j in range(out.shape[1]):
+            mean = light[i, j] + dark[i, j]
+            faint += mean < least
+            out[i, j] = min(_poisson_expansion(max(mean, least), normal[i, j]), well)
+        if faint:
+            for j in range(out.shape[1]):
+                mean = light[i, j] + dark[i, j]
+                if mean < least:
+                    out[i, j] = min(np.float32(poisson_quantile(mean, normal[i, j])), well)
+
+
+@njit(cache=True, nogil=True, inline="always")  # type: ignore[untyped-decorator]
+def _poisson_expansion(mean: np.float32, w: np.float32) -> np.float32:
+    w2 = w * w
+    root = math.sqrt(mean)
+    first = -w * (np.float32(1 / 36) + w2 * np.float32(1 / 72))
+    second = np.float32(-8 / 405) + w2 * (np.float32(7 / 810) + w2 * np.float32(1 / 270))
+    rest = np.float32(1 / 3) + w2 * np.float32(1 / 6) + first / root + second / mean
+    return math.floor(mean + root * w + rest)  # type: ignore[return-value]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def poisson_quantile(mean: float, w: float) -> int:
+    """Smallest n whose Poisson distribution function reaches that of a standard normal at ``w``.
+
+    By summing, so for means below `EXACT_BELOW`; zero for means of zero or less.
+    """
+    if mean <= 0:
+        return 0
+    # Of the two tails the smaller is exact: the sum stops where the rest of it is the upper tail.
+    upper = 0.5 * math.erfc(w / math.sqrt(2.0))
+    term = math.exp(-mean)
+    rest = 1.0 - term
+    n = 0
+    while rest > upper and term > 1e-18:
+        n += 1
+        term *= mean / n
+        rest -= term
+    return n
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def read_out(
+    charge: Float32,
+    bias: Float32,
+    normal: Float32,
+    read_noise: float,
+    gain: float,
+    top: int,
+    out: NDArray[np.uint16],
+) -> None:
+    """Samples of the converter, clipped to 0 and ``top``.
+
+    Parameters
+    ----------
+    charge : ndarray of float32, shape (y, x)
+        e-.
+    bias : ndarray of float32, shape (y, x)
+        ADU.
+    normal : ndarray of float32, shape (y, x)
+        Standard normals.
+    read_noise, gain : float
+        e- rms and e-/ADU.
+    top : int
+        Largest value, ADU.
+    out : ndarray of uint16, shape (y, x)
+        ADU.
+    """
+    noise, scale = np.float32(read_noise), np.float32(1.0 / gain)
+    low, high, half = np.float32(0), np.float32(top), np.float32(0.5)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            value = (charge[i, j] + noise * normal[i, j]) * scale + bias[i, j]
+            out[i, j] = np.uint16(np.int32(min(max(value, low) + half, high)))
+
+
+def block_normals(
+    rows: tuple[int, int], columns: int, seed: int, key: tuple[int, ...], count: int = 2
+) -> list[Float32]:
+    """Standard normals for some rows of the window, whichever blocks they lie in.
+
+    Parameters
+    ----------
+    rows : tuple of int
+        First row and the one after the last.
+    columns : int
+        Width of the window.
+    seed : int
+        Of the bench.
+    key : tuple of int
+        Kind, sequence and frame.
+    count : int
+        How many independent arrays (shot noise, read noise).
+
+    Returns
+    -------
+    list of ndarray of float32, shape (y, x)
+    """
+    first, last = rows
+    begin, end = first // BLOCK_ROWS, -(-last // BLOCK_ROWS)
+    blocks = np.empty((count, (end - begin) * BLOCK_ROWS, columns), np.float32)
+    for block in range(begin, end):
+        rng = generator(seed, Stream.NOISE, *key, block)
+        at = (block - begin) * BLOCK_ROWS
+        for array in blocks:
+            fill_normal(rng, array[at : at + BLOCK_ROWS])
+    skip = first - begin * BLOCK_ROWS
+    return [array[skip : skip + last - first] for array in blocks]
+
+
+def turns(angles: NDArray[Any]) -> Float32:
+    """cos and sin of angles (rad) as `illuminate` takes them, shape (2, n)."""
+    return np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)

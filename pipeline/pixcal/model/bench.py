@@ -1,0 +1,285 @@
+"""A bench to simulate: everything ``pixcal simulate`` needs to know, schema ``pixcal/bench/1``."""
+
+import re
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+
+from pixcal.model.config import parse, quantity, read_yaml
+from pixcal.model.errors import InputError
+
+SCHEMA = "pixcal/bench/1"
+
+CALIBRATIONS = ("bias", "dark", "flat")
+"""Kinds of calibration frames; their folders, so no fringe set may have these names."""
+
+MAX_FRAMES = 10_000_000
+MAX_DURATION_S = 1e10
+
+
+@dataclass(frozen=True)
+class SimulatedDetector:
+    """The chip, the window of it that is read, and its truth maps.
+
+    The maps belong to the chip: the same ``seed`` and chip give the same pixels in every window.
+    """
+
+    shape: tuple[int, int] = quantity(
+        unit="px", low=1, high=65536, doc="window that is read: [rows, columns]"
+    )
+    pitch_um: float = quantity(unit="um", above=0, high=1000, doc="pixel pitch")
+    gain_e_per_adu: float = quantity(unit="e-/ADU", above=0, high=1e6, doc="conversion gain")
+    read_noise_e: float = quantity(unit="e-", low=0, high=1e6, doc="read noise, rms")
+    name: str = quantity("", doc="free text")
+    seed: int = quantity(0, low=0, high=10**18, doc="which specimen of the chip this is")
+    chip: tuple[int, int] | None = quantity(
+        None, unit="px", low=1, high=65536, doc="whole chip: [rows, columns]; default: the window"
+    )
+    origin_px: tuple[int, int] | None = quantity(
+        None,
+        unit="px",
+        low=0,
+        high=65536,
+        doc="window's first pixel; default: window in the middle",
+    )
+    bits: int = quantity(16, low=1, high=16, doc="of the analogue-to-digital converter")
+    saturation_adu: float | None = quantity(
+        None, unit="ADU", above=0, doc="samples are clipped here; default: the converter's end"
+    )
+    full_well_e: float | None = quantity(
+        None, unit="e-", above=0, high=1e7, doc="charge is clipped here; default: never"
+    )
+    bias_adu: float = quantity(500.0, unit="ADU", low=0, high=65535, doc="mean bias")
+    bias_pixel_rms_adu: float = quantity(
+        0.0, unit="ADU", low=0, high=65535, doc="bias structure from pixel to pixel"
+    )
+    bias_column_rms_adu: float = quantity(
+        0.0, unit="ADU", low=0, high=65535, doc="bias structure from column to column"
+    )
+    dark_e_s: float = quantity(0.0, unit="e-/s", low=0, high=1e7, doc="dark current")
+    hot_fraction: float = quantity(0.0, low=0, high=0.5, doc="share of the pixels that are hot")
+    hot_rate_e_s: float = quantity(
+        0.0, unit="e-/s", low=0, high=1e7, doc="mean dark current of hot pixels (at least half)"
+    )
+    dead_fraction: float = quantity(
+        0.0, low=0, high=0.5, doc="share of the pixels without response"
+    )
+    prnu_rms: float = quantity(0.0, low=0, high=0.5, doc="response from pixel to pixel, relative")
+    delta_rms_px: float = quantity(
+        0.0, unit="px", low=0, high=0.5, doc="offsets from pixel to pixel, each axis"
+    )
+    stitch_rms_px: float = quantity(
+        0.0, unit="px", low=0, high=0.5, doc="offsets from stitching block to block, each axis"
+    )
+    stitch_px: tuple[int, int] = quantity(
+        (64, 64), unit="px", low=1, high=65536, doc="stitching block: [rows, columns]"
+    )
+    temperature_c: float = quantity(35.0, unit="C", low=-273.15, high=200, doc="for the headers")
+
+    def __post_init__(self) -> None:
+        if not self.name.isprintable():
+            raise InputError(f"name: {self.name!r:.80} holds characters that cannot be printed")
+        for axis, name in enumerate(("rows", "columns")):
+            first, size, whole = self.origin[axis], self.shape[axis], self.chip_shape[axis]
+            if first < 0 or first + size > whole:
+                raise InputError(
+                    f"origin_px: {size} {name} from {first} do not fit on {whole}; see shape, chip"
+                )
+        if self.saturation_adu is not None and self.saturation_adu > (1 << self.bits) - 1:
+            raise InputError(
+                f"saturation_adu: {self.saturation_adu:g} ADU is above the end of a converter of "
+                f"{self.bits} bits ({(1 << self.bits) - 1})"
+            )
+        if self.bias_adu >= self.top_adu:
+            raise InputError(f"bias_adu: {self.bias_adu:g} ADU leaves no room below saturation")
+        if self.hot_fraction + self.dead_fraction > 0.5:
+            raise InputError("hot_fraction: with dead_fraction more than half of the pixels")
+
+    @property
+    def chip_shape(self) -> tuple[int, int]:
+        """Rows and columns of the chip."""
+        return self.chip or self.shape
+
+    @property
+    def origin(self) -> tuple[int, int]:
+        """Chip row and column of the window's first pixel."""
+        if self.origin_px is not None:
+            return self.origin_px
+        (rows, columns), (ny, nx) = self.chip_shape, self.shape
+        return (rows - ny) // 2, (columns - nx) // 2
+
+    @property
+    def top_adu(self) -> int:
+        """Largest value that is read, in ADU."""
+        top = (1 << self.bits) - 1
+        return top if self.saturation_adu is None else min(top, int(self.saturation_adu))
+
+    @property
+    def chip_centre_px(self) -> tuple[float, float]:
+        """The chip's centre as (x, y) in pixels of the window."""
+        (rows, columns), (row, column) = self.chip_shape, self.origin
+        return (columns - 1) / 2 - column, (rows - 1) / 2 - row
+
+
+@dataclass(frozen=True)
+class SimulatedOptics:
+    """Laser, fibres and their light; lengths on the detector are from the chip's centre."""
+
+    wavelength_nm: float = quantity(unit="nm", above=0, high=1e6, doc="laser wavelength")
+    distance_mm: float = quantity(unit="mm", above=0, high=1e7, doc="fibres to detector, true")
+    beam_radius_mm: float = quantity(
+        unit="mm", above=0, high=1e7, doc="1/e² radius of each fibre's light on the detector"
+    )
+    nominal_distance_mm: float | None = quantity(
+        None, unit="mm", above=0, high=1e7, doc="what the acquisition declares; default: the truth"
+    )
+    offset_mm: tuple[float, float] = quantity(
+        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="foot of the fibres' centre: [x, y]"
+    )
+    pointing_a_mm: tuple[float, float] = quantity(
+        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="peak of A's light from the foot of A"
+    )
+    pointing_b_mm: tuple[float, float] = quantity(
+        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="peak of B's light from the foot of B"
+    )
+    power_ratio: float = quantity(1.0, above=0, high=1e3, doc="power of B over that of A")
+    visibility: float = quantity(
+        1.0, above=0, high=1, doc="contrast where both fibres give the same light"
+    )
+    laser_noise_rms: float = quantity(
+        0.0, low=0, high=0.5, doc="relative change of the laser's power from frame to frame"
+    )
+
+
+@dataclass(frozen=True)
+class SimulatedSet:
+    """One scan of the fringes of a pair of fibres."""
+
+    name: str = quantity(doc="letters, digits, '-' and '_'")
+    baseline_mm: tuple[float, float] = quantity(
+        unit="mm", low=-1e4, high=1e4, doc="fibre B minus fibre A along x and y"
+    )
+    count: int = quantity(low=1, high=MAX_FRAMES, doc="number of frames")
+    peak_e: float = quantity(
+        unit="e-",
+        above=0,
+        high=1e7,
+        doc="brightest fringe in the window, unit response, mean power",
+    )
+    baseline_z_mm: float = quantity(
+        0.0, unit="mm", low=-1e4, high=1e4, doc="tilt: fibre B minus fibre A away from the detector"
+    )
+    offset_mm: tuple[float, float] | None = quantity(
+        None, unit="mm", low=-1e5, high=1e5, doc="of this pair, instead of the one in optics"
+    )
+    phase_law: str = quantity(
+        "random", choices=("random", "ramp"), doc="random: uniform over a turn; ramp: equal steps"
+    )
+    phase_step_rad: float = quantity(0.0, unit="rad", low=-1e3, high=1e3, doc="step of a ramp")
+    visibility_jitter_rms: float = quantity(
+        0.0, low=0, high=0.5, doc="relative change of the visibility from frame to frame"
+    )
+    vector_jitter_rad: float = quantity(
+        0.0, unit="rad", low=0, high=1e3, doc="rms tilt of the phase, edge to edge, each axis"
+    )
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", self.name):
+            raise InputError(f"name: {self.name!r:.80} is not made of letters, digits, '-' and '_'")
+        if self.name in CALIBRATIONS:
+            raise InputError(f"name: {self.name!r} is the folder of calibration frames")
+        if self.baseline_mm == (0.0, 0.0):
+            raise InputError("baseline_mm: both components are zero, so there are no fringes")
+        if self.phase_law == "ramp" and self.phase_step_rad == 0:
+            raise InputError("phase_step_rad: zero, so the ramp never moves; give its step")
+
+
+@dataclass(frozen=True)
+class Rung:
+    """Calibration frames of one exposure time."""
+
+    exptime_s: float = quantity(unit="s", low=0, high=1e6, doc="exposure time")
+    count: int = quantity(low=1, high=MAX_FRAMES, doc="number of frames")
+
+
+@dataclass(frozen=True)
+class SimulatedFrames:
+    """What is recorded, in the order bias, dark, flat, fringes, and how it is filed."""
+
+    exptime_s: float = quantity(unit="s", above=0, high=1e6, doc="of the fringe frames")
+    period_s: float = quantity(
+        unit="s", above=0, high=1e6, doc="frame to frame; longer exposures take their own time"
+    )
+    start: str = quantity("2026-01-01T00:00:00", doc="of the first frame, ISO 8601, UTC")
+    per_file: int = quantity(1, low=1, high=100_000, doc="1: 2-D frames; more: 3-D cubes")
+    compress: tuple[str, ...] = quantity((), doc="bias, dark, flat or sets to tile-compress (RICE)")
+    bias: int = quantity(0, low=0, high=MAX_FRAMES, doc="number of bias frames")
+    bias_exptime_s: float = quantity(0.0, unit="s", low=0, high=1e6, doc="of the bias frames")
+    darks: tuple[Rung, ...] = quantity((), doc="dark frames, one entry for each exposure time")
+    flats: tuple[Rung, ...] = quantity((), doc="flats under a steady lamp: a ladder of levels")
+    flat_rate_e_s: float | None = quantity(
+        None, unit="e-/s", above=0, high=1e12, doc="the lamp, for unit response"
+    )
+    fringes: tuple[SimulatedSet, ...] = quantity((), doc="the fringe sets")
+
+    def __post_init__(self) -> None:
+        names = [*CALIBRATIONS, *(s.name for s in self.fringes)]
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"fringes: two sets are named {name!r}")
+        for name in self.compress:
+            if name not in names:
+                raise InputError(f"compress: {name!r} is not one of {', '.join(names)}")
+        for key, ladder in (("darks", self.darks), ("flats", self.flats)):
+            times = [rung.exptime_s for rung in ladder]
+            if len(set(times)) < len(times):
+                raise InputError(f"{key}: two entries have the same exptime_s; join them")
+        if self.flats and self.flat_rate_e_s is None:
+            raise InputError("flat_rate_e_s: missing (in e-/s), and there are flats")
+        if not (self.bias or self.darks or self.flats or self.fringes):
+            raise InputError("bias, darks, flats, fringes: no frames at all")
+        if self.period_s < self.exptime_s:
+            raise InputError(f"period_s: shorter than exptime_s ({self.exptime_s:g} s)")
+        try:
+            moment = datetime.fromisoformat(self.start)
+        except ValueError as error:
+            raise InputError(
+                f"start: {self.start!r:.80} is not like 2026-01-01T00:00:00"
+            ) from error
+        if moment.tzinfo is not None and moment.utcoffset() != timedelta(0):
+            raise InputError(f"start: {self.start!r:.80} is not in UTC; leave the zone out")
+        counts = [(self.bias, self.bias_exptime_s), *((s.count, 0.0) for s in self.fringes)]
+        counts += [(rung.count, rung.exptime_s) for rung in (*self.darks, *self.flats)]
+        seconds = sum(count * max(self.period_s, exptime) for count, exptime in counts)
+        if seconds > MAX_DURATION_S or not 1858 < moment.year < 2200:
+            raise InputError(f"start: {self.start!r:.80} and {seconds:g} s from there: not a date")
+
+    @property
+    def start_time(self) -> datetime:
+        """Time of the first frame (UTC, without a zone)."""
+        return datetime.fromisoformat(self.start).replace(tzinfo=None)
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Contents of a bench file."""
+
+    schema: str = quantity(choices=(SCHEMA,))
+    detector: SimulatedDetector = quantity()
+    optics: SimulatedOptics = quantity()
+    frames: SimulatedFrames = quantity()
+    seed: int = quantity(0, low=0, high=10**18, doc="of everything that changes between frames")
+    shot_noise: bool = quantity(True, doc="false: the charge is its mean")
+
+
+def load_bench(path: Path) -> Bench:
+    """Read a bench file.
+
+    Raises
+    ------
+    InputError
+        If it is missing or any key is unknown, missing or out of range.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: not found; give a bench file such as configs/demo.yaml")
+    return parse(Bench, read_yaml(path), str(path))

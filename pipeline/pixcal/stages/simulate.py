@@ -1,0 +1,488 @@
+"""``pixcal simulate``: an acquisition as a bench would write it, and the truth apart from it.
+
+The work is cut into pieces of some frames by some rows; `expose` makes one, from the bench alone.
+Its steps are separate so that effects can act between them: what moves phase or intensity goes
+before `synthesis.illuminate`, what couples or deforms charge around `synthesis.collect`, what the
+electronics do around `synthesis.read_out`. Noise is keyed by frame and place, so an effect that
+needs the rows around a piece, or the frame before it, makes them again.
+
+The truth is a directory of its own: ``delta_x``, ``delta_y`` (px), ``response``, ``bias`` (ADU),
+``dark_rate`` (e-/s) and ``mask`` (`PixelFlag`) as FITS images; ``truth.json`` with the geometry of
+each set (``centre_px`` from the window's first pixel, ``kx`` and ``ky`` at its centre in rad/px)
+and its frames (``B``, ``A``, ``phi``, ``dkx``, ``dky``); and the bench file.
+"""
+
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields, replace
+from datetime import datetime, timedelta
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from pixcal.engine.plan import make_plan
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.kernels import optics, synthesis
+from pixcal.kernels.scene import (
+    DetectorMaps,
+    FrameStates,
+    LightMaps,
+    Rows,
+    detector_maps,
+    electrons_per_unit,
+    frame_states,
+    geometry,
+    light_maps,
+)
+from pixcal.model import acquisition as described
+from pixcal.model.bench import Bench, load_bench
+from pixcal.model.config import to_plain
+from pixcal.model.errors import InputError
+from pixcal.storage.artefact import (
+    MANIFEST,
+    Manifest,
+    artefact_key,
+    lock,
+    read_manifest,
+    write_json,
+)
+from pixcal.storage.fits_out import COMPRESSED, FrameWriter
+
+STAGE = "simulate"
+TRUTH = "simulate-truth"
+FORMAT = 1
+TRUTH_SCHEMA = "pixcal/truth/1"
+
+FRAMES_PER_TASK = 128
+"""The maps of some rows are made once for so many frames."""
+
+_BYTES_PER_PIXEL = 160
+"""Peak of a task for each pixel of its rows: maps, phases in float64, one frame (measured)."""
+
+_BYTES_PER_COMPRESSED_SAMPLE = 10
+"""Peak of a task for each sample of a file that is compressed (measured)."""
+
+_MJD_EPOCH = datetime(1858, 11, 17)
+_KINDS = ("bias", "dark", "flat", "fringes")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of the command.
+
+    Attributes
+    ----------
+    truth : Path, optional
+        Where the truth goes; default: beside the acquisition, ``<out>-truth``.
+    """
+
+    truth: Path | None = None
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Frames taken one after the other under the same conditions.
+
+    Attributes
+    ----------
+    kind : str
+        ``bias``, ``dark``, ``flat`` or ``fringes``.
+    number : int
+        Among those of its kind.
+    folder, stem : str
+        Of its files.
+    start_s, period_s : float
+        First frame after the start of the acquisition, and from frame to frame.
+    electrons : float
+        Electrons for unit light: of a flat its mean, of fringes as in `electrons_per_unit`.
+    """
+
+    kind: str
+    number: int
+    folder: str
+    stem: str
+    count: int
+    exptime_s: float
+    start_s: float
+    period_s: float
+    electrons: float
+
+
+Span = tuple[Sequence, range, dict[int, FrameWriter]]
+"""Some frames of a sequence, and the files (by number) that they go to."""
+
+
+def sequences(bench: Bench) -> list[Sequence]:
+    """Everything that the bench records, in order of time."""
+    f = bench.frames
+    planned: list[tuple[str, int, str, int, float, float]] = []
+    if f.bias:
+        planned.append(("bias", 0, "bias", f.bias, f.bias_exptime_s, 0.0))
+    for n, rung in enumerate(f.darks):
+        planned.append(("dark", n, "dark", rung.count, rung.exptime_s, 0.0))
+    for n, rung in enumerate(f.flats):
+        mean = (f.flat_rate_e_s or 0.0) * rung.exptime_s
+        planned.append(("flat", n, "flat", rung.count, rung.exptime_s, mean))
+    for n, scan in enumerate(f.fringes):
+        electrons = electrons_per_unit(bench, n)
+        planned.append(("fringes", n, scan.name, scan.count, f.exptime_s, electrons))
+    found, clock = [], 0.0
+    for kind, number, folder, count, exptime, electrons in planned:
+        period = max(f.period_s, exptime)
+        stem = f"{folder}-{number}" if kind in ("dark", "flat") else folder
+        found.append(Sequence(kind, number, folder, stem, count, exptime, clock, period, electrons))
+        clock += count * period
+    return found
+
+
+def expose(
+    bench: Bench, sequence: Sequence, frames: range, rows: Rows, maps: DetectorMaps
+) -> Iterator[tuple[int, NDArray[np.uint16]]]:
+    """Frames of a sequence as the camera reads them.
+
+    Parameters
+    ----------
+    frames : range
+        Numbers within the sequence.
+    rows : tuple of int
+        First row of the window and the one after the last; any rows give the same samples.
+    maps : DetectorMaps
+        Of these rows.
+
+    Yields
+    ------
+    tuple
+        Number of the frame and its samples, uint16 (y, x), ADU; the array is used again.
+    """
+    d = bench.detector
+    light = _light(bench, sequence, rows, maps)
+    states = _states(bench, sequence)
+    dark = maps.dark_rate * np.float32(sequence.exptime_s)
+    well = np.inf if d.full_well_e is None else d.full_well_e
+    mean, charge = np.empty_like(dark), np.empty_like(dark)
+    samples = np.empty(dark.shape, np.uint16)
+    for frame in frames:
+        columns, lines = states.turns(frame, d.shape, rows)
+        key = (_KINDS.index(sequence.kind), sequence.number, frame)
+        shot, read = synthesis.block_normals(rows, d.shape[1], bench.seed, key)
+        synthesis.illuminate(
+            light.iota,
+            light.alpha_sin,
+            light.alpha_cos,
+            states.level[frame],
+            states.amplitude[frame],
+            columns,
+            lines,
+            mean,
+        )
+        synthesis.collect(mean, dark, shot, bench.shot_noise, well, charge)
+        synthesis.read_out(
+            charge, maps.bias, read, d.read_noise_e, d.gain_e_per_adu, d.top_adu, samples
+        )
+        yield frame, samples
+
+
+def _light(bench: Bench, sequence: Sequence, rows: Rows, maps: DetectorMaps) -> LightMaps:
+    if sequence.kind == "fringes":
+        return light_maps(bench, sequence.number, rows, maps, sequence.electrons)
+    nothing = np.zeros_like(maps.response)
+    return LightMaps(maps.response * np.float32(sequence.electrons), nothing, nothing)
+
+
+def _states(bench: Bench, sequence: Sequence) -> FrameStates:
+    if sequence.kind == "fringes":
+        return frame_states(bench, sequence.number)
+    still, steady = np.zeros(sequence.count), np.ones(sequence.count)
+    return FrameStates(phi=still, level=steady, amplitude=still, dkx=still, dky=still)
+
+
+def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
+    """Simulate a bench.
+
+    Parameters
+    ----------
+    bench : Path
+        Bench file (schema ``pixcal/bench/1``).
+    out : Path
+        Directory of the acquisition. It appears when it is complete.
+    config : Config
+    runtime : Runtime
+
+    Returns
+    -------
+    Manifest
+        The acquisition's; its key is a digest, so that it tells nothing of the truth.
+
+    Raises
+    ------
+    InputError
+        If the bench file is wrong, or a directory holds what simulate did not put there.
+    """
+    plan = load_bench(bench)
+    out = out.resolve()
+    truth = (config.truth or out.with_name(f"{out.name}-truth")).resolve()
+    if truth.is_relative_to(out) or out.is_relative_to(truth):
+        raise InputError(f"--truth {truth}: one inside the other with {out}; keep the truth apart")
+    key = artefact_key(STAGE, FORMAT, to_plain(plan), {})
+    before, truth_before = _standing(out, STAGE, "--out"), _standing(truth, TRUTH, "--truth")
+    if before and truth_before and _whole(out, before, key) and _whole(truth, truth_before, key):
+        return before
+    aside, truth_aside = (p.with_name(f".{p.name}.partial") for p in (out, truth))
+    with lock(aside):
+        try:
+            return _build(plan, bench, key, (aside, out), (truth_aside, truth), runtime)
+        finally:
+            for folder in (aside, truth_aside):
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+def _build(
+    plan: Bench,
+    source: Path,
+    key: str,
+    acquisition: tuple[Path, Path],
+    truth: tuple[Path, Path],
+    runtime: Runtime,
+) -> Manifest:
+    """Write acquisition and truth, each aside (first path), then in place (second path)."""
+    (aside, out), (truth_aside, truth_out) = acquisition, truth
+    made, truth_made = aside / "made", truth_aside / "made"
+    for folder in (made, truth_made):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+    recorded = sequences(plan)
+    runtime = _fitting(plan, recorded, runtime)
+    _write_truth(plan, recorded, truth_made, runtime)
+    shutil.copyfile(source, truth_made / "bench.yaml")
+    _write_frames(plan, recorded, made, runtime)
+    _write_description(plan, made)
+    _put(truth_made, truth_out, Manifest(TRUTH, FORMAT, key, to_plain(plan), {}))
+    return _put(made, out, Manifest(STAGE, FORMAT, key, {}, {}))
+
+
+def _standing(folder: Path, stage: str, option: str) -> Manifest | None:
+    """Manifest of what stands where we want to write; refused when it is not simulate's."""
+    if not folder.exists():
+        return None
+    if not folder.is_dir():
+        raise InputError(f"{option} {folder}: a file is in the way; choose another directory")
+    there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if not p.is_dir()}
+    if not there:
+        return None
+    manifest = read_manifest(folder)
+    if manifest is None or manifest.stage != stage:
+        raise InputError(
+            f"{option} {folder}: not empty, and not made by 'pixcal simulate'; choose another"
+        )
+    foreign = sorted(there - set(manifest.summary.get("files", {})) - {MANIFEST})
+    if foreign:
+        raise InputError(f"{folder / foreign[0]}: not made by 'pixcal simulate'; move it away")
+    return manifest
+
+
+def _whole(folder: Path, manifest: Manifest, key: str) -> bool:
+    """Whether a directory was made from this bench and all of it is still there."""
+    return manifest.key == key and _sizes(folder) == manifest.summary.get("files")
+
+
+def _sizes(folder: Path) -> dict[str, int]:
+    files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p != folder / MANIFEST)
+    return {p.relative_to(folder).as_posix(): p.stat().st_size for p in files}
+
+
+def _put(made: Path, final: Path, manifest: Manifest) -> Manifest:
+    """Write the manifest and put a complete directory in place of what stood there."""
+    manifest.summary["files"] = _sizes(made)
+    write_json(made / MANIFEST, asdict(manifest))
+    if final.exists():
+        old = made.with_name("replaced")
+        shutil.rmtree(old, ignore_errors=True)
+        final.rename(old)
+    made.rename(final)
+    return manifest
+
+
+def _blocks(bench: Bench) -> list[Rows]:
+    """The window's rows, in the blocks that share their noise generator."""
+    ny, step = bench.detector.shape[0], synthesis.BLOCK_ROWS
+    return [(row, min(row + step, ny)) for row in range(0, ny, step)]
+
+
+def _fitting(bench: Bench, recorded: list[Sequence], runtime: Runtime) -> Runtime:
+    """The runtime with as many workers as fit the memory."""
+    ny, nx = bench.detector.shape
+    need = min(ny, synthesis.BLOCK_ROWS) * nx * _BYTES_PER_PIXEL
+    for sequence in recorded:
+        if sequence.folder in bench.frames.compress:
+            planes = min(bench.frames.per_file, sequence.count)
+            need = max(need, planes * ny * nx * _BYTES_PER_COMPRESSED_SAMPLE)
+    workers = make_plan("simulate", need, 0, runtime).workers
+    return replace(runtime, workers=workers)
+
+
+def _write_frames(bench: Bench, recorded: list[Sequence], folder: Path, runtime: Runtime) -> None:
+    spans: list[Span] = []
+    ready: list[tuple[FrameWriter, bool]] = []
+    for sequence in recorded:
+        files = _create_files(bench, sequence, folder)
+        ready += [(file, sequence.folder in bench.frames.compress) for file in files]
+        spans += _spans(sequence, files, bench.frames.per_file)
+    pieces = list(product(_blocks(bench), _batches(spans)))
+    run_tasks(partial(_write_piece, bench), pieces, runtime, label="frames")
+    run_tasks(_finish, ready, runtime, label="files")
+
+
+def _spans(sequence: Sequence, files: list[FrameWriter], per_file: int) -> list[Span]:
+    """A sequence in spans of `FRAMES_PER_TASK` frames."""
+    spans: list[Span] = []
+    for first in range(0, sequence.count, FRAMES_PER_TASK):
+        frames = range(first, min(first + FRAMES_PER_TASK, sequence.count))
+        used = range(frames[0] // per_file, frames[-1] // per_file + 1)
+        spans.append((sequence, frames, {n: files[n] for n in used}))
+    return spans
+
+
+def _batches(spans: list[Span]) -> list[list[Span]]:
+    """Short spans together, so that a task has about `FRAMES_PER_TASK` frames."""
+    batches: list[list[Span]] = [[]]
+    for span in spans:
+        if sum(len(s[1]) for s in batches[-1]) + len(span[1]) > FRAMES_PER_TASK:
+            batches.append([])
+        batches[-1].append(span)
+    return [batch for batch in batches if batch]
+
+
+def _create_files(bench: Bench, sequence: Sequence, folder: Path) -> list[FrameWriter]:
+    per_file = bench.frames.per_file
+    (folder / sequence.folder).mkdir(exist_ok=True)
+    made = []
+    for number, first in enumerate(range(0, sequence.count, per_file)):
+        planes = min(per_file, sequence.count - first)
+        shape = bench.detector.shape if per_file == 1 else (planes, *bench.detector.shape)
+        path = folder / sequence.folder / f"{sequence.stem}-{number:05d}.fits"
+        cards = _cards(bench, sequence, first)
+        made.append(FrameWriter.create(path, shape, "uint16", cards))
+    return made
+
+
+def _cards(bench: Bench, sequence: Sequence, frame: int) -> dict[str, Any]:
+    """Header of a file whose first frame has this number."""
+    seconds = sequence.start_s + frame * sequence.period_s
+    start = bench.frames.start_time
+    mjd = (start - _MJD_EPOCH) / timedelta(days=1) + seconds / 86400
+    moment = start + timedelta(seconds=seconds)
+    return {
+        "DATE-OBS": (moment.isoformat(timespec="microseconds"), "start of the first frame"),
+        "MJD-OBS": (mjd, "[d] start of the first frame"),
+        "TIMESYS": "UTC",
+        "EXPTIME": (sequence.exptime_s, "[s] exposure time"),
+        "CADENCE": (sequence.period_s, "[s] frame to frame"),
+        "CCD-TEMP": (bench.detector.temperature_c, "[C] detector temperature"),
+        "IMAGETYP": sequence.kind,
+        "OBJECT": sequence.folder,
+        "INSTRUME": bench.detector.name.encode("ascii", "replace").decode()[:60],
+        "ORIGIN": "pixcal simulate",
+    }
+
+
+def _write_piece(bench: Bench, piece: tuple[Rows, list[Span]]) -> None:
+    rows, spans = piece
+    maps = detector_maps(bench.detector, rows)
+    for sequence, frames, files in spans:
+        for frame, samples in expose(bench, sequence, frames, rows, maps):
+            number, plane = divmod(frame, bench.frames.per_file)
+            files[number].write_rows(rows[0], samples, plane)
+
+
+def _finish(ready: tuple[FrameWriter, bool]) -> None:
+    file, compress = ready
+    if compress:
+        file.finish_compressed()
+    else:
+        file.finish()
+
+
+def _write_description(bench: Bench, folder: Path) -> None:
+    """``acquisition.yaml``: what the owner of such a bench would declare."""
+    d, o, f = bench.detector, bench.optics, bench.frames
+
+    def globs(name: str) -> tuple[str, ...]:
+        return (f"{name}/*{COMPRESSED if name in f.compress else '.fits'}",)
+
+    contents = described.Acquisition(
+        schema=described.SCHEMA,
+        detector=described.Detector(
+            name=d.name,
+            pitch_um=d.pitch_um,
+            gain_e_per_adu=d.gain_e_per_adu,
+            read_noise_e=d.read_noise_e,
+            full_well_e=d.full_well_e,
+            saturation_adu=float(d.top_adu),
+        ),
+        optics=described.Optics(
+            wavelength_nm=o.wavelength_nm,
+            distance_mm=o.nominal_distance_mm or o.distance_mm,
+            frame_period_s=f.period_s,
+        ),
+        frames=described.Frames(
+            bias=globs("bias") if f.bias else (),
+            dark=globs("dark") if f.darks else (),
+            flat=globs("flat") if f.flats else (),
+            fringes=tuple(
+                described.FringeSet(s.name, globs(s.name), s.baseline_mm) for s in f.fringes
+            ),
+        ),
+    )
+    text = yaml.safe_dump(to_plain(contents), sort_keys=False, default_flow_style=None)
+    (folder / "acquisition.yaml").write_text(text, encoding="utf-8")
+
+
+def _write_truth(bench: Bench, recorded: list[Sequence], folder: Path, runtime: Runtime) -> None:
+    """Maps as FITS; geometry and frames as JSON."""
+    units = {"delta_x": "pix", "delta_y": "pix", "bias": "adu", "dark_rate": "electron/s"}
+    maps = [
+        FrameWriter.create(
+            folder / f"{field.name}.fits",
+            bench.detector.shape,
+            "uint8" if field.name == "mask" else "float32",
+            {"BUNIT": units[field.name]} if field.name in units else None,
+        )
+        for field in fields(DetectorMaps)
+    ]
+    run_tasks(partial(_write_maps, bench, maps), _blocks(bench), runtime, label="truth")
+    for writer in maps:
+        writer.finish()
+    sets = {s.folder: _set_truth(bench, s) for s in recorded if s.kind == "fringes"}
+    write_json(folder / "truth.json", {"schema": TRUTH_SCHEMA, "sets": sets})
+
+
+def _write_maps(bench: Bench, writers: list[FrameWriter], rows: Rows) -> None:
+    maps = detector_maps(bench.detector, rows)
+    for field, writer in zip(fields(DetectorMaps), writers, strict=True):
+        writer.write_rows(rows[0], getattr(maps, field.name))
+
+
+def _set_truth(bench: Bench, sequence: Sequence) -> dict[str, Any]:
+    g, states = geometry(bench, sequence.number), frame_states(bench, sequence.number)
+    ny, nx = bench.detector.shape
+    kx, ky = optics.fringe_vector((nx - 1) / 2, (ny - 1) / 2, g)
+    return {
+        "centre_px": [g.centre_x / g.pitch, g.centre_y / g.pitch],
+        "baseline_mm": [g.baseline_x, g.baseline_y, g.baseline_z],
+        "distance_mm": g.distance,
+        "wavelength_nm": bench.optics.wavelength_nm,
+        "interfringe_px": float(2 * np.pi / np.hypot(kx, ky)),
+        "kx": float(kx),
+        "ky": float(ky),
+        "electrons": sequence.electrons,
+        "B": states.level.tolist(),
+        "A": states.amplitude.tolist(),
+        "phi": states.phi.tolist(),
+        "dkx": states.dkx.tolist(),
+        "dky": states.dky.tolist(),
+    }
