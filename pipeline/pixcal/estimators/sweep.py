@@ -200,7 +200,9 @@ def phase_bound(tile: Tile, theta: F64, frames: FrameParameters) -> F64:
     where = np.flatnonzero(usable)
     if not len(where):
         return np.zeros(0)
-    picked = where[np.linspace(0, len(where) - 1, min(BOUND_PIXELS, len(where))).astype(int)]
+    # Golden-ratio steps: an even step would fall on the same phase of the fringe again and again.
+    spread = np.arange(min(BOUND_PIXELS, len(where))) * 0.6180339887498949 % 1.0
+    picked = where[(spread * len(where)).astype(int)]
     bounds = []
     for y, x in zip(*np.unravel_index(picked, tile.shape), strict=True):
         own = theta[:, y, x]
