@@ -14,8 +14,8 @@ from pixcal.kernels.bilinear import N_SUMS, solve_pixels
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-BOUND_PIXELS = 24
-"""Pixels of each tile for which the Cramér-Rao bound is worked out."""
+BOUND_PIXELS = 128
+"""Pixels of a tile for which the Cramér-Rao bound is worked out, where there are few tiles."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,7 @@ def sweep_tile(
     k: tuple[float, float],
     batches: Batches,
     prime: int,
+    bound_pixels: int = BOUND_PIXELS,
 ) -> TileMaps:
     """Fit a tile, taking its samples block after block.
 
@@ -86,6 +87,8 @@ def sweep_tile(
     batches : Batches
     prime : int
         From `frames_to_prime`.
+    bound_pixels : int
+        Pixels for which to work out the Cramér-Rao bound.
     """
     held: list[NDArray[np.uint16]] = []
     model: F32 | None = None
@@ -108,7 +111,7 @@ def sweep_tile(
             position += len(block)
     if model is None or position != len(frames.g):
         raise ValueError(f"{position} frames given, {len(frames.g)} expected")
-    return sums.finish(model, k)
+    return sums.finish(model, k, bound_pixels)
 
 
 class _BatchSums:
@@ -149,7 +152,7 @@ class _BatchSums:
             self.sigma[batch] = phase_sigma(theta, covariance)
         self.part[:] = 0
 
-    def finish(self, model: F32, k: tuple[float, float]) -> TileMaps:
+    def finish(self, model: F32, k: tuple[float, float], bound_pixels: int) -> TileMaps:
         self._close(model, None)
         step, covariance, chi2 = solve_pixels(self.total)
         theta = model + step
@@ -170,7 +173,7 @@ class _BatchSums:
             count=count.astype(np.float32),
             batch_phase=np.angle(self.phasor * z.conj()[None]).astype(np.float32),
             batch_sigma=self.sigma,
-            bound=phase_bound(self.tile, theta, self.frames),
+            bound=phase_bound(self.tile, theta, self.frames, bound_pixels),
         )
 
 
@@ -190,7 +193,7 @@ def phase_sigma(theta: F64, covariance: F64) -> F64:
         return np.asarray(np.sqrt(variance) / power)
 
 
-def phase_bound(tile: Tile, theta: F64, frames: FrameParameters) -> F64:
+def phase_bound(tile: Tile, theta: F64, frames: FrameParameters, number: int = BOUND_PIXELS) -> F64:
     """Cramér-Rao bound of the phase (rad) for some pixels of a tile.
 
     For known frame parameters and Gaussian noise of the variance that the pixel's own fitted model
@@ -201,7 +204,7 @@ def phase_bound(tile: Tile, theta: F64, frames: FrameParameters) -> F64:
     if not len(where):
         return np.zeros(0)
     # Golden-ratio steps: an even step would fall on the same phase of the fringe again and again.
-    spread = np.arange(min(BOUND_PIXELS, len(where))) * 0.6180339887498949 % 1.0
+    spread = np.arange(min(number, len(where))) * 0.6180339887498949 % 1.0
     picked = where[(spread * len(where)).astype(int)]
     bounds = []
     for y, x in zip(*np.unravel_index(picked, tile.shape), strict=True):

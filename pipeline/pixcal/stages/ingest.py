@@ -3,10 +3,10 @@
 Everything that can be told from headers and file lengths is checked before any data are read. The
 frames then go through memory in blocks of 64 frames and bands of rows, which are whole chunks: no
 chunk is written twice, and a run that was cut short goes on with the blocks that are missing.
+Arrays whose files have not changed since an earlier ingest are taken over from it, unread.
 """
 
 import errno
-import hashlib
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,6 +24,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.config import quantity, to_plain
 from pixcal.model.errors import InputError
+from pixcal.stages.ingest_arrays import create, find_kept, finish, take_over
 from pixcal.storage.artefact import (
     Build,
     Manifest,
@@ -34,7 +35,7 @@ from pixcal.storage.artefact import (
     up_to_date,
     write_json,
 )
-from pixcal.storage.cube import CHUNK, INDEX, ArrayWriter, create_array, create_group
+from pixcal.storage.cube import CHUNK, ArrayWriter
 from pixcal.storage.fits_in import FrameFile, inspect
 from pixcal.storage.fits_rows import read_rows, unpack, unpack_bytes
 from pixcal.storage.frames import Frame, columns, tabulate
@@ -67,6 +68,9 @@ class Config:
 def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
     """Make ``RUN/ingest`` from an acquisition, unless it is up to date.
 
+    Of an earlier ingest, arrays made from the same files are taken over; when there are none, it
+    was of another acquisition and is only replaced with `Config.overwrite`.
+
     Parameters
     ----------
     acquisition : Path
@@ -98,13 +102,18 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
         done = up_to_date(out, STAGE, artefact_key(STAGE, FORMAT, plain, inputs))
         if done is not None:
             return done
-        if not config.overwrite:
-            _refuse_other(out, plain, inputs)
-        tables, warnings = _check(described, sources, runtime)
+        earlier = read_manifest(out / STAGE)
+        same = _same_files(earlier, inputs)
+        if earlier is not None and not same and not config.overwrite:
+            _refuse_other(out, earlier, plain, inputs)
+        kept = find_kept(out / STAGE, earlier, same, sources) if earlier is not None else []
         try:
             with build(out, STAGE, FORMAT, plain, inputs) as made:
-                _fill(made, tables, runtime)
-                _close(made, described, sources, tables, warnings)
+                facts = take_over(made.folder, kept, runtime)
+                known = {k.array: k.files for k in kept if k.array in facts}
+                tables, warnings = _check(described, sources, known, runtime)
+                _fill(made, {a: f for a, f in tables.items() if a not in known}, runtime)
+                _close(made, described, sources, tables, warnings, facts)
         except OSError as error:
             if error.errno not in (errno.ENOSPC, errno.EDQUOT):
                 raise
@@ -116,14 +125,21 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
     return manifest
 
 
-def _refuse_other(out: Path, plain: Mapping[str, Any], inputs: Mapping[str, str]) -> None:
+def _same_files(earlier: Manifest | None, inputs: Mapping[str, str]) -> dict[str, str]:
+    """Arrays made from the same files as an earlier one, whose name is the value."""
+    if earlier is None or earlier.format != FORMAT:
+        return {}
+    names = {files: array for array, files in earlier.inputs.items()}
+    return {array: names[files] for array, files in inputs.items() if files in names}
+
+
+def _refuse_other(
+    out: Path, earlier: Manifest, plain: Mapping[str, Any], inputs: Mapping[str, str]
+) -> None:
     """Refuse to replace an ingest of another acquisition, saying what is different."""
-    old = read_manifest(out / STAGE)
-    if old is None:
-        return
-    arrays = sorted(inputs.keys() | old.inputs.keys())
-    other = [f"the files of {a}" for a in arrays if inputs.get(a) != old.inputs.get(a)]
-    if old.config != plain:
+    arrays = sorted(inputs.keys() | earlier.inputs.keys())
+    other = [f"the files of {a}" for a in arrays if inputs.get(a) != earlier.inputs.get(a)]
+    if earlier.config != plain:
         other.insert(0, "acquisition.yaml")
     raise InputError(
         f"{out / STAGE}: made from another acquisition ({', '.join(other) or 'format'} changed "
@@ -135,10 +151,17 @@ def _refuse_other(out: Path, plain: Mapping[str, Any], inputs: Mapping[str, str]
 
 
 def _check(
-    described: Acquisition, sources: Mapping[str, Sequence[SourceFile]], runtime: Runtime
+    described: Acquisition,
+    sources: Mapping[str, Sequence[SourceFile]],
+    known: Mapping[str, list[FrameFile]],
+    runtime: Runtime,
 ) -> tuple[dict[str, list[Frame]], list[str]]:
-    """Headers of all files, checked: the table of frames of each array, and warnings."""
-    listed = [source for files in sources.values() for source in files]
+    """Headers of all files, checked: the table of frames of each array, and warnings.
+
+    Only those of arrays that are not ``known`` are read.
+    """
+    unknown = {array: files for array, files in sources.items() if array not in known}
+    listed = [source for files in unknown.values() for source in files]
     batches = [listed[n : n + _FILES_A_TASK] for n in range(0, len(listed), _FILES_A_TASK)]
     results = run_tasks(_inspect_batch, batches, runtime, label="headers")
     answers = [answer for batch in results for answer in batch]
@@ -147,11 +170,13 @@ def _check(
         more = f" ({len(problems) - 1} more files are bad)" if len(problems) > 1 else ""
         raise InputError(problems[0] + more)
     files = iter(answer for answer in answers if isinstance(answer, FrameFile))
-    by_array = {array: [next(files) for _ in listed] for array, listed in sources.items()}
+    read = {array: [next(files) for _ in its_files] for array, its_files in unknown.items()}
+    by_array = {array: known[array] if array in known else read[array] for array in sources}
     _check_shapes(by_array)
+    for array, its_files in read.items():
+        _common_dtype(array, its_files)
     tables, warnings = {}, []
     for array, its_files in by_array.items():
-        _common_dtype(array, its_files)
         frames, odd = tabulate(array, its_files, described.optics.frame_period_s)
         tables[array] = frames
         warnings += odd
@@ -207,7 +232,9 @@ def _plan(tables: Mapping[str, Sequence[Frame]], runtime: Runtime) -> tuple[int,
     shared = _BYTES_A_FRAME * sum(map(len, tables.values()))
     rows, need = 0, 0
     for rows in _BAND_ROWS:
-        need = max(_task_bytes(array, frames, rows) for array, frames in tables.items())
+        need = max(
+            (_task_bytes(array, frames, rows) for array, frames in tables.items()), default=0
+        )
         if Plan(need, shared, runtime.n_workers).total <= runtime.memory:
             break
     return rows, make_plan("ingest", need, shared, runtime)
@@ -287,12 +314,8 @@ def _fill(made: Build, tables: Mapping[str, Sequence[Frame]], runtime: Runtime) 
 
 
 def _create(folder: Path, array: str, frames: Sequence[Frame]) -> ArrayWriter:
-    create_group(folder / "raw.zarr")
-    if "/" in array:
-        create_group(folder / "raw.zarr" / array.split("/")[0])
     shape = (len(frames), *frames[0].file.shape[1:])
-    dtype = _common_dtype(array, _files(frames))
-    return create_array(folder / "raw.zarr" / array, shape, dtype, attrs={"units": "adu"})
+    return create(folder, array, shape, _common_dtype(array, _files(frames)))
 
 
 def _write_piece(piece: _Piece) -> None:
@@ -349,14 +372,19 @@ def _close(
     sources: Mapping[str, Sequence[SourceFile]],
     tables: Mapping[str, Sequence[Frame]],
     warnings: list[str],
+    facts: Mapping[str, dict[str, Any]],
 ) -> None:
-    """Check that nothing is missing or was changed meanwhile, and write the tables."""
+    """Check that nothing is missing or was changed meanwhile, and write the tables.
+
+    The ``facts`` are those of the arrays that were taken over.
+    """
     try:
         for files in sources.values():
             for source in files:
                 source.check_unchanged()
         arrays = {
-            array: _finish(_create(made.folder, array, frames)) | {"files": len(_files(frames))}
+            array: (facts.get(array) or finish(_create(made.folder, array, frames)))
+            | {"files": len(_files(frames))}
             for array, frames in tables.items()
         }
     except InputError:
@@ -366,15 +394,3 @@ def _close(
     write_json(made.folder / "acquisition.json", to_plain(described))
     write_json(made.folder / "frames.json", {a: columns(f) for a, f in tables.items()})
     made.summary.update(arrays=arrays, warnings=warnings)
-
-
-def _finish(writer: ArrayWriter) -> dict[str, Any]:
-    """Close an array: its shape, type, and the digest of its content."""
-    writer.finish()
-    content = hashlib.sha256(repr((writer.shape, writer.dtype.str)).encode())
-    content.update(np.load(writer.path / INDEX).tobytes())
-    return {
-        "shape": list(writer.shape),
-        "dtype": writer.dtype.name,
-        "digest": content.hexdigest()[:32],
-    }

@@ -188,12 +188,18 @@ def _create_maps(folder: Path, source: ReducedSet, n_batches: int) -> dict[str, 
             folder / name, (n_batches, ny, nx), "<f4", dims=("batch", "y", "x"),
             chunks=(n_batches, cy, cx), fill_value=np.nan,
         )  # fmt: skip
-    width = 1 + BOUND_PIXELS
+    width = 1 + _bound_pixels(source)
     writers["tiles"] = create_array(
         folder / "tiles", (*source.grid, width), "<f8", dims=("row", "column", "fact"),
         chunks=(1, 1, width), fill_value=np.nan,
     )  # fmt: skip
     return writers
+
+
+def _bound_pixels(source: ReducedSet) -> int:
+    """Pixels of each tile for the bound: some hundreds in all, whatever the number of tiles."""
+    rows, columns = source.grid
+    return max(4, min(BOUND_PIXELS, 512 // (rows * columns)))
 
 
 def _sweep_task(
@@ -207,13 +213,16 @@ def _sweep_task(
 ) -> None:
     tile = source.tile(at)
     fresh = sum(not source.signal.holds((n, *at)) for n in range(source.n_blocks))
-    maps = sweep_tile(tile, source.blocks(at), source.coding, frames, carrier, batches, prime)
+    number = _bound_pixels(source)
+    maps = sweep_tile(
+        tile, source.blocks(at), source.coding, frames, carrier, batches, prime, number
+    )
     start = (tile.y[0], tile.x[0])
     for name in MAPS:
         writers[name].write(start, getattr(maps, name))
     for name in BATCH_MAPS if "batch_phase" in writers else ():
         writers[name].write((0, *start), getattr(maps, name))
-    facts = np.full((1, 1, 1 + BOUND_PIXELS), np.nan)
+    facts = np.full((1, 1, 1 + number), np.nan)
     facts[0, 0, 0] = fresh
     facts[0, 0, 1 : 1 + len(maps.bound)] = maps.bound
     writers["tiles"].write((*at, 0), facts)

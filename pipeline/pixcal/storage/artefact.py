@@ -3,7 +3,7 @@
 An artefact is a directory ``RUN/<stage>`` with a ``manifest.json``. It is built aside, in
 ``RUN/.partial/<stage>-<key>``, and renamed when complete, so that a directory that exists is whole.
 The key is a digest of everything the result depends on: a build with the same key that was killed
-is found again and resumed, one with another key is not touched.
+is found again and resumed. Unfinished builds with other keys are removed when one completes.
 """
 
 import fcntl
@@ -21,6 +21,7 @@ from pixcal import __version__
 from pixcal.model.errors import DamagedError, InputError
 
 MANIFEST = "manifest.json"
+_KEY_IN_NAME = 16
 
 
 @dataclass(frozen=True)
@@ -162,26 +163,40 @@ def build(
 
     When the block raises (or the process is killed) the unfinished folder stays, and the next
     build with the same key resumes in it. An artefact of the same stage with another key is
-    replaced only once the new one is complete.
+    replaced only once the new one is complete; unfinished builds of the stage are then removed.
     """
     key = artefact_key(stage, format, config, inputs)
-    folder = run / ".partial" / f"{stage}-{key[:16]}"
+    folder = run / ".partial" / f"{stage}-{key[:_KEY_IN_NAME]}"
     resumed = folder.is_dir()
     folder.mkdir(parents=True, exist_ok=True)
     made = Build(folder, key, resumed)
     yield made
     manifest = Manifest(stage, format, key, config, inputs, summary=made.summary)
     write_json(folder / MANIFEST, asdict(manifest))
-    (folder / "journal.jsonl").unlink(missing_ok=True)
     final = run / stage
-    old = run / ".partial" / f"{stage}-replaced"
+    old = _replaced(run, stage)
     if old.exists():
         shutil.rmtree(old)
     if final.exists():
         final.rename(old)
     folder.rename(final)
-    if old.exists():
-        shutil.rmtree(old)
+    # Only now: killed before, the build is resumed, with every step noted as done.
+    (final / "journal.jsonl").unlink(missing_ok=True)
+    for left in [old, *folder.parent.glob(f"{stage}-{'[0-9a-f]' * _KEY_IN_NAME}")]:
+        shutil.rmtree(left, ignore_errors=True)
+
+
+def _replaced(run: Path, stage: str) -> Path:
+    """Where an artefact waits while the new one takes its place."""
+    return run / ".partial" / f"{stage}-replaced"
+
+
+def _put_back(run: Path) -> None:
+    """Put back the artefacts that a kill left aside before the new one was in place."""
+    for old in run.glob(_replaced(Path(), "*").as_posix()):
+        final = run / old.name.removesuffix("-replaced")
+        if not final.exists():
+            old.rename(final)
 
 
 @contextmanager
@@ -203,4 +218,5 @@ def lock(run: Path) -> Iterator[None]:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise InputError(f"{run}: another pixcal is working there; wait for it") from error
+        _put_back(run)
         yield
