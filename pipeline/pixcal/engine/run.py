@@ -2,7 +2,10 @@
 
 import os
 from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from multiprocessing import get_context
 from typing import Any, TypeVar
 
 import dask
@@ -116,6 +119,12 @@ def run_tasks(
         return _run_local(function, items, runtime, progress, done)
 
 
+@lru_cache(maxsize=1)
+def _process_pool(workers: int) -> ProcessPoolExecutor:
+    """Worker processes, kept: each takes seconds to import what the tasks need."""
+    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
+
+
 def _run_local(
     function: Callable[..., R],
     items: Sequence[Any],
@@ -123,8 +132,10 @@ def _run_local(
     progress: Progress,
     done: Callable[[int, R], None] | None,
 ) -> list[R]:
+    options: dict[str, Any] = {"num_workers": runtime.n_workers}
     if runtime.cluster == "processes":
         function = _InWorker(function)
+        options["pool"] = _process_pool(runtime.n_workers)
     names = [f"task-{n}" for n in range(len(items))]
     graph = {name: (function, item) for name, item in zip(names, items, strict=True)}
     number = {name: n for n, name in enumerate(names)}
@@ -137,7 +148,7 @@ def _run_local(
 
     get = dask.base.get_scheduler(scheduler=runtime.cluster)
     with Callback(posttask=ended):
-        return list(get(graph, names, num_workers=runtime.n_workers))
+        return list(get(graph, names, **options))
 
 
 def _run_distributed(
