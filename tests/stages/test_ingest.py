@@ -1,7 +1,9 @@
 """Ingest: exact values, whatever the files, the tiling, the workers or the interruptions."""
 
+import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -18,8 +20,9 @@ from numpy.typing import NDArray
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError, PlanError
 from pixcal.stages import ingest
-from pixcal.storage import fits_rows
+from pixcal.storage import fits_rows, frames
 from pixcal.storage.cube import ArrayReader, ArrayWriter
+from pixcal.storage.sources import SourceFile
 
 YAML = """\
 schema: pixcal/acquisition/1
@@ -91,9 +94,9 @@ def test_artefact(acquisition: Path, tmp_path: Path) -> None:
         "manifest.json",
         "raw.zarr",
     ]
-    frames = json.loads((folder / "frames.json").read_text())
-    assert set(frames) == {"bias", "fringes/vertical"}
-    table = frames["fringes/vertical"]
+    tables = json.loads((folder / "frames.json").read_text())
+    assert set(tables) == {"bias", "fringes/vertical"}
+    table = tables["fringes/vertical"]
     assert table["file"] == [f"v/f{n}.fits" for n in range(70)]
     assert table["time_s"] == pytest.approx(np.arange(70) * 0.14)
     assert table["exptime_s"] == [0.1] * 70
@@ -249,23 +252,32 @@ def test_resumed_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n
     assert not list((tmp_path / "run/.partial").iterdir())
 
 
-def test_another_acquisition_is_refused(acquisition: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    first = ingest.run(acquisition, run, ingest.Config(), SYNC)
-    save(acquisition / "v/f7.fits", np.zeros((67, 131), "u2"))
+def test_another_acquisition_is_refused(tmp_path: Path) -> None:
+    run, folder = tmp_path / "run", describe(tmp_path / "acq")
+    save_frames(folder / "v", noise((3, 7, 5)))
+    first = ingest.run(folder, run, ingest.Config(), SYNC)
+    save(folder / "v/f2.fits", np.zeros((7, 5), "u2"))
     with pytest.raises(InputError) as caught:
-        ingest.run(acquisition, run, ingest.Config(), SYNC)
-    for word in (str(run / "ingest"), "fringes/vertical", "--out", "--overwrite"):
+        ingest.run(folder, run, ingest.Config(), SYNC)
+    for word in (str(run / "ingest"), "the files of fringes/vertical", "--out", "--overwrite"):
         assert word in str(caught.value)
     assert "acquisition.yaml" not in str(caught.value)
-    assert "bias" not in str(caught.value)
-    second = ingest.run(acquisition, run, ingest.Config(overwrite=True), SYNC)
-    assert not read(run)[7].any()
+    describe(folder, period=0.15)
+    with pytest.raises(InputError, match=r"acquisition \(acquisition\.yaml, the files of fringes"):
+        ingest.run(folder, run, ingest.Config(), SYNC)
+    second = ingest.run(folder, run, ingest.Config(overwrite=True), SYNC)
+    assert not read(run)[2].any()
     digests = [m.summary["arrays"]["fringes/vertical"]["digest"] for m in (first, second)]
     assert digests[0] != digests[1]
-    describe(acquisition, period=0.15, bias=["bias 1/*.fits"])
-    with pytest.raises(InputError, match=r"acquisition \(acquisition\.yaml changed"):
-        ingest.run(acquisition, run, ingest.Config(), SYNC)
+
+
+def test_another_format_is_refused(
+    acquisition: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+    monkeypatch.setattr(ingest, "FORMAT", ingest.FORMAT + 1)
+    with pytest.raises(InputError, match=r"\(format changed since\).*--overwrite"):
+        ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
 
 
 def test_file_changed_while_read(
@@ -309,6 +321,228 @@ def test_full_disk_is_told(
     monkeypatch.setattr(ArrayWriter, "write", full)
     with pytest.raises(InputError, match="run: the disk is full"):
         ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+
+
+# Something changed since: only that is read
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Path:
+    """Numbered biases, flats in cubes with time stamps and temperatures, 70 fringe frames."""
+    folder = describe(tmp_path / "acq", **GLOBS)
+    save_frames(folder / "bias", noise((3, 67, 131), 1))
+    for n, name in enumerate(["c.fits", "b.fits.gz", "a.fz"]):
+        cards = {"MJD_OBS": 60000 + n / 7e3, "EXPTIME": 0.1 + n / 3, "CCD_TEMP": -10 - n / 7}
+        save(folder / "flat" / name, noise((3 + n, 67, 131), 2 + n), **cards)
+    save_frames(folder / "v", noise((70, 67, 131)))
+    return folder
+
+
+GLOBS = {"bias": ["bias/*"], "flat": ["flat/*"], "vertical": ["v/*"]}
+
+
+def a_gain(folder: Path) -> None:
+    text = (folder / "acquisition.yaml").read_text()
+    (folder / "acquisition.yaml").write_text(
+        text.replace("gain_e_per_adu: 1.0", "gain_e_per_adu: 2")
+    )
+
+
+def a_period(folder: Path) -> None:
+    describe(folder, period=0.31, **GLOBS)
+
+
+def no_period(folder: Path) -> None:
+    describe(folder, period=None, **GLOBS)
+
+
+def a_name(folder: Path) -> None:
+    text = (folder / "acquisition.yaml").read_text()
+    (folder / "acquisition.yaml").write_text(text.replace("name: vertical", "name: across"))
+
+
+def a_glob(folder: Path) -> None:
+    describe(folder, **GLOBS | {"vertical": ["v/f?.fits", "v/f??.fits"]})
+
+
+def one_bias_more(folder: Path) -> None:
+    save(folder / "bias/g.fits", noise((67, 131), 9).astype("f4"))
+
+
+def a_flat(folder: Path) -> None:
+    save(folder / "flat/c.fits", noise((67, 131), 9), EXPTIME=7.0)
+
+
+def no_bias(folder: Path) -> None:
+    describe(folder, **GLOBS | {"bias": []})
+
+
+def a_touched_frame(folder: Path) -> None:
+    os.utime(folder / "v/f69.fits", (1, 1))
+
+
+CHANGES: list[tuple[Callable[[Path], None], str]] = [
+    (a_gain, ""),
+    (a_period, ""),
+    (no_period, ""),
+    (a_name, ""),
+    (a_glob, ""),
+    (no_bias, ""),
+    (one_bias_more, "bias"),
+    (a_flat, "flat"),
+    (a_touched_frame, "v"),
+]
+
+
+@pytest.mark.parametrize(("change", "folder_read"), CHANGES)
+def test_only_what_changed_is_read(
+    bench: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    change: Callable[[Path], None],
+    folder_read: str,
+) -> None:
+    """And the result is that of a fresh ingest, to the bit."""
+    run, fresh = tmp_path / "run", tmp_path / "fresh"
+    before = ingest.run(bench, run, ingest.Config(), SYNC)
+    change(bench)
+    opened: list[Any] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(SourceFile, "open", counted(SourceFile.open, opened))
+        after = ingest.run(bench, run, ingest.Config(), SYNC)
+    assert {call[0].name for call in opened} == set(changed_files(bench, folder_read))
+    assert ingest.run(bench, fresh, ingest.Config(), SYNC) == after
+    assert tree(run / "ingest") == tree(fresh / "ingest")
+    assert after.key != before.key
+    assert not list((run / ".partial").iterdir())
+    monkeypatch.setattr(ingest, "build", None)
+    assert ingest.run(bench, run, ingest.Config(), SYNC) == after
+
+
+def changed_files(bench: Path, folder: str) -> list[str]:
+    return [f"{folder}/{p.name}" for p in (bench / folder).iterdir()] if folder else []
+
+
+@pytest.mark.parametrize(
+    ("links", "cluster"), [(True, "threads"), (True, "processes"), (False, "threads")]
+)
+def test_chunks_are_linked_or_else_copied(
+    bench: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool, cluster: str
+) -> None:
+    run = tmp_path / "run"
+    ingest.run(bench, run, ingest.Config(), SYNC)
+    chunk = run / "ingest/raw.zarr/fringes/vertical/c/1/0/1"
+    inode, content = chunk.stat().st_ino, tree(run / "ingest/raw.zarr")
+    a_gain(bench)
+    if not links:
+        monkeypatch.setattr(Path, "hardlink_to", without_links)
+    ingest.run(bench, run, ingest.Config(), Runtime(cluster=cluster, workers=2))
+    assert (chunk.stat().st_ino == inode) is links
+    assert chunk.stat().st_nlink == 1
+    assert tree(run / "ingest/raw.zarr") == content
+
+
+def without_links(*_: Any) -> None:
+    raise OSError(errno.EPERM, "Operation not permitted")
+
+
+def test_copies_that_fill_the_disk_are_told(
+    bench: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ingest.run(bench, tmp_path / "run", ingest.Config(), SYNC)
+    a_gain(bench)
+
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "hardlink_to", without_links)
+    monkeypatch.setattr(shutil, "copyfile", full)
+    with pytest.raises(InputError, match="run: the disk is full"):
+        ingest.run(bench, tmp_path / "run", ingest.Config(), SYNC)
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut", "altered", "tables", "planes"])
+def test_damaged_arrays_are_read_again(bench: Path, tmp_path: Path, damage: str) -> None:
+    run, fresh = tmp_path / "run", tmp_path / "fresh"
+    ingest.run(bench, run, ingest.Config(), SYNC)
+    chunk = run / "ingest/raw.zarr/fringes/vertical/c/1/0/1"
+    tables = run / "ingest/frames.json"
+    if damage == "missing":
+        chunk.unlink()
+    elif damage == "cut":
+        os.truncate(chunk, chunk.stat().st_size - 5)
+    elif damage == "altered":
+        chunk.write_bytes(chunk.read_bytes()[:-1] + b"?")
+    elif damage == "tables":
+        os.truncate(tables, 1000)
+    else:
+        tables.write_text(tables.read_text().replace("v/f69.fits", "v/f68.fits"))
+    a_gain(bench)
+    ingest.run(bench, run, ingest.Config(), SYNC)
+    ingest.run(bench, fresh, ingest.Config(), SYNC)
+    assert tree(run / "ingest") == tree(fresh / "ingest")
+
+
+def test_array_in_another_order_is_read_again(
+    bench: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As an older pixcal might have left it: f10 before f2."""
+    with monkeypatch.context() as patch:
+        patch.setattr(frames, "natural_key", str)
+        ingest.run(bench, tmp_path / "run", ingest.Config(), SYNC)
+    a_gain(bench)
+    ingest.run(bench, tmp_path / "run", ingest.Config(), SYNC)
+    np.testing.assert_array_equal(read(tmp_path / "run"), noise((70, 67, 131)))
+
+
+@pytest.mark.parametrize("moment", ["linking", "reading"])
+def test_taking_over_resumed_after_a_kill(
+    bench: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    run, fresh = tmp_path / "run", tmp_path / "fresh"
+    ingest.run(bench, run, ingest.Config(), SYNC)
+    before = tree(run / "ingest")
+    save_frames(bench / "bias", noise((130, 67, 131), 5))
+    link, write = Path.hardlink_to, ArrayWriter.write
+    linked: list[Any] = []
+    written: list[Any] = []
+
+    def killed_after(calls: list[Any], count: int, call: Callable[..., Any]) -> Callable[..., Any]:
+        def wrapped(*args: Any) -> None:
+            if len(calls) == count:
+                raise KeyboardInterrupt
+            calls.append(args)
+            call(*args)
+
+        return wrapped
+
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            Path, "hardlink_to", killed_after(linked, 4 if moment == "linking" else -1, link)
+        )
+        patch.setattr(ArrayWriter, "write", killed_after(written, 1, write))
+        with pytest.raises(KeyboardInterrupt):
+            ingest.run(bench, run, ingest.Config(), SYNC)
+    assert tree(run / "ingest") == before
+    monkeypatch.setattr(Path, "hardlink_to", counted(link, linked))
+    monkeypatch.setattr(ArrayWriter, "write", counted(write, written))
+    ingest.run(bench, run, ingest.Config(), SYNC)
+    assert len(linked) == 2 + 4  # the chunks of 12 flats and 70 fringe frames, each once
+    assert [call[1][0] for call in written] == [0, 64, 128]
+    monkeypatch.undo()
+    ingest.run(bench, fresh, ingest.Config(), SYNC)
+    assert tree(run / "ingest") == tree(fresh / "ingest")
+    assert not list((run / ".partial").iterdir())
+
+
+def test_new_frames_of_another_size_leave_the_old_artefact(bench: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    ingest.run(bench, run, ingest.Config(), SYNC)
+    before = tree(run / "ingest")
+    save(bench / "bias/g.fits", noise((67, 130)))
+    with pytest.raises(InputError, match=r"bias/g\.fits: frames of 130 × 67"):
+        ingest.run(bench, run, ingest.Config(), SYNC)
+    assert tree(run / "ingest") == before
 
 
 # Bad files, found before anything is read

@@ -6,7 +6,6 @@ chunk is written twice, and a run that was cut short goes on with the blocks tha
 Arrays whose files have not changed since an earlier ingest are taken over from it, unread.
 """
 
-import errno
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,7 +23,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.config import quantity, to_plain
 from pixcal.model.errors import InputError
-from pixcal.stages.ingest_arrays import create, find_kept, finish, take_over
+from pixcal.stages.ingest_arrays import DISK_FULL, create, find_kept, finish, take_over
 from pixcal.storage.artefact import (
     Build,
     Manifest,
@@ -115,7 +114,7 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
                 _fill(made, {a: f for a, f in tables.items() if a not in known}, runtime)
                 _close(made, described, sources, tables, warnings, facts)
         except OSError as error:
-            if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            if error.errno not in DISK_FULL:
                 raise
             raise InputError(
                 f"{out}: the disk is full; free some space and run again, it goes on from there"
@@ -232,9 +231,8 @@ def _plan(tables: Mapping[str, Sequence[Frame]], runtime: Runtime) -> tuple[int,
     shared = _BYTES_A_FRAME * sum(map(len, tables.values()))
     rows, need = 0, 0
     for rows in _BAND_ROWS:
-        need = max(
-            (_task_bytes(array, frames, rows) for array, frames in tables.items()), default=0
-        )
+        tasks = (_task_bytes(array, frames, rows) for array, frames in tables.items())
+        need = max(tasks, default=0)
         if Plan(need, shared, runtime.n_workers).total <= runtime.memory:
             break
     return rows, make_plan("ingest", need, shared, runtime)

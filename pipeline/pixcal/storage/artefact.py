@@ -174,7 +174,7 @@ def build(
     manifest = Manifest(stage, format, key, config, inputs, summary=made.summary)
     write_json(folder / MANIFEST, asdict(manifest))
     final = run / stage
-    old = _replaced(run, stage)
+    old = run / ".partial" / f"{stage}-replaced"
     if old.exists():
         shutil.rmtree(old)
     if final.exists():
@@ -186,14 +186,9 @@ def build(
         shutil.rmtree(left, ignore_errors=True)
 
 
-def _replaced(run: Path, stage: str) -> Path:
-    """Where an artefact waits while the new one takes its place."""
-    return run / ".partial" / f"{stage}-replaced"
-
-
 def _put_back(run: Path) -> None:
     """Put back the artefacts that a kill left aside before the new one was in place."""
-    for old in run.glob(_replaced(Path(), "*").as_posix()):
+    for old in run.glob(".partial/*-replaced"):
         final = run / old.name.removesuffix("-replaced")
         if not final.exists():
             old.rename(final)

@@ -4,12 +4,13 @@ zarr-python makes the metadata; the chunks of a local store are read and written
 own pipeline does not scale with threads (design note on storage). The bytes are the same: the
 tests read each with the other. Every chunk has a crc32c inside (the Zarr codec), and its size and
 that crc are kept in an index beside the array, so that a chunk that is missing, cut or exchanged
-is refused and never read as zeros.
+is refused and never read as zeros. The index ends with a crc of itself and of the metadata.
 """
 
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -101,6 +102,12 @@ def _aside(file: Path) -> Path:
     return file.with_name(f".{file.name}.aside")
 
 
+def _seal(path: Path, index: bytes) -> bytes:
+    """Checksum of an array's metadata and index, kept at the end of the index."""
+    seal: int = google_crc32c.value((path / "zarr.json").read_bytes() + index)
+    return seal.to_bytes(4, "little")
+
+
 def _chunk_file(path: Path, index: Sequence[int]) -> Path:
     return path.joinpath("c", *map(str, index))
 
@@ -174,9 +181,12 @@ class ArrayWriter:
             if len(tail) < 4:
                 raise DamagedError(f"{file}: chunk cut short")
             index[where] = (size, int.from_bytes(tail, "little"))
+        body = BytesIO()
+        np.save(body, index)
         aside = self.path / f".{INDEX}"
         with aside.open("wb") as out:
-            np.save(out, index)
+            out.write(body.getvalue())
+            out.write(_seal(self.path, body.getvalue()))
             out.flush()
             os.fsync(out.fileno())
         aside.replace(self.path / INDEX)
@@ -193,15 +203,17 @@ class ArrayReader:
     Raises
     ------
     DamagedError
-        If the metadata or the chunk index is missing or does not parse.
+        If the metadata or the chunk index is missing, cut or altered.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
+            body = (path / INDEX).read_bytes()
+            if _seal(path, body[:-4]) != body[-4:]:
+                raise ValueError(f"zarr.json or {INDEX} was altered")
             meta = zarr.open_array(store=zarr.storage.LocalStore(path, read_only=True), mode="r")
-            with (path / INDEX).open("rb") as file:
-                self._index = np.load(file, allow_pickle=False)
+            self._index = np.load(BytesIO(body[:-4]), allow_pickle=False)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DamagedError(
                 f"{path}: not a complete array ({' '.join(str(error).split())}); "
@@ -211,8 +223,6 @@ class ArrayReader:
         self.chunks: tuple[int, ...] = tuple(meta.chunks)
         self.dtype: np.dtype[Any] = np.dtype(meta.dtype)
         self.attrs: dict[str, Any] = dict(meta.attrs)
-        if self._index.dtype != _INDEX_DTYPE or self._index.shape != _grid(self.shape, self.chunks):
-            raise DamagedError(f"{path / INDEX}: does not belong to this array")
         self.chunks_read = 0
 
     @property
@@ -274,13 +284,13 @@ class ArrayReader:
         scratch = np.empty(self.chunks, self.dtype)
         spans = [range(a // c, -(-b // c)) for (a, b), c in zip(full, self.chunks, strict=True)]
         for index in product(*spans):
-            self.read_chunk(index, scratch)
+            chunk = self.read_chunk(index, scratch)
             source, target = [], []
             for i, c, (a, b) in zip(index, self.chunks, full, strict=True):
                 lo, hi = max(a, i * c), min(b, (i + 1) * c)
                 source.append(slice(lo - i * c, hi - i * c))
                 target.append(slice(lo - a, hi - a))
-            block[tuple(target)] = scratch[tuple(source)]
+            block[tuple(target)] = chunk[tuple(source)]
         return block
 
     def tiles(self) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:

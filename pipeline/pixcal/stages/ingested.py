@@ -1,0 +1,98 @@
+"""What ``RUN/ingest`` holds, as the reduction wants it."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixcal.model.acquisition import Acquisition, Detector
+from pixcal.model.config import parse
+from pixcal.model.errors import InputError
+from pixcal.stages.exposures import Exposures, group_exposures
+from pixcal.storage.artefact import read_json
+from pixcal.storage.cube import ArrayReader
+
+
+@dataclass(frozen=True)
+class Ingested:
+    """Frames and their tables.
+
+    Parameters
+    ----------
+    folder : Path
+        ``RUN/ingest``.
+    """
+
+    folder: Path
+
+    @property
+    def raw(self) -> Path:
+        """The store of raw frames."""
+        return self.folder / "raw.zarr"
+
+    @cached_property
+    def detector(self) -> Detector:
+        """The detector as declared."""
+        described = self.folder / "acquisition.json"
+        return parse(Acquisition, read_json(described), str(described)).detector
+
+    @cached_property
+    def tables(self) -> dict[str, dict[str, list[Any]]]:
+        """Columns of facts on the frames of each array."""
+        tables: dict[str, dict[str, list[Any]]] = read_json(self.folder / "frames.json")
+        return tables
+
+    @cached_property
+    def exposures(self) -> Exposures:
+        """Groups of the calibration frames, exposure times of the others."""
+        return group_exposures(self.tables)
+
+    @cached_property
+    def arrays(self) -> Mapping[str, ArrayReader]:
+        """A reader of each array."""
+        return {name: ArrayReader(self.raw / name) for name in self.tables}
+
+    @cached_property
+    def shape(self) -> tuple[int, int]:
+        """Size (y, x) of the frames.
+
+        Raises
+        ------
+        InputError
+            If arrays have frames of different sizes.
+        """
+        shapes = {name: (a.shape[1], a.shape[2]) for name, a in self.arrays.items()}
+        first, (ny, nx) = next(iter(shapes.items()))
+        for name, shape in shapes.items():
+            if shape != (ny, nx):
+                raise InputError(
+                    f"{self.folder}: the frames of {name} have {shape[1]} × {shape[0]} pixels, "
+                    f"those of {first} {nx} × {ny}; use frames of one size"
+                )
+        return ny, nx
+
+    @property
+    def quantum(self) -> float:
+        """Step of the calibration frames (ADU), 0 where any are real numbers."""
+        groups = (*self.exposures.dark, *self.exposures.flat)
+        return float(all(self._is_integer(group.array) for group in groups))
+
+    def saturation(self, name: str) -> float:
+        """Level (ADU) from which on samples of an array are saturated: declared, or its type's."""
+        end = math.inf
+        if self._is_integer(name):
+            end = float(np.iinfo(self.arrays[name].dtype).max)
+        return min(self.detector.saturation_adu or end, end)
+
+    def lowest(self, name: str) -> float:
+        """Least sample (ADU) that an array can hold."""
+        if self._is_integer(name):
+            return float(np.iinfo(self.arrays[name].dtype).min)
+        return -math.inf
+
+    def _is_integer(self, name: str) -> bool:
+        return self.arrays[name].dtype.kind in "iu"
