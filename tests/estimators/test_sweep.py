@@ -82,7 +82,9 @@ def test_the_bound_is_the_benchs_own(case):
     bench, codes = case
     maps = sweep(bench, codes, [64, 128])
     k = bench.wave_number("vertical")
-    assert np.sqrt((maps.bound**2).mean()) / k == pytest.approx(bench.bound("vertical", 7), rel=0.02)
+    assert np.sqrt((maps.bound**2).mean()) / k == pytest.approx(
+        bench.bound("vertical", 7), rel=0.02
+    )
     assert np.median(maps.sigma) == pytest.approx(np.median(maps.bound), rel=0.01)
 
 

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.batches import Batches
 from pixcal.estimators.fringes import FrameParameters, grid
-from pixcal.estimators.scout import Coding, Tile, accumulate, start_model
-from pixcal.kernels.bilinear import N_SUMS, solve_pixels
+from pixcal.estimators.pixel_sums import PixelSums, pixel_sums
+from pixcal.estimators.scout import Coding, Tile, start_model
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -91,38 +91,44 @@ def sweep_tile(
         Pixels for which to work out the Cramér-Rao bound.
     """
     held: list[NDArray[np.uint16]] = []
-    model: F32 | None = None
-    n_held, position = 0, 0
-    sums = _BatchSums(tile, coding, frames, batches)
+    sums: _BatchSums | None = None
+    position = 0
     for block in blocks:
-        if model is None:
+        if sums is None:
             held.append(block.copy())
-            n_held += len(block)
+            n_held = sum(map(len, held))
             if n_held < prime and n_held < len(frames.g):
                 continue
             first = FrameParameters(frames.g[:n_held], frames.dk[:n_held], frames.reference)
-            model, _ = start_model(tile, held, coding, first, k)
+            model, smooth = start_model(tile, held, coding, first, k)
+            pixels = pixel_sums(tile, coding, frames, model, smooth)
+            sums = _BatchSums(tile, coding, frames, batches, model, pixels)
             for part in held:
-                sums.add(part, position, model)
+                sums.add(part, position)
                 position += len(part)
             held = []
         else:
-            sums.add(block, position, model)
+            sums.add(block, position)
             position += len(block)
-    if model is None or position != len(frames.g):
+    if sums is None or position != len(frames.g):
         raise ValueError(f"{position} frames given, {len(frames.g)} expected")
-    return sums.finish(model, k, bound_pixels)
+    return sums.finish(k, bound_pixels)
 
 
 class _BatchSums:
-    """Sums of the whole run and of the batch at hand."""
+    """Sums of the whole run and of the batch at hand, cut where batches begin and end."""
 
     def __init__(
-        self, tile: Tile, coding: Coding, frames: FrameParameters, batches: Batches
+        self,
+        tile: Tile,
+        coding: Coding,
+        frames: FrameParameters,
+        batches: Batches,
+        model: F32,
+        sums: PixelSums,
     ) -> None:
-        self.tile, self.coding, self.frames, self.batches = tile, coding, frames, batches
-        self.total: F64 = np.zeros((N_SUMS, *tile.shape))
-        self.part: F64 = np.zeros((N_SUMS, *tile.shape))
+        self.tile, self.coding, self.frames, self.model = tile, coding, frames, model
+        self.sums = sums
         shape = (len(batches.ranges), *tile.shape)
         self.phasor = np.full(shape, np.nan, np.complex64)
         self.sigma = np.full(shape, np.nan, np.float32)
@@ -130,67 +136,38 @@ class _BatchSums:
         self.ends = {b: n for n, (a, b) in enumerate(batches.ranges) if b > a}
         self.cuts = sorted({a for a, b in batches.ranges if b > a} | set(self.ends))
 
-    def add(self, block: NDArray[np.uint16], position: int, model: F32) -> None:
+    def add(self, block: NDArray[np.uint16], position: int) -> None:
         stop = position + len(block)
         cuts = [c for c in self.cuts if position < c < stop]
         for a, b in zip([position, *cuts], [*cuts, stop], strict=True):
-            at = slice(a, b)
-            part = FrameParameters(self.frames.g[at], self.frames.dk[at], self.frames.reference)
-            inside = block[a - position : b - position]
-            accumulate(self.tile, [inside], self.coding, part, model, self.part)
+            self.sums.add(block[a - position : b - position], slice(a, b))
             if b in self.ends:
-                self._close(model, self.ends[b])
+                theta, sigma = self.sums.close()
+                self.phasor[self.ends[b]] = theta[2] + 1j * theta[1]
+                self.sigma[self.ends[b]] = sigma
             elif b in self.cuts:
-                self._close(model, None)
+                self.sums.close()
 
-    def _close(self, model: F32, batch: int | None) -> None:
-        self.total += self.part
-        if batch is not None:
-            theta, covariance, _ = solve_pixels(self.part)
-            theta += model
-            self.phasor[batch] = theta[2] + 1j * theta[1]
-            self.sigma[batch] = phase_sigma(theta, covariance)
-        self.part[:] = 0
-
-    def finish(self, model: F32, k: tuple[float, float], bound_pixels: int) -> TileMaps:
-        self._close(model, None)
-        step, covariance, chi2 = solve_pixels(self.total)
-        theta = model + step
+    def finish(self, k: tuple[float, float], bound_pixels: int) -> TileMaps:
+        theta, sigma, chi2, count = self.sums.finish()
         z = theta[2] + 1j * theta[1]
         y, x = grid(self.tile.shape)
         cy, cx = self.tile.centre
         ry, rx = self.frames.reference
         carrier = np.exp(1j * (k[0] * (x + cx - rx) + k[1] * (y + cy - ry)))
-        count = self.total[10]
         with np.errstate(divide="ignore", invalid="ignore"):
             reduced = np.where(count > 3, chi2 / (count - 3), np.nan)
         return TileMaps(
             iota=theta[0].astype(np.float32),
             alpha=np.abs(z).astype(np.float32),
             phase=np.angle(z * carrier.conj()).astype(np.float32),
-            sigma=phase_sigma(theta, covariance).astype(np.float32),
+            sigma=sigma.astype(np.float32),
             chi2=reduced.astype(np.float32),
             count=count.astype(np.float32),
             batch_phase=np.angle(self.phasor * z.conj()[None]).astype(np.float32),
             batch_sigma=self.sigma,
             bound=phase_bound(self.tile, theta, self.frames, bound_pixels),
         )
-
-
-def phase_sigma(theta: F64, covariance: F64) -> F64:
-    """Error of the phase (rad) from the covariance of theta.
-
-    Parameters
-    ----------
-    theta : (3, ...) float64
-    covariance : (6, ...) float64
-        As from `pixcal.kernels.bilinear.solve_pixels`.
-    """
-    s, c = theta[1], theta[2]
-    power = s * s + c * c
-    with np.errstate(divide="ignore", invalid="ignore"):
-        variance = c * c * covariance[3] - 2 * c * s * covariance[4] + s * s * covariance[5]
-        return np.asarray(np.sqrt(variance) / power)
 
 
 def phase_bound(tile: Tile, theta: F64, frames: FrameParameters, number: int = BOUND_PIXELS) -> F64:

@@ -271,6 +271,188 @@ def frame_sums(
             right[t, 4] += ry
 
 
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _fringe_row(
+    codes: Any, row: int, scale: float, offset: float, g: Any, unit: Any, rho: float,
+    level: Any, s: Any, c: Any, b0: Any, b1: Any, b2: Any, rr: Any,
+) -> None:  # fmt: skip
+    # Four frames at a time: the sums are loaded and stored once for all of them.
+    base = np.float32(1) + rho
+    n = codes.shape[0] // 4 * 4
+    for t in range(0, n, 4):
+        p0, p1, p2 = g[t, 0], g[t, 1], g[t, 2]
+        pc, ps, pf = unit[t, 0], unit[t, 1], unit[t, 2]
+        q0, q1, q2 = g[t + 1, 0], g[t + 1, 1], g[t + 1, 2]
+        qc, qs, qf = unit[t + 1, 0], unit[t + 1, 1], unit[t + 1, 2]
+        u0, u1, u2 = g[t + 2, 0], g[t + 2, 1], g[t + 2, 2]
+        uc, us, uf = unit[t + 2, 0], unit[t + 2, 1], unit[t + 2, 2]
+        v0, v1, v2 = g[t + 3, 0], g[t + 3, 1], g[t + 3, 2]
+        vc, vs, vf = unit[t + 3, 0], unit[t + 3, 1], unit[t + 3, 2]
+        for i in range(codes.shape[2]):
+            si, ci, li = s[i], c[i], level[i]
+            rp = scale * np.float32(codes[t, row, i]) + offset - li * (p0 + si * p1 + ci * p2)
+            rq = scale * np.float32(codes[t + 1, row, i]) + offset - li * (q0 + si * q1 + ci * q2)
+            ru = scale * np.float32(codes[t + 2, row, i]) + offset - li * (u0 + si * u1 + ci * u2)
+            rv = scale * np.float32(codes[t + 3, row, i]) + offset - li * (v0 + si * v1 + ci * v2)
+            wp = pf * rp / (base + si * pc + ci * ps)
+            wq = qf * rq / (base + si * qc + ci * qs)
+            wu = uf * ru / (base + si * uc + ci * us)
+            wv = vf * rv / (base + si * vc + ci * vs)
+            b0[i] += wp * p0 + wq * q0 + wu * u0 + wv * v0
+            b1[i] += wp * p1 + wq * q1 + wu * u1 + wv * v1
+            b2[i] += wp * p2 + wq * q2 + wu * u2 + wv * v2
+            rr[i] += wp * rp + wq * rq + wu * ru + wv * rv
+    for t in range(n, codes.shape[0]):
+        p0, p1, p2 = g[t, 0], g[t, 1], g[t, 2]
+        pc, ps, pf = unit[t, 0], unit[t, 1], unit[t, 2]
+        for i in range(codes.shape[2]):
+            si, ci = s[i], c[i]
+            rp = scale * np.float32(codes[t, row, i]) + offset
+            rp -= level[i] * (p0 + si * p1 + ci * p2)
+            wp = pf * rp / (base + si * pc + ci * ps)
+            b0[i] += wp * p0
+            b1[i] += wp * p1
+            b2[i] += wp * p2
+            rr[i] += wp * rp
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _fill_row(codes: Any, row: int, fill: int, count: Any) -> None:
+    for t in range(codes.shape[0]):
+        for i in range(codes.shape[2]):
+            count[i] += np.float32(codes[t, row, i] == fill)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def fringe_block(
+    codes: Any,
+    scale: float,
+    offset: float,
+    fill: int,
+    g: F32,
+    unit: F32,
+    rho: float,
+    level: F32,
+    s: F32,
+    c: F32,
+    sums: F64,
+    missing: F64,
+) -> None:
+    """Right-hand sums of a tile for weights that depend on the phase of the fringe only.
+
+    The weight is ``f / (1 + rho + s cos phi + c sin phi)``; the normal sums follow from the frames
+    (`pixcal.estimators.harmonics`), less those of samples without weight, given in ``missing``.
+
+    Parameters
+    ----------
+    codes, scale, offset, fill
+        As in `sweep_block`.
+    g : (t, 3) float32
+        Frame parameters at the tile's centre.
+    unit : (t, 3) float32
+        (cos phi, sin phi, f), f the frame's own weight.
+    rho : float
+        Read variance over level, in the weights.
+    level, s, c : (y, x) float32
+        Start model ``level * (B + s A cos phi + c A sin phi)``, in electrons.
+    sums : (4, y, x) float64
+        Added to: right-hand sums 0 to 2 of the residual, weighted square of the residual.
+    missing : (7, y, x) float64
+        Added to: normal sums of the samples without weight (6), and their number.
+    """
+    ny, nx = codes.shape[1], codes.shape[2]
+    p = [np.empty(nx, np.float32) for _ in range(5)]
+    sc, of, rh = np.float32(scale), np.float32(offset), np.float32(rho)
+    for row in range(ny):
+        for k in range(5):
+            p[k][:] = np.float32(0)
+        _fringe_row(
+            codes, row, sc, of, g, unit, rh, level[row], s[row], c[row], p[0], p[1], p[2], p[3]
+        )
+        _fill_row(codes, row, fill, p[4])
+        for i in range(nx):
+            if p[4][i] > 0:
+                _without_fill(
+                    codes[:, row, i], sc, of, fill, g, unit, rh,
+                    level[row, i], s[row, i], c[row, i], p, i, missing[:, row, i],
+                )  # fmt: skip
+        for k in range(4):
+            for i in range(nx):
+                sums[k, row, i] += p[k][i]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _without_fill(
+    codes: Any, scale: float, offset: float, fill: int, g: Any, unit: Any, rho: float,
+    level: float, s: float, c: float, p: Any, i: int, missing: Any,
+) -> None:  # fmt: skip
+    """Sum a pixel anew without its samples of no weight, and note what the frames must lose."""
+    b0 = b1 = b2 = rr = 0.0
+    for t in range(codes.shape[0]):
+        a0, a1, a2 = g[t, 0], g[t, 1], g[t, 2]
+        w = unit[t, 2] / (1.0 + rho + s * unit[t, 0] + c * unit[t, 1])
+        if codes[t] == fill:
+            missing[0] += w * a0 * a0
+            missing[1] += w * a0 * a1
+            missing[2] += w * a0 * a2
+            missing[3] += w * a1 * a1
+            missing[4] += w * a1 * a2
+            missing[5] += w * a2 * a2
+            missing[6] += 1.0
+            continue
+        r = scale * codes[t] + offset - level * (a0 + s * a1 + c * a2)
+        b0 += w * r * a0
+        b1 += w * r * a1
+        b2 += w * r * a2
+        rr += w * r * r
+    p[0][i], p[1][i], p[2][i], p[3][i] = b0, b1, b2, rr
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def frame_moments(g: F64, weight: F64, out: Any) -> None:
+    """Add ``f exp(i k phi) g_i g_j`` of every frame to out (6, orders), for k = 0, 1, ...
+
+    Parameters
+    ----------
+    g : (t, 3) float64
+        (B, A cos phi, A sin phi).
+    weight : (t,) float64
+        The frames' own weights f.
+    out : (6, orders) complex128
+        Pairs ij in the order 00, 01, 02, 11, 12, 22.
+    """
+    for t in range(g.shape[0]):
+        a0, a1, a2 = g[t, 0], g[t, 1], g[t, 2]
+        length = np.sqrt(a1 * a1 + a2 * a2)
+        turn = complex(a1, a2) / length if length > 0 else complex(1.0, 0.0)
+        power = complex(weight[t], 0.0)
+        for k in range(out.shape[1]):
+            out[0, k] += power * (a0 * a0)
+            out[1, k] += power * (a0 * a1)
+            out[2, k] += power * (a0 * a2)
+            out[3, k] += power * (a1 * a1)
+            out[4, k] += power * (a1 * a2)
+            out[5, k] += power * (a2 * a2)
+            power *= turn
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def interpolate_periodic(table: F64, phase: F64) -> F64:
+    """Linear interpolation of tables (n, size) over one turn at phases (p,), rad: (n, p)."""
+    n, size = table.shape
+    out = np.empty((n, phase.size))
+    per_rad = size / (2 * np.pi)
+    for p in range(phase.size):
+        at = phase[p] * per_rad
+        first = np.floor(at)
+        part = at - first
+        i = int(first) % size
+        j = i + 1 if i + 1 < size else 0
+        for k in range(n):
+            out[k, p] = table[k, i] * (1 - part) + table[k, j] * part
+    return out
+
+
 def solve_pixels(sums: F64) -> tuple[F64, F64, F64]:
     """Solve the pixels' 3 x 3 systems.
 
