@@ -41,7 +41,9 @@ def test_a_period_that_is_off_does_not_add_up():
     assert plan_batches(time).count.tolist() == [500] * 9 or plan_batches(time).frames < 500
 
 
-@pytest.mark.parametrize("time", [np.zeros(50), np.concatenate([np.arange(25), 1e9 + np.arange(25)])])
+@pytest.mark.parametrize(
+    "time", [np.zeros(50), np.concatenate([np.arange(25), 1e9 + np.arange(25)])]
+)
 def test_stamps_without_pace_count_frames(time):
     batches = plan_batches(time.astype(float), 10)
     assert batches.count.tolist() == [10] * 5

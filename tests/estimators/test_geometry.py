@@ -37,7 +37,9 @@ def test_tile_plane_of_a_plane():
     assert plane.kx == pytest.approx(0.02, abs=1e-6)
     assert plane.ky == pytest.approx(-0.05, abs=1e-6)
     assert np.angle(np.exp(1j * (plane.phase - 3.0))) == pytest.approx(0, abs=1e-5)
-    np.testing.assert_allclose(np.exp(1j * unwrapped_phase(wrapped, plane)), np.exp(1j * value), atol=1e-5)
+    np.testing.assert_allclose(
+        np.exp(1j * unwrapped_phase(wrapped, plane)), np.exp(1j * value), atol=1e-5
+    )
 
 
 def paper_bench(dx=18.0, dy=-18.0, distance=410.0, baseline=6.3, shape=(5456, 8320)):
@@ -57,7 +59,9 @@ def test_the_whole_detector_is_unwrapped():
         value = phase(cx, cy, truth) - phase(reference[1], reference[0], truth)
         value -= kx * (cx - reference[1]) + ky * (cy - reference[0])
         first = done[len(done) // 2]
-        base = phase(first.centre[1], first.centre[0], truth) - phase(reference[1], reference[0], truth)
+        base = phase(first.centre[1], first.centre[0], truth) - phase(
+            reference[1], reference[0], truth
+        )
         base -= kx * (first.centre[1] - reference[1]) + ky * (first.centre[0] - reference[0])
         assert plane.phase - first.phase == pytest.approx(value - base, abs=0.02)
 
@@ -77,7 +81,9 @@ def test_fibres_are_found_from_a_wrong_start_over_the_full_detector():
     assert found.centre_x == pytest.approx(truth.centre_x, abs=1.0)
     y, x = np.array([0.0, 2000.0, 5455.0]), np.array([8319.0, 100.0, 4000.0])
     wanted = phase(x, y, truth) - phase(reference[1], reference[0], truth)
-    got = shape_found.phase(y, x) - shape_found.phase(np.array(reference[:1]), np.array(reference[1:]))
+    got = shape_found.phase(y, x) - shape_found.phase(
+        np.array(reference[:1]), np.array(reference[1:])
+    )
     np.testing.assert_allclose(got, wanted, atol=0.2)
 
 
@@ -92,4 +98,6 @@ def test_modes_are_the_derivatives_of_the_phase(name):
         step = np.zeros(len(modes))
         step[n] = 1e-4
         difference = (shape.moved(step).phase(y, x) - shape.moved(-step).phase(y, x)) / 2e-4
-        np.testing.assert_allclose(difference, modes[n], rtol=1e-5, atol=1e-5 * np.abs(modes[n]).max())
+        np.testing.assert_allclose(
+            difference, modes[n], rtol=1e-5, atol=1e-5 * np.abs(modes[n]).max()
+        )

@@ -4,7 +4,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from multiprocessing import get_context
 from typing import Any, TypeVar
 
@@ -137,7 +137,8 @@ def _run_local(
         function = _InWorker(function)
         options["pool"] = _process_pool(runtime.n_workers)
     names = [f"task-{n}" for n in range(len(items))]
-    graph = {name: (function, item) for name, item in zip(names, items, strict=True)}
+    # Bound to the function: inside a graph Dask would take some items for keys or tasks.
+    graph = {name: (partial(function, item),) for name, item in zip(names, items, strict=True)}
     number = {name: n for n, name in enumerate(names)}
 
     def ended(key: Any, result: Any, _dsk: Any, _state: Any, _worker: Any) -> None:
@@ -168,7 +169,7 @@ def _run_distributed(
         futures = client.map(_InWorker(function), items, pure=False)
         number = {future.key: n for n, future in enumerate(futures)}
         results: dict[int, R] = {}
-        for future in as_completed(futures):
+        for future in as_completed(futures, loop=client.loop):
             n = number[future.key]
             results[n] = future.result()
             future.release()

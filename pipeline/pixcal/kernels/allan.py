@@ -1,0 +1,119 @@
+"""Allan deviation of many series at once, with gaps (NIST SP 1065, equation 11)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+PIXELS_AT_ONCE = 128
+"""Series whose running sums are held at the same time: they stay in the processor's cache."""
+
+
+def averaging_lengths(n_batches: int) -> tuple[int, ...]:
+    """Octaves and what lies between them (1, 2, 3, 4, 6, 8, 12, …), up to a third of the batches.
+
+    Parameters
+    ----------
+    n_batches : int
+        Length of the series, gaps included.
+    """
+    octaves = [1 << n for n in range(n_batches.bit_length())]
+    lengths = sorted({*octaves, *(3 * m for m in octaves)})
+    return tuple(m for m in lengths if m <= n_batches // 3)
+
+
+def allan_deviation(series: NDArray[np.floating], lengths: Sequence[int]) -> F64:
+    r"""Overlapping Allan deviation of each column.
+
+    .. math:: \sigma^2(m) = \tfrac12 \langle (\bar y_{k+m} - \bar y_k)^2 \rangle_k
+
+    with :math:`\bar y_k` the mean of ``m`` batches from ``k`` on, over all ``k`` for which both
+    means exist. A missing batch takes away every mean that it is part of; what it leaves is never
+    joined over the gap.
+
+    Parameters
+    ----------
+    series : (batch, pixel) float
+        Evenly spaced in time; NaN where there is no batch.
+    lengths : sequence of int
+        Averaging lengths in batches.
+
+    Returns
+    -------
+    (length, pixel) float64
+        In the unit of ``series``; NaN where no two means are left.
+    """
+    out = np.empty((len(lengths), series.shape[1]))
+    _deviations(np.ascontiguousarray(series), np.array(lengths, dtype=np.int64), out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _deviations(series, lengths, out):  # type: ignore[no-untyped-def]
+    n, n_pixels = series.shape
+    total = np.zeros((n + 1, PIXELS_AT_ONCE))
+    missing = np.zeros((n + 1, PIXELS_AT_ONCE))
+    for start in range(0, n_pixels, PIXELS_AT_ONCE):
+        size = min(PIXELS_AT_ONCE, n_pixels - start)
+        for k in range(n):
+            for p in range(size):
+                value = np.float64(series[k, start + p])
+                absent = value != value
+                total[k + 1, p] = total[k, p] + (0.0 if absent else value)
+                missing[k + 1, p] = missing[k, p] + (1.0 if absent else 0.0)
+        for number in range(len(lengths)):
+            m = lengths[number]
+            squares = np.zeros(PIXELS_AT_ONCE)
+            count = np.zeros(PIXELS_AT_ONCE)
+            for k in range(n - 2 * m + 1):
+                _add_difference(total, missing, k, m, squares, count)
+            for p in range(size):
+                mean = squares[p] / (2.0 * count[p]) if count[p] > 0 else np.nan
+                out[number, start + p] = np.sqrt(mean) / m
+
+
+@njit(cache=True, nogil=True)
+def _add_difference(total, missing, k, m, squares, count):  # type: ignore[no-untyped-def]
+    for p in range(PIXELS_AT_ONCE):
+        whole = 1.0 if missing[k + 2 * m, p] == missing[k, p] else 0.0
+        step = total[k + 2 * m, p] - 2.0 * total[k + m, p] + total[k, p]
+        squares[p] += whole * step * step
+        count[p] += whole
+
+
+def disjoint_differences(series: NDArray[np.floating], m: int, most: int) -> F64:
+    """Differences of neighbouring means of ``m`` batches that share no batch.
+
+    In white noise they are independent in time, so that their products measure what pixels share.
+
+    Parameters
+    ----------
+    series : (batch, pixel) float
+        NaN where there is no batch.
+    m : int
+        Averaging length in batches.
+    most : int
+        How many differences to take of those there are, spread over the series.
+
+    Returns
+    -------
+    (difference, pixel) float64
+        NaN where a batch is missing.
+    """
+    pairs = len(series) // (2 * m)
+    chosen = np.unique(np.linspace(0, pairs - 1, min(pairs, most)).round().astype(np.int64))
+    out = np.zeros((len(chosen), series.shape[1]))
+    _differences(np.ascontiguousarray(series), m, 2 * m * chosen, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _differences(series, m, starts, out):  # type: ignore[no-untyped-def]
+    for number in range(len(starts)):
+        for k in range(2 * m):
+            share = -1.0 / m if k < m else 1.0 / m
+            for p in range(out.shape[1]):
+                out[number, p] += share * series[starts[number] + k, p]

@@ -1,0 +1,390 @@
+"""Stability: Allan deviation of the offset maps over batches of frames (paper, section 4.3).
+
+``allan.json`` holds ``schema``, ``pixcal`` and, for each fringe set under ``sets``, the curve of
+the window's median pixel: the lists ``frames``, ``seconds``, ``adev_px``, its one-sigma error
+``adev_err_px`` and limits ``adev_lo_px``, ``adev_hi_px``, and ``white_expected_px`` (what the
+errors of the fit let expect of white noise); ``slope`` with ``slope_err`` of the white part;
+``knee_frames`` (null when none); ``pixels``; ``n_batches``, of them ``gaps`` without data;
+``batch_frames``, ``batch_seconds``; ``region`` (null: the window, else [y0, y1, x0, x1]);
+``warnings`` (sentences); and under ``regions`` the same curve for each rectangle asked for, by its
+name ``y0:y1,x0:x1``.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal import __version__
+from pixcal.engine.plan import make_plan
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.stability import (
+    MAX_DRAWS,
+    NO_CURVE,
+    ONE_SIGMA,
+    Curve,
+    fit_curve,
+    shared_noise,
+    white_population,
+)
+from pixcal.kernels.allan import allan_deviation, averaging_lengths, disjoint_differences
+from pixcal.model.config import quantity
+from pixcal.model.errors import DamagedError, InputError
+from pixcal.storage.artefact import (
+    Build,
+    Manifest,
+    artefact_key,
+    build,
+    lock,
+    read_json,
+    require,
+    up_to_date,
+    write_json,
+)
+from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
+
+FORMAT = 1
+SCHEMA = "pixcal/allan/1"
+BATCH_FRAMES = 500
+"""Frames of a batch in a long run (paper, section 4.3); shorter batches are pointed out."""
+MIN_BATCHES = 3
+TILES_A_SIDE = 4
+"""A task takes a square of as many of the fit's chunks a side: one file of each length."""
+DIFFERENCES = 32
+"""Differences in time whose products show what pixels share."""
+NOISE_LEVELS = (np.arange(64) + 0.5) / 64
+"""Levels of the quantiles that describe the noise over a region."""
+
+Range = tuple[int, int]
+Tile = tuple[Range, Range]
+Region = tuple[int, int, int, int]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of the stability stage."""
+
+    region: Region | None = quantity(
+        None, unit="px", low=0, doc="(y0, y1, x0, x1), ends excluded, of the main curve"
+    )
+    regions: tuple[Region, ...] = quantity(
+        (), doc="further rectangles with a curve of their own; a single pixel is one of 1 x 1"
+    )
+
+
+@dataclass(frozen=True)
+class Batches:
+    """The batch maps of one fringe set, as the fit left them."""
+
+    folder: Path
+    n: int
+    """Batches, gaps included."""
+    window: tuple[int, int]
+    chunks: tuple[int, int]
+    """Of the fit's maps, (rows, columns)."""
+    frames: int
+    """Frames of a batch."""
+    step_s: float
+    """From one batch to the next, seconds."""
+    note: str
+    """What the fit says of them, or ""."""
+
+    @classmethod
+    def open(cls, folder: Path, facts: dict[str, Any]) -> "Batches":
+        """Look at ``fit.zarr/<set name>``; ``facts`` are the set's part of ``fit.json``."""
+        delta, time = ArrayReader(folder / "delta"), ArrayReader(folder / "batch_time").read()
+        ny, nx = delta.shape
+        cy, cx = delta.chunks
+        step = round(float(time[1] - time[0]), 9) if len(time) > 1 else 0.0
+        note = facts.get("batch_note", "")
+        return cls(folder, len(time), (ny, nx), (cy, cx), facts["batch_frames"], step, note)
+
+    def tiles(self, area: Region, times: int = 1) -> list[Tile]:
+        """Squares of ``times`` chunks a side, cut to an area."""
+        y0, y1, x0, x1 = area
+        sides = [c * times for c in self.chunks]
+        return list(product(_spans(y0, y1, sides[0]), _spans(x0, x1, sides[1])))
+
+    def read(self, name: str, tile: Tile) -> F32:
+        """``batch_delta`` or ``batch_sigma`` (batch, y, x) of a tile, px."""
+        return ArrayReader(self.folder / name).read((0, self.n), *tile)
+
+
+def _spans(start: int, stop: int, size: int) -> Iterator[Range]:
+    for edge in range(start // size * size, stop, size):
+        yield max(edge, start), min(edge + size, stop)
+
+
+def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
+    """Measure how the error of the offset maps falls with the number of frames.
+
+    Reads ``RUN/fit``; makes ``RUN/allan`` and the product ``allan.json``.
+
+    Raises
+    ------
+    InputError
+        If the fit has not been run, or a region is not inside the window.
+    """
+    fit = require(run_dir, "fit", 1)
+    inputs = {"fit": fit.key}
+    with lock(run_dir):
+        facts = read_json(run_dir / "fit" / "fit.json")["sets"]
+        sets = {
+            name: Batches.open(run_dir / "fit" / "fit.zarr" / name, found)
+            for name, found in facts.items()
+        }
+        for batches in sets.values():
+            for region in (config.region, *config.regions):
+                _check_region(region, batches.window)
+        key = artefact_key("allan", FORMAT, asdict(config), inputs)
+        if up_to_date(run_dir, "allan", key) is None:
+            with build(run_dir, "allan", FORMAT, asdict(config), inputs) as made:
+                create_group(made.folder / "allan.zarr")
+                result = {
+                    name: _measure_set(made, name, batches, config, runtime)
+                    for name, batches in sets.items()
+                }
+                whole = {"schema": SCHEMA, "pixcal": __version__, "sets": result}
+                write_json(made.folder / "allan.json", whole)
+        (run_dir / "products").mkdir(exist_ok=True)
+        published = read_json(run_dir / "allan" / "allan.json")
+        write_json(run_dir / "products" / "allan.json", published)
+        return require(run_dir, "allan", FORMAT)
+
+
+def _name(region: Region) -> str:
+    y0, y1, x0, x1 = region
+    return f"{y0}:{y1},{x0}:{x1}"
+
+
+def _check_region(region: Region | None, window: tuple[int, int]) -> None:
+    if region is None:
+        return
+    y0, y1, x0, x1 = region
+    if not (0 <= y0 < y1 <= window[0] and 0 <= x0 < x1 <= window[1]):
+        raise InputError(
+            f"--region {_name(region)}: not inside the window; as y0:y1,x0:x1 with the ends "
+            f"excluded all of it is 0:{window[0]},0:{window[1]}"
+        )
+
+
+def _measure_set(
+    made: Build, name: str, batches: Batches, config: Config, runtime: Runtime
+) -> dict[str, Any]:
+    """Maps and curves of one fringe set; returns its part of ``allan.json``."""
+    folder = made.folder / "allan.zarr" / name
+    lengths = averaging_lengths(batches.n)
+    cy, cx = batches.chunks
+    tile_bytes = 4 * cy * cx * (2 * batches.n + len(lengths) * (TILES_A_SIDE**2 + 2))
+    held = 9 * batches.window[0] * batches.window[1] + 40 * MAX_DRAWS * len(lengths)
+    plan = make_plan(f"the Allan deviation of {name}", tile_bytes, held, runtime)
+    runtime = runtime.with_workers(plan.workers)
+    if lengths:
+        _write_maps(made, folder, name, batches, lengths, runtime)
+    whole = (0, batches.window[0], 0, batches.window[1])
+    main = _measure_region(folder, batches, lengths, config.region or whole, runtime)
+    regions = {
+        _name(region): _measure_region(folder, batches, lengths, region, runtime)
+        for region in config.regions
+    }
+    notes = [batches.note] if batches.note else []
+    if batches.frames < BATCH_FRAMES:
+        notes.append(f"batches have {batches.frames} frames, fewer than the usual {BATCH_FRAMES}")
+    return main | {
+        "warnings": notes + main["warnings"],
+        "region": config.region,
+        "batch_frames": batches.frames,
+        "batch_seconds": batches.step_s,
+        "regions": regions,
+    }
+
+
+def _write_maps(
+    made: Build,
+    folder: Path,
+    name: str,
+    batches: Batches,
+    lengths: tuple[int, ...],
+    runtime: Runtime,
+) -> None:
+    """Deviation of every pixel, and what its error of the fit lets expect for one batch."""
+    create_group(folder)
+    shape, chunks = batches.window, tuple(TILES_A_SIDE * c for c in batches.chunks)
+    options: dict[str, Any] = {"fill_value": np.nan, "attrs": {"units": "pixel"}}
+    adev = create_array(
+        folder / "adev", (len(lengths), *shape), "<f4", dims=("length", "y", "x"),
+        chunks=(1, *chunks), **options,
+    )  # fmt: skip
+    expected = create_array(
+        folder / "expected", shape, "<f4", dims=("y", "x"), chunks=chunks, **options
+    )
+    done = made.journal()
+    squares = batches.tiles((0, shape[0], 0, shape[1]), TILES_A_SIDE)
+    steps = {square: f"{name}:{square[0][0]},{square[1][0]}" for square in squares}
+    squares = [square for square in squares if steps[square] not in done]
+    run_tasks(
+        partial(_maps_task, batches, lengths, adev, expected),
+        squares,
+        runtime,
+        label=f"Allan deviation {name}",
+        done=lambda n, _: made.note(steps[squares[n]]),
+    )
+    adev.finish()
+    expected.finish()
+    frames = np.array(lengths) * batches.frames
+    write_array(folder / "length", frames, dims=("length",), attrs={"units": "frames"})
+    seconds = np.array(lengths) * batches.step_s
+    write_array(folder / "seconds", seconds, dims=("length",), attrs={"units": "s"})
+
+
+def _maps_task(
+    batches: Batches,
+    lengths: tuple[int, ...],
+    adev: ArrayWriter,
+    expected: ArrayWriter,
+    square: Tile,
+) -> None:
+    (y0, y1), (x0, x1) = square
+    deviations = np.empty((len(lengths), y1 - y0, x1 - x0), np.float32)
+    white = np.empty((y1 - y0, x1 - x0), np.float32)
+    for y, x in batches.tiles((y0, y1, x0, x1)):
+        part = (slice(y[0] - y0, y[1] - y0), slice(x[0] - x0, x[1] - x0))
+        series = batches.read("batch_delta", (y, x)).reshape(batches.n, -1)
+        shape = (len(lengths), y[1] - y[0], x[1] - x[0])
+        deviations[:, *part] = allan_deviation(series, lengths).reshape(shape)
+        white[part] = _root_mean_square(batches.read("batch_sigma", (y, x)))
+    adev.write((0, y0, x0), deviations)
+    expected.write((y0, x0), white)
+
+
+def _root_mean_square(sigma: F32) -> F64:
+    """Over the batches that there are; NaN where there are none."""
+    total, count = np.zeros(sigma.shape[1:]), np.zeros(sigma.shape[1:])
+    for plane in sigma:
+        there = np.isfinite(plane)
+        total[there] += plane[there].astype(float) ** 2
+        count += there
+    return np.sqrt(np.where(count > 0, total, np.nan) / np.maximum(count, 1))
+
+
+def _measure_region(
+    folder: Path, batches: Batches, lengths: tuple[int, ...], region: Region, runtime: Runtime
+) -> dict[str, Any]:
+    """Curve of the median pixel of a region, as it goes into ``allan.json``."""
+    counts, grams = _sums(folder, batches, lengths, region, runtime)
+    # A batch is there when most pixels have it: a few may lack one for reasons of their own.
+    present = counts > counts.max(initial=0) / 2
+    filled = int(present.sum())
+    common = {"n_batches": batches.n, "gaps": batches.n - filled}
+    usable = [n for n, m in enumerate(lengths) if _has_difference(present, m)]
+    found, pixels = _quantiles(folder / "adev", region, usable)
+    if filled < MIN_BATCHES or not found:
+        reason = f"{filled} of {batches.n} batches have data: too few for an Allan deviation"
+        return _as_json(batches, [], NO_CURVE, [], [reason]) | common | {"pixels": 0}
+    chosen = [lengths[n] for n in found]
+    low, median, high = np.array(list(found.values())).T
+    noise = _noise_levels(folder / "expected", region)
+    white = white_population(present, chosen, noise if pixels > 1 else None)
+    shared = shared_noise([grams[n] for n in found], pixels)
+    curve = fit_curve(chosen, median, np.log(high / low) / 2, pixels, shared, white)
+    warnings = []
+    if curve.knee is not None and curve.knee > batches.n / 2:
+        warnings = [f"not quite white: a knee at {curve.knee * batches.frames:.2g} frames, "
+                    "beyond what the run can show, is not given"]  # fmt: skip
+        curve = replace(curve, knee=None)
+    expected = float(np.median(noise)) / np.sqrt(chosen)
+    own = _as_json(batches, chosen, curve, expected.tolist(), warnings)
+    return own | common | {"pixels": pixels}
+
+
+def _sums(
+    folder: Path, batches: Batches, lengths: tuple[int, ...], region: Region, runtime: Runtime
+) -> tuple[NDArray[np.int64], list[F64]]:
+    """Pixels of a region that have each batch, and for each length their products."""
+    if not lengths:
+        return ArrayReader(batches.folder / "batch_count").read().astype(np.int64), []
+    sums = run_tasks(
+        partial(_sums_task, batches, lengths, folder / "expected"),
+        batches.tiles(region, TILES_A_SIDE),
+        runtime,
+        label=f"region {_name(region)}",
+    )
+    grams = [np.sum(parts, axis=0) for parts in zip(*(s[1] for s in sums), strict=True)]
+    return np.sum([s[0] for s in sums], axis=0), grams
+
+
+def _sums_task(
+    batches: Batches, lengths: tuple[int, ...], expected: Path, square: Tile
+) -> tuple[NDArray[np.int64], list[F64]]:
+    """Pixels that have each batch, and the products of differences that pixels may share."""
+    counts = np.zeros(batches.n, np.int64)
+    grams: list[Any] = [0.0] * len(lengths)
+    for tile in batches.tiles((*square[0], *square[1])):
+        series = batches.read("batch_delta", tile).reshape(batches.n, -1)
+        noise = ArrayReader(expected).read(*tile).ravel()
+        noise[noise <= 0] = np.nan
+        counts += np.isfinite(series).sum(axis=1)
+        for number, m in enumerate(lengths):
+            # Missing batches and pixels without errors are NaN both, and add nothing.
+            steps = np.nan_to_num(disjoint_differences(series, m, DIFFERENCES) / noise)
+            grams[number] = grams[number] + steps @ steps.T
+    return counts, grams
+
+
+def _has_difference(present: NDArray[np.bool_], m: int) -> bool:
+    return bool(np.isin(2 * m, np.convolve(present, np.ones(2 * m, int), "valid")))
+
+
+def _quantiles(
+    path: Path, region: Region, usable: Sequence[int]
+) -> tuple[dict[int, tuple[float, float, float]], int]:
+    """Central 68 % and median over a region for each length's number, and how many pixels."""
+    found, pixels = {}, 0
+    for n in usable:
+        values = ArrayReader(path).read((n, n + 1), region[:2], region[2:])
+        values = values[values > 0]  # not NaN; nor zero, which no noise gives
+        pixels = max(pixels, len(values))
+        if len(values):
+            levels = (ONE_SIGMA[0], 0.5, ONE_SIGMA[1])
+            low, median, high = np.quantile(values, levels, overwrite_input=True).tolist()
+            found[n] = (low, median, high)
+    return found, pixels
+
+
+def _noise_levels(path: Path, region: Region) -> F64:
+    """Quantiles of the expected deviation of one batch over a region, px."""
+    values = ArrayReader(path).read(region[:2], region[2:])
+    values = values[np.isfinite(values) & (values > 0)]
+    if not len(values):
+        raise DamagedError(f"{path}: no errors of batches; remove RUN/fit and run 'pixcal fit'")
+    levels = np.quantile(values, NOISE_LEVELS, overwrite_input=True)
+    return np.asarray(levels, dtype=np.float64)
+
+
+def _as_json(
+    batches: Batches,
+    lengths: Sequence[int],
+    curve: Curve,
+    expected: list[float],
+    warnings: list[str],
+) -> dict[str, Any]:
+    return {
+        "frames": [m * batches.frames for m in lengths],
+        "seconds": [m * batches.step_s for m in lengths],
+        "adev_px": curve.adev.tolist(),
+        "adev_err_px": curve.error.tolist(),
+        "adev_lo_px": curve.low.tolist(),
+        "adev_hi_px": curve.high.tolist(),
+        "slope": curve.slope,
+        "slope_err": curve.slope_error,
+        "white_expected_px": expected,
+        "knee_frames": None if curve.knee is None else curve.knee * batches.frames,
+        "warnings": warnings,
+    }

@@ -1,0 +1,49 @@
+"""Memory is decided before anything is read, and refused with both numbers."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pixcal.engine.plan import BASE_BYTES, Plan, make_plan
+from pixcal.engine.run import Runtime
+from pixcal.model.errors import InputError, PlanError
+
+MIB = 1 << 20
+
+
+def test_the_total() -> None:
+    assert Plan(3, 5, 7).total == BASE_BYTES + 5 + 7 * 3
+
+
+@given(
+    task=st.integers(0, 1 << 34),
+    shared=st.integers(0, 1 << 34),
+    workers=st.integers(1, 64),
+    memory=st.integers(1, 1 << 36),
+)
+def test_as_many_workers_as_fit(task: int, shared: int, workers: int, memory: int) -> None:
+    runtime = Runtime("threads", workers, memory)
+    try:
+        plan = make_plan("the work", task, shared, runtime)
+    except PlanError:
+        assert BASE_BYTES + shared + task > memory
+        return
+    assert 1 <= plan.workers <= workers
+    assert plan.total <= memory
+    if plan.workers < workers:
+        assert BASE_BYTES + shared + (plan.workers + 1) * task > memory
+
+
+def test_too_little_memory_is_refused_with_both_numbers() -> None:
+    runtime = Runtime("threads", 4, 600 * MIB)
+    with pytest.raises(PlanError) as caught:
+        make_plan("the fit of vertical", 100 * MIB, 1000 * MIB, runtime)
+    need = BASE_BYTES // MIB + 1100
+    assert str(caught.value) == (
+        f"--memory: the fit of vertical needs {need} MiB, 600 MiB are allowed"
+    )
+    assert isinstance(caught.value, InputError), "so that the exit code is 2"
+
+
+def test_sync_has_one_worker() -> None:
+    assert make_plan("it", MIB, 0, Runtime("sync", 8)).workers == 1

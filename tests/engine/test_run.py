@@ -1,0 +1,155 @@
+"""Tasks give the same results wherever they run, each is noted once, and a failure is heard."""
+
+import math
+import operator
+import os
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import pytest
+from distributed import LocalCluster
+
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.model.errors import InputError
+
+# Functions that other processes can import: those of the standard library.
+POWER = partial(pow, 3)
+LOCAL = [
+    Runtime("sync"),
+    Runtime("threads", 1),
+    Runtime("threads", 3),
+    Runtime("processes", 2),
+]
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Runtime]:
+    """A Dask cluster of two workers, reached by its address."""
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, host="127.0.0.1",
+        protocol="tcp://", dashboard_address=None,
+    ) as local:  # fmt: skip
+        yield Runtime(local.scheduler_address)
+
+
+@pytest.fixture(params=[*LOCAL, "cluster"], ids=str)
+def runtime(request: pytest.FixtureRequest) -> Runtime:
+    if request.param == "cluster":
+        found: Runtime = request.getfixturevalue("cluster")
+        return found
+    local: Runtime = request.param
+    return local
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 7, 41])
+def test_results_in_the_order_of_the_items(runtime: Runtime, count: int) -> None:
+    assert run_tasks(POWER, range(count), runtime, label="test") == [3**n for n in range(count)]
+
+
+def test_each_task_is_noted_once_in_this_thread(runtime: Runtime) -> None:
+    noted: list[tuple[int, int]] = []
+    threads = set()
+
+    def done(number: int, result: int) -> None:
+        noted.append((number, result))
+        threads.add(threading.get_ident())
+
+    items = [5, 5, 0, 9, 2, 5, 7]
+    results = run_tasks(POWER, items, runtime, label="test", done=done)
+    assert Counter(noted) == Counter(enumerate(results))
+    assert threads == {threading.get_ident()}
+
+
+def test_a_failure_comes_out_as_it_is(runtime: Runtime) -> None:
+    noted: list[int] = []
+    with pytest.raises(ValueError, match="factorial"):
+        run_tasks(
+            math.factorial, [3, 4, -1, 5], runtime, label="test", done=lambda n, _: noted.append(n)
+        )
+    assert 2 not in noted
+    assert run_tasks(math.factorial, [3, 4], runtime, label="test") == [6, 24], "and not for long"
+
+
+def test_an_input_error_stays_one(runtime: Runtime) -> None:
+    with pytest.raises(InputError, match="--cluster nonsense"):
+        run_tasks(Runtime, ["sync", "nonsense"], runtime, label="test")
+
+
+def test_items_are_handed_over_as_they_are(runtime: Runtime) -> None:
+    """Whatever they look like to Dask, whose graphs give tuples, lists and words a meaning."""
+    items: list[Any] = [
+        "task-1", ["task-0", "task-2"], (len, "four"), {"a": "task-0"}, ((0, 4), (3, 9)), None,
+    ]  # fmt: skip
+    wrapped = partial(operator.contains, items[1:])
+    expected = [item in items[1:] for item in items]
+    assert run_tasks(wrapped, items, runtime, label="test") == expected
+    assert run_tasks(partial(str.format, "{}"), items, runtime, label="test") == list(
+        map(str, items)
+    )
+
+
+def test_threads_are_threads_and_processes_processes() -> None:
+    items = [None] * 8
+    here = os.getpid()
+    assert set(run_tasks(_pid, items, Runtime("threads", 2), label="test")) == {here}
+    others = set(run_tasks(partial(eval, "__import__('os').getpid()"), [{}] * 8,
+                           Runtime("processes", 2), label="test"))  # fmt: skip
+    assert here not in others
+    assert len(others) <= 2
+
+
+def _pid(_item: None) -> int:
+    return os.getpid()
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_no_more_tasks_at_a_time_than_workers(workers: int) -> None:
+    running, most, lock = 0, 0, threading.Lock()
+
+    def task(_item: int) -> None:
+        nonlocal running, most
+        with lock:
+            running += 1
+            most = max(most, running)
+        threading.Event().wait(0.01)
+        with lock:
+            running -= 1
+
+    run_tasks(task, range(12), Runtime("threads", workers), label="test")
+    assert most == workers
+
+
+def test_workers() -> None:
+    assert Runtime("sync", 5).n_workers == 1
+    assert Runtime("threads", 5).n_workers == 5
+    assert Runtime("threads").n_workers == len(os.sched_getaffinity(0))
+    assert Runtime("threads", memory=7).with_workers(3) == Runtime("threads", 3, 7)
+
+
+@pytest.mark.parametrize("name", ["", "thread", "slurm", "Threads"])
+def test_an_unknown_place_is_refused(name: str) -> None:
+    with pytest.raises(InputError, match=f"--cluster {name}: not one of threads, processes, sync"):
+        Runtime(name)
+
+
+@pytest.mark.parametrize("address", ["nonsense://127.0.0.1:1", "tcp://127.0.0.1:notaport"])
+def test_an_address_that_is_none(address: str) -> None:
+    with pytest.raises(InputError, match=f"--cluster {address}: no Dask scheduler"):
+        run_tasks(POWER, [1], Runtime(address), label="test")
+
+
+@pytest.mark.slow
+def test_a_scheduler_that_does_not_answer() -> None:
+    with pytest.raises(InputError, match="no Dask scheduler answers"):
+        run_tasks(POWER, [1], Runtime("tcp://127.0.0.1:1"), label="test")
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_progress_goes_to_stderr(quiet: bool, capfd: pytest.CaptureFixture[str]) -> None:
+    run_tasks(POWER, range(4), Runtime("sync", quiet=quiet), label="counting")
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert err == "" if quiet else ("counting" in err and "4/4" in err)

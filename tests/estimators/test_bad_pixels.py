@@ -1,0 +1,118 @@
+"""Flags are set on bad pixels, and on a perfect detector on fewer than one in 100,000."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from pixcal.estimators.bad_pixels import dead, hot, noisy, nonlinear
+from pixcal.estimators.detector import Rung
+
+F64 = NDArray[np.float64]
+CLEAN = (1200, 1000)
+FEW = 1e-5 * CLEAN[0] * CLEAN[1]
+
+
+@pytest.mark.parametrize("dof", [1, 7, 39, 999])
+def test_clean_noise_is_not_noisy(dof: int) -> None:
+    variance = 25 * chi2.rvs(dof, size=CLEAN, random_state=np.random.default_rng(dof)) / dof
+    same = np.ones(CLEAN)
+    outliers = np.random.default_rng(0).poisson(6.4e-5 * (dof + 1), CLEAN).astype(float)
+    kurtosis = np.random.default_rng(1).normal(0, np.sqrt(24 / (dof + 1)), CLEAN)
+    found = noisy(variance, dof * same, 25 * same, np.maximum(kurtosis, -2), outliers, 1.5)
+    assert found.sum() < FEW
+
+
+def test_loud_telegraph_and_blinking_pixels_are_noisy() -> None:
+    one = np.ones((1, 5))
+    variance = 25 * np.array([[1.0, 9.0, 1.9, 1.9, 1.0]])
+    kurtosis = np.array([[0.0, 0.0, 0.0, -1.0, 0.0]])
+    outliers = np.array([[0.0, 0.0, 0.0, 0.0, 20.0]])
+    found = noisy(variance, 500 * one, 25 * one, kurtosis, outliers, 1.5)
+    assert found.tolist() == [[False, True, False, True, True]]
+
+
+def test_without_samples_nothing_is_noisy() -> None:
+    zero = np.zeros((3, 3))
+    assert not noisy(zero, zero, zero + 1, zero, zero, 1.5).any()
+
+
+def test_clean_darks_are_not_hot_and_hot_ones_are() -> None:
+    rate = np.random.default_rng(2).normal(20, 3, CLEAN)
+    error = np.full(CLEAN, 3.0)
+    assert hot(rate, error, 20, 3, 10).sum() < FEW
+    rate[7, 9], rate[8, 9], error[8, 9] = 100, 100, 50
+    assert np.argwhere(hot(rate, error, 20, 3, 10)).tolist() == [[7, 9]]
+
+
+def test_an_unknown_rate_is_not_hot() -> None:
+    assert not hot(np.array([[1e6, np.nan]]), np.zeros((1, 2)), 0, 0, 10).any()
+
+
+@pytest.mark.parametrize("sigma", [0.01, 0.09])
+def test_a_clean_flat_has_no_dead_pixels(sigma: float) -> None:
+    flat = np.random.default_rng(3).normal(1, sigma, CLEAN)
+    # The lamp's edge is no defect.
+    flat *= np.linspace(0.2, 1.2, CLEAN[1])
+    error = sigma * np.broadcast_to(np.linspace(0.2, 1.2, CLEAN[1]), CLEAN)
+    assert dead(flat, error, 0.5, 2.0, 0.05).sum() < FEW
+
+
+def test_pixels_that_respond_too_little_or_too_much_are_dead() -> None:
+    flat = np.random.default_rng(4).normal(1, 0.01, (37, 53))
+    flat[36, 52], flat[5, 6], flat[20:24, 30:34] = 0.4, 2.5, 0.0
+    flat[:, 48:] *= 0.3
+    flat[2, 50] = 0.1
+    found = dead(flat, np.full(flat.shape, 0.01), 0.5, 2.0, 0.05)
+    assert {tuple(map(int, w)) for w in np.argwhere(found)} == {
+        (36, 52), (5, 6), (2, 50), *((y, x) for y in range(20, 24) for x in range(30, 34)),
+    }  # fmt: skip
+
+
+def test_columns_without_light_are_dead_and_those_beside_them_are_not() -> None:
+    flat = np.ones((32, 64))
+    flat[:, :27] = 0.0
+    found = dead(flat, np.full(flat.shape, 0.01), 0.5, 2.0, 0.05)
+    np.testing.assert_array_equal(found, flat == 0)
+
+
+def ladder(
+    rng: np.random.Generator, shape: tuple[int, int], frames: int = 4
+) -> tuple[list[Rung], F64]:
+    response = rng.normal(1, 0.02, shape)
+    rungs = []
+    for t in (0.1, 0.2, 0.4, 0.8):
+        expected = 4e4 * t * response
+        variance = np.full(shape, (4e4 * t + 225) / frames)
+        rungs.append(Rung(t, frames, rng.normal(expected, np.sqrt(variance)), variance))
+    return rungs, response
+
+
+def test_a_clean_ladder_is_linear() -> None:
+    rungs, _ = ladder(np.random.default_rng(5), CLEAN)
+    assert nonlinear(rungs, 0.03).sum() < FEW
+    # Even without the allowance, by significance alone.
+    assert nonlinear(rungs, 1e-9).sum() < FEW
+
+
+def test_a_curve_that_all_pixels_share_flags_none() -> None:
+    rungs, _ = ladder(np.random.default_rng(6), (100, 100))
+    bent = [Rung(r.exptime, 4, r.signal - 2e-6 * r.signal**2, r.variance) for r in rungs]
+    assert not nonlinear(bent, 0.03).any()
+
+
+def test_a_pixel_that_bends_is_nonlinear() -> None:
+    rungs, _ = ladder(np.random.default_rng(7), (50, 60))
+    for rung in rungs:
+        rung.signal[3, 4] *= 1 - 0.2 * rung.exptime
+        rung.signal[5, 6] *= 1 - 0.005 * rung.exptime
+    assert np.argwhere(nonlinear(rungs, 0.03)).tolist() == [[3, 4]]
+
+
+def test_two_levels_do_not_tell() -> None:
+    rungs, _ = ladder(np.random.default_rng(8), (20, 20))
+    rungs[2].signal[3, 4] = rungs[3].signal[3, 4] = np.nan
+    rungs[0].signal[3, 4] *= 2
+    rungs[0].signal[5, 4] *= 2
+    assert np.argwhere(nonlinear(rungs, 0.03)).tolist() == [[5, 4]]
+    assert not nonlinear(rungs[:2], 0.03).any()

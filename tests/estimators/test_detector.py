@@ -1,0 +1,129 @@
+"""Bias, dark signal, response and linearity from combined frames, in closed form."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from pixcal.estimators.detector import (
+    Rung,
+    dark_line,
+    linearity,
+    median_and_sigma,
+    response_rate,
+    usual_variance,
+)
+
+F64 = NDArray[np.float64]
+SHAPE = (7, 11)
+
+
+def full(value: float) -> F64:
+    return np.full(SHAPE, value)
+
+
+def test_a_line_through_bias_and_darks_is_exact_without_noise() -> None:
+    rng = np.random.default_rng(0)
+    bias, rate = rng.normal(500, 5, SHAPE), rng.exponential(20, SHAPE)
+    times, counts = [0.0, 0.3, 2.0], [full(40), full(5), full(16)]
+    line = dark_line([bias + rate * t for t in times], counts, times)
+    np.testing.assert_allclose(line.bias, bias)
+    np.testing.assert_allclose(line.rate, rate)
+    np.testing.assert_allclose(line.signal(1.7), bias + rate * 1.7)
+
+
+def test_the_errors_of_a_line_are_those_of_weighted_least_squares() -> None:
+    times, counts = np.array([0.0, 0.3, 2.0]), np.array([40.0, 5.0, 16.0])
+    line = dark_line([full(500.0)] * 3, [full(n) for n in counts], list(times))
+    design = np.stack([np.ones(3), times], axis=1)
+    covariance = np.linalg.inv(design.T @ (counts[:, None] * design))
+    for t in (0.0, 0.5, 3.0):
+        at = np.array([1, t])
+        np.testing.assert_allclose(line.variance(t), at @ covariance @ at)
+    np.testing.assert_allclose(line.per_rate, covariance[1, 1])
+
+
+def test_one_exposure_time_gives_no_rate() -> None:
+    line = dark_line([full(510.0), full(520.0)], [full(3), full(1)], [0.5, 0.5])
+    np.testing.assert_allclose(line.bias, 512.5)
+    np.testing.assert_array_equal(line.rate, 0)
+    np.testing.assert_allclose(line.variance(7.0), 1 / 4)
+
+
+def test_a_pixel_without_samples_has_no_line() -> None:
+    bias, dark = full(500.0), full(520.0)
+    bias[2, 3] = dark[2, 3] = np.nan
+    dark[4, 5] = np.nan
+    line = dark_line([bias, dark], [full(9), full(9)], [0.0, 1.0])
+    assert np.isnan(line.bias[2, 3])
+    assert np.isnan(line.rate[4, 5])
+    assert np.isfinite(line.rate).sum() == line.rate.size - 2
+
+
+def test_the_response_is_all_charge_over_all_time() -> None:
+    rate = np.random.default_rng(1).normal(1e5, 1e3, SHAPE)
+    times = (0.1, 0.2, 0.4)
+    rungs = [Rung(t, n, rate * t, full(rate.mean() * t / n)) for t, n in zip(times, (3, 5, 7))]  # noqa: B905
+    found, error = response_rate(rungs)
+    np.testing.assert_allclose(found, rate)
+    seconds = sum(t * n for t, n in zip(times, (3, 5, 7)))  # noqa: B905
+    # Poisson: the variance of the whole charge is that charge.
+    np.testing.assert_allclose(error, np.sqrt(rate.mean() * seconds) / seconds)
+
+
+def test_a_saturated_rung_does_not_count() -> None:
+    short, long = full(1e4), full(4e4)
+    long[3, 3] = np.nan
+    short[5, 5] = long[5, 5] = np.nan
+    found, _ = response_rate([Rung(0.1, 4, short, full(1.0)), Rung(0.4, 4, long, full(1.0))])
+    assert found[3, 3] == pytest.approx(1e5)
+    assert np.isnan(found[5, 5])
+
+
+def test_a_straight_ladder_is_straight() -> None:
+    times = np.array([0.1, 0.2, 0.5, 1.0])
+    found = linearity(times, 3 + 4e4 * times, np.ones(4, np.bool_))
+    assert found is not None
+    assert found.max_deviation < 1e-12
+    assert found.slope == pytest.approx(4e4)
+    assert found.intercept == pytest.approx(3)
+
+
+def test_a_bent_ladder_is_bent() -> None:
+    times = np.linspace(0.1, 1, 8)
+    straight = 5e4 * times
+    bent = straight * (1 - 0.03 * straight / 5e4)
+    found = linearity(times, bent, np.ones(8, np.bool_))
+    assert found is not None
+    # A parabola of 3 % at full scale, after a line is taken out.
+    assert 0.003 < found.max_deviation < 0.015
+    assert found.deviation[0] * found.deviation[4] < 0
+
+
+def test_rungs_that_are_not_used_have_no_deviation() -> None:
+    times = np.array([0.1, 0.2, 0.3, 0.4])
+    levels = np.array([1e4, 2e4, 3e4, 3.1e4])
+    found = linearity(times, levels, np.array([True, True, True, False]))
+    assert found is not None
+    assert found.max_deviation < 1e-12
+    assert np.isnan(found.deviation[3])
+    assert linearity(times, levels, np.array([True, True, False, False])) is None
+
+
+@pytest.mark.parametrize("dof", [1, 2, 5, 30])
+def test_the_usual_variance_is_unbiased_and_robust(dof: int) -> None:
+    rng = np.random.default_rng(dof)
+    variance = 9.0 * chi2.rvs(dof, size=200_000, random_state=rng) / dof
+    variance[:2000] = 1e6
+    variance[2000:4000] = np.nan
+    assert usual_variance(variance, dof) == pytest.approx(9, rel=0.04)
+    assert np.isnan(usual_variance(variance, 0))
+
+
+def test_median_and_sigma_of_a_gaussian_with_outliers() -> None:
+    values = np.random.default_rng(2).normal(5, 3, 100_000)
+    values[:100], values[100:200] = np.nan, 1e9
+    median, sigma = median_and_sigma(values)
+    assert median == pytest.approx(5, abs=0.05)
+    assert sigma == pytest.approx(3, rel=0.02)
+    assert np.isnan(median_and_sigma(np.full(3, np.nan))).all()
