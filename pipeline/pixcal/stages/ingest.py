@@ -107,7 +107,7 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
             _refuse_other(out, earlier, plain, inputs)
         kept = find_kept(out / STAGE, earlier, same, sources) if earlier is not None else []
         try:
-            with build(out, STAGE, FORMAT, plain, inputs) as made:
+            with build(out, STAGE, FORMAT, plain, inputs, durable=True) as made:
                 facts = take_over(made.folder, kept, runtime)
                 known = {k.array: k.files for k in kept if k.array in facts}
                 tables, warnings = _check(described, sources, known, runtime)

@@ -32,7 +32,9 @@ def create(folder: Path, array: str, shape: Sequence[int], dtype: Any) -> ArrayW
     create_group(folder / "raw.zarr")
     if "/" in array:
         create_group(folder / "raw.zarr" / array.split("/")[0])
-    return create_array(folder / "raw.zarr" / array, shape, dtype, attrs={"units": "adu"})
+    return create_array(
+        folder / "raw.zarr" / array, shape, dtype, attrs={"units": "adu"}, durable=True
+    )
 
 
 def finish(writer: ArrayWriter) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -121,9 +122,14 @@ class Build:
     key: str
     resumed: bool
     summary: dict[str, Any] = field(default_factory=dict)
+    durable: bool = False
 
     def journal(self) -> set[str]:
-        """Steps noted as done by an earlier, interrupted build."""
+        """Steps noted as done by an earlier, interrupted build.
+
+        Unless the build is durable, only those of this run of the machine: after a power failure
+        nobody knows what reached the disk.
+        """
         path = self.folder / "journal.jsonl"
         if not path.exists():
             return set()
@@ -131,17 +137,29 @@ class Build:
         for line in path.read_text(encoding="utf-8").splitlines():
             # The last line may have been cut by a kill: what does not parse was not done.
             try:
-                done.add(json.loads(line)["done"])
+                step = json.loads(line)
+                if self.durable or step["boot"] == _boot():
+                    done.add(step["done"])
             except (ValueError, KeyError, TypeError):
                 continue
         return done
 
     def note(self, step: str) -> None:
-        """Note a step as done, durably. Call it when all that the step wrote is on disk."""
+        """Note a step as done. Call it when all that the step wrote is in place."""
         with (self.folder / "journal.jsonl").open("a", encoding="utf-8") as file:
-            file.write("\n" + json.dumps({"done": step}) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
+            file.write("\n" + json.dumps({"done": step, "boot": _boot()}) + "\n")
+            if self.durable:
+                file.flush()
+                os.fsync(file.fileno())
+
+
+@cache
+def _boot() -> str:
+    """Name of this run of the machine; of this process where the system gives none."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except OSError:
+        return f"process {os.getpid()}"
 
 
 def artefact_key(stage: str, format: int, config: dict[str, Any], inputs: dict[str, str]) -> str:
@@ -157,20 +175,34 @@ def up_to_date(run: Path, stage: str, key: str) -> Manifest | None:
 
 @contextmanager
 def build(
-    run: Path, stage: str, format: int, config: dict[str, Any], inputs: dict[str, str]
+    run: Path,
+    stage: str,
+    format: int,
+    config: dict[str, Any],
+    inputs: dict[str, str],
+    *,
+    durable: bool = False,
 ) -> Iterator[Build]:
     """Build an artefact aside and put it in place when the block ends without an exception.
 
     When the block raises (or the process is killed) the unfinished folder stays, and the next
     build with the same key resumes in it. An artefact of the same stage with another key is
     replaced only once the new one is complete; unfinished builds of the stage are then removed.
+
+    Parameters
+    ----------
+    durable : bool
+        What is noted as done has been flushed to the disk (arrays created ``durable``), and is
+        trusted even after a power failure.
     """
     key = artefact_key(stage, format, config, inputs)
     folder = run / ".partial" / f"{stage}-{key[:_KEY_IN_NAME]}"
     resumed = folder.is_dir()
     folder.mkdir(parents=True, exist_ok=True)
-    made = Build(folder, key, resumed)
+    made = Build(folder, key, resumed, durable=durable)
     yield made
+    # What is called complete must be on the disk, not on its way to it.
+    os.sync()
     manifest = Manifest(stage, format, key, config, inputs, summary=made.summary)
     write_json(folder / MANIFEST, asdict(manifest))
     final = run / stage

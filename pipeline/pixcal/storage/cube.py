@@ -43,6 +43,7 @@ def create_array(
     chunks: Sequence[int] = CHUNK,
     fill_value: Any = 0,
     attrs: dict[str, Any] | None = None,
+    durable: bool = False,
 ) -> "ArrayWriter":
     """Create an array to be written chunk by chunk, or reopen one that was left unfinished.
 
@@ -56,6 +57,9 @@ def create_array(
         Of fixed size; stored little-endian.
     fill_value : scalar
         Value outside the array in edge chunks, and CF ``_FillValue`` where ``attrs`` says so.
+    durable : bool
+        Flush every chunk to the disk as it is written, so that work of hours also outlives a power
+        failure half-way. Otherwise the artefact is flushed once, when it is complete.
     """
     shape, chunks = tuple(map(int, shape)), tuple(map(int, chunks))
     dtype = np.dtype(dtype).newbyteorder("<")
@@ -77,7 +81,7 @@ def create_array(
             attributes=attrs or {},
             overwrite=True,
         )
-    return ArrayWriter(path, shape, chunks, dtype, fill_value)
+    return ArrayWriter(path, shape, chunks, dtype, fill_value, durable)
 
 
 def create_group(path: Path, attrs: dict[str, Any] | None = None) -> None:
@@ -121,11 +125,12 @@ class ArrayWriter:
     chunks: tuple[int, ...]
     dtype: np.dtype[Any]
     fill_value: Any
+    durable: bool = False
 
     def write(self, start: Sequence[int], data: NDArray[Any]) -> None:
         """Write a block that begins and ends on chunk borders (or at the array's end).
 
-        Each chunk is written aside, flushed to the disk and renamed: one that exists is whole.
+        Each chunk is written aside and renamed: one that exists is whole.
         Blocks that share no chunk may be written at the same time.
         """
         codec = Blosc("lz4", 1, Blosc.BITSHUFFLE)
@@ -155,8 +160,9 @@ class ArrayWriter:
             files.append(file)
         # Flushed once all are written: the disk works meanwhile (twice as fast as one by one).
         for file in files:
-            with _aside(file).open("rb") as written:
-                os.fdatasync(written.fileno())
+            if self.durable:
+                with _aside(file).open("rb") as written:
+                    os.fdatasync(written.fileno())
             _aside(file).replace(file)
 
     def finish(self) -> None:
@@ -187,8 +193,9 @@ class ArrayWriter:
         with aside.open("wb") as out:
             out.write(body.getvalue())
             out.write(_seal(self.path, body.getvalue()))
-            out.flush()
-            os.fsync(out.fileno())
+            if self.durable:
+                out.flush()
+                os.fsync(out.fileno())
         aside.replace(self.path / INDEX)
 
 
