@@ -458,8 +458,8 @@ def solve_pixels(sums: F64) -> tuple[F64, F64, F64]:
 
     Parameters
     ----------
-    sums : (N_SUMS, ...) float64
-        From `sweep_block`.
+    sums : (10 or more, ...) float64
+        Normal sums 00, 01, 02, 11, 12, 22; right-hand sums 0 to 2; weighted square.
 
     Returns
     -------
@@ -470,23 +470,30 @@ def solve_pixels(sums: F64) -> tuple[F64, F64, F64]:
     chi2 : (...) float64
         Weighted square of the residual that remains.
     """
-    a, b, c, d, e, f = sums[:6]
-    r0, r1, r2 = sums[6:9]
-    i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
-    i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
-    det = a * i00 + b * i01 + c * i02
-    with np.errstate(divide="ignore", invalid="ignore"):
+    shape = sums.shape[1:]
+    flat = np.ascontiguousarray(sums, float).reshape(len(sums), -1)
+    step, covariance = np.empty((3, flat.shape[1])), np.empty((6, flat.shape[1]))
+    chi2 = np.empty(flat.shape[1])
+    _solve(flat, step, covariance, chi2)
+    return step.reshape(3, *shape), covariance.reshape(6, *shape), chi2.reshape(shape)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def _solve(sums: F64, step: F64, covariance: F64, chi2: F64) -> None:
+    for p in range(sums.shape[1]):
+        a, b, c = sums[0, p], sums[1, p], sums[2, p]
+        d, e, f = sums[3, p], sums[4, p], sums[5, p]
+        r0, r1, r2 = sums[6, p], sums[7, p], sums[8, p]
+        i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
+        i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
+        det = a * i00 + b * i01 + c * i02
         # Without three different phases the matrix is singular up to rounding.
-        good = (det > 1e-9 * a * d * f) & np.isfinite(det)
-        inverse = np.where(good, 1 / det, np.nan)
-    covariance = np.stack([i00, i01, i02, i11, i12, i22]) * inverse
-    v = covariance
-    step = np.stack(
-        [
-            v[0] * r0 + v[1] * r1 + v[2] * r2,
-            v[1] * r0 + v[3] * r1 + v[4] * r2,
-            v[2] * r0 + v[4] * r1 + v[5] * r2,
-        ]
-    )
-    chi2 = sums[9] - (step[0] * r0 + step[1] * r1 + step[2] * r2)
-    return step, covariance, chi2
+        inverse = 1.0 / det if det > 1e-9 * a * d * f else np.nan
+        covariance[0, p], covariance[1, p] = i00 * inverse, i01 * inverse
+        covariance[2, p], covariance[3, p] = i02 * inverse, i11 * inverse
+        covariance[4, p], covariance[5, p] = i12 * inverse, i22 * inverse
+        s0 = (i00 * r0 + i01 * r1 + i02 * r2) * inverse
+        s1 = (i01 * r0 + i11 * r1 + i12 * r2) * inverse
+        s2 = (i02 * r0 + i12 * r1 + i22 * r2) * inverse
+        step[0, p], step[1, p], step[2, p] = s0, s1, s2
+        chi2[p] = sums[9, p] - (s0 * r0 + s1 * r1 + s2 * r2)
