@@ -1,0 +1,196 @@
+"""Electrons in two bytes a sample: which step, what it costs, and the conversion of raw frames.
+
+``electrons = scale * code + offset``; rounding to a step adds ``scale² / 12`` to a sample's
+variance. It is small where the step is well below the read noise, and photon noise, which grows
+with the level, makes it smaller still.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+
+FILL = 65535
+"""Code of a sample without weight."""
+
+_DIGITS = 7
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Codes 0 to 65534 cover ``offset`` to ``offset + 65534 step`` electrons.
+
+    Attributes
+    ----------
+    step, offset : float
+        In electrons; ``scale_factor`` and ``add_offset`` of CF.
+    """
+
+    step: float
+    offset: float
+
+    @property
+    def variance(self) -> float:
+        """What rounding adds to the variance of a sample (e-²)."""
+        return self.step**2 / 12
+
+
+def choose_scale(low: float, high: float, smallest_variance: float, share: float) -> Scale:
+    """Coarsest step that costs less than a share of the variance, and covers a range.
+
+    Steps are powers of two where one will do, so that integers stay what they were. Where the
+    range needs a coarser step than the noise allows, the range wins.
+
+    Parameters
+    ----------
+    low, high : float
+        Range to cover (e-).
+    smallest_variance : float
+        Of any sample (e-²).
+    share : float
+        Of that variance that rounding may add.
+
+    Returns
+    -------
+    Scale
+        Its offset is a whole number of steps.
+    """
+    span = max(high - low, 1e-6)
+    # Two codes in reserve: the offset is rounded down, the ends are rounded.
+    needed = span / (FILL - 3)
+    allowed = math.sqrt(12 * share * smallest_variance)
+    step = 2.0 ** math.floor(math.log2(allowed)) if allowed > 0 else 0.0
+    if step < needed:
+        unit = 2.0 ** (math.floor(math.log2(needed)) - _DIGITS)
+        step = math.ceil(needed / unit) * unit
+    return Scale(step, math.floor(low / step) * step)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _encode_row(
+    raw: Any, slope: Any, start: Any, dark: Any, exptime: float, saturation: float, codes: Any
+) -> Any:
+    good, total = np.int32(0), np.int32(0)  # 32 bits: of one chunk's row, and faster
+    for i in range(raw.size):
+        sample = np.float32(raw[i])
+        value = sample * slope[i] + (start[i] - dark[i] * exptime) + np.float32(0.5)
+        # Both false for NaN; infinite samples are saturated or below the range.
+        inside = (value >= np.float32(0)) & (value < np.float32(FILL)) & (sample < saturation)
+        code = np.int32(value) if inside else np.int32(FILL)
+        codes[i] = code
+        good += np.int32(inside)
+        total += code if inside else np.int32(0)
+    return good, total
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _count_row(raw: Any, saturation: float, codes: Any, saturated: Any, lost: Any) -> None:
+    for i in range(raw.size):
+        if codes[i] == FILL:
+            if np.float32(raw[i]) >= saturation:
+                saturated[i] += 1
+            else:
+                lost[i] += 1
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def encode(
+    raw: Any,
+    slope: Any,
+    start: Any,
+    dark: Any,
+    exptime: Any,
+    saturation: float,
+    codes: Any,
+    saturated: Any,
+    lost: Any,
+) -> int:
+    """Convert raw frames of a tile to codes: ``raw * slope + start - dark * exptime``, rounded.
+
+    Parameters
+    ----------
+    raw : (t, y, x) any real type
+        Samples in ADU.
+    slope, start, dark : (y, x) float32
+        In codes per ADU, codes, and codes per second, see `coefficients`.
+    exptime : (t,) float32
+        Exposure times (s).
+    saturation : float32
+        Samples at or above this level (ADU) get the fill value.
+    codes : (t, y, x) uint16
+        Result; samples that are saturated, not finite or out of range get `FILL`.
+    saturated, lost : (y, x) uint32
+        Counts to add to: saturated samples; others that got the fill value.
+
+    Returns
+    -------
+    int
+        Sum of the codes of the samples that have weight.
+    """
+    total = 0
+    for y in range(raw.shape[1]):
+        for t in range(raw.shape[0]):
+            good, part = _encode_row(
+                raw[t, y], slope[y], start[y], dark[y], exptime[t], saturation, codes[t, y]
+            )
+            total += part
+            if good < raw.shape[2]:
+                _count_row(raw[t, y], saturation, codes[t, y], saturated[y], lost[y])
+    return total
+
+
+def coefficients(
+    scale: Scale, gain: float, bias: F32, dark_rate: F32, flat: F32
+) -> tuple[F32, F32, F32]:
+    """What `encode` needs, so that the codes mean ``(gain (raw - bias) - dark t) / flat``.
+
+    Parameters
+    ----------
+    scale : Scale
+        Step and offset of the codes.
+    gain : float
+        e-/ADU.
+    bias, dark_rate, flat : (y, x) float32
+        ADU; e-/s; relative response.
+
+    Returns
+    -------
+    slope, start, dark : (y, x) float32
+    """
+    to_codes = 1 / (scale.step * flat.astype(float))
+    slope = gain * to_codes
+    start = -gain * bias * to_codes - scale.offset / scale.step
+    dark = dark_rate * to_codes
+    return slope.astype(np.float32), start.astype(np.float32), dark.astype(np.float32)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _extremes_of_row(raw: Any, saturation: float, lowest: Any, highest: Any) -> None:
+    for i in range(raw.size):
+        sample = np.float32(raw[i])
+        good = sample < saturation
+        lowest[i] = sample if good & (sample < lowest[i]) else lowest[i]
+        highest[i] = sample if good & (sample > highest[i]) else highest[i]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def extremes(raw: Any, saturation: float, lowest: Any, highest: Any) -> None:
+    """Widen the range of each pixel's samples below saturation by those of more frames.
+
+    Parameters
+    ----------
+    raw : (t, y, x) any real type
+        Samples in ADU.
+    saturation : float32
+        Samples at or above do not count, nor does NaN.
+    lowest, highest : (y, x) float32
+        Begin with +inf and -inf.
+    """
+    for y in range(raw.shape[1]):
+        for t in range(raw.shape[0]):
+            _extremes_of_row(raw[t, y], saturation, lowest[y], highest[y])

@@ -1,0 +1,283 @@
+"""Robust combination of many frames of one scene, batch by batch, each sample read once.
+
+The first batch (64 frames or fewer) gives each pixel's median and its noise from the median of the
+absolute deviations; samples further than ``clip`` sigmas are then left out of the running sums.
+What all pixels of a frame have in common (a shift of the bias, the power of a lamp) is taken out
+first, so that it neither widens the limits nor makes a whole frame an outlier, and its mean is put
+back at the end: where no sample is left out, the result is the plain mean.
+
+Bias of the clipping: on Gaussian noise the mean keeps its value, the variance is too small by
+`clipped_variance_factor` (0.1 % at 4 sigma, 1.5e-5 at 5), for which it is corrected. Limits are
+never closer than the usual noise of the tile asks for, since that of one pixel is known from few
+samples only; below 4 sigmas the correction would be too large for that reason. An outlier beyond
+the limit has no weight; one just inside it moves the mean of n frames by ``clip / sqrt(n)`` of the
+mean's own noise.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+BATCH = 64
+"""Frames that are looked at together."""
+
+_LEVEL_PIXELS = 4096
+_ROUNDING = np.float32(1e-6)
+_SIGMA_OF_MAD = 1.482602218505602
+
+
+def clipped_variance_factor(clip: float) -> float:
+    """Variance of Gaussian noise cut at ``±clip`` sigmas, as a share of the uncut variance."""
+    density = math.exp(-0.5 * clip * clip) / math.sqrt(2 * math.pi)
+    return 1 - 2 * clip * density / math.erf(clip / math.sqrt(2))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _exchange(a: Any, b: Any) -> None:
+    for i in range(a.size):
+        low, high = a[i], b[i]
+        a[i] = low if low < high else high
+        b[i] = high if low < high else low
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _sort_columns(rows: Any) -> None:
+    # Batcher's merge exchange (Knuth, TAOCP 3, 5.2.2 M): the same exchanges whatever the data, so
+    # that neighbouring columns are sorted in step, in vector registers.
+    n = rows.shape[0]
+    top = 1
+    while 2 * top < n:
+        top *= 2
+    p = top
+    while p > 0:
+        q, r, d = top, 0, p
+        while True:
+            for i in range(n - d):
+                if i & p == r:
+                    _exchange(rows[i], rows[i + d])
+            if q == p:
+                break
+            d, q, r = q - p, q // 2, p
+        p //= 2
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _median_of_columns(rows: Any, out: Any) -> None:
+    # Sorts the rows; NaN goes to the end and is not counted.
+    for x in range(rows.shape[1]):
+        out[x] = 0
+    for t in range(rows.shape[0]):
+        for x in range(rows.shape[1]):
+            if math.isnan(rows[t, x]):
+                rows[t, x] = np.inf
+            else:
+                out[x] += 1
+    _sort_columns(rows)
+    for x in range(rows.shape[1]):
+        m = int(out[x])
+        out[x] = 0.5 * (rows[(m - 1) // 2, x] + rows[m // 2, x]) if m > 0 else np.nan
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _median_and_deviation(frames: Any, median: Any, deviation: Any) -> None:
+    rows = np.empty((frames.shape[0], frames.shape[2]), np.float32)
+    for y in range(frames.shape[1]):
+        rows[:] = frames[:, y]
+        _median_of_columns(rows, median[y])
+        for t in range(frames.shape[0]):
+            for x in range(frames.shape[2]):
+                rows[t, x] = abs(frames[t, y, x] - median[y, x])
+        _median_of_columns(rows, deviation[y])
+
+
+def median_and_deviation(frames: F32) -> tuple[F32, F32]:
+    """Median of each pixel over the frames, and the median of the absolute deviations from it.
+
+    Parameters
+    ----------
+    frames : (t, y, x) float32
+        NaN where there is no sample.
+
+    Returns
+    -------
+    median, deviation : (y, x) float32
+        NaN where a pixel has no sample at all.
+    """
+    median = np.empty(frames.shape[1:], np.float32)
+    deviation = np.empty_like(median)
+    _median_and_deviation(frames, median, deviation)
+    return median, deviation
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _add_row(
+    samples: Any, offset: float, factor: float, reference: Any, limit: Any, widen: float,
+    seen: Any, count: Any, s1: Any, s2: Any, s3: Any, s4: Any,
+) -> None:  # fmt: skip
+    for i in range(samples.size):
+        d = (samples[i] - offset) * factor - reference[i]
+        seen[i] += np.float64(d == d)
+        kept = abs(d) <= limit[i] * widen
+        z = np.float64(d) if kept else 0.0
+        count[i] += np.float64(kept)
+        zz = z * z
+        s1[i] += z
+        s2[i] += zz
+        s3[i] += zz * z
+        s4[i] += zz * zz
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _add_frames(
+    frames: Any, offsets: Any, factors: Any, reference: Any, limit: Any, sums: Any
+) -> None:
+    for y in range(frames.shape[1]):
+        for t in range(frames.shape[0]):
+            # A dim frame, made as bright as the others, is noisier by up to that factor.
+            widen = max(np.float32(1), factors[t])
+            _add_row(
+                frames[t, y], offsets[t], factors[t], reference[y], limit[y], widen,
+                sums[0, y], sums[1, y], sums[2, y], sums[3, y], sums[4, y], sums[5, y],
+            )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Combined:
+    """What many frames of one scene say of each pixel; all (y, x) float64.
+
+    Attributes
+    ----------
+    mean : ndarray
+        Of the samples within the limits; NaN where there is none.
+    variance : ndarray
+        Of one sample, unbiased, corrected for the clipping; NaN with fewer than two samples.
+    excess_kurtosis : ndarray
+        0 for Gaussian noise, negative for noise with two levels; NaN with fewer than four samples.
+    seen, kept : ndarray
+        Samples that were not NaN, and those of them within the limits.
+    """
+
+    mean: F64
+    variance: F64
+    excess_kurtosis: F64
+    seen: F64
+    kept: F64
+
+
+class Combination:
+    """Streaming robust mean and variance of frames.
+
+    Parameters
+    ----------
+    clip : float
+        Limit in sigmas.
+    lamp : bool
+        What frames have in common is a factor (a lamp's power); else it is an offset.
+    quantum : float
+        Step of the samples, added to the limits, so that noise below it does not close them.
+    """
+
+    def __init__(self, *, clip: float, lamp: bool, quantum: float) -> None:
+        self._clip = clip
+        self._lamp = lamp
+        self._quantum = quantum
+        self._reference: F32 | None = None
+        self._limit = np.zeros((0, 0), np.float32)
+        self._sums = np.zeros((6, 0, 0))
+        self._sigma = 0.0
+        self._levels: list[F32] = []
+
+    def update(self, frames: F32) -> F32:
+        """Add frames; the first call sets the limits, so give it `BATCH` frames or all.
+
+        Parameters
+        ----------
+        frames : (t, y, x) float32
+            NaN where there is no sample.
+
+        Returns
+        -------
+        (t,) float32
+            What each frame has in common with no other: its factor, or its offset, to the first
+            batch; NaN for a frame without samples.
+        """
+        if self._reference is None:
+            self._start(frames)
+        levels = self._common(frames)
+        self._levels.append(levels)
+        zeros, ones = np.zeros_like(levels), np.ones_like(levels)
+        offsets, factors = (zeros, ones / levels) if self._lamp else (levels, ones)
+        _add_frames(frames, offsets, factors, self._reference, self._limit, self._sums)
+        return levels
+
+    def result(self) -> Combined:
+        """Mean, variance and shape of the noise, from all frames added so far."""
+        if self._reference is None:
+            raise ValueError("no frames were added")
+        seen, n, s1, s2, s3, s4 = self._sums
+        with np.errstate(invalid="ignore", divide="ignore"):
+            m1, m2, m3, m4 = (s / n for s in (s1, s2, s3, s4))
+            central2 = m2 - m1**2
+            central4 = m4 - 4 * m1 * m3 + 6 * m1**2 * m2 - 3 * m1**4
+            variance = central2 * n / (n - 1) / clipped_variance_factor(self._clip)
+            kurtosis = central4 / central2**2 - 3
+        mean = self._reference + m1
+        variance = np.where(n > 1, variance, np.nan)
+        kurtosis = np.where((n > 3) & (central2 > 0), kurtosis, np.nan)
+        levels = np.concatenate(self._levels).astype(float)
+        common = float(np.mean(levels[np.isfinite(levels)])) if np.isfinite(levels).any() else 1.0
+        if self._lamp:
+            mean, variance = mean * common, variance * common**2
+        else:
+            mean = mean + common
+        return Combined(mean, variance, kurtosis, seen, n)
+
+    def _start(self, frames: F32) -> None:
+        # Twice: the frames' common part is taken out before the limits are measured for good.
+        self._reference, deviation = median_and_deviation(frames)
+        scale = _SIGMA_OF_MAD * len(frames) / max(len(frames) - 0.8, 0.2)
+        self._sigma = scale * _finite_median(deviation)
+        levels = self._common(frames)[:, None, None]
+        level = frames / levels if self._lamp else frames - levels
+        self._reference, deviation = median_and_deviation(level)
+        sigma = scale * deviation
+        self._sigma = _finite_median(sigma)
+        if len(frames) == 2:
+            # Two samples cannot tell which is wrong, nor their own noise: the tile's noise decides,
+            # and of two that disagree the lower one is right, since particles only add charge.
+            apart = np.ptp(level, axis=0) > self._clip * math.sqrt(2) * self._sigma + self._quantum
+            self._reference = np.where(apart, level.min(axis=0), self._reference)
+            sigma = np.full_like(sigma, self._sigma)
+        sigma = np.maximum(sigma, np.float32(self._sigma))
+        rounding = np.float32(self._quantum) + _ROUNDING * np.abs(self._reference)
+        self._limit = np.float32(self._clip) * sigma + rounding
+        self._sums = np.zeros((6, *frames.shape[1:]))
+
+    def _common(self, frames: F32) -> F32:
+        """Factor or offset of each frame to the reference, from the median of some pixels."""
+        assert self._reference is not None
+        # An odd stride meets all columns, whatever pattern they have.
+        stride = (frames[0].size // _LEVEL_PIXELS) | 1
+        samples = frames.reshape(len(frames), -1)[:, ::stride]
+        reference = self._reference.reshape(-1)[::stride]
+        if not self._lamp:
+            return np.array([_finite_median(s - reference) for s in samples], np.float32)
+        level = _finite_median(reference)
+        if not level > 3 * self._sigma or level <= 0:
+            # Too dark here to see the lamp.
+            return np.ones(len(frames), np.float32)
+        bright = reference >= level
+        ratios = (_finite_median(s[bright] / reference[bright]) for s in samples)
+        return np.array([r if r > 0 else np.nan for r in ratios], np.float32)
+
+
+def _finite_median(values: F32) -> float:
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if finite.size else math.nan

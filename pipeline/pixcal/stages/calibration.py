@@ -1,0 +1,206 @@
+"""The calibration maps of ``RUN/reduce``, made from the statistics of the frames.
+
+First what is usual on the whole detector, then, column of chunks by column, the maps in electrons
+and the flags of the pixels that are not usual.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.bad_pixels import dead, hot, noisy
+from pixcal.estimators.detector import median_and_sigma, usual_variance
+from pixcal.model.flags import PixelFlag
+from pixcal.stages.columns import Index, extent, indices
+from pixcal.stages.frame_statistics import STATISTICS, Limits
+from pixcal.storage.cube import CHUNK, ArrayReader, ArrayWriter, create_array, create_group
+
+F64 = NDArray[np.float64]
+
+_SAMPLES = 1 << 20
+_FLAT_FLOOR = 0.05
+
+FLAG_ATTRS = {
+    "long_name": "why a pixel is not to be used",
+    "flag_masks": [int(flag) for flag in PixelFlag],
+    "flag_meanings": " ".join(str(flag.name).lower() for flag in PixelFlag),
+}
+"""Attributes of a mask, as CF has them."""
+
+_MAPS: dict[str, tuple[Any, dict[str, Any]]] = {
+    "bias": (np.float32, {"units": "adu", "long_name": "signal at exposure zero"}),
+    "dark_rate": (np.float32, {"units": "electron s-1", "long_name": "dark signal"}),
+    "flat": (np.float32, {"units": "1", "long_name": "response over the median response"}),
+    "read_noise": (np.float32, {"units": "electron", "long_name": "read noise, rms"}),
+    "mask": (np.uint8, FLAG_ATTRS),
+}
+
+
+@dataclass(frozen=True)
+class Usual:
+    """What is usual on the detector.
+
+    Attributes
+    ----------
+    response : float
+        Median response of the flats (ADU/s); NaN without flats.
+    dark_rate, dark_rate_sigma : float
+        Median and robust spread of the dark signal (ADU/s).
+    dark_variance : float
+        Variance of a sample without light and without dark signal (ADU²).
+    bias : float
+        Median (ADU).
+    """
+
+    response: float
+    dark_rate: float
+    dark_rate_sigma: float
+    dark_variance: float
+    bias: float
+
+
+def usual(folder: Path, shape: tuple[int, int], gain: float) -> Usual:
+    """Medians of the maps that `measure` wrote, over at most a million pixels on a regular grid.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the maps are.
+    shape : (int, int)
+        Of the detector's window (y, x).
+    gain : float
+        Rough guess (e-/ADU).
+    """
+    reader = ArrayReader(folder / "maps")
+    stride = int(np.ceil(np.sqrt(shape[0] * shape[1] / _SAMPLES)))
+    names = ("response", "dark_rate", "dark_variance", "dark_charge", "dark_dof", "bias")
+    wanted = [STATISTICS.index(name) for name in names]
+    parts = []
+    for index in indices(shape):
+        (y0, y1), (x0, x1) = extent(shape, index)
+        block = reader.read((0, len(STATISTICS)), (y0, y1), (x0, x1))
+        on_grid = block[wanted, -y0 % stride :: stride, -x0 % stride :: stride]
+        parts.append(on_grid.reshape(len(wanted), -1))
+    response, rate, variance, charge, dof, bias = np.concatenate(parts, axis=1)
+    return Usual(
+        median_and_sigma(response[response > 0])[0],
+        *median_and_sigma(rate),
+        usual_variance((variance - charge / gain)[dof > 0], int(np.median(dof))),
+        median_and_sigma(bias)[0],
+    )
+
+
+@dataclass(frozen=True)
+class Finishing:
+    """What the second task of a column needs.
+
+    Attributes
+    ----------
+    statistics : Path
+        What `measure` wrote.
+    shape : (int, int)
+        Of the detector's window (y, x).
+    usual : Usual
+        What is usual on the detector.
+    gain : float
+        To use (e-/ADU).
+    read_noise : float
+        Of the detector (e-).
+    each_pixel : bool
+        Whether to use that of each pixel, where it is known.
+    floor : float
+        Least read noise of a pixel (e-): the rounding of the converter.
+    has_rate, has_flat : bool
+        Whether dark signal and response were measured.
+    limits : Limits
+        Of the flags.
+    writers : dict
+        Arrays for the maps.
+    """
+
+    statistics: Path
+    shape: tuple[int, int]
+    usual: Usual
+    gain: float
+    read_noise: float
+    each_pixel: bool
+    floor: float
+    has_rate: bool
+    has_flat: bool
+    limits: Limits
+    writers: Mapping[str, ArrayWriter]
+
+
+def calibration_writers(folder: Path, shape: tuple[int, int]) -> dict[str, ArrayWriter]:
+    """Make the arrays of ``calibration.zarr``."""
+    create_group(folder, {"Conventions": "CF-1.11", "title": "calibration of the detector"})
+    return {
+        name: create_array(folder / name, shape, dtype, dims=("y", "x"), chunks=CHUNK[1:], attrs=a)
+        for name, (dtype, a) in _MAPS.items()
+    }
+
+
+def finish(job: Finishing, index: Index) -> F64:
+    """Write the calibration maps of a column.
+
+    Returns
+    -------
+    (4,) float64
+        Over the good pixels: least and largest flat, largest bias (ADU) and dark signal (e-/s);
+        infinite of the other sign when there is none.
+    """
+    (y0, y1), (x0, x1) = extent(job.shape, index)
+    block = ArrayReader(job.statistics / "maps").read((0, len(STATISTICS)), (y0, y1), (x0, x1))
+    found = dict(zip(STATISTICS, block.astype(float), strict=True))
+    flat = np.ones_like(found["bias"])
+    error = np.zeros_like(flat)
+    if job.has_flat:
+        flat, error = (found[n] / job.usual.response for n in ("response", "response_error"))
+    mask = _flags(job, found, flat, error)
+    read = np.full_like(flat, job.read_noise)
+    if job.each_pixel:
+        of_pixel = job.gain * np.sqrt(np.maximum(found["read_variance"], 0))
+        read = np.where(np.isfinite(of_pixel), np.maximum(of_pixel, job.floor), read)
+    good = mask == 0
+    maps = {
+        "bias": np.nan_to_num(found["bias"]),
+        "dark_rate": job.gain * np.nan_to_num(found["dark_rate"]),
+        "flat": np.where(np.isfinite(flat), np.maximum(flat, _FLAT_FLOOR), 1.0),
+        "read_noise": read,
+        "mask": mask,
+    }
+    for name, data in maps.items():
+        job.writers[name].write((y0, x0), data.astype(job.writers[name].dtype))
+    if not good.any():
+        return np.array([np.inf, -np.inf, -np.inf, -np.inf])
+    bias, rate, flat = (maps[name][good] for name in ("bias", "dark_rate", "flat"))
+    return np.array([flat.min(), flat.max(), bias.max(), rate.max()])
+
+
+def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> NDArray[np.uint8]:
+    mask = found["flags"].astype(np.uint8)
+    limits, medians = job.limits, job.usual
+    if job.has_flat:
+        mask[~np.isfinite(flat)] |= np.uint8(PixelFlag.NO_DATA)
+        where = dead(flat, error, limits.dead, limits.bright, _FLAT_FLOOR)
+        mask[where] |= np.uint8(PixelFlag.DEAD)
+    if job.has_rate:
+        rate_error = found["dark_rate_error"] * np.sqrt(medians.dark_variance)
+        level, sigma = medians.dark_rate, medians.dark_rate_sigma
+        where = hot(found["dark_rate"], rate_error, level, sigma, limits.hot)
+        mask[where] |= np.uint8(PixelFlag.HOT)
+    if np.isfinite(medians.dark_variance):
+        where = noisy(
+            found["dark_variance"],
+            found["dark_dof"],
+            medians.dark_variance + found["dark_charge"] / job.gain,
+            found["kurtosis"],
+            found["outliers"],
+            limits.noisy,
+        )
+        mask[where] |= np.uint8(PixelFlag.NOISY)
+    return mask

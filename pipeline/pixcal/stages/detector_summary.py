@@ -1,0 +1,189 @@
+"""The detector as a whole: read noise, gain and linearity, from the statistics of all columns."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.detector import Linearity, linearity
+from pixcal.kernels.photon_transfer import GainFit, fit_gain
+from pixcal.model.acquisition import Detector
+from pixcal.model.errors import InputError
+from pixcal.stages.calibration import Usual, usual
+from pixcal.stages.columns import grid
+from pixcal.stages.frame_statistics import Measuring
+from pixcal.storage.cube import ArrayReader
+
+F64 = NDArray[np.float64]
+
+ROUNDING_ADU = 1 / math.sqrt(12)
+"""Noise of a converter that rounds to whole ADU."""
+
+_LINEAR_SHARE = 0.7
+_SATURATED_RUNG = 1e-2
+_GAIN_ERROR = 0.2
+_GUESS_ERROR = 0.1
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What the calibration frames say of the detector as a whole; None where they do not.
+
+    Attributes
+    ----------
+    declared : Detector
+        What its owner says.
+    usual : Usual
+        Medians of the maps.
+    read_noise : (float, float) or None
+        From differences of successive frames, and its error (ADU).
+    gain : GainFit or None
+        By photon transfer.
+    levels : (rung,) float64
+        Of the ladder of flats (ADU above bias and dark).
+    usable : (rung,) bool
+        Rungs without saturation.
+    linearity : Linearity or None
+        Of the usable rungs.
+    """
+
+    declared: Detector
+    usual: Usual
+    read_noise: tuple[float, float] | None
+    gain: GainFit | None
+    levels: F64
+    usable: NDArray[np.bool_]
+    linearity: Linearity | None
+
+    def gain_to_use(self, choice: str) -> float:
+        """Gain (e-/ADU), ``declared`` or ``measured``.
+
+        Raises
+        ------
+        InputError
+            If it is to be the measured one and there is none.
+        """
+        if choice == "declared":
+            return self.declared.gain_e_per_adu
+        if self.gain is None:
+            raise InputError(
+                "gain: 'measured', but the flats show no photon noise above the read noise, or "
+                "there are neither bias nor dark frames; use gain: declared"
+            )
+        return self.gain.gain
+
+    def read_noise_e(self, gain: float) -> float:
+        """Read noise (e-): measured, else declared; never below the converter's rounding."""
+        noise = self.declared.read_noise_e
+        if self.read_noise is not None:
+            noise = gain * self.read_noise[0]
+        return max(noise, gain * ROUNDING_ADU)
+
+    def warnings(self, gain: float) -> list[str]:
+        """Sentences on what was declared otherwise than it was measured."""
+        found = []
+        declared = self.declared.gain_e_per_adu
+        if self.gain is not None:
+            value, error = self.gain.gain, self.gain.error
+            if abs(value - declared) > max(3 * error, 0.02 * declared):
+                found.append(
+                    f"photon transfer gives a gain of {value:.4g} ± {error:.2g} e-/ADU, declared "
+                    f"are {declared:g}: {gain:.4g} is used"
+                )
+        noise = self.declared.read_noise_e
+        if self.read_noise is not None:
+            value, error = (gain * v for v in self.read_noise)
+            if abs(value - noise) > max(3 * error, 0.1 * noise, gain * ROUNDING_ADU):
+                found.append(
+                    f"the read noise measured is {value:.4g} ± {error:.2g} e-, declared are "
+                    f"{noise:g}: the measured one is used"
+                )
+        return found
+
+
+def summarise(job: Measuring, folder: Path, declared: Detector) -> Summary:
+    """Put the statistics of all columns together.
+
+    Parameters
+    ----------
+    job : Measuring
+        What they were measured with.
+    folder : Path
+        Where they are.
+    declared : Detector
+        What its owner says.
+    """
+    medians = usual(folder, job.shape, job.gain)
+    tables = ArrayReader(folder / "pairs")
+    sums = np.zeros(tables.shape[2:])
+    # Added up in the order of the columns: the same sums whoever measured them.
+    for i, j in np.ndindex(grid(job.shape)):
+        sums += tables.read((i, i + 1), (j, j + 1))[0, 0]
+    levels, usable = _rungs(ArrayReader(folder / "levels").read(), job)
+    straight = None
+    if job.flats_timed and job.flat:
+        straight = linearity(np.array([group.exptime for group in job.flat]), levels, usable)
+    read_variance = _read_variance(sums[0])
+    read_noise = None
+    if read_variance is not None:
+        noise = math.sqrt(read_variance[0])
+        read_noise = (noise, read_variance[1] / (2 * noise) if noise else 0.0)
+    gain = _gain(sums[1], read_variance, medians, job)
+    return Summary(declared, medians, read_noise, gain, levels, usable, straight)
+
+
+def _read_variance(sums: F64) -> tuple[float, float] | None:
+    """Variance of a sample without light and its error (ADU²)."""
+    dof, _, square = sums.sum(axis=0)
+    return (square / dof, square / dof * math.sqrt(2 / dof)) if dof > 0 else None
+
+
+def _gain(
+    sums: F64, read_variance: tuple[float, float] | None, medians: Usual, job: Measuring
+) -> GainFit | None:
+    """Photon transfer; None where the level above bias is unknown, or the error is too large."""
+    if not (job.dark and job.flat):
+        return None
+    guess = job.read_noise**2
+    variance, error = read_variance or (guess, 2 * _GUESS_ERROR * guess)
+    top = _LINEAR_SHARE * (job.saturation - medians.bias)
+    fitted = fit_gain(sums, variance, error, top)
+    return fitted if fitted is not None and fitted.error < _GAIN_ERROR * fitted.gain else None
+
+
+def _rungs(tables: F64, job: Measuring) -> tuple[F64, NDArray[np.bool_]]:
+    """Level of each rung (ADU) over the columns that have one on all rungs, and which to use."""
+    if not job.flat:
+        return np.zeros(0), np.zeros(0, np.bool_)
+    level, pixels, lost = (tables.reshape(-1, len(job.flat), 3)[..., n] for n in range(3))
+    frames = np.array([len(group.frames) for group in job.flat])
+    usable = np.less_equal(lost.sum(axis=0), _SATURATED_RUNG * frames * pixels.sum(axis=0))
+    common = np.isfinite(level[:, usable]).all(axis=1, keepdims=True)
+    weight = np.where(common & np.isfinite(level), pixels, 0.0)
+    total = (weight * np.nan_to_num(level)).sum(axis=0)
+    seen = weight.sum(axis=0)
+    return np.divide(total, seen, out=np.zeros_like(total), where=seen > 0), usable
+
+
+def linearity_report(summary: Summary, job: Measuring, gain: float) -> dict[str, Any] | None:
+    """What ``reduce.json`` says of the ladder of flats; None when there is none."""
+    if summary.linearity is None:
+        return None
+    rows = zip(job.flat, summary.levels, summary.linearity.deviation, strict=True)
+    return {
+        "max_deviation_percent": 100 * summary.linearity.max_deviation,
+        "intercept_adu": summary.linearity.intercept,
+        "levels": [
+            {
+                "exptime_s": group.exptime,
+                "frames": len(group.frames),
+                "level_adu": float(level),
+                "level_e": float(gain * level),
+                "deviation_percent": 100 * float(off) if math.isfinite(off) else None,
+            }
+            for group, level, off in rows
+        ],
+    }

@@ -1,0 +1,166 @@
+"""Which frames were exposed how long, and what to do where the headers do not say."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_SAME = 1e-3
+"""Exposure times are the same within this relative distance: cameras write what they measured."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """Frames of one array and one exposure time.
+
+    Attributes
+    ----------
+    array : str
+        Name of the array.
+    exptime : float
+        Median exposure time (s).
+    frames : tuple of int
+        Their numbers in the array.
+    """
+
+    array: str
+    exptime: float
+    frames: tuple[int, ...]
+
+
+@dataclass
+class Exposures:
+    """Groups of the calibration frames and exposure times of the fringe frames.
+
+    Attributes
+    ----------
+    dark : list of Group
+        Frames without light, bias among them.
+    flat : list of Group
+        Sorted by exposure time.
+    known : bool
+        Whether the exposure times of the flats are known; else there is one group, at one second.
+    fringes : dict
+        Exposure times (s) of the frames of each set, float32, zero where dark is not to be scaled.
+    warnings : list of str
+        Sentences.
+    """
+
+    dark: list[Group] = field(default_factory=list)
+    flat: list[Group] = field(default_factory=list)
+    known: bool = True
+    fringes: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def has_rate(self) -> bool:
+        """Whether the dark signal per second can be told from the bias."""
+        return len({group.exptime for group in self.dark}) > 1
+
+    @property
+    def read_series(self) -> Group | None:
+        """Frames whose noise is the read noise: bias, else the longest series of darks.
+
+        None when it has a single frame.
+        """
+        series = [group for group in self.dark if group.array == "bias"] or self.dark
+        longest = max(series, key=lambda group: len(group.frames), default=None)
+        return longest if longest is not None and len(longest.frames) > 1 else None
+
+
+def group_exposures(tables: Mapping[str, Mapping[str, Sequence[Any]]]) -> Exposures:
+    """Group frames by exposure time.
+
+    Parameters
+    ----------
+    tables : mapping
+        Contents of ``RUN/ingest/frames.json``.
+    """
+    times = {name: list(table["exptime_s"]) for name, table in tables.items()}
+    lit = [name for name in times if name not in ("bias", "dark")]
+    exposed = [t for name in ["dark", *lit] for t in times.get(name, [])]
+    found = Exposures()
+    if "dark" in times and all(t is None for t in exposed):
+        # The exposure is the unit of time, the same for all but the bias frames.
+        times |= {name: [1.0] * len(times[name]) for name in ["dark", *lit]}
+        unit = ", and dark_rate is in electrons an exposure" if "bias" in times else ""
+        found.warnings.append(
+            f"no frame has EXPTIME: darks are taken to be exposed as long as the others{unit}"
+        )
+    _group_darks(found, times)
+    _group_flats(found, times.get("flat", []))
+    for name in lit:
+        if name != "flat":
+            _time_fringes(found, name, times[name])
+    return found
+
+
+def _groups(array: str, times: Sequence[float | None]) -> list[Group]:
+    """Frames with a known time, in groups of the same, sorted by time."""
+    order = sorted((t, n) for n, t in enumerate(times) if t is not None)
+    groups: list[list[tuple[float, int]]] = []
+    for t, n in order:
+        if groups and t <= groups[-1][-1][0] * (1 + _SAME):
+            groups[-1].append((t, n))
+        else:
+            groups.append([(t, n)])
+    return [Group(array, float(g[len(g) // 2][0]), tuple(sorted(n for _, n in g))) for g in groups]
+
+
+def _group_darks(found: Exposures, times: Mapping[str, list[float | None]]) -> None:
+    bias, dark = times.get("bias", []), times.get("dark", [])
+    found.dark += _groups("bias", [t or 0.0 for t in bias])
+    found.dark += _groups("dark", dark)
+    unknown = sum(t is None for t in dark)
+    if unknown:
+        found.warnings.append(f"{unknown} of {len(dark)} dark frames have no EXPTIME: not used")
+    if not found.dark:
+        found.warnings.append(
+            "no bias and no dark frames: bias and dark signal are taken as zero, the gain is not "
+            "measured, and signals hold the bias"
+        )
+    elif not bias and not found.has_rate:
+        found.warnings.append(
+            "no bias frames, and darks of one exposure time only: their mean stands for bias and "
+            "dark signal together, which is right for frames exposed as long as the darks"
+        )
+    elif not found.has_rate and dark:
+        found.warnings.append(
+            "darks are exposed as long as bias frames: the dark signal is part of the bias"
+        )
+
+
+def _group_flats(found: Exposures, times: list[float | None]) -> None:
+    if not times:
+        found.warnings.append("no flat frames: the flat is 1, the gain is not measured")
+        return
+    usable = [t if t else None for t in times]
+    found.flat = _groups("flat", usable)
+    unknown = sum(t is None for t in usable)
+    if not found.flat:
+        found.known = False
+        found.flat = [Group("flat", 1.0, tuple(range(len(times))))]
+        if found.has_rate:
+            found.warnings.append("flat frames have no EXPTIME: their dark signal is not removed")
+    elif unknown:
+        found.warnings.append(f"{unknown} of {len(times)} flat frames have no EXPTIME: not used")
+
+
+def _time_fringes(found: Exposures, name: str, times: list[float | None]) -> None:
+    unknown = sum(t is None for t in times)
+    found.fringes[name] = np.array([t or 0.0 for t in times], np.float32)
+    if found.has_rate and unknown:
+        found.warnings.append(
+            f"{name}: {unknown} of {len(times)} frames have no EXPTIME, their dark signal is taken "
+            "as zero"
+        )
+    if len(found.dark) == 1 and found.dark[0].array == "dark":
+        expected = found.dark[0].exptime
+        other = sum(t is not None and abs(t - expected) > _SAME * expected for t in times)
+        if other:
+            found.warnings.append(
+                f"{name}: {other} of {len(times)} frames are not exposed {expected:g} s as the "
+                "darks that stand for their bias and dark signal"
+            )

@@ -1,0 +1,199 @@
+"""Write the datasets of the fringe sets: range, precision, conversion, and what there is to say."""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.kernels.quantise import Scale, choose_scale
+from pixcal.stages.columns import indices, run_noted
+from pixcal.stages.electrons import (
+    Converting,
+    FringeSet,
+    convert,
+    set_writers,
+    signal_range,
+    write_coordinates,
+)
+from pixcal.stages.ingested import Ingested
+from pixcal.storage.artefact import Build
+from pixcal.storage.cube import ArrayReader
+
+F64 = NDArray[np.float64]
+
+_CONVERTERS = (8, 10, 12, 14)
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Extremes over the good pixels.
+
+    Attributes
+    ----------
+    flat : (float, float)
+        Least and largest relative response.
+    bias, dark_rate : float
+        Largest (ADU; e-/s).
+    read_noise : float
+        Usual (e-).
+    """
+
+    flat: tuple[float, float]
+    bias: float
+    dark_rate: float
+    read_noise: float
+
+    @property
+    def smallest_variance(self) -> float:
+        """Of a sample of the detector (e-²): its read noise where the response is largest."""
+        return (self.read_noise / self.flat[1]) ** 2
+
+
+def write_set(
+    made: Build,
+    source: Ingested,
+    name: str,
+    *,
+    gain: float,
+    bounds: Bounds,
+    share: float,
+    runtime: Runtime,
+) -> dict[str, Any]:
+    """Write the dataset of a fringe set.
+
+    Parameters
+    ----------
+    made : Build
+        With ``calibration.zarr``, and ``scratch.zarr`` for the counts.
+    source : Ingested
+        With the raw frames.
+    name : str
+        Of the array, ``fringes/<set>``.
+    gain : float
+        To use (e-/ADU).
+    bounds : Bounds
+        Extremes of the calibration.
+    share : float
+        Of the variance that the stored precision may cost.
+    runtime : Runtime
+        How to run.
+
+    Returns
+    -------
+    dict
+        What ``reduce.json`` says of the set.
+    """
+    fringes = FringeSet(
+        name=name.partition("/")[2],
+        raw=source.raw / name,
+        calibration=made.folder / "calibration.zarr",
+        exptime=source.exposures.fringes[name],
+        saturation=source.saturation(name),
+        gain=gain,
+    )
+    todo = indices(source.shape)
+    low, high = _possible_range(source, name, gain, bounds)
+    origin = "saturation"
+    scale = None
+    if math.isfinite(high - low):
+        scale = choose_scale(low, high, bounds.smallest_variance, share)
+    if scale is None or scale.variance > share * bounds.smallest_variance:
+        # Worth a look at the frames: they need not fill the range that the converter has.
+        origin = "frames"
+        ends = run_tasks(partial(signal_range, fringes), todo, runtime, label=f"{name} range")
+        low, high = min(e[0] for e in ends), max(e[1] for e in ends)
+        low, high = (low, high) if low <= high else (0.0, 1.0)
+        scale = choose_scale(low, high, bounds.smallest_variance, share)
+    folder = made.folder / "reduced.zarr" / fringes.name
+    scratch = made.folder / "scratch.zarr" / "counts" / fringes.name
+    job = Converting(
+        fringes, scale, set_writers(folder, scratch, fringes.frames, source.shape, scale)
+    )
+    run_noted(made, partial(convert, job), todo, runtime, name)
+    for writer in job.writers.values():
+        writer.finish()
+    write_coordinates(folder, source.tables[name]["time_s"], source.shape)
+    return {
+        "frames": fringes.frames,
+        **_describe_counts(ArrayReader(scratch).read(), scale),
+        "quantisation": _describe_scale(scale, (low, high), origin, bounds),
+    }
+
+
+def _possible_range(
+    source: Ingested, name: str, gain: float, bounds: Bounds
+) -> tuple[float, float]:
+    """Electrons that a good pixel can have, from nothing on the converter to its end."""
+    # Types with a sign are not filled below zero by a converter, only by noise about a bias.
+    lowest = max(source.lowest(name), -32 * max(bounds.read_noise / gain, 1.0))
+    flat = bounds.flat[0]
+    dark = bounds.dark_rate * float(source.exposures.fringes[name].max())
+    low = gain * (lowest - max(bounds.bias, 0.0)) - max(dark, 0.0)
+    return low / flat, gain * source.saturation(name) / flat
+
+
+def _describe_counts(counts: NDArray[np.int64], scale: Scale) -> dict[str, Any]:
+    saturated, lost, weighted, total = (int(counts[..., n].sum()) for n in range(4))
+    return {
+        "samples": saturated + lost + weighted,
+        "saturated_samples": saturated,
+        "lost_samples": lost,
+        "mean_e": total / weighted * scale.step + scale.offset if weighted else None,
+        "largest_adu": int(counts[..., 4].max()),
+    }
+
+
+def _describe_scale(
+    scale: Scale, span: tuple[float, float], origin: str, bounds: Bounds
+) -> dict[str, Any]:
+    return {
+        "step_e": scale.step,
+        "offset_e": scale.offset,
+        "range_e": list(span),
+        "range_from": origin,
+        "share_of_variance_dark": scale.variance / bounds.smallest_variance,
+    }
+
+
+def share_at_mean(found: dict[str, Any], bounds: Bounds) -> float | None:
+    """Share of the variance that rounding adds at the mean signal of a set."""
+    if found["mean_e"] is None:
+        return None
+    variance = max(found["mean_e"], 0.0) + bounds.read_noise**2
+    return float(found["quantisation"]["step_e"] ** 2 / 12 / variance)
+
+
+def set_warnings(name: str, found: dict[str, Any], declared: bool, share: float) -> list[str]:
+    """Sentences on what is odd about a set.
+
+    Parameters
+    ----------
+    name : str
+        Of the set.
+    found : dict
+        As `write_set` returns it.
+    declared : bool
+        Whether the saturation level is.
+    share : float
+        Of the variance that the stored precision may cost.
+    """
+    warnings = []
+    cost = found["quantisation"]["share_of_variance_dark"]
+    if cost > share:
+        warnings.append(
+            f"{name}: steps of {found['quantisation']['step_e']:.3g} e-, which the range of the "
+            f"signal needs, add {100 * cost:.2g} % to the variance of a sample without light"
+        )
+    largest = found["largest_adu"]
+    if not declared and any(largest == 2**bits - 1 for bits in _CONVERTERS):
+        warnings.append(
+            f"{name}: the largest sample is {largest}, the end of a converter; if it saturates "
+            "there, declare detector.saturation_adu"
+        )
+    if found["mean_e"] is None:
+        warnings.append(f"{name}: no sample has weight: all are saturated or missing")
+    return warnings

@@ -1,0 +1,280 @@
+"""Reduce: from raw frames to electrons, with what is needed to weight every sample.
+
+Reads ``RUN/ingest`` only: when bias or flat frames change, no FITS file is read again.
+"""
+
+import math
+import shutil
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixcal.engine.plan import make_plan
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.model.config import quantity, to_plain
+from pixcal.model.errors import InputError
+from pixcal.model.flags import PixelFlag
+from pixcal.stages.calibration import Finishing, calibration_writers, finish
+from pixcal.stages.columns import extent, indices, run_noted
+from pixcal.stages.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
+from pixcal.stages.electrons import CONVERT_BYTES
+from pixcal.stages.frame_statistics import (
+    Limits,
+    Measuring,
+    measure,
+    measure_bytes,
+    statistics_writers,
+)
+from pixcal.stages.fringe_sets import Bounds, set_warnings, share_at_mean, write_set
+from pixcal.stages.ingested import Ingested
+from pixcal.storage.artefact import (
+    Build,
+    Manifest,
+    artefact_key,
+    build,
+    lock,
+    read_manifest,
+    require,
+    up_to_date,
+    write_json,
+)
+from pixcal.storage.cube import ArrayReader, create_group
+
+STAGE = "reduce"
+FORMAT = 1
+SCHEMA = "pixcal/reduce/1"
+
+_INGEST_FORMAT = 1
+_MIN_READ_FRAMES = 8  # fewer do not tell the noise of each pixel
+_SHARED_BYTES = 64 << 20
+
+
+@dataclass(frozen=True)
+class Config:
+    """How to reduce.
+
+    Attributes
+    ----------
+    gain : str
+        ``declared``: electrons mean what the owner says; ``measured``: by photon transfer.
+    clip_sigma : float
+        Samples of bias, dark and flat frames further from the rest are left out.
+    hot_sigma : float
+        Dark signal above the median by so many robust sigmas of the detector is ``hot``.
+    dead_below, dead_above : float
+        Response over that of the neighbours out of these limits is ``dead``.
+    noisy_factor : float
+        Noise above the usual noise by this factor is ``noisy``.
+    nonlinear_share : float
+        Relative departure from the other pixels over a ladder of flats that is ``nonlinear``.
+    rounding_share : float
+        Share of the variance that the stored precision may cost.
+    """
+
+    gain: str = quantity("declared", choices=("declared", "measured"), doc="which gain to use")
+    clip_sigma: float = quantity(4.0, low=4, high=100, doc="outliers in calibration frames")
+    hot_sigma: float = quantity(10.0, low=5, high=1e6, doc="dark signal of hot pixels")
+    dead_below: float = quantity(0.5, low=0, high=1, doc="response over that of the neighbours")
+    dead_above: float = quantity(2.0, low=1, high=1e6, doc="response over that of the neighbours")
+    noisy_factor: float = quantity(1.5, low=1, high=1e6, doc="noise over the usual noise")
+    nonlinear_share: float = quantity(0.03, above=0, high=1e6, doc="departure over a ladder")
+    rounding_share: float = quantity(1e-3, above=0, high=1, doc="of the variance, for storing")
+
+
+def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
+    """Make ``RUN/reduce`` from ``RUN/ingest``, unless it is up to date.
+
+    Parameters
+    ----------
+    run_dir : Path
+        The run directory.
+    config : Config
+        Options.
+    runtime : Runtime
+        How to run.
+
+    Returns
+    -------
+    Manifest
+        Its ``summary`` holds the gain, the counts of flags and the ``warnings``.
+
+    Raises
+    ------
+    InputError
+        If the frames have not been ingested, or the gain is to be measured and cannot be.
+    """
+    ingest = require(run_dir, "ingest", _INGEST_FORMAT)
+    inputs, plain = {"ingest": ingest.key}, to_plain(config)
+    with lock(run_dir):
+        done = up_to_date(run_dir, STAGE, artefact_key(STAGE, FORMAT, plain, inputs))
+        if done is not None:
+            return done
+        source = Ingested(run_dir / "ingest")
+        if config.gain == "measured" and len(source.tables.get("flat", {}).get("file", ())) < 2:
+            raise InputError(
+                "gain: 'measured' needs two flat frames or more; list them under frames.flat of "
+                "acquisition.yaml, or use gain: declared"
+            )
+        with build(run_dir, STAGE, FORMAT, plain, inputs) as made:
+            _reduce(made, source, config, runtime)
+    manifest = read_manifest(run_dir / STAGE)
+    assert manifest is not None
+    return manifest
+
+
+def _reduce(made: Build, source: Ingested, config: Config, runtime: Runtime) -> None:
+    exposures = source.exposures
+    need = max(measure_bytes(exposures.dark, exposures.flat), CONVERT_BYTES)
+    runtime = runtime.with_workers(make_plan("reduce", need, _SHARED_BYTES, runtime).workers)
+    scratch = made.folder / "scratch.zarr"
+    create_group(scratch)
+    job = _measuring(source, config, scratch / "statistics")
+    run_noted(made, partial(measure, job), indices(source.shape), runtime, "statistics")
+    for writer in job.writers.values():
+        writer.finish()
+    summary = summarise(job, scratch / "statistics", source.detector)
+    gain = summary.gain_to_use(config.gain)
+    bounds = _calibrate(made, source, summary, gain, config, runtime)
+    sets = {}
+    for name in exposures.fringes:
+        sets[name.partition("/")[2]] = write_set(
+            made, source, name,
+            gain=gain, bounds=bounds, share=config.rounding_share, runtime=runtime,
+        )  # fmt: skip
+    _report(made, source, config, job, summary, gain, bounds, sets)
+    shutil.rmtree(scratch)
+
+
+def _measuring(source: Ingested, config: Config, folder: Path) -> Measuring:
+    exposures, detector = source.exposures, source.detector
+    return Measuring(
+        raw=source.raw,
+        shape=source.shape,
+        dark=exposures.dark,
+        flat=exposures.flat,
+        read_series=exposures.read_series,
+        flats_timed=exposures.known,
+        saturation=source.saturation("flat") if exposures.flat else math.inf,
+        quantum=source.quantum,
+        gain=detector.gain_e_per_adu,
+        read_noise=max(detector.read_noise_e / detector.gain_e_per_adu, ROUNDING_ADU),
+        limits=_limits(config),
+        writers=statistics_writers(folder, source.shape, len(exposures.flat)),
+    )
+
+
+def _limits(config: Config) -> Limits:
+    return Limits(
+        clip=config.clip_sigma,
+        hot=config.hot_sigma,
+        dead=config.dead_below,
+        bright=config.dead_above,
+        noisy=config.noisy_factor,
+        nonlinear=config.nonlinear_share,
+    )
+
+
+def _calibrate(
+    made: Build,
+    source: Ingested,
+    summary: Summary,
+    gain: float,
+    config: Config,
+    runtime: Runtime,
+) -> Bounds:
+    """Write ``calibration.zarr``; return its extremes over the good pixels."""
+    series = source.exposures.read_series
+    read_noise = summary.read_noise_e(gain)
+    job = Finishing(
+        statistics=made.folder / "scratch.zarr" / "statistics",
+        shape=source.shape,
+        usual=summary.usual,
+        gain=gain,
+        read_noise=read_noise,
+        each_pixel=series is not None and len(series.frames) >= _MIN_READ_FRAMES,
+        floor=gain * ROUNDING_ADU * source.quantum,
+        has_rate=source.exposures.has_rate,
+        has_flat=bool(source.exposures.flat),
+        limits=_limits(config),
+        writers=calibration_writers(made.folder / "calibration.zarr", source.shape),
+    )
+    todo = indices(source.shape)
+    ends = np.array(run_tasks(partial(finish, job), todo, runtime, label="calibration"))
+    for writer in job.writers.values():
+        writer.finish()
+    least, largest = float(ends[:, 0].min()), ends[:, 1:].max(axis=0)
+    if not math.isfinite(least):
+        return Bounds((1.0, 1.0), 0.0, 0.0, read_noise)
+    return Bounds((least, float(largest[0])), float(largest[1]), float(largest[2]), read_noise)
+
+
+# reduce.json
+
+
+def _report(
+    made: Build,
+    source: Ingested,
+    config: Config,
+    job: Measuring,
+    summary: Summary,
+    gain: float,
+    bounds: Bounds,
+    sets: Mapping[str, dict[str, Any]],
+) -> None:
+    warnings = [*source.exposures.warnings, *summary.warnings(gain)]
+    declared = source.detector.saturation_adu is not None
+    for name, found in sets.items():
+        warnings += set_warnings(name, found, declared, config.rounding_share)
+        found["quantisation"]["share_at_mean"] = share_at_mean(found, bounds)
+        found["flags"] = _count_flags(made.folder / "reduced.zarr" / name / "mask", source.shape)
+    report = {
+        "schema": SCHEMA,
+        **_report_noise(summary, config, gain, bounds),
+        "linearity": linearity_report(summary, job, gain),
+        "flags": _count_flags(made.folder / "calibration.zarr" / "mask", source.shape),
+        "quantisation": {name: found.pop("quantisation") for name, found in sets.items()},
+        "sets": sets,
+        "warnings": warnings,
+    }
+    write_json(made.folder / "reduce.json", report)
+    made.summary.update({key: report[key] for key in ("gain_e_per_adu", "flags", "warnings")})
+
+
+def _report_noise(
+    summary: Summary, config: Config, gain: float, bounds: Bounds
+) -> dict[str, dict[str, Any]]:
+    fitted, noise = summary.gain, summary.read_noise
+    return {
+        "gain_e_per_adu": {
+            "declared": summary.declared.gain_e_per_adu,
+            "measured": fitted.gain if fitted else None,
+            "error": fitted.error if fitted else None,
+            "chi2_reduced": fitted.chi2_reduced if fitted else None,
+            "levels_adu": list(fitted.levels) if fitted else None,
+            "used": gain,
+            "used_from": config.gain,
+        },
+        "read_noise_e": {
+            "declared": summary.declared.read_noise_e,
+            "measured": gain * noise[0] if noise else None,
+            "error": gain * noise[1] if noise else None,
+            "used": bounds.read_noise,
+        },
+    }
+
+
+def _count_flags(mask: Path, shape: tuple[int, int]) -> dict[str, int]:
+    """Pixels with each flag, and without any."""
+    reader = ArrayReader(mask)
+    counts: Counter[str] = Counter()
+    for index in indices(shape):
+        values = reader.read(*extent(shape, index))
+        counts["good"] += int((values == 0).sum())
+        for flag in PixelFlag:
+            counts[str(flag.name).lower()] += int((values & flag > 0).sum())
+    return dict(counts)

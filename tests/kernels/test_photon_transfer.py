@@ -1,0 +1,130 @@
+"""Photon transfer gives back the gain that Poisson light was made with, with an honest error."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pixcal.kernels.photon_transfer import (
+    BLOCK,
+    N_BINS,
+    GainFit,
+    bin_pairs,
+    fit_gain,
+    pair_statistics,
+)
+
+F64 = NDArray[np.float64]
+GAIN, READ_ADU, BIAS = 2.3, 5.0, 500.0
+
+
+def frame(rng: np.random.Generator, electrons: F64) -> NDArray[np.float32]:
+    """A frame in whole ADU, bias subtracted."""
+    charge = rng.poisson(electrons) + rng.normal(0, READ_ADU * GAIN, electrons.shape)
+    return (np.round(charge / GAIN + BIAS) - BIAS).astype(np.float32)
+
+
+def pair(rng: np.random.Generator, electrons: F64) -> F64:
+    first, second = frame(rng, electrons), frame(rng, electrons)
+    return pair_statistics(first, second, gain=1.5, read_noise=3.0, quantum=1.0)
+
+
+def measure(rng: np.random.Generator, scenes: list[F64]) -> GainFit:
+    dof, _, square = bin_pairs(pair(rng, np.zeros_like(scenes[0]))).sum(axis=0)
+    sums = sum(bin_pairs(pair(rng, scene)) for scene in scenes)
+    variance = square / dof
+    fitted = fit_gain(np.asarray(sums), variance, variance * np.sqrt(2 / dof), np.inf)
+    assert fitted is not None
+    return fitted
+
+
+def flats(shape: tuple[int, int], levels: tuple[float, ...]) -> list[F64]:
+    return [np.full(shape, level) for level in levels]
+
+
+def test_the_gain_of_flats_is_right_to_half_a_percent() -> None:
+    fitted = measure(np.random.default_rng(0), flats((701, 513), (2e3, 1e4, 4e4)))
+    assert fitted.error < 0.002 * GAIN
+    assert fitted.gain == pytest.approx(GAIN, abs=min(3 * fitted.error, 0.005 * GAIN))
+
+
+def test_structured_light_does_not_bias_the_gain() -> None:
+    y, x = np.mgrid[:640, :640]
+    scene = 12_000 * (1 + 0.95 * np.sin(2 * np.pi * (x + 0.3 * y) / 9.6))
+    fitted = measure(np.random.default_rng(1), [scene])
+    assert fitted.error < 0.005 * GAIN
+    assert fitted.gain == pytest.approx(GAIN, abs=3 * fitted.error)
+
+
+def test_a_dark_edge_within_blocks_does_not_bias_the_gain() -> None:
+    scene = np.full((512, 512), 2e4)
+    scene.reshape(512, -1, BLOCK)[..., :10] = 0
+    fitted = measure(np.random.default_rng(2), [scene])
+    assert fitted.gain == pytest.approx(GAIN, abs=3 * fitted.error)
+
+
+def test_outliers_do_not_bias_the_gain() -> None:
+    rng = np.random.default_rng(3)
+    electrons = np.full((512, 512), 1e4)
+    first, second = frame(rng, electrons), frame(rng, electrons)
+    first.reshape(-1)[rng.choice(first.size, 1000)] += 3000
+    second.reshape(-1)[rng.choice(first.size, 1000)] = 0
+    first[100], second[:, 50] = np.nan, np.nan
+    sums = bin_pairs(pair_statistics(first, second, gain=1.5, read_noise=3.0, quantum=1.0))
+    fitted = fit_gain(sums, READ_ADU**2, 0.1, np.inf)
+    assert fitted is not None
+    assert fitted.gain == pytest.approx(GAIN, abs=3 * fitted.error)
+
+
+def test_the_error_of_the_gain_is_honest() -> None:
+    rng = np.random.default_rng(4)
+    pulls = []
+    for _ in range(60):
+        fitted = measure(rng, flats((64, 96), (500, 5e3, 3e4)))
+        pulls.append((fitted.gain - GAIN) / fitted.error)
+    assert abs(np.mean(pulls)) < 4 / np.sqrt(60)
+    assert 0.7 < np.std(pulls) < 1.3
+
+
+def test_levels_above_the_highest_are_not_used() -> None:
+    rng = np.random.default_rng(5)
+    low, high = (bin_pairs(pair(rng, np.full((256, 256), n))) for n in (1e4, 8e4))
+    high[:, 2] *= 0.3  # saturation takes the noise away
+    fitted = fit_gain(low + high, READ_ADU**2, 0.1, 2e4 / GAIN)
+    assert fitted is not None
+    assert fitted.gain == pytest.approx(GAIN, abs=3 * fitted.error)
+    assert fitted.levels[1] < 2e4 / GAIN
+
+
+def test_points_off_the_line_widen_the_error() -> None:
+    rng = np.random.default_rng(6)
+    low, high = (bin_pairs(pair(rng, np.full((256, 256), n))) for n in (1e4, 4e4))
+    straight = fit_gain(low + high, READ_ADU**2, 0.1, np.inf)
+    high[:, 2] *= 1.2
+    bent = fit_gain(low + high, READ_ADU**2, 0.1, np.inf)
+    assert straight is not None
+    assert bent is not None
+    assert bent.chi2_reduced > 10 > straight.chi2_reduced
+    assert bent.error > 3 * straight.error
+
+
+def test_without_light_there_is_no_gain() -> None:
+    rng = np.random.default_rng(7)
+    assert fit_gain(np.zeros((N_BINS, 3)), 25.0, 0.1, np.inf) is None
+    dark = bin_pairs(pair(rng, np.zeros((64, 64))))
+    fitted = fit_gain(dark, READ_ADU**2 + 1 / 12, 0.1, np.inf)
+    assert fitted is None or fitted.error > 0.2 * fitted.gain
+
+
+def test_bins_hold_all_blocks_and_may_be_added() -> None:
+    rng = np.random.default_rng(8)
+    a, b = (pair(rng, np.full((50, 37), n)) for n in (0.0, 3e4))
+    both = bin_pairs(np.concatenate([a, b]))
+    np.testing.assert_allclose(both, bin_pairs(a) + bin_pairs(b))
+    assert both[:, 0].sum() == a[:, 0].sum() + b[:, 0].sum()
+    assert both[:, 1].sum() == pytest.approx((a[:, 0] * a[:, 1]).sum() + (b[:, 0] * b[:, 1]).sum())
+
+
+def test_partial_blocks_are_blocks_if_they_are_large_enough() -> None:
+    blocks = pair(np.random.default_rng(9), np.full((17, 35), 1e4))
+    # 16 and 1 rows, 16, 16 and 3 columns; all pixels but one are degrees of freedom.
+    np.testing.assert_array_equal(blocks[:, 0], [255, 255, 47, 0, 0, 0])
