@@ -1,0 +1,95 @@
+"""Colours of the figures: perceptually uniform, and safe for the colour-blind."""
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import ListedColormap, to_rgb
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+LEVELS = 81
+"""Steps of a colour scale: with all others they fit the 256 colours of a small PNG."""
+
+MASKED = "#9b9b9b"
+"""Where there is no value."""
+
+INK = "#1d2733"
+BLUE = "#2667b0"
+RED = "#c1431f"
+GREEN = "#1b8a5a"
+GREY = "#7d8896"
+BAR = "#b9cbe4"
+"""Bars of histograms."""
+BAND = "#dfe3e9"
+"""What chance allows."""
+UNFLAGGED = "#eef1f5"
+SEVERAL = "#000080"
+
+MARKS = ("#ff3d1f", "#00a7e1", "#ff3dc8", "#39c24a")
+"""The fringe frequencies of each set, on the spectrum and on paper."""
+
+FLAGS = {
+    1: "#d7301f", 2: "#54278f", 4: "#fdae33", 8: "#1f9ed1", 16: "#e377c2", 32: "#111111",
+    64: "#2ca25f", 128: "#8c510a",
+}  # fmt: skip
+"""One colour for each bit of the flags."""
+
+# Björn Ottosson's OKLab (2020): a space whose distances are those that the eye sees.
+_LMS_FROM_LAB = np.array(
+    [
+        [1, 0.3963377774, 0.2158037573],
+        [1, -0.1055613458, -0.0638541728],
+        [1, -0.0894841775, -1.2914855480],
+    ]
+)
+_RGB_FROM_LMS = np.array(
+    [
+        [4.0767416621, -3.3077115913, 0.2309699292],
+        [-1.2684380046, 2.6097574011, -0.3413193965],
+        [-0.0041960863, -0.7034186147, 1.7076147010],
+    ]
+)
+
+
+def srgb(lab: F64) -> F64:
+    """sRGB (n, 3) in 0..1 of OKLab colours (n, 3), clipped to what a screen shows."""
+    linear = (lab @ _LMS_FROM_LAB.T) ** 3 @ _RGB_FROM_LMS.T
+    linear = np.clip(linear, 0, 1)
+    gamma = 1.055 * linear ** (1 / 2.4) - 0.055
+    return np.asarray(np.where(linear <= 0.0031308, 12.92 * linear, gamma))
+
+
+def _diverging() -> F64:
+    """Blue through white to red, in equal steps of perceived difference from the middle."""
+    ends = np.array([[0.36, -0.035, -0.145], [0.97, 0.0, 0.0], [0.43, 0.155, 0.085]])
+    at = np.linspace(0, 2, LEVELS)
+    lab = np.stack([np.interp(at, [0, 1, 2], channel) for channel in ends.T], axis=1)
+    return srgb(lab)
+
+
+_DIVERGING = _diverging()
+_SEQUENTIAL = np.asarray(colormaps["viridis"](np.linspace(0, 1, LEVELS)))[:, :3]
+
+DIVERGING = ListedColormap(_DIVERGING, name="pixcal_diverging").with_extremes(bad=MASKED)
+SEQUENTIAL = ListedColormap(_SEQUENTIAL, name="pixcal_sequential").with_extremes(bad=MASKED)
+
+
+def _tints(colour: str, number: int) -> F64:
+    """From the colour to white, without white."""
+    strength = np.linspace(1, 0, number, endpoint=False)[:, None]
+    return np.asarray(strength * np.array(to_rgb(colour)) + (1 - strength))
+
+
+def _palette() -> bytes:
+    """Every colour that the figures use, edges of lines and letters included, as RGB bytes."""
+    solid = [to_rgb(c) for c in (*FLAGS.values(), *MARKS, SEVERAL, UNFLAGGED, MASKED, BAR, BAND)]
+    parts = [
+        _DIVERGING, _SEQUENTIAL, _tints("#000000", 18), _tints(INK, 8), _tints(BLUE, 12),
+        _tints(RED, 12), _tints(GREEN, 8), _tints(GREY, 6), solid, [(1, 1, 1)],
+    ]  # fmt: skip
+    colours = np.rint(255 * np.concatenate([np.asarray(p) for p in parts])).astype(np.uint8)
+    assert len(colours) <= 256
+    return bytes(colours)
+
+
+PALETTE = _palette()

@@ -1,0 +1,163 @@
+"""What a report shows, as plain data: read by the stage, drawn by the page."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.report.summary import FlagSummary, MapSummary, Spectrum
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Detail:
+    """The middle of a map, pixel by pixel.
+
+    Attributes
+    ----------
+    start : (int, int)
+        First row and column.
+    """
+
+    start: tuple[int, int]
+    delta: MapSummary
+    sigma: MapSummary
+
+
+@dataclass(frozen=True)
+class OffsetMap:
+    """One product of the fit; all maps in px.
+
+    Attributes
+    ----------
+    name : str
+        ``delta_x``, ``delta_y`` or ``delta_fringe``.
+    detail : Detail, optional
+        Where the whole map is shown in means of blocks.
+    """
+
+    name: str
+    delta: MapSummary
+    sigma: MapSummary
+    spectrum: Spectrum | None
+    detail: Detail | None = None
+
+
+@dataclass(frozen=True)
+class Series:
+    """Parameters of each frame (t,): time in s, phi in rad, dkx and dky in rad/px."""
+
+    time: F64
+    B: F64
+    A: F64
+    phi: F64
+    dkx: F64
+    dky: F64
+
+    @property
+    def moving(self) -> bool:
+        """Whether the fringe vector was free in each frame."""
+        return bool(np.any(self.dkx != 0) or np.any(self.dky != 0))
+
+
+@dataclass(frozen=True)
+class FringeSet:
+    """One fringe set.
+
+    Attributes
+    ----------
+    facts : dict
+        Its entry in ``fit.json``.
+    iota, visibility, chi2 : MapSummary
+        Mean level (e-), alpha / iota, reduced chi-square.
+    allan : dict, optional
+        Its entry in ``allan.json``.
+    """
+
+    name: str
+    facts: dict[str, Any]
+    iota: MapSummary
+    visibility: MapSummary
+    chi2: MapSummary
+    flags: FlagSummary
+    series: Series
+    allan: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Detector:
+    """What the reduction found.
+
+    Attributes
+    ----------
+    facts : dict
+        ``reduce.json``; empty where there is none.
+    maps : dict
+        ``bias`` (ADU), ``dark_rate`` (e-/s), ``flat``, ``read_noise`` (e-), those that exist.
+    """
+
+    facts: dict[str, Any] = field(default_factory=dict)
+    maps: dict[str, MapSummary] = field(default_factory=dict)
+    flags: FlagSummary | None = None
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """What a stage's manifest says."""
+
+    name: str
+    key: str
+    format: int
+    pixcal: str
+    config: dict[str, Any]
+    inputs: dict[str, str]
+
+
+@dataclass(frozen=True)
+class ArrayRecord:
+    """Frames of one kind, as ingested; unknown facts are None."""
+
+    name: str
+    files: int
+    frames: int
+    shape: tuple[int, int] | None
+    first_mjd: float | None
+    duration_s: float | None
+    exptimes_s: tuple[float, ...]
+    temperature_c: tuple[float, float] | None
+    time_source: str | None
+
+
+@dataclass(frozen=True)
+class Contents:
+    """A whole run.
+
+    Attributes
+    ----------
+    acquisition : dict
+        As in ``acquisition.json``.
+    fit : dict, optional
+        ``fit.json``.
+    flags : FlagSummary, optional
+        Of the products.
+    warnings : tuple of str
+        Sentences that the stages left.
+    """
+
+    acquisition: dict[str, Any]
+    stages: tuple[StageRecord, ...]
+    arrays: tuple[ArrayRecord, ...] = ()
+    detector: Detector = field(default_factory=Detector)
+    fit: dict[str, Any] | None = None
+    offsets: tuple[OffsetMap, ...] = ()
+    sets: tuple[FringeSet, ...] = ()
+    flags: FlagSummary | None = None
+    allan_measured: bool = False
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def pitch_um(self) -> float:
+        """Pixel pitch."""
+        return float(self.acquisition["detector"]["pitch_um"])

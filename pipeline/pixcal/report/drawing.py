@@ -1,0 +1,191 @@
+"""What all figures share: axes, scales, legible text, and the way to a PNG.
+
+Figures are made by themselves, never through pyplot: nothing is global, threads do not meet.
+"""
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Colormap, LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from numpy.typing import NDArray
+from PIL import Image
+
+from pixcal.report.colours import DIVERGING, INK, PALETTE, SEQUENTIAL
+from pixcal.report.summary import MapSummary, robust_spread
+
+WIDE = 10.4
+"""Width of a figure that takes the whole page, inches."""
+DPI = 130
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A unit with its power of ten, for axes whose numbers stay short.
+
+    Attributes
+    ----------
+    factor : float
+        What values are multiplied by.
+    label : str
+        E.g. ``10⁻³ px``.
+    """
+
+    factor: float
+    label: str
+
+
+def unit_for(values: Any, name: str) -> Unit:
+    """Thousandths or millionths of a unit, as the largest of the values asks."""
+    finite = np.abs(np.asarray(values, dtype=float))
+    top = float(np.max(finite[np.isfinite(finite)], initial=0.0))
+    if top == 0 or top >= 0.1:
+        return Unit(1.0, name)
+    return Unit(1e3, f"10⁻³ {name}") if top >= 1e-4 else Unit(1e6, f"10⁻⁶ {name}")
+
+
+@dataclass(frozen=True)
+class ColourScale:
+    """Limits and colours of a map, and which ends go beyond."""
+
+    low: float
+    high: float
+    colours: Colormap
+    beyond: str
+
+    @property
+    def norm(self) -> Normalize:
+        """For matplotlib."""
+        return Normalize(self.low, self.high)
+
+
+def symmetric_scale(image: NDArray[Any], middle: float = 0.0) -> ColourScale:
+    """Three robust standard deviations on both sides of the middle."""
+    reach = 3 * robust_spread(image)
+    if not reach > 0:
+        finite = image[np.isfinite(image)]
+        reach = float(np.max(np.abs(finite - middle), initial=0.0)) or 1.0
+    return _scale(image, middle - reach, middle + reach, DIVERGING)
+
+
+def span_scale(image: NDArray[Any]) -> ColourScale:
+    """From the 0.5th to the 99.5th percentile, a little wider."""
+    finite = image[np.isfinite(image)]
+    low, high = np.percentile(finite, [0.5, 99.5]) if len(finite) else (0.0, 1.0)
+    # A constant map still gets a scale with readable numbers.
+    pad = 0.03 * (high - low) or 0.01 * abs(high) or 1.0
+    return _scale(image, float(low - pad), float(high + pad), SEQUENTIAL)
+
+
+def _scale(image: NDArray[Any], low: float, high: float, colours: Colormap) -> ColourScale:
+    finite = image[np.isfinite(image)]
+    below, above = bool(np.any(finite < low)), bool(np.any(finite > high))
+    words = {(True, True): "both", (True, False): "min", (False, True): "max"}
+    return ColourScale(low, high, colours, words.get((below, above), "neither"))
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """A figure of so many inches that lays itself out."""
+    layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
+    return Figure(figsize=(width, height), dpi=DPI, layout=layout)
+
+
+def bare_figure(width: float, height: float) -> Figure:
+    """A figure whose axes are placed by `place`."""
+    return Figure(figsize=(width, height), dpi=DPI)
+
+
+def place(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
+    """Axes at a place given in inches from the lower left corner."""
+    w, h = figure.get_size_inches()
+    return figure.add_axes((left / w, bottom / h, width / w, height / h))
+
+
+def draw_map(
+    axes: Axes,
+    summary: MapSummary,
+    scale: ColourScale,
+    factor: float = 1.0,
+    start: tuple[int, int] = (0, 0),
+) -> ScalarMappable:
+    """A map with x to the right and y upwards, in pixels."""
+    ny, nx = summary.shape
+    y0, x0 = start
+    shown = np.ma.masked_invalid(summary.image * factor)
+    drawn = axes.imshow(
+        shown, norm=scale.norm, cmap=scale.colours, origin="lower", interpolation="nearest",
+        extent=covered(summary.image.shape, summary.block, start), aspect="auto",
+    )  # fmt: skip
+    axes.set_xlim(x0 - 0.5, x0 + nx - 0.5)
+    axes.set_ylim(y0 - 0.5, y0 + ny - 0.5)
+    return drawn
+
+
+def add_bar(figure: Figure, axes: Axes, drawn: ScalarMappable, label: str, beyond: str) -> None:
+    """A colour bar as high as the map beside it."""
+    place = axes.inset_axes((1.04, 0, 0.05, 1))
+    bar = figure.colorbar(drawn, cax=place, extend=beyond)
+    bar.set_label(label)
+    if not isinstance(drawn.norm, LogNorm):
+        place.ticklabel_format(useOffset=False, style="plain")
+
+
+def covered(
+    blocks: tuple[int, ...], side: int, start: tuple[int, int] = (0, 0)
+) -> tuple[float, float, float, float]:
+    """Outer edges (left, right, bottom, top), in pixels, of an image of blocks."""
+    (y0, x0), (ny, nx) = start, blocks
+    return x0 - 0.5, x0 + nx * side - 0.5, y0 - 0.5, y0 + ny * side - 0.5
+
+
+def block_note(summary: MapSummary) -> str:
+    """How pixels were averaged for the figure, or nothing."""
+    n = summary.block
+    return f"mean of {n} × {n} px" if n > 1 else ""
+
+
+def fit_box(shape: tuple[int, int], width: float, height: float, least: float = 1.4) -> Any:
+    """Width and height (inches) of a map inside a box, pixels square unless it is very long."""
+    ny, nx = shape
+    scale = min(width / nx, height / ny)
+    return max(nx * scale, least), max(ny * scale, least)
+
+
+def finish(axes: Axes, *, grid: bool = True) -> None:
+    """The look of axes that hold lines or points."""
+    axes.spines[["top", "right"]].set_visible(False)
+    if grid:
+        axes.grid(True, color="#d9dee5", linewidth=0.7)
+        axes.set_axisbelow(True)
+    axes.tick_params(colors=INK)
+
+
+def limits(values: Sequence[Any], share: float = 0.002) -> tuple[float, float]:
+    """Limits that hold all but few of the values, with a margin."""
+    every = np.concatenate([np.ravel(np.asarray(v, dtype=float)) for v in values])
+    every = every[np.isfinite(every)]
+    if not len(every):
+        return -1.0, 1.0
+    low, high = np.quantile(every, [share, 1 - share])
+    margin = 0.12 * (high - low) or max(abs(high), 1e-12) * 0.1
+    return float(low - margin), float(high + margin)
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as a PNG of 256 colours (a third of the bytes), the same every time."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    picture = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(PALETTE)
+    reduced = picture.quantize(palette=palette, dither=Image.Dither.NONE)
+    out = io.BytesIO()
+    reduced.save(out, "PNG", optimize=True)
+    return out.getvalue()

@@ -1,0 +1,392 @@
+"""The page: contents in, one HTML document out."""
+
+import base64
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+
+from jinja2 import Environment, StrictUndefined
+from matplotlib.figure import Figure
+
+from pixcal import __version__
+from pixcal.report import detector_figures, map_figures, set_figures
+from pixcal.report.contents import (
+    Contents,
+    OffsetMap,
+)
+from pixcal.report.drawing import DPI, png
+from pixcal.report.summary import FlagSummary
+from pixcal.report.tables import (
+    Table,
+    allan_table,
+    fit_tables,
+    flag_table,
+    flat_rows,
+    frames_table,
+    is_table,
+    reduction_tables,
+    stage_tables,
+)
+from pixcal.report.text import (
+    NAMES,
+    date_of_mjd,
+    mode_in_words,
+    number,
+)
+from pixcal.report.verdict import cards, findings, headline
+
+NOT_MEASURED = "Not measured"
+
+DETECTOR_MAPS = {
+    "bias": ("bias", "ADU"),
+    "dark_rate": ("dark current", "e⁻/s"),
+    "flat": ("flat", "relative response"),
+    "read_noise": ("read noise", "e⁻"),
+}
+"""Title and unit of each map of the reduction."""
+
+
+@dataclass(frozen=True)
+class Plate:
+    """A figure with its title, and a caption that says what to see and what would be bad."""
+
+    title: str
+    caption: str
+    picture: str
+    width: int
+    height: int
+    kind: str = "plate"
+
+
+@dataclass(frozen=True)
+class Section:
+    """A chapter of the page."""
+
+    id: str
+    title: str
+    lead: str
+    blocks: Sequence[Plate | Table]
+
+
+def render(contents: Contents) -> str:
+    """Draw all figures and write the page.
+
+    Parameters
+    ----------
+    contents : Contents
+        What there is; parts that are missing become sections that say so.
+
+    Returns
+    -------
+    str
+        HTML without any reference to something outside it.
+    """
+    sections = [
+        _maps(contents),
+        _levels(contents),
+        _temporal(contents),
+        _residuals(contents),
+        _allan(contents),
+        _detector(contents),
+        _masks(contents),
+        _removed(contents),
+        _provenance(contents),
+    ]
+    text = files("pixcal.report").joinpath("page.html.j2").read_text(encoding="utf-8")
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    detector = contents.acquisition["detector"]
+    return environment.from_string(text).render(
+        title=f"{detector['name']}: pixel offsets" if detector.get("name") else "Pixel offsets",
+        subtitle=_subtitle(contents),
+        headline=headline(contents),
+        cards=cards(contents),
+        findings=findings(contents),
+        sections=sections,
+        version=__version__,
+    )
+
+
+def _plate(title: str, caption: str, figure: Figure) -> Plate:
+    body = png(figure)
+    # The size in the page is the figure's in inches at 106 px an inch: text of 10 pt is 15 px.
+    width, height = (round(v * 106) for v in figure.get_size_inches())
+    data = base64.b64encode(body).decode("ascii")
+    assert figure.dpi == DPI
+    return Plate(title, caption, f"data:image/png;base64,{data}", width, height)
+
+
+def _subtitle(contents: Contents) -> str:
+    detector, optics = contents.acquisition["detector"], contents.acquisition["optics"]
+    flags = contents.flags or contents.detector.flags
+    parts = [f"{flags.shape[1]} × {flags.shape[0]} px"] if flags else []
+    parts.append(f"pitch {number(detector['pitch_um'])} µm")
+    parts.append(f"{number(optics['wavelength_nm'], 4)} nm")
+    parts.append(f"{number(optics['distance_mm'], 4)} mm from the fibres")
+    starts = [a.first_mjd for a in contents.arrays if a.first_mjd is not None]
+    if starts:
+        parts.append(f"first frame {date_of_mjd(min(starts))} UTC")
+    return " · ".join(parts)
+
+
+def _missing(contents: Contents, what: str, stage: str) -> str:
+    if not contents.acquisition.get("frames", {}).get("fringes"):
+        return f"{NOT_MEASURED}: the acquisition has no fringe sets."
+    return f"{NOT_MEASURED}: {what}; run 'pixcal {stage}' and make the report again."
+
+
+# Sections
+
+
+def _maps(contents: Contents) -> Section:
+    lead = (
+        "Offset of each pixel's response barycentre from the perfect grid; positive towards larger "
+        "x (y). Grey pixels are masked."
+    )
+    blocks: list[Plate | Table] = []
+    for offset in contents.offsets:
+        blocks += _offset_plates(offset, contents)
+    if not blocks:
+        lead = _missing(contents, "there is no fit", "fit")
+    return Section("maps", "Maps of the offsets", lead, blocks)
+
+
+def _offset_plates(offset: OffsetMap, contents: Contents) -> Iterator[Plate]:
+    name, n = NAMES[offset.name], offset.delta.block
+    yield _plate(
+        f"Map of {name}",
+        (f"Each point is the mean of {n} × {n} px. " if n > 1 else "")
+        + "Colours span ±3 robust standard deviations. The profiles are means over whole columns "
+        "(below) and rows (right), in full resolution. Good: a map without pattern, means inside "
+        "the band of independent offsets. Bad: teeth with a period of few rows or columns "
+        "(crosstalk, read-out), a smooth crest (curved fringes fitted as straight ones), stripes "
+        "with the fringes' period. Steps between blocks are the stitching of the mask and belong "
+        "to the detector.",
+        map_figures.offsets(offset.name, offset.delta, offset.sigma),
+    )
+    if offset.detail is not None:
+        (y0, x0), part = offset.detail.start, offset.detail.delta
+        yield _plate(
+            f"Middle of the map of {name}, pixel by pixel",
+            f"Rows {y0} to {y0 + part.shape[0] - 1}, columns {x0} to {x0 + part.shape[1] - 1}, "
+            "without averaging: patterns of few pixels, which the means above wash out, show here.",
+            map_figures.offsets(offset.name, part, offset.detail.sigma, offset.detail.start),
+        )
+    yield _plate(
+        f"Errors and distribution of {name}",
+        "Left: 1-sigma error; it follows the illumination and the visibility; faint fringes (a few "
+        "per cent) are the chance of how the phases fell. Right: all offsets against a normal law "
+        "of the same robust width, and the width of the noise. Bad: wings far above the normal "
+        "law, or a histogram no wider than the noise (then the map holds no measured offsets).",
+        map_figures.errors_and_histogram(offset),
+    )
+    if offset.spectrum is not None:
+        vectors = {s.name: (s.facts["kx"], s.facts["ky"]) for s in contents.sets}
+        windows = offset.spectrum.windows
+        my, mx = offset.spectrum.power.shape
+        yield _plate(
+            f"Power spectrum of {name}",
+            f"Mean of {windows} window{'s' if windows > 1 else ''} of {mx} × {my} px. Left: power "
+            "over that of the white noise which the errors predict. Circles mark the fringe "
+            "frequency, squares twice that. Good: no peak in the marks (modes there were removed, "
+            "so a dip is natural) and a flat floor. Bad: peaks in a mark (fringe residuals), on an "
+            "axis (rows or columns, e.g. 0.25 cycles/px for a period of four), or a floor below "
+            "the dashed line (errors too large).",
+            map_figures.power(offset.name, offset.spectrum, vectors),
+        )
+
+
+def _levels(contents: Contents) -> Section:
+    lead = "Mean level and visibility of the fringes in each pixel."
+    blocks = [
+        _plate(
+            f"Set {s.name}: mean level ι and visibility α/ι",
+            "Both should follow the smooth light of the fibres. A ring or a speck is dust; a "
+            "pattern of rows in the visibility is crosstalk; visibility above 1 is impossible and "
+            "points to a wrong bias. Fringes of less than a per cent are the chance of how the "
+            "phases fell. The errors grow where the visibility falls.",
+            map_figures.map_row(
+                [("mean level ι", "e⁻", s.iota), ("visibility α/ι", "α/ι", s.visibility)]
+            ),
+        )
+        for s in contents.sets
+    ]
+    if not blocks:
+        lead = _missing(contents, "there is no fit", "fit")
+    return Section("levels", "Level and visibility", lead, blocks)
+
+
+def _temporal(contents: Contents) -> Section:
+    lead = (
+        "What was fitted in each frame: intensity B (over its mean), visibility (A/B times the "
+        "median of α/ι), phase φ, and the change of the fringe vector where it moves."
+    )
+    blocks = [
+        _plate(
+            f"Set {s.name}: parameters of the frames",
+            "Right: how often each value occurs; for the phase, the dashed line and its band are a "
+            "uniform coverage and its chance (±2σ). Good: phases all over the turn, constant "
+            "visibility. Bad: gaps in the phase (the fit is then ill-conditioned), a slow drift or "
+            "steps in B (laser, coupling), visibility that drops (vibration within the exposure)."
+            + (
+                " The fringe vector was free: noise about zero is vibration, a trend is drift."
+                if s.series.moving
+                else " The fringe vector was held: it does not move by more than its error."
+            ),
+            set_figures.temporal(s),
+        )
+        for s in contents.sets
+    ]
+    if not blocks:
+        lead = _missing(contents, "there is no fit", "fit")
+    return Section("temporal", "Frame by frame", lead, blocks)
+
+
+def _residuals(contents: Contents) -> Section:
+    lead = "What is left after the fit, over the noise that gain and read noise predict."
+    blocks = [
+        _plate(
+            f"Set {s.name}: reduced χ²",
+            "Good: a map without pattern and a histogram on the dashed law. A histogram shifted "
+            "as a whole (red) means that gain or read noise are off by that factor, or that the "
+            "light fluctuates; the errors were scaled by its root. Bad: fringes, rows or blocks in "
+            "the map, or a long tail. Effects that are linear and constant (crosstalk, curved "
+            "fringes) leave nothing here: look for them in the maps.",
+            set_figures.residuals(s),
+        )
+        for s in contents.sets
+    ]
+    if not blocks:
+        lead = _missing(contents, "there is no fit", "fit")
+    return Section("noise", "Residuals", lead, blocks)
+
+
+def _allan(contents: Contents) -> Section:
+    lead = (
+        "Allan deviation of the offsets between batches of frames: how the error falls as more "
+        "frames are averaged, without knowing the true offsets."
+    )
+    measured = [s for s in contents.sets if s.allan is not None and s.allan.get("frames")]
+    blocks: list[Plate | Table] = [
+        _plate(
+            f"Set {s.name}: Allan deviation",
+            "Median over the pixels. Good: points on the square-root law, which is what the errors "
+            "of the fit predict, and that law close to the Cramér–Rao bound (short batches lie a "
+            "little above it). Bad: points that leave the law upwards at long times (drift), or "
+            "that lie above it everywhere (noise that is not in the errors).",
+            set_figures.allan(s.name, s.allan or {}, s.facts),
+        )
+        for s in measured
+    ]
+    if measured:
+        blocks.append(allan_table(measured))
+    else:
+        lead = _missing(contents, "there is no Allan deviation", "allan")
+    return Section("allan", "Allan deviation", lead, blocks)
+
+
+def _detector(contents: Contents) -> Section:
+    detector = contents.detector
+    panels = [
+        (title, unit, detector.maps[key])
+        for key, (title, unit) in DETECTOR_MAPS.items()
+        if key in detector.maps
+    ]
+    blocks: list[Plate | Table] = []
+    if panels:
+        blocks.append(
+            _plate(
+                "Calibration maps",
+                "Colours span the 0.5th to the 99.5th percentile. Good: smooth or random maps. "
+                "Bad: rows, columns or blocks in the read noise, fringes in the flat (coherent "
+                "light), a flat that follows the dark current (dark subtraction).",
+                map_figures.map_row(panels),
+            )
+        )
+        rows = [
+            [title, unit, *(number(v, 4) for v in (m.median, m.robust_std, m.mean, m.std))]
+            for title, unit, m in panels
+        ]
+        header = ["map", "unit", "median", "robust σ", "mean", "σ"]
+        blocks.append(Table("Calibration maps in numbers", header, rows))
+    linearity = detector.facts.get("linearity") or {}
+    if is_table(linearity.get("levels")):
+        blocks.append(
+            _plate(
+                "Linearity",
+                "Departure of each flat level from the straight line over exposure time. Good: "
+                "within a few tenths of a per cent, without trend. Bad: a curve that grows towards "
+                "the full well (nonlinear response), or scatter (an unsteady lamp).",
+                detector_figures.linearity(linearity["levels"]),
+            )
+        )
+    blocks += reduction_tables(detector.facts)
+    lead = "Bias, dark current, flat and read noise, and what the ladder of flats says."
+    if not blocks:
+        lead = f"{NOT_MEASURED}: the reduction left no calibration maps."
+    return Section("detector", "Detector", lead, blocks)
+
+
+def _masks(contents: Contents) -> Section:
+    panels: list[tuple[str, FlagSummary]] = []
+    if contents.detector.flags is not None:
+        panels.append(("calibration frames", contents.detector.flags))
+    panels += [(f"set {s.name}", s.flags) for s in contents.sets]
+    if contents.flags is not None:
+        panels.append(("products", contents.flags))
+    if not panels:
+        return Section("masks", "Masks", f"{NOT_MEASURED}: there are no masks.", [])
+    blocks: list[Plate | Table] = []
+    if any(summary.masked for _, summary in panels):
+        blocks.append(
+            _plate(
+                "Flags of the pixels",
+                "Maps that are the same are drawn once. Good: few, scattered pixels. Bad: whole "
+                "rows, columns or blocks, or masks that follow the fringes (saturation at the "
+                "crests).",
+                map_figures.flags(panels),
+            )
+        )
+    blocks.append(flag_table(panels))
+    lead = (
+        "Pixels without an offset, and why. A pixel may have several flags. A set's own mask "
+        "includes that of the calibration frames; in the products a flag counts where it costs the "
+        "pixel its value."
+    )
+    return Section("masks", "Masks", lead, blocks)
+
+
+def _removed(contents: Contents) -> Section:
+    lead = (
+        "The data cannot tell these modes of the maps from the bench. They are not in the "
+        "products; remove them from both sides before you compare a map with another."
+    )
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for fringes in contents.sets:
+        groups.setdefault(tuple(fringes.facts.get("removed_modes", ())), []).append(fringes.name)
+    blocks = [
+        Table(
+            f"Set{'s' if len(names) > 1 else ''} {', '.join(names)}",
+            ["mode", "what it is"],
+            [[mode, mode_in_words(mode)] for mode in modes],
+        )
+        for modes, names in groups.items()
+    ]
+    if not blocks:
+        lead = "Nothing was removed: there are no maps of offsets."
+    return Section("removed", "What was removed", lead, blocks)
+
+
+def _provenance(contents: Contents) -> Section:
+    blocks: list[Plate | Table] = []
+    if contents.fit is not None:
+        blocks += fit_tables(contents.fit)
+    if contents.arrays:
+        blocks.append(frames_table(contents.arrays))
+    blocks += stage_tables(contents.stages)
+    blocks.append(
+        Table("Acquisition as understood", ["key", "value"], flat_rows(contents.acquisition))
+    )
+    lead = "What this page was made from. Equal keys mean equal results."
+    return Section("provenance", "Provenance", lead, blocks)

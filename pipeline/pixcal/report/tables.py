@@ -1,0 +1,234 @@
+"""Tables of the page: every number that the stages left, as words."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pixcal.model.flags import PixelFlag
+from pixcal.report.contents import ArrayRecord, FringeSet, StageRecord
+from pixcal.report.summary import FlagSummary
+from pixcal.report.text import (
+    date_of_mjd,
+    duration,
+    exact,
+    flag_name,
+    number,
+    share,
+    with_error,
+)
+
+FLAG_WORDS = {
+    PixelFlag.HOT: "dark signal far above that of the other pixels",
+    PixelFlag.DEAD: "response far from that of the neighbours",
+    PixelFlag.NOISY: "noise far above the read noise, telegraph noise included",
+    PixelFlag.SATURATED: "some fringe samples are saturated and carry no weight",
+    PixelFlag.NONLINEAR: "departs from the straight line over the ladder of flats",
+    PixelFlag.NO_DATA: "samples are missing or not finite",
+    PixelFlag.BAD_FIT: "the fringe model does not describe the pixel",
+}
+
+
+_GAIN_COLUMNS = ("declared", "measured", "error", "used")
+_REDUCTION_SHOWN = (
+    "schema", "warnings", "flags", "gain_e_per_adu", "read_noise_e", "linearity", "sets",
+    "quantisation",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table; the first column names the rows."""
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    kind: str = "table"
+
+
+def allan_table(measured: Sequence[FringeSet]) -> Table:
+    """Slope, knee and batches of each set."""
+    rows = []
+    for s in measured:
+        a = s.allan or {}
+        knee = a.get("knee_frames")
+        rows.append(
+            [
+                s.name,
+                with_error(a.get("slope"), a.get("slope_err")),
+                "none" if knee is None else f"{number(round(knee))} frames",
+                number(a.get("n_batches")),
+                number(a.get("batch_frames")),
+                number(a.get("gaps")) if not isinstance(a.get("gaps"), list) else str(a["gaps"]),
+            ]
+        )
+    header = ["set", "slope", "knee", "batches", "frames a batch", "gaps"]
+    return Table("Allan deviation in numbers", header, rows)
+
+
+def flag_table(panels: Sequence[tuple[str, FlagSummary]]) -> Table:
+    """How many pixels have each flag, one column each mask."""
+    rows = []
+    for flag in PixelFlag:
+        counts = [_count(s.counts[flag.value], s) for _, s in panels]
+        rows.append([flag_name(flag), FLAG_WORDS[flag], *counts])
+    rows.append(["any", "masked", *(_count(s.masked, s) for _, s in panels)])
+    return Table("Pixels flagged", ["flag", "meaning", *(title for title, _ in panels)], rows)
+
+
+def _count(pixels: int, summary: FlagSummary) -> str:
+    ny, nx = summary.shape
+    return f"{number(pixels)} ({share(pixels, ny * nx)})"
+
+
+def reduction_tables(facts: Mapping[str, Any]) -> Iterator[Table]:
+    """Gain and read noise side by side, the ladder of flats, then what each set was made of."""
+    rows = []
+    for key, label in (("gain_e_per_adu", "gain (e⁻/ADU)"), ("read_noise_e", "read noise (e⁻)")):
+        entry = facts.get(key)
+        if isinstance(entry, Mapping):
+            measured = with_error(entry.get("measured"), entry.get("error"))
+            others = {k: v for k, v in entry.items() if k not in _GAIN_COLUMNS}
+            rows.append(
+                [
+                    label,
+                    number(entry.get("declared"), 4),
+                    measured,
+                    number(entry.get("used"), 4),
+                    "; ".join(f"{k.replace('_', ' ')} {_plain(v)}" for k, v in others.items()),
+                ]
+            )
+    if rows:
+        yield Table("Gain and read noise", ["", "declared", "measured", "used", ""], rows)
+    straight = facts.get("linearity") or {}
+    if is_table(straight.get("levels")):
+        title = f"Ladder of flats, intercept {number(straight.get('intercept_adu'), 2)} ADU"
+        yield _list_table(title, straight["levels"])
+    sets = {
+        name: dict(_flat({k: v for k, v in entry.items() if k != "flags"}))
+        | {f"quantisation.{k}": v for k, v in facts.get("quantisation", {}).get(name, {}).items()}
+        for name, entry in (facts.get("sets") or {}).items()
+    }
+    if sets:
+        yield _columns_table("Fringe sets as reduced", sets)
+    rest = {k: v for k, v in facts.items() if k not in _REDUCTION_SHOWN}
+    if rest:
+        yield Table("Other numbers of the reduction", ["quantity", "value"], flat_rows(rest))
+
+
+def _columns_table(title: str, columns: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Like facts of several sets, one column each."""
+    keys = dict.fromkeys(key for facts in columns.values() for key in facts)
+    rows = [[key, *(_plain(facts.get(key)) for facts in columns.values())] for key in keys]
+    return Table(title, ["quantity", *columns], rows)
+
+
+def is_table(value: Any) -> bool:
+    """Whether a value is a list of mappings."""
+    return isinstance(value, list) and bool(value) and all(isinstance(v, Mapping) for v in value)
+
+
+def _list_table(title: str, entries: Sequence[Mapping[str, Any]]) -> Table:
+    """A list of like mappings, one row each."""
+    keys = list(dict.fromkeys(key for entry in entries for key in entry))
+    return Table(title, keys, [[_plain(entry.get(key)) for key in keys] for entry in entries])
+
+
+def stage_tables(stages: Sequence[StageRecord]) -> Iterator[Table]:
+    """What each stage was made from, by key; and the digests of the files."""
+    present = {stage.name: stage.key for stage in stages}
+    rows = []
+    for stage in stages:
+        # The acquisition has a table of its own.
+        options = {k: v for k, v in stage.config.items() if k != "acquisition"}
+        made_from = [
+            name if name not in present or present[name] == key else f"another {name}, {key}"
+            for name, key in stage.inputs.items()
+        ]
+        rows.append(
+            [
+                stage.name,
+                stage.pixcal,
+                str(stage.format),
+                stage.key,
+                ", ".join(made_from) or "–",
+                "; ".join(f"{k} {_plain(v)}" for k, v in options.items()) or "–",
+            ]
+        )
+    header = ["stage", "pixcal", "format", "key", "made from", "options"]
+    yield Table("Stages", header, rows)
+    files = [
+        [name, key] for stage in stages for name, key in stage.inputs.items() if name not in present
+    ]
+    if files:
+        yield Table("Digests of the files", ["array", "digest"], files)
+
+
+def fit_tables(fit: Mapping[str, Any]) -> Iterator[Table]:
+    """All numbers of fit.json; the removed modes have a section of their own."""
+    sets = {
+        name: dict(_flat({k: v for k, v in facts.items() if k != "removed_modes"}))
+        for name, facts in fit["sets"].items()
+    }
+    yield _columns_table("fit.json, each set", sets)
+    rest = {key: value for key, value in fit.items() if key != "sets"}
+    yield Table("fit.json, all sets together", ["quantity", "value"], flat_rows(rest))
+
+
+def frames_table(arrays: Sequence[ArrayRecord]) -> Table:
+    """What was ingested."""
+    rows = []
+    for a in arrays:
+        exposures = ", ".join(exact(v) for v in a.exptimes_s[:8])
+        rows.append(
+            [
+                a.name,
+                number(a.files),
+                number(a.frames),
+                "–" if a.shape is None else f"{a.shape[1]}\u00a0×\u00a0{a.shape[0]}",
+                "–" if a.first_mjd is None else date_of_mjd(a.first_mjd),
+                "–" if a.duration_s is None else duration(a.duration_s),
+                exposures + (", …" if len(a.exptimes_s) > 8 else "") or "–",
+                _span(a.temperature_c),
+                a.time_source or "–",
+            ]
+        )
+    header = [
+        "array", "files", "frames", "x × y", "first frame (UTC)", "duration", "exposures (s)", "°C",
+        "times from",
+    ]  # fmt: skip
+    return Table("Frames", header, rows)
+
+
+def _span(ends: tuple[float, float] | None) -> str:
+    if ends is None:
+        return "–"
+    low, high = (f"{v:.1f}" for v in ends)
+    return low if low == high else f"{low} to {high}"
+
+
+def _flat(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and values of nested data; lists of words or numbers stay whole."""
+    if isinstance(data, Mapping):
+        for name, value in data.items():
+            yield from _flat(value, f"{key}.{name}" if key else str(name))
+    elif isinstance(data, list) and any(isinstance(v, (Mapping, list)) for v in data):
+        for n, value in enumerate(data):
+            yield from _flat(value, f"{key}[{n}]")
+    else:
+        yield key, data
+
+
+def flat_rows(data: Any) -> list[list[str]]:
+    """Rows of dotted key and value."""
+    return [[key, _plain(value)] for key, value in _flat(data)]
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, list):
+        shown = ", ".join(_plain(v) for v in value[:12])
+        return shown + (f", … ({len(value)} in all)" if len(value) > 12 else "") or "–"
+    if value == "":
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return exact(value)

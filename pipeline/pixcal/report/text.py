@@ -1,0 +1,117 @@
+"""Numbers and names as words."""
+
+import math
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from pixcal.model.flags import PixelFlag
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+NAMES = {"delta_x": "δx", "delta_y": "δy", "delta_fringe": "δ along the fringe axis"}
+SYMBOLS = {"delta_x": "δx", "delta_y": "δy", "delta_fringe": "δ"}
+
+_MODES = {
+    "1": "the mean of the map (piston): where the fringes' phase is zero is not known",
+    "x": "a slope along x: it is a small change of the fringe vector",
+    "y": "a slope along y: it is a small change of the fringe vector",
+    "cos(psi)*iota/alpha": "fringes of the set's own period (cosine): left open by an intensity "
+    "that is free in each frame",
+    "sin(psi)*iota/alpha": "fringes of the set's own period (sine): likewise",
+    "cos(2*psi)": "fringes of half that period (cosine): left open by an amplitude that is free "
+    "in each frame",
+    "sin(2*psi)": "fringes of half that period (sine): likewise",
+}
+
+_FIBRES = {
+    "centre_x": "the place of the fibres along x",
+    "centre_y": "the place of the fibres along y",
+    "distance": "the distance of the fibres",
+    "baseline_x": "the separation of the fibres along x",
+    "baseline_y": "the separation of the fibres along y",
+    "baseline_z": "one fibre being nearer than the other",
+}
+
+
+def mode_in_words(name: str) -> str:
+    """What a removed mode is."""
+    if name.startswith("d psi / d "):
+        moved = name.removeprefix("d psi / d ")
+        return f"how the fringes change with {_FIBRES.get(moved, moved)}"
+    return _MODES.get(name, "a smooth mode of the fringes' shape")
+
+
+def flag_name(flag: PixelFlag) -> str:
+    """A flag as words."""
+    return (flag.name or "").lower().replace("_", " ")
+
+
+def number(value: Any, digits: int = 3) -> str:
+    """A number with so many digits, powers of ten written out; a dash for what is not known."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return str(value)
+    if isinstance(value, int):
+        return _grouped(f"{value:,}")
+    if not math.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
+    exponent = int(power)  # of the rounded value: 0.9996 is 1.00
+    if -3 <= exponent < 7:
+        decimals = digits - 1 - exponent
+        return _grouped(f"{round(value, decimals):,.{max(0, decimals)}f}")
+    return f"{mantissa} × 10{str(exponent).translate(_SUPERSCRIPT)}".replace("-", "−")
+
+
+def exact(value: Any) -> str:
+    """A number with up to six digits, as many as it needs."""
+    text = number(value, 6)
+    if not isinstance(value, float) or "." not in text:
+        return text
+    mantissa, times, power = text.partition(" × ")
+    return mantissa.rstrip("0").rstrip(".") + times + power
+
+
+def _grouped(text: str) -> str:
+    """Thousands apart by a thin space that does not break, and a real minus sign."""
+    return text.replace(",", "\u202f").replace("-", "−")
+
+
+def with_error(value: float | None, error: float | None) -> str:
+    """A value with two digits of its error."""
+    if value is None or not math.isfinite(value):
+        return "–"
+    if error is None or not math.isfinite(error) or error <= 0:
+        return number(value, 4)
+    exponent = math.floor(math.log10(error))
+    if -6 <= exponent < 4:
+        decimals = max(0, 1 - exponent)
+        return f"{value:.{decimals}f} ± {error:.{decimals}f}".replace("-", "−")
+    power = math.floor(math.log10(max(abs(value), error)))
+    decimals = max(0, power - exponent + 1)
+    scale = 10.0**power
+    text = f"({value / scale:.{decimals}f} ± {error / scale:.{decimals}f})".replace("-", "−")
+    return f"{text} × 10{str(power).translate(_SUPERSCRIPT)}"
+
+
+def share(part: int, whole: int) -> str:
+    """A part in per cent."""
+    percent = 100 * part / max(whole, 1)
+    return "0\u00a0%" if part == 0 else f"{number(percent, 2)}\u00a0%".replace(" ", "\u00a0")
+
+
+def duration(seconds: float) -> str:
+    """A time in the unit that suits it."""
+    for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * length:
+            return f"{number(seconds / length)} {unit}"
+    return f"{number(seconds)} s"
+
+
+def date_of_mjd(mjd: float) -> str:
+    """Date and time, UTC, of a modified Julian date; leap seconds are not resolved."""
+    moment = datetime(1858, 11, 17, tzinfo=UTC) + timedelta(days=mjd)
+    return f"{moment:%Y-%m-%d %H:%M:%S}"

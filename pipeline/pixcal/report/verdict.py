@@ -1,0 +1,258 @@
+"""The run in a few sentences: what was reached, and what a reader must look at."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pixcal.report.contents import Contents, FringeSet
+from pixcal.report.text import NAMES, duration, number, share, with_error
+
+TARGET_PX = 5e-5
+"""Precision wanted of a calibration (paper, section 4.2)."""
+
+FAR_MM = 40.0
+"""A place of the fibres that a laboratory would notice: twice its 2 cm (paper, section 5.2)."""
+
+GOOD, CHECK, BAD = "good", "check", "bad"
+
+
+@dataclass(frozen=True)
+class Card:
+    """One number that matters, with what it is compared to."""
+
+    title: str
+    value: str
+    detail: str
+    level: str
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence, and how much it should worry (``good``, ``check`` or ``bad``)."""
+
+    level: str
+    text: str
+
+
+def headline(contents: Contents) -> str:
+    """One sentence on the whole run."""
+    if not contents.sets:
+        return (
+            "No offsets were measured: "
+            + ("the fit has not been run." if _has_fringes(contents) else "no fringe sets.")
+            + " This page holds what the detector frames show."
+        )
+    parts = []
+    for offset in contents.offsets:
+        sigma = offset.sigma.median
+        if np.isfinite(sigma):
+            nm = sigma * contents.pitch_um * 1e3
+            parts.append(f"{NAMES[offset.name]} to {number(sigma, 2)} px ({number(nm, 2)} nm)")
+    if not parts:
+        return "The fit left no pixel with an offset: see the masks."
+    return f"The median pixel is calibrated in {' and '.join(parts)}."
+
+
+def _has_fringes(contents: Contents) -> bool:
+    return bool(contents.acquisition.get("frames", {}).get("fringes"))
+
+
+def cards(contents: Contents) -> list[Card]:
+    """Numbers for the top of the page."""
+    made = []
+    for offset in contents.offsets:
+        sigma, found = offset.sigma.median, offset.delta
+        nm = sigma * contents.pitch_um * 1e3
+        made.append(
+            Card(
+                f"median σ of {NAMES[offset.name]}",
+                f"{number(sigma, 3)} px",
+                f"{number(nm, 3)} nm; offsets themselves: {number(found.robust_std, 3)} px rms",
+                GOOD if np.isfinite(sigma) else BAD,
+            )
+        )
+    for fringes in contents.sets:
+        ratio = _ratio(fringes.facts.get("sigma_median_px"), fringes.facts.get("crb_median_px"))
+        made.append(
+            Card(
+                f"σ over the bound, {fringes.name}",
+                number(ratio, 4),
+                "1 is the best any estimator can do (Cramér–Rao)",
+                _level(ratio, 1.1, 1.5),
+            )
+        )
+        if fringes.allan is not None and fringes.allan.get("slope") is not None:
+            made.append(_allan_card(fringes.name, fringes.allan))
+    made.append(_mask_card(contents))
+    return made
+
+
+def _allan_card(name: str, measured: dict[str, Any]) -> Card:
+    knee = measured.get("knee_frames")
+    return Card(
+        f"Allan slope, {name}",
+        with_error(measured["slope"], measured.get("slope_err")),
+        "−0.5 is white noise; "
+        + ("no knee" if knee is None else f"knee at {number(round(knee))} frames"),
+        GOOD if knee is None and _slope_is_white(measured) else CHECK,
+    )
+
+
+def _slope_is_white(measured: dict[str, Any]) -> bool:
+    error = measured.get("slope_err") or 0.0
+    return bool(abs(measured["slope"] + 0.5) <= max(3 * error, 0.02))
+
+
+def _mask_card(contents: Contents) -> Card:
+    flags = contents.flags or contents.detector.flags
+    if flags is None:
+        return Card("masked pixels", "–", "not measured", CHECK)
+    whole = flags.shape[0] * flags.shape[1]
+    part = flags.masked / whole
+    return Card(
+        "masked pixels",
+        share(flags.masked, whole),
+        f"{number(flags.masked)} of {number(whole)}",
+        _level(part, 0.01, 0.1),
+    )
+
+
+def findings(contents: Contents) -> list[Finding]:
+    """Sentences in the order of how much they should worry."""
+    made = [Finding(CHECK, _sentence(text)) for text in contents.warnings]
+    if not contents.acquisition.get("frames", {}).get("flat"):
+        made.append(Finding(CHECK, "There are no flat frames: the flat is taken as 1 everywhere."))
+    if _has_fringes(contents) and not contents.sets:
+        made.append(Finding(CHECK, "The fit has not been run: there are no maps of offsets yet."))
+    for fringes in contents.sets:
+        made += _of_set(fringes)
+    consistency = (contents.fit or {}).get("sets_chi2_reduced")
+    if consistency is not None:
+        agree = consistency < 1.2
+        made.append(
+            Finding(
+                GOOD if agree else BAD,
+                f"Fringe sets that measure the same offsets "
+                f"{'agree' if agree else 'do not agree'}: reduced χ² {number(consistency)} "
+                "between them."
+                + ("" if agree else " An effect that depends on the fringe vector is at work."),
+            )
+        )
+    order = {BAD: 0, CHECK: 1, GOOD: 2}
+    return sorted(made, key=lambda f: order[f.level])
+
+
+def _sentence(text: str) -> str:
+    """With a capital letter and a full stop."""
+    return text[:1].upper() + text[1:].rstrip(".") + "."
+
+
+def _of_set(fringes: FringeSet) -> Iterator[Finding]:
+    facts, name = fringes.facts, f"Set {fringes.name}"
+    ratio = _ratio(facts.get("sigma_median_px"), facts.get("crb_median_px"))
+    if ratio is not None:
+        yield Finding(
+            _level(ratio, 1.1, 1.5),
+            f"{name}: the errors are {number(ratio, 4)} times the Cramér–Rao bound of its "
+            f"{number(facts.get('frames'))} frames.",
+        )
+    scale = facts.get("sigma_scale")
+    if scale is not None and abs(scale - 1) > 0.02:
+        yield Finding(
+            _level(abs(scale - 1), 0.02, 0.3),
+            f"{name}: residuals are {number(scale**2, 4)} times the declared noise in variance, "
+            f"so all errors were multiplied by {number(scale, 4)}. Gain or read noise may be off, "
+            "or the model misses something.",
+        )
+    if facts.get("fringe_vector_moves"):
+        yield Finding(
+            CHECK, f"{name}: the fringe vector moves from frame to frame and was fitted in each."
+        )
+    yield from _of_shape(name, facts)
+    if facts.get("batch_note") and fringes.allan is None:
+        yield Finding(CHECK, _sentence(f"{name}: {facts['batch_note']}"))
+    yield from _of_allan(fringes)
+    yield from _of_target(fringes)
+
+
+def _of_shape(name: str, facts: dict[str, Any]) -> Iterator[Finding]:
+    """Which shape the fringes were fitted with, and whether the bench is where it should be."""
+    if facts.get("model") != "hyperbolic":
+        return
+    why = f" ({facts['evidence']})" if facts.get("evidence") else ""
+    yield Finding(GOOD, f"{name}: the fringes were fitted as hyperbolic{why}.")
+    geometry = facts.get("geometry", {})
+    for axis in ("x", "y"):
+        centre = geometry.get(f"centre_{axis}_mm")
+        nominal = geometry.get(f"centre_{axis}_nominal_mm")
+        if centre is None or nominal is None or abs(centre - nominal) <= FAR_MM:
+            continue
+        yield Finding(
+            CHECK,
+            f"{name}: the fit places the fibres {number(abs(centre - nominal))} mm from their "
+            f"nominal place along {axis}. If the bench is not that far off, smooth structure of "
+            "the detector (steps between stitched blocks) was taken for curved fringes: fit with "
+            "--model paraxial and compare.",
+        )
+
+
+def _of_allan(fringes: FringeSet) -> Iterator[Finding]:
+    measured = fringes.allan
+    if measured is None:
+        yield Finding(CHECK, f"Set {fringes.name}: the Allan deviation has not been measured.")
+        return
+    for text in measured.get("warnings") or ():
+        yield Finding(CHECK, _sentence(f"Set {fringes.name}, Allan deviation: {text}"))
+    if measured.get("slope") is None:
+        return
+    knee = measured.get("knee_frames")
+    if knee is not None:
+        yield Finding(
+            CHECK,
+            f"Set {fringes.name}: beyond {number(round(knee))} frames more averaging does not "
+            "help as the square-root law says: something drifts.",
+        )
+    elif _slope_is_white(measured):
+        yield Finding(
+            GOOD,
+            f"Set {fringes.name}: the Allan deviation falls with the square root of the frames, "
+            "over all lengths measured.",
+        )
+    else:
+        yield Finding(
+            CHECK,
+            f"Set {fringes.name}: the Allan deviation falls with slope "
+            f"{with_error(measured['slope'], measured.get('slope_err'))}, not −0.5.",
+        )
+
+
+def _of_target(fringes: FringeSet) -> Iterator[Finding]:
+    """How far it is to the precision wanted, if nothing but photons counts."""
+    sigma, frames = fringes.facts.get("sigma_median_px"), fringes.facts.get("frames")
+    if not sigma or not frames:
+        return
+    if sigma <= TARGET_PX:
+        yield Finding(
+            GOOD, f"Set {fringes.name}: better than the {number(TARGET_PX, 1)} px wanted."
+        )
+        return
+    needed = frames * (sigma / TARGET_PX) ** 2
+    pace = fringes.facts.get("batch_period_s")
+    time = f" ({duration(needed * pace)} at this rate)" if pace else ""
+    yield Finding(
+        GOOD,
+        f"Set {fringes.name}: {number(TARGET_PX, 1)} px would take {number(needed, 2)} frames"
+        f"{time}, if the square-root law holds so long.",
+    )
+
+
+def _ratio(above: float | None, below: float | None) -> float | None:
+    return above / below if above is not None and below else None
+
+
+def _level(value: float | None, good: float, look: float) -> str:
+    if value is None or not np.isfinite(value):
+        return CHECK
+    return GOOD if value <= good else CHECK if value <= look else BAD

@@ -1,0 +1,300 @@
+"""Report: one HTML page on everything that a run holds."""
+
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.engine.plan import make_plan
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.report.contents import (
+    ArrayRecord,
+    Contents,
+    Detail,
+    Detector,
+    FringeSet,
+    OffsetMap,
+    Series,
+    StageRecord,
+)
+from pixcal.report.page import DETECTOR_MAPS, render
+from pixcal.report.summary import (
+    BAND_ROWS,
+    DETAIL,
+    SAMPLE,
+    SEGMENT,
+    FlagSummary,
+    MapSummary,
+    RatioSource,
+    Source,
+    Spectrum,
+    detail,
+    spectrum,
+    summarise,
+    summarise_flags,
+)
+from pixcal.storage.artefact import (
+    Manifest,
+    artefact_key,
+    build,
+    lock,
+    read_json,
+    read_manifest,
+    require,
+    up_to_date,
+)
+from pixcal.storage.cube import INDEX, ArrayReader
+
+STAGE = "report"
+FORMAT = 1
+SHOWN_STAGES = ("ingest", "reduce", "sweep", "fit", "allan")
+FIGURE_BYTES = 192 << 20
+"""Matplotlib, one figure and the page."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """A report has no options."""
+
+
+def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
+    """Write ``RUN/report/report.html`` and ``RUN/products/report.html``.
+
+    Only ``RUN/reduce`` must be there; what the later stages would add is marked as not measured.
+
+    Raises
+    ------
+    InputError
+        If reduce has not been run, or an artefact cannot be read.
+    """
+    require(run_dir, "reduce", 1)
+    with lock(run_dir):
+        manifests = _manifests(run_dir)
+        inputs = {stage: manifest.key for stage, manifest in manifests.items()}
+        key = artefact_key(STAGE, FORMAT, asdict(config), inputs)
+        made = up_to_date(run_dir, STAGE, key)
+        if made is None:
+            contents = _collect(run_dir, manifests, runtime)
+            with build(run_dir, STAGE, FORMAT, asdict(config), inputs) as report:
+                page = render(contents)
+                (report.folder / "report.html").write_text(page, encoding="utf-8")
+                report.summary = {"bytes": len(page.encode()), "sections": page.count("<section")}
+            made = require(run_dir, STAGE, FORMAT)
+        _publish(run_dir)
+        return made
+
+
+def _publish(run_dir: Path) -> None:
+    product = run_dir / "products" / "report.html"
+    product.parent.mkdir(exist_ok=True)
+    aside = product.with_name(".report.html.aside")
+    shutil.copyfile(run_dir / STAGE / "report.html", aside)
+    with aside.open("rb") as copy:
+        os.fsync(copy.fileno())
+    aside.replace(product)
+
+
+def _manifests(run_dir: Path) -> dict[str, Manifest]:
+    """Manifests of the stages that there are."""
+    return {
+        stage: require(run_dir, stage, 1)
+        for stage in SHOWN_STAGES
+        if read_manifest(run_dir / stage) is not None
+    }
+
+
+def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime) -> Contents:
+    """Read everything that the page shows."""
+    facts = _optional_json(run_dir / "reduce" / "reduce.json")
+    fit = read_json(run_dir / "fit" / "fit.json") if "fit" in manifests else None
+    measured = read_json(run_dir / "allan" / "allan.json")["sets"] if "allan" in manifests else {}
+    jobs = _jobs(run_dir, fit)
+    results = _summaries(jobs, runtime)
+    sets = _sets(run_dir, fit, measured, results)
+    return Contents(
+        acquisition=read_json(run_dir / "ingest" / "acquisition.json"),
+        stages=tuple(
+            StageRecord(m.stage, m.key, m.format, m.pixcal, m.config, m.inputs)
+            for m in manifests.values()
+        ),
+        arrays=_arrays(run_dir, manifests),
+        detector=Detector(
+            facts,
+            {
+                name: results[f"detector/{name}"]
+                for name in DETECTOR_MAPS
+                if f"detector/{name}" in results
+            },
+            results.get("flags/detector"),
+        ),
+        fit=fit,
+        offsets=_offsets(fit, results),
+        sets=sets,
+        flags=results.get("flags/products"),
+        warnings=_warnings(manifests, facts),
+    )
+
+
+# Maps
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One reading of a map; ``kind`` says what is made of it."""
+
+    name: str
+    kind: str
+    sources: tuple[Source, ...]
+
+
+def _jobs(run_dir: Path, fit: Mapping[str, Any] | None) -> list[_Job]:
+    """Every map that is read, once for each thing made of it."""
+    calibration = run_dir / "reduce" / "calibration.zarr"
+    jobs = [
+        _Job(f"detector/{name}", "map", (ArrayReader(calibration / name),))
+        for name in DETECTOR_MAPS
+        if (calibration / name / INDEX).exists()
+    ]
+    if (calibration / "mask" / INDEX).exists():
+        jobs.append(_Job("flags/detector", "flags", (ArrayReader(calibration / "mask"),)))
+    if fit is None:
+        return jobs
+    group = run_dir / "fit" / "fit.zarr"
+    for name in fit["outputs"]:
+        delta, sigma = ArrayReader(group / name), ArrayReader(group / f"{name}_sigma")
+        jobs += [
+            _Job(f"{name}/delta", "map", (delta,)),
+            _Job(f"{name}/sigma", "map", (sigma,)),
+            _Job(f"{name}/spectrum", "spectrum", (delta, sigma)),
+            _Job(f"{name}/detail", "detail", (delta, sigma)),
+        ]
+    jobs.append(_Job("flags/products", "flags", (ArrayReader(group / "mask"),)))
+    for name in fit["sets"]:
+        iota, alpha = ArrayReader(group / name / "iota"), ArrayReader(group / name / "alpha")
+        jobs += [
+            _Job(f"set/{name}/iota", "map", (iota,)),
+            _Job(f"set/{name}/visibility", "map", (RatioSource(alpha, iota),)),
+            _Job(f"set/{name}/chi2", "map", (ArrayReader(group / name / "chi2"),)),
+            _Job(f"flags/set/{name}", "flags", (ArrayReader(group / name / "mask"),)),
+        ]
+    return jobs
+
+
+def _summaries(jobs: Sequence[_Job], runtime: Runtime) -> dict[str, Any]:
+    if not jobs:
+        return {}
+    columns = max(job.sources[0].shape[1] for job in jobs)
+    # A band and some copies of it in float64; windows of the spectrum; the sample.
+    per_task = 64 * BAND_ROWS * columns + 128 * SEGMENT**2 + 8 * SAMPLE
+    plan = make_plan("the report", per_task, FIGURE_BYTES, runtime)
+    results = run_tasks(_summary, jobs, runtime.with_workers(plan.workers), label="report maps")
+    return {job.name: result for job, result in zip(jobs, results, strict=True)}
+
+
+def _summary(job: _Job) -> MapSummary | FlagSummary | Spectrum | Detail | None:
+    first, *rest = job.sources
+    if job.kind == "flags":
+        return summarise_flags(first)
+    if job.kind == "spectrum":
+        return spectrum(first, rest[0])
+    if job.kind == "detail":
+        (delta, start), (sigma, _) = detail(first), detail(rest[0])
+        return Detail(start, delta, sigma)
+    return summarise(first)
+
+
+def _offsets(fit: Mapping[str, Any] | None, results: Mapping[str, Any]) -> tuple[OffsetMap, ...]:
+    made = []
+    for name in fit["outputs"] if fit else ():
+        delta = results[f"{name}/delta"]
+        # Pixel by pixel is the whole map already where no blocks were averaged.
+        part = results[f"{name}/detail"] if delta.block > 1 and min(delta.shape) > DETAIL else None
+        made.append(
+            OffsetMap(name, delta, results[f"{name}/sigma"], results[f"{name}/spectrum"], part)
+        )
+    return tuple(made)
+
+
+def _sets(
+    run_dir: Path,
+    fit: Mapping[str, Any] | None,
+    measured: Mapping[str, Any],
+    results: Mapping[str, Any],
+) -> tuple[FringeSet, ...]:
+    made = []
+    for name, facts in fit["sets"].items() if fit else ():
+        folder = run_dir / "fit" / "fit.zarr" / name
+        made.append(
+            FringeSet(
+                name=name,
+                facts=facts,
+                iota=results[f"set/{name}/iota"],
+                visibility=results[f"set/{name}/visibility"],
+                chi2=results[f"set/{name}/chi2"],
+                flags=results[f"flags/set/{name}"],
+                series=Series(
+                    *(_column(folder / n) for n in ("time", "B", "A", "phi", "dkx", "dky"))
+                ),
+                allan=measured.get(name),
+            )
+        )
+    return tuple(made)
+
+
+def _column(path: Path) -> NDArray[np.float64]:
+    return ArrayReader(path).read().astype(float)
+
+
+# Words and tables
+
+
+def _optional_json(path: Path) -> dict[str, Any]:
+    found: dict[str, Any] = read_json(path) if path.exists() else {}
+    return found
+
+
+def _warnings(manifests: Mapping[str, Manifest], facts: Mapping[str, Any]) -> tuple[str, ...]:
+    """Sentences of the stages, and stages that were made from what is no longer there."""
+    found = []
+    for stage, manifest in manifests.items():
+        for made_from, key in manifest.inputs.items():
+            present = manifests.get(made_from)
+            if present is not None and present.key != key:
+                command = "fit" if stage == "sweep" else stage
+                found.append(
+                    f"{stage} was made from an earlier {made_from}: run 'pixcal {command}' again."
+                )
+    if "ingest" in manifests:
+        found += [str(text) for text in manifests["ingest"].summary.get("warnings", ())]
+    found += [str(text) for text in facts.get("warnings", ())]
+    return tuple(found)
+
+
+def _arrays(run_dir: Path, manifests: Mapping[str, Manifest]) -> tuple[ArrayRecord, ...]:
+    tables = _optional_json(run_dir / "ingest" / "frames.json")
+    shapes = manifests["ingest"].summary.get("arrays", {}) if "ingest" in manifests else {}
+    return tuple(_array(name, table, shapes.get(name)) for name, table in tables.items())
+
+
+def _array(name: str, table: Mapping[str, list[Any]], facts: Any) -> ArrayRecord:
+    def known(column: str) -> list[float]:
+        return [v for v in table.get(column, ()) if v is not None]
+
+    mjd, warm, times = known("mjd"), known("temperature_c"), known("time_s")
+    source = (table.get("time_source") or [None])[0]
+    return ArrayRecord(
+        name=name,
+        files=len(set(table["file"])),
+        frames=len(table["file"]),
+        shape=tuple(facts["shape"][1:]) if facts else None,
+        first_mjd=min(mjd) if mjd else None,
+        duration_s=max(times) - min(times) if times and source != "number" else None,
+        exptimes_s=tuple(sorted(set(known("exptime_s")))),
+        temperature_c=(min(warm), max(warm)) if warm else None,
+        time_source=source,
+    )
