@@ -1,7 +1,7 @@
 """Strict configuration: YAML into frozen dataclasses, every mistake named by its key.
 
 A configuration class is a frozen dataclass whose fields carry their limits in ``metadata``; make
-them with `quantity`. What is read back can be written out again by `to_plain`.
+them with `quantity`. `to_plain` and `to_yaml` write out what `parse` reads.
 """
 
 import dataclasses
@@ -89,6 +89,10 @@ class _StrictLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep=deep)
 
 
+class _StrictDumper(yaml.SafeDumper):
+    """Quotes every text that YAML 1.1 or 1.2 would read as something else."""
+
+
 _StrictLoader.yaml_implicit_resolvers = {}
 for _tag, _pattern in {
     "null": r"~|null|Null|NULL|",
@@ -97,9 +101,10 @@ for _tag, _pattern in {
     "float": r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?"
     r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
 }.items():
-    _StrictLoader.add_implicit_resolver(
-        f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), None
-    )
+    for _class in (_StrictLoader, _StrictDumper):
+        _class.add_implicit_resolver(
+            f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), None
+        )
 _StrictLoader.add_constructor("tag:yaml.org,2002:int", lambda _loader, node: int(node.value))
 
 
@@ -181,6 +186,13 @@ def to_plain(config: Any) -> Any:
     if isinstance(config, Path):
         return str(config)
     return config
+
+
+def to_yaml(config: Any) -> str:
+    """Text of a configuration, as `read_yaml` and `parse` read it."""
+    return yaml.dump(
+        to_plain(config), Dumper=_StrictDumper, sort_keys=False, default_flow_style=None
+    )
 
 
 def _kind(value: Any) -> str:

@@ -13,6 +13,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.geometry import TilePlane, tile_plane, unwrap, unwrapped_phase
 from pixcal.estimators.models import FringeShape, Start, fringe_models
 from pixcal.estimators.modes import ModeBasis, mode_sums
+from pixcal.estimators.smooth import Polynomial
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduced_set import ReducedSet
@@ -30,6 +31,10 @@ STEP_RAD = 1e-7
 EVIDENCE = 40.0
 """Fall in chi-square for which ``auto`` takes the richer shape: far past chance (p < 1e-6) and the
 Bayesian information criterion for its few parameters."""
+QUADRATIC = 3
+"""Terms of second order, which is what hyperbolic fringes show first."""
+FISHER = 15.0
+"""F(3, 15) at a chance of 1e-4: the fall for each term over that for terms of no cause."""
 
 
 @dataclass(frozen=True)
@@ -185,23 +190,35 @@ def _choose(
     runtime: Runtime,
     name: str,
 ) -> tuple[SetFit, str]:
-    """Fit the shape asked for; ``auto`` takes hyperbolic fringes where the map asks for them."""
+    """Fit the shape asked for; ``auto`` takes hyperbolic fringes where the map asks for them.
+
+    True offsets have structure of their own at large scales (stitches), which any richer shape
+    takes for curvature. How much, a polynomial tells: what it finds beyond the hyperbolic shape is
+    what curvature of no cause amounts to here.
+    """
     shapes = fringe_models()
 
-    def fit(which: str) -> SetFit:
-        shape = shapes[which].start(start)
-        return _fit_shape(swept, shape, start, jobs, n_batches, runtime, f"{which} {name}")
+    def fit(shape: type[FringeShape], label: str, background: float = 1.0) -> SetFit:
+        first = shape.start(start)
+        return _fit_shape(swept, first, start, jobs, n_batches, runtime, label, background)
 
     if model != "auto":
-        return fit(model), "asked for"
-    straight, exact = fit("paraxial"), fit("hyperbolic")
-    gain = (straight.square - exact.square) / max(exact.spread, 1e-300)
-    taken = exact if gain > EVIDENCE else straight
+        return fit(shapes[model], f"{model} {name}"), "asked for"
+    straight = fit(shapes["paraxial"], f"paraxial {name}")
+    exact = fit(shapes["hyperbolic"], f"hyperbolic {name}")
+    smooth = fit(Polynomial, f"smooth {name}")
+    gain = (straight.square - exact.square) / smooth.spread
+    others = len(smooth.basis.names) - len(straight.basis.names) - QUADRATIC
+    beyond = max(exact.square - smooth.square, 0.0) / smooth.spread / others
+    background = max(1.0, beyond)
+    needed = max(EVIDENCE, QUADRATIC * FISHER * background)
     reason = (
-        f"hyperbolic fringes lower chi-square by {gain:.0f} "
-        f"({'more' if gain > EVIDENCE else 'not more'} than {EVIDENCE:.0f})"
+        f"hyperbolic fringes lower chi-square by {gain:.0f}; {needed:.0f} are asked for, since "
+        f"large scales hold {background:.1f} times the power of small ones"
     )
-    return taken, reason
+    if gain <= needed:
+        return straight, reason
+    return fit(shapes["hyperbolic"], f"hyperbolic {name}", background), reason
 
 
 def _fit_shape(
@@ -212,6 +229,7 @@ def _fit_shape(
     n_batches: int,
     runtime: Runtime,
     label: str,
+    background: float,
 ) -> SetFit:
     """Gauss-Newton steps of a shape on all pixels, and the gauge's modes with it."""
     size = len(shape.names)
@@ -222,7 +240,7 @@ def _fit_shape(
         right = np.sum([s[1] for s in sums], axis=0)
         square, pixels = sum(s[2] for s in sums), max(sum(s[3] for s in sums), 1)
         free = np.linalg.lstsq(normal, right[:, 0], rcond=1e-12)[0]
-        spread = max(1.0, float(square - free @ right[:, 0]) / pixels)
+        spread = background * max(1.0, float(square - free @ right[:, 0]) / pixels)
         c = basis.solve(normal, right, spread)
         own = c[:size, 0]
         moved = np.sqrt(

@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
@@ -41,7 +40,7 @@ from pixcal.kernels.scene import (
 )
 from pixcal.model import acquisition as described
 from pixcal.model.bench import Bench, load_bench
-from pixcal.model.config import to_plain
+from pixcal.model.config import to_plain, to_yaml
 from pixcal.model.errors import InputError
 from pixcal.storage.artefact import (
     MANIFEST,
@@ -438,8 +437,7 @@ def _write_description(bench: Bench, folder: Path) -> None:
             ),
         ),
     )
-    text = yaml.safe_dump(to_plain(contents), sort_keys=False, default_flow_style=None)
-    (folder / "acquisition.yaml").write_text(text, encoding="utf-8")
+    (folder / "acquisition.yaml").write_text(to_yaml(contents), encoding="utf-8")
 
 
 def _write_truth(bench: Bench, recorded: list[Sequence], folder: Path, runtime: Runtime) -> None:
