@@ -1,0 +1,47 @@
+# The commands of the project: `make help` lists them.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+TOOLS := $(VENV)/.installed-tools
+# Compiled on first use: most of what is installed is never imported.
+PIP := $(BIN)/python -m pip --quiet install --no-compile
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test lint smoke clean
+
+help: ## list these commands
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
+
+install: $(TOOLS) ## make the environment .venv (the others do so when needed)
+
+$(INSTALLED): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "pixcal needs Python 3.11 or newer, $(PYTHON) is not; try: make PYTHON=python3.12" >&2; \
+	  exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) --upgrade 'pip>=25.1'
+	$(PIP) --editable .
+	@touch $@
+
+$(TOOLS): $(INSTALLED)
+	$(PIP) --group dev
+	@touch $@
+
+demo: $(INSTALLED) ## calibrate the sample acquisition into demo/
+	$(BIN)/pixcal run data_samples/demo --out demo
+
+test: $(TOOLS) ## run the tests
+	$(BIN)/pytest
+
+lint: $(TOOLS) ## check style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+smoke: $(INSTALLED) ## run every shell command once on a small simulated acquisition
+	PATH="$(abspath $(BIN)):$$PATH" .ci/smoke
+
+clean: ## remove the environment, the demo and all caches
+	rm -rf .venv demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find pipeline cli tests -name __pycache__ -type d -prune -exec rm -rf {} +

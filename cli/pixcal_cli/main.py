@@ -1,0 +1,110 @@
+"""The shell command ``pixcal``: its commands, its exit codes, and one line for every error."""
+
+import errno
+import os
+import sys
+import traceback
+import warnings
+from collections.abc import Sequence
+
+import click
+
+from pixcal import __version__
+from pixcal.model.errors import PixcalError
+from pixcal_cli.allan import allan
+from pixcal_cli.fit import fit
+from pixcal_cli.ingest import ingest
+from pixcal_cli.options import examples
+from pixcal_cli.reduce import reduce
+from pixcal_cli.report import report
+from pixcal_cli.run import run
+from pixcal_cli.simulate import simulate
+
+
+class InOrder(click.Group):
+    """Lists its commands in the order in which the data take them."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Names of the commands."""
+        return list(self.commands)
+
+
+@click.group(
+    cls=InOrder,
+    commands=[run, ingest, reduce, fit, allan, report, simulate],
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    epilog=examples("pixcal run data_samples/demo --out demo"),
+)
+@click.version_option(__version__, prog_name="pixcal")
+@click.pass_context
+def cli(ctx: click.Context) -> None:
+    """Maps of pixel response offsets from Young's fringes.
+
+    `pixcal run` does everything; the other commands are its steps. Each step writes a folder under
+    RUN, skips what is up to date, and resumes what was cut short.
+    """
+    if ctx.invoked_subcommand is None:
+        click.echo(ctx.get_help())
+
+
+def explain(error: BaseException) -> tuple[int, str]:
+    """Exit code and line on stderr for an error; an empty line prints nothing."""
+    again = "run the same command again to resume"
+    match error:
+        case click.UsageError(ctx=ctx):
+            path = ctx.command_path if ctx else "pixcal"
+            return 2, f"{error.format_message().rstrip('.')}; see '{path} --help'"
+        case click.ClickException():
+            return 2, error.format_message()
+        case PixcalError():
+            return 2, str(error)
+        case click.Abort() | KeyboardInterrupt():
+            return 1, f"interrupted; {again}"
+        case BrokenPipeError():
+            return 1, ""
+        case OSError(errno=errno.ENOSPC | errno.EDQUOT):
+            place = f"{error.filename}: " if error.filename else ""
+            return 1, f"{place}disk full; what was complete is kept: make room and {again}"
+        case PermissionError(filename=str() | os.PathLike()):
+            return 2, f"{error.filename}: no permission; change its owner or mode"
+        case OSError(filename=str() | os.PathLike()):
+            return 1, f"{error.filename}: {error.strerror}"
+        case MemoryError():
+            return 1, "out of memory; lower --memory or --workers"
+    name = type(error).__name__
+    return 1, f"internal error: {name}: {error} (PIXCAL_DEBUG=1 shows where)"
+
+
+def invoke(args: Sequence[str]) -> int:
+    """Run one command line.
+
+    Returns
+    -------
+    int
+        0 on success, 2 for a usage or input error, 1 for anything else.
+    """
+    try:
+        code = cli.main(args, prog_name="pixcal", standalone_mode=False)
+        sys.stdout.flush()
+    except (Exception, KeyboardInterrupt) as error:
+        if os.environ.get("PIXCAL_DEBUG"):
+            traceback.print_exc()
+        code, message = explain(error)
+        if message:
+            click.echo(f"pixcal: {' '.join(message.split())}", err=True)
+    return code or 0
+
+
+def main() -> None:
+    """Entry point of the shell command."""
+    if not sys.warnoptions and not os.environ.get("PIXCAL_DEBUG"):
+        # Libraries warn of what pixcal checks itself; what a user must know is in the results.
+        warnings.simplefilter("ignore")
+    code = invoke(sys.argv[1:])
+    try:
+        sys.stdout.flush()
+    except OSError:
+        # Nobody reads any more: keep the interpreter from saying so as it closes stdout.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(code)

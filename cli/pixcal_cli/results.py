@@ -1,0 +1,169 @@
+"""What the commands print on stdout: where a result is, and the numbers that matter most."""
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pixcal.storage.artefact import MANIFEST, read_json
+
+
+@contextmanager
+def announce(stage: str, folder: Path) -> Iterator[None]:
+    """Say where the stage that runs inside the block left its artefact, and whether it is new."""
+    before = _made_at(folder)
+    yield
+    state = "up to date" if before is not None and before == _made_at(folder) else "written"
+    click.echo(f"{stage}: {folder} ({state})")
+
+
+def _made_at(folder: Path) -> int | None:
+    # A manifest is written once, with its artefact: another time is another artefact.
+    try:
+        return (folder / MANIFEST).stat().st_mtime_ns
+    except FileNotFoundError:
+        return None
+
+
+def show_simulate(acquisition: Path) -> None:
+    """Print how many files of each kind there are."""
+    files = read_json(acquisition / MANIFEST)["summary"]["files"]
+    folders = Counter(name.partition("/")[0] for name in files if "/" in name)
+    _table(("folder", "files"), list(folders.items()))
+
+
+def show_ingest(run: Path) -> None:
+    """Print one row for each array of frames, and what looked odd."""
+    summary = read_json(run / "ingest" / MANIFEST)["summary"]
+    rows = [
+        (name, found["shape"][0], f"{found['shape'][2]} × {found['shape'][1]}", found["dtype"])
+        for name, found in summary["arrays"].items()
+    ]
+    _table(("array", "frames", "x × y", "type"), rows)
+    _notes(summary["warnings"])
+
+
+def show_reduce(run: Path) -> None:
+    """Print gain and read noise, declared and measured, and how many pixels have each flag."""
+    facts = read_json(run / "reduce" / "reduce.json")
+    rows = [
+        (
+            label,
+            _number(facts[key]["declared"]),
+            _with_error(facts[key]["measured"], facts[key]["error"]),
+            _number(facts[key]["used"]),
+        )
+        for label, key in (("gain e-/ADU", "gain_e_per_adu"), ("read noise e-", "read_noise_e"))
+    ]
+    _table(("quantity", "declared", "measured", "used"), rows)
+    counts = ", ".join(f"{count} {flag}" for flag, count in facts["flags"].items() if count)
+    click.echo(f"  pixels: {counts}")
+    _notes(facts["warnings"])
+
+
+def show_fit(run: Path) -> None:
+    """Print one row for each fringe set: how good its map of offsets is, and the bound."""
+    rows = [
+        (
+            name,
+            found["model"],
+            found["frames"],
+            _number(found["interfringe_px"], 5),
+            _number(found["sigma_median_px"], 3),
+            _number(found["crb_median_px"], 3),
+            _number(_ratio(found["sigma_median_px"], found["crb_median_px"]), 3),
+            _number(found["chi2_reduced"], 4),
+        )
+        for name, found in read_json(run / "fit" / "fit.json")["sets"].items()
+    ]
+    header = [
+        "set",
+        "model",
+        "frames",
+        "interfringe px",
+        "sigma px",
+        "bound px",
+        "sigma/bound",
+        "chi2",
+    ]
+    _table(header, rows)
+
+
+def show_allan(run: Path) -> None:
+    """Print one row for each fringe set and region: how the error falls with more frames."""
+    rows, notes = [], []
+    for name, found in read_json(run / "allan" / "allan.json")["sets"].items():
+        for region, curve in ({"all": found} | found["regions"]).items():
+            rows.append((name, region, *_allan_row(curve)))
+        notes += [f"{name}: {sentence}" for sentence in found["warnings"]]
+    _table(("set", "region", "slope", "knee", "frames", "deviation px", "if white px"), rows)
+    _notes(notes)
+
+
+def _allan_row(curve: Mapping[str, Any]) -> tuple[str, ...]:
+    """Slope, knee, and the deviation at the longest averaging."""
+    if not curve["adev_px"]:
+        return ("-",) * 5
+    knee = curve["knee_frames"]
+    return (
+        _with_error(curve["slope"], curve["slope_err"]),
+        "none" if knee is None else f"{_number(knee)} frames",
+        str(curve["frames"][-1]),
+        _with_error(curve["adev_px"][-1], curve["adev_err_px"][-1]),
+        _number(curve["white_expected_px"][-1], 3),
+    )
+
+
+def show_report(run: Path) -> None:
+    """Print where the page is."""
+    click.echo(f"  {run / 'products' / 'report.html'}")
+
+
+def show_run(run: Path, *, fitted: bool) -> None:
+    """Print the results of all steps, and where the products are."""
+    steps = {"reduce": show_reduce} | ({"fit": show_fit, "allan": show_allan} if fitted else {})
+    for stage, show in steps.items():
+        click.echo(f"\n{stage}")
+        show(run)
+    if not fitted:
+        click.echo("\nacquisition.yaml lists no fringes: there is nothing to fit")
+    click.echo("\nproducts")
+    for file in sorted((run / "products").iterdir()):
+        click.echo(f"  {file}")
+
+
+def _ratio(a: float | None, b: float | None) -> float | None:
+    return a / b if a is not None and b else None
+
+
+def _number(value: float | None, digits: int = 4) -> str:
+    return "-" if value is None else f"{value:.{digits}g}"
+
+
+def _with_error(value: float | None, error: float | None) -> str:
+    """The value rounded to two digits of its error."""
+    if value is None or not error:
+        return _number(value)
+    decimals = max(0, 1 - math.floor(math.log10(abs(error))))
+    return f"{value:.{decimals}f} ± {error:.{decimals}f}"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    cells = [header, *([_text(value) for value in row] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for row in cells:
+        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        click.echo(f"  {line.rstrip()}")
+
+
+def _notes(sentences: Sequence[str]) -> None:
+    for sentence in sentences:
+        click.echo(f"  note: {sentence}")
+
+
+def _text(value: Any) -> str:
+    return "-" if value is None else str(value)

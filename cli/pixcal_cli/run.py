@@ -1,0 +1,50 @@
+"""``pixcal run``: all steps from the acquisition to the report."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from pixcal.model.acquisition import load_acquisition
+from pixcal_cli import results
+from pixcal_cli.options import (
+    acquisition_argument,
+    examples,
+    gain_option,
+    model_option,
+    out_run_option,
+    overwrite_option,
+    runtime_options,
+)
+
+if TYPE_CHECKING:
+    from pixcal.engine.run import Runtime
+
+
+@click.command(epilog=examples("pixcal run data_samples/demo --out demo"))
+@acquisition_argument
+@out_run_option
+@overwrite_option
+@gain_option
+@model_option
+@runtime_options
+def run(
+    acquisition: Path, run: Path, overwrite: bool, gain: str, model: str, runtime: "Runtime"
+) -> None:
+    """Do all steps, from the acquisition ACQ to the report under RUN."""
+    # Here, not at the top: for a fast `pixcal --help`.
+    from pixcal.stages import allan, fit, ingest, reduce, report
+
+    with results.announce("ingest", run / "ingest"):
+        ingest.run(acquisition, run, ingest.Config(overwrite=overwrite), runtime)
+    with results.announce("reduce", run / "reduce"):
+        reduce.run(run, reduce.Config(gain=gain), runtime)
+    fringes = bool(load_acquisition(acquisition).frames.fringes)
+    if fringes:
+        with results.announce("fit", run / "fit"):
+            fit.run(run, fit.Config(model=model), runtime)
+        with results.announce("allan", run / "allan"):
+            allan.run(run, allan.Config(), runtime)
+    with results.announce("report", run / "report"):
+        report.run(run, report.Config(), runtime)
+    results.show_run(run, fitted=fringes)

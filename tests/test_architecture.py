@@ -1,0 +1,172 @@
+"""The code's real imports, held against the table in docs/architecture.md."""
+
+import ast
+import graphlib
+import re
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = {"pixcal": ROOT / "pipeline/pixcal", "pixcal_cli": ROOT / "cli/pixcal_cli"}
+NEW_RANDOM = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64", "Philox"}
+PAGE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+
+
+def table() -> dict[str, tuple[str, str]]:
+    """Folder -> (what it holds, what it may import), as the page says."""
+    rows = {}
+    for line in PAGE.splitlines():
+        cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
+        folder = re.fullmatch(r"`([\w/]+)/`", cells[0])
+        if folder and len(cells) == 3:
+            rows[folder[1].split("/")[-1]] = (cells[1], cells[2])
+    return rows
+
+
+def allowed(folder: str) -> set[str]:
+    rows = list(table())
+    text = table()[folder][1]
+    if text == "nothing of the project":
+        return set()
+    if text == "all of the above":
+        return set(rows[: rows.index(folder)])
+    names = set(re.findall(r"`(\w+)`", text))
+    assert names, f"{folder}: what it may import is not said"
+    assert re.fullmatch(r"(`\w+`(, )?)+", text), f"{folder}: {text!r} is not a list of folders"
+    return names
+
+
+def exclusive() -> dict[str, str]:
+    """Library -> the one folder that may import it, as the page says."""
+    owners: dict[str, str] = {}
+    for folder, (holds, _) in table().items():
+        _, _, only = holds.partition("the only importer of ")
+        owners |= dict.fromkeys(re.findall(r"[\w.]+", only.replace(" and ", " ")), folder)
+    return owners
+
+
+def modules() -> dict[str, Path]:
+    found = {}
+    for package, folder in PACKAGES.items():
+        for file in folder.rglob("*.py"):
+            parts = file.relative_to(folder).with_suffix("").parts
+            found[".".join([package, *(p for p in parts if p != "__init__")])] = file
+    return found
+
+
+MODULES = modules()
+
+
+def folder_of(module: str) -> str:
+    """Row of the table that a module belongs to; '' for the package ``pixcal`` itself."""
+    parts = module.split(".")
+    return "pixcal_cli" if parts[0] == "pixcal_cli" else parts[1] if len(parts) > 1 else ""
+
+
+@cache
+def syntax(file: Path) -> ast.Module:
+    return ast.parse(file.read_text(encoding="utf-8"))
+
+
+def imports(module: str) -> Iterator[str]:
+    """Dotted names that a module imports, anywhere in its text."""
+    for node in ast.walk(syntax(MODULES[module])):
+        if isinstance(node, ast.Import):
+            yield from (name.name for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: imports are absolute"
+            yield from (f"{node.module}.{name.name}" for name in node.names)
+
+
+def own_imports(module: str) -> set[str]:
+    """Modules of the project that a module imports."""
+    found = set()
+    for name in imports(module):
+        if name.split(".")[0] in PACKAGES:
+            while name not in MODULES:
+                name = name.rpartition(".")[0]
+            found.add(name)
+    return found - {module}
+
+
+def test_the_page_lists_the_folders_that_there_are() -> None:
+    there = {f.name for f in PACKAGES["pixcal"].iterdir() if (f / "__init__.py").exists()}
+    assert set(table()) == there | {"pixcal_cli"}
+    assert {"zarr", "astropy.io", "dask", "rich", "matplotlib", "jinja2"} <= set(exclusive())
+
+
+@pytest.mark.parametrize("module", sorted(MODULES))
+def test_a_module_imports_only_what_its_folder_may(module: str) -> None:
+    folder = folder_of(module)
+    if not folder:
+        assert not own_imports(module), "the package itself imports nothing of the project"
+        return
+    used = {folder_of(name) for name in own_imports(module)} - {folder, ""}
+    assert used <= allowed(folder), f"{module} imports {used - allowed(folder)}"
+
+
+@pytest.mark.parametrize("module", sorted(MODULES))
+def test_a_library_stays_in_its_folder(module: str) -> None:
+    owners = exclusive()
+    owners["distributed"] = owners["dask"]
+    for name in imports(module):
+        for library, folder in owners.items():
+            if name == library or name.startswith(f"{library}."):
+                assert folder_of(module) == folder, f"{name} belongs in {folder}/"
+
+
+def test_no_module_imports_itself_in_a_circle() -> None:
+    graph = {module: own_imports(module) for module in MODULES}
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        circle = error.args[1]
+        pytest.fail(" -> ".join(circle))
+
+
+@pytest.mark.parametrize("module", sorted(MODULES))
+def test_random_numbers_come_from_a_generator(module: str) -> None:
+    assert "random" not in set(imports(module)), "the standard library's global generator"
+    for node in ast.walk(syntax(MODULES[module])):
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) in (
+            "np.random",
+            "numpy.random",
+        ):
+            assert node.attr in NEW_RANDOM, f"line {node.lineno}: np.random.{node.attr} is global"
+    for name in imports(module):
+        if name.startswith("numpy.random."):
+            assert name.rpartition(".")[2] in NEW_RANDOM, name
+
+
+@pytest.mark.parametrize(
+    ("line", "rule"),
+    [
+        ("from pixcal.storage import cube", test_a_module_imports_only_what_its_folder_may),
+        ("def f():\n    import pixcal_cli", test_a_module_imports_only_what_its_folder_may),
+        ("from astropy import io", test_a_library_stays_in_its_folder),
+        ("import astropy.io.fits", test_a_library_stays_in_its_folder),
+        ("from distributed import Client", test_a_library_stays_in_its_folder),
+        ("np.random.seed(1)", test_random_numbers_come_from_a_generator),
+        ("from numpy.random import rand", test_random_numbers_come_from_a_generator),
+    ],
+)
+def test_a_breach_is_caught(
+    line: str, rule: Callable[[str], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "breach.py"
+    file.write_text(line)
+    monkeypatch.setitem(MODULES, "pixcal.model.breach", file)
+    with pytest.raises(AssertionError):
+        rule("pixcal.model.breach")
+
+
+def test_a_circle_is_caught(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, other in (("one", "two"), ("two", "one")):
+        file = tmp_path / f"{name}.py"
+        file.write_text(f"def f():\n    from pixcal.model import {other}\n")
+        monkeypatch.setitem(MODULES, f"pixcal.model.{name}", file)
+    with pytest.raises(pytest.fail.Exception, match="one"):
+        test_no_module_imports_itself_in_a_circle()
