@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 import yaml
 from astropy.io import fits
+from hypothesis import settings
 from numpy.typing import NDArray
+
+# Property tests try the same examples everywhere, however slow the machine.
+settings.register_profile("pixcal", deadline=None, derandomize=True, database=None)
+settings.load_profile("pixcal")
 
 F64 = NDArray[np.float64]
 SETS = {"vertical": (6.0, 0.0), "horizontal": (0.0, 6.0)}

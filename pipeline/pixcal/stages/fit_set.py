@@ -33,8 +33,9 @@ EVIDENCE = 40.0
 Bayesian information criterion for its few parameters."""
 QUADRATIC = 3
 """Terms of second order, which is what hyperbolic fringes show first."""
-FISHER = 15.0
-"""F(3, 15) at a chance of 1e-4: the fall for each term over that for terms of no cause."""
+EXCESS = 50.0
+"""Fall asked of each term over that of terms of no cause. F(3, 15) is 15 at a chance of 1e-4; but
+the power of steps falls with the order of the term, and two stitches reach 15."""
 
 
 @dataclass(frozen=True)
@@ -211,7 +212,7 @@ def _choose(
     others = len(smooth.basis.names) - len(straight.basis.names) - QUADRATIC
     beyond = max(exact.square - smooth.square, 0.0) / smooth.spread / others
     background = max(1.0, beyond)
-    needed = max(EVIDENCE, QUADRATIC * FISHER * background)
+    needed = max(EVIDENCE, QUADRATIC * EXCESS * background)
     reason = (
         f"hyperbolic fringes lower chi-square by {gain:.0f}; {needed:.0f} are asked for, since "
         f"large scales hold {background:.1f} times the power of small ones"
