@@ -1,5 +1,7 @@
 """Batches on a regular grid of time."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -54,4 +56,4 @@ def test_every_frame_is_in_one_batch_at_most():
     rng = np.random.default_rng(3)
     time = np.cumsum(rng.choice([0.1, 0.1, 0.1, 0.1, 1.7], 997))
     ranges = [r for r in plan_batches(time, 20).ranges if r[1] > r[0]]
-    assert all(b1 <= a2 for (_, b1), (a2, _) in zip(ranges, ranges[1:]))
+    assert all(b1 <= a2 for (_, b1), (a2, _) in itertools.pairwise(ranges))

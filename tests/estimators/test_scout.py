@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from pixcal.estimators.fringes import FrameParameters, find_fringe_vector, smooth_phasor
-from pixcal.estimators.scout import Coding, Scout, Tile, accumulate, start_model
 from pixcal.estimators.pixel_sums import phase_sigma
+from pixcal.estimators.scout import Coding, Scout, Tile, accumulate, start_model
 from pixcal.kernels.bilinear import solve_pixels
 from pixcal.model.errors import InputError
 

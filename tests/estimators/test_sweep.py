@@ -50,7 +50,7 @@ def test_how_time_is_cut_into_blocks_does_not_matter(case):
 def test_phases_and_levels_are_the_truth_within_their_errors(case):
     bench, codes = case
     maps = sweep(bench, codes, [64, 128, 192])
-    y, x = np.mgrid[: bench.shape[0], : bench.shape[1]]
+    _y, x = np.mgrid[: bench.shape[0], : bench.shape[1]]
     carrier = 2 * np.pi / 5 * (x - bench.shape[1] / 2)
     error = np.angle(np.exp(1j * (maps.phase + carrier - bench.psi("vertical"))))
     assert (error / maps.sigma).std() == pytest.approx(1.0, abs=0.08)

@@ -104,7 +104,10 @@ def test_frame_sums_give_each_frame_its_parameters(far):
     y, x = rng.uniform(-far, far, (2, n))
     theta = np.stack([np.full(n, 2e4), *rng.normal(0, 4e3, (2, n))])
     model = np.stack(
-        [(turned(g, dk, b, a) * theta[:, i]).sum(axis=1) for i, (b, a) in enumerate(zip(y, x))]
+        [
+            (turned(g, dk, b, a) * theta[:, i]).sum(axis=1)
+            for i, (b, a) in enumerate(zip(y, x, strict=False))
+        ]
     ).T
     f = np.float32
     start_g, start_dk = (g + 1e-5).astype(f), (dk + 1e-7 / far).astype(f)

@@ -119,10 +119,10 @@ def test_the_same_bits_however_it_runs(fitted, tmp_path, runtime):
         shutil.copytree(run / part, again / part)
     fit.run(again, fit.Config(), runtime)
     for name in SETS.values():
-        with fits.open(run / "products" / f"{name}.fits") as a:
-            with fits.open(again / "products" / f"{name}.fits") as b:
-                for n in range(3):
-                    np.testing.assert_array_equal(a[n].data, b[n].data)
+        paths = (folder / "products" / f"{name}.fits" for folder in (run, again))
+        with fits.open(next(paths)) as a, fits.open(next(paths)) as b:
+            for n in range(3):
+                np.testing.assert_array_equal(a[n].data, b[n].data)
 
 
 def test_up_to_date_work_is_skipped_and_another_model_sweeps_no_more(fitted, tmp_path):
@@ -242,7 +242,7 @@ def test_three_sets_are_consistent(make_bench, write_reduced, tmp_path):
     result = json.loads((run / "products" / "fit.json").read_text())
     # The sets' own removed modes differ: what one set lost, another keeps; some chi-square is left.
     assert 0.8 < result["sets_chi2_reduced"] < 1.3
-    data, sigma, _, _ = read_map(run / "products" / "delta_x.fits")
+    _data, sigma, _, _ = read_map(run / "products" / "delta_x.fits")
     assert np.nanmedian(sigma) < result["sets"]["a"]["sigma_median_px"]
 
 
