@@ -12,6 +12,7 @@ import click
 from pixcal import __version__
 from pixcal.model.errors import PixcalError
 from pixcal_cli.allan import allan
+from pixcal_cli.crests import crests
 from pixcal_cli.fit import fit
 from pixcal_cli.ingest import ingest
 from pixcal_cli.options import examples
@@ -31,7 +32,7 @@ class InOrder(click.Group):
 
 @click.group(
     cls=InOrder,
-    commands=[run, ingest, reduce, fit, allan, report, simulate],
+    commands=[run, ingest, reduce, fit, allan, crests, report, simulate],
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog=examples("pixcal run data_samples/demo --out demo"),

@@ -3,6 +3,8 @@
 import math
 import operator
 import os
+import subprocess
+import sys
 import threading
 from collections import Counter
 from collections.abc import Iterator
@@ -143,8 +145,13 @@ def test_an_address_that_is_none(address: str) -> None:
 
 @pytest.mark.slow
 def test_a_scheduler_that_does_not_answer() -> None:
-    with pytest.raises(InputError, match="no Dask scheduler answers"):
-        run_tasks(POWER, [1], Runtime("tcp://127.0.0.1:1"), label="test")
+    # In a process of its own: clusters of other tests leave their event loops behind.
+    code = (
+        "from pixcal.engine.run import Runtime, run_tasks\n"
+        "run_tasks(print, [1], Runtime('tcp://127.0.0.1:1'), label='test')"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "InputError: --cluster tcp://127.0.0.1:1: no Dask scheduler answers" in ended.stderr
 
 
 @pytest.mark.parametrize("quiet", [True, False])

@@ -133,6 +133,9 @@ def test_up_to_date_work_is_skipped_and_another_model_sweeps_no_more(fitted, tmp
     before = (again / "fit" / "manifest.json").stat().st_mtime_ns
     assert fit.run(again, fit.Config(), Runtime()) == first
     assert (again / "fit" / "manifest.json").stat().st_mtime_ns == before
+    (again / "products" / "delta_x.fits").unlink()
+    fit.run(again, fit.Config(), Runtime())
+    assert (again / "products" / "delta_x.fits").exists()
     swept = (again / "sweep" / "manifest.json").stat().st_mtime_ns
     other = fit.run(again, fit.Config(model="hyperbolic"), Runtime())
     assert other.summary["sets"]["vertical"]["model"] == "hyperbolic"

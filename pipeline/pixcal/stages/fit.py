@@ -10,7 +10,7 @@ from pixcal.estimators.models import fringe_models
 from pixcal.model.config import quantity
 from pixcal.stages import sweep
 from pixcal.stages.fit_combine import combine
-from pixcal.stages.fit_products import publish
+from pixcal.stages.fit_products import publish, published
 from pixcal.stages.fit_set import fit_set
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.sweep import load_run
@@ -62,6 +62,8 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         inputs = {"sweep": swept.key}
         key = artefact_key("fit", FORMAT, asdict(config), inputs)
         if (ready := up_to_date(run_dir, "fit", key)) is not None:
+            if not published(run_dir):
+                publish(run_dir)
             return ready
         with build(run_dir, "fit", FORMAT, asdict(config), inputs) as made:
             made.summary = _fit_all(run_dir, made, swept, config, runtime)

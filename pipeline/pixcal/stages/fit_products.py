@@ -2,9 +2,22 @@
 
 from pathlib import Path
 
+from pixcal.model.errors import DamagedError
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.products import Card, write_map
+
+
+def published(run_dir: Path) -> bool:
+    """Whether the products are there and are those of the present fit."""
+    try:
+        product = read_json(run_dir / "products" / "fit.json")
+        same = product == read_json(run_dir / "fit" / "fit.json")
+    except DamagedError:
+        return False
+    return same and all(
+        (run_dir / "products" / f"{name}.fits").exists() for name in product["outputs"]
+    )
 
 
 def publish(run_dir: Path) -> None:

@@ -23,7 +23,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.config import quantity, to_plain
 from pixcal.model.errors import InputError
-from pixcal.stages.ingest_arrays import DISK_FULL, create, find_kept, finish, take_over
+from pixcal.stages.ingest_arrays import create, find_kept, finish, take_over
 from pixcal.storage.artefact import (
     Build,
     Manifest,
@@ -106,19 +106,12 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
         if earlier is not None and not same and not config.overwrite:
             _refuse_other(out, earlier, plain, inputs)
         kept = find_kept(out / STAGE, earlier, same, sources) if earlier is not None else []
-        try:
-            with build(out, STAGE, FORMAT, plain, inputs, durable=True) as made:
-                facts = take_over(made.folder, kept, runtime)
-                known = {k.array: k.files for k in kept if k.array in facts}
-                tables, warnings = _check(described, sources, known, runtime)
-                _fill(made, {a: f for a, f in tables.items() if a not in known}, runtime)
-                _close(made, described, sources, tables, warnings, facts)
-        except OSError as error:
-            if error.errno not in DISK_FULL:
-                raise
-            raise InputError(
-                f"{out}: the disk is full; free some space and run again, it goes on from there"
-            ) from error
+        with build(out, STAGE, FORMAT, plain, inputs, durable=True) as made:
+            facts = take_over(made.folder, kept, runtime)
+            known = {k.array: k.files for k in kept if k.array in facts}
+            tables, warnings = _check(described, sources, known, runtime)
+            _fill(made, {a: f for a, f in tables.items() if a not in known}, runtime)
+            _close(made, described, sources, tables, warnings, facts)
     manifest = read_manifest(out / STAGE)
     assert manifest is not None
     return manifest
