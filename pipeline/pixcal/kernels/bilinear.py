@@ -31,41 +31,13 @@ _FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def _sweep_row(
     codes: Any, row: int, scale: float, offset: float, fill: float, g: Any,
-    t0: Any, t1: Any, t2: Any, read: Any, shot: Any,
-    n00: Any, n01: Any, n02: Any, n11: Any, n12: Any, n22: Any,
-    b0: Any, b1: Any, b2: Any, rr: Any,
-) -> None:  # fmt: skip
-    # One array a sum and no more arrays than these: with them LLVM proves that none overlap and
-    # vectorises over i; one more and it gives up (6 times slower).
-    one, zero = np.float32(1), np.float32(0)
-    for t in range(codes.shape[0]):
-        a0, a1, a2 = g[t, 0], g[t, 1], g[t, 2]
-        for i in range(codes.shape[2]):
-            code = np.float32(codes[t, row, i])
-            model = t0[i] * a0 + t1[i] * a1 + t2[i] * a2
-            w = (one if code != fill else zero) / (shot[i] * max(model, zero) + read[i])
-            r = scale * code + offset - model
-            wr, w0, w1 = w * r, w * a0, w * a1
-            n00[i] += w0 * a0
-            n01[i] += w0 * a1
-            n02[i] += w0 * a2
-            n11[i] += w1 * a1
-            n12[i] += w1 * a2
-            n22[i] += w * a2 * a2
-            b0[i] += wr * a0
-            b1[i] += wr * a1
-            b2[i] += wr * a2
-            rr[i] += wr * r
-
-
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _sweep_row_moving(
-    codes: Any, row: int, scale: float, offset: float, fill: float, g: Any,
     dk: Any, y: float, x0: float,
     t0: Any, t1: Any, t2: Any, read: Any, shot: Any,
     n00: Any, n01: Any, n02: Any, n11: Any, n12: Any, n22: Any,
     b0: Any, b1: Any, b2: Any, rr: Any,
 ) -> None:  # fmt: skip
+    # One array a sum and few others: with them LLVM proves that none overlap and vectorises over i;
+    # with a few more it gives up (6 times slower).
     one, zero, half = np.float32(1), np.float32(0), np.float32(0.5)
     for t in range(codes.shape[0]):
         a0, c1, c2 = g[t, 0], g[t, 1], g[t, 2]
@@ -140,23 +112,16 @@ def sweep_block(
     """
     ny, nx = codes.shape[1], codes.shape[2]
     p = [np.empty(nx, np.float32) for _ in range(11)]
-    moving = bool(np.any(dk != 0))
     s, o, f = np.float32(scale), np.float32(offset), np.float32(fill)
     for row in range(ny):
         for k in range(11):
             p[k][:] = np.float32(0)
         t0, t1, t2 = theta[0, row], theta[1, row], theta[2, row]
-        if moving:
-            _sweep_row_moving(
-                codes, row, s, o, f, g, dk, np.float32(y0 + row), np.float32(x0),
-                t0, t1, t2, read[row], shot[row],
-                p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9],
-            )  # fmt: skip
-        else:
-            _sweep_row(
-                codes, row, s, o, f, g, t0, t1, t2, read[row], shot[row],
-                p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9],
-            )  # fmt: skip
+        _sweep_row(
+            codes, row, s, o, f, g, dk, np.float32(y0 + row), np.float32(x0),
+            t0, t1, t2, read[row], shot[row],
+            p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9],
+        )  # fmt: skip
         _count_row(codes, row, fill, p[10])
         for k in range(11):
             for i in range(nx):
