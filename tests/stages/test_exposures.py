@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pixcal.stages.exposures import group_exposures
+from pixcal.stages.reduce.exposures import group_exposures
 
 
 def tables(**exptimes: list[float | None]) -> dict[str, dict[str, Any]]:

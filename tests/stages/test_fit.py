@@ -147,7 +147,7 @@ def test_a_killed_fit_resumes_to_the_same_bits(fitted, tmp_path, monkeypatch):
     again = tmp_path / "run"
     for part in ("ingest", "reduce"):
         shutil.copytree(run / part, again / part)
-    from pixcal.stages import sweep
+    from pixcal.stages.fit import sweep
 
     calls = []
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError, PlanError
-from pixcal.stages import ingest
+from pixcal.stages.ingest import stage as ingest
 from pixcal.storage import fits_rows, frames
 from pixcal.storage.cube import ArrayReader, ArrayWriter
 from pixcal.storage.sources import SourceFile
@@ -592,7 +592,7 @@ PEAK = """
 import re, sys
 from pathlib import Path
 from pixcal.engine.run import Runtime
-from pixcal.stages import ingest
+from pixcal.stages.ingest import stage as ingest
 ingest.run(Path(sys.argv[1]), Path(sys.argv[2]), ingest.Config(), Runtime(workers=2, memory=MEMORY))
 # VmHWM, not ru_maxrss, which begins at the peak of the process that started this one.
 print(int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) * 1024)

@@ -4,11 +4,11 @@
 (numbers of those read), ``points``, ``points_used`` (no outliers), ``paths``, ``interfringe_px``,
 ``segment_px``, ``point_sigma_median_px``; ``geometry`` (of each parameter the value, its 1-sigma
 error, the nominal value and the prior's error, mm, from pixel (0, 0)); ``cost_rad2`` (equation 7),
-``chi2_reduced``, ``evaluations``; ``minima``, how many minima each map of the cost has; and
+``chi2_reduced``, ``evaluations``; ``unique_minimum`` of the cost as far as the maps go; and
 ``agreement`` with the geometry of ``RUN/fit`` (null, with ``agreement_note``, where it has none):
 of each parameter the difference in mm and in its sigma, and the phases of both over the window,
 less a piston, in px. That sigma adds both errors in square: too much where priors or frames count
-in both. ``crests.zarr/<set name>`` holds the points and the maps.
+in both. ``warnings`` are sentences. ``crests.zarr/<set name>`` holds the points and the maps.
 """
 
 import shutil
@@ -29,8 +29,8 @@ from pixcal.estimators.crest_fit import (
     CrestFit,
     Prior,
     cost_map,
+    falls_then_rises,
     fit_crests,
-    local_minima,
     valley,
 )
 from pixcal.estimators.crests import (
@@ -49,8 +49,8 @@ from pixcal.model.config import quantity
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.report.crest_figures import CrestView, Extract, crest_figure
 from pixcal.report.drawing import png
+from pixcal.stages.fit.sweep import load_run, nominal_vector
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.stages.sweep import load_run, nominal_vector
 from pixcal.storage.artefact import (
     Build,
     Manifest,
@@ -72,6 +72,8 @@ MAP_SIDE = 25
 """Places along each side of a cost map; odd, so that the minimum is one of them."""
 MAP_REACH = 0.04
 """How far the maps go from the minimum, as a share of distance and baseline."""
+NOTABLE_CHI2 = 3.0
+"""From here on the reduced chi-square of the points is pointed out."""
 FIGURE_BYTES = 128 << 20
 """Matplotlib and one figure."""
 
@@ -176,7 +178,11 @@ def _measure(
         "cost_rad2": fit.cost,
         "chi2_reduced": fit.chi2_reduced,
         "evaluations": fit.evaluations,
-        "minima": {title: local_minima(found.cost) for title, found in maps.maps.items()},
+        "unique_minimum": all(
+            falls_then_rises(cost)
+            for cost in (maps.baseline.cost, maps.ratio.cost, maps.valley_cost)
+        ),
+        "warnings": _warnings(fit),
         "agreement": None if other is None else _agreement(paths, fit, *other),
         "agreement_note": note,
     }
@@ -284,9 +290,10 @@ def _row_task(
 
 @dataclass(frozen=True)
 class _Maps:
-    """Figure 17: maps by name, and the valley along the distance."""
+    """Figure 17: (D, B) with the others held, (D, B/D) with the others refitted, and its valley."""
 
-    maps: dict[str, CostMap]
+    baseline: CostMap
+    ratio: CostMap
     valley_ratio: F64
     valley_cost: F64
 
@@ -299,16 +306,14 @@ def _cost_maps(paths: CrestPaths, fit: CrestFit) -> _Maps:
     ratio, cost = valley(paths, fit, distance)
     middle = length / best.distance
     # As wide as the valley wanders, and wide enough to see its walls.
-    reach = max(2 * float(np.max(np.abs(ratio - middle))), 1e-4 * middle)
+    reach = max(2 * float(np.max(np.abs(ratio - middle))), 1e-5 * middle)
     lengths, ratios = length * (1 + MAP_REACH * steps), middle + reach * steps
-    maps = {
-        f"{'ratio' if by_ratio else 'baseline'}_{'refitted' if refit else 'fixed'}": cost_map(
-            paths, fit, distance, ratios if by_ratio else lengths, ratio=by_ratio, refit=refit
-        )
-        for by_ratio in (False, True)
-        for refit in (False, True)
-    }
-    return _Maps(maps, ratio, cost)
+    return _Maps(
+        cost_map(paths, fit, distance, lengths, ratio=False, refit=False),
+        cost_map(paths, fit, distance, ratios, ratio=True, refit=True),
+        ratio,
+        cost,
+    )
 
 
 def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit, maps: _Maps) -> None:
@@ -320,16 +325,28 @@ def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit, maps: _Maps) -
     }  # fmt: skip
     for array, (data, units) in points.items():
         write_array(folder / array, data, dims=("point",), attrs={"units": units})
-    for title, found in maps.maps.items():
-        axis = "ratio" if title.startswith("ratio") else "baseline"
-        write_array(folder / f"cost_{title}", found.cost, dims=("distance", axis))
-        if found.refitted:
-            units = "1" if axis == "ratio" else "mm"
-            write_array(folder / axis, found.second, dims=(axis,), attrs={"units": units})
-    distance = next(iter(maps.maps.values())).distance
+    for axis, found, units in (("baseline", maps.baseline, "mm"), ("ratio", maps.ratio, "1")):
+        note = "others refitted" if found.refitted else "phase refitted, others held"
+        attrs = {"units": "1", "comment": note}
+        write_array(folder / f"cost_{axis}", found.cost, dims=("distance", axis), attrs=attrs)
+        write_array(folder / axis, found.second, dims=(axis,), attrs={"units": units})
+    distance = maps.baseline.distance
     write_array(folder / "distance", distance, dims=("distance",), attrs={"units": "mm"})
     write_array(folder / "valley_ratio", maps.valley_ratio, dims=("distance",))
     write_array(folder / "valley_cost", maps.valley_cost, dims=("distance",))
+
+
+def _warnings(fit: CrestFit) -> list[str]:
+    found = []
+    if fit.chi2_reduced > NOTABLE_CHI2:
+        found.append(
+            f"points scatter {np.sqrt(fit.chi2_reduced):.1f} times more than their noise; errors "
+            "allow for it as if points were independent, which offsets of whole blocks are not"
+        )
+    lost = int((~fit.used).sum())
+    if lost > 0.05 * len(fit.used):
+        found.append(f"{lost} of {len(fit.used)} points are outliers and were left out")
+    return found
 
 
 def _geometry_facts(fit: CrestFit) -> dict[str, float]:
@@ -400,11 +417,11 @@ def _view(
         extracts=tuple(
             _extract_at(source, frame, paths, k) for k in (paths.k.min(), paths.k.max())
         ),
-        distance=maps.maps["baseline_refitted"].distance,
-        baseline=maps.maps["baseline_refitted"].second,
-        ratio=maps.maps["ratio_refitted"].second,
-        cost_baseline=maps.maps["baseline_refitted"].cost,
-        cost_ratio=maps.maps["ratio_refitted"].cost,
+        distance=maps.baseline.distance,
+        baseline=maps.baseline.second,
+        ratio=maps.ratio.second,
+        cost_baseline=maps.baseline.cost,
+        cost_ratio=maps.ratio.cost,
         valley_ratio=maps.valley_ratio, valley_cost=maps.valley_cost,
         best=(best.distance, float(np.hypot(best.baseline_x, best.baseline_y))),
         distance_sigma=float(fit.sigma[2]),

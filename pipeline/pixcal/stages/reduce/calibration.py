@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pixcal.estimators.bad_pixels import dead, hot, noisy
 from pixcal.estimators.detector import median_and_sigma, usual_variance
 from pixcal.model.flags import PixelFlag
-from pixcal.stages.columns import Index, extent, indices
-from pixcal.stages.frame_statistics import STATISTICS, Limits
+from pixcal.stages.reduce.columns import Index, extent, indices
+from pixcal.stages.reduce.frame_statistics import STATISTICS, Limits
 from pixcal.storage.cube import CHUNK, ArrayReader, ArrayWriter, create_array, create_group
 
 F64 = NDArray[np.float64]

@@ -12,9 +12,9 @@ from pixcal.estimators.detector import Linearity, linearity
 from pixcal.kernels.photon_transfer import GainFit, fit_gain
 from pixcal.model.acquisition import Detector
 from pixcal.model.errors import InputError
-from pixcal.stages.calibration import Usual, usual
-from pixcal.stages.columns import grid
-from pixcal.stages.frame_statistics import Measuring
+from pixcal.stages.reduce.calibration import Usual, usual
+from pixcal.stages.reduce.columns import grid
+from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.storage.cube import ArrayReader
 
 F64 = NDArray[np.float64]

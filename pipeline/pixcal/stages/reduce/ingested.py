@@ -12,7 +12,7 @@ import numpy as np
 from pixcal.model.acquisition import Acquisition, Detector
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
-from pixcal.stages.exposures import Exposures, group_exposures
+from pixcal.stages.reduce.exposures import Exposures, group_exposures
 from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
 

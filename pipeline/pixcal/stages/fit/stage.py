@@ -8,12 +8,12 @@ from pixcal import __version__
 from pixcal.engine.run import Runtime
 from pixcal.estimators.models import fringe_models
 from pixcal.model.config import quantity
-from pixcal.stages import sweep
-from pixcal.stages.fit_combine import combine
-from pixcal.stages.fit_products import publish, published
-from pixcal.stages.fit_set import fit_set
+from pixcal.stages.fit import sweep
+from pixcal.stages.fit.combination import combine
+from pixcal.stages.fit.fringe_set import fit_set
+from pixcal.stages.fit.products import publish, published
+from pixcal.stages.fit.sweep import load_run
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.stages.sweep import load_run
 from pixcal.storage.artefact import (
     Build,
     Manifest,

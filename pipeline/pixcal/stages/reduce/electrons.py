@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pixcal.kernels.quantise import FILL, Scale, coefficients, encode, extremes
 from pixcal.model.flags import PixelFlag
-from pixcal.stages.calibration import FLAG_ATTRS
-from pixcal.stages.columns import Index, extent, grid
+from pixcal.stages.reduce.calibration import FLAG_ATTRS
+from pixcal.stages.reduce.columns import Index, extent, grid
 from pixcal.storage.cube import (
     CHUNK,
     ArrayReader,

@@ -24,8 +24,8 @@ from pixcal.estimators.detector import (
 from pixcal.kernels.photon_transfer import N_BINS, bin_pairs, pair_statistics
 from pixcal.kernels.robust import BATCH, Combination, Combined
 from pixcal.model.flags import PixelFlag
-from pixcal.stages.columns import Index, extent, grid
-from pixcal.stages.exposures import Group
+from pixcal.stages.reduce.columns import Index, extent, grid
+from pixcal.stages.reduce.exposures import Group
 from pixcal.storage.cube import CHUNK, ArrayReader, ArrayWriter, create_array, create_group
 
 F32 = NDArray[np.float32]

@@ -19,19 +19,19 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.config import quantity, to_plain
 from pixcal.model.errors import InputError
 from pixcal.model.flags import PixelFlag
-from pixcal.stages.calibration import Finishing, calibration_writers, finish
-from pixcal.stages.columns import extent, indices, run_noted
-from pixcal.stages.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
-from pixcal.stages.electrons import CONVERT_BYTES
-from pixcal.stages.frame_statistics import (
+from pixcal.stages.reduce.calibration import Finishing, calibration_writers, finish
+from pixcal.stages.reduce.columns import extent, indices, run_noted
+from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
+from pixcal.stages.reduce.electrons import CONVERT_BYTES
+from pixcal.stages.reduce.frame_statistics import (
     Limits,
     Measuring,
     measure,
     measure_bytes,
     statistics_writers,
 )
-from pixcal.stages.fringe_sets import Bounds, set_warnings, share_at_mean, write_set
-from pixcal.stages.ingested import Ingested
+from pixcal.stages.reduce.fringe_sets import Bounds, set_warnings, share_at_mean, write_set
+from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.artefact import (
     Build,
     Manifest,

@@ -23,7 +23,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.config import quantity, to_plain
 from pixcal.model.errors import InputError
-from pixcal.stages.ingest_arrays import create, find_kept, finish, take_over
+from pixcal.stages.ingest.arrays import create, find_kept, finish, take_over
 from pixcal.storage.artefact import (
     Build,
     Manifest,

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels.quantise import Scale, choose_scale
-from pixcal.stages.columns import indices, run_noted
-from pixcal.stages.electrons import (
+from pixcal.stages.reduce.columns import indices, run_noted
+from pixcal.stages.reduce.electrons import (
     Converting,
     FringeSet,
     convert,
@@ -19,7 +19,7 @@ from pixcal.stages.electrons import (
     signal_range,
     write_coordinates,
 )
-from pixcal.stages.ingested import Ingested
+from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import ArrayReader
 

@@ -16,8 +16,8 @@ from pixcal.estimators.modes import ModeBasis, mode_sums
 from pixcal.estimators.smooth import Polynomial
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.flags import PixelFlag
+from pixcal.stages.fit.sweep import read_frames
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.stages.sweep import read_frames
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
 
 F32 = NDArray[np.float32]

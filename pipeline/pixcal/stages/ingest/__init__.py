@@ -1,0 +1,5 @@
+"""From FITS frames to checksummed cubes."""
+
+from pixcal.stages.ingest.stage import Config, run
+
+__all__ = ["Config", "run"]
