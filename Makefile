@@ -8,7 +8,7 @@ TOOLS := $(VENV)/.installed-tools
 PIP := $(BIN)/python -m pip --quiet install --no-compile
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint smoke clean
+.PHONY: help install demo test lint smoke precision clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
@@ -41,6 +41,9 @@ lint: $(TOOLS) ## check style and types
 
 smoke: $(INSTALLED) ## run every shell command once on a small simulated acquisition
 	PATH="$(abspath $(BIN)):$$PATH" .ci/smoke
+
+precision: $(INSTALLED) ## 12 000 simulated frames against their truth (half a minute, 1 GB of disk)
+	$(BIN)/python benchmarks/precision.py
 
 clean: ## remove the environment, the demo and all caches
 	rm -rf .venv demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
