@@ -52,8 +52,10 @@ class Polynomial:
     def modes(self, y: F64, x: F64) -> F64:
         """The powers, on the scale of the window."""
         ry, rx = self.reference
-        y, x = np.broadcast_arrays((y - ry) / self.scale, (x - rx) / self.scale)
-        return np.stack([x**i * y**j for i, j in _powers()])
+        # Columns and rows are small: their powers cost nothing, the products all.
+        xs = [np.asarray((x - rx) / self.scale) ** n for n in range(DEGREE + 1)]
+        ys = [np.asarray((y - ry) / self.scale) ** n for n in range(DEGREE + 1)]
+        return np.stack([xs[i] * ys[j] for i, j in _powers()])
 
     def moved(self, step: F64) -> Self:
         """The surface after a step."""
