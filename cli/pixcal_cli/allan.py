@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     type=region,
     multiple=True,
     metavar="y0:y1,x0:x1",
-    help="Pixels to use, ends excluded; may be given several times. All of them by default.",
+    help="Pixels for a curve of their own, ends excluded; may be given several times.",
 )
 @runtime_options
 def allan(run: Path, regions: tuple[tuple[int, int, int, int], ...], runtime: "Runtime") -> None:

@@ -47,3 +47,9 @@ def test_too_little_memory_is_refused_with_both_numbers() -> None:
 
 def test_sync_has_one_worker() -> None:
     assert make_plan("it", MIB, 0, Runtime("sync", 8)).workers == 1
+
+
+def test_every_process_has_an_interpreter_of_its_own() -> None:
+    runtime = Runtime("processes", 4, 2 * BASE_BYTES + 3 * MIB)
+    assert make_plan("it", MIB, MIB, runtime).workers == 1
+    assert make_plan("it", MIB, MIB, Runtime("threads", 4, runtime.memory)).workers == 4

@@ -53,3 +53,12 @@ def test_axes_that_span():
     assert axes_span_plane(unit(0, 30))
     assert not axes_span_plane(unit(0, 3, 180))
     assert not axes_span_plane(unit(20))
+
+
+def test_sets_of_very_unequal_errors_still_give_both():
+    """Whether two axes give both components does not depend on how well each is measured."""
+    delta, sigma = np.array([[1.0], [2.0]]), np.array([[1e-5], [1e-2]])
+    xy, sigma_xy, _ = combine_sets(unit(0, 90), delta, sigma)
+    np.testing.assert_allclose(xy, delta, atol=1e-12)
+    np.testing.assert_allclose(sigma_xy, sigma)
+    assert np.isnan(combine_sets(unit(0, 4), delta, np.ones((2, 1)))[0]).all()

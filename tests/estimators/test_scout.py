@@ -1,5 +1,7 @@
 """The scout finds the frames; the sweep then reaches the bound."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -134,3 +136,39 @@ def test_frame_parameters_elsewhere():
     there = FrameParameters(frames.at(10.0, -5.0), frames.dk, (10.0, -5.0))
     np.testing.assert_allclose(there.at(3.0, 4.0), frames.g)
     np.testing.assert_allclose(there.A, frames.A)
+
+
+def test_a_frame_without_samples_takes_nothing_from_the_others(bench):
+    scout, codes = scout_of(bench(shape=(40, 47), frames=60, vector_noise=1e-2))
+    codes[17] = 65535
+    frames = scout.prime([codes])
+    np.testing.assert_allclose(frames.g[17], 0, atol=1e-30)
+    others = np.arange(60) != 17
+    alone, _ = scout_of(bench(shape=(40, 47), frames=60, vector_noise=1e-2))
+    wanted = alone.prime([codes[others]])
+    assert scout.moving
+    assert alone.moving
+    np.testing.assert_allclose(frames.B[others] / frames.B[0], wanted.B / wanted.B[0], rtol=1e-4)
+    again = scout.solve([codes[16:19]])
+    assert np.isfinite(again.g).all()
+    np.testing.assert_allclose(again.g[1], 0, atol=1e-30)
+
+
+def test_the_first_look_does_not_hold_all_samples_as_floating_point(bench):
+    """Codes are two bytes a sample; their floats, four, are made a part at a time."""
+    scout, codes = scout_of(bench(shape=(128, 128), frames=60))
+    many = np.tile(codes, (8, 1, 1))
+    tracemalloc.start()
+    scout._subspace([many])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1.5 * many.nbytes
+
+
+def test_a_smooth_phasor_of_two_good_rows(bench):
+    y, x = np.mgrid[:64, :70]
+    good = (y == 10) | (y == 11)
+    phasor = np.where(good, 0.9 * np.exp(0.5j * x), 0)
+    smooth, k = smooth_phasor(phasor, good, (0.5, 0.0))
+    np.testing.assert_allclose(smooth[good], phasor[good], atol=1e-6)
+    assert k[0] == pytest.approx(0.5)

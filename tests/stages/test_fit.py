@@ -272,3 +272,100 @@ def test_stitches_are_not_taken_for_hyperbolic_fringes(make_bench, write_reduced
     result = fit.run(run, fit.Config(), Runtime()).summary
     for name in SETS:
         assert result["sets"][name]["model"] == "paraxial", result["sets"][name]["evidence"]
+
+
+def remask(run, name, mask):
+    group = run / "reduce" / "reduced.zarr" / name
+    shutil.rmtree(group / "mask")
+    write_array(group / "mask", mask, dims=("y", "x"), chunks=(128, 128))
+
+
+@pytest.mark.parametrize(
+    ("shape", "masked"),
+    [
+        ((137, 150), np.s_[:128, :128]),  # a whole tile
+        ((137, 150), np.s_[2:128, :128]),  # all of a tile but two rows
+        ((1, 150), np.s_[:, 3:5]),  # a window of one row
+        ((150, 9), np.s_[3:5, :]),
+    ],
+)
+def test_tiles_of_few_good_pixels(make_bench, write_reduced, tmp_path, shape, masked):
+    name, baseline = ("vertical", (6.0, 0.0)) if shape[1] > 9 else ("horizontal", (0.0, 6.0))
+    bench = make_bench(shape=shape, frames=80, sets={name: baseline})
+    run = write_reduced(bench, tmp_path / "run")
+    mask = np.zeros(shape, np.uint8)
+    mask[masked] = PixelFlag.DEAD
+    remask(run, name, mask)
+    fit.run(run, fit.Config(), Runtime())
+    data, sigma, flags, _ = read_map(run / "products" / "delta_fringe.fits")
+    np.testing.assert_array_equal(flags > 0, mask > 0)
+    np.testing.assert_array_equal(np.isnan(data), mask > 0)
+    truth = bench.delta_x if name == "vertical" else bench.delta_y
+    error = bench.without_modes(data - truth, name)
+    assert 0.85 < np.nanstd(error / sigma) < 1.15
+    result = json.loads((run / "products" / "fit.json").read_text())["sets"][name]
+    assert result["pixels_masked"] == np.count_nonzero(mask)
+    assert result["sigma_median_px"] == pytest.approx(np.nanmedian(sigma), rel=0.02)
+
+
+def test_a_frame_of_saturated_samples_costs_no_more_than_itself(
+    make_bench, write_reduced, tmp_path
+):
+    bench = make_bench(shape=(40, 45), frames=90, sets={"only": (6.0, 0.0)})
+    read_out = bench.read_out
+
+    def saturated(electrons):
+        codes = read_out(electrons)
+        codes[[5, 70]] = 65535
+        return codes
+
+    bench.read_out = saturated
+    run = write_reduced(bench, tmp_path / "run")
+    fit.run(run, fit.Config(), Runtime())
+    data, sigma, flags, _ = read_map(run / "products" / "delta_fringe.fits")
+    assert not flags.any()
+    error = bench.without_modes(data - bench.delta_x, "only")
+    assert 0.93 < np.nanstd(error / sigma) < 1.07
+
+
+def test_a_slow_scan_is_looked_at_all_along(make_bench, write_reduced, tmp_path, monkeypatch):
+    """Three turns in the whole run, and memory for one chunk of it."""
+    from pixcal.stages.fit import sweep
+
+    bench = make_bench(shape=(30, 37), frames=960, sets={"only": (6.0, 0.0)})
+    scan = bench.scan
+    bench.scan = lambda name: (*scan(name)[:2], np.linspace(0, 6 * np.pi, 960), scan(name)[3])
+    run = write_reduced(bench, tmp_path / "run")
+    monkeypatch.setattr(sweep, "PRIME_BYTES", 1)
+    fit.run(run, fit.Config(), Runtime())
+    data, sigma, _, _ = read_map(run / "products" / "delta_fringe.fits")
+    error = bench.without_modes(data - bench.delta_x, "only")
+    assert np.nanstd(error / sigma) < 1.1
+
+
+def test_a_set_without_a_pixel_that_can_be_fitted_is_named(fitted, tmp_path):
+    _, run, _ = fitted
+    again = tmp_path / "run"
+    for part in ("ingest", "reduce", "sweep"):
+        shutil.copytree(run / part, again / part)
+    for array in (again / "reduce" / "reduced.zarr").glob("*/mask"):
+        remask(again, array.parent.name, np.ones((137, 150), np.uint8))
+    with pytest.raises(InputError, match="'vertical': no pixel"):
+        fit.run(again, fit.Config(), Runtime())
+
+
+def test_the_consistency_of_sets_counts_pixels_that_one_set_lacks(
+    make_bench, write_reduced, tmp_path
+):
+    bench = make_bench(
+        shape=(50, 55), frames=80,
+        sets={"a": (6.0, 0.0), "b": (0.0, 6.0), "c": (4.0, 4.0)}, interfringe=None,
+    )  # fmt: skip
+    run = write_reduced(bench, tmp_path / "run")
+    mask = np.zeros(bench.shape, np.uint8)
+    mask[5:] = PixelFlag.DEAD
+    remask(run, "c", mask)
+    fit.run(run, fit.Config(), Runtime())
+    result = json.loads((run / "products" / "fit.json").read_text())
+    # Nine pixels of ten have two sets, which cannot disagree.
+    assert 0.5 < result["sets_chi2_reduced"] < 1.5

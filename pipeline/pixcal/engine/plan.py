@@ -16,7 +16,7 @@ class Plan:
     Attributes
     ----------
     bytes_per_task : int
-        Peak of one task.
+        Peak of one task; of its process, where each has its own.
     shared_bytes : int
         Held by the coordinating process during the whole stage.
     workers : int
@@ -41,6 +41,9 @@ def make_plan(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtim
     PlanError
         If not even one worker fits; the message holds both numbers.
     """
+    if runtime.cluster == "processes":
+        # Each has an interpreter of its own.
+        bytes_per_task += BASE_BYTES
     workers = runtime.n_workers
     while workers > 1 and Plan(bytes_per_task, shared_bytes, workers).total > runtime.memory:
         workers -= 1

@@ -48,8 +48,11 @@ def combine_sets(
     )
     rx, ry = (w * a[:, 0] * d).sum(0), (w * a[:, 1] * d).sum(0)
     det = xx * yy - xy * xy
+    # Whether they give both is a matter of the axes alone, however unequal the errors.
+    n, cc = good.sum(0), (good * a[:, 0] ** 2).sum(0)
+    spread = cc * (n - cc) - (good * a[:, 0] * a[:, 1]).sum(0) ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = np.where(det > 0.005 * (xx + yy) ** 2, 1 / det, np.nan)
+        inverse = np.where(spread > 0.005 * n**2, 1 / det, np.nan)
         x, y = (yy * rx - xy * ry) * inverse, (xx * ry - xy * rx) * inverse
         sigma_xy = np.sqrt(np.stack([yy, xx]) * inverse)
     rest = d - a[:, 0] * x - a[:, 1] * y

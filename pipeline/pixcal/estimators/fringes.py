@@ -201,8 +201,9 @@ def smooth_phasor(
             basis, fit = basis[:, :1], np.array([turned[use].mean() if use.any() else 0.0])
             break
         # Terms of low degree on ±1 are nearly orthogonal: normal equations keep their digits.
+        # A tile of which a few rows are good does not tell all of them: least squares, not solve.
         inside = basis * use[:, None]
-        fit = np.linalg.solve(inside.T @ basis, inside.T @ turned)
+        fit = np.linalg.lstsq(inside.T @ basis, inside.T @ turned, rcond=1e-10)[0]
         rest = np.abs(turned - basis @ fit)
         kept = good.ravel() & (rest <= 5 * np.median(rest[use]) + 1e-12)
         if np.array_equal(kept, use):

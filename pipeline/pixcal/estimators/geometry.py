@@ -1,7 +1,7 @@
 """From phases to the fringes' geometry: planes of tiles, unwrapped, and what is fitted to them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,8 +85,9 @@ def tile_plane(
 def unwrap(planes: Sequence[TilePlane], grid_shape: tuple[int, int]) -> list[TilePlane]:
     """Add whole turns so that neighbouring tiles agree where they meet.
 
-    Each tile is joined to an unwrapped neighbour whose plane, followed to the common border from
-    both sides, leaves the least doubt; outwards from the best tile.
+    Outwards from the tile nearest to the middle, each is joined to a neighbour by their planes,
+    followed from both sides. Tiles that no neighbour joins (a band without good pixels lies
+    between) are joined to the nearest tile across the gap.
 
     Parameters
     ----------
@@ -110,26 +111,29 @@ def unwrap(planes: Sequence[TilePlane], grid_shape: tuple[int, int]) -> list[Til
     done[seed] = True
     while queue:
         i, j = queue.pop(0)
-        here = result[i, j]
         for ni, nj in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
             if not (0 <= ni < rows and 0 <= nj < columns) or done[ni, nj] or not usable[ni, nj]:
                 continue
-            there = table[ni, nj]
-            dy, dx = there.centre[0] - here.centre[0], there.centre[1] - here.centre[1]
-            expected = here.phase + (here.kx + there.kx) / 2 * dx + (here.ky + there.ky) / 2 * dy
-            turns = np.rint((expected - there.phase) / (2 * np.pi))
-            result[ni, nj] = TilePlane(
-                there.centre,
-                float(there.phase + 2 * np.pi * turns),
-                there.kx,
-                there.ky,
-                there.sigma,
-                there.ratio,
-            )
+            result[ni, nj] = _joined(result[i, j], table[ni, nj])
             done[ni, nj] = True
             queue.append((ni, nj))
-    # Islands that no good tile joins keep their own turn.
+        if not queue and (left := np.argwhere(usable & ~done)).size:
+            reached = np.argwhere(done)
+            apart = ((left[:, None] - reached) ** 2).sum(axis=2)
+            n, m = np.unravel_index(int(np.argmin(apart)), apart.shape)
+            (ni, nj), (i, j) = left[n], reached[m]
+            result[ni, nj] = _joined(result[i, j], table[ni, nj])
+            done[ni, nj] = True
+            queue.append((int(ni), int(nj)))
     return list(result.ravel())
+
+
+def _joined(here: TilePlane, there: TilePlane) -> TilePlane:
+    """A plane on the turn that another, unwrapped, leads to."""
+    dy, dx = there.centre[0] - here.centre[0], there.centre[1] - here.centre[1]
+    expected = here.phase + (here.kx + there.kx) / 2 * dx + (here.ky + there.ky) / 2 * dy
+    turns = np.rint((expected - there.phase) / (2 * np.pi))
+    return replace(there, phase=float(there.phase + 2 * np.pi * turns))
 
 
 def unwrapped_phase(phase: F32, plane: TilePlane) -> F64:

@@ -79,7 +79,7 @@ class ModeBasis:
     def covariance(self, normal: F64, spread: float) -> F64:
         """Covariance of the coefficients."""
         n = normal / spread + np.diag(self._precision(1.0))
-        scale = np.sqrt(np.maximum(np.diag(n), np.finfo(float).tiny))
+        scale = _scales(n)
         return np.asarray(np.linalg.pinv(n / np.outer(scale, scale)) / np.outer(scale, scale))
 
     def _precision(self, spread: float) -> F64:
@@ -104,9 +104,15 @@ def mode_sums(modes: F64, weight: F64, maps: F64) -> tuple[F64, F64]:
     return weighted @ flat.T, weighted @ values.T
 
 
+def _scales(normal: F64) -> F64:
+    """Size of each mode; 1 for one that is zero all over the window (y on a single row)."""
+    size = np.sqrt(np.maximum(np.diag(normal), 0.0))
+    return np.where(size > 0, size, 1.0)
+
+
 def solve_modes(normal: F64, right: F64) -> F64:
     """Coefficients (mode, n); modes that the window cannot tell apart share what they explain."""
-    scale = np.sqrt(np.maximum(np.diag(normal), np.finfo(float).tiny))
+    scale = _scales(normal)
     unit = normal / np.outer(scale, scale)
     return np.asarray(
         np.linalg.lstsq(unit, right / scale[:, None], rcond=1e-12)[0] / scale[:, None]

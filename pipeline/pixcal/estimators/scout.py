@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh
 
 from pixcal.estimators.fringes import (
     FrameParameters,
@@ -176,15 +177,18 @@ class Scout:
         """First frame parameters: rank three, then turned by means of the fringe vector."""
         gram: F64 = np.zeros((len(codes[0]), len(codes[0])))
         for tile, block in zip(self.tiles, codes, strict=True):
-            electrons = self._electrons(block, self._picked(tile))
-            gram += electrons @ electrons.T
-        values, vectors = np.linalg.eigh(gram)
-        if values[-3] <= 0 or values[-3] < 1e-12 * values[-1]:
+            for part in _parts(self._picked(tile)):
+                electrons = self._electrons(block, part)
+                gram += electrons @ electrons.T
+        last = len(gram) - 1
+        values, vectors = eigh(gram, subset_by_index=(last - 2, last), overwrite_a=True)
+        if values[0] <= 0 or values[0] < 1e-12 * values[2]:
             raise InputError("the frames do not differ: the phase was not scanned")
-        g = vectors[:, -3:][:, ::-1]
+        g = vectors[:, ::-1]
         first, block = self.tiles[0], codes[0]
-        every = np.arange(first.good.size)
-        maps = (g.T @ self._electrons(block, every)).reshape(3, *first.shape)
+        every = _parts(np.arange(first.good.size))
+        maps = np.hstack([g.T @ self._electrons(block, part) for part in every])
+        maps = maps.reshape(3, *first.shape)
         mean = np.where(first.good & (np.abs(maps[0]) > 0), maps[0], 1.0)
         ratios = np.where(first.good, maps[1:] / mean, 0.0)
         # A third map that is only noise must not drown the fringes of the second.
@@ -264,8 +268,9 @@ class Scout:
         normal[:, upper[1], upper[0]] = packed
         size = 5 if moving else 3
         step = np.zeros((n, 5))
-        solved = np.linalg.solve(normal[:, :size, :size], right[:, :size, None])
-        step[:, :size] = solved[..., 0]
+        step[:, :size] = np.einsum(
+            "tij,tj->ti", _inverses(normal[:, :size, :size]), right[:, :size]
+        )
         # The kernel saw float32 parameters: the step is from those.
         moved = FrameParameters(
             g.astype(float) + step[:, :3], dk.astype(float) + step[:, 3:], frames.reference
@@ -277,15 +282,33 @@ class Scout:
     ) -> float:
         """Mean of dk' C^-1 dk / 2 over frames, in units of the noise: 1 without motion."""
         _, step, normal = self._frame_step(codes, frames, moving=True)
-        covariance = np.linalg.inv(normal)[:, 3:, 3:]
-        dk = step[:, 3:]
+        seen = normal[:, 0, 0] > 0
+        covariance = _inverses(normal[seen])[:, 3:, 3:]
+        dk = step[seen, 3:]
         dk = dk - dk.mean(axis=0)
-        size = np.einsum("ti,tij,tj->t", dk, np.linalg.inv(covariance), dk).mean() / 2
+        size = np.einsum("ti,tij,tj->t", dk, _inverses(covariance), dk).mean() / 2
         noise = [
             residual_chi2(tile, block, self.coding, frames, theta)
             for tile, block, theta in zip(self.tiles, codes, self.theta, strict=True)
+            if tile.good.any()
         ]
         return float(size / np.median(noise))
+
+
+def _parts(pixels: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+    """Pixels a thousand at a time: their samples are many bytes as floating point."""
+    return [pixels[first : first + 1024] for first in range(0, len(pixels), 1024)]
+
+
+def _inverses(matrices: F64) -> F64:
+    """Inverses of symmetric matrices (t, n, n), zero where samples tell nothing.
+
+    A frame may have no sample with weight, and a window of one row tells nothing of ky.
+    """
+    scale = np.sqrt(np.einsum("tii->ti", matrices))
+    scale = np.where(scale > 0, scale, 1.0)
+    both = scale[:, :, None] * scale[:, None, :]
+    return np.asarray(np.linalg.pinv(matrices / both, rcond=1e-10, hermitian=True) / both)
 
 
 def residual_chi2(

@@ -1,7 +1,7 @@
 """A smooth surface of any shape: what the map holds at large scales, whatever its cause."""
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -17,6 +17,8 @@ class Polynomial:
     It has no physics and is no model of the fringes; see `pixcal.estimators.models.FringeShape`
     for its methods.
     """
+
+    linear: ClassVar[bool] = True
 
     coefficients: tuple[float, ...]
     k: tuple[float, float]

@@ -47,7 +47,7 @@ from pixcal.kernels.optics import PARAMETERS, Geometry, phase, phase_jacobian
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import quantity
 from pixcal.model.errors import DamagedError, InputError
-from pixcal.report.crest_figures import CrestView, Extract, crest_figure
+from pixcal.report.crest_figures import CrestView, Extract, crest_figure, outermost
 from pixcal.report.drawing import png
 from pixcal.stages.fit.sweep import load_run, nominal_vector
 from pixcal.stages.reduced_set import ReducedSet
@@ -68,7 +68,7 @@ from pixcal.storage.cube import create_group, write_array
 STAGE = "crests"
 FORMAT = 1
 SCHEMA = "pixcal/crests/1"
-MAP_SIDE = 25
+MAP_SIDE = 21
 """Places along each side of a cost map; odd, so that the minimum is one of them."""
 MAP_REACH = 0.04
 """How far the maps go from the minimum, as a share of distance and baseline."""
@@ -336,6 +336,11 @@ def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit, maps: _Maps) -
     write_array(folder / "valley_cost", maps.valley_cost, dims=("distance",))
 
 
+def _from_prior(fit: CrestFit) -> NDArray[np.bool_]:
+    """Parameters of which the prior says more than the points."""
+    return np.asarray(fit.sigma > np.sqrt(0.5) * fit.prior.sigma)
+
+
 def _warnings(fit: CrestFit) -> list[str]:
     found = []
     if fit.chi2_reduced > NOTABLE_CHI2:
@@ -390,10 +395,10 @@ def _agreement(paths: CrestPaths, fit: CrestFit, other: Geometry, sigma: F64) ->
                 "difference_mm": float(d),
                 "sigma_mm": float(s),
                 "difference_sigma": float(d / s),
-                "from_prior": bool(own > 0.7 * prior),
+                "from_prior": bool(prior),
             }
-            for name, d, s, own, prior in zip(
-                PARAMETERS, difference, both, fit.sigma, fit.prior.sigma, strict=True
+            for name, d, s, prior in zip(
+                PARAMETERS, difference, both, _from_prior(fit), strict=True
             )
         },
         "phase_rms_px": float(np.std(away) * px),
@@ -407,6 +412,7 @@ def _view(
 ) -> CrestView:
     """What the figure shows."""
     best = fit.geometry
+    first, last = outermost(paths.k)
     foot = np.array([best.centre_x, best.centre_y])
     half = np.array([best.baseline_x, best.baseline_y]) / 2
     return CrestView(
@@ -414,9 +420,7 @@ def _view(
         x=paths.x, y=paths.y, k=paths.k, used=fit.used,
         sigma_px=paths.sigma_px * np.sqrt(fit.spread), residual_px=fit.residual / paths.slope,
         fibres=((foot - half) / best.pitch, (foot + half) / best.pitch),
-        extracts=tuple(
-            _extract_at(source, frame, paths, k) for k in (paths.k.min(), paths.k.max())
-        ),
+        extracts=tuple(_extract_at(source, frame, paths, k) for k in (first[0], last[-1])),
         distance=maps.baseline.distance,
         baseline=maps.baseline.second,
         ratio=maps.ratio.second,
@@ -425,6 +429,7 @@ def _view(
         valley_ratio=maps.valley_ratio, valley_cost=maps.valley_cost,
         best=(best.distance, float(np.hypot(best.baseline_x, best.baseline_y))),
         distance_sigma=float(fit.sigma[2]),
+        distance_from_prior=bool(_from_prior(fit)[2]),
     )  # fmt: skip
 
 
@@ -433,7 +438,7 @@ def _extract_at(source: ReducedSet, frame: int, paths: CrestPaths, k: int) -> Ex
     on = np.flatnonzero(paths.k == k)
     ry, rx = paths.reference
     near = on[np.argmin((paths.x[on] - rx) ** 2 + (paths.y[on] - ry) ** 2)]
-    side = int(np.clip(8 * paths.interfringe, 32, 320))
+    side = int(np.clip(max(8 * paths.interfringe, 1.7 * paths.segment), 32, 320))
     ranges = []
     for at, n in ((paths.y[near], source.shape[0]), (paths.x[near], source.shape[1])):
         first = int(np.clip(round(at) - side // 2, 0, max(0, n - side)))

@@ -38,14 +38,14 @@ def write_map(
     history : sequence of str
         HISTORY lines of the primary header.
     """
-    primary = fits.PrimaryHDU(data.astype(">f4"))
+    primary = fits.PrimaryHDU(data.astype(">f4", copy=False))
     primary.header["BUNIT"] = ("pixel", "offset from the perfect grid")
     primary.header["CREATOR"] = (f"pixcal {__version__}", "program that wrote this file")
     for key, value, comment in cards:
         primary.header[key] = (value, comment)
     for line in history:
         primary.header.add_history(line)
-    errors = fits.ImageHDU(sigma.astype(">f4"), name="SIGMA")
+    errors = fits.ImageHDU(sigma.astype(">f4", copy=False), name="SIGMA")
     errors.header["BUNIT"] = ("pixel", "1-sigma error")
     flags = fits.ImageHDU(mask, name="MASK")
     for flag in PixelFlag:

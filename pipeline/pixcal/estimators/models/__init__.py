@@ -9,7 +9,7 @@ import importlib
 import pkgutil
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +49,15 @@ class Start:
 
 
 class FringeShape(Protocol):
-    """A shape with its present parameters."""
+    """A shape with its present parameters.
+
+    Attributes
+    ----------
+    linear : bool
+        Whether the phase is linear in the coefficients, so that one step is all.
+    """
+
+    linear: ClassVar[bool]
 
     @classmethod
     def start(cls, start: Start) -> Self:

@@ -5,7 +5,7 @@ section 4). What a small window cannot tell, the bench's nominal values hold wit
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -39,6 +39,8 @@ class Hyperbolic:
     reference : (float, float)
         Point (y, x) where the phase is ``phase0``, px.
     """
+
+    linear: ClassVar[bool] = False
 
     phase0: float
     geometry: Geometry

@@ -1,7 +1,7 @@
 """Straight fringes: one fringe vector for the whole window (paper, equation 4)."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -11,6 +11,8 @@ from pixcal.estimators.models import F64, Start
 @dataclass(frozen=True)
 class Paraxial:
     """Phase ``phase0 + kx (x - x_ref) + ky (y - y_ref)``."""
+
+    linear: ClassVar[bool] = True
 
     phase0: float
     kx: float

@@ -36,7 +36,7 @@ def combine(
             )  # fmt: skip
     writers["mask"] = create_array(group / "mask", shape, "u1", dims=("y", "x"), chunks=(cy, cx))
     tiles = source.tiles()
-    chi2 = run_tasks(
+    squares = run_tasks(
         partial(_combine_task, group, source, shapes, both, writers),
         tiles,
         runtime,
@@ -44,9 +44,8 @@ def combine(
     )
     for writer in writers.values():
         writer.finish()
-    freedom = len(names) - (2 if both else 1)
-    every = np.concatenate(chi2)
-    consistency = float(every.mean() / freedom) if freedom > 0 and len(every) else None
+    square, freedom = sum(s[0] for s in squares), sum(s[1] for s in squares)
+    consistency = square / freedom if freedom else None
     return {"outputs": list(outputs), "sets_chi2_reduced": consistency}
 
 
@@ -57,7 +56,8 @@ def _combine_task(
     both: bool,
     writers: dict[str, ArrayWriter],
     at: tuple[int, int],
-) -> F64:
+) -> tuple[float, int]:
+    """Join the sets on a tile; disagreement of the sets and its degrees of freedom."""
     y, x = source.ranges(at)
 
     def stack(array: str) -> NDArray[Any]:
@@ -80,7 +80,8 @@ def _combine_task(
         writers[name].write((y[0], x[0]), value[n].astype(np.float32))
         writers[f"{name}_sigma"].write((y[0], x[0]), error[n].astype(np.float32))
     writers["mask"].write((y[0], x[0]), flags)
-    return np.asarray(chi2[~missing])
+    freedom = np.isfinite(delta).sum(axis=0) - len(outputs)
+    return float(chi2[~missing].sum()), int(freedom[~missing].sum())
 
 
 def axis(shape: FringeShape, y: float, x: float) -> tuple[float, float]:

@@ -15,6 +15,7 @@ from pixcal.estimators.models import FringeShape, Start, fringe_models
 from pixcal.estimators.modes import ModeBasis, mode_sums
 from pixcal.estimators.smooth import Polynomial
 from pixcal.model.acquisition import Acquisition
+from pixcal.model.errors import InputError
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.fit.sweep import read_frames
 from pixcal.stages.reduced_set import ReducedSet
@@ -126,6 +127,11 @@ def fit_set(
     chi2_limit : float
         Pixels with a reduced chi-square above are flagged.
     runtime : Runtime
+
+    Raises
+    ------
+    InputError
+        If no pixel of the set can be fitted.
     """
     tiles = source.tiles()
     n_batches = len(ArrayReader(maps / "batch_count").read())
@@ -144,17 +150,24 @@ def fit_set(
         run_tasks(partial(_plane_task, swept), tiles, runtime, label=f"phases {name}"),
         source.grid,
     )
+    if not any(np.isfinite(p.sigma) for p in planes):
+        raise InputError(
+            f"fringe set {name!r}: no pixel can be fitted; its fringes are too faint for "
+            f"{source.n_frames} frames, or the mask leaves no pixel"
+        )
     jobs = list(zip(tiles, planes, strict=True))
     start = _start(source, facts, planes, acquisition, name)
     fitted, evidence = _choose(model, swept, start, jobs, n_batches, runtime, name)
 
     writers = _create_outputs(folder, source, n_batches)
-    run_tasks(partial(_write_task, swept, fitted, writers), jobs, runtime, label=f"maps {name}")
+    told = run_tasks(
+        partial(_write_task, swept, fitted, writers), jobs, runtime, label=f"maps {name}"
+    )
     for writer in writers.values():
         writer.finish()
     _write_frames(folder, maps)
     shape = fitted.basis.shape.moved(fitted.coefficients[: len(fitted.basis.shape.names), 0])
-    facts = _describe(folder, source, facts, planes, fitted, shape, noise)
+    facts = _describe(source, facts, planes, fitted, shape, noise, told)
     return shape, facts | {"model": _model_name(shape), "evidence": evidence}
 
 
@@ -206,8 +219,11 @@ def _choose(
     if model != "auto":
         return fit(shapes[model], f"{model} {name}"), "asked for"
     straight = fit(shapes["paraxial"], f"paraxial {name}")
-    exact = fit(shapes["hyperbolic"], f"hyperbolic {name}")
     smooth = fit(Polynomial, f"smooth {name}")
+    most = (straight.square - smooth.square) / smooth.spread
+    if most < EVIDENCE:
+        return straight, f"no curvature: chi-square falls by {most:.0f} at most"
+    exact = fit(shapes["hyperbolic"], f"hyperbolic {name}")
     gain = (straight.square - exact.square) / smooth.spread
     others = len(smooth.basis.names) - len(straight.basis.names) - QUADRATIC
     beyond = max(exact.square - smooth.square, 0.0) / smooth.spread / others
@@ -247,7 +263,7 @@ def _fit_shape(
         moved = np.sqrt(
             abs(own @ normal[:size, :size] @ own) / max(np.trace(normal[:1, :1]), 1e-300)
         )
-        if moved < STEP_RAD or steps == MAX_STEPS:
+        if shape.linear or moved < STEP_RAD or steps == MAX_STEPS:
             break
         shape = shape.moved(own)
     rest = float(square - 2 * c[:, 0] @ right[:, 0] + c[:, 0] @ normal @ c[:, 0])
@@ -255,26 +271,24 @@ def _fit_shape(
 
 
 def _describe(
-    folder: Path,
     source: ReducedSet,
     facts: dict[str, Any],
     planes: list[TilePlane],
     fitted: SetFit,
     shape: FringeShape,
     noise: float,
+    told: list[tuple[int, F32]],
 ) -> dict[str, Any]:
-    sigma, mask = ArrayReader(folder / "sigma").read(), ArrayReader(folder / "mask").read()
-    good = mask == 0
     ny, nx = source.shape
     kx, ky = shape.vector((ny - 1) / 2, (nx - 1) / 2)
     k = float(np.hypot(kx, ky))
-    ratio = np.median([p.ratio for p in planes if np.isfinite(p.sigma)] or [np.nan])
+    ratio = np.median([p.ratio for p in planes if np.isfinite(p.sigma)])
     own = len(shape.names)
     origin = float(shape.phase(np.zeros(1), np.zeros(1))[0])
     return {
         "frames": source.n_frames,
-        "pixels": int(good.size),
-        "pixels_masked": int((~good).sum()),
+        "pixels": ny * nx,
+        "pixels_masked": ny * nx - sum(good for good, _ in told),
         "interfringe_px": 2 * np.pi / k,
         "geometry": shape.facts(fitted.covariance[:own, :own]),
         "kx": kx,
@@ -284,7 +298,7 @@ def _describe(
         "phase_at_origin_rad": float(np.remainder(origin, 2 * np.pi)),
         "axis": [kx / k, ky / k],
         "visibility": float(1 / ratio),
-        "sigma_median_px": float(np.median(sigma[good])) if good.any() else None,
+        "sigma_median_px": float(np.median(np.concatenate([some for _, some in told]))),
         "crb_median_px": None if facts["bound_rad"] is None else facts["bound_rad"] / k,
         "chi2_reduced": noise,
         "sigma_scale": float(np.sqrt(noise)),
@@ -316,8 +330,12 @@ def _noise_task(maps: Path, source: ReducedSet, at: tuple[int, int]) -> F32:
     """Reduced chi-squares of the pixels that the reduction finds good (every n-th of many)."""
     y, x = source.ranges(at)
     chi2 = ArrayReader(maps / "chi2").read(y, x)
-    values = chi2[(source.mask(at) == 0) & np.isfinite(chi2)]
-    return np.asarray(values[:: max(1, len(values) // 4000)])
+    return _some(chi2[(source.mask(at) == 0) & np.isfinite(chi2)])
+
+
+def _some(values: F32) -> F32:
+    """Every n-th of many values; a copy, lest they all stay in memory."""
+    return values[:: max(1, len(values) // 4000)].copy()
 
 
 def _plane_task(swept: SweptSet, at: tuple[int, int]) -> TilePlane:
@@ -382,7 +400,10 @@ def _create_outputs(folder: Path, source: ReducedSet, n_batches: int) -> dict[st
     return writers
 
 
-def _write_task(swept: SweptSet, fitted: SetFit, writers: dict[str, ArrayWriter], job: Job) -> None:
+def _write_task(
+    swept: SweptSet, fitted: SetFit, writers: dict[str, ArrayWriter], job: Job
+) -> tuple[int, F32]:
+    """Write the maps of a tile; the number of its good pixels, and errors (px) of some of them."""
     at, plane = job
     phase, _, flags = _tile_phases(swept, plane, at)
     modes, model = fitted.basis.on(plane, (phase.shape[0], phase.shape[1]))
@@ -397,16 +418,19 @@ def _write_task(swept: SweptSet, fitted: SetFit, writers: dict[str, ArrayWriter]
         begin = (0, *start) if values.ndim == 3 else start
         writers[name].write(begin, np.where(bad, np.nan, values).astype(np.float32))
 
+    sigma = (swept.map("sigma", at) * scale).astype(np.float32)
+    told = int((~bad).sum()), _some(sigma[~bad])
     write("delta", rest / k)
-    write("sigma", swept.map("sigma", at) * scale)
+    write("sigma", sigma)
     for name in ("iota", "alpha", "chi2"):
         writers[name].write(start, swept.map(name, at))
     writers["mask"].write(start, flags)
     if "batch_delta" not in writers:
-        return
+        return told
     everything = (0, writers["batch_delta"].shape[0])
     steps = ArrayReader(swept.sweep / "batch_phase").read(everything, *ranges)
     removed = np.tensordot(fitted.coefficients[:, 1:].T, modes, 1)
     write("batch_delta", (rest + steps - removed) / k)
     errors = ArrayReader(swept.sweep / "batch_sigma").read(everything, *ranges)
     write("batch_sigma", errors * scale)
+    return told

@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from pixcal.model.errors import DamagedError
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader
@@ -47,8 +49,11 @@ def publish(run_dir: Path) -> None:
         history.append(f"set {name}: modes removed: {', '.join(facts['removed_modes'])}")
     mask = ArrayReader(folder / "fit.zarr" / "mask").read()
     for name in result["outputs"]:
-        data = ArrayReader(folder / "fit.zarr" / name).read()
-        sigma = ArrayReader(folder / "fit.zarr" / f"{name}_sigma").read()
+        data, sigma = (
+            # In the byte order of FITS at once: whole maps are large.
+            ArrayReader(folder / "fit.zarr" / array).read(out=np.empty(mask.shape, ">f4"))
+            for array in (name, f"{name}_sigma")
+        )
         write_map(run_dir / "products" / f"{name}.fits", data, sigma, mask, cards, history)
     for other in {"delta_x", "delta_y", "delta_fringe"} - set(result["outputs"]):
         (run_dir / "products" / f"{other}.fits").unlink(missing_ok=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.progress import Progress
@@ -44,6 +45,8 @@ CACHE_BYTES = 384 << 20
 """Memory for the scout's tiles; fixed, so that results do not depend on ``--memory``."""
 PRIME_BYTES = 96 << 20
 """Memory for the codes of the scout's first look."""
+LOOKS = 16
+"""Chunks along time that the first look takes frames from: one may hold little of a slow scan."""
 MAPS = ("iota", "alpha", "phase", "sigma", "chi2", "count")
 BATCH_MAPS = ("batch_phase", "batch_sigma")
 
@@ -245,10 +248,15 @@ def _scout_set(
     ny, nx = source.shape
     scout = Scout(tiles, source.coding, nominal, ((ny - 1) / 2, (nx - 1) / 2))
 
-    wanted = int(np.clip(PRIME_BYTES // (len(places) * chunk_bytes), 1, source.n_blocks))
-    first = np.unique(np.linspace(0, source.n_blocks - 1, wanted).astype(int))
-    codes = [np.concatenate([source.codes(at, int(n), keep=keep) for n in first]) for at in places]
+    # The chunks kept; the first look's codes, copies of a tile's share, and its Gram matrix.
+    kept = len(places) * tile_bytes if keep else 0
+    make_plan(f"the scout of {name}", 3 * PRIME_BYTES, kept, runtime.with_workers(1))
+    first = _first_look(source, PRIME_BYTES // (len(places) * chunk_bytes))
+    codes = [
+        np.concatenate([source.codes(at, n, keep=keep)[some] for n, some in first]) for at in places
+    ]
     scout.prime(codes)
+    del codes
     parts = []
     with Progress(f"scout {name}", source.n_blocks, quiet=runtime.quiet) as progress:
         for block in range(source.n_blocks):
@@ -269,6 +277,19 @@ def _scout_set(
         "scout_tiles": len(places),
         "chunks_read": len(places) * source.n_blocks if keep else again,
     }
+
+
+def _first_look(source: ReducedSet, blocks: int) -> list[tuple[int, NDArray[np.intp]]]:
+    """Blocks spread over the run and frames of each, as many in all as in ``blocks`` whole ones."""
+    wanted = min(source.n_blocks, max(blocks, LOOKS))
+    each = max(1, source.block * max(1, min(blocks, wanted)) // wanted)
+    # At random: frames at even steps may have the same phase again and again.
+    rng = np.random.default_rng(0)
+    looks = []
+    for n in np.linspace(0, source.n_blocks - 1, wanted).astype(int):
+        frames = rng.permutation(min(source.block, source.n_frames - n * source.block))
+        looks.append((int(n), np.sort(frames[:each])))
+    return looks
 
 
 def read_frames(folder: Path) -> FrameParameters:

@@ -1,0 +1,79 @@
+"""``pixcal crests``."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pixcal.storage.artefact import read_json
+from pixcal_cli import results
+from pixcal_cli.options import examples, run_argument, runtime_options
+
+if TYPE_CHECKING:
+    from pixcal.engine.run import Runtime
+
+
+@click.command(epilog=examples("pixcal crests demo", "pixcal crests demo --frames 1 --paths 4"))
+@run_argument
+@click.option(
+    "--frames",
+    type=click.IntRange(1),
+    default=8,
+    show_default=True,
+    metavar="N",
+    help="Frames to use, spread over the run.",
+)
+@click.option(
+    "--paths",
+    type=click.IntRange(2),
+    default=None,
+    show_default="all",
+    metavar="N",
+    help="Crests and valleys to use of each end, the outermost.",
+)
+@click.option(
+    "--segment",
+    type=click.IntRange(4),
+    default=None,
+    show_default="an eighth of the window, 8 to 128",
+    metavar="PX",
+    help="Length along a fringe that gives one point.",
+)
+@runtime_options
+def crests(
+    run: Path, frames: int, paths: int | None, segment: int | None, runtime: "Runtime"
+) -> None:
+    """Find the fibres from crests and valleys, a check of the fit."""
+    from pixcal.stages import crests as stage  # here: for a fast `pixcal --help`
+
+    with results.announce("crests", run / "crests"):
+        stage.run(run, stage.Config(frames, paths, segment), runtime)
+    for name, found in read_json(run / "crests" / "crests.json")["sets"].items():
+        _show(name, found)
+        click.echo(f"  {run / 'products' / f'crests-{name}.png'}")
+
+
+def _show(name: str, found: dict[str, Any]) -> None:
+    """The points, the fibres, and the difference to the fit's."""
+    click.echo(
+        f"  {name}: {found['points_used']} of {found['points']} points, each good to "
+        f"{found['point_sigma_median_px']:.2g} px, chi2 {found['chi2_reduced']:.3g}"
+    )
+    geometry, agreement = found["geometry"], found["agreement"]
+    for parameter in ("centre_x", "centre_y", "distance", "baseline_x", "baseline_y", "baseline_z"):
+        value, sigma = geometry[f"{parameter}_mm"], geometry[f"{parameter}_sigma_mm"]
+        line = f"    {parameter:10s} {value:.6g} ± {sigma:.2g} mm"
+        if agreement is not None:
+            other = agreement["parameters"][parameter]
+            origin = ", mostly from its prior" if other["from_prior"] else ""
+            line += f", {other['difference_sigma']:+.2f} sigma from the fit{origin}"
+        click.echo(line)
+    if agreement is None:
+        click.echo(f"    not compared: {found['agreement_note']}")
+    else:
+        click.echo(
+            f"    phases of both: {agreement['phase_rms_px']:.2g} px rms apart, "
+            f"{agreement['phase_sigma_px']:.2g} px expected"
+        )
+    for sentence in found["warnings"]:
+        click.echo(f"    note: {sentence}")

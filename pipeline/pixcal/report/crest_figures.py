@@ -1,0 +1,264 @@
+"""Crests and valleys of one fringe set, and the cost of the fit to them (paper, figures 16, 17)."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure, SubFigure
+from numpy.typing import NDArray
+
+from pixcal.report.colours import BLUE, GREY, INK, RED, SEQUENTIAL
+from pixcal.report.drawing import WIDE, finish, new_figure
+
+F64 = NDArray[np.float64]
+
+SHOWN_PATHS = 4
+"""Paths of each end (paper, figure 16)."""
+CREST, VALLEY = RED, BLUE
+
+
+@dataclass(frozen=True)
+class Extract:
+    """A part of a frame: electrons (y, x), NaN where bad, and (y, x) of its first pixel."""
+
+    image: NDArray[Any]
+    start: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class CrestView:
+    """What the figure shows of one fringe set.
+
+    Attributes
+    ----------
+    frame : (int, int)
+        (y, x) size, px.
+    direction : (float, float)
+        Along the fringe vector (x, y), any length.
+    x, y : (point,) float64
+        Points, px.
+    k : (point,) int
+        Paths they are on: crests even, valleys odd.
+    used : (point,) bool
+        No outliers.
+    sigma_px, residual_px : (point,) float64
+        Errors, and fit minus path, across the fringes, px.
+    fibres : (2,) float64, (2,) float64
+        (x, y) of fibres A and B projected on the detector, px.
+    extracts : tuple of Extract
+        About the first and the last path.
+    distance, baseline, ratio : (n,) float64
+        Axes of the maps: mm, mm, 1.
+    cost_baseline, cost_ratio : (distance, other) float64
+        Maps of the cost: the other parameters those of the minimum, and fitted again.
+    valley_ratio, valley_cost : (distance,) float64
+        The best ratio at each distance, and its cost.
+    best : (float, float)
+        Distance and baseline of the minimum, mm.
+    distance_sigma : float
+        mm.
+    distance_from_prior : bool
+        Whether that is mostly the error of the bench's nominal value.
+    """
+
+    name: str
+    frame: tuple[int, int]
+    direction: tuple[float, float]
+    x: F64
+    y: F64
+    k: NDArray[np.int64]
+    used: NDArray[np.bool_]
+    sigma_px: F64
+    residual_px: F64
+    fibres: tuple[F64, F64]
+    extracts: tuple[Extract, ...]
+    distance: F64
+    baseline: F64
+    ratio: F64
+    cost_baseline: F64
+    cost_ratio: F64
+    valley_ratio: F64
+    valley_cost: F64
+    best: tuple[float, float]
+    distance_sigma: float
+    distance_from_prior: bool
+
+    @property
+    def across(self) -> F64:
+        """Coordinates across the fringes, px."""
+        ux, uy = np.array(self.direction) / np.hypot(*self.direction)
+        return np.asarray(ux * self.x + uy * self.y)
+
+    @property
+    def along(self) -> F64:
+        """Coordinates along the fringes, px."""
+        ux, uy = np.array(self.direction) / np.hypot(*self.direction)
+        return np.asarray(ux * self.y - uy * self.x)
+
+
+def crest_figure(view: CrestView) -> Figure:
+    """Paths over the frame and stretched at its ends; the fit's cost about its minimum."""
+    figure = new_figure(WIDE, 11.2)
+    rows: Any = figure.subfigures(3, 1, height_ratios=[1.15, 1, 1])
+    left, middle, right = rows[0].subplots(1, 3, width_ratios=[1, 1.7, 1])
+    first, last = outermost(view.k)
+    _stretched(left, view, first, "first paths")
+    _whole(middle, view, np.concatenate([first, last]))
+    _stretched(right, view, last, "last paths")
+    left, middle, right = rows[1].subplots(1, 3)
+    for axes, extract, title in zip((left, middle), view.extracts, ("first", "last"), strict=True):
+        _extract(axes, view, extract, f"frame about the {title} path")
+    _pulls(right, view)
+    left, middle, right = rows[2].subplots(1, 3)
+    _map(rows[2], left, view, by_ratio=False)
+    _map(rows[2], middle, view, by_ratio=True)
+    _valley(right, view)
+    return figure
+
+
+def outermost(k: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Numbers of the paths to show, of the first and of the last.
+
+    Paths through a corner of a turned frame are too short to show their shape.
+    """
+    paths, number = np.unique(k, return_counts=True)
+    long = paths[number >= 0.5 * number.max()]
+    shown = min(SHOWN_PATHS, max(1, len(long) // 2))
+    return long[:shown], long[-shown:]
+
+
+def _colour(k: int) -> str:
+    return VALLEY if k % 2 else CREST
+
+
+def _stretched(axes: Axes, view: CrestView, paths: NDArray[np.int64], title: str) -> None:
+    """Shape of some paths: across less its mean, a path beside the other."""
+    chosen = {int(k): np.flatnonzero((view.k == k) & view.used) for k in paths}
+    reach = max([float(np.ptp(view.across[on])) for on in chosen.values() if len(on)], default=0.0)
+    noise = float(np.median(view.sigma_px)) or 1e-6
+    spacing = max(1.3 * reach, 12 * noise)
+    for number, (k, on) in enumerate(chosen.items()):
+        on = on[np.argsort(view.along[on])]
+        middle = float(np.mean(view.across[on])) if len(on) else 0.0
+        at = view.across[on] - middle + number * spacing
+        axes.errorbar(
+            at, view.along[on], xerr=view.sigma_px[on], fmt="o", color=_colour(k),
+            markersize=3, linewidth=0.8,
+        )  # fmt: skip
+        axes.plot(at - view.residual_px[on], view.along[on], color=INK, linewidth=0.8)
+    axes.set_xticks([n * spacing for n in range(len(chosen))], [str(k) for k in chosen])
+    axes.set(xlabel="k", ylabel="along (px)", title=title)
+    length = 10.0 ** np.floor(np.log10(max(0.6 * spacing, 1e-9)))
+    low, high = axes.get_ylim()
+    foot = low - 0.09 * (high - low)
+    left = axes.get_xlim()[0]
+    axes.plot([left, left + length], [foot, foot], color=INK, linewidth=3, solid_capstyle="butt")
+    axes.annotate(
+        f"{length:.3g} px", (left + length, foot), xytext=(5, 0), textcoords="offset points",
+        va="center", fontsize=8,
+    )  # fmt: skip
+    finish(axes, grid=False)
+
+
+def _whole(axes: Axes, view: CrestView, paths: NDArray[np.int64]) -> None:
+    """The outermost paths over the whole frame, and the fibres before it."""
+    ny, nx = view.frame
+    axes.plot(
+        [-0.5, nx - 0.5, nx - 0.5, -0.5, -0.5], [-0.5, -0.5, ny - 0.5, ny - 0.5, -0.5],
+        color=GREY, linewidth=1,
+    )  # fmt: skip
+    for k in paths:
+        on = np.flatnonzero(view.k == k)
+        on = on[np.argsort(view.along[on])]
+        axes.plot(view.x[on], view.y[on], ".-", color=_colour(int(k)), markersize=3, linewidth=0.7)
+    for (x, y), label in zip(view.fibres, ("A", "B"), strict=True):
+        axes.plot(x, y, "+", color=INK, markersize=9)
+        axes.annotate(f"$s_{label}$", (x, y), xytext=(4, 4), textcoords="offset points", color=INK)
+    axes.set(
+        xlabel="x (px)",
+        ylabel="y (px)",
+        aspect="equal",
+        title=f"{view.name}: outermost paths, fibres",
+    )
+    axes.set_anchor("C")
+    finish(axes, grid=False)
+
+
+def _extract(axes: Axes, view: CrestView, extract: Extract, title: str) -> None:
+    (y0, x0), (ny, nx) = extract.start, extract.image.shape
+    axes.imshow(
+        extract.image / 1e3, origin="lower", cmap="gray", interpolation="nearest",
+        extent=(x0 - 0.5, x0 + nx - 0.5, y0 - 0.5, y0 + ny - 0.5),
+    )  # fmt: skip
+    for k in np.unique(view.k):
+        on = np.flatnonzero(view.k == k)
+        on = on[np.argsort(view.along[on])]
+        axes.plot(view.x[on], view.y[on], color=_colour(int(k)), linewidth=1.2)
+    for odd, label in ((0, "crest"), (1, "valley")):
+        on = view.k % 2 == odd
+        axes.plot(
+            view.x[on], view.y[on], "o", color=VALLEY if odd else CREST, markersize=6,
+            markeredgecolor="white", markeredgewidth=0.8, label=label,
+        )  # fmt: skip
+    axes.set_xlim(x0 - 0.5, x0 + nx - 0.5)
+    axes.set_ylim(y0 - 0.5, y0 + ny - 0.5)
+    axes.set(xlabel="x (px)", ylabel="y (px)", title=title)
+    axes.legend(loc="upper right", fontsize=8, framealpha=0.9)
+
+
+def _pulls(axes: Axes, view: CrestView) -> None:
+    """Residuals in units of their errors, against a Gaussian."""
+    pull = (view.residual_px / view.sigma_px)[view.used]
+    edges = np.linspace(-5, 5, int(np.clip(np.sqrt(len(pull)), 10, 60)) + 1)
+    axes.hist(pull, edges.tolist(), density=True, color=BLUE, alpha=0.35)
+    at = np.linspace(-5, 5, 201)
+    axes.plot(at, np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi), color=INK, linewidth=1)
+    axes.set(
+        xlabel="residual / error", ylabel="density",
+        title=f"{view.used.sum()} points, good to {np.median(view.sigma_px):.1e} px",
+    )  # fmt: skip
+    finish(axes)
+
+
+def _map(figure: SubFigure, axes: Axes, view: CrestView, *, by_ratio: bool) -> None:
+    distance, baseline = view.best
+    middle = baseline / distance
+    if by_ratio:
+        values, cost = 1e6 * (view.ratio / middle - 1), view.cost_ratio
+        label, at = "B/D − best (10⁻⁶)", 0.0
+    else:
+        values, cost, label, at = view.baseline, view.cost_baseline, "B (mm)", baseline
+    reduced = np.maximum(cost, 1e-300) / max(int(view.used.sum()), 1)
+    norm = LogNorm() if reduced.max() > 10 * reduced.min() else Normalize()
+    drawn = axes.pcolormesh(
+        view.distance, values, reduced.T, norm=norm, cmap=SEQUENTIAL, shading="nearest"
+    )
+    if by_ratio:
+        trace = 1e6 * (view.valley_ratio / middle - 1)
+        axes.plot(view.distance, trace, color="white", linewidth=1, ls="--")
+    axes.plot(distance, at, "x", color=RED, markersize=9, markeredgewidth=2)
+    axes.set(xlabel="D (mm)", ylabel=label,
+        title="cost per point, others " + ("refitted" if by_ratio else "held"),
+    )  # fmt: skip
+    axes.set_ylim(values[0], values[-1])
+    bar = figure.colorbar(drawn, ax=axes, pad=0.02)
+    bar.minorticks_off()
+
+
+def _valley(axes: Axes, view: CrestView) -> None:
+    """Cost along the bottom of the valley, above its least."""
+    above = view.valley_cost - view.valley_cost.min()
+    axes.plot(view.distance, above, ".-", color=BLUE, linewidth=1)
+    axes.axvline(view.best[0], color=RED, linewidth=1)
+    axes.set_yscale("symlog", linthresh=1.0)
+    axes.set_ylim(0, 1.3 * max(1.0, float(above.max())))
+    error = view.distance_sigma
+    decimals = max(0, 1 - int(np.floor(np.log10(error)))) if error > 0 else 3
+    origin = ", nominal" if view.distance_from_prior else ""
+    axes.set(
+        xlabel="D (mm)", ylabel="cost above its least",
+        title=f"{view.best[0]:.{decimals}f} ± {error:.{decimals}f} mm{origin}",
+    )  # fmt: skip
+    finish(axes)
