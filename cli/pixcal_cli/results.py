@@ -25,7 +25,7 @@ def _made_at(folder: Path) -> int | None:
     # A manifest is written once, with its artefact: another time is another artefact.
     try:
         return (folder / MANIFEST).stat().st_mtime_ns
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
 
 

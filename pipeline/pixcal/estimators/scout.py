@@ -118,8 +118,7 @@ class Scout:
         n_frames = codes[0].shape[0]
         if n_frames < MIN_FRAMES:
             raise InputError(f"{n_frames} frames: at least {MIN_FRAMES} are needed")
-        if sum(int(t.good.sum()) for t in self.tiles) < 30:
-            raise InputError("fewer than 30 good pixels are left to find the fringes with")
+        self._require_pixels()
         g = self._subspace(codes)
         frames = FrameParameters(g, np.zeros((n_frames, 2)), self.reference)
         for _ in range(3):
@@ -160,6 +159,13 @@ class Scout:
             frames, _, _ = self._frame_step(codes, frames, self.moving)
         return frames
 
+    def _require_pixels(self) -> None:
+        if sum(int(t.good.sum()) for t in self.tiles) < 30:
+            raise InputError(
+                "fewer than 30 good pixels are left to find the fringes with: the others are "
+                "masked, saturated too often, or do not fit the fringes"
+            )
+
     def _picked(self, tile: Tile) -> NDArray[np.intp]:
         """Flat numbers of the good pixels that frames are solved with, evenly taken."""
         good = np.flatnonzero(tile.good)
@@ -167,10 +173,18 @@ class Scout:
         return good[:: max(1, -(-len(good) // wanted))]
 
     def _electrons(self, codes: NDArray[np.uint16], picked: NDArray[np.intp]) -> F32:
-        """Samples (t, p) in electrons, zero where without weight."""
+        """Samples (t, p) in electrons, for first values that know no weights.
+
+        Most samples without weight are saturated: the brightest of the pixel stands for them. A
+        frame that has no other samples is zero.
+        """
         flat = np.take(codes.reshape(len(codes), -1), picked, axis=1)
         electrons = flat * np.float32(self.coding.scale) + np.float32(self.coding.offset)
-        electrons[flat == self.coding.fill] = 0
+        lost = flat == self.coding.fill
+        if lost.any():
+            electrons[lost] = 0
+            lost &= ~lost.all(axis=1, keepdims=True)
+            electrons = np.where(lost, electrons.max(axis=0), electrons)
         return np.asarray(electrons, np.float32)
 
     def _subspace(self, codes: Sequence[NDArray[np.uint16]]) -> F64:
@@ -233,6 +247,7 @@ class Scout:
         ]
         for tile, good in zip(self.tiles, goods, strict=True):
             tile.good &= good
+        self._require_pixels()
         frames = FrameParameters(g / norm, frames.dk, self.reference)
         frames, _, _ = self._frame_step(codes, frames, self.moving)
         return frames

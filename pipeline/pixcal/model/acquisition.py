@@ -59,6 +59,8 @@ class FringeSet:
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", self.name):
             raise InputError(f"name: {self.name!r:.80} is not made of letters, digits, '-' and '_'")
+        if re.fullmatch("mask|delta_(x|y|fringe)(_sigma)?", self.name):
+            raise InputError(f"name: {self.name!r} is the name of a result; choose another")
         if not self.files:
             raise InputError("files: the list is empty")
         _check_globs("files", self.files)

@@ -238,6 +238,8 @@ def lock(run: Path) -> Iterator[None]:
     try:
         run.mkdir(parents=True, exist_ok=True)
         handle = (run / ".lock").open("w")
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InputError(f"{run}: not a directory; choose another RUN") from error
     except OSError as error:
         raise InputError(f"{run}: cannot be written ({error.strerror})") from error
     with handle:

@@ -29,14 +29,16 @@ MAX_STEPS = 8
 """Gauss-Newton steps of a shape; it is nearly linear (physics note, section 4)."""
 STEP_RAD = 1e-7
 """A step that moves phases by less, rms, is the last."""
-EVIDENCE = 40.0
-"""Fall in chi-square for which ``auto`` takes the richer shape: far past chance (p < 1e-6) and the
-Bayesian information criterion for its few parameters."""
+EVIDENCE = 12.0
+"""Fall in chi-square for which ``auto`` takes hyperbolic fringes: one chance in a hundred for three
+terms. Taken in vain they cost three modes of the map; curvature missed stays in it whole."""
 QUADRATIC = 3
 """Terms of second order, which is what hyperbolic fringes show first."""
+RED = 2.5
+"""Power at large scales over that at small ones beyond which the map has structure of its own."""
 EXCESS = 50.0
-"""Fall asked of each term over that of terms of no cause. F(3, 15) is 15 at a chance of 1e-4; but
-the power of steps falls with the order of the term, and two stitches reach 15."""
+"""Fall then asked of each term over that of terms of no cause: the power of steps falls with the
+order of the term, and two stitches reach 15."""
 
 
 @dataclass(frozen=True)
@@ -228,9 +230,9 @@ def _choose(
     others = len(smooth.basis.names) - len(straight.basis.names) - QUADRATIC
     beyond = max(exact.square - smooth.square, 0.0) / smooth.spread / others
     background = max(1.0, beyond)
-    needed = max(EVIDENCE, QUADRATIC * EXCESS * background)
+    needed = QUADRATIC * EXCESS * background if background > RED else EVIDENCE
     reason = (
-        f"hyperbolic fringes lower chi-square by {gain:.0f}; {needed:.0f} are asked for, since "
+        f"hyperbolic fringes lower chi-square by {gain:.0f}, {needed:.0f} are asked for where "
         f"large scales hold {background:.1f} times the power of small ones"
     )
     if gain <= needed:

@@ -190,13 +190,14 @@ def _calibrate(
     """Write ``calibration.zarr``; return its extremes over the good pixels."""
     series = source.exposures.read_series
     read_noise = summary.read_noise_e(gain)
+    frames = 0 if series is None else len(series.frames)
     job = Finishing(
         statistics=made.folder / "scratch.zarr" / "statistics",
         shape=source.shape,
         usual=summary.usual,
         gain=gain,
         read_noise=read_noise,
-        each_pixel=series is not None and len(series.frames) >= _MIN_READ_FRAMES,
+        read_dof=frames - 1 if frames >= _MIN_READ_FRAMES else 0,
         floor=gain * ROUNDING_ADU * source.quantum,
         has_rate=source.exposures.has_rate,
         has_flat=bool(source.exposures.flat),
