@@ -103,7 +103,6 @@ MISTAKES: list[tuple[str, Any, str]] = [
         [{"exptime_s": 1, "count": 2}, {"exptime_s": 1.0, "count": 3}],
         "frames: darks: two entries have the same exptime_s",
     ),
-    ("frames.fringes.0.name", "mask", "frames.fringes[0]: name: 'mask' is the name of a result"),
     ("frames.fringes.0.name", "a b", "frames.fringes[0]: name: 'a b' is not made of"),
     ("frames.fringes.0.name", "flat", "frames.fringes[0]: name: 'flat' is the folder"),
     ("frames.fringes.0.name", "horizontal", "fringes: two sets are named 'horizontal'"),

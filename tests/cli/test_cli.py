@@ -195,6 +195,24 @@ def test_an_error_inside_a_stage_is_one_line(
         assert name in err
 
 
+@pytest.mark.parametrize("out", ["file", "file/run"])
+@pytest.mark.parametrize("command", ["run", "ingest"])
+def test_a_run_that_is_a_file_is_named(
+    command: str,
+    out: str,
+    make_bench: Any,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    make_bench(shape=(8, 8), frames=2).write(tmp_path / "acq")
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("kept")
+    assert invoke([command, "acq", "--out", out]) == 2
+    assert capsys.readouterr().err == f"pixcal: {out}: not a directory; choose another RUN\n"
+    assert Path("file").read_text() == "kept"
+
+
 def test_the_traceback_is_shown_on_demand(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -170,7 +170,10 @@ def test_the_lock_is_free_again(tmp_path: Path) -> None:
 
 def test_a_run_that_cannot_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="file: not a directory; choose another RUN"), lock(tmp_path / "file"):
+    with (
+        pytest.raises(InputError, match="file: not a directory; choose another RUN"),
+        lock(tmp_path / "file"),
+    ):
         pass
 
 
