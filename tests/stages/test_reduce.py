@@ -622,7 +622,7 @@ MEMORY = """
 import sys
 from pathlib import Path
 from pixcal.engine.run import Runtime
-from pixcal.stages import reduce
+from pixcal.stages.reduce import stage as reduce
 plans, make_plan = [], reduce.make_plan
 reduce.make_plan = lambda *a: plans.append(make_plan(*a)) or plans[-1]
 reduce.run(Path(sys.argv[1]), reduce.Config(), Runtime(workers=2))
