@@ -8,7 +8,7 @@ TOOLS := $(VENV)/.installed-tools
 PIP := $(BIN)/python -m pip --quiet install --no-compile
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint smoke precision clean
+.PHONY: help install demo test lint smoke precision bench clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
@@ -44,6 +44,9 @@ smoke: $(INSTALLED) ## run every shell command once on a small simulated acquisi
 
 precision: $(INSTALLED) ## 12 000 simulated frames against their truth (half a minute, 1 GB of disk)
 	$(BIN)/python benchmarks/precision.py
+
+bench: $(INSTALLED) ## speed of ingest, reduce and fit against a bare scan (a minute or two, 5 GB of disk)
+	$(BIN)/python benchmarks/throughput.py
 
 clean: ## remove the environment, the demo and all caches
 	rm -rf .venv demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
