@@ -93,6 +93,13 @@ def test_frames_without_fringes_are_refused(bench):
         scout.prime([codes])
 
 
+@pytest.mark.parametrize("interfringe", [36.0, 38.0, 42.0])
+def test_too_few_fringes_for_honest_errors_are_refused(bench, interfringe):
+    scout, codes = scout_of(bench(interfringe=interfringe))
+    with pytest.raises(InputError, match=r"1\.[4-9] fringes across 67 x 61 px"):
+        scout.prime([codes])
+
+
 def test_one_phase_is_refused(bench):
     made = bench(frames=30)
     made.scan = lambda name: (np.ones(30), np.ones(30), np.zeros(30), np.zeros((30, 2)))

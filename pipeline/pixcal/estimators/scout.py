@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from pixcal.estimators.fringes import (
+    HONEST_FRINGES,
     FrameParameters,
     find_fringe_vector,
     grid,
@@ -123,6 +124,7 @@ class Scout:
         frames = FrameParameters(g, np.zeros((n_frames, 2)), self.reference)
         for _ in range(3):
             frames = self._refine(codes, frames)
+        self._count_fringes()
         significance = self._motion_significance(codes, frames)
         self.moving_significance = significance
         # Six standard deviations of what frames without motion would show.
@@ -218,6 +220,20 @@ class Scout:
             raise InputError("the frames do not differ enough: the phase was scanned too little")
         g = g @ np.linalg.inv(mix)
         return np.asarray(g / self._norm(g))
+
+    def _count_fringes(self) -> None:
+        """Refuse fringes too wide for the window (their vector is well known only by now)."""
+        tile, theta = self.tiles[0], self.theta[0]
+        level = np.where(tile.good, theta[0], 1.0)
+        phasor = np.where(tile.good, theta[2] + 1j * theta[1], 0.0) / level
+        _, (kx, ky) = smooth_phasor(np.asarray(phasor, complex), tile.good, self.k)
+        ny, nx = tile.shape
+        across = float(np.hypot(kx * nx, ky * ny)) / (2 * np.pi)
+        if across < HONEST_FRINGES:
+            raise InputError(
+                f"{across:.1f} fringes across {nx} x {ny} px: at least {HONEST_FRINGES:g} are "
+                "needed; use a longer baseline or a larger window"
+            )
 
     @staticmethod
     def _norm(g: F64) -> F64:

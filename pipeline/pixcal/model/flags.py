@@ -13,7 +13,7 @@ class PixelFlag(IntFlag):
     NOISY = 4
     """Noise in bias or dark frames far above the read noise; telegraph noise included."""
     SATURATED = 8
-    """Saturated in more than a thousandth of the fringe samples (which have no weight)."""
+    """Saturated in more than two, and a thousandth, of its samples (which have no weight)."""
     NONLINEAR = 16
     """Departs from the straight line over a ladder of flats."""
     NO_DATA = 32

@@ -162,6 +162,9 @@ STRAY_SHARE = 1e-3
 """Share of saturated samples up to which a pixel is good: particles hit it now and then, and those
 samples have no weight. Light that saturates does so in every bright fringe, and biases the rest."""
 
+STRAY_SAMPLES = 2
+"""Saturated samples that a pixel may have in a short run."""
+
 
 def convert(job: Converting, index: Index) -> None:
     """Write a column of chunks in electrons, its maps, and its counts.
@@ -191,7 +194,7 @@ def convert(job: Converting, index: Index) -> None:
             largest = max(largest, int(samples.max()))
     seconds = float(fringes.exptime.mean())
     read = (maps["read_noise"] ** 2 + np.maximum(rate, 0) * seconds) / flat**2 + job.scale.variance
-    often = saturated > STRAY_SHARE * fringes.frames
+    often = saturated > max(STRAY_SHARE * fringes.frames, STRAY_SAMPLES)
     mask = maps["mask"] | PixelFlag.SATURATED * often | PixelFlag.NO_DATA * (lost > 0)
     for name, data in (("read_variance", read), ("shot_factor", 1 / flat), ("mask", mask)):
         writers[name].write((y0, x0), data.astype(writers[name].dtype))
