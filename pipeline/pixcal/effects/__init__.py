@@ -1,1 +1,0 @@
-"""One file per physical effect of the bench."""
