@@ -45,7 +45,7 @@ smoke: $(INSTALLED) ## run every shell command once on a small simulated acquisi
 precision: $(INSTALLED) ## 12 000 simulated frames against their truth (half a minute, 1 GB of disk)
 	$(BIN)/python benchmarks/precision.py
 
-bench: $(INSTALLED) ## speed of ingest, reduce and fit against a bare scan (a minute or two, 5 GB of disk)
+bench: $(INSTALLED) ## speed of ingest, reduce and fit against a bare scan (a minute, 3 GB of disk)
 	$(BIN)/python benchmarks/throughput.py
 
 clean: ## remove the environment, the demo and all caches

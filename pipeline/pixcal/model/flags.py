@@ -20,9 +20,3 @@ class PixelFlag(IntFlag):
     """Samples are missing or not finite."""
     BAD_FIT = 64
     """The fringe model does not describe the pixel (chi-square, or no contrast)."""
-
-
-def describe(value: int) -> str:
-    """Names of the flags set in ``value``, joined by ``+``; ``good`` when none is."""
-    names = [flag.name for flag in PixelFlag if flag.name and value & flag]
-    return "+".join(n.lower() for n in names) or "good"
