@@ -148,7 +148,9 @@ def test_samples_are_rounded_and_clipped() -> None:
     bias = rng.uniform(-30, 90, SHAPE).astype(np.float32)
     noise = rng.standard_normal(SHAPE).astype(np.float32)
     out = np.zeros(SHAPE, np.uint16)
-    synthesis.read_out(electrons, bias, noise, 5.0, 2.5, 200, out)
+    adu = np.empty_like(electrons)
+    synthesis.amplify(electrons, bias, noise, 5.0, 2.5, adu)
+    synthesis.convert(adu, 200, out)
     exact = (electrons + 5.0 * noise.astype(np.float64)) / 2.5 + bias
     assert np.abs(out - np.clip(exact, 0, 200)).max() <= 0.5 + 1e-4
     assert out.max() == 200

@@ -18,6 +18,8 @@ from pixcal.model.acquisition import load_acquisition
 from pixcal.model.bench import load_bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError, PlanError
+from pixcal.simulation.exposure import Camera
+from pixcal.simulation.recording import recordings
 from pixcal.stages import simulate
 from pixcal.stages.simulate import Config, run
 from pixcal.storage.artefact import artefact_key, read_manifest
@@ -428,12 +430,12 @@ def test_too_little_memory_is_refused_with_both_numbers(tmp_path: Path) -> None:
 def test_the_sample_is_what_its_bench_gives(set_number: int) -> None:
     bench = load_bench(ROOT / "configs/demo.yaml")
     sample = ROOT / "data_samples/demo"
-    sequence = [s for s in simulate.sequences(bench) if s.kind == "fringes"][set_number]
+    recording = [r for r in recordings(bench) if r.kind == "fringes"][set_number]
     rows = (59, 77)
     maps = detector_maps(bench.detector, rows)
-    recorded = frames(sample, sequence.folder)
-    assert recorded.shape == (sequence.count, *bench.detector.shape)
-    for frame, samples in simulate.expose(bench, sequence, range(58, 63), rows, maps):
+    recorded = frames(sample, recording.folder)
+    assert recorded.shape == (recording.count, *bench.detector.shape)
+    for frame, samples in Camera(bench, rows).expose(recording, range(58, 63)):
         assert np.array_equal(samples, recorded[frame, rows[0] : rows[1]])
     with fits.open(ROOT / "data_samples/demo-truth/delta_x.fits") as hdus:
         assert np.array_equal(hdus[0].data[rows[0] : rows[1]], maps.delta_x)

@@ -182,7 +182,8 @@ def light_maps(
     a, b = fibre_light(bench, number, rows)
     x = np.arange(bench.detector.shape[1]) + maps.delta_x.astype(np.float64)
     y = np.arange(*rows)[:, None] + maps.delta_y.astype(np.float64)
-    psi = optics.phase(x, y, geometry(bench, number))
+    shape = optics.phase if bench.optics.fringes == "exact" else optics.paraxial_phase
+    psi = shape(x, y, geometry(bench, number))
     iota = electrons * maps.response * (a + b)
     alpha = electrons * maps.response * 2 * bench.optics.visibility * np.sqrt(a * b)
     return LightMaps(

@@ -2,7 +2,8 @@
 
 A frame is made in separate steps, each over arrays (y, x) of the rows at hand, so that an effect
 can act between any two: `illuminate` (light and pixel response: mean electrons), `collect`
-(charge: dark current, shot noise, full well), `read_out` (gain, bias, read noise, converter).
+(charge: dark current, shot noise, full well), `amplify` (gain, bias, read noise), `convert`
+(codes).
 
 Random numbers come from `numpy.random.Generator` (PCG64), one for each (purpose, place): noise for
 each frame and block of `BLOCK_ROWS` rows of the window, maps of the chip for each tile of it. So
@@ -44,6 +45,7 @@ class Stream(IntEnum):
     VISIBILITY = 10
     VECTOR = 11
     NOISE = 12
+    EFFECT = 13
 
 
 def generator(seed: int, stream: Stream, *key: int) -> np.random.Generator:
@@ -170,20 +172,14 @@ def poisson_quantile(mean: float, w: float) -> int:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def read_out(
-    charge: Float32,
-    bias: Float32,
-    normal: Float32,
-    read_noise: float,
-    gain: float,
-    top: int,
-    out: NDArray[np.uint16],
+def amplify(
+    signal: Float32, bias: Float32, normal: Float32, read_noise: float, gain: float, out: Float32
 ) -> None:
-    """Samples of the converter, clipped to 0 and ``top``.
+    """Electrons in ADU, with read noise and bias.
 
     Parameters
     ----------
-    charge : ndarray of float32, shape (y, x)
+    signal : ndarray of float32, shape (y, x)
         e-.
     bias : ndarray of float32, shape (y, x)
         ADU.
@@ -191,17 +187,22 @@ def read_out(
         Standard normals.
     read_noise, gain : float
         e- rms and e-/ADU.
-    top : int
-        Largest value, ADU.
-    out : ndarray of uint16, shape (y, x)
+    out : ndarray of float32, shape (y, x)
         ADU.
     """
     noise, scale = np.float32(read_noise), np.float32(1.0 / gain)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = (signal[i, j] + noise * normal[i, j]) * scale + bias[i, j]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def convert(adu: Float32, top: int, out: NDArray[np.uint16]) -> None:
+    """Codes of the converter, rounded and clipped to 0 and ``top`` (ADU)."""
     low, high, half = np.float32(0), np.float32(top), np.float32(0.5)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
-            value = (charge[i, j] + noise * normal[i, j]) * scale + bias[i, j]
-            out[i, j] = np.uint16(np.int32(min(max(value, low) + half, high)))
+            out[i, j] = np.uint16(np.int32(min(max(adu[i, j], low) + half, high)))
 
 
 def block_normals(

@@ -1,9 +1,10 @@
 """A bench to simulate: everything ``pixcal simulate`` needs to know, schema ``pixcal/bench/1``."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
+from typing import Any
 
 from pixcal.model.config import parse, quantity, read_yaml
 from pixcal.model.errors import InputError
@@ -149,6 +150,11 @@ class SimulatedOptics:
     laser_noise_rms: float = quantity(
         0.0, low=0, high=0.5, doc="relative change of the laser's power from frame to frame"
     )
+    fringes: str = quantity(
+        "exact",
+        choices=("exact", "straight"),
+        doc="exact: hyperbolic, as two fibres make them; straight: their paraxial limit",
+    )
 
 
 @dataclass(frozen=True)
@@ -270,6 +276,9 @@ class Bench:
     frames: SimulatedFrames = quantity()
     seed: int = quantity(0, low=0, high=10**18, doc="of everything that changes between frames")
     shot_noise: bool = quantity(True, doc="false: the charge is its mean")
+    effects: dict[str, Any] = field(
+        default_factory=dict, metadata={"doc": "effects to add: their names and parameters"}
+    )
 
 
 def load_bench(path: Path) -> Bench:

@@ -183,6 +183,8 @@ def to_plain(config: Any) -> Any:
         return {f.name: to_plain(getattr(config, f.name)) for f in dataclasses.fields(config)}
     if isinstance(config, (tuple, list)):
         return [to_plain(v) for v in config]
+    if isinstance(config, dict):
+        return {name: to_plain(value) for name, value in config.items()}
     if isinstance(config, Path):
         return str(config)
     return config
@@ -215,6 +217,11 @@ def _value(hint: Any, value: Any, where: str, key: str, meta: Any) -> Any:
         return _value(options[0], value, where, key, meta)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return parse(hint, value, where, key=key)
+    if origin is dict:
+        # A section whose keys another module knows.
+        if not isinstance(value, dict):
+            raise InputError(f"{place}: expected keys and values, found {_kind(value)}")
+        return value
     if origin is tuple:
         args = get_args(hint)
         if not isinstance(value, (list, tuple)):

@@ -1,10 +1,7 @@
 """``pixcal simulate``: an acquisition as a bench would write it, and the truth apart from it.
 
-The work is cut into pieces of some frames by some rows; `expose` makes one, from the bench alone.
-Its steps are separate so that effects can act between them: what moves phase or intensity goes
-before `synthesis.illuminate`, what couples or deforms charge around `synthesis.collect`, what the
-electronics do around `synthesis.read_out`. Noise is keyed by frame and place, so an effect that
-needs the rows around a piece, or the frame before it, makes them again.
+The work is cut into pieces of some frames by some rows, which `pixcal.simulation.exposure` makes
+from the bench and its effects alone.
 
 The truth is a directory of its own: ``delta_x``, ``delta_y`` (px), ``response``, ``bias`` (ADU),
 ``dark_rate`` (e-/s) and ``mask`` (`PixelFlag`) as FITS images; ``truth.json`` with the geometry of
@@ -13,7 +10,6 @@ and its frames (``B``, ``A``, ``phi``, ``dkx``, ``dky``); and the bench file.
 """
 
 import shutil
-from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import datetime, timedelta
 from functools import partial
@@ -22,26 +18,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pixcal.effects import parse_effects
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels import optics, synthesis
-from pixcal.kernels.scene import (
-    DetectorMaps,
-    FrameStates,
-    LightMaps,
-    Rows,
-    detector_maps,
-    electrons_per_unit,
-    frame_states,
-    geometry,
-    light_maps,
-)
+from pixcal.kernels.scene import DetectorMaps, Rows, geometry
 from pixcal.model import acquisition as described
 from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import to_plain, to_yaml
 from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect
+from pixcal.simulation.exposure import Camera, states_of
+from pixcal.simulation.recording import Recording, recordings
 from pixcal.storage.artefact import (
     MANIFEST,
     Manifest,
@@ -67,7 +56,6 @@ _BYTES_PER_COMPRESSED_SAMPLE = 10
 """Peak of a task for each sample of a file that is compressed (measured)."""
 
 _MJD_EPOCH = datetime(1858, 11, 17)
-_KINDS = ("bias", "dark", "flat", "fringes")
 
 
 @dataclass(frozen=True)
@@ -83,121 +71,10 @@ class Config:
     truth: Path | None = None
 
 
-@dataclass(frozen=True)
-class Sequence:
-    """Frames taken one after the other under the same conditions.
+Effects = tuple[Effect, ...]
 
-    Attributes
-    ----------
-    kind : str
-        ``bias``, ``dark``, ``flat`` or ``fringes``.
-    number : int
-        Among those of its kind.
-    folder, stem : str
-        Of its files.
-    start_s, period_s : float
-        First frame after the start of the acquisition, and from frame to frame.
-    electrons : float
-        Electrons for unit light: of a flat its mean, of fringes as in `electrons_per_unit`.
-    """
-
-    kind: str
-    number: int
-    folder: str
-    stem: str
-    count: int
-    exptime_s: float
-    start_s: float
-    period_s: float
-    electrons: float
-
-
-Span = tuple[Sequence, range, dict[int, FrameWriter]]
-"""Some frames of a sequence, and the files (by number) that they go to."""
-
-
-def sequences(bench: Bench) -> list[Sequence]:
-    """Everything that the bench records, in order of time."""
-    f = bench.frames
-    planned: list[tuple[str, int, str, int, float, float]] = []
-    if f.bias:
-        planned.append(("bias", 0, "bias", f.bias, f.bias_exptime_s, 0.0))
-    for n, rung in enumerate(f.darks):
-        planned.append(("dark", n, "dark", rung.count, rung.exptime_s, 0.0))
-    for n, rung in enumerate(f.flats):
-        mean = (f.flat_rate_e_s or 0.0) * rung.exptime_s
-        planned.append(("flat", n, "flat", rung.count, rung.exptime_s, mean))
-    for n, scan in enumerate(f.fringes):
-        electrons = electrons_per_unit(bench, n)
-        planned.append(("fringes", n, scan.name, scan.count, f.exptime_s, electrons))
-    found, clock = [], 0.0
-    for kind, number, folder, count, exptime, electrons in planned:
-        period = max(f.period_s, exptime)
-        stem = f"{folder}-{number}" if kind in ("dark", "flat") else folder
-        found.append(Sequence(kind, number, folder, stem, count, exptime, clock, period, electrons))
-        clock += count * period
-    return found
-
-
-def expose(
-    bench: Bench, sequence: Sequence, frames: range, rows: Rows, maps: DetectorMaps
-) -> Iterator[tuple[int, NDArray[np.uint16]]]:
-    """Frames of a sequence as the camera reads them.
-
-    Parameters
-    ----------
-    frames : range
-        Numbers within the sequence.
-    rows : tuple of int
-        First row of the window and the one after the last; any rows give the same samples.
-    maps : DetectorMaps
-        Of these rows.
-
-    Yields
-    ------
-    tuple
-        Number of the frame and its samples, uint16 (y, x), ADU; the array is used again.
-    """
-    d = bench.detector
-    light = _light(bench, sequence, rows, maps)
-    states = _states(bench, sequence)
-    dark = maps.dark_rate * np.float32(sequence.exptime_s)
-    well = np.inf if d.full_well_e is None else d.full_well_e
-    mean, charge = np.empty_like(dark), np.empty_like(dark)
-    samples = np.empty(dark.shape, np.uint16)
-    for frame in frames:
-        columns, lines = states.turns(frame, d.shape, rows)
-        key = (_KINDS.index(sequence.kind), sequence.number, frame)
-        shot, read = synthesis.block_normals(rows, d.shape[1], bench.seed, key)
-        synthesis.illuminate(
-            light.iota,
-            light.alpha_sin,
-            light.alpha_cos,
-            states.level[frame],
-            states.amplitude[frame],
-            columns,
-            lines,
-            mean,
-        )
-        synthesis.collect(mean, dark, shot, bench.shot_noise, well, charge)
-        synthesis.read_out(
-            charge, maps.bias, read, d.read_noise_e, d.gain_e_per_adu, d.top_adu, samples
-        )
-        yield frame, samples
-
-
-def _light(bench: Bench, sequence: Sequence, rows: Rows, maps: DetectorMaps) -> LightMaps:
-    if sequence.kind == "fringes":
-        return light_maps(bench, sequence.number, rows, maps, sequence.electrons)
-    nothing = np.zeros_like(maps.response)
-    return LightMaps(maps.response * np.float32(sequence.electrons), nothing, nothing)
-
-
-def _states(bench: Bench, sequence: Sequence) -> FrameStates:
-    if sequence.kind == "fringes":
-        return frame_states(bench, sequence.number)
-    still, steady = np.zeros(sequence.count), np.ones(sequence.count)
-    return FrameStates(phi=still, level=steady, amplitude=still, dkx=still, dky=still)
+Span = tuple[Recording, range, dict[int, FrameWriter]]
+"""Some frames of a recording, and the files (by number) that they go to."""
 
 
 def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -254,11 +131,12 @@ def _build(
     for folder in (made, truth_made):
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-    recorded = sequences(plan)
+    recorded = recordings(plan)
+    effects = checked_effects(plan, source)
     runtime = _fitting(plan, recorded, runtime)
-    _write_truth(plan, recorded, truth_made, runtime)
+    _write_truth(plan, effects, recorded, truth_made, runtime)
     shutil.copyfile(source, truth_made / "bench.yaml")
-    _write_frames(plan, recorded, made, runtime)
+    _write_frames(plan, effects, recorded, made, runtime)
     _write_description(plan, made)
     _put(truth_made, truth_out, Manifest(TRUTH, FORMAT, key, to_plain(plan), {}))
     return _put(made, out, Manifest(STAGE, FORMAT, key, {}, {}))
@@ -306,43 +184,56 @@ def _put(made: Path, final: Path, manifest: Manifest) -> Manifest:
     return manifest
 
 
+def checked_effects(bench: Bench, where: Path) -> Effects:
+    """Effects of a bench file, which must go together with the bench."""
+    found = parse_effects(bench.effects, str(where))
+    for effect in found:
+        try:
+            effect.check(bench)
+        except InputError as error:
+            raise InputError(f"{where}: effects.{effect.name}: {error}") from error
+    return found
+
+
 def _blocks(bench: Bench) -> list[Rows]:
     """The window's rows, in the blocks that share their noise generator."""
     ny, step = bench.detector.shape[0], synthesis.BLOCK_ROWS
     return [(row, min(row + step, ny)) for row in range(0, ny, step)]
 
 
-def _fitting(bench: Bench, recorded: list[Sequence], runtime: Runtime) -> Runtime:
+def _fitting(bench: Bench, recorded: list[Recording], runtime: Runtime) -> Runtime:
     """The runtime with as many workers as fit the memory."""
     ny, nx = bench.detector.shape
     need = min(ny, synthesis.BLOCK_ROWS) * nx * _BYTES_PER_PIXEL
-    for sequence in recorded:
-        if sequence.folder in bench.frames.compress:
-            planes = min(bench.frames.per_file, sequence.count)
+    for recording in recorded:
+        if recording.folder in bench.frames.compress:
+            planes = min(bench.frames.per_file, recording.count)
             need = max(need, planes * ny * nx * _BYTES_PER_COMPRESSED_SAMPLE)
     workers = make_plan("simulate", need, 0, runtime).workers
     return replace(runtime, workers=workers)
 
 
-def _write_frames(bench: Bench, recorded: list[Sequence], folder: Path, runtime: Runtime) -> None:
+def _write_frames(
+    bench: Bench, effects: Effects, recorded: list[Recording], folder: Path, runtime: Runtime
+) -> None:
     spans: list[Span] = []
     ready: list[tuple[FrameWriter, bool]] = []
-    for sequence in recorded:
-        files = _create_files(bench, sequence, folder)
-        ready += [(file, sequence.folder in bench.frames.compress) for file in files]
-        spans += _spans(sequence, files, bench.frames.per_file)
+    for recording in recorded:
+        files = _create_files(bench, recording, folder)
+        ready += [(file, recording.folder in bench.frames.compress) for file in files]
+        spans += _spans(recording, files, bench.frames.per_file)
     pieces = list(product(_blocks(bench), _batches(spans)))
-    run_tasks(partial(_write_piece, bench), pieces, runtime, label="frames")
+    run_tasks(partial(_write_piece, bench, effects), pieces, runtime, label="frames")
     run_tasks(_finish, ready, runtime, label="files")
 
 
-def _spans(sequence: Sequence, files: list[FrameWriter], per_file: int) -> list[Span]:
-    """A sequence in spans of `FRAMES_PER_TASK` frames."""
+def _spans(recording: Recording, files: list[FrameWriter], per_file: int) -> list[Span]:
+    """A recording in spans of `FRAMES_PER_TASK` frames."""
     spans: list[Span] = []
-    for first in range(0, sequence.count, FRAMES_PER_TASK):
-        frames = range(first, min(first + FRAMES_PER_TASK, sequence.count))
+    for first in range(0, recording.count, FRAMES_PER_TASK):
+        frames = range(first, min(first + FRAMES_PER_TASK, recording.count))
         used = range(frames[0] // per_file, frames[-1] // per_file + 1)
-        spans.append((sequence, frames, {n: files[n] for n in used}))
+        spans.append((recording, frames, {n: files[n] for n in used}))
     return spans
 
 
@@ -356,22 +247,22 @@ def _batches(spans: list[Span]) -> list[list[Span]]:
     return [batch for batch in batches if batch]
 
 
-def _create_files(bench: Bench, sequence: Sequence, folder: Path) -> list[FrameWriter]:
+def _create_files(bench: Bench, recording: Recording, folder: Path) -> list[FrameWriter]:
     per_file = bench.frames.per_file
-    (folder / sequence.folder).mkdir(exist_ok=True)
+    (folder / recording.folder).mkdir(exist_ok=True)
     made = []
-    for number, first in enumerate(range(0, sequence.count, per_file)):
-        planes = min(per_file, sequence.count - first)
+    for number, first in enumerate(range(0, recording.count, per_file)):
+        planes = min(per_file, recording.count - first)
         shape = bench.detector.shape if per_file == 1 else (planes, *bench.detector.shape)
-        path = folder / sequence.folder / f"{sequence.stem}-{number:05d}.fits"
-        cards = _cards(bench, sequence, first)
+        path = folder / recording.folder / f"{recording.stem}-{number:05d}.fits"
+        cards = _cards(bench, recording, first)
         made.append(FrameWriter.create(path, shape, "uint16", cards))
     return made
 
 
-def _cards(bench: Bench, sequence: Sequence, frame: int) -> dict[str, Any]:
+def _cards(bench: Bench, recording: Recording, frame: int) -> dict[str, Any]:
     """Header of a file whose first frame has this number."""
-    seconds = sequence.start_s + frame * sequence.period_s
+    seconds = recording.start_s + frame * recording.period_s
     start = bench.frames.start_time
     mjd = (start - _MJD_EPOCH) / timedelta(days=1) + seconds / 86400
     moment = start + timedelta(seconds=seconds)
@@ -379,21 +270,21 @@ def _cards(bench: Bench, sequence: Sequence, frame: int) -> dict[str, Any]:
         "DATE-OBS": (moment.isoformat(timespec="microseconds"), "start of the first frame"),
         "MJD-OBS": (mjd, "[d] start of the first frame"),
         "TIMESYS": "UTC",
-        "EXPTIME": (sequence.exptime_s, "[s] exposure time"),
-        "CADENCE": (sequence.period_s, "[s] frame to frame"),
+        "EXPTIME": (recording.exptime_s, "[s] exposure time"),
+        "CADENCE": (recording.period_s, "[s] frame to frame"),
         "CCD-TEMP": (bench.detector.temperature_c, "[C] detector temperature"),
-        "IMAGETYP": sequence.kind,
-        "OBJECT": sequence.folder,
+        "IMAGETYP": recording.kind,
+        "OBJECT": recording.folder,
         "INSTRUME": bench.detector.name.encode("ascii", "replace").decode()[:60],
         "ORIGIN": "pixcal simulate",
     }
 
 
-def _write_piece(bench: Bench, piece: tuple[Rows, list[Span]]) -> None:
+def _write_piece(bench: Bench, effects: Effects, piece: tuple[Rows, list[Span]]) -> None:
     rows, spans = piece
-    maps = detector_maps(bench.detector, rows)
-    for sequence, frames, files in spans:
-        for frame, samples in expose(bench, sequence, frames, rows, maps):
+    camera = Camera(bench, rows, effects)
+    for recording, frames, files in spans:
+        for frame, samples in camera.expose(recording, frames):
             number, plane = divmod(frame, bench.frames.per_file)
             files[number].write_rows(rows[0], samples, plane)
 
@@ -440,7 +331,9 @@ def _write_description(bench: Bench, folder: Path) -> None:
     (folder / "acquisition.yaml").write_text(to_yaml(contents), encoding="utf-8")
 
 
-def _write_truth(bench: Bench, recorded: list[Sequence], folder: Path, runtime: Runtime) -> None:
+def _write_truth(
+    bench: Bench, effects: Effects, recorded: list[Recording], folder: Path, runtime: Runtime
+) -> None:
     """Maps as FITS; geometry and frames as JSON."""
     units = {"delta_x": "pix", "delta_y": "pix", "bias": "adu", "dark_rate": "electron/s"}
     maps = [
@@ -452,21 +345,23 @@ def _write_truth(bench: Bench, recorded: list[Sequence], folder: Path, runtime: 
         )
         for field in fields(DetectorMaps)
     ]
-    run_tasks(partial(_write_maps, bench, maps), _blocks(bench), runtime, label="truth")
+    run_tasks(partial(_write_maps, bench, effects, maps), _blocks(bench), runtime, label="truth")
     for writer in maps:
         writer.finish()
-    sets = {s.folder: _set_truth(bench, s) for s in recorded if s.kind == "fringes"}
+    sets = {s.folder: _set_truth(bench, effects, s) for s in recorded if s.kind == "fringes"}
     write_json(folder / "truth.json", {"schema": TRUTH_SCHEMA, "sets": sets})
 
 
-def _write_maps(bench: Bench, writers: list[FrameWriter], rows: Rows) -> None:
-    maps = detector_maps(bench.detector, rows)
+def _write_maps(bench: Bench, effects: Effects, writers: list[FrameWriter], rows: Rows) -> None:
+    camera = Camera(bench, rows, effects)
+    skip = rows[0] - camera.rows[0]
+    keep = slice(skip, skip + rows[1] - rows[0])
     for field, writer in zip(fields(DetectorMaps), writers, strict=True):
-        writer.write_rows(rows[0], getattr(maps, field.name))
+        writer.write_rows(rows[0], getattr(camera.maps, field.name)[keep])
 
 
-def _set_truth(bench: Bench, sequence: Sequence) -> dict[str, Any]:
-    g, states = geometry(bench, sequence.number), frame_states(bench, sequence.number)
+def _set_truth(bench: Bench, effects: Effects, recording: Recording) -> dict[str, Any]:
+    g, states = geometry(bench, recording.number), states_of(recording, effects)
     ny, nx = bench.detector.shape
     kx, ky = optics.fringe_vector((nx - 1) / 2, (ny - 1) / 2, g)
     return {
@@ -477,7 +372,7 @@ def _set_truth(bench: Bench, sequence: Sequence) -> dict[str, Any]:
         "interfringe_px": float(2 * np.pi / np.hypot(kx, ky)),
         "kx": float(kx),
         "ky": float(ky),
-        "electrons": sequence.electrons,
+        "electrons": recording.electrons,
         "B": states.level.tolist(),
         "A": states.amplitude.tolist(),
         "phi": states.phi.tolist(),

@@ -1,0 +1,218 @@
+"""What a part of an acquisition tells about its effects: samples, maps, frames, side by side."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.fringes import grid
+from pixcal.estimators.scout import Coding
+from pixcal.kernels.bilinear import frame_sums
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FringeEvidence:
+    """One fringe set on a part of the window, and what the fit found there.
+
+    Attributes
+    ----------
+    name : str
+    baseline_mm : (float, float)
+        Nominal.
+    k : (float, float)
+        Fringe vector (kx, ky) at the window's centre, rad/px.
+    origin : (int, int)
+        Row and column of the part's first pixel in the window.
+    window : (int, int)
+        Rows and columns of the whole window.
+    time_s, exptime_s : (t,), float
+        Time of each frame, s; exposure time (nan when unknown).
+    electrons : (t, y, x) float32
+        Reduced samples (bias and dark taken off, divided by the flat); NaN without weight.
+    adu : (t, y, x) uint16 or other
+        The same samples as the camera wrote them.
+    g : (t, 3) float64
+        (B, A cos phi, A sin phi) at the middle of the part.
+    dk : (t, 2) float64
+        Change of the fringe vector (x, y), rad/px; zeros when the fit held it.
+    free : (t, 5) float64
+        (B, A cos phi, A sin phi, dkx, dky) of each frame by itself, from this part's pixels, with
+        the fringe vector free whether the fit held it or not.
+    free_covariance : (t, 5, 5) float64
+        Of ``free``, from the noise of the samples.
+    theta : (3, y, x) float64
+        (iota, alpha sin psi, alpha cos psi), e-.
+    sigma : (y, x) float64
+        1-sigma error of the phase psi, rad, of the noise.
+    delta : (y, x) float64
+        Offset along the fringe axis, px, modes removed; NaN where masked.
+    good : (y, x) bool
+    read_variance, shot_factor : (y, x) float64
+        Variance of a sample: ``shot_factor * model + read_variance`` (e-²).
+    """
+
+    name: str
+    baseline_mm: tuple[float, float]
+    k: tuple[float, float]
+    origin: tuple[int, int]
+    window: tuple[int, int]
+    time_s: F64
+    exptime_s: float
+    electrons: F32
+    adu: NDArray[np.generic]
+    g: F64
+    dk: F64
+    free: F64
+    free_covariance: F64
+    theta: F64
+    sigma: F64
+    delta: F64
+    good: NDArray[np.bool_]
+    read_variance: F64
+    shot_factor: F64
+
+    @cached_property
+    def model(self) -> F32:
+        """Fitted model (t, y, x), e-; the change of the fringe vector to first order."""
+        model = np.einsum("ti,iyx->tyx", self.g, self.theta)
+        if np.any(self.dk):
+            ny, nx = self.good.shape
+            y, x = np.arange(ny) - (ny - 1) / 2, np.arange(nx) - (nx - 1) / 2
+            turn = self.dk[:, 0, None, None] * x + self.dk[:, 1, None, None] * y[:, None]
+            slope = (
+                self.g[:, 1, None, None] * self.theta[2] - self.g[:, 2, None, None] * self.theta[1]
+            )
+            model += turn * slope
+        return np.asarray(model, np.float32)
+
+    @cached_property
+    def residual(self) -> F32:
+        """Samples less the model (t, y, x), e-; NaN without weight."""
+        return np.asarray(self.electrons - self.model)
+
+    @cached_property
+    def variance(self) -> F32:
+        """Variance (t, y, x) that the noise model predicts, e-²."""
+        model = np.maximum(self.model, 0)
+        return (self.shot_factor * model + self.read_variance).astype(np.float32)
+
+    @property
+    def phi(self) -> F64:
+        """Phase of each frame, rad."""
+        return np.arctan2(self.g[:, 2], self.g[:, 1])
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Calibration frames of one kind and exposure time, as the camera wrote them.
+
+    Attributes
+    ----------
+    kind : str
+        ``bias``, ``dark`` or ``flat``.
+    exptime_s : float
+        nan when unknown.
+    time_s : (t,) float64
+        Time of each frame, from the first of its kind.
+    adu : (t, y, x) float32
+    """
+
+    kind: str
+    exptime_s: float
+    time_s: F64
+    adu: F32
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A part of the window of an acquisition that was reduced and fitted.
+
+    Attributes
+    ----------
+    fringes : mapping
+        Fringe sets by name.
+    stacks : tuple of Stack
+        Bias, darks and flats.
+    gain : float
+        e-/ADU.
+    read_noise : float
+        e- rms.
+    bias, dark_rate, flat : (y, x) float64
+        Calibration maps: ADU, e-/s, relative.
+    good : (y, x) bool
+        Pixels without flags.
+    saturation_adu : float
+    pitch_um, wavelength_nm, distance_mm : float
+        Nominal bench.
+    """
+
+    fringes: Mapping[str, FringeEvidence]
+    stacks: tuple[Stack, ...]
+    gain: float
+    read_noise: float
+    bias: F64
+    dark_rate: F64
+    flat: F64
+    good: NDArray[np.bool_]
+    saturation_adu: float
+    pitch_um: float
+    wavelength_nm: float
+    distance_mm: float
+    notes: tuple[str, ...] = field(default=())
+
+    def of_kind(self, kind: str) -> tuple[Stack, ...]:
+        """Stacks of a kind, by exposure time."""
+        return tuple(sorted((s for s in self.stacks if s.kind == kind), key=lambda s: s.exptime_s))
+
+
+def free_frames(
+    codes: NDArray[np.uint16],
+    coding: Coding,
+    g: F64,
+    dk: F64,
+    theta: F64,
+    read_variance: F64,
+    shot_factor: F64,
+    good: NDArray[np.bool_],
+) -> tuple[F64, F64]:
+    """Parameters of every frame by itself, the pixels being known, and their covariance.
+
+    Parameters
+    ----------
+    codes : (t, y, x) uint16
+    coding : Coding
+    g, dk : (t, 3), (t, 2) float64
+        Start, at the middle of the part.
+    theta, read_variance, shot_factor, good
+        As in `FringeEvidence`.
+
+    Returns
+    -------
+    free : (t, 5) float64
+    covariance : (t, 5, 5) float64
+        As in `FringeEvidence`.
+    """
+    n = len(g)
+    y, x = np.broadcast_arrays(*grid((good.shape[0], good.shape[1])))
+    packed, right = np.zeros((n, 15)), np.zeros((n, 5))
+    start, turned = g.astype(np.float32), dk.astype(np.float32)
+    frame_sums(
+        np.ascontiguousarray(codes[:, good]), coding.scale, coding.offset, coding.fill,
+        start, turned, y[good].astype(np.float32), x[good].astype(np.float32),
+        theta[:, good].astype(np.float32), read_variance[good].astype(np.float32),
+        shot_factor[good].astype(np.float32), packed, right,
+    )  # fmt: skip
+    normal = np.zeros((n, 5, 5))
+    upper = np.triu_indices(5)
+    normal[:, upper[0], upper[1]] = packed
+    normal[:, upper[1], upper[0]] = packed
+    scale = np.sqrt(np.maximum(np.einsum("tii->ti", normal), 1e-30))
+    both = scale[:, :, None] * scale[:, None, :]
+    covariance = np.linalg.pinv(normal / both, rcond=1e-10, hermitian=True) / both
+    step = np.einsum("tij,tj->ti", covariance, right)
+    return np.hstack([start, turned]) + step, covariance

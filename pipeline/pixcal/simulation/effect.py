@@ -1,0 +1,188 @@
+"""What an effect of the bench or the detector is: a frozen dataclass of its parameters.
+
+An effect can act on the frames of a simulation, learn its own parameters from an acquisition, say
+what it does to the maps of a fit, and, where physics allows, undo that. Its fields are made with
+`pixcal.model.config.quantity`: units, ranges, and defaults of the size that the literature gives,
+cited in ``sources``.
+
+An effect overrides the steps of the exposure that it acts on; the others leave things as they are.
+The order of the steps is that of a camera (`pixcal.simulation.exposure`); within a step, effects
+act in the order of `Effect.stage` and then of their names.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.evidence import Evidence
+from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
+from pixcal.model.bench import Bench
+from pixcal.simulation.recording import Recording
+from pixcal.simulation.shot import Shot
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+
+class Stage(IntEnum):
+    """Where in the chain from fibre to file an effect acts; effects are applied in this order."""
+
+    LIGHT = 1
+    """Laser, fibres, modulator, glass: before the photon is absorbed."""
+    PIXEL = 2
+    """Where and how well a pixel responds."""
+    CHARGE = 3
+    """Collected electrons, shot noise included."""
+    SIGNAL = 4
+    """Voltages: coupling between pixels, response of the amplifier."""
+    READOUT = 5
+    """Noise and drift of the electronics, the converter."""
+
+
+@dataclass(frozen=True)
+class FringeMaps:
+    """What a fit finds of one fringe set, for effects that are linear in the intensity.
+
+    Attributes
+    ----------
+    theta : (3, y, x) float64
+        (iota, alpha sin psi, alpha cos psi), e-.
+    k : (float, float)
+        Fringe vector (kx, ky) at the centre, rad/px.
+    origin : (int, int)
+        First row and column of these maps in the detector's window.
+    """
+
+    theta: F64
+    k: tuple[float, float]
+    origin: tuple[int, int] = (0, 0)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Parameters of an effect, learnt from an acquisition.
+
+    Attributes
+    ----------
+    effect : Effect
+        With the best parameters.
+    errors : mapping
+        1-sigma errors of the parameters that were fitted, by field name (``couplings[0].share``).
+    significance : float
+        How far from no effect at all, in standard deviations of chance.
+    why : str
+        One sentence: which frames and which statistic told.
+    details : mapping
+        Numbers by which several ways of measuring can be compared.
+    """
+
+    effect: "Effect"
+    errors: Mapping[str, float]
+    significance: float
+    why: str
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """Base of all effects; a subclass is a frozen dataclass in a file of its own in ``effects/``.
+
+    Attributes
+    ----------
+    name : str
+        In files and reports.
+    title : str
+        In a few words, for people.
+    stage : Stage
+    domains : tuple of str
+        Where it shows: ``space``, ``time``, ``intensity``, ``noise``.
+    strengths : tuple of str
+        Fields that `scaled` multiplies: with all of them zero the effect does nothing.
+    sources : tuple of str
+        Where the default sizes come from.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    stage: ClassVar[Stage]
+    domains: ClassVar[tuple[str, ...]]
+    strengths: ClassVar[tuple[str, ...]]
+    sources: ClassVar[tuple[str, ...]]
+
+    def scaled(self, factor: float) -> Self:
+        """The same effect, ``factor`` times as strong."""
+        changed = {name: _times(getattr(self, name), factor) for name in self.strengths}
+        return dataclasses.replace(self, **changed)
+
+    @property
+    def is_null(self) -> bool:
+        """Whether it does nothing."""
+        return all(_is_zero(getattr(self, name)) for name in self.strengths)
+
+    @property
+    def halo(self) -> int:
+        """Rows above and below a piece of the window that the piece depends on."""
+        return 0
+
+    # What it does to the frames.
+
+    def check(self, bench: Bench) -> None:
+        """Raise InputError where a bench and the effect do not go together."""
+
+    def states(self, states: FrameStates, recording: Recording) -> FrameStates:
+        """Intensity, amplitude, phase and fringe vector of every frame of a fringe set."""
+        return states
+
+    def detector(self, maps: DetectorMaps, bench: Bench, rows: Rows) -> DetectorMaps:
+        """The detector's maps on some rows of the window (first, one after the last)."""
+        return maps
+
+    def light(
+        self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
+    ) -> LightMaps:
+        """Mean and fringe amplitude on some rows (e-); of flats only the mean."""
+        return light
+
+    def photons(self, mean: F32, shot: Shot) -> F32:
+        """Mean electrons (y, x) of a frame, before shot noise; dark current comes after."""
+        return mean
+
+    def charge(self, charge: F32, shot: Shot) -> F32:
+        """Collected electrons (y, x), shot noise and full well included."""
+        return charge
+
+    def signal(self, signal: F32, shot: Shot) -> F32:
+        """Signal (y, x) at the amplifiers, in electrons."""
+        return signal
+
+    def readout(self, adu: F32, shot: Shot) -> F32:
+        """Samples (y, x) in ADU, bias and read noise included, before they are rounded."""
+        return adu
+
+    # What is learnt of it, and what becomes of the maps.
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Estimate | None:
+        """Parameters and errors from an acquisition; None where it holds no evidence of it."""
+        raise NotImplementedError(f"{cls.__name__} cannot be estimated")
+
+    def predict(self, maps: FringeMaps) -> FringeMaps | None:
+        """Maps that a fit finds with the effect on; None where maps alone do not tell."""
+        return None
+
+    def undo(self, maps: FringeMaps) -> FringeMaps | None:
+        """Maps without the effect, from those with it; None where that is not possible."""
+        return None
+
+
+def _times(value: Any, factor: float) -> Any:
+    return tuple(_times(v, factor) for v in value) if isinstance(value, tuple) else value * factor
+
+
+def _is_zero(value: Any) -> bool:
+    return all(map(_is_zero, value)) if isinstance(value, tuple) else value == 0

@@ -1,0 +1,244 @@
+"""From a bench to samples, effects acting between the steps.
+
+States of the frames and maps of the pixels → mean electrons → charge (shot noise, full well) →
+signal → ADU → codes. Noise is keyed by frame and place: a piece of some frames by some rows comes
+out the same however the work is cut, and an effect that needs the rows around a piece or the frame
+before it has them made again.
+"""
+
+from collections.abc import Iterator, Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.kernels import synthesis
+from pixcal.kernels.scene import (
+    FrameStates,
+    LightMaps,
+    Rows,
+    detector_maps,
+    frame_states,
+    light_maps,
+)
+from pixcal.kernels.synthesis import BLOCK_ROWS, fill_normal
+from pixcal.model.bench import Bench
+from pixcal.simulation.effect import Effect
+from pixcal.simulation.recording import Recording
+
+F32 = NDArray[np.float32]
+
+KEPT = 4
+"""Charges of earlier frames that are kept for effects that ask for them."""
+
+
+class Camera:
+    """Some rows of a bench, with its effects.
+
+    Parameters
+    ----------
+    bench : Bench
+    rows : tuple of int
+        First row of the window and the one after the last; any rows give the same samples.
+    effects : sequence of Effect
+    """
+
+    def __init__(self, bench: Bench, rows: Rows, effects: Sequence[Effect] = ()) -> None:
+        self.bench = bench
+        self.effects = sorted(
+            (e for e in effects if not e.is_null), key=lambda e: (e.stage, e.name)
+        )
+        halo = sum(e.halo for e in self.effects)
+        self.inside = rows
+        self.rows: Rows = (max(0, rows[0] - halo), min(bench.detector.shape[0], rows[1] + halo))
+        self.maps = detector_maps(bench.detector, self.rows)
+        for effect in self.effects:
+            self.maps = effect.detector(self.maps, bench, self.rows)
+
+    def expose(
+        self, recording: Recording, frames: range
+    ) -> Iterator[tuple[int, NDArray[np.uint16]]]:
+        """Frames as the camera reads them.
+
+        Parameters
+        ----------
+        recording : Recording
+        frames : range
+            Numbers within the recording.
+
+        Yields
+        ------
+        tuple
+            Number of the frame and its samples, uint16 (y, x), ADU; the array is used again.
+        """
+        chain = _Chain(self, recording)
+        skip = self.inside[0] - self.rows[0]
+        keep = slice(skip, skip + self.inside[1] - self.inside[0])
+        for frame in frames:
+            yield frame, chain.samples(frame)[keep]
+
+
+class _Shot:
+    """`pixcal.simulation.shot.Shot` of a chain, seen by the effect at a place in it."""
+
+    def __init__(self, chain: "_Chain", frame: int, at: int) -> None:
+        self._chain, self._at = chain, at
+        self.recording = chain.recording
+        self.bench = chain.camera.bench
+        self.maps = chain.camera.maps
+        self.rows = chain.camera.rows
+        self.frame = frame
+
+    @property
+    def time_s(self) -> float:
+        """Start of the frame after that of the acquisition."""
+        return self.recording.start_s + self.frame * self.recording.period_s
+
+    @property
+    def states(self) -> FrameStates:
+        """Of all frames of the recording."""
+        return self._chain.states
+
+    @property
+    def light(self) -> LightMaps:
+        """Mean and fringe amplitude of the recording on these rows, e-."""
+        return self._chain.light
+
+    def mean(self, frame: int) -> F32 | None:
+        """Mean electrons of another frame, without this effect; None outside the recording."""
+        if not 0 <= frame < self.recording.count:
+            return None
+        return self._chain.mean(frame, self._at)
+
+    def charge(self, frame: int) -> F32 | None:
+        """Charge of another frame, without this effect; None outside the recording."""
+        if not 0 <= frame < self.recording.count:
+            return None
+        return self._chain.charge(frame, self._at)
+
+    def rng(self, effect: str, *key: int) -> np.random.Generator:
+        """Random numbers of an effect in this frame."""
+        return self.recording.rng(effect, self.frame, *key)
+
+    def normals(self, effect: str) -> F32:
+        """Standard normals (y, x) of an effect in this frame, the same however rows are cut."""
+        first, last = self.rows
+        width = self.bench.detector.shape[1]
+        begin, end = first // BLOCK_ROWS, -(-last // BLOCK_ROWS)
+        out = np.empty(((end - begin) * BLOCK_ROWS, width), np.float32)
+        for block in range(begin, end):
+            at = (block - begin) * BLOCK_ROWS
+            fill_normal(self.rng(effect, block), out[at : at + BLOCK_ROWS])
+        skip = first - begin * BLOCK_ROWS
+        return out[skip : skip + last - first]
+
+
+class _Chain:
+    """The steps of one recording on the rows of a camera."""
+
+    def __init__(self, camera: Camera, recording: Recording) -> None:
+        self.camera, self.recording = camera, recording
+        self.effects = camera.effects
+        d = camera.bench.detector
+        self.dark = camera.maps.dark_rate * np.float32(recording.exptime_s)
+        self.well = np.inf if d.full_well_e is None else d.full_well_e
+        self._charges: dict[tuple[int, int], F32] = {}
+        self._samples = np.empty(self.dark.shape, np.uint16)
+
+    @cached_property
+    def states(self) -> FrameStates:
+        return states_of(self.recording, self.effects)
+
+    @cached_property
+    def light(self) -> LightMaps:
+        r, maps, rows = self.recording, self.camera.maps, self.camera.rows
+        if r.kind == "fringes":
+            light = light_maps(r.bench, r.number, rows, maps, r.electrons)
+        else:
+            nothing = np.zeros_like(maps.response)
+            light = LightMaps(maps.response * np.float32(r.electrons), nothing, nothing)
+        for effect in self.effects:
+            light = effect.light(light, r, rows, maps)
+        return light
+
+    def mean(self, frame: int, upto: int) -> F32:
+        """Mean electrons, by the first ``upto`` effects."""
+        states, light = self.states, self.light
+        columns, lines = states.turns(frame, self.camera.bench.detector.shape, self.camera.rows)
+        mean = np.empty_like(self.dark)
+        synthesis.illuminate(
+            light.iota, light.alpha_sin, light.alpha_cos,
+            states.level[frame], states.amplitude[frame], columns, lines, mean,
+        )  # fmt: skip
+        for at, effect in enumerate(self.effects[:upto]):
+            mean = effect.photons(mean, _Shot(self, frame, at))
+        return mean
+
+    def charge(self, frame: int, upto: int) -> F32:
+        """Charge, by all that acts on the light and the first ``upto`` effects on charge."""
+        key = (frame, upto)
+        if key in self._charges:
+            return self._charges[key]
+        bench = self.camera.bench
+        charge = np.empty_like(self.dark)
+        light = self.mean(frame, len(self.effects))
+        shot = self._normals(frame)[0]
+        synthesis.collect(light, self.dark, shot, bench.shot_noise, self.well, charge)
+        for at, effect in enumerate(self.effects[:upto]):
+            charge = effect.charge(charge, _Shot(self, frame, at))
+        while len(self._charges) >= KEPT:
+            self._charges.pop(next(iter(self._charges)))
+        self._charges[key] = charge
+        return charge
+
+    def samples(self, frame: int) -> NDArray[np.uint16]:
+        """Codes of a frame."""
+        d = self.camera.bench.detector
+        signal = self.charge(frame, len(self.effects)).copy()
+        for at, effect in enumerate(self.effects):
+            signal = effect.signal(signal, _Shot(self, frame, at))
+        adu = np.empty_like(signal)
+        read = self._normals(frame)[1]
+        synthesis.amplify(
+            signal, self.camera.maps.bias, read, d.read_noise_e, d.gain_e_per_adu, adu
+        )
+        for at, effect in enumerate(self.effects):
+            adu = effect.readout(adu, _Shot(self, frame, at))
+        synthesis.convert(adu, d.top_adu, self._samples)
+        return self._samples
+
+    def _normals(self, frame: int) -> list[F32]:
+        """Shot and read noise of a frame; made once for both."""
+        if getattr(self, "_drawn", (-1, []))[0] != frame:
+            bench = self.camera.bench
+            drawn = synthesis.block_normals(
+                self.camera.rows, bench.detector.shape[1], bench.seed, (*self.recording.key, frame)
+            )
+            self._drawn: tuple[int, list[F32]] = (frame, drawn)
+        return self._drawn[1]
+
+
+def states_of(recording: Recording, effects: Sequence[Effect]) -> FrameStates:
+    """What changes from frame to frame of a recording; of fringes only, with effects."""
+    if recording.kind != "fringes":
+        still, steady = np.zeros(recording.count), np.ones(recording.count)
+        return FrameStates(phi=still, level=steady, amplitude=still, dkx=still, dky=still)
+    states = frame_states(recording.bench, recording.number)
+    for effect in effects:
+        states = effect.states(states, recording)
+    return states
+
+
+def frames_of(
+    bench: Bench, recording: Recording, effects: Sequence[Effect] = ()
+) -> NDArray[np.uint16]:
+    """All frames (time, y, x) of a recording, in memory."""
+    shape = bench.detector.shape
+    out = np.empty((recording.count, *shape), np.uint16)
+    for first in range(0, shape[0], BLOCK_ROWS):
+        rows = (first, min(first + BLOCK_ROWS, shape[0]))
+        for frame, samples in Camera(bench, rows, effects).expose(
+            recording, range(recording.count)
+        ):
+            out[frame, rows[0] : rows[1]] = samples
+    return out

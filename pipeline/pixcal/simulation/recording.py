@@ -1,0 +1,81 @@
+"""What a bench records: sequences of frames, in order of time."""
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from pixcal.kernels.scene import electrons_per_unit
+from pixcal.kernels.synthesis import Stream, generator
+from pixcal.model.bench import Bench
+
+KINDS = ("bias", "dark", "flat", "fringes")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Frames taken one after the other under the same conditions.
+
+    Attributes
+    ----------
+    bench : Bench
+    kind : str
+        ``bias``, ``dark``, ``flat`` or ``fringes``.
+    number : int
+        Among those of its kind.
+    folder, stem : str
+        Of its files.
+    count : int
+        Frames.
+    exptime_s : float
+    start_s, period_s : float
+        First frame after the start of the acquisition, and from frame to frame.
+    electrons : float
+        Electrons for unit light: of a flat its mean, of fringes as in `electrons_per_unit`.
+    """
+
+    bench: Bench
+    kind: str
+    number: int
+    folder: str
+    stem: str
+    count: int
+    exptime_s: float
+    start_s: float
+    period_s: float
+    electrons: float
+
+    @property
+    def key(self) -> tuple[int, int]:
+        """Key of its random numbers."""
+        return KINDS.index(self.kind), self.number
+
+    def rng(self, effect: str, *key: int) -> np.random.Generator:
+        """Random numbers of an effect, the same whoever asks, in whatever order."""
+        name = zlib.crc32(effect.encode())
+        return generator(self.bench.seed, Stream.EFFECT, name, *self.key, *key)
+
+
+def recordings(bench: Bench) -> list[Recording]:
+    """Everything that the bench records, in order of time."""
+    f = bench.frames
+    planned: list[tuple[str, int, str, int, float, float]] = []
+    if f.bias:
+        planned.append(("bias", 0, "bias", f.bias, f.bias_exptime_s, 0.0))
+    for n, rung in enumerate(f.darks):
+        planned.append(("dark", n, "dark", rung.count, rung.exptime_s, 0.0))
+    for n, rung in enumerate(f.flats):
+        mean = (f.flat_rate_e_s or 0.0) * rung.exptime_s
+        planned.append(("flat", n, "flat", rung.count, rung.exptime_s, mean))
+    for n, scan in enumerate(f.fringes):
+        electrons = electrons_per_unit(bench, n)
+        planned.append(("fringes", n, scan.name, scan.count, f.exptime_s, electrons))
+    found, clock = [], 0.0
+    for kind, number, folder, count, exptime, electrons in planned:
+        period = max(f.period_s, exptime)
+        stem = f"{folder}-{number}" if kind in ("dark", "flat") else folder
+        found.append(
+            Recording(bench, kind, number, folder, stem, count, exptime, clock, period, electrons)
+        )
+        clock += count * period
+    return found

@@ -1,0 +1,59 @@
+"""A frame being made, as an effect sees it."""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
+from pixcal.model.bench import Bench
+from pixcal.simulation.recording import Recording
+
+F32 = NDArray[np.float32]
+
+
+class Shot(Protocol):
+    """Where, when and of what a frame is taken.
+
+    Attributes
+    ----------
+    bench : Bench
+    recording : Recording
+        That the frame belongs to; ``recording.kind`` tells bias, dark, flat and fringes apart.
+    frame : int
+        Its number in the recording.
+    rows : (int, int)
+        Rows of the window at hand: first, and one after the last.
+    maps : DetectorMaps
+        Of these rows.
+    """
+
+    bench: Bench
+    recording: Recording
+    frame: int
+    rows: Rows
+    maps: DetectorMaps
+
+    @property
+    def time_s(self) -> float:
+        """Start of the frame after that of the acquisition."""
+
+    @property
+    def states(self) -> FrameStates:
+        """Of all frames of the recording."""
+
+    @property
+    def light(self) -> LightMaps:
+        """Mean and fringe amplitude of the recording on these rows, e-."""
+
+    def mean(self, frame: int) -> F32 | None:
+        """Mean electrons of another frame, without this effect; None outside the recording."""
+
+    def charge(self, frame: int) -> F32 | None:
+        """Charge of another frame, without this effect; None outside the recording."""
+
+    def rng(self, effect: str, *key: int) -> np.random.Generator:
+        """Random numbers of an effect in this frame, the same for all rows."""
+
+    def normals(self, effect: str) -> F32:
+        """Standard normals (y, x) of an effect in this frame, the same however rows are cut."""

@@ -1,0 +1,164 @@
+"""A part of a run as evidence for effects: samples, maps, frames and calibration, in memory."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack, free_frames
+from pixcal.estimators.fringes import grid
+from pixcal.model.acquisition import Acquisition
+from pixcal.model.config import parse
+from pixcal.model.errors import InputError
+from pixcal.stages.fit.sweep import read_frames
+from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduced_set import ReducedSet
+from pixcal.storage.artefact import read_json, require
+from pixcal.storage.cube import ArrayReader
+
+Part = tuple[tuple[int, int], tuple[int, int]]
+"""Rows and columns of the window: ((y0, y1), (x0, x1))."""
+
+F64 = NDArray[np.float64]
+
+MAX_SAMPLES = 1 << 26
+"""Samples of a set that are taken into memory (some ten bytes each)."""
+
+
+def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice(None)) -> Evidence:
+    """Evidence of a part of the window; without one, of the whole window.
+
+    Parameters
+    ----------
+    run_dir : Path
+        A run that was reduced, and fitted where it has fringes.
+    part : ((int, int), (int, int)), optional
+        Rows and columns.
+    frames : slice
+        Frames of each fringe set to take.
+
+    Raises
+    ------
+    InputError
+        If a stage is missing, or the part holds more than `MAX_SAMPLES` samples.
+    """
+    require(run_dir, "reduce", 1)
+    file = run_dir / "ingest" / "acquisition.json"
+    acquisition = parse(Acquisition, read_json(file), str(file))
+    ingested = Ingested(run_dir / "ingest")
+    ny, nx = ingested.shape
+    y, x = part or ((0, ny), (0, nx))
+    maps = {
+        name: ArrayReader(run_dir / "reduce" / "calibration.zarr" / name).read(y, x)
+        for name in ("bias", "dark_rate", "flat", "mask")
+    }
+    fringes = {}
+    if acquisition.frames.fringes:
+        require(run_dir, "fit", 1)
+        for listed in acquisition.frames.fringes:
+            fringes[listed.name] = _fringes(
+                run_dir, ingested, listed.name, listed.baseline_mm, (y, x), frames
+            )
+    used = read_json(run_dir / "reduce" / "reduce.json")
+    return Evidence(
+        fringes=fringes,
+        stacks=_stacks(ingested, (y, x)),
+        gain=float(used["gain_e_per_adu"]["used"]),
+        read_noise=float(used["read_noise_e"]["used"]),
+        bias=maps["bias"].astype(float),
+        dark_rate=maps["dark_rate"].astype(float),
+        flat=maps["flat"].astype(float),
+        good=maps["mask"] == 0,
+        saturation_adu=float(acquisition.detector.saturation_adu or np.inf),
+        pitch_um=acquisition.detector.pitch_um,
+        wavelength_nm=acquisition.optics.wavelength_nm,
+        distance_mm=acquisition.optics.distance_mm,
+    )
+
+
+def _fringes(
+    run_dir: Path,
+    ingested: Ingested,
+    name: str,
+    baseline: tuple[float, float],
+    part: Part,
+    frames: slice,
+) -> FringeEvidence:
+    source = ReducedSet(run_dir / "reduce" / "reduced.zarr" / name)
+    swept = run_dir / "sweep" / "sweep.zarr" / name
+    fitted = run_dir / "fit" / "fit.zarr" / name
+    y, x = part
+    times = source.time_s()[frames]
+    first, last, step = frames.indices(source.n_frames)
+    if step != 1:
+        raise ValueError("frames that follow one another are needed")
+    if (last - first) * (y[1] - y[0]) * (x[1] - x[0]) > MAX_SAMPLES:
+        raise InputError(f"fringe set {name!r}: more than {MAX_SAMPLES} samples; take a part")
+    codes = source.signal.read((first, last), y, x).astype(np.uint16)
+    coding = source.coding
+    electrons = codes * np.float32(coding.scale) + np.float32(coding.offset)
+    electrons[codes == coding.fill] = np.nan
+
+    found = read_frames(swept)
+    centre = ((y[0] + y[1] - 1) / 2, (x[0] + x[1] - 1) / 2)
+    g, dk = found.at(*centre)[frames], found.dk[frames]
+    facts = read_json(run_dir / "fit" / "fit.json")["sets"][name]
+    theta = _theta(swept, part, found.reference)
+    mask = ArrayReader(fitted / "mask").read(y, x)
+    good = (mask == 0) & np.isfinite(theta).all(axis=0)
+    read = ArrayReader(source.folder / "read_variance").read(y, x).astype(float)
+    shot = ArrayReader(source.folder / "shot_factor").read(y, x).astype(float)
+    free, covariance = free_frames(codes, coding, g, dk, theta, read, shot, good)
+    table = ingested.tables[f"fringes/{name}"]
+    exposure = table["exptime_s"][0]
+    return FringeEvidence(
+        name=name,
+        baseline_mm=baseline,
+        k=(float(facts["kx"]), float(facts["ky"])),
+        origin=(y[0], x[0]),
+        window=source.shape,
+        time_s=times,
+        exptime_s=np.nan if exposure is None else float(exposure),
+        electrons=electrons,
+        adu=ArrayReader(ingested.raw / "fringes" / name).read((first, last), y, x),
+        g=g,
+        dk=dk,
+        free=free,
+        free_covariance=covariance,
+        theta=theta,
+        sigma=ArrayReader(swept / "sigma").read(y, x).astype(float),
+        delta=ArrayReader(fitted / "delta").read(y, x).astype(float),
+        good=good,
+        read_variance=read,
+        shot_factor=shot,
+    )
+
+
+def _theta(swept: Path, part: Part, reference: tuple[float, float]) -> F64:
+    """Maps (iota, alpha sin psi, alpha cos psi) of a part, from those of the sweep."""
+    y, x = part
+    iota, alpha, phase = (
+        ArrayReader(swept / name).read(y, x).astype(float) for name in ("iota", "alpha", "phase")
+    )
+    rows, columns = grid((y[1] - y[0], x[1] - x[0]))
+    rows, columns = rows + (y[0] + y[1] - 1) / 2, columns + (x[0] + x[1] - 1) / 2
+    kx, ky = read_json(swept / "scout.json")["k"]
+    psi = phase + kx * (columns - reference[1]) + ky * (rows - reference[0])
+    return np.stack([iota, alpha * np.sin(psi), alpha * np.cos(psi)])
+
+
+def _stacks(ingested: Ingested, part: Part) -> tuple[Stack, ...]:
+    """Calibration frames of a part, by kind and exposure time."""
+    found = []
+    for kind in ("bias", "dark", "flat"):
+        if kind not in ingested.tables:
+            continue
+        table: dict[str, list[Any]] = ingested.tables[kind]
+        exposures = np.array([np.nan if t is None else t for t in table["exptime_s"]], float)
+        frames = ingested.arrays[kind].read((0, len(exposures)), *part)
+        times = np.asarray(table["time_s"], float)
+        for exposure in np.unique(exposures):
+            own = (exposures == exposure) | (np.isnan(exposures) & np.isnan(exposure))
+            found.append(Stack(kind, float(exposure), times[own], frames[own].astype(np.float32)))
+    return tuple(found)

@@ -1,0 +1,60 @@
+"""Intensity noise: its size and correlation are those given, and are found again."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pixcal.effects.intensity_noise import IntensityNoise
+from pixcal.estimators.evidence import Evidence
+from pixcal.model.bench import Bench
+from pixcal.simulation.exposure import states_of
+from pixcal.simulation.recording import recordings
+
+
+def recording(bench: Bench, count: int):  # type: ignore[no-untyped-def]
+    fringes = next(r for r in recordings(bench) if r.kind == "fringes")
+    scan = replace(bench.frames.fringes[0], count=count)
+    frames = replace(bench.frames, fringes=(scan, *bench.frames.fringes[1:]))
+    return replace(fringes, bench=replace(bench, frames=frames), count=count)
+
+
+@pytest.mark.parametrize("correlation_s", [0.0, 1.4])
+def test_the_factor_is_the_same_for_mean_and_fringe_and_has_the_size_given(
+    make_effect_bench: Callable[..., Bench], correlation_s: float
+) -> None:
+    frames = recording(make_effect_bench(), 20_000)
+    plain = states_of(frames, ())
+    noisy = states_of(frames, (IntensityNoise(0.03, correlation_s),))
+    factor = noisy.level / plain.level
+    np.testing.assert_allclose(noisy.amplitude / plain.amplitude, factor)
+    step = np.exp(-frames.period_s / correlation_s) if correlation_s else 0.0
+    effective = len(factor) * (1 - step**2) / (1 + step**2)
+    assert factor.std() == pytest.approx(0.03, rel=4 / np.sqrt(2 * effective))
+    x = factor - factor.mean()
+    assert (x[1:] @ x[:-1]) / (x @ x) == pytest.approx(step, abs=4 / np.sqrt(len(x)))
+
+
+@pytest.mark.parametrize("rms", [0.002, 0.02])
+def test_its_size_is_found(acquired: Callable[..., Evidence], rms: float) -> None:
+    found = IntensityNoise.estimate(acquired(None, {"intensity_noise": {"rms": rms}}))
+    assert found is not None
+    assert isinstance(found.effect, IntensityNoise)
+    assert abs(found.effect.rms - rms) < 4 * found.errors["rms"]
+    assert found.errors["rms"] < 0.05 * rms
+    assert found.significance > 20
+
+
+def test_a_correlation_is_found(acquired: Callable[..., Evidence]) -> None:
+    found = IntensityNoise.estimate(
+        acquired(None, {"intensity_noise": {"rms": 0.01, "correlation_s": 1.4}})
+    )
+    assert found is not None
+    assert isinstance(found.effect, IntensityNoise)
+    assert abs(found.effect.correlation_s - 1.4) < 4 * found.errors["correlation_s"] < 2.0
+
+
+def test_nothing_is_found_where_there_is_nothing(acquired: Callable[..., Evidence]) -> None:
+    found = IntensityNoise.estimate(acquired())
+    assert found is None or found.significance < 4
