@@ -44,7 +44,7 @@ def test_normal_matrices_are_the_sums_over_frames(visibility, rho):
     g = np.stack([b, b * np.cos(phi), b * np.sin(phi)], axis=1)
     psi = rng.uniform(-np.pi, np.pi, (3, 5))
     weights = PhaseWeights.of(visibility, rho)
-    for power, error in ((1, 2e-5), (2, 5e-5)):
+    for power, error in ((1, 8e-5), (2, 2e-4)):
         got = normal_matrices(moments(g), weights.series(power), psi)
         for at in np.ndindex(psi.shape):
             w = (1 + rho + visibility * np.sin(psi[at] + phi)) ** -power / b
@@ -59,10 +59,10 @@ def test_samples_without_weight_leave_no_trace(make_bench):
     bench = make_bench(shape=(9, 21), frames=131, laser_noise=0.05)
     tile, codes, frames, model, smooth = case(bench)
     codes[[3, 40, 41, 130], 4, 7] = 65535
-    theta, sigma, chi2, count = total(FringeSums(tile, CODING, frames, model, smooth), codes)
+    theta, sigma, chi2, count = total(FringeSums(tile, CODING, frames, model, smooth.map), codes)
     kept = np.setdiff1d(np.arange(131), [3, 40, 41, 130])
     fewer = FrameParameters(frames.g[kept], frames.dk[kept], frames.reference)
-    other = total(FringeSums(tile, CODING, fewer, model, smooth), codes[kept])
+    other = total(FringeSums(tile, CODING, fewer, model, smooth.map), codes[kept])
     np.testing.assert_allclose(theta[:, 4, 7], other[0][:, 4, 7], rtol=3e-5)
     assert sigma[4, 7] == pytest.approx(other[1][4, 7], rel=1e-4)
     assert chi2[4, 7] == pytest.approx(other[2][4, 7], rel=1e-3)
@@ -82,7 +82,7 @@ def test_samples_without_weight_leave_no_trace(make_bench):
 def test_nothing_that_matters_is_lost(make_bench, options, loss):
     bench = make_bench(frames=150, **options)
     tile, codes, frames, model, smooth = case(bench)
-    fast = pixel_sums(tile, CODING, frames, model, smooth)
+    fast = pixel_sums(tile, CODING, frames, model, smooth.map)
     assert isinstance(fast, FringeSums)
     errors = []
     for sums in (fast, SampleSums(tile, CODING, frames, model)):
@@ -98,7 +98,7 @@ def test_nothing_that_matters_is_lost(make_bench, options, loss):
 def test_unsteady_fringes_are_summed_sample_by_sample(make_bench, options):
     bench = make_bench(shape=(20, 30), frames=60, **options)
     tile, _, frames, model, smooth = case(bench)
-    assert isinstance(pixel_sums(tile, CODING, frames, model, smooth), SampleSums)
+    assert isinstance(pixel_sums(tile, CODING, frames, model, smooth.map), SampleSums)
 
 
 def test_batches_close_to_the_same_in_both(make_bench):
@@ -106,12 +106,11 @@ def test_batches_close_to_the_same_in_both(make_bench):
     tile, codes, frames, model, smooth = case(bench)
     results = []
     for sums in (
-        FringeSums(tile, CODING, frames, model, smooth),
+        FringeSums(tile, CODING, frames, model, smooth.map),
         SampleSums(tile, CODING, frames, model),
     ):
         sums.add(codes[:40], slice(0, 40))
-        theta, sigma = sums.close()
-        results.append((np.angle(theta[2] + 1j * theta[1]), sigma))
+        results.append(sums.close())
     (a, sigma_a), (b, sigma_b) = results
     assert (np.angle(np.exp(1j * (a - b))) / sigma_b).std() < 0.05
     np.testing.assert_allclose(sigma_a / sigma_b, 1.0, atol=0.02)

@@ -131,7 +131,8 @@ def test_smooth_phasor_keeps_a_curved_phase():
     good = np.ones(x.shape, bool)
     noisy = truth + noise[0] + 1j * noise[1]
     noisy[5, 6] = 40.0
-    smooth, k = smooth_phasor(noisy, good, (1.19, 0.11))
+    found = smooth_phasor(noisy, good, (1.19, 0.11))
+    smooth, k = found.map, found.k
     assert np.abs(smooth - truth).max() < 0.02
     np.testing.assert_allclose(k, (1.2, 0.1), atol=2e-3)
 
@@ -176,6 +177,7 @@ def test_a_smooth_phasor_of_two_good_rows(bench):
     y, x = np.mgrid[:64, :70]
     good = (y == 10) | (y == 11)
     phasor = np.where(good, 0.9 * np.exp(0.5j * x), 0)
-    smooth, k = smooth_phasor(phasor, good, (0.5, 0.0))
+    found = smooth_phasor(phasor, good, (0.5, 0.0))
+    smooth, k = found.map, found.k
     np.testing.assert_allclose(smooth[good], phasor[good], atol=1e-6)
     assert k[0] == pytest.approx(0.5)

@@ -8,6 +8,7 @@ import pytest
 from astropy.io import fits
 
 from pixcal.engine.run import Runtime
+from pixcal.estimators import fit_flags
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.flags import PixelFlag
 from pixcal.stages import fit
@@ -330,13 +331,13 @@ def test_a_frame_of_saturated_samples_costs_no_more_than_itself(
 
 def test_a_slow_scan_is_looked_at_all_along(make_bench, write_reduced, tmp_path, monkeypatch):
     """Little more than a turn in the whole run, and memory for one chunk of it."""
-    from pixcal.stages.fit import sweep
+    from pixcal.stages.fit import scouting
 
     bench = make_bench(shape=(30, 37), frames=960, sets={"only": (6.0, 0.0)})
     scan = bench.scan
     bench.scan = lambda name: (*scan(name)[:2], np.linspace(0, 8.2, 960), scan(name)[3])
     run = write_reduced(bench, tmp_path / "run")
-    monkeypatch.setattr(sweep, "PRIME_BYTES", 1)
+    monkeypatch.setattr(scouting, "PRIME_BYTES", 1)
     fit.run(run, fit.Config(), Runtime())
     data, sigma, _, _ = read_map(run / "products" / "delta_fringe.fits")
     error = bench.without_modes(data - bench.delta_x, "only")
@@ -345,13 +346,12 @@ def test_a_slow_scan_is_looked_at_all_along(make_bench, write_reduced, tmp_path,
     assert result["sets"]["only"]["chi2_reduced"] == pytest.approx(1.0, abs=0.02)
 
 
-def test_a_set_without_a_pixel_that_can_be_fitted_is_named(fitted, tmp_path):
+def test_a_set_without_a_pixel_that_can_be_fitted_is_named(fitted, tmp_path, monkeypatch):
     _, run, _ = fitted
     again = tmp_path / "run"
-    for part in ("ingest", "reduce", "sweep"):
+    for part in ("ingest", "reduce"):
         shutil.copytree(run / part, again / part)
-    for array in (again / "reduce" / "reduced.zarr").glob("*/mask"):
-        remask(again, array.parent.name, np.ones((137, 150), np.uint8))
+    monkeypatch.setattr(fit_flags, "MAX_SIGMA_RAD", 0.0)
     with pytest.raises(InputError, match="'vertical': no pixel"):
         fit.run(again, fit.Config(), Runtime())
 

@@ -1,15 +1,19 @@
 """What a set's fringes look like: frame parameters, the local fringe vector, smooth phasors."""
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
+from pixcal.estimators.harmonics import FrameMoments
 from pixcal.model.errors import InputError
 
 F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
+Phases = TypeVar("Phases", NDArray[np.float32], NDArray[np.float64])
 
 MIN_FRINGES = 1.5
 """Fewest fringes across a window for a peak to be looked for."""
@@ -46,6 +50,14 @@ class FrameParameters:
         turn = self.dk[:, 0] * (x - self.reference[1]) + self.dk[:, 1] * (y - self.reference[0])
         phasor = (self.g[:, 1] + 1j * self.g[:, 2]) * np.exp(1j * turn)
         return np.stack([self.g[:, 0], phasor.real, phasor.imag], axis=1)
+
+    @cached_property
+    def _moments(self) -> FrameMoments:
+        return FrameMoments.of(self.g)
+
+    def moments_at(self, y: float, x: float) -> FrameMoments:
+        """The frames' moments at a point; the same for all where the fringe vector is held."""
+        return FrameMoments.of(self.at(y, x)) if self.moving else self._moments
 
     @property
     def B(self) -> F64:
@@ -150,6 +162,7 @@ def find_fringe_vector(
     return float(sign * found[0]), float(sign * found[1])
 
 
+@lru_cache(maxsize=8)
 def polynomial_basis(shape: tuple[int, int], degree: int) -> F64:
     """Terms x^i y^j, i + j up to ``degree``, on coordinates scaled to ±1: (y * x, terms)."""
     y, x = grid(shape)
@@ -158,9 +171,25 @@ def polynomial_basis(shape: tuple[int, int], degree: int) -> F64:
     return np.stack([np.broadcast_to(t, shape).ravel() for t in terms], axis=1)
 
 
+@dataclass(frozen=True)
+class SmoothPhasor:
+    """A smooth phasor over a tile.
+
+    Attributes
+    ----------
+    map : (y, x) complex128
+        Visibility times exp(i psi), on every pixel.
+    k : (float, float)
+        Fringe vector (kx, ky), the mean over the tile, rad/px.
+    """
+
+    map: C128
+    k: tuple[float, float]
+
+
 def smooth_phasor(
     phasor: C128, good: NDArray[np.bool_], k: tuple[float, float], degree: int = 3
-) -> tuple[C128, tuple[float, float]]:
+) -> SmoothPhasor:
     """Smooth version of a phasor map alpha exp(i psi) / iota.
 
     The fringe vector is first corrected by the mean phase step from pixel to pixel, then a complex
@@ -176,40 +205,48 @@ def smooth_phasor(
         Fringe vector (kx, ky) to start from, rad/px.
     degree : int
         Of the polynomial; lowered for tiles of few pixels.
-
-    Returns
-    -------
-    smooth : (y, x) complex128
-        The polynomial times exp(i k r), on every pixel.
-    k : (float, float)
-        The local fringe vector.
     """
     shape = (phasor.shape[0], phasor.shape[1])
-    y, x = grid(shape)
     kx, ky = k
-    turned = np.where(good, phasor, 0) * np.exp(-1j * (kx * x + ky * y))
+    turned = np.where(good, phasor, 0) * plane_wave(shape, (-kx, -ky))
     if shape[1] > 1:
-        kx += float(np.angle((turned[:, 1:] * turned[:, :-1].conj()).sum()))
+        kx += float(np.angle(np.vdot(turned[:, :-1], turned[:, 1:])))
     if shape[0] > 1:
-        ky += float(np.angle((turned[1:] * turned[:-1].conj()).sum()))
-    carrier = np.exp(1j * (kx * x + ky * y))
+        ky += float(np.angle(np.vdot(turned[:-1], turned[1:])))
+    carrier = plane_wave(shape, (kx, ky))
     turned = (np.where(good, phasor, 0) * carrier.conj()).ravel()
-    use = good.ravel().copy()
+    # Real and imaginary part are two maps of the same real fit.
+    parts = np.ascontiguousarray(turned).view(float).reshape(-1, 2)
+    use = good.ravel()
     while degree > 0 and min(shape) < 4 * (degree + 1):
         degree -= 1
     basis = polynomial_basis(shape, degree)
-    fit = np.zeros(basis.shape[1], complex)
+    fit = np.zeros((basis.shape[1], 2))
     for _ in range(3):
-        if use.sum() < 2 * basis.shape[1]:
-            basis, fit = basis[:, :1], np.array([turned[use].mean() if use.any() else 0.0])
+        n = np.count_nonzero(use)
+        if n < 2 * basis.shape[1]:
+            basis = polynomial_basis(shape, 0)
+            fit = parts[use].mean(axis=0)[None] if n else np.zeros((1, 2))
             break
         # Terms of low degree on ±1 are nearly orthogonal: normal equations keep their digits.
         # A tile of which a few rows are good does not tell all of them: least squares, not solve.
-        inside = basis * use[:, None]
-        fit = np.linalg.lstsq(inside.T @ basis, inside.T @ turned, rcond=1e-10)[0]
-        rest = np.abs(turned - basis @ fit)
-        kept = good.ravel() & (rest <= 5 * np.median(rest[use]) + 1e-12)
+        inside = basis if n == use.size else basis * use[:, None]
+        fit = np.linalg.lstsq(inside.T @ basis, inside.T @ parts, rcond=1e-10)[0]
+        rest = ((parts - basis @ fit) ** 2).sum(axis=1)
+        kept = good.ravel() & (rest <= 25 * np.median(rest[use]) + 1e-24)
         if np.array_equal(kept, use):
             break
         use = kept
-    return (basis @ fit).reshape(shape) * carrier, (kx, ky)
+    return SmoothPhasor((basis @ fit).view(complex).reshape(shape) * carrier, (kx, ky))
+
+
+def plane_wave(shape: tuple[int, int], k: tuple[float, float], phase: float = 0.0) -> C128:
+    """``exp(i (phase + k . r))`` over a tile (y, x), r from its centre: a product of two sides."""
+    y, x = grid(shape)
+    return np.asarray(np.exp(1j * (phase + k[1] * y)) * np.exp(1j * k[0] * x))
+
+
+def wrapped(phase: Phases) -> Phases:
+    """Phases in ±pi, rad."""
+    turn = phase.dtype.type(2 * np.pi)
+    return np.asarray(phase - turn * np.rint(phase / turn))

@@ -6,10 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.fringes import grid, smooth_phasor
+from pixcal.estimators.fringes import grid
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+
+MAX_PIXELS = 1024
+"""Pixels that a tile's plane is laid through."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +47,14 @@ class TilePlane:
 
 
 def tile_plane(
-    phase: F32, sigma: F32, ratio: F32, good: NDArray[np.bool_], centre: tuple[float, float]
+    phase: F32,
+    sigma: F32,
+    ratio: F32,
+    good: NDArray[np.bool_],
+    slope: tuple[float, float],
+    centre: tuple[float, float],
 ) -> TilePlane:
-    """Plane through a tile's phases.
+    """Plane through a tile's phases (through a thousand of them, when there are more).
 
     Parameters
     ----------
@@ -56,29 +64,32 @@ def tile_plane(
         iota / alpha.
     good : (y, x) bool
         Pixels to use.
+    slope : (float, float)
+        Of the phase along x and y, rad/px, so near that no turn is missed over the tile.
     centre : (float, float)
         Of the tile, (y, x) in pixels of the window.
     """
-    if not good.any():
+    picked = np.flatnonzero(good)
+    if not len(picked):
         return TilePlane(centre, 0.0, 0.0, 0.0, np.inf, 1.0)
-    phasor = np.asarray(np.where(good, np.exp(1j * np.where(good, phase, 0.0)), 0.0), complex)
-    smooth, (kx, ky) = smooth_phasor(phasor, good, (0.0, 0.0), degree=0)
-    y, x = grid((phase.shape[0], phase.shape[1]))
-    rest = np.angle(phasor[good] * smooth[good].conj())
-    basis = np.stack(np.broadcast_arrays(1.0, x, y), axis=-1)[good]
+    error = float(np.median(sigma.ravel()[picked]) / np.sqrt(len(picked)))
+    picked = picked[:: -(-len(picked) // MAX_PIXELS)]
+    rows, columns = np.divmod(picked, phase.shape[1])
+    y, x = (grid((phase.shape[0], phase.shape[1]))[n].ravel() for n in (0, 1))
+    y, x = y[rows], x[columns]
+    phasor = np.exp(1j * (phase[rows, columns] - slope[0] * x - slope[1] * y))
+    middle = np.angle(phasor.sum())
+    rest = np.angle(phasor * np.exp(-1j * middle))
+    step = np.array([rest.mean(), 0.0, 0.0])
     if len(rest) >= 12:
-        step = np.linalg.lstsq(basis, rest, rcond=None)[0]
-    else:
-        step = np.array([rest.mean(), 0.0, 0.0])
-    at_centre = float(np.angle(smooth.ravel()[0]) - kx * x.ravel()[0] - ky * y.ravel()[0])
-    error = float(np.median(sigma[good]) / np.sqrt(good.sum()))
+        step = np.linalg.lstsq(np.stack([np.ones(len(x)), x, y], axis=1), rest, rcond=None)[0]
     return TilePlane(
         centre,
-        float(np.angle(np.exp(1j * (at_centre + step[0])))),
-        kx + float(step[1]),
-        ky + float(step[2]),
+        float(np.angle(np.exp(1j * (middle + step[0])))),
+        slope[0] + float(step[1]),
+        slope[1] + float(step[2]),
         error,
-        float(np.median(ratio[good])),
+        float(np.median(ratio[rows, columns])),
     )
 
 
@@ -134,9 +145,3 @@ def _joined(here: TilePlane, there: TilePlane) -> TilePlane:
     expected = here.phase + (here.kx + there.kx) / 2 * dx + (here.ky + there.ky) / 2 * dy
     turns = np.rint((expected - there.phase) / (2 * np.pi))
     return replace(there, phase=float(there.phase + 2 * np.pi * turns))
-
-
-def unwrapped_phase(phase: F32, plane: TilePlane) -> F64:
-    """A tile's phases (y, x), rad, on the turn of its plane."""
-    smooth = plane.on((phase.shape[0], phase.shape[1]))
-    return np.asarray(smooth + np.angle(np.exp(1j * (phase - smooth))))

@@ -7,7 +7,7 @@ summed sample by sample (physics note, section 3). What such weights leave out i
 visibility from frame to frame.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,9 @@ MIN_RHO = 0.005
 gain nothing that matters."""
 ORDERS = 192
 """Terms kept: the series falls as 0.905^k at V = 1 and `MIN_RHO`, to 5e-9 here."""
-TABLE = 8192
-"""Phases at which normal matrices are tabulated; linear in between. Errors are under 2e-5
-for w and 5e-5 for its square at the limits, and act on the step from the start model only."""
+TABLE = 4096
+"""Phases at which normal matrices are tabulated; linear in between. Errors are under 8e-5
+for w and 2e-4 for its square at the limits, and act on the step from the start model only."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,38 @@ def moments(g: F64) -> C128:
     return out
 
 
+@dataclass
+class FrameMoments:
+    """Frames at a point, as the sums want them, and the moments of those that follow one another.
+
+    Attributes
+    ----------
+    g : (t, 3) float32
+        (B, A cos phi, A sin phi).
+    unit : (t, 3) float32
+        (cos phi, sin phi, f), f the frame's own weight.
+    """
+
+    exact: F64
+    g: NDArray[np.float32]
+    unit: NDArray[np.float32]
+    kept: dict[tuple[int, int], C128] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, g: F64) -> "FrameMoments":
+        """Of frames (t, 3)."""
+        amplitude = np.maximum(np.hypot(g[:, 1], g[:, 2]), 1e-30)
+        unit = np.column_stack([g[:, 1:] / amplitude[:, None], frame_weights(g)])
+        return cls(g, g.astype(np.float32), unit.astype(np.float32))
+
+    def sums(self, part: slice) -> C128:
+        """`moments` of some frames."""
+        key = (part.start, part.stop)
+        if key not in self.kept:
+            self.kept[key] = moments(self.exact[part])
+        return self.kept[key]
+
+
 def normal_matrices(frame_sums: C128, weights: C128, psi: F64) -> F64:
     """Normal sums of pixels of given phases.
 
@@ -86,5 +118,10 @@ def normal_matrices(frame_sums: C128, weights: C128, psi: F64) -> F64:
     (6, ...) float64
         Upper triangle of ``sum_t w^power g g'``.
     """
-    table = np.fft.irfft(frame_sums * weights, n=TABLE, axis=1) * TABLE
+    table = normal_table(frame_sums, weights)
     return np.asarray(interpolate_periodic(table, psi.ravel()).reshape(6, *psi.shape))
+
+
+def normal_table(frame_sums: C128, weights: C128, size: int = TABLE) -> F64:
+    """Normal sums (6, size) over one turn of the phase; arguments as `normal_matrices`."""
+    return np.asarray(np.fft.irfft(frame_sums * weights, n=size, axis=1) * size)

@@ -1,4 +1,4 @@
-"""Least squares of the modes that the data cannot tell from the bench, over tiles.
+"""Least squares of the modes that the data cannot tell from the bench, from the sums of tiles.
 
 Sums of each tile are taken by themselves and added in the order of the tiles, so that the result
 is the same however the work was shared out.
@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.fringes import grid
-from pixcal.estimators.gauge import FRINGE_MODES, fringe_modes
+from pixcal.estimators.gauge import FRINGE_MODES
 from pixcal.estimators.geometry import TilePlane
+from pixcal.estimators.local_basis import SCALE_PX, expand, powers
 from pixcal.estimators.models import FringeShape
+from pixcal.estimators.tile_sums import N_LOCAL, Carrier, TileSums
 
 F64 = NDArray[np.float64]
 
@@ -25,37 +26,69 @@ class ModeBasis:
     ----------
     shape : FringeShape
         Present shape of the fringes.
-    k : (float, float)
-        Carrier (kx, ky), rad/px, that measured phases are relative to.
-    reference : (float, float)
-        Point (y, x) where the carrier's phase is zero.
+    carrier : Carrier
+        That measured phases are relative to.
     """
 
     shape: FringeShape
-    k: tuple[float, float]
-    reference: tuple[float, float]
+    carrier: Carrier
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the modes, in the order of `on`."""
+        """Names of the modes."""
         return (*self.shape.names, *FRINGE_MODES)
 
-    def on(self, plane: TilePlane, size: tuple[int, int]) -> tuple[F64, F64]:
-        """The modes (mode, y, x) on a tile, and the shape's phase relative to the carrier (y, x).
+    def _local(self, planes: list[TilePlane]) -> tuple[F64, F64]:
+        """The modes (tile, mode, local) and the shape's phase (tile, local) in local modes.
+
+        The phase is relative to each tile's plane.
+        """
+        centres = np.array([p.centre for p in planes])
+        n_poly, n_own = len(powers()), len(self.shape.names)
+        modes = np.zeros((len(planes), len(self.names), N_LOCAL))
+        modes[:, :n_own, :n_poly] = expand(self.shape.modes, centres)
+        modes[:, n_own:, n_poly:] = np.eye(len(FRINGE_MODES))
+        phase = np.zeros((len(planes), N_LOCAL))
+        phase[:, :n_poly] = expand(
+            lambda y, x: self.shape.phase(y, x) - self.carrier.phase(y, x), centres
+        )
+        at = {p: n for n, p in enumerate(powers())}
+        phase[:, at[0, 0]] -= [p.phase for p in planes]
+        phase[:, at[1, 0]] -= [p.kx * SCALE_PX for p in planes]
+        phase[:, at[0, 1]] -= [p.ky * SCALE_PX for p in planes]
+        return modes, phase
+
+    def sums(self, tiles: TileSums) -> tuple[F64, F64, float]:
+        """Normal matrix (mode, mode), right-hand sides (mode, 1 + batch) and weighted square.
+
+        Of the phases less the shape's.
+        """
+        modes, phase = self._local(tiles.planes)
+        right = tiles.right.copy()
+        moved = np.einsum("tij,tj->ti", tiles.normal, phase)
+        square = tiles.square + (phase * (moved - 2 * right[:, :, 0])).sum(axis=1)
+        right[:, :, 0] -= moved
+        normal = np.einsum("tmi,tni->mn", modes @ tiles.normal, modes)
+        return normal, np.einsum("tmi,tib->mb", modes, right), float(square.sum())
+
+    def removed(self, planes: list[TilePlane], coefficients: F64) -> F64:
+        """What to take off each tile's phases, in its local modes.
 
         Parameters
         ----------
-        plane : TilePlane
-            Smooth phase of the tile relative to the carrier.
-        size : (int, int)
-            Of the tile.
+        planes : list of TilePlane
+        coefficients : (mode, 1 + batch) float64
+            Of the run's phases relative to the shape, and of the batches' relative to the run's.
+
+        Returns
+        -------
+        (tile, local, 1 + batch) float64
+            The first column is relative to the tile's plane and holds the shape as well.
         """
-        y, x = grid(size)
-        y, x = y + plane.centre[0], x + plane.centre[1]
-        carrier = self.k[0] * (x - self.reference[1]) + self.k[1] * (y - self.reference[0])
-        gauge = fringe_modes(carrier + plane.on(size), np.asarray(plane.ratio))
-        modes = np.concatenate([self.shape.modes(y, x), np.stack(gauge)])
-        return modes, self.shape.phase(y, x) - carrier
+        modes, phase = self._local(planes)
+        removed = np.einsum("tmi,mb->tib", modes, coefficients)
+        removed[:, :, 0] += phase
+        return removed
 
     def solve(self, normal: F64, right: F64, spread: float) -> F64:
         """Coefficients (mode, n) of maps from their sums, with what the shape knows beforehand.
@@ -85,23 +118,6 @@ class ModeBasis:
     def _precision(self, spread: float) -> F64:
         known = self.shape.precision * spread
         return np.concatenate([known, np.zeros(len(FRINGE_MODES))])
-
-
-def mode_sums(modes: F64, weight: F64, maps: F64) -> tuple[F64, F64]:
-    """Normal matrix (mode, mode) and right-hand sides (mode, n) of maps (n, y, x) on a tile.
-
-    Parameters
-    ----------
-    modes : (mode, y, x) float64
-    weight : (y, x) float64
-        Zero where a pixel must not count.
-    maps : (n, y, x) float64
-        Finite wherever ``weight`` is not zero.
-    """
-    flat = modes.reshape(len(modes), -1)
-    weighted = flat * weight.ravel()
-    values = np.where(weight.ravel() > 0, maps.reshape(len(maps), -1), 0.0)
-    return weighted @ flat.T, weighted @ values.T
 
 
 def _scales(normal: F64) -> F64:

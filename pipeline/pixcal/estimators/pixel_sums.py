@@ -11,9 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.fringes import FrameParameters
-from pixcal.estimators.harmonics import PhaseWeights, frame_weights, moments, normal_matrices
+from pixcal.estimators.harmonics import (
+    PhaseWeights,
+    normal_matrices,
+    normal_table,
+)
 from pixcal.estimators.scout import Coding, Tile, accumulate
-from pixcal.kernels.bilinear import N_SUMS, fringe_block, solve_pixels
+from pixcal.kernels.bilinear import N_SUMS, close_fringes, fringe_block, solve_pixels
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -22,6 +26,9 @@ C128 = NDArray[np.complex128]
 STILL = 3e-4
 """Motion of the phase between a tile's centre and its corner (rad, rms) that may be left out: far
 below the noise of a sample, some 1e-2 rad."""
+
+BATCH_TABLE = 1024
+"""Phases tabulated for the normal matrices of a batch, whose error is larger than the run's."""
 
 STEADY = 0.03
 """Scatter of the visibility that the weights may leave out: it costs 0.5 % of the error at most
@@ -34,8 +41,11 @@ class PixelSums(Protocol):
     def add(self, codes: NDArray[np.uint16], at: slice) -> None:
         """Add the codes (t, y, x) of the frames ``at``."""
 
-    def close(self) -> tuple[F64, F64]:
-        """End the batch: its theta (3, y, x) and phase errors (y, x); sums go to the run's."""
+    def close(self) -> tuple[F32, F32]:
+        """End the batch: its phase relative to the start model and the error, each (y, x), rad.
+
+        Its sums go to the run's.
+        """
 
     def finish(self) -> tuple[F64, F64, F64, F64]:
         """End the run: theta (3, y, x); phase errors, chi-square and samples, each (y, x)."""
@@ -76,13 +86,14 @@ class SampleSums:
         part = FrameParameters(self.frames.g[at], self.frames.dk[at], self.frames.reference)
         accumulate(self.tile, [codes], self.coding, part, self.model, self.part)
 
-    def close(self) -> tuple[F64, F64]:
+    def close(self) -> tuple[F32, F32]:
         """As in `PixelSums`."""
         step, covariance, _ = solve_pixels(self.part)
         self.total += self.part
         self.part[:] = 0
         theta = self.model + step
-        return theta, phase_sigma(theta, covariance)
+        turn = np.angle((theta[2] + 1j * theta[1]) * (self.model[2] - 1j * self.model[1]))
+        return turn.astype(np.float32), phase_sigma(theta, covariance).astype(np.float32)
 
     def finish(self) -> tuple[F64, F64, F64, F64]:
         """As in `PixelSums`."""
@@ -98,80 +109,77 @@ class FringeSums:
     def __init__(
         self, tile: Tile, coding: Coding, frames: FrameParameters, model: F32, smooth: C128
     ) -> None:
-        self.coding = coding
-        self.g = frames.at(*tile.centre)
-        self.level = np.maximum(model[0], 1e-6)
-        self.scale = tile.shot * self.level
-        good = tile.good
-        ratio = tile.read / self.scale
-        visibility = np.abs(smooth)
+        self.coding, self.shape = coding, tile.shape
+        self.moments = frames.moments_at(*tile.centre)
+        level = np.maximum(model[0], 1e-6).ravel()
+        scale = tile.shot.ravel() * level
+        good = tile.good.ravel()
+        ratio = tile.read.ravel() / scale
+        visibility = np.abs(smooth).ravel()
         typical = (float(np.median(v[good])) if good.any() else 1.0 for v in (visibility, ratio))
         self.weights = PhaseWeights.of(*typical)
-        self.excess = ratio - self.weights.rho
-        self.psi = np.angle(smooth)
-        # One visibility for the tile, so that the normal matrix depends on the phase alone.
-        self.s = (self.weights.visibility * np.sin(self.psi)).astype(np.float32)
-        self.c = (self.weights.visibility * np.cos(self.psi)).astype(np.float32)
-        start = np.stack([np.ones(tile.shape, np.float32), self.s, self.c])
-        self.model = (self.level * start).astype(float)
         self.series = self.weights.series(1)
-        self.parts: list[C128] = []
+        self.excess = ratio - self.weights.rho
+        # Variance of a sample over the weights' own, the mean over phases.
+        self.spread = scale * (1 + self.excess * self.series[0].real)
+        self.level, self.scale = level, scale
+        self.psi = np.angle(smooth).ravel().astype(np.float32)
+        # One visibility for the tile, so that the normal matrix depends on the phase alone.
+        self.s = np.float32(self.weights.visibility) * np.sin(self.psi)
+        self.c = np.float32(self.weights.visibility) * np.cos(self.psi)
         self.at: list[slice] = []
-        self.part, self.lost = np.zeros((4, *tile.shape)), np.zeros((7, *tile.shape))
-        self.total, self.total_lost = np.zeros_like(self.part), np.zeros_like(self.lost)
+        self.parts: list[slice] = []
+        n = level.size
+        self.part, self.lost, self.any_lost = np.zeros((4, n)), np.zeros((7, n)), False
+        self.total, self.total_lost = np.zeros((4, n)), np.zeros((7, n))
 
     def add(self, codes: NDArray[np.uint16], at: slice) -> None:
         """As in `PixelSums`."""
-        g = self.g[at]
-        amplitude = np.maximum(np.hypot(g[:, 1], g[:, 2]), 1e-30)
-        own = frame_weights(g)
-        unit = np.column_stack([g[:, 1:] / amplitude[:, None], own]).astype(np.float32)
+        g, unit = self.moments.g, self.moments.unit
+        flat = codes.reshape(len(codes), -1)
         for first in range(0, len(codes), 64):
-            now = slice(first, first + 64)
-            fringe_block(
-                codes[now], self.coding.scale, self.coding.offset, self.coding.fill,
-                g[now].astype(np.float32), unit[now], self.weights.rho, self.level, self.s, self.c,
+            now = slice(at.start + first, min(at.start + first + 64, at.stop))
+            self.any_lost |= fringe_block(
+                flat[first : first + 64], self.coding.scale, self.coding.offset, self.coding.fill,
+                g[now], unit[now], self.weights.rho, self.level, self.s, self.c,
                 self.part, self.lost,
             )  # fmt: skip
         self.at.append(at)
 
-    def _end_part(self) -> C128:
-        """Moments of the frames since the last cut."""
-        rows = [self.g[at] for at in self.at]
+    def _end_part(self) -> slice | None:
+        """Frames since the last cut, which follow one another; they are the run's from now on."""
+        if not self.at:
+            return None
+        part = slice(self.at[0].start, self.at[-1].stop)
         self.at = []
-        self.parts.append(moments(np.concatenate(rows) if rows else np.zeros((0, 3))))
-        return self.parts[-1]
-
-    def _solve(self, frame_sums: C128, right: F64, lost: F64, frames: int) -> tuple[F64, ...]:
-        """Theta, inverse normal matrix, weighted square of the residual, samples."""
-        normal = normal_matrices(frame_sums, self.series, self.psi) - lost[:6]
-        count = frames - lost[6]
-        step, inverse, chi2 = solve_pixels(np.concatenate([normal, right, count[None]]))
-        return self.model + step, inverse, chi2, count
-
-    def close(self) -> tuple[F64, F64]:
-        """As in `PixelSums`."""
-        frames = sum(at.stop - at.start for at in self.at)
-        theta, inverse, _, _ = self._solve(self._end_part(), self.part, self.lost, frames)
+        self.parts.append(part)
         self.total += self.part
-        self.total_lost += self.lost
-        self.part[:], self.lost[:] = 0, 0
-        return theta, np.sqrt(np.maximum(phase_variance(theta, inverse), 0) * self._spread)
+        if self.any_lost:
+            self.total_lost += self.lost
+        return part
 
-    @property
-    def _spread(self) -> F64:
-        """Variance of a batch's samples over the weights' own, the mean over phases."""
-        return np.asarray(self.scale * (1 + self.excess * self.series[0].real))
+    def close(self) -> tuple[F32, F32]:
+        """As in `PixelSums`."""
+        turn, sigma = (np.full(self.level.size, np.nan, np.float32) for _ in range(2))
+        if (part := self._end_part()) is not None:
+            table = normal_table(self.moments.sums(part), self.series, BATCH_TABLE)
+            close_fringes(
+                table, self.psi, self.level, self.s, self.c, self.part, self.lost, self.any_lost,
+                self.spread, turn, sigma,
+            )  # fmt: skip
+        self.part[:] = 0
+        if self.any_lost:
+            self.lost[:], self.any_lost = 0, False
+        return turn.reshape(self.shape), sigma.reshape(self.shape)
 
     def finish(self) -> tuple[F64, F64, F64, F64]:
         """As in `PixelSums`."""
         self._end_part()
-        self.total += self.part
-        self.total_lost += self.lost
-        frame_sums = np.sum(self.parts, axis=0)
-        theta, inverse, square, count = self._solve(
-            frame_sums, self.total, self.total_lost, len(self.g)
-        )
+        frame_sums = np.sum([self.moments.sums(part) for part in self.parts], axis=0)
+        normal = normal_matrices(frame_sums, self.series, self.psi) - self.total_lost[:6]
+        count = len(self.moments.g) - self.total_lost[6]
+        step, inverse, square = solve_pixels(np.concatenate([normal, self.total]))
+        theta = self.level * np.stack([np.ones_like(self.s), self.s, self.c]) + step
         # The samples' variance is scale * (1 / w + excess): what exceeds the weights' own goes
         # through the estimate as it is, N^-1 (N + excess N2) N^-1.
         squared = normal_matrices(frame_sums, self.weights.series(2), self.psi)
@@ -180,7 +188,9 @@ class FringeSums:
         )
         with np.errstate(invalid="ignore"):
             sigma = np.sqrt(variance * self.scale)
-        return theta, sigma, square / self._spread, count
+        ny, nx = self.shape
+        sigma, chi2, count = (v.reshape(ny, nx) for v in (sigma, square / self.spread, count))
+        return theta.reshape(3, ny, nx), sigma, chi2, count
 
 
 def phase_variance(theta: F64, inverse: F64, middle: F64 | None = None) -> F64:

@@ -16,6 +16,7 @@ from scipy.linalg import eigh
 from pixcal.estimators.fringes import (
     HONEST_FRINGES,
     FrameParameters,
+    SmoothPhasor,
     find_fringe_vector,
     grid,
     smooth_phasor,
@@ -27,8 +28,8 @@ from pixcal.model.errors import InputError
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-MAX_PIXELS = 40_000
-"""Pixels that frames are solved with: their noise then adds some 1e-4 to a map's variance."""
+MAX_PIXELS = 20_000
+"""Pixels that frames are solved with: their noise then adds some 2e-4 to a map's variance."""
 MIN_FRAMES = 6
 """Three unknowns a pixel, and as many again to tell whether they fit."""
 
@@ -87,6 +88,17 @@ class Scout:
         Nominal fringe vector (kx, ky), rad/px.
     reference : (float, float)
         Point (y, x) at which the frame parameters hold.
+
+    Attributes
+    ----------
+    k : (float, float)
+        Fringe vector of the first tile, rad/px.
+    moving, moving_significance : bool, float
+        Whether the fringe vector changes from frame to frame, and the test's statistic.
+    noise : float
+        Usual reduced chi-square of the pixels.
+    theta : list of (3, y, x) float64
+        Of each tile.
     """
 
     tiles: Sequence[Tile]
@@ -96,6 +108,7 @@ class Scout:
     k: tuple[float, float] = (0.0, 0.0)
     moving: bool = False
     moving_significance: float = 0.0
+    noise: float = 1.0
     theta: list[F64] = field(default_factory=list)
 
     def prime(self, codes: Sequence[NDArray[np.uint16]]) -> FrameParameters:
@@ -132,6 +145,7 @@ class Scout:
         if self.moving:
             for _ in range(8):
                 frames = self._refine(codes, frames)
+        self.noise = self._noise(codes, frames) / (1 - 2 / (9 * (n_frames - 3))) ** 3
         return frames
 
     def solve(
@@ -147,19 +161,24 @@ class Scout:
             Where to start; else from an unweighted fit.
         """
         if start is None:
-            matrix: F64 = np.zeros((3, 3))
-            right: F64 = np.zeros((len(codes[0]), 3))
-            for tile, theta, block in zip(self.tiles, self.theta, codes, strict=True):
-                picked = self._picked(tile)
-                design = theta.reshape(3, -1)[:, picked]
-                matrix = matrix + design @ design.T
-                right = right + self._electrons(block, picked) @ design.T
-            g = np.asarray(np.linalg.solve(matrix, right.T).T, dtype=np.float64)
-            start = FrameParameters(g, np.zeros((len(g), 2)), self.reference)
+            start = self._unweighted(codes)
         frames = start
-        for _ in range(3 if self.moving else 2):
+        # Weights come from the step before: where the phase is linear one is enough.
+        for _ in range(3 if self.moving else 1):
             frames, _, _ = self._frame_step(codes, frames, self.moving)
         return frames
+
+    def _unweighted(self, codes: Sequence[NDArray[np.uint16]]) -> FrameParameters:
+        """Frames by plain least squares."""
+        matrix: F64 = np.zeros((3, 3))
+        right: F64 = np.zeros((len(codes[0]), 3))
+        for tile, theta, block in zip(self.tiles, self.theta, codes, strict=True):
+            picked = self._picked(tile)
+            design = theta.reshape(3, -1)[:, picked]
+            matrix = matrix + design @ design.T
+            right = right + self._electrons(block, picked) @ design.T.astype(np.float32)
+        g = np.asarray(np.linalg.solve(matrix, right.T).T, dtype=np.float64)
+        return FrameParameters(g, np.zeros((len(g), 2)), self.reference)
 
     def _require_pixels(self) -> None:
         if sum(int(t.good.sum()) for t in self.tiles) < 30:
@@ -226,7 +245,7 @@ class Scout:
         tile, theta = self.tiles[0], self.theta[0]
         level = np.where(tile.good, theta[0], 1.0)
         phasor = np.where(tile.good, theta[2] + 1j * theta[1], 0.0) / level
-        _, (kx, ky) = smooth_phasor(np.asarray(phasor, complex), tile.good, self.k)
+        kx, ky = smooth_phasor(np.asarray(phasor, complex), tile.good, self.k).k
         ny, nx = tile.shape
         across = float(np.hypot(kx * nx, ky * ny)) / (2 * np.pi)
         if across < HONEST_FRINGES:
@@ -318,12 +337,19 @@ class Scout:
         dk = step[seen, 3:]
         dk = dk - dk.mean(axis=0)
         size = np.einsum("ti,tij,tj->t", dk, _inverses(covariance), dk).mean() / 2
-        noise = [
-            residual_chi2(tile, block, self.coding, frames, theta)
-            for tile, block, theta in zip(self.tiles, codes, self.theta, strict=True)
-            if tile.good.any()
-        ]
-        return float(size / np.median(noise))
+        return float(size / self._noise(codes, frames))
+
+    def _noise(self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters) -> float:
+        """Usual reduced chi-square of the pixels."""
+        return float(
+            np.median(
+                [
+                    residual_chi2(tile, block, self.coding, frames, theta)
+                    for tile, block, theta in zip(self.tiles, codes, self.theta, strict=True)
+                    if tile.good.any()
+                ]
+            )
+        )
 
 
 def _parts(pixels: NDArray[np.intp]) -> list[NDArray[np.intp]]:
@@ -414,7 +440,7 @@ def start_model(
     coding: Coding,
     frames: FrameParameters,
     k: tuple[float, float],
-) -> tuple[F32, NDArray[np.complex128]]:
+) -> tuple[F32, SmoothPhasor]:
     """Smooth model of a tile, for weights that do not know the pixel's own noise.
 
     The phase and the visibility are smooth over the tile; the level is the pixel's own, known to a
@@ -431,22 +457,41 @@ def start_model(
     -------
     theta : (3, y, x) float32
         The model.
-    smooth : (y, x) complex128
-        The smooth phasor alpha exp(i psi) / iota.
+    smooth : SmoothPhasor
+        Of alpha exp(i psi) / iota.
     """
-    nothing = np.zeros((3, *tile.shape), np.float32)
-    even = (np.ones(tile.shape, np.float32), np.zeros(tile.shape, np.float32))
-    sums = accumulate(tile, blocks, coding, frames, nothing, variance=even)
-    theta, _, _ = solve_pixels(sums)
+    theta = _unweighted_pixels(tile, blocks, coding, frames)
     iota = theta[0]
     usable = np.isfinite(iota) & (iota > 0)
     good = tile.good & usable
     level = float(np.median(iota[good])) if good.any() else 1.0
     iota = np.where(usable, iota, level)
     phasor = np.asarray(np.where(usable, theta[2] + 1j * theta[1], 0.0) / iota, complex)
-    smooth, _ = smooth_phasor(phasor, good, k)
-    model = np.stack([iota, iota * smooth.imag, iota * smooth.real])
+    smooth = smooth_phasor(phasor, good, k)
+    model = np.stack([iota, iota * smooth.map.imag, iota * smooth.map.real])
     return model.astype(np.float32), smooth
+
+
+def _unweighted_pixels(
+    tile: Tile, blocks: Sequence[NDArray[np.uint16]], coding: Coding, frames: FrameParameters
+) -> F64:
+    """Pixels (3, y, x) by plain least squares.
+
+    Where no sample is missing and the fringe vector is held the normal matrix is the same for all.
+    """
+    if frames.moving or any((block == coding.fill).any() for block in blocks):
+        nothing = np.zeros((3, *tile.shape), np.float32)
+        even = (np.ones(tile.shape, np.float32), np.zeros(tile.shape, np.float32))
+        return solve_pixels(accumulate(tile, blocks, coding, frames, nothing, variance=even))[0]
+    right: F64 = np.zeros((3, tile.good.size))
+    start = 0
+    for block in blocks:
+        g = frames.g[start : start + len(block)]
+        electrons = block.reshape(len(block), -1) * np.float32(coding.scale)
+        right += g.T.astype(np.float32) @ electrons + coding.offset * g.sum(axis=0)[:, None]
+        start += len(block)
+    theta = np.linalg.lstsq(frames.g.T @ frames.g, right, rcond=1e-9)[0]
+    return np.asarray(theta.reshape(3, *tile.shape))
 
 
 def fit_tile(
@@ -460,4 +505,4 @@ def fit_tile(
     model, smooth = start_model(tile, blocks, coding, frames, k)
     sums = accumulate(tile, blocks, coding, frames, model)
     step, _, _ = solve_pixels(sums)
-    return model + step, smooth
+    return model + step, smooth.map

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.batches import Batches
-from pixcal.estimators.fringes import FrameParameters, grid
+from pixcal.estimators.fringes import FrameParameters, SmoothPhasor, plane_wave, wrapped
 from pixcal.estimators.pixel_sums import PixelSums, pixel_sums
 from pixcal.estimators.scout import Coding, Tile, start_model
 
@@ -34,6 +34,8 @@ class TileMaps:
         Reduced chi-square.
     count : (y, x) float32
         Samples with weight.
+    smooth : SmoothPhasor
+        Of the start model.
     batch_phase, batch_sigma : (batch, y, x) float32
         Phase of each batch relative to that of all frames, and its error (rad); NaN in gaps.
     bound : (n,) float64
@@ -46,6 +48,7 @@ class TileMaps:
     sigma: F32
     chi2: F32
     count: F32
+    smooth: SmoothPhasor
     batch_phase: F32
     batch_sigma: F32
     bound: F64
@@ -101,8 +104,8 @@ def sweep_tile(
                 continue
             first = FrameParameters(frames.g[:n_held], frames.dk[:n_held], frames.reference)
             model, smooth = start_model(tile, held, coding, first, k)
-            pixels = pixel_sums(tile, coding, frames, model, smooth)
-            sums = _BatchSums(tile, coding, frames, batches, model, pixels)
+            pixels = pixel_sums(tile, coding, frames, model, smooth.map)
+            sums = _BatchSums(tile, frames, batches, smooth, pixels)
             for part in held:
                 sums.add(part, position)
                 position += len(part)
@@ -121,16 +124,15 @@ class _BatchSums:
     def __init__(
         self,
         tile: Tile,
-        coding: Coding,
         frames: FrameParameters,
         batches: Batches,
-        model: F32,
+        smooth: SmoothPhasor,
         sums: PixelSums,
     ) -> None:
-        self.tile, self.coding, self.frames, self.model = tile, coding, frames, model
-        self.sums = sums
+        self.tile, self.frames, self.smooth, self.sums = tile, frames, smooth, sums
         shape = (len(batches.ranges), *tile.shape)
-        self.phasor = np.full(shape, np.nan, np.complex64)
+        # Phases relative to the start model, and their errors.
+        self.turn = np.full(shape, np.nan, np.float32)
         self.sigma = np.full(shape, np.nan, np.float32)
         # Where the sums are cut: at the ends of batches (those of gaps do not cut).
         self.ends = {b: n for n, (a, b) in enumerate(batches.ranges) if b > a}
@@ -142,21 +144,20 @@ class _BatchSums:
         for a, b in zip([position, *cuts], [*cuts, stop], strict=True):
             self.sums.add(block[a - position : b - position], slice(a, b))
             if b in self.ends:
-                theta, sigma = self.sums.close()
-                self.phasor[self.ends[b]] = theta[2] + 1j * theta[1]
-                self.sigma[self.ends[b]] = sigma
+                n = self.ends[b]
+                self.turn[n], self.sigma[n] = self.sums.close()
             elif b in self.cuts:
                 self.sums.close()
 
     def finish(self, k: tuple[float, float], bound_pixels: int) -> TileMaps:
         theta, sigma, chi2, count = self.sums.finish()
         z = theta[2] + 1j * theta[1]
-        y, x = grid(self.tile.shape)
         cy, cx = self.tile.centre
         ry, rx = self.frames.reference
-        carrier = np.exp(1j * (k[0] * (x + cx - rx) + k[1] * (y + cy - ry)))
+        carrier = plane_wave(self.tile.shape, k, k[0] * (cx - rx) + k[1] * (cy - ry))
         with np.errstate(divide="ignore", invalid="ignore"):
             reduced = np.where(count > 3, chi2 / (count - 3), np.nan)
+        turn = np.angle(z * self.smooth.map.conj()).astype(np.float32)
         return TileMaps(
             iota=theta[0].astype(np.float32),
             alpha=np.abs(z).astype(np.float32),
@@ -164,7 +165,8 @@ class _BatchSums:
             sigma=sigma.astype(np.float32),
             chi2=reduced.astype(np.float32),
             count=count.astype(np.float32),
-            batch_phase=np.angle(self.phasor * z.conj()[None]).astype(np.float32),
+            smooth=self.smooth,
+            batch_phase=wrapped(self.turn - turn),
             batch_sigma=self.sigma,
             bound=phase_bound(self.tile, theta, self.frames, bound_pixels),
         )

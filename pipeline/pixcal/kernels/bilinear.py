@@ -25,6 +25,9 @@ F64 = NDArray[np.float64]
 N_SUMS = 11
 """Sums kept for each pixel: 6 normal, 3 right-hand, weighted square of the residual, samples."""
 
+SINGULAR = 1e-9
+"""Determinant over the product of the diagonal: without three phases it is zero up to rounding."""
+
 _FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
 
 
@@ -236,9 +239,13 @@ def frame_sums(
             right[t, 4] += ry
 
 
+GROUP = 1024
+"""Pixels summed at a time by `fringe_block`: their sums stay in the first cache."""
+
+
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _fringe_row(
-    codes: Any, row: int, scale: float, offset: float, g: Any, unit: Any, rho: float,
+def _fringe_group(
+    codes: Any, first: int, stop: int, scale: float, offset: float, g: Any, unit: Any, rho: float,
     level: Any, s: Any, c: Any, b0: Any, b1: Any, b2: Any, rr: Any,
 ) -> None:  # fmt: skip
     # Four frames at a time: the sums are loaded and stored once for all of them.
@@ -253,12 +260,14 @@ def _fringe_row(
         uc, us, uf = unit[t + 2, 0], unit[t + 2, 1], unit[t + 2, 2]
         v0, v1, v2 = g[t + 3, 0], g[t + 3, 1], g[t + 3, 2]
         vc, vs, vf = unit[t + 3, 0], unit[t + 3, 1], unit[t + 3, 2]
-        for i in range(codes.shape[2]):
+        cp, cq = codes[t, first:stop], codes[t + 1, first:stop]
+        cu, cv = codes[t + 2, first:stop], codes[t + 3, first:stop]
+        for i in range(stop - first):
             si, ci, li = s[i], c[i], level[i]
-            rp = scale * np.float32(codes[t, row, i]) + offset - li * (p0 + si * p1 + ci * p2)
-            rq = scale * np.float32(codes[t + 1, row, i]) + offset - li * (q0 + si * q1 + ci * q2)
-            ru = scale * np.float32(codes[t + 2, row, i]) + offset - li * (u0 + si * u1 + ci * u2)
-            rv = scale * np.float32(codes[t + 3, row, i]) + offset - li * (v0 + si * v1 + ci * v2)
+            rp = scale * np.float32(cp[i]) + offset - li * (p0 + si * p1 + ci * p2)
+            rq = scale * np.float32(cq[i]) + offset - li * (q0 + si * q1 + ci * q2)
+            ru = scale * np.float32(cu[i]) + offset - li * (u0 + si * u1 + ci * u2)
+            rv = scale * np.float32(cv[i]) + offset - li * (v0 + si * v1 + ci * v2)
             wp = pf * rp / (base + si * pc + ci * ps)
             wq = qf * rq / (base + si * qc + ci * qs)
             wu = uf * ru / (base + si * uc + ci * us)
@@ -270,9 +279,10 @@ def _fringe_row(
     for t in range(n, codes.shape[0]):
         p0, p1, p2 = g[t, 0], g[t, 1], g[t, 2]
         pc, ps, pf = unit[t, 0], unit[t, 1], unit[t, 2]
-        for i in range(codes.shape[2]):
+        cp = codes[t, first:stop]
+        for i in range(stop - first):
             si, ci = s[i], c[i]
-            rp = scale * np.float32(codes[t, row, i]) + offset
+            rp = scale * np.float32(cp[i]) + offset
             rp -= level[i] * (p0 + si * p1 + ci * p2)
             wp = pf * rp / (base + si * pc + ci * ps)
             b0[i] += wp * p0
@@ -282,10 +292,20 @@ def _fringe_row(
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _fill_row(codes: Any, row: int, fill: int, count: Any) -> None:
+def _count_fill(codes: Any, first: int, stop: int, fill: int, count: Any) -> None:
     for t in range(codes.shape[0]):
-        for i in range(codes.shape[2]):
-            count[i] += np.float32(codes[t, row, i] == fill)
+        row = codes[t, first:stop]
+        for i in range(stop - first):
+            count[i] += np.float32(row[i] == fill)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _holds(codes: Any, fill: int) -> bool:
+    found = False
+    flat = codes.reshape(-1)
+    for i in range(flat.size):
+        found |= flat[i] == fill
+    return found
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -302,15 +322,17 @@ def fringe_block(
     c: F32,
     sums: F64,
     missing: F64,
-) -> None:
-    """Right-hand sums of a tile for weights that depend on the phase of the fringe only.
+) -> bool:
+    """Right-hand sums of pixels for weights that depend on the phase of the fringe only.
 
     The weight is ``f / (1 + rho + s cos phi + c sin phi)``; the normal sums follow from the frames
     (`pixcal.estimators.harmonics`), less those of samples without weight, given in ``missing``.
 
     Parameters
     ----------
-    codes, scale, offset, fill
+    codes : (t, p) array of unsigned integers
+        Stored samples of p pixels; other facts as in `sweep_block`.
+    scale, offset, fill
         As in `sweep_block`.
     g : (t, 3) float32
         Frame parameters at the tile's centre.
@@ -318,32 +340,43 @@ def fringe_block(
         (cos phi, sin phi, f), f the frame's own weight.
     rho : float
         Read variance over level, in the weights.
-    level, s, c : (y, x) float32
+    level, s, c : (p,) float32
         Start model ``level * (B + s A cos phi + c A sin phi)``, in electrons.
-    sums : (4, y, x) float64
+    sums : (4, p) float64
         Added to: right-hand sums 0 to 2 of the residual, weighted square of the residual.
-    missing : (7, y, x) float64
+    missing : (7, p) float64
         Added to: normal sums of the samples without weight (6), and their number.
+
+    Returns
+    -------
+    bool
+        Whether any sample had no weight.
     """
-    ny, nx = codes.shape[1], codes.shape[2]
-    p = [np.empty(nx, np.float32) for _ in range(5)]
+    n = codes.shape[1]
+    p = [np.empty(GROUP, np.float32) for _ in range(5)]
     sc, of, rh = np.float32(scale), np.float32(offset), np.float32(rho)
-    for row in range(ny):
+    filled = _holds(codes, fill)
+    for first in range(0, n, GROUP):
+        stop = min(first + GROUP, n)
         for k in range(5):
             p[k][:] = np.float32(0)
-        _fringe_row(
-            codes, row, sc, of, g, unit, rh, level[row], s[row], c[row], p[0], p[1], p[2], p[3]
-        )
-        _fill_row(codes, row, fill, p[4])
-        for i in range(nx):
-            if p[4][i] > 0:
-                _without_fill(
-                    codes[:, row, i], sc, of, fill, g, unit, rh,
-                    level[row, i], s[row, i], c[row, i], p, i, missing[:, row, i],
-                )  # fmt: skip
+        _fringe_group(
+            codes, first, stop, sc, of, g, unit, rh, level[first:stop], s[first:stop],
+            c[first:stop], p[0], p[1], p[2], p[3],
+        )  # fmt: skip
+        if filled:
+            _count_fill(codes, first, stop, fill, p[4])
+            for i in range(stop - first):
+                if p[4][i] > 0:
+                    at = first + i
+                    _without_fill(
+                        codes[:, at], sc, of, fill, g, unit, rh,
+                        level[at], s[at], c[at], p, i, missing[:, at],
+                    )  # fmt: skip
         for k in range(4):
-            for i in range(nx):
-                sums[k, row, i] += p[k][i]
+            for i in range(stop - first):
+                sums[k, first + i] += p[k][i]
+    return filled
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -371,6 +404,85 @@ def _without_fill(
         b2 += w * r * a2
         rr += w * r * r
     p[0][i], p[1][i], p[2][i], p[3][i] = b0, b1, b2, rr
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def close_fringes(
+    table: F64,
+    psi: F32,
+    level: F32,
+    s: F32,
+    c: F32,
+    sums: F64,
+    missing: F64,
+    filled: bool,
+    spread: F64,
+    turn: F32,
+    sigma: F32,
+) -> None:
+    """Phase of a batch relative to the start model, and its error.
+
+    Parameters
+    ----------
+    table : (6, size) float64
+        Normal sums over one turn of the pixel's phase (`pixcal.estimators.harmonics`).
+    psi : (p,) float32
+        Phase of the start model, rad.
+    level, s, c, sums, missing
+        As in `fringe_block`.
+    filled : bool
+        Whether ``missing`` holds anything.
+    spread : (p,) float64
+        Variance of the samples over that of the weights.
+    turn, sigma : (p,) float32
+        Written: rad.
+    """
+    size = table.shape[1]
+    per_rad = size / (2 * np.pi)
+    m = np.empty(6)
+    for p in range(psi.size):
+        place = psi[p] * per_rad
+        below = np.floor(place)
+        part = place - below
+        i = int(below) % size
+        j = i + 1 if i + 1 < size else 0
+        for k in range(6):
+            m[k] = table[k, i] * (1 - part) + table[k, j] * part
+        if filled:
+            for k in range(6):
+                m[k] -= missing[k, p]
+        i00, i01, i02 = (
+            m[3] * m[5] - m[4] * m[4],
+            m[2] * m[4] - m[1] * m[5],
+            m[1] * m[4] - m[2] * m[3],
+        )
+        i11, i12, i22 = (
+            m[0] * m[5] - m[2] * m[2],
+            m[1] * m[2] - m[0] * m[4],
+            m[0] * m[3] - m[1] * m[1],
+        )
+        det = m[0] * i00 + m[1] * i01 + m[2] * i02
+        if not det > SINGULAR * m[0] * m[3] * m[5]:
+            turn[p], sigma[p] = np.nan, np.nan
+            continue
+        r0, r1, r2 = sums[0, p] / det, sums[1, p] / det, sums[2, p] / det
+        ms, mc = level[p] * s[p], level[p] * c[p]
+        ts = ms + i01 * r0 + i11 * r1 + i12 * r2
+        tc = mc + i02 * r0 + i12 * r1 + i22 * r2
+        turn[p] = _angle(ts * mc - tc * ms, tc * mc + ts * ms)
+        power = ts * ts + tc * tc
+        variance = (tc * tc * i11 - 2 * tc * ts * i12 + ts * ts * i22) / (det * power * power)
+        sigma[p] = np.sqrt(max(variance, 0.0) * spread[p])
+
+
+@njit(cache=True, nogil=True, inline="always")  # type: ignore[untyped-decorator]
+def _angle(y: float, x: float) -> float:
+    """``atan2(y, x)``, fast where it is small: a series, good to 2e-8 rad."""
+    if x > 0 and abs(y) < 0.25 * x:
+        q = y / x
+        q2 = q * q
+        return float(q * (1 - q2 * (1 / 3 - q2 * (1 / 5 - q2 * (1 / 7 - q2 / 9)))))
+    return np.arctan2(y, x)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -452,8 +564,7 @@ def _solve(sums: F64, step: F64, covariance: F64, chi2: F64) -> None:
         i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
         i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
         det = a * i00 + b * i01 + c * i02
-        # Without three different phases the matrix is singular up to rounding.
-        inverse = 1.0 / det if det > 1e-9 * a * d * f else np.nan
+        inverse = 1.0 / det if det > SINGULAR * a * d * f else np.nan
         covariance[0, p], covariance[1, p] = i00 * inverse, i01 * inverse
         covariance[2, p], covariance[3, p] = i02 * inverse, i11 * inverse
         covariance[4, p], covariance[5, p] = i12 * inverse, i22 * inverse

@@ -1,29 +1,23 @@
-"""One fringe set: from the sweep's phases to the map of offsets along its axis."""
+"""One fringe set: the shape of its fringes, from the sums that the sweep left of every tile."""
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.engine.plan import make_plan
-from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.geometry import TilePlane, tile_plane, unwrap, unwrapped_phase
+from pixcal.estimators.geometry import TilePlane, unwrap
 from pixcal.estimators.models import FringeShape, Start, fringe_models
-from pixcal.estimators.modes import ModeBasis, mode_sums
+from pixcal.estimators.modes import ModeBasis
 from pixcal.estimators.smooth import Polynomial
+from pixcal.estimators.tile_sums import Carrier, TileSums
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.errors import InputError
-from pixcal.model.flags import PixelFlag
-from pixcal.stages.fit.sweep import read_frames
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
+from pixcal.storage.cube import ArrayReader
 
-F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
-Job = tuple[tuple[int, int], TilePlane]
 
 MAX_STEPS = 8
 """Gauss-Newton steps of a shape; it is nearly linear (physics note, section 4)."""
@@ -39,36 +33,6 @@ RED = 2.5
 EXCESS = 50.0
 """Fall then asked of each term over that of terms of no cause: the power of steps falls with the
 order of the term, and two stitches reach 15."""
-
-
-@dataclass(frozen=True)
-class SweptSet:
-    """A set's maps of the sweep, tile by tile."""
-
-    sweep: Path
-    source: ReducedSet
-    noise: float
-    chi2_limit: float
-
-    def map(self, name: str, at: tuple[int, int]) -> F32:
-        """One map on a tile."""
-        y, x = self.source.ranges(at)
-        return ArrayReader(self.sweep / name).read(y, x)
-
-    def flags(self, at: tuple[int, int]) -> NDArray[np.uint8]:
-        """Flags of a tile's pixels, those of the fit included."""
-        mask = self.source.mask(at)
-        sigma, chi2 = self.map("sigma", at), self.map("chi2", at)
-        count, iota = self.map("count", at), self.map("iota", at)
-        mask[count == 0] |= np.uint8(PixelFlag.NO_DATA)
-        # Chance alone gives a scatter of sqrt(2 / n) to a reduced chi-square.
-        chance = 8 * np.sqrt(2 / np.maximum(count - 3, 1))
-        good_fit = np.isfinite(sigma) & (
-            chi2 / self.noise < np.maximum(self.chi2_limit, 1 + chance)
-        )
-        good_fit &= (iota > 0) & (sigma < 0.5)
-        mask[~good_fit] |= np.uint8(PixelFlag.BAD_FIT)
-        return mask
 
 
 @dataclass(frozen=True)
@@ -99,24 +63,64 @@ class SetFit:
     steps: int
 
 
+@dataclass(frozen=True)
+class FittedSet:
+    """A set with its shape, ready for its maps to be written.
+
+    Attributes
+    ----------
+    name : str
+    source : ReducedSet
+    swept : Path
+        ``sweep.zarr/<set name>``.
+    facts : dict
+        Summary of the set's sweep.
+    planes : list of TilePlane
+        Unwrapped, one a tile.
+    fit : SetFit
+    shape : FringeShape
+        With the fitted parameters.
+    model, evidence : str
+        Name of the shape, and why it was chosen.
+    noise : float
+        Usual reduced chi-square: the variance of the samples over that of the noise model.
+    """
+
+    name: str
+    source: ReducedSet
+    swept: Path
+    facts: dict[str, Any]
+    planes: list[TilePlane]
+    fit: SetFit
+    shape: FringeShape
+    model: str
+    evidence: str
+    noise: float
+
+    @property
+    def carrier(self) -> Carrier:
+        """That the sweep's phases are relative to."""
+        return self.fit.basis.carrier
+
+    @property
+    def n_batches(self) -> int:
+        """Batches of the run."""
+        return self.fit.coefficients.shape[1] - 1
+
+
 def fit_set(
-    folder: Path,
-    maps: Path,
+    swept: Path,
     source: ReducedSet,
     facts: dict[str, Any],
     acquisition: Acquisition,
     name: str,
     model: str,
-    chi2_limit: float,
-    runtime: Runtime,
-) -> tuple[FringeShape, dict[str, Any]]:
-    """Fit a set's shape, write its maps, and tell what ``fit.json`` says of it.
+) -> FittedSet:
+    """Fit the shape of a set's fringes.
 
     Parameters
     ----------
-    folder : Path
-        ``fit.zarr/<set name>``, to be written.
-    maps : Path
+    swept : Path
         ``sweep.zarr/<set name>``.
     source : ReducedSet
     facts : dict
@@ -126,55 +130,28 @@ def fit_set(
         Of the set.
     model : str
         A shape's name, or ``auto``.
-    chi2_limit : float
-        Pixels with a reduced chi-square above are flagged.
-    runtime : Runtime
 
     Raises
     ------
     InputError
         If no pixel of the set can be fitted.
     """
-    tiles = source.tiles()
-    n_batches = len(ArrayReader(maps / "batch_count").read())
-    pixels = int(np.prod(source.signal.chunks[1:]))
-    plan = make_plan(f"the fit of {name}", pixels * (600 + 40 * n_batches), 0, runtime)
-    runtime = runtime.with_workers(plan.workers)
-
-    every = np.concatenate(
-        run_tasks(partial(_noise_task, maps, source), tiles, runtime, label=f"noise {name}")
-    )
-    freedom = max(source.n_frames - 3, 1)
-    # Median of a reduced chi-square by Wilson and Hilferty's cube.
-    noise = float(np.median(every) / (1 - 2 / (9 * freedom)) ** 3) if len(every) else 1.0
-    swept = SweptSet(maps, source, noise, chi2_limit)
-    planes = unwrap(
-        run_tasks(partial(_plane_task, swept), tiles, runtime, label=f"phases {name}"),
-        source.grid,
-    )
-    if not any(np.isfinite(p.sigma) for p in planes):
+    rows = ArrayReader(swept / "sums").read()
+    tiles = TileSums.of_rows(rows.reshape(-1, rows.shape[-1]))
+    if not any(np.isfinite(p.sigma) for p in tiles.planes):
         raise InputError(
             f"fringe set {name!r}: no pixel can be fitted; its fringes are too faint for "
             f"{source.n_frames} frames, or the mask leaves no pixel"
         )
-    jobs = list(zip(tiles, planes, strict=True))
-    start = _start(source, facts, planes, acquisition, name)
-    fitted, evidence = _choose(model, swept, start, jobs, n_batches, runtime, name)
-
-    writers = _create_outputs(folder, source, n_batches)
-    told = run_tasks(
-        partial(_write_task, swept, fitted, writers), jobs, runtime, label=f"maps {name}"
-    )
-    for writer in writers.values():
-        writer.finish()
-    _write_frames(folder, maps)
+    tiles = tiles.with_planes(unwrap(tiles.planes, source.grid))
+    start = _start(source, facts, tiles.planes, acquisition, name)
+    fitted, evidence = _choose(model, tiles, start)
     shape = fitted.basis.shape.moved(fitted.coefficients[: len(fitted.basis.shape.names), 0])
-    facts = _describe(source, facts, planes, fitted, shape, noise, told)
-    return shape, facts | {"model": _model_name(shape), "evidence": evidence}
-
-
-def _model_name(shape: FringeShape) -> str:
-    return next(name for name, cls in fringe_models().items() if isinstance(shape, cls))
+    chosen = next(n for n, cls in fringe_models().items() if isinstance(shape, cls))
+    return FittedSet(
+        name, source, swept, facts, tiles.planes, fitted, shape, chosen, evidence,
+        float(facts["chi2_reduced"]),
+    )  # fmt: skip
 
 
 def _start(
@@ -197,15 +174,7 @@ def _start(
     )
 
 
-def _choose(
-    model: str,
-    swept: SweptSet,
-    start: Start,
-    jobs: list[Job],
-    n_batches: int,
-    runtime: Runtime,
-    name: str,
-) -> tuple[SetFit, str]:
+def _choose(model: str, tiles: TileSums, start: Start) -> tuple[SetFit, str]:
     """Fit the shape asked for; ``auto`` takes hyperbolic fringes where the map asks for them.
 
     True offsets have structure of their own at large scales (stitches), which any richer shape
@@ -213,19 +182,14 @@ def _choose(
     what curvature of no cause amounts to here.
     """
     shapes = fringe_models()
-
-    def fit(shape: type[FringeShape], label: str, background: float = 1.0) -> SetFit:
-        first = shape.start(start)
-        return _fit_shape(swept, first, start, jobs, n_batches, runtime, label, background)
-
     if model != "auto":
-        return fit(shapes[model], f"{model} {name}"), "asked for"
-    straight = fit(shapes["paraxial"], f"paraxial {name}")
-    smooth = fit(Polynomial, f"smooth {name}")
+        return _fit_shape(tiles, shapes[model], start), "asked for"
+    straight = _fit_shape(tiles, shapes["paraxial"], start)
+    smooth = _fit_shape(tiles, Polynomial, start)
     most = (straight.square - smooth.square) / smooth.spread
     if most < EVIDENCE:
         return straight, f"no curvature: chi-square falls by {most:.0f} at most"
-    exact = fit(shapes["hyperbolic"], f"hyperbolic {name}")
+    exact = _fit_shape(tiles, shapes["hyperbolic"], start)
     gain = (straight.square - exact.square) / smooth.spread
     others = len(smooth.basis.names) - len(straight.basis.names) - QUADRATIC
     beyond = max(exact.square - smooth.square, 0.0) / smooth.spread / others
@@ -237,27 +201,20 @@ def _choose(
     )
     if gain <= needed:
         return straight, reason
-    return fit(shapes["hyperbolic"], f"hyperbolic {name}", background), reason
+    return _fit_shape(tiles, shapes["hyperbolic"], start, background), reason
 
 
 def _fit_shape(
-    swept: SweptSet,
-    shape: FringeShape,
-    start: Start,
-    jobs: list[Job],
-    n_batches: int,
-    runtime: Runtime,
-    label: str,
-    background: float,
+    tiles: TileSums, cls: type[FringeShape], start: Start, background: float = 1.0
 ) -> SetFit:
     """Gauss-Newton steps of a shape on all pixels, and the gauge's modes with it."""
+    shape = cls.start(start)
     size = len(shape.names)
+    pixels = max(float(tiles.pixels.sum()), 1.0)
+    carrier = Carrier(start.k, start.reference)
     for steps in range(1, MAX_STEPS + 1):
-        basis = ModeBasis(shape, start.k, start.reference)
-        sums = run_tasks(partial(_modes_task, swept, basis, n_batches), jobs, runtime, label=label)
-        normal = np.sum([s[0] for s in sums], axis=0)
-        right = np.sum([s[1] for s in sums], axis=0)
-        square, pixels = sum(s[2] for s in sums), max(sum(s[3] for s in sums), 1)
+        basis = ModeBasis(shape, carrier)
+        normal, right, square = basis.sums(tiles)
         free = np.linalg.lstsq(normal, right[:, 0], rcond=1e-12)[0]
         spread = background * max(1.0, float(square - free @ right[:, 0]) / pixels)
         c = basis.solve(normal, right, spread)
@@ -272,27 +229,30 @@ def _fit_shape(
     return SetFit(basis, c, basis.covariance(normal, spread), rest, spread, steps)
 
 
-def _describe(
-    source: ReducedSet,
-    facts: dict[str, Any],
-    planes: list[TilePlane],
-    fitted: SetFit,
-    shape: FringeShape,
-    noise: float,
-    told: list[tuple[int, F32]],
-) -> dict[str, Any]:
+def describe(fitted: FittedSet, masked: int, sigma_px: float) -> dict[str, Any]:
+    """What ``fit.json`` says of a set.
+
+    Parameters
+    ----------
+    fitted : FittedSet
+    masked : int
+        Pixels without a value.
+    sigma_px : float
+        Median error of the others.
+    """
+    source, facts, shape, fit = fitted.source, fitted.facts, fitted.shape, fitted.fit
     ny, nx = source.shape
     kx, ky = shape.vector((ny - 1) / 2, (nx - 1) / 2)
     k = float(np.hypot(kx, ky))
-    ratio = np.median([p.ratio for p in planes if np.isfinite(p.sigma)])
+    ratio = np.median([p.ratio for p in fitted.planes if np.isfinite(p.sigma)])
     own = len(shape.names)
     origin = float(shape.phase(np.zeros(1), np.zeros(1))[0])
     return {
         "frames": source.n_frames,
         "pixels": ny * nx,
-        "pixels_masked": ny * nx - sum(good for good, _ in told),
+        "pixels_masked": masked,
         "interfringe_px": 2 * np.pi / k,
-        "geometry": shape.facts(fitted.covariance[:own, :own]),
+        "geometry": shape.facts(fit.covariance[:own, :own]),
         "kx": kx,
         "ky": ky,
         "nominal_kx": facts["nominal_k"][0],
@@ -300,139 +260,19 @@ def _describe(
         "phase_at_origin_rad": float(np.remainder(origin, 2 * np.pi)),
         "axis": [kx / k, ky / k],
         "visibility": float(1 / ratio),
-        "sigma_median_px": float(np.median(np.concatenate([some for _, some in told]))),
+        "sigma_median_px": sigma_px,
         "crb_median_px": None if facts["bound_rad"] is None else facts["bound_rad"] / k,
-        "chi2_reduced": noise,
-        "sigma_scale": float(np.sqrt(noise)),
+        "chi2_reduced": fitted.noise,
+        "sigma_scale": float(np.sqrt(fitted.noise)),
         "fringe_vector_moves": facts["moving"],
-        "iterations": fitted.steps,
+        "iterations": fit.steps,
         "passes": facts["chunks_read"] / facts["chunks"],
         "chunks_read": facts["chunks_read"],
         "chunks": facts["chunks"],
         "batch_frames": facts["batch_frames"],
         "batch_period_s": facts["batch_period_s"],
         "batch_note": facts["batch_note"],
-        "removed_modes": list(fitted.basis.names),
+        "removed_modes": list(fit.basis.names),
+        "model": fitted.model,
+        "evidence": fitted.evidence,
     }
-
-
-def _write_frames(folder: Path, maps: Path) -> None:
-    """Parameters of every frame and the times of the batches, for those who read the fit."""
-    frames = read_frames(maps)
-    for array, data in (
-        ("B", frames.B), ("A", frames.A), ("phi", frames.phi), ("dkx", frames.dk[:, 0]),
-        ("dky", frames.dk[:, 1]), ("time", ArrayReader(maps / "time").read()),
-    ):  # fmt: skip
-        write_array(folder / array, data, dims=("time",))
-    for array in ("batch_time", "batch_count"):
-        write_array(folder / array, ArrayReader(maps / array).read(), dims=("batch",))
-
-
-def _noise_task(maps: Path, source: ReducedSet, at: tuple[int, int]) -> F32:
-    """Reduced chi-squares of the pixels that the reduction finds good (every n-th of many)."""
-    y, x = source.ranges(at)
-    chi2 = ArrayReader(maps / "chi2").read(y, x)
-    return _some(chi2[(source.mask(at) == 0) & np.isfinite(chi2)])
-
-
-def _some(values: F32) -> F32:
-    """Every n-th of many values; a copy, lest they all stay in memory."""
-    return values[:: max(1, len(values) // 4000)].copy()
-
-
-def _plane_task(swept: SweptSet, at: tuple[int, int]) -> TilePlane:
-    good = swept.flags(at) == 0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = swept.map("iota", at) / swept.map("alpha", at)
-    y, x = swept.source.ranges(at)
-    centre = ((y[0] + y[1] - 1) / 2, (x[0] + x[1] - 1) / 2)
-    return tile_plane(swept.map("phase", at), swept.map("sigma", at), ratio, good, centre)
-
-
-def _tile_phases(
-    swept: SweptSet, plane: TilePlane, at: tuple[int, int]
-) -> tuple[F64, F64, NDArray[np.uint8]]:
-    """Unwrapped phases, weights (zero where masked) and flags of a tile."""
-    flags = swept.flags(at)
-    sigma = swept.map("sigma", at).astype(float)
-    phase = unwrapped_phase(swept.map("phase", at), plane)
-    good = (flags == 0) & np.isfinite(phase)
-    weight = np.where(good, 1 / np.where(good, sigma, 1.0) ** 2, 0.0)
-    return phase, weight, flags
-
-
-def _batch_phases(swept: SweptSet, at: tuple[int, int], n_batches: int) -> F64:
-    """Phases (batch, y, x) of the batches relative to the whole run; zero in gaps."""
-    if not n_batches:
-        return np.zeros((0, *swept.source.tile(at).shape))
-    y, x = swept.source.ranges(at)
-    phases = ArrayReader(swept.sweep / "batch_phase").read((0, n_batches), y, x)
-    return np.asarray(np.nan_to_num(phases.astype(float)))
-
-
-def _modes_task(
-    swept: SweptSet, basis: ModeBasis, n_batches: int, job: Job
-) -> tuple[F64, F64, float, int]:
-    at, plane = job
-    phase, weight, _ = _tile_phases(swept, plane, at)
-    modes, model = basis.on(plane, (phase.shape[0], phase.shape[1]))
-    phase = phase - model
-    maps = np.concatenate([phase[None], _batch_phases(swept, at, n_batches)])
-    normal, right = mode_sums(modes, weight, maps)
-    square = float((weight * np.where(weight > 0, phase, 0.0) ** 2).sum())
-    return normal, right, square, int((weight > 0).sum())
-
-
-def _create_outputs(folder: Path, source: ReducedSet, n_batches: int) -> dict[str, ArrayWriter]:
-    create_group(folder)
-    (cy, cx), shape = source.signal.chunks[1:], source.shape
-    units = {"delta": "pixel", "sigma": "pixel", "iota": "electron", "alpha": "electron"}
-    writers = {}
-    for name in ("delta", "sigma", "iota", "alpha", "chi2"):
-        writers[name] = create_array(
-            folder / name, shape, "<f4", dims=("y", "x"), chunks=(cy, cx), fill_value=np.nan,
-            attrs={"units": units.get(name, "1")},
-        )  # fmt: skip
-    writers["mask"] = create_array(folder / "mask", shape, "u1", dims=("y", "x"), chunks=(cy, cx))
-    for name in ("batch_delta", "batch_sigma") if n_batches else ():
-        writers[name] = create_array(
-            folder / name, (n_batches, *shape), "<f4", dims=("batch", "y", "x"),
-            chunks=(n_batches, cy, cx), fill_value=np.nan, attrs={"units": "pixel"},
-        )  # fmt: skip
-    return writers
-
-
-def _write_task(
-    swept: SweptSet, fitted: SetFit, writers: dict[str, ArrayWriter], job: Job
-) -> tuple[int, F32]:
-    """Write the maps of a tile; the number of its good pixels, and errors (px) of some of them."""
-    at, plane = job
-    phase, _, flags = _tile_phases(swept, plane, at)
-    modes, model = fitted.basis.on(plane, (phase.shape[0], phase.shape[1]))
-    ranges = swept.source.ranges(at)
-    start = (ranges[0][0], ranges[1][0])
-    bad = flags != 0
-    k = float(np.hypot(*fitted.basis.shape.vector(*plane.centre)))
-    scale = np.sqrt(swept.noise) / k
-    rest = phase - model - np.tensordot(fitted.coefficients[:, 0], modes, 1)
-
-    def write(name: str, values: F64 | F32) -> None:
-        begin = (0, *start) if values.ndim == 3 else start
-        writers[name].write(begin, np.where(bad, np.nan, values).astype(np.float32))
-
-    sigma = (swept.map("sigma", at) * scale).astype(np.float32)
-    told = int((~bad).sum()), _some(sigma[~bad])
-    write("delta", rest / k)
-    write("sigma", sigma)
-    for name in ("iota", "alpha", "chi2"):
-        writers[name].write(start, swept.map(name, at))
-    writers["mask"].write(start, flags)
-    if "batch_delta" not in writers:
-        return told
-    everything = (0, writers["batch_delta"].shape[0])
-    steps = ArrayReader(swept.sweep / "batch_phase").read(everything, *ranges)
-    removed = np.tensordot(fitted.coefficients[:, 1:].T, modes, 1)
-    write("batch_delta", (rest + steps - removed) / k)
-    errors = ArrayReader(swept.sweep / "batch_sigma").read(everything, *ranges)
-    write("batch_sigma", errors * scale)
-    return told

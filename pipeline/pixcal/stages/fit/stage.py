@@ -9,8 +9,8 @@ from pixcal.engine.run import Runtime
 from pixcal.estimators.models import fringe_models
 from pixcal.model.config import quantity
 from pixcal.stages.fit import sweep
-from pixcal.stages.fit.combination import combine
-from pixcal.stages.fit.fringe_set import fit_set
+from pixcal.stages.fit.fringe_set import describe, fit_set
+from pixcal.stages.fit.maps import write_maps
 from pixcal.stages.fit.products import publish, published
 from pixcal.stages.fit.sweep import load_run
 from pixcal.stages.reduced_set import ReducedSet
@@ -24,7 +24,6 @@ from pixcal.storage.artefact import (
     up_to_date,
     write_json,
 )
-from pixcal.storage.cube import create_group
 
 FORMAT = 1
 
@@ -58,7 +57,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """
     require(run_dir, "reduce", 1)
     with lock(run_dir):
-        swept = sweep.run(run_dir, sweep.Config(config.batch_frames), runtime)
+        swept = sweep.run(run_dir, sweep.Config(config.batch_frames, config.chi2_limit), runtime)
         inputs = {"sweep": swept.key}
         key = artefact_key("fit", FORMAT, asdict(config), inputs)
         if (ready := up_to_date(run_dir, "fit", key)) is not None:
@@ -75,29 +74,29 @@ def _fit_all(
     run_dir: Path, made: Build, swept: Manifest, config: Config, runtime: Runtime
 ) -> dict[str, Any]:
     acquisition, _ = load_run(run_dir)
-    create_group(made.folder / "fit.zarr")
-    shapes, sets = {}, {}
-    for fringe_set in acquisition.frames.fringes:
-        name = fringe_set.name
-        shapes[name], sets[name] = fit_set(
-            made.folder / "fit.zarr" / name,
-            run_dir / "sweep" / "sweep.zarr" / name,
-            ReducedSet(run_dir / "reduce" / "reduced.zarr" / name),
-            swept.summary["sets"][name],
+    fitted = [
+        fit_set(
+            run_dir / "sweep" / "sweep.zarr" / listed.name,
+            ReducedSet(run_dir / "reduce" / "reduced.zarr" / listed.name),
+            swept.summary["sets"][listed.name],
             acquisition,
-            name,
+            listed.name,
             config.model,
-            config.chi2_limit,
-            runtime,
         )
-    combined = combine(made.folder, run_dir, shapes, runtime)
+        for listed in acquisition.frames.fringes
+    ]
+    totals = write_maps(made.folder / "fit.zarr", fitted, runtime)
     result = {
         "schema": "pixcal/fit/1",
         "pixcal": __version__,
         "input": require(run_dir, "ingest", 1).key,
         "model": config.model,
-        "sets": sets,
-        **combined,
+        "sets": {
+            f.name: describe(f, totals.sets[f.name].masked, totals.sets[f.name].sigma_px)
+            for f in fitted
+        },
+        "outputs": list(totals.outputs),
+        "sets_chi2_reduced": totals.consistency,
     }
     write_json(made.folder / "fit.json", result)
     return result

@@ -1,0 +1,252 @@
+"""The maps of all sets and what they give together: one pass over the sweep's maps."""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.engine.plan import make_plan
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.combine import axes_span_plane, combine_parallel, combine_sets
+from pixcal.estimators.fringes import wrapped
+from pixcal.estimators.models import FringeShape
+from pixcal.estimators.tile_sums import local_modes
+from pixcal.stages.fit.fringe_set import FittedSet
+from pixcal.stages.fit.scouting import read_frames
+from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
+from pixcal.storage.links import link_files
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+SAME_AS_SWEPT = ("iota", "alpha", "chi2", "mask")
+"""Maps of a set that are those of its sweep."""
+TOLD = 4000
+"""Errors that a tile tells for the median of all."""
+
+
+@dataclass(frozen=True)
+class SetTotals:
+    """What is known of a set once its maps are written."""
+
+    masked: int
+    sigma_px: float
+
+
+@dataclass(frozen=True)
+class Totals:
+    """What is known once all maps are written.
+
+    Attributes
+    ----------
+    sets : dict
+        By name.
+    outputs : tuple of str
+        Maps that the sets give together.
+    consistency : float or None
+        Reduced chi-square of the sets' disagreement; None where they determine no more than that.
+    """
+
+    sets: dict[str, SetTotals]
+    outputs: tuple[str, ...]
+    consistency: float | None
+
+
+def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals:
+    """Write ``fit.zarr``: the maps of each set, and those that all sets give together.
+
+    Parameters
+    ----------
+    group : Path
+        ``fit.zarr``.
+    fitted : list of FittedSet
+        All of the same window.
+    runtime : Runtime
+    """
+    source = fitted[0].source
+    ny, nx = source.shape
+    both = axes_span_plane([axis(f.shape, ny / 2, nx / 2) for f in fitted])
+    outputs = outputs_of(both)
+    create_group(group)
+    writers = {f.name: _create_set(group / f.name, f) for f in fitted}
+    joint = _create_joint(group, fitted[0], outputs)
+    pixels = int(np.prod(source.signal.chunks[1:]))
+    most = max(f.n_batches for f in fitted)
+    plan = make_plan(
+        "the maps of the fit", pixels * (500 + 60 * len(fitted) + 40 * most), 0, runtime
+    )
+    removed = {f.name: f.fit.basis.removed(f.planes, f.fit.coefficients) for f in fitted}
+    # Each tile gets its own part of them: on a cluster they travel with it.
+    jobs = [
+        (at, {name: local[n] for name, local in removed.items()})
+        for n, at in enumerate(source.tiles())
+    ]
+    told = run_tasks(
+        partial(_tile_task, fitted, writers, joint, both),
+        jobs,
+        runtime.with_workers(plan.workers),
+        label="maps",
+    )
+    for writer in [*(w for own in writers.values() for w in own.values()), *joint.values()]:
+        writer.finish()
+    sets = {}
+    for n, f in enumerate(fitted):
+        good = sum(t.good[n] for t in told)
+        errors = np.concatenate([t.sigma[n] for t in told])
+        sets[f.name] = SetTotals(ny * nx - good, float(np.median(errors)))
+    freedom = sum(t.freedom for t in told)
+    square = sum(t.square for t in told)
+    return Totals(sets, outputs, square / freedom if freedom else None)
+
+
+@dataclass(frozen=True)
+class _Told:
+    """Of one tile: good pixels and some errors (px) of each set, and how the sets disagree."""
+
+    good: list[int]
+    sigma: list[F32]
+    square: float
+    freedom: int
+
+
+def _tile_task(
+    fitted: list[FittedSet],
+    writers: dict[str, dict[str, ArrayWriter]],
+    joint: dict[str, ArrayWriter],
+    both: bool,
+    job: tuple[tuple[int, int], dict[str, F64]],
+) -> _Told:
+    at, removed = job
+    y, x = fitted[0].source.ranges(at)
+    found = [_write_set(f, at, removed[f.name], writers[f.name]) for f in fitted]
+    delta, sigma = (np.stack([m[n] for m in found]).astype(float) for n in (0, 1))
+    masks = np.stack([m[2] for m in found])
+    # Hyperbolic fringes turn over the window: each tile has its own axes.
+    axes = [axis(f.shape, (y[0] + y[1] - 1) / 2, (x[0] + x[1] - 1) / 2) for f in fitted]
+    value, error, chi2 = (combine_sets if both else combine_parallel)(axes, delta, sigma)
+    value, error = (v.reshape(-1, *chi2.shape).astype(np.float32) for v in (value, error))
+    missing = ~np.isfinite(value).all(axis=0)
+    # A flag counts where it costs the pixel its value; a set that others replace does not.
+    flags = np.where(missing, np.bitwise_or.reduce(masks, axis=0), 0).astype(np.uint8)
+    start = (y[0], x[0])
+    for n, name in enumerate(
+        name for name in joint if name.startswith("delta") and "sigma" not in name
+    ):
+        joint[name].write(start, value[n])
+        joint[f"{name}_sigma"].write(start, error[n])
+    joint["mask"].write(start, flags)
+    freedom = np.isfinite(delta).sum(axis=0) - len(value)
+    goods = [np.isfinite(s) for s in sigma]
+    some = [_some(s[good].astype(np.float32)) for s, good in zip(sigma, goods, strict=True)]
+    return _Told(
+        [int(good.sum()) for good in goods],
+        some,
+        float(chi2[~missing].sum()),
+        int(freedom[~missing].sum()),
+    )
+
+
+def _write_set(
+    fitted: FittedSet, at: tuple[int, int], removed: F64, writers: dict[str, ArrayWriter]
+) -> tuple[F32, F32, NDArray[np.uint8]]:
+    """Write a set's own maps of a tile; its offsets and errors (px, NaN where masked), its mask."""
+    source = fitted.source
+    y, x = source.ranges(at)
+    plane = fitted.planes[at[0] * source.grid[1] + at[1]]
+    flags: NDArray[np.uint8] = ArrayReader(fitted.swept / "mask").read(y, x)
+    bad = flags != 0
+    phase = ArrayReader(fitted.swept / "phase").read(y, x)
+    shape = (phase.shape[0], phase.shape[1])
+    surfaces = (removed.T @ local_modes(fitted.carrier, plane, shape)).reshape(-1, *shape)
+    k = float(np.hypot(*fitted.shape.vector(*plane.centre)))
+    scale = np.float32(np.sqrt(fitted.noise) / k)
+    start = (y[0], x[0])
+    delta = ((wrapped(phase - plane.on(shape)) - surfaces[0]) / k).astype(np.float32)
+    sigma = np.asarray(ArrayReader(fitted.swept / "sigma").read(y, x) * scale)
+    delta[bad] = sigma[bad] = np.nan
+    writers["delta"].write(start, delta)
+    writers["sigma"].write(start, sigma)
+    if fitted.n_batches:
+        everything = (0, fitted.n_batches)
+        for name, array in (("batch_delta", "batch_phase"), ("batch_sigma", "batch_sigma")):
+            maps = ArrayReader(fitted.swept / array).read(everything, y, x)
+            if name == "batch_delta":
+                maps -= surfaces[1:].astype(np.float32)
+                maps *= np.float32(1 / k)
+                maps += delta
+            else:
+                maps *= scale
+            maps[:, bad] = np.nan
+            writers[name].write((0, *start), maps)
+    return delta, sigma, flags
+
+
+def _create_set(folder: Path, fitted: FittedSet) -> dict[str, ArrayWriter]:
+    """The set's folder: what is the sweep's is linked; writers of the rest."""
+    create_group(folder)
+    for name in SAME_AS_SWEPT:
+        link_files(fitted.swept / name, folder / name)
+    _write_frames(folder, fitted.swept)
+    (cy, cx), shape = fitted.source.signal.chunks[1:], fitted.source.shape
+    attrs = {"units": "pixel"}
+    writers = {
+        name: create_array(
+            folder / name, shape, "<f4", dims=("y", "x"), chunks=(cy, cx), fill_value=np.nan,
+            attrs=attrs,
+        )
+        for name in ("delta", "sigma")
+    }  # fmt: skip
+    n = fitted.n_batches
+    for name in ("batch_delta", "batch_sigma") if n else ():
+        writers[name] = create_array(
+            folder / name, (n, *shape), "<f4", dims=("batch", "y", "x"), chunks=(n, cy, cx),
+            fill_value=np.nan, attrs=attrs,
+        )  # fmt: skip
+    return writers
+
+
+def _create_joint(
+    group: Path, fitted: FittedSet, outputs: tuple[str, ...]
+) -> dict[str, ArrayWriter]:
+    (cy, cx), shape = fitted.source.signal.chunks[1:], fitted.source.shape
+    names = [array for name in outputs for array in (name, f"{name}_sigma")]
+    writers = {
+        name: create_array(
+            group / name, shape, "<f4", dims=("y", "x"), chunks=(cy, cx), fill_value=np.nan,
+            attrs={"units": "pixel"},
+        )
+        for name in names
+    }  # fmt: skip
+    writers["mask"] = create_array(group / "mask", shape, "u1", dims=("y", "x"), chunks=(cy, cx))
+    return writers
+
+
+def _write_frames(folder: Path, maps: Path) -> None:
+    """Parameters of every frame and the times of the batches, for those who read the fit."""
+    frames = read_frames(maps)
+    for array, data in (
+        ("B", frames.B), ("A", frames.A), ("phi", frames.phi), ("dkx", frames.dk[:, 0]),
+        ("dky", frames.dk[:, 1]), ("time", ArrayReader(maps / "time").read()),
+    ):  # fmt: skip
+        write_array(folder / array, data, dims=("time",))
+    for array in ("batch_time", "batch_count"):
+        write_array(folder / array, ArrayReader(maps / array).read(), dims=("batch",))
+
+
+def outputs_of(both: bool) -> tuple[str, ...]:
+    """Maps that sets give together, whose axes differ or not."""
+    return ("delta_x", "delta_y") if both else ("delta_fringe",)
+
+
+def _some(values: F32) -> F32:
+    """Every n-th of many values; a copy, lest they all stay in memory."""
+    return values[:: max(1, len(values) // TOLD)].copy()
+
+
+def axis(shape: FringeShape, y: float, x: float) -> tuple[float, float]:
+    """Unit vector (x, y) along which a set measures at a point."""
+    kx, ky = shape.vector(y, x)
+    k = float(np.hypot(kx, ky))
+    return kx / k, ky / k

@@ -1,0 +1,149 @@
+"""The scout's part of the sweep: frame parameters of a set, from a few tiles."""
+
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.engine.plan import make_plan
+from pixcal.engine.run import Runtime, one_blas_thread, run_tasks
+from pixcal.estimators.fringes import FrameParameters
+from pixcal.estimators.scout import Scout
+from pixcal.stages.reduced_set import ReducedSet
+from pixcal.storage.artefact import read_json, write_json
+from pixcal.storage.cube import ArrayReader, write_array
+
+SCOUT_SHARE = 0.01
+"""Share of the tiles that the scout reads (of large windows)."""
+SCOUT_TILES = 5
+"""Tiles that the scout reads where they can be kept in memory."""
+CACHE_BYTES = 384 << 20
+"""Memory for the scout's tiles; fixed, so that results do not depend on ``--memory``."""
+PRIME_BYTES = 96 << 20
+"""Memory for the codes of the scout's first look."""
+LOOKS = 16
+"""Chunks along time that the first look takes frames from: one may hold little of a slow scan."""
+
+
+@dataclass(frozen=True)
+class Lookout:
+    """Where the scout looks, and whether what it reads is kept for the sweep."""
+
+    source: ReducedSet
+    places: list[tuple[int, int]]
+    keep: bool
+
+    def codes(self, block: int) -> list[NDArray[np.uint16]]:
+        """Codes (t, y, x) of a block of frames, for each place."""
+        return [self.source.codes(at, block, keep=self.keep) for at in self.places]
+
+
+def scout_tiles(grid: tuple[int, int], number: int) -> list[tuple[int, int]]:
+    """Tiles spread over the window: the central one, then each time the one farthest from all."""
+    tiles = np.array(list(product(range(grid[0]), range(grid[1]))), dtype=float)
+    middle = (np.array(grid) - 1) / 2
+    chosen = [int(np.argmin(((tiles - middle) ** 2).sum(axis=1)))]
+    distance = ((tiles - tiles[chosen[0]]) ** 2).sum(axis=1)
+    while len(chosen) < min(number, len(tiles)):
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, ((tiles - tiles[chosen[-1]]) ** 2).sum(axis=1))
+    return [(int(tiles[n][0]), int(tiles[n][1])) for n in chosen]
+
+
+def scout_set(
+    source: ReducedSet, nominal: tuple[float, float], folder: Path, runtime: Runtime, name: str
+) -> None:
+    """Find the frame parameters of a set and write them, and ``scout.json`` last.
+
+    Parameters
+    ----------
+    source : ReducedSet
+    nominal : (float, float)
+        Nominal fringe vector (kx, ky), rad/px.
+    folder : Path
+        ``sweep.zarr/<set name>``.
+    runtime : Runtime
+    name : str
+        Of the set.
+
+    Raises
+    ------
+    InputError
+        If the set has too few frames or good pixels, or no fringes that can be fitted.
+    """
+    n_tiles = source.grid[0] * source.grid[1]
+    chunk_bytes = int(np.prod(source.signal.chunks)) * source.signal.dtype.itemsize
+    tile_bytes = source.n_blocks * chunk_bytes
+    number = max(1, round(SCOUT_SHARE * n_tiles), min(SCOUT_TILES, CACHE_BYTES // tile_bytes))
+    places = scout_tiles(source.grid, number)
+    keep = len(places) * tile_bytes <= CACHE_BYTES
+    tiles = [source.tile(at) for at in places]
+    # The first tile must show fringes: one with few good pixels is a bad place to look.
+    order = sorted(range(len(tiles)), key=lambda n: -int(tiles[n].good.sum() > 100))
+    places, tiles = [places[n] for n in order], [tiles[n] for n in order]
+    ny, nx = source.shape
+    scout = Scout(tiles, source.coding, nominal, ((ny - 1) / 2, (nx - 1) / 2))
+    lookout = Lookout(source, places, keep)
+
+    # The chunks kept; the first look's codes, copies of a tile's share, and its Gram matrix.
+    kept = len(places) * tile_bytes if keep else 0
+    make_plan(f"the scout of {name}", 3 * PRIME_BYTES, kept, runtime.with_workers(1))
+    first = _first_look(source, PRIME_BYTES // (len(places) * chunk_bytes))
+    looks = [[codes[some] for codes in lookout.codes(n)] for n, some in first]
+    with one_blas_thread():
+        scout.prime([np.concatenate(tile) for tile in zip(*looks, strict=True)])
+    del looks
+    # A chunk of each place and what its solution takes.
+    plan = make_plan(f"the scout of {name}", 3 * len(places) * chunk_bytes, kept, runtime)
+    parts = run_tasks(
+        partial(_solve_block, lookout, scout),
+        range(source.n_blocks),
+        runtime.with_workers(plan.workers),
+        label=f"scout {name}",
+    )
+    g = np.concatenate([p.g for p in parts])
+    dk = np.concatenate([p.dk for p in parts])
+    for array, data in (("g", g), ("dk", dk), ("time", source.time_s())):
+        dims = ("time", "component")[: data.ndim]
+        write_array(folder / array, data, dims=dims)
+    again = 0 if keep else len(places) * (source.n_blocks + len(first))
+    facts: dict[str, Any] = {
+        "k": [float(v) for v in scout.k],
+        "nominal_k": list(nominal),
+        "reference": list(scout.reference),
+        "moving": bool(scout.moving),
+        "moving_significance": scout.moving_significance,
+        "noise": scout.noise,
+        "scout_tiles": len(places),
+        "chunks_read": len(places) * source.n_blocks if keep else again,
+    }
+    write_json(folder / "scout.json", facts)
+
+
+def _solve_block(lookout: Lookout, scout: Scout, block: int) -> FrameParameters:
+    return scout.solve(lookout.codes(block))
+
+
+def _first_look(source: ReducedSet, blocks: int) -> list[tuple[int, NDArray[np.intp]]]:
+    """Blocks spread over the run and frames of each, as many in all as in ``blocks`` whole ones."""
+    wanted = min(source.n_blocks, max(blocks, LOOKS))
+    each = max(1, source.block * max(1, min(blocks, wanted)) // wanted)
+    # At random: frames at even steps may have the same phase again and again.
+    rng = np.random.default_rng(0)
+    looks = []
+    for n in np.linspace(0, source.n_blocks - 1, wanted).astype(int):
+        frames = rng.permutation(min(source.block, source.n_frames - n * source.block))
+        looks.append((int(n), np.sort(frames[:each])))
+    return looks
+
+
+def read_frames(folder: Path) -> FrameParameters:
+    """Frame parameters that the scout left in ``sweep.zarr/<set name>``."""
+    y, x = read_json(folder / "scout.json")["reference"]
+    return FrameParameters(
+        ArrayReader(folder / "g").read(), ArrayReader(folder / "dk").read(), (float(y), float(x))
+    )
