@@ -1,0 +1,65 @@
+"""The advanced iterative algorithm (AIA) in NumPy, for frames shifted at random.
+
+Wang and Han 2004, Opt. Lett. 29, 1671. Two linear fits in turn: with the frames' phases known, each
+pixel gives its phase, and a background and modulation taken as the same in all frames; with the
+pixels' phases known, each frame gives its phase, and a background and modulation taken as the same
+in all pixels. They end when the frames' phases, relative to the first frame's, stand still.
+
+What it takes for granted: uniform light and response in the one step, a steady laser in the other,
+one fringe vector for all frames. All samples weigh the same. The algorithm starts from guessed
+shifts of the frames; nothing is known of them here, but the nominal fringes are, so the frames come
+first.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+TOLERANCE_RAD = 1e-4
+"""The phases stand still when none moves by more."""
+
+MAX_ITERATIONS = 50
+
+
+def fit_phases(
+    cube: F64,
+    vector: tuple[float, float],
+    *,
+    tolerance_rad: float = TOLERANCE_RAD,
+    max_iterations: int = MAX_ITERATIONS,
+) -> F64:
+    """Phase of every pixel; that of the last iteration where the frames' never stand still.
+
+    Parameters
+    ----------
+    cube : (t, y, x) float64
+        Frames, e-.
+    vector : (float, float)
+        Nominal fringe vector (kx, ky), rad/px.
+    tolerance_rad : float
+    max_iterations : int
+
+    Returns
+    -------
+    (y, x) float64
+        psi of ``a + b cos(psi + phi)``, rad, in ±pi.
+    """
+    frames = cube.reshape(len(cube), -1)
+    y, x = np.indices(cube.shape[1:])
+    psi = (vector[0] * x + vector[1] * y).ravel()
+    shifts = _phases(frames.T, psi)
+    for _ in range(max_iterations):
+        psi = _phases(frames, shifts)
+        before, shifts = shifts, _phases(frames.T, psi)
+        moved = np.angle(np.exp(1j * ((shifts - shifts[0]) - (before - before[0]))))
+        if np.abs(moved).max() < tolerance_rad:
+            break
+    return psi.reshape(cube.shape[1:])
+
+
+def _phases(samples: F64, known: F64) -> F64:
+    """u (n,) of ``a + b cos(known + u)``, from samples (m, n) and the known phases (m,)."""
+    basis = np.stack([np.ones_like(known), np.cos(known), np.sin(known)], axis=1)
+    _, c, s = np.linalg.pinv(basis) @ samples
+    return np.asarray(np.arctan2(-s, c))

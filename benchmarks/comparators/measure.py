@@ -1,0 +1,174 @@
+"""One method on one reduced cube, in a process of its own: ``python -m comparators.measure``.
+
+Prints what it cost as JSON, and leaves its map of phases in a file where the run's products do not
+have it.
+"""
+
+import argparse
+import json
+import re
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import NDArray
+
+from comparators import advanced_iterative, alternating, curve_fit
+from pixcal.engine.run import Runtime
+from pixcal.stages import fit
+
+F64 = NDArray[np.float64]
+
+PIXCAL = "pixcal fit"
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a method is given.
+
+    Attributes
+    ----------
+    run : Path
+        A run that has been reduced.
+    name : str
+        Of the fringe set.
+    vector : (float, float)
+        Nominal fringe vector, rad/px.
+    read_noise : float
+        e- rms.
+    pixels : int
+        How many pixels are fitted by the method that takes them one by one.
+    """
+
+    run: Path
+    name: str
+    vector: tuple[float, float]
+    read_noise: float
+    pixels: int
+
+
+@dataclass(frozen=True)
+class Result:
+    """One go of a method.
+
+    Attributes
+    ----------
+    seconds : float
+        From the reduced cube on disk to the phases of all pixels.
+    reading : float
+        Of it, until all frames are in memory as float64; 0 where a method reads as it goes.
+    phase : (y, x) float64, optional
+        rad, NaN where not fitted; None where the run's products have the map.
+    """
+
+    seconds: float
+    reading: float
+    phase: F64 | None
+
+
+def read_cube(task: Task) -> F64:
+    """Frames (t, y, x) in electrons, as a user of zarr reads them.
+
+    Raises
+    ------
+    ValueError
+        If samples are missing, which the comparators know nothing of.
+    """
+    stored = zarr.open_array(task.run / "reduce" / "reduced.zarr" / task.name / "signal", mode="r")
+    codes, attrs = np.asarray(stored[:]), dict[str, Any](stored.attrs)
+    if (codes == attrs["_FillValue"]).any():
+        raise ValueError(f"{task.run}: samples are missing; take a bench that never saturates")
+    cube: F64 = np.multiply(codes, attrs["scale_factor"], dtype=np.float64)
+    cube += attrs["add_offset"]
+    return cube
+
+
+def whole(fit_phases: Callable[[F64, tuple[float, float]], F64], task: Task) -> Result:
+    """A method that takes all pixels at once."""
+    begin = time.perf_counter()
+    cube = read_cube(task)
+    reading = time.perf_counter() - begin
+    phase = fit_phases(cube, task.vector)
+    return Result(time.perf_counter() - begin, reading, phase)
+
+
+def pixel_by_pixel(task: Task) -> Result:
+    """``curve_fit`` on some pixels; the time that they took is scaled to all."""
+    begin = time.perf_counter()
+    cube = read_cube(task)
+    reading = time.perf_counter() - begin
+    frames = curve_fit.demodulate(cube, task.vector)
+    ready = time.perf_counter() - begin
+    chosen = np.zeros(cube.shape[1:], bool)
+    rng = np.random.default_rng(0)
+    chosen.flat[rng.choice(chosen.size, min(task.pixels, chosen.size), replace=False)] = True
+    phase = curve_fit.fit_phases(cube, task.vector, frames, chosen, task.read_noise)
+    fitting = time.perf_counter() - begin - ready
+    return Result(ready + fitting * chosen.size / chosen.sum(), reading, phase)
+
+
+def pixcal(task: Task) -> Result:
+    """``pixcal fit`` with its defaults, Allan batches and products included."""
+    for stage in ("sweep", "fit"):
+        shutil.rmtree(task.run / stage, ignore_errors=True)
+    begin = time.perf_counter()
+    fit.run(task.run, fit.Config(), Runtime())
+    return Result(time.perf_counter() - begin, 0.0, None)
+
+
+METHODS: dict[str, Callable[[Task], Result]] = {
+    PIXCAL: pixcal,
+    "alternating, A and B constant": partial(whole, partial(alternating.fit_phases, constant=True)),
+    "alternating, A and B free": partial(whole, partial(alternating.fit_phases, constant=False)),
+    "advanced iterative": partial(whole, advanced_iterative.fit_phases),
+    "curve_fit per pixel": pixel_by_pixel,
+}
+
+
+def memory(field: str) -> int:
+    """Bytes of memory of this process: ``VmRSS`` now, ``VmHWM`` at most.
+
+    Not ru_maxrss, which begins at the peak of the process that started this one.
+    """
+    (kibibytes,) = re.findall(rf"{field}:\s+(\d+)", Path("/proc/self/status").read_text())
+    return int(kibibytes) * 1024
+
+
+def main() -> None:
+    """Run a method once for its memory and to warm up, then as often as asked for its time."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("method", choices=METHODS)
+    parser.add_argument("run", type=Path)
+    parser.add_argument("name")
+    parser.add_argument("--vector", type=float, nargs=2, required=True)
+    parser.add_argument("--read-noise", type=float, required=True)
+    parser.add_argument("--pixels", type=int, required=True)
+    parser.add_argument("--repeat", type=int, required=True)
+    parser.add_argument("--phase", type=Path, required=True, help="file for the map, .npy")
+    options = parser.parse_args()
+    method, vector = METHODS[options.method], (options.vector[0], options.vector[1])
+    task = Task(options.run, options.name, vector, options.read_noise, options.pixels)
+    start = memory("VmRSS")
+    first = method(task)
+    peak = memory("VmHWM")
+    best = min((method(task) for _ in range(options.repeat)), key=lambda result: result.seconds)
+    if first.phase is not None:
+        np.save(options.phase, first.phase)
+    cost = {
+        "seconds": best.seconds,
+        "reading_seconds": best.reading,
+        "first_seconds": first.seconds,
+        "memory_bytes": peak - start,
+        "imports_bytes": start,
+    }
+    print(json.dumps(cost))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,170 @@
+"""``pixcal fit`` beside what a user would do instead, on the same data: ``make bench``.
+
+One fringe set is simulated three times over: as the simplest simulation has it, with a laser and
+pixels as they are, and with fringes that move. Each is ingested and reduced once; each method then
+fits the same reduced cube, warm, in a process of its own. The errors are those of the phases
+against the simulated truth, over the Cramér-Rao bound for the same frames. The others take the
+fringes as straight: from some 400 pixels on (``--size``), their curvature adds to the errors.
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from comparators.measure import METHODS, PIXCAL
+from pixcal.engine.run import Runtime
+from pixcal.stages import ingest, reduce, simulate
+from pixcal.storage.products import read_map
+from truth import PLANE, Truth
+
+HERE = Path(__file__).parent
+NAME = "vertical"
+MOVING = {"visibility_jitter_rms": 0.03, "vector_jitter_rad": 0.01}
+SCENARIOS: dict[str, tuple[dict[str, float], dict[str, float], dict[str, float]]] = {
+    "steady laser, even light, equal pixels": (
+        {"prnu_rms": 0.0},
+        {"laser_noise_rms": 0.0, "beam_radius_mm": 1e5},
+        {},
+    ),
+    "laser noise 2 %, pixels unequal by 1 %": ({}, {}, {}),
+    "the same, visibility changing by 3 %, fringes tilting by 1e-2 rad across": ({}, {}, MOVING),
+}
+"""What each changes in the bench: detector, optics, fringe set."""
+
+NOTES = """\
+time: from the reduced cube on disk, warm, to the phases of all pixels; the fastest of {repeat} goes
+  after a first one, which loads compiled code (pixcal's took {first:.1f} s). read: of it, until the
+  frames are float64 in memory; pixcal decodes as it goes. GB/s: of 16-bit samples. Part of pixcal's
+  time, that of its scout, does not grow with the window.
+  curve_fit was run on {pixels} pixels, on one core, and that time is scaled to all pixels.
+memory: at most, above the {imports:.0f} MiB of an interpreter with all imports. The others hold the
+  cube and more, {others:.1f} bytes a sample: at 8320 x 5456 pixels x 10,000 frames {tera:.1f} TB.
+error: rms over the bound, less the seven modes that such data leave open; good to {chance:.1%}
+  ({chance_pixels:.1%} for curve_fit). as given: less piston and slopes only, so that fringes in the
+  map count as errors (pixcal's own map lacks four fringe modes of the true one)."""
+
+
+def bench(folder: Path, scenario: str, size: int, frames: int) -> Path:
+    """Bench file of a scenario on a square window."""
+    config = yaml.safe_load((HERE.parent / "configs" / "precision.yaml").read_text())
+    detector, optics, fringes = SCENARIOS[scenario]
+    config["detector"] |= {"shape": [size, size], **detector}
+    config["optics"] |= {"visibility": 0.95, **optics}
+    config["frames"]["fringes"][0] |= {"count": frames, **fringes}
+    path = folder / "bench.yaml"
+    path.write_text(yaml.safe_dump(config))
+    return path
+
+
+def nominal_vector(config: dict[str, Any]) -> tuple[float, float]:
+    """Fringe vector that an acquisition declares, rad/px (paper, equation 4)."""
+    optics, (scan,) = config["optics"], config["frames"]["fringes"]
+    wavelength, pitch = optics["wavelength_nm"] * 1e-6, config["detector"]["pitch_um"] * 1e-3
+    scale = 2 * np.pi * pitch / (wavelength * optics["distance_mm"])
+    return float(scale * scan["baseline_mm"][0]), float(scale * scan["baseline_mm"][1])
+
+
+def measure(
+    method: str, folder: Path, truth: Truth, options: argparse.Namespace
+) -> dict[str, float]:
+    """What a method costs, in a process of its own, and how far it is from the truth."""
+    config = yaml.safe_load((folder / "acq" / "acquisition.yaml").read_text())
+    phase = folder / f"{method}.npy"
+    command = [sys.executable, "-m", "comparators.measure", method, str(folder / "run"), NAME]
+    command += ["--vector", *(str(k) for k in nominal_vector(config))]
+    command += ["--read-noise", str(config["detector"]["read_noise_e"])]
+    command += ["--pixels", str(options.pixels), "--repeat", str(options.repeat)]
+    command += ["--phase", str(phase)]
+    done = subprocess.run(command, cwd=HERE, check=True, stdout=subprocess.PIPE, text=True)
+    cost: dict[str, float] = json.loads(done.stdout)
+    if phase.exists():
+        offsets = truth.offsets(np.load(phase))
+    else:
+        offsets = read_map(folder / "run" / "products" / "delta_fringe.fits")[0].astype(float)
+    return cost | {
+        "pixels": int(np.isfinite(offsets).sum()),
+        "error_over_bound": truth.error(offsets) / truth.bound,
+        "error_as_given_over_bound": truth.error(offsets, PLANE) / truth.bound,
+    }
+
+
+def compare(scenario: str, options: argparse.Namespace) -> dict[str, Any]:
+    """All methods on one scenario: the bound in px, and what each costs and achieves."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder, runtime = Path(scratch), Runtime()
+        source = bench(folder, scenario, options.size, options.frames)
+        simulate.run(source, folder / "acq", simulate.Config(), runtime)
+        ingest.run(folder / "acq", folder / "run", ingest.Config(), runtime)
+        reduce.run(folder / "run", reduce.Config(), runtime)
+        truth = Truth.read(folder / "acq-truth", NAME)
+        rows = {method: measure(method, folder, truth, options) for method in METHODS}
+    return {"bound_px": truth.bound, "methods": rows}
+
+
+def table(found: dict[str, Any], samples: int) -> str:
+    """The methods of a scenario as lines of text."""
+    rows = found["methods"]
+    reference = rows[PIXCAL]["seconds"]
+    lines = [
+        f"{'':31}{'time':>9}{'read':>8}{'times':>9}{'':>8}{'memory':>9}{'error':>8}{'as':>8}",
+        f"{'':31}{'s':>9}{'s':>8}{'pixcal':>9}{'GB/s':>8}{'MiB':>9}{'/bound':>8}{'given':>8}",
+    ]
+    for method, row in rows.items():
+        seconds = row["seconds"]
+        lines.append(
+            f"{method:31}{seconds:9.2f}{row['reading_seconds']:8.2f}{seconds / reference:9.2f}"
+            f"{2e-9 * samples / seconds:8.3f}{row['memory_bytes'] / 2**20:9.0f}"
+            f"{row['error_over_bound']:8.3f}{row['error_as_given_over_bound']:8.2f}"
+        )
+    return "\n".join(lines)
+
+
+def notes(results: dict[str, Any], samples: int, repeat: int) -> str:
+    """What the columns mean, and what follows from them by arithmetic."""
+    rows = [found["methods"] for found in results.values()]
+    each = min(r["memory_bytes"] for m in rows for name, r in m.items() if name != PIXCAL) / samples
+    fewest = min(r["pixels"] for m in rows for r in m.values())
+    return NOTES.format(
+        repeat=repeat,
+        first=max(m[PIXCAL]["first_seconds"] for m in rows),
+        pixels=fewest,
+        imports=max(r["imports_bytes"] for m in rows for r in m.values()) / 2**20,
+        others=each,
+        tera=each * 8320 * 5456 * 10_000 * 1e-12,
+        chance=rows[0][PIXCAL]["pixels"] ** -0.5 * 0.5**0.5,
+        chance_pixels=fewest**-0.5 * 0.5**0.5,
+    )
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", type=int, default=256, help="pixels along each side")
+    parser.add_argument("--frames", type=int, default=600)
+    parser.add_argument("--pixels", type=int, default=500, help="pixels that curve_fit is run on")
+    parser.add_argument("--repeat", type=int, default=2, help="goes, of which the fastest counts")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
+    options = parser.parse_args()
+    samples = options.size**2 * options.frames
+    print(
+        f"pixcal fit and others, {options.size} x {options.size} pixels x {options.frames} frames"
+    )
+    results = {}
+    for scenario in SCENARIOS:
+        results[scenario] = compare(scenario, options)
+        print(f"\n{scenario}; bound {results[scenario]['bound_px']:.3e} px")
+        print(table(results[scenario], samples), flush=True)
+    print(f"\n{notes(results, samples, options.repeat)}")
+    if options.json:
+        options.json.write_text(json.dumps({"samples": samples, "scenarios": results}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
