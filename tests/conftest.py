@@ -1,6 +1,9 @@
 """A bench that shares no code with pixcal: plain NumPy and astropy, in the contract's format."""
 
-from collections.abc import Callable
+import itertools
+import logging
+import os
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -247,3 +250,64 @@ def _reduced_run(bench: Bench, run: Path) -> Path:
                 data = np.broadcast_to(value, bench.shape).astype(dtype)
                 write_array(group / array, data, dims=("y", "x"), chunks=(128, 128))
     return run
+
+
+class Bucket:
+    """A bucket of an object store, looked at without the libraries that pixcal uses for it."""
+
+    def __init__(self, endpoint: str, name: str) -> None:
+        import boto3
+
+        self.name, self.url = name, f"s3://{name}"
+        self.client: Any = boto3.client("s3", endpoint_url=endpoint)
+        self.client.create_bucket(Bucket=name)
+
+    def keys(self) -> list[str]:
+        pages = self.client.get_paginator("list_objects_v2").paginate(Bucket=self.name)
+        return [found["Key"] for page in pages for found in page.get("Contents", [])]
+
+    def get(self, key: str) -> bytes:
+        content: bytes = self.client.get_object(Bucket=self.name, Key=key)["Body"].read()
+        return content
+
+    def put(self, key: str, content: bytes) -> None:
+        self.client.put_object(Bucket=self.name, Key=key, Body=content)
+
+    def delete(self, key: str) -> None:
+        self.client.delete_object(Bucket=self.name, Key=key)
+
+    def tree(self, prefix: str) -> dict[str, bytes]:
+        """Contents below a prefix, by their names from there on."""
+        return {k[len(prefix) :]: self.get(k) for k in self.keys() if k.startswith(prefix)}
+
+
+@pytest.fixture(scope="session")
+def s3_endpoint() -> Iterator[str]:
+    """A stand-in of S3 on this machine, and the environment that leads there."""
+    from moto.server import ThreadedMotoServer
+
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
+    server.start()
+    host, port = server.get_host_and_port()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ENDPOINT_URL", f"http://{host}:{port}")
+        patch.setenv("AWS_ACCESS_KEY_ID", "test")
+        patch.setenv("AWS_SECRET_ACCESS_KEY", "test")
+        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+        patch.setenv("AWS_CONFIG_FILE", os.devnull)
+        yield f"http://{host}:{port}"
+    server.stop()
+
+
+@pytest.fixture(scope="session")
+def make_bucket(s3_endpoint: str) -> Callable[[], Bucket]:
+    """Make a bucket, for fixtures that live longer than a test."""
+    numbers = itertools.count()
+    return lambda: Bucket(s3_endpoint, f"bucket-{next(numbers)}")
+
+
+@pytest.fixture
+def bucket(make_bucket: Callable[[], Bucket]) -> Bucket:
+    """A new bucket."""
+    return make_bucket()

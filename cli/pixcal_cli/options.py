@@ -54,6 +54,12 @@ out_run_option = click.option(
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace what was ingested from another acquisition."
 )
+cubes_option = click.option(
+    "--cubes",
+    metavar="PLACE",
+    help="Folder or URL (s3://bucket/prefix) for the large cubes; RUN to keep them there. "
+    "[default: as before, or as in ingest; else RUN]",
+)
 gain_option = click.option(
     "--gain",
     type=click.Choice(["declared", "measured"]),

@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from pixcal.storage.artefact import MANIFEST, read_json
+from pixcal.storage.cube_place import cubes_of
 
 
 @contextmanager
@@ -19,6 +20,8 @@ def announce(stage: str, folder: Path) -> Iterator[None]:
     yield
     state = "up to date" if before is not None and before == _made_at(folder) else "written"
     click.echo(f"{stage}: {folder} ({state})")
+    if (place := cubes_of(folder)) != folder:
+        click.echo(f"  cubes: {place}")
 
 
 def _made_at(folder: Path) -> int | None:
@@ -33,7 +36,7 @@ def show_simulate(acquisition: Path) -> None:
     """Print how many files of each kind there are."""
     files = read_json(acquisition / MANIFEST)["summary"]["files"]
     folders = Counter(name.partition("/")[0] for name in files if "/" in name)
-    _table(("folder", "files"), list(folders.items()))
+    show_table(("folder", "files"), list(folders.items()))
 
 
 def show_ingest(run: Path) -> None:
@@ -43,8 +46,8 @@ def show_ingest(run: Path) -> None:
         (name, found["shape"][0], f"{found['shape'][2]} × {found['shape'][1]}", found["dtype"])
         for name, found in summary["arrays"].items()
     ]
-    _table(("array", "frames", "x × y", "type"), rows)
-    _notes(summary["warnings"])
+    show_table(("array", "frames", "x × y", "type"), rows)
+    show_notes(summary["warnings"])
 
 
 def show_reduce(run: Path) -> None:
@@ -54,15 +57,15 @@ def show_reduce(run: Path) -> None:
         (
             label,
             _number(facts[key]["declared"]),
-            _with_error(facts[key]["measured"], facts[key]["error"]),
+            with_error(facts[key]["measured"], facts[key]["error"]),
             _number(facts[key]["used"]),
         )
         for label, key in (("gain e-/ADU", "gain_e_per_adu"), ("read noise e-", "read_noise_e"))
     ]
-    _table(("quantity", "declared", "measured", "used"), rows)
+    show_table(("quantity", "declared", "measured", "used"), rows)
     counts = ", ".join(f"{count} {flag}" for flag, count in facts["flags"].items() if count)
     click.echo(f"  pixels: {counts}")
-    _notes(facts["warnings"])
+    show_notes(facts["warnings"])
 
 
 def show_fit(run: Path) -> None:
@@ -90,7 +93,7 @@ def show_fit(run: Path) -> None:
         "sigma/bound",
         "chi2",
     ]
-    _table(header, rows)
+    show_table(header, rows)
 
 
 def show_allan(run: Path) -> None:
@@ -100,8 +103,8 @@ def show_allan(run: Path) -> None:
         for region, curve in ({"all": found} | found["regions"]).items():
             rows.append((name, region, *_allan_row(curve)))
         notes += [f"{name}: {sentence}" for sentence in found["warnings"]]
-    _table(("set", "region", "slope", "knee", "frames", "deviation px", "if white px"), rows)
-    _notes(notes)
+    show_table(("set", "region", "slope", "knee", "frames", "deviation px", "if white px"), rows)
+    show_notes(notes)
 
 
 def _allan_row(curve: Mapping[str, Any]) -> tuple[str, ...]:
@@ -110,10 +113,10 @@ def _allan_row(curve: Mapping[str, Any]) -> tuple[str, ...]:
         return ("-",) * 5
     knee = curve["knee_frames"]
     return (
-        _with_error(curve["slope"], curve["slope_err"]),
+        with_error(curve["slope"], curve["slope_err"]),
         "none" if knee is None else f"{_number(knee)} frames",
         str(curve["frames"][-1]),
-        _with_error(curve["adev_px"][-1], curve["adev_err_px"][-1]),
+        with_error(curve["adev_px"][-1], curve["adev_err_px"][-1]),
         _number(curve["white_expected_px"][-1], 3),
     )
 
@@ -144,7 +147,7 @@ def _number(value: float | None, digits: int = 4) -> str:
     return "-" if value is None else f"{value:.{digits}g}"
 
 
-def _with_error(value: float | None, error: float | None) -> str:
+def with_error(value: float | None, error: float | None) -> str:
     """The value rounded to two digits of its error."""
     if value is None or not error:
         return _number(value)
@@ -152,7 +155,8 @@ def _with_error(value: float | None, error: float | None) -> str:
     return f"{value:.{decimals}f} ± {error:.{decimals}f}"
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+def show_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print columns below their titles."""
     cells = [header, *([_text(value) for value in row] for row in rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     for row in cells:
@@ -160,7 +164,8 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
         click.echo(f"  {line.rstrip()}")
 
 
-def _notes(sentences: Sequence[str]) -> None:
+def show_notes(sentences: Sequence[str]) -> None:
+    """Print what a reader should know, a line each."""
     for sentence in sentences:
         click.echo(f"  note: {sentence}")
 

@@ -9,6 +9,7 @@ from pixcal.model.acquisition import load_acquisition
 from pixcal_cli import results
 from pixcal_cli.options import (
     acquisition_argument,
+    cubes_option,
     examples,
     gain_option,
     model_option,
@@ -27,18 +28,25 @@ if TYPE_CHECKING:
 @overwrite_option
 @gain_option
 @model_option
+@cubes_option
 @runtime_options
 def run(
-    acquisition: Path, run: Path, overwrite: bool, gain: str, model: str, runtime: "Runtime"
+    acquisition: Path,
+    run: Path,
+    overwrite: bool,
+    gain: str,
+    model: str,
+    cubes: str | None,
+    runtime: "Runtime",
 ) -> None:
     """Do all steps, from the acquisition ACQ to the report under RUN."""
     # Here, not at the top: for a fast `pixcal --help`.
     from pixcal.stages import allan, fit, ingest, reduce, report
 
     with results.announce("ingest", run / "ingest"):
-        ingest.run(acquisition, run, ingest.Config(overwrite=overwrite), runtime)
+        ingest.run(acquisition, run, ingest.Config(overwrite=overwrite, cubes=cubes), runtime)
     with results.announce("reduce", run / "reduce"):
-        reduce.run(run, reduce.Config(gain=gain), runtime)
+        reduce.run(run, reduce.Config(gain=gain, cubes=cubes), runtime)
     fringes = bool(load_acquisition(acquisition).frames.fringes)
     if fringes:
         with results.announce("fit", run / "fit"):

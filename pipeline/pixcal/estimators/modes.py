@@ -88,7 +88,7 @@ class ModeBasis:
         modes, phase = self._local(planes)
         removed = np.einsum("tmi,mb->tib", modes, coefficients)
         removed[:, :, 0] += phase
-        return removed
+        return np.asarray(removed)
 
     def solve(self, normal: F64, right: F64, spread: float) -> F64:
         """Coefficients (mode, n) of maps from their sums, with what the shape knows beforehand.

@@ -175,14 +175,15 @@ class FringeSums:
     def finish(self) -> tuple[F64, F64, F64, F64]:
         """As in `PixelSums`."""
         self._end_part()
+        psi = self.psi.astype(float)
         frame_sums = np.sum([self.moments.sums(part) for part in self.parts], axis=0)
-        normal = normal_matrices(frame_sums, self.series, self.psi) - self.total_lost[:6]
+        normal = normal_matrices(frame_sums, self.series, psi) - self.total_lost[:6]
         count = len(self.moments.g) - self.total_lost[6]
         step, inverse, square = solve_pixels(np.concatenate([normal, self.total]))
         theta = self.level * np.stack([np.ones_like(self.s), self.s, self.c]) + step
         # The samples' variance is scale * (1 / w + excess): what exceeds the weights' own goes
         # through the estimate as it is, N^-1 (N + excess N2) N^-1.
-        squared = normal_matrices(frame_sums, self.weights.series(2), self.psi)
+        squared = normal_matrices(frame_sums, self.weights.series(2), psi)
         variance = phase_variance(theta, inverse) + self.excess * phase_variance(
             theta, inverse, squared
         )

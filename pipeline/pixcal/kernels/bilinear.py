@@ -305,7 +305,7 @@ def _holds(codes: Any, fill: int) -> bool:
     flat = codes.reshape(-1)
     for i in range(flat.size):
         found |= flat[i] == fill
-    return found
+    return bool(found)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -376,7 +376,7 @@ def fringe_block(
         for k in range(4):
             for i in range(stop - first):
                 sums[k, first + i] += p[k][i]
-    return filled
+    return bool(filled)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -482,7 +482,7 @@ def _angle(y: float, x: float) -> float:
         q = y / x
         q2 = q * q
         return float(q * (1 - q2 * (1 / 3 - q2 * (1 / 5 - q2 * (1 / 7 - q2 / 9)))))
-    return np.arctan2(y, x)
+    return float(np.arctan2(y, x))
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

@@ -15,3 +15,11 @@ class DamagedError(InputError):
 
 class PlanError(InputError):
     """The work does not fit the memory allowed; the message holds both numbers."""
+
+
+class RemoteError(InputError):
+    """A place at a URL cannot be used, or not now; what was written there is not in doubt."""
+
+
+class ClusterError(PixcalError):
+    """Workers or their scheduler were lost; what was done is kept (exit code 1)."""

@@ -11,7 +11,7 @@ from pixcal.estimators.fringes import grid
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
-from pixcal.stages.fit.sweep import read_frames
+from pixcal.stages.fit.scouting import read_frames
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json, require
@@ -74,6 +74,7 @@ def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice
         pitch_um=acquisition.detector.pitch_um,
         wavelength_nm=acquisition.optics.wavelength_nm,
         distance_mm=acquisition.optics.distance_mm,
+        origin=(y[0], x[0]),
     )
 
 

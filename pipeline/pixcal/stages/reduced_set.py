@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.scout import Coding, Tile
 from pixcal.storage.cube import ArrayReader, CachedReader
+from pixcal.storage.cube_place import cubes_of
+from pixcal.storage.place import Place
 
 
 @dataclass
@@ -25,9 +27,21 @@ class ReducedSet:
     folder: Path
 
     @cached_property
+    def place(self) -> Place:
+        """Where the set's arrays are: ``folder``, unless reduce was told to put cubes elsewhere."""
+        store = self.folder.parent
+        return cubes_of(store.parent) / store.name / self.folder.name
+
+    @cached_property
     def signal(self) -> CachedReader:
         """Stored codes (time, y, x)."""
-        return CachedReader(self.folder / "signal")
+        return CachedReader(self.place / "signal")
+
+    @cached_property
+    def _maps(self) -> dict[str, ArrayReader]:
+        """Readers of the maps (y, x), opened once: at a URL that takes its time."""
+        names = ("read_variance", "shot_factor", "mask")
+        return {name: ArrayReader(self.place / name) for name in names}
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -70,7 +84,7 @@ class ReducedSet:
 
     def time_s(self) -> NDArray[np.float64]:
         """Time of each frame, s."""
-        return ArrayReader(self.folder / "time").read().astype(float)
+        return ArrayReader(self.place / "time").read().astype(float)
 
     def ranges(self, tile: tuple[int, int]) -> tuple[tuple[int, int], tuple[int, int]]:
         """((y0, y1), (x0, x1)) of a tile, given its row and column."""
@@ -84,25 +98,33 @@ class ReducedSet:
         return Tile(
             y,
             x,
-            ArrayReader(self.folder / "read_variance").read(y, x).astype(np.float32),
-            ArrayReader(self.folder / "shot_factor").read(y, x).astype(np.float32),
+            self._maps["read_variance"].read(y, x).astype(np.float32),
+            self._maps["shot_factor"].read(y, x).astype(np.float32),
             self.mask(tile) == 0,
         )
 
     def mask(self, tile: tuple[int, int]) -> NDArray[np.uint8]:
         """Flags of a tile's pixels."""
         y, x = self.ranges(tile)
-        return ArrayReader(self.folder / "mask").read(y, x).astype(np.uint8)
+        return self._maps["mask"].read(y, x).astype(np.uint8)
 
     def codes(self, tile: tuple[int, int], block: int, *, keep: bool = False) -> NDArray[np.uint16]:
         """Codes (t, y, x) of one block of frames of a tile."""
         index = (block, *tile)
         chunk = self.signal.keep(index) if keep else self.signal.read_chunk(index)
+        return self._inside(chunk, tile, block)
+
+    def blocks(self, tile: tuple[int, int]) -> Iterator[NDArray[np.uint16]]:
+        """Codes of a tile, block after block; each is overwritten by the next."""
+        # Fresh memory for every chunk would cost more than decoding it.
+        buffer = np.empty(self.signal.chunks, self.signal.dtype)
+        for block in range(self.n_blocks):
+            yield self._inside(self.signal.read_chunk((block, *tile), buffer), tile, block)
+
+    def _inside(
+        self, chunk: NDArray[np.uint16], tile: tuple[int, int], block: int
+    ) -> NDArray[np.uint16]:
+        """The part of a chunk that lies in the window and the run."""
         y, x = self.ranges(tile)
         n = min(self.block, self.n_frames - block * self.block)
         return np.ascontiguousarray(chunk[:n, : y[1] - y[0], : x[1] - x[0]])
-
-    def blocks(self, tile: tuple[int, int]) -> Iterator[NDArray[np.uint16]]:
-        """Codes of a tile, block after block."""
-        for block in range(self.n_blocks):
-            yield self.codes(tile, block)

@@ -1,1 +1,1 @@
-"""Everything on disk: FITS, Zarr cubes, artefacts. The only importer of zarr and astropy.io."""
+"""Everything on disk: FITS, Zarr cubes, artefacts. Only importer of zarr, fsspec, astropy.io."""

@@ -20,6 +20,8 @@ from typing import Any
 
 from pixcal import __version__
 from pixcal.model.errors import DamagedError, InputError
+from pixcal.storage.cube_place import cubes_of, remove_cubes, settle, settled
+from pixcal.storage.place import Place
 
 MANIFEST = "manifest.json"
 _KEY_IN_NAME = 16
@@ -112,6 +114,8 @@ class Build:
     ----------
     folder : Path
         Where to write; becomes ``RUN/<stage>`` when complete.
+    cubes : Path or UrlPath
+        Where to write cubes: ``folder``, unless they go elsewhere.
     key : str
         Digest of everything the result depends on.
     summary : dict
@@ -119,10 +123,15 @@ class Build:
     """
 
     folder: Path
+    cubes: Place
     key: str
     resumed: bool
     summary: dict[str, Any] = field(default_factory=dict)
     durable: bool = False
+
+    def discard(self) -> None:
+        """Remove all that was written: the next run begins again."""
+        _discard(self.folder, self.folder.parents[1])
 
     def journal(self) -> set[str]:
         """Steps noted as done by an earlier, interrupted build.
@@ -182,6 +191,7 @@ def build(
     inputs: dict[str, str],
     *,
     durable: bool = False,
+    cubes: Place | None = None,
 ) -> Iterator[Build]:
     """Build an artefact aside and put it in place when the block ends without an exception.
 
@@ -194,12 +204,23 @@ def build(
     durable : bool
         What is noted as done has been flushed to the disk (arrays created ``durable``), and is
         trusted even after a power failure.
+    cubes : Path or UrlPath, optional
+        Folder below which to make one for the cubes, instead of ``RUN/<stage>``; no part of the
+        key. An unfinished build whose cubes lie under another is not resumed.
+
+    Raises
+    ------
+    InputError
+        If ``cubes`` cannot be written.
     """
     key = artefact_key(stage, format, config, inputs)
     folder = run / ".partial" / f"{stage}-{key[:_KEY_IN_NAME]}"
+    if folder.is_dir() and not settled(folder, run, cubes):
+        _discard(folder, run)
     resumed = folder.is_dir()
     folder.mkdir(parents=True, exist_ok=True)
-    made = Build(folder, key, resumed, durable=durable)
+    settle(folder, run, cubes)
+    made = Build(folder, cubes_of(folder), key, resumed, durable=durable)
     yield made
     # What is called complete must be on the disk, not on its way to it.
     os.sync()
@@ -208,14 +229,20 @@ def build(
     final = run / stage
     old = run / ".partial" / f"{stage}-replaced"
     if old.exists():
-        shutil.rmtree(old)
+        _discard(old, run)
     if final.exists():
         final.rename(old)
     folder.rename(final)
     # Only now: killed before, the build is resumed, with every step noted as done.
     (final / "journal.jsonl").unlink(missing_ok=True)
     for left in [old, *folder.parent.glob(f"{stage}-{'[0-9a-f]' * _KEY_IN_NAME}")]:
-        shutil.rmtree(left, ignore_errors=True)
+        _discard(left, run)
+
+
+def _discard(folder: Path, run: Path) -> None:
+    """Remove an artefact that is of no use any more, and its cubes elsewhere."""
+    remove_cubes(folder, run)
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _put_back(run: Path) -> None:

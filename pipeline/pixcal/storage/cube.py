@@ -1,14 +1,14 @@
 """Cubes (time, y, x) on disk: Zarr 3 arrays in whole, checksummed chunks, one writer a chunk.
 
-zarr-python makes the metadata; the chunks of a local store are read and written here, because its
-own pipeline does not scale with threads (design note on storage). The bytes are the same: the
-tests read each with the other. Every chunk has a crc32c inside (the Zarr codec), and its size and
-that crc are kept in an index beside the array, so that a chunk that is missing, cut or exchanged
-is refused and never read as zeros. The index ends with a crc of itself and of the metadata.
+zarr-python makes the metadata; the chunks are read and written here, because its own pipeline does
+not scale with threads (design note on storage). The bytes are the same: the tests read each with
+the other. Cubes lie in folders of this machine or at URLs (`pixcal.storage.place`). Every chunk has
+a crc32c inside (the Zarr codec), and its size and that crc are kept in an index beside the array,
+so that a chunk that is missing, cut or exchanged is refused and never read as zeros. The index ends
+with a crc of itself and of the metadata.
 """
 
 import json
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from io import BytesIO
@@ -24,11 +24,17 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec
 
 from pixcal.model.errors import DamagedError
+from pixcal.storage.folder import File, open_folder, read_file
+from pixcal.storage.links import copy_files, link_files
+from pixcal.storage.place import Place, UrlPath
+from pixcal.storage.read_ahead import AHEAD, ReadAhead
 
 CHUNK = (64, 128, 128)
 """Samples of a chunk along (time, y, x): 2 MiB of uint16."""
 
 INDEX = "chunks.npy"
+_RESIDUE = 0x48674BC7
+"""CRC-32C of anything that ends with its own CRC-32C, least byte first."""
 _INDEX_DTYPE = np.dtype([("size", "<u4"), ("crc", "<u4")])
 
 # Threads belong to the engine: Blosc must not start its own, nor share a global context.
@@ -36,7 +42,7 @@ blosc.use_threads = False
 
 
 def create_array(
-    path: Path,
+    path: Place,
     shape: Sequence[int],
     dtype: Any,
     *,
@@ -50,7 +56,7 @@ def create_array(
 
     Parameters
     ----------
-    path : Path
+    path : Path or UrlPath
         Folder of the array, e.g. ``raw.zarr/fringes/vertical``.
     shape, chunks : sequence of int
         In the order of ``dims``.
@@ -65,9 +71,9 @@ def create_array(
     shape, chunks = tuple(map(int, shape)), tuple(map(int, chunks))
     dtype = np.dtype(dtype).newbyteorder("<")
     if not (path / "zarr.json").exists():
-        path.mkdir(parents=True, exist_ok=True)
+        made: dict[str, Any] = {}
         zarr.create_array(
-            store=zarr.storage.LocalStore(path),
+            store=made,
             shape=shape,
             chunks=chunks,
             dtype=dtype,
@@ -80,18 +86,25 @@ def create_array(
             filters=None,
             dimension_names=tuple(dims),
             attributes=attrs or {},
-            overwrite=True,
         )
+        _write_metadata(path, made)
     return ArrayWriter(path, shape, chunks, dtype, fill_value, durable)
 
 
-def create_group(path: Path, attrs: dict[str, Any] | None = None) -> None:
+def create_group(path: Place, attrs: dict[str, Any] | None = None) -> None:
     """Create a Zarr group (a folder that xarray opens as a dataset) if it is not there."""
     if not (path / "zarr.json").exists():
-        zarr.create_group(store=zarr.storage.LocalStore(path), attributes=attrs or {})
+        made: dict[str, Any] = {}
+        zarr.create_group(store=made, attributes=attrs or {})
+        _write_metadata(path, made)
 
 
-def write_array(path: Path, data: NDArray[Any], **options: Any) -> None:
+def _write_metadata(path: Place, made: dict[str, Any]) -> None:
+    """Put down what zarr-python has made in memory."""
+    open_folder(path).write((name, [content.to_bytes()]) for name, content in made.items())
+
+
+def write_array(path: Place, data: NDArray[Any], **options: Any) -> None:
     """Write a whole small array (maps, coordinates) at once; options as `create_array`."""
     options.setdefault("chunks", tuple(max(1, min(1024, n)) for n in data.shape))
     writer = create_array(path, data.shape, data.dtype, **options)
@@ -103,25 +116,27 @@ def _grid(shape: tuple[int, ...], chunks: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(-(-n // c) for n, c in zip(shape, chunks, strict=True))
 
 
-def _aside(file: Path) -> Path:
-    return file.with_name(f".{file.name}.aside")
-
-
-def _seal(path: Path, index: bytes) -> bytes:
+def _seal(path: Place, index: bytes) -> bytes:
     """Checksum of an array's metadata and index, kept at the end of the index."""
     seal: int = google_crc32c.value((path / "zarr.json").read_bytes() + index)
     return seal.to_bytes(4, "little")
 
 
-def _chunk_file(path: Path, index: Sequence[int]) -> Path:
-    return path.joinpath("c", *map(str, index))
+def _chunk_name(index: Sequence[int]) -> str:
+    return "/".join(["c", *map(str, index)])
+
+
+def _names(grid: tuple[int, ...]) -> Iterator[list[str]]:
+    """Names of all chunks, those of one step along the first axis at a time."""
+    for first in range(grid[0]):
+        yield [_chunk_name((first, *rest)) for rest in np.ndindex(grid[1:])]
 
 
 @dataclass
 class ArrayWriter:
     """Writes whole chunks of an array; made by `create_array`."""
 
-    path: Path
+    path: Place
     shape: tuple[int, ...]
     chunks: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -131,17 +146,24 @@ class ArrayWriter:
     def write(self, start: Sequence[int], data: NDArray[Any]) -> None:
         """Write a block that begins and ends on chunk borders (or at the array's end).
 
-        Each chunk is written aside and renamed: one that exists is whole.
-        Blocks that share no chunk may be written at the same time.
+        A chunk that exists is whole. Blocks that share no chunk may be written at the same time.
+
+        Raises
+        ------
+        RemoteError
+            If the array is at a URL that does not take it.
         """
-        codec = Blosc("lz4", 1, Blosc.BITSHUFFLE)
         first = []
-        files: list[Path] = []
         for s, n, c, size in zip(start, data.shape, self.chunks, self.shape, strict=True):
             if s % c or not (n % c == 0 or s + n == size):
                 block_at = f"block {tuple(start)} + {data.shape}"
                 raise ValueError(f"{block_at} is not on chunks {self.chunks}")
             first.append(s // c)
+        open_folder(self.path).write(self._encode(first, data), durable=self.durable)
+
+    def _encode(self, first: Sequence[int], data: NDArray[Any]) -> Iterator[File]:
+        """Name and content of the chunks of a block."""
+        codec = Blosc("lz4", 1, Blosc.BITSHUFFLE)
         for offset in product(*map(range, _grid(data.shape, self.chunks))):
             part = data[
                 tuple(slice(o * c, (o + 1) * c) for o, c in zip(offset, self.chunks, strict=True))
@@ -152,22 +174,28 @@ class ArrayWriter:
                 block = np.full(self.chunks, self.fill_value, self.dtype)
                 block[tuple(map(slice, part.shape))] = part
             body = bytes(codec.encode(block))
-            crc = google_crc32c.value(body)
-            file = _chunk_file(self.path, [f + o for f, o in zip(first, offset, strict=True)])
-            file.parent.mkdir(parents=True, exist_ok=True)
-            with _aside(file).open("wb") as out:
-                out.write(body)
-                out.write(crc.to_bytes(4, "little"))
-            files.append(file)
-        # Flushed once all are written: the disk works meanwhile (twice as fast as one by one).
-        for file in files:
-            if self.durable:
-                with _aside(file).open("rb") as written:
-                    os.fdatasync(written.fileno())
-            _aside(file).replace(file)
+            crc: int = google_crc32c.value(body)
+            name = _chunk_name([f + o for f, o in zip(first, offset, strict=True)])
+            yield name, (body, crc.to_bytes(4, "little"))
 
-    def finish(self) -> None:
+    def take(self, source: Place) -> None:
+        """Take the chunks of another array of the same shape and type as they are, unchecked.
+
+        Linked where the file systems allow, else copied; what is there already stays.
+        """
+        if isinstance(source, Path) and isinstance(self.path, Path):
+            link_files(source / "c", self.path / "c")
+            return
+        for names in _names(_grid(self.shape, self.chunks)):
+            copy_files(source, self.path, names)
+
+    def finish(self) -> NDArray[Any]:
         """Check that every chunk is there and write the index of sizes and checksums.
+
+        Returns
+        -------
+        ndarray
+            The index: ``size`` (bytes) and ``crc`` of each chunk, in the shape of their grid.
 
         Raises
         ------
@@ -176,28 +204,41 @@ class ArrayWriter:
         """
         grid = _grid(self.shape, self.chunks)
         index = np.zeros(grid, _INDEX_DTYPE)
-        for where in np.ndindex(grid):
-            file = _chunk_file(self.path, where)
+        folder = open_folder(self.path)
+        for first, names in enumerate(_names(grid)):
+            rows = []
             try:
-                with file.open("rb") as handle:
-                    size = os.fstat(handle.fileno()).st_size
-                    handle.seek(max(0, size - 4))
-                    tail = handle.read(4)
+                for name, (size, tail) in zip(names, folder.ends(names), strict=True):
+                    if len(tail) < 4:
+                        raise DamagedError(f"{self.path}/{name}: chunk cut short")
+                    rows.append((size, int.from_bytes(tail, "little")))
             except OSError as error:
-                raise DamagedError(f"{file}: chunk missing ({error.strerror})") from error
-            if len(tail) < 4:
-                raise DamagedError(f"{file}: chunk cut short")
-            index[where] = (size, int.from_bytes(tail, "little"))
+                raise DamagedError(f"{error.filename}: chunk missing ({error.strerror})") from error
+            index[first] = np.array(rows, _INDEX_DTYPE).reshape(grid[1:])
         body = BytesIO()
         np.save(body, index)
-        aside = self.path / f".{INDEX}"
-        with aside.open("wb") as out:
-            out.write(body.getvalue())
-            out.write(_seal(self.path, body.getvalue()))
-            if self.durable:
-                out.flush()
-                os.fsync(out.fileno())
-        aside.replace(self.path / INDEX)
+        content = body.getvalue()
+        folder.write([(INDEX, (content, _seal(self.path, content)))], durable=self.durable)
+        return index
+
+
+def remove_arrays(path: Place) -> None:
+    """Remove the groups and arrays that lie in a folder, and nothing else that is there."""
+    folder = open_folder(path)
+    for child in folder.children():
+        try:
+            meta = json.loads((path / child / "zarr.json").read_bytes())
+        except (OSError, ValueError):
+            continue
+        node = open_folder(path / child)
+        if meta["node_type"] == "group":
+            remove_arrays(path / child)
+        else:
+            grid = _grid(meta["shape"], meta["chunk_grid"]["configuration"]["chunk_shape"])
+            for names in _names(grid):
+                node.remove(names)
+        # Last, so that a removal that was cut short can be repeated.
+        node.remove([INDEX, "zarr.json"])
 
 
 class ArrayReader:
@@ -205,16 +246,18 @@ class ArrayReader:
 
     Parameters
     ----------
-    path : Path
+    path : Path or UrlPath
         Folder of the array.
 
     Raises
     ------
     DamagedError
         If the metadata or the chunk index is missing, cut or altered.
+    RemoteError
+        If the array is at a URL that does not answer.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Place) -> None:
         self.path = path
         try:
             body = (path / INDEX).read_bytes()
@@ -233,6 +276,8 @@ class ArrayReader:
         self.chunks: tuple[int, ...] = tuple(meta["chunk_grid"]["configuration"]["chunk_shape"])
         self.dtype: np.dtype[Any] = np.dtype(meta["data_type"])
         self.attrs: dict[str, Any] = meta["attributes"]
+        self._ahead = ReadAhead(path) if isinstance(path, UrlPath) else None
+        self._folder = f"{path}/"
         self.chunks_read = 0
 
     @property
@@ -255,27 +300,44 @@ class ArrayReader:
         DamagedError
             Naming the chunk's file when it is missing, cut or altered.
         """
-        file = _chunk_file(self.path, index)
-        expected = self._index[tuple(index)]
-        mend = "run the stage that wrote it again"
+        name = _chunk_name(index)
+        size, crc = self._index[tuple(index)].item()
+
+        def damaged(what: str) -> DamagedError:
+            return DamagedError(f"{self.path / name}: {what}; run the stage that wrote it again")
+
         try:
-            body = file.read_bytes()
+            if self._ahead is None:
+                body = read_file(f"{self._folder}{name}", size, self._next(index))
+            else:
+                body = self._fetch(self._ahead, index)
         except OSError as error:
-            raise DamagedError(f"{file}: chunk missing ({error.strerror}); {mend}") from error
-        if len(body) != expected["size"]:
-            raise DamagedError(
-                f"{file}: {len(body)} bytes where {expected['size']} were written; {mend}"
-            )
-        data, tail = body[:-4], int.from_bytes(body[-4:], "little")
-        if tail != expected["crc"] or google_crc32c.value(data) != tail:
-            raise DamagedError(f"{file}: checksum does not match, the chunk was altered; {mend}")
+            raise damaged(f"chunk missing ({error.strerror})") from error
+        if len(body) != size:
+            raise damaged(f"{len(body)} bytes where {size} were written")
+        if int.from_bytes(body[-4:], "little") != crc or google_crc32c.value(body) != _RESIDUE:
+            raise damaged("checksum does not match, the chunk was altered")
         buffer = np.empty(self.chunks, self.dtype) if out is None else out
         try:
-            blosc.decompress(data, buffer)
+            blosc.decompress(memoryview(body)[:-4], buffer)
         except (RuntimeError, ValueError) as error:
-            raise DamagedError(f"{file}: cannot be decoded ({error}); {mend}") from error
+            raise damaged(f"cannot be decoded ({error})") from error
         self.chunks_read += 1
         return buffer
+
+    def _next(self, index: Sequence[int]) -> str | None:
+        """File of the chunk that is read after the next one, if time goes on."""
+        first, *rest = index
+        if first + 2 >= len(self._index):
+            return None
+        return f"{self._folder}{_chunk_name((first + 2, *rest))}"
+
+    def _fetch(self, ahead: ReadAhead, index: Sequence[int]) -> bytes:
+        """Content of a chunk at a URL; those that follow it in time are on their way then."""
+        first, *rest = index
+        places = [(n, *rest) for n in range(first, min(first + 1 + AHEAD, len(self._index)))]
+        file, *following = [(_chunk_name(at), int(self._index[at]["size"])) for at in places]
+        return ahead.read(file, following)
 
     def read(self, *ranges: tuple[int, int], out: NDArray[Any] | None = None) -> NDArray[Any]:
         """A block, given one (start, stop) for each axis; fastest when it follows the chunks.
@@ -319,11 +381,11 @@ class ArrayReader:
 class CachedReader(ArrayReader):
     """An `ArrayReader` that keeps chosen chunks in memory; plain again in another process."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Place) -> None:
         super().__init__(path)
         self._kept: dict[tuple[int, ...], NDArray[Any]] = {}
 
-    def __reduce__(self) -> tuple[type["CachedReader"], tuple[Path]]:
+    def __reduce__(self) -> tuple[type["CachedReader"], tuple[Place]]:
         return CachedReader, (self.path,)
 
     def keep(self, index: Sequence[int]) -> NDArray[Any]:

@@ -2,7 +2,11 @@
 
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
+
+from pixcal.storage.folder import UrlFolder, open_folder
+from pixcal.storage.place import Place, UrlPath
 
 
 def link_files(source: Path, target: Path) -> None:
@@ -35,3 +39,22 @@ def _link(file: Path, target: Path) -> None:
         with aside.open("rb") as copy:
             os.fsync(copy.fileno())
         aside.replace(target)
+
+
+def copy_files(source: Place, target: Place, names: Sequence[str]) -> None:
+    """Copy files of a folder to another, either of which may be at a URL.
+
+    Inside one store the store copies, and what is there already stays; else all come by here.
+
+    Raises
+    ------
+    OSError
+        If a file is not there.
+    """
+    if isinstance(source, UrlPath) and isinstance(target, UrlPath):
+        inside = UrlFolder(target).copy(source, names)
+    else:
+        inside = False
+    if not inside:
+        contents = ((name, [(source / name).read_bytes()]) for name in names)
+        open_folder(target).write(contents, durable=True)

@@ -105,7 +105,7 @@ class FittedSet:
     @property
     def n_batches(self) -> int:
         """Batches of the run."""
-        return self.fit.coefficients.shape[1] - 1
+        return int(self.fit.coefficients.shape[1]) - 1
 
 
 def fit_set(

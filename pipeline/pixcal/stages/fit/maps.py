@@ -126,18 +126,16 @@ def _tile_task(
     # Hyperbolic fringes turn over the window: each tile has its own axes.
     axes = [axis(f.shape, (y[0] + y[1] - 1) / 2, (x[0] + x[1] - 1) / 2) for f in fitted]
     value, error, chi2 = (combine_sets if both else combine_parallel)(axes, delta, sigma)
-    value, error = (v.reshape(-1, *chi2.shape).astype(np.float32) for v in (value, error))
-    missing = ~np.isfinite(value).all(axis=0)
+    values, errors = (v.reshape(-1, *chi2.shape).astype(np.float32) for v in (value, error))
+    missing = ~np.isfinite(values).all(axis=0)
     # A flag counts where it costs the pixel its value; a set that others replace does not.
     flags = np.where(missing, np.bitwise_or.reduce(masks, axis=0), 0).astype(np.uint8)
     start = (y[0], x[0])
-    for n, name in enumerate(
-        name for name in joint if name.startswith("delta") and "sigma" not in name
-    ):
-        joint[name].write(start, value[n])
-        joint[f"{name}_sigma"].write(start, error[n])
+    for name, own_value, own_error in zip(outputs_of(both), values, errors, strict=True):
+        joint[name].write(start, own_value)
+        joint[f"{name}_sigma"].write(start, own_error)
     joint["mask"].write(start, flags)
-    freedom = np.isfinite(delta).sum(axis=0) - len(value)
+    freedom = np.isfinite(delta).sum(axis=0) - len(values)
     goods = [np.isfinite(s) for s in sigma]
     some = [_some(s[good].astype(np.float32)) for s, good in zip(sigma, goods, strict=True)]
     return _Told(

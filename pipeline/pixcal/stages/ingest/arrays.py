@@ -12,28 +12,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.errors import DamagedError
 from pixcal.storage.artefact import Manifest, read_json
-from pixcal.storage.cube import INDEX, ArrayWriter, create_array, create_group
+from pixcal.storage.cube import ArrayWriter, create_array, create_group
+from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.fits_in import Coding, FrameFile
 from pixcal.storage.frames import tabulate
-from pixcal.storage.links import link_files
+from pixcal.storage.place import Place
 from pixcal.storage.sources import SourceFile
 
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
 """Errors of the system that are no fault of the file."""
 
 
-def create(folder: Path, array: str, shape: Sequence[int], dtype: Any) -> ArrayWriter:
-    """Create an array (time, y, x) in an artefact, in ADU, or reopen it."""
-    create_group(folder / "raw.zarr")
+def create(cubes: Place, array: str, shape: Sequence[int], dtype: Any) -> ArrayWriter:
+    """Create an array (time, y, x) among the cubes of an artefact, in ADU, or reopen it."""
+    create_group(cubes / "raw.zarr")
     if "/" in array:
-        create_group(folder / "raw.zarr" / array.split("/")[0])
+        create_group(cubes / "raw.zarr" / array.split("/")[0])
     return create_array(
-        folder / "raw.zarr" / array, shape, dtype, attrs={"units": "adu"}, durable=True
+        cubes / "raw.zarr" / array, shape, dtype, attrs={"units": "adu"}, durable=True
     )
 
 
@@ -45,9 +44,9 @@ def finish(writer: ArrayWriter) -> dict[str, Any]:
     DamagedError
         Naming a chunk that is missing or cut.
     """
-    writer.finish()
+    index = writer.finish()
     content = hashlib.sha256(repr((writer.shape, writer.dtype.str)).encode())
-    content.update(np.load(writer.path / INDEX).tobytes())
+    content.update(index.tobytes())
     return {
         "shape": list(writer.shape),
         "dtype": writer.dtype.name,
@@ -63,8 +62,8 @@ class Kept:
     ----------
     array : str
         Its name now; the earlier one may be another.
-    path : Path
-        Its folder in the earlier artefact.
+    path : Path or UrlPath
+        Its folder among the cubes of the earlier artefact.
     facts : mapping
         What `finish` returned then.
     files : list of FrameFile
@@ -72,7 +71,7 @@ class Kept:
     """
 
     array: str
-    path: Path
+    path: Place
     facts: Mapping[str, Any]
     files: list[FrameFile]
 
@@ -113,7 +112,7 @@ def find_kept(
         except (LookupError, TypeError):
             continue
         if _order(files) == list(zip(tables[name]["file"], tables[name]["plane"], strict=True)):
-            kept.append(Kept(array, folder / "raw.zarr" / name, facts, files))
+            kept.append(Kept(array, cubes_of(folder) / "raw.zarr" / name, facts, files))
     return kept
 
 
@@ -145,8 +144,9 @@ def _order(files: Sequence[FrameFile]) -> list[tuple[str, int]]:
     return [(frame.file.source.name, frame.plane) for frame in frames]
 
 
-def take_over(folder: Path, kept: Sequence[Kept], runtime: Runtime) -> dict[str, dict[str, Any]]:
-    """Link the chunks of earlier arrays into a build, and hold them against their digests.
+def take_over(cubes: Place, kept: Sequence[Kept], runtime: Runtime) -> dict[str, dict[str, Any]]:
+    """Link the chunks of earlier arrays into a build (from one place to another they are copied),
+    and hold them against their digests.
 
     Returns
     -------
@@ -154,7 +154,7 @@ def take_over(folder: Path, kept: Sequence[Kept], runtime: Runtime) -> dict[str,
         What `finish` returns, by array, of those that are whole; the others must be read again.
     """
     # Made here, one by one: they share groups, which two tasks must not make at once.
-    writers = [create(folder, k.array, k.facts["shape"], k.facts["dtype"]) for k in kept]
+    writers = [create(cubes, k.array, k.facts["shape"], k.facts["dtype"]) for k in kept]
     tasks = list(zip(kept, writers, strict=True))
     found = run_tasks(_take_over, tasks, runtime, label="unchanged")
     return {k.array: facts for k, facts in zip(kept, found, strict=True) if facts is not None}
@@ -163,7 +163,7 @@ def take_over(folder: Path, kept: Sequence[Kept], runtime: Runtime) -> dict[str,
 def _take_over(task: tuple[Kept, ArrayWriter]) -> dict[str, Any] | None:
     kept, writer = task
     try:
-        link_files(kept.path / "c", writer.path / "c")
+        writer.take(kept.path)
         facts = finish(writer)
     except DamagedError:
         return None

@@ -22,7 +22,7 @@ from pixcal.engine.plan import Plan, make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.config import quantity, to_plain
-from pixcal.model.errors import InputError
+from pixcal.model.errors import InputError, RemoteError
 from pixcal.stages.ingest.arrays import create, find_kept, finish, take_over
 from pixcal.storage.artefact import (
     Build,
@@ -35,9 +35,12 @@ from pixcal.storage.artefact import (
     write_json,
 )
 from pixcal.storage.cube import CHUNK, ArrayWriter
+from pixcal.storage.cube_place import base_of, chosen_base
 from pixcal.storage.fits_in import FrameFile, inspect
 from pixcal.storage.fits_rows import read_rows, unpack, unpack_bytes
+from pixcal.storage.folder import transit_bytes
 from pixcal.storage.frames import Frame, columns, tabulate
+from pixcal.storage.place import Place
 from pixcal.storage.sources import SourceFile, find_sources, fingerprint
 
 STAGE = "ingest"
@@ -59,9 +62,13 @@ class Config:
     ----------
     overwrite : bool
         Replace what was ingested from another acquisition; no part of the result.
+    cubes : str or None
+        Folder or URL for the cubes, or RUN; None for where those of the earlier ingest are, or
+        else RUN. No part of the result.
     """
 
     overwrite: bool = quantity(False, doc="replace an ingest of another acquisition")
+    cubes: str | None = quantity(None, doc="folder or URL for the cubes")
 
 
 def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -98,16 +105,17 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
     plain = {"acquisition": to_plain(described)}
     inputs = {array: fingerprint(files) for array, files in sources.items()}
     with lock(out):
+        base = chosen_base(config.cubes, out, out / STAGE)
         done = up_to_date(out, STAGE, artefact_key(STAGE, FORMAT, plain, inputs))
-        if done is not None:
+        if done is not None and base_of(out / STAGE) == base:
             return done
         earlier = read_manifest(out / STAGE)
         same = _same_files(earlier, inputs)
         if earlier is not None and not same and not config.overwrite:
             _refuse_other(out, earlier, plain, inputs)
         kept = find_kept(out / STAGE, earlier, same, sources) if earlier is not None else []
-        with build(out, STAGE, FORMAT, plain, inputs, durable=True) as made:
-            facts = take_over(made.folder, kept, runtime)
+        with build(out, STAGE, FORMAT, plain, inputs, durable=True, cubes=base) as made:
+            facts = take_over(made.cubes, kept, runtime)
             known = {k.array: k.files for k in kept if k.array in facts}
             tables, warnings = _check(described, sources, known, runtime)
             _fill(made, {a: f for a, f in tables.items() if a not in known}, runtime)
@@ -219,13 +227,15 @@ def _common_dtype(array: str, files: Sequence[FrameFile]) -> np.dtype[Any]:
 # Memory and tasks
 
 
-def _plan(tables: Mapping[str, Sequence[Frame]], runtime: Runtime) -> tuple[int, Plan]:
+def _plan(
+    tables: Mapping[str, Sequence[Frame]], cubes: Place, runtime: Runtime
+) -> tuple[int, Plan]:
     """Rows of a band, and the memory: rather lower bands than fewer workers."""
     shared = _BYTES_A_FRAME * sum(map(len, tables.values()))
     rows, need = 0, 0
     for rows in _BAND_ROWS:
         tasks = (_task_bytes(array, frames, rows) for array, frames in tables.items())
-        need = max(tasks, default=0)
+        need = max(tasks, default=0) + transit_bytes(cubes)
         if Plan(need, shared, runtime.n_workers).total <= runtime.memory:
             break
     return rows, make_plan("ingest", need, shared, runtime)
@@ -284,14 +294,14 @@ def _pieces(
 
 def _fill(made: Build, tables: Mapping[str, Sequence[Frame]], runtime: Runtime) -> None:
     """Write all blocks that an earlier run has not written."""
-    rows, plan = _plan(tables, runtime)
+    rows, plan = _plan(tables, made.cubes, runtime)
     scratch = made.folder / "scratch"
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     journal = made.journal()
     todo: list[_Piece] = []
     for array, frames in tables.items():
-        writer = _create(made.folder, array, frames)
+        writer = _create(made.cubes, array, frames)
         pieces = _pieces(array, frames, writer, rows, scratch)
         todo += [piece for piece in pieces if piece.step not in journal]
     run_tasks(
@@ -304,9 +314,9 @@ def _fill(made: Build, tables: Mapping[str, Sequence[Frame]], runtime: Runtime) 
     scratch.rmdir()
 
 
-def _create(folder: Path, array: str, frames: Sequence[Frame]) -> ArrayWriter:
+def _create(cubes: Place, array: str, frames: Sequence[Frame]) -> ArrayWriter:
     shape = (len(frames), *frames[0].file.shape[1:])
-    return create(folder, array, shape, _common_dtype(array, _files(frames)))
+    return create(cubes, array, shape, _common_dtype(array, _files(frames)))
 
 
 def _write_piece(piece: _Piece) -> None:
@@ -374,13 +384,15 @@ def _close(
             for source in files:
                 source.check_unchanged()
         arrays = {
-            array: (facts.get(array) or finish(_create(made.folder, array, frames)))
+            array: (facts.get(array) or finish(_create(made.cubes, array, frames)))
             | {"files": len(_files(frames))}
             for array, frames in tables.items()
         }
+    except RemoteError:
+        raise
     except InputError:
-        # What was read cannot be trusted: the next run begins again.
-        shutil.rmtree(made.folder)
+        # What was read cannot be trusted.
+        made.discard()
         raise
     write_json(made.folder / "acquisition.json", to_plain(described))
     write_json(made.folder / "frames.json", {a: columns(f) for a, f in tables.items()})

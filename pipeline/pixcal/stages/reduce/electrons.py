@@ -20,6 +20,7 @@ from pixcal.storage.cube import (
     create_group,
     write_array,
 )
+from pixcal.storage.place import Place
 
 F32 = NDArray[np.float32]
 
@@ -35,8 +36,10 @@ class FringeSet:
     ----------
     name : str
         As in ``acquisition.yaml``.
-    raw, calibration : Path
-        Array of the frames; ``calibration.zarr``.
+    raw : Path or UrlPath
+        Array of the frames.
+    calibration : Path
+        ``calibration.zarr``.
     exptime : (t,) float32
         Exposure times for the dark signal (s).
     saturation : float
@@ -46,7 +49,7 @@ class FringeSet:
     """
 
     name: str
-    raw: Path
+    raw: Place
     calibration: Path
     exptime: F32
     saturation: float
@@ -113,7 +116,7 @@ class Converting:
 
 
 def set_writers(
-    folder: Path, scratch: Path, frames: int, shape: tuple[int, int], scale: Scale
+    folder: Place, scratch: Path, frames: int, shape: tuple[int, int], scale: Scale
 ) -> dict[str, ArrayWriter]:
     """Make the arrays of a dataset that `convert` writes, and one for its counts."""
     signal = {
@@ -148,7 +151,7 @@ def set_writers(
     return made
 
 
-def write_coordinates(folder: Path, time_s: Any, shape: tuple[int, int]) -> None:
+def write_coordinates(folder: Place, time_s: Any, shape: tuple[int, int]) -> None:
     """Write the coordinates of a dataset."""
     for name, values, attrs in (
         ("time", np.asarray(time_s, float), {"units": "s", "long_name": "since the first frame"}),

@@ -27,6 +27,7 @@ from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.columns import Index, extent, grid
 from pixcal.stages.reduce.exposures import Group
 from pixcal.storage.cube import CHUNK, ArrayReader, ArrayWriter, create_array, create_group
+from pixcal.storage.place import Place
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -68,8 +69,8 @@ class Measuring:
 
     Attributes
     ----------
-    raw : Path
-        ``RUN/ingest/raw.zarr``.
+    raw : Path or UrlPath
+        ``raw.zarr`` of ``RUN/ingest``.
     shape : (int, int)
         Of the detector's window (y, x).
     dark, flat : sequence of Group
@@ -90,7 +91,7 @@ class Measuring:
         Arrays for the results.
     """
 
-    raw: Path
+    raw: Place
     shape: tuple[int, int]
     dark: Sequence[Group]
     flat: Sequence[Group]

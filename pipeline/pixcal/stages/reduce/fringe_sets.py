@@ -108,7 +108,7 @@ def write_set(
         low, high = min(e[0] for e in ends), max(e[1] for e in ends)
         low, high = (low, high) if low <= high else (0.0, 1.0)
         scale = choose_scale(low, high, bounds.smallest_variance, share)
-    folder = made.folder / "reduced.zarr" / fringes.name
+    folder = made.cubes / "reduced.zarr" / fringes.name
     scratch = made.folder / "scratch.zarr" / "counts" / fringes.name
     job = Converting(
         fringes, scale, set_writers(folder, scratch, fringes.frames, source.shape, scale)

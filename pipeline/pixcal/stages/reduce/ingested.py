@@ -15,6 +15,8 @@ from pixcal.model.errors import InputError
 from pixcal.stages.reduce.exposures import Exposures, group_exposures
 from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.cube_place import cubes_of
+from pixcal.storage.place import Place
 
 
 @dataclass(frozen=True)
@@ -29,10 +31,10 @@ class Ingested:
 
     folder: Path
 
-    @property
-    def raw(self) -> Path:
+    @cached_property
+    def raw(self) -> Place:
         """The store of raw frames."""
-        return self.folder / "raw.zarr"
+        return cubes_of(self.folder) / "raw.zarr"
 
     @cached_property
     def detector(self) -> Detector:

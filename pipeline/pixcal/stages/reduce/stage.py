@@ -44,6 +44,9 @@ from pixcal.storage.artefact import (
     write_json,
 )
 from pixcal.storage.cube import ArrayReader, create_group
+from pixcal.storage.cube_place import base_of, chosen_base
+from pixcal.storage.folder import transit_bytes
+from pixcal.storage.place import Place
 
 STAGE = "reduce"
 FORMAT = 1
@@ -74,6 +77,9 @@ class Config:
         Relative departure from the other pixels over a ladder of flats that is ``nonlinear``.
     rounding_share : float
         Share of the variance that the stored precision may cost.
+    cubes : str or None
+        Folder or URL for the cubes, or RUN; None for where those of ingest are. No part of the
+        result.
     """
 
     gain: str = quantity("declared", choices=("declared", "measured"), doc="which gain to use")
@@ -84,6 +90,7 @@ class Config:
     noisy_factor: float = quantity(1.5, low=1, high=1e6, doc="noise over the usual noise")
     nonlinear_share: float = quantity(0.03, above=0, high=1e6, doc="departure over a ladder")
     rounding_share: float = quantity(1e-3, above=0, high=1, doc="of the variance, for storing")
+    cubes: str | None = quantity(None, doc="folder or URL for the cubes")
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -110,9 +117,11 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """
     ingest = require(run_dir, "ingest", _INGEST_FORMAT)
     inputs, plain = {"ingest": ingest.key}, to_plain(config)
+    del plain["cubes"]
     with lock(run_dir):
+        base = chosen_base(config.cubes, run_dir, run_dir / "ingest")
         done = up_to_date(run_dir, STAGE, artefact_key(STAGE, FORMAT, plain, inputs))
-        if done is not None:
+        if done is not None and (config.cubes is None or base_of(run_dir / STAGE) == base):
             return done
         source = Ingested(run_dir / "ingest")
         if config.gain == "measured" and len(source.tables.get("flat", {}).get("file", ())) < 2:
@@ -120,7 +129,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
                 "gain: 'measured' needs two flat frames or more; list them under frames.flat of "
                 "acquisition.yaml, or use gain: declared"
             )
-        with build(run_dir, STAGE, FORMAT, plain, inputs) as made:
+        with build(run_dir, STAGE, FORMAT, plain, inputs, cubes=base) as made:
             _reduce(made, source, config, runtime)
     manifest = read_manifest(run_dir / STAGE)
     assert manifest is not None
@@ -130,6 +139,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 def _reduce(made: Build, source: Ingested, config: Config, runtime: Runtime) -> None:
     exposures = source.exposures
     need = max(measure_bytes(exposures.dark, exposures.flat), CONVERT_BYTES)
+    need += transit_bytes(source.raw, made.cubes)
     runtime = runtime.with_workers(make_plan("reduce", need, _SHARED_BYTES, runtime).workers)
     scratch = made.folder / "scratch.zarr"
     create_group(scratch)
@@ -232,7 +242,7 @@ def _report(
     for name, found in sets.items():
         warnings += set_warnings(name, found, declared, config.rounding_share)
         found["quantisation"]["share_at_mean"] = share_at_mean(found, bounds)
-        found["flags"] = _count_flags(made.folder / "reduced.zarr" / name / "mask", source.shape)
+        found["flags"] = _count_flags(made.cubes / "reduced.zarr" / name / "mask", source.shape)
     report = {
         "schema": SCHEMA,
         **_report_noise(summary, config, gain, bounds),
@@ -269,7 +279,7 @@ def _report_noise(
     }
 
 
-def _count_flags(mask: Path, shape: tuple[int, int]) -> dict[str, int]:
+def _count_flags(mask: Place, shape: tuple[int, int]) -> dict[str, int]:
     """Pixels with each flag, and without any."""
     reader = ArrayReader(mask)
     counts: Counter[str] = Counter()

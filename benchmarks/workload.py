@@ -1,0 +1,167 @@
+"""Acquisitions to measure speed on, and how time and memory are measured."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from pixcal.engine.run import Runtime
+from pixcal.stages import fit, ingest, reduce, simulate
+from pixcal.stages.reduced_set import ReducedSet
+
+ROOT = Path(__file__).parents[1]
+
+
+def seconds(work: Callable[[], object]) -> float:
+    """Wall time of a call."""
+    begin = time.perf_counter()
+    work()
+    return time.perf_counter() - begin
+
+
+@dataclass(frozen=True)
+class Workload:
+    """A simulated acquisition of one or two sets, and the run made from it.
+
+    Attributes
+    ----------
+    folder : Path
+        Its own; holds ``acq`` and ``run``.
+    shape : (int, int)
+        Rows and columns.
+    frames, sets : int
+        Frames of each set; one set or two, of crossed axes.
+    """
+
+    folder: Path
+    shape: tuple[int, int]
+    frames: int
+    sets: int = 1
+
+    @property
+    def gigabytes(self) -> float:
+        """Raw samples of the fringe frames, GB."""
+        return 2e-9 * self.shape[0] * self.shape[1] * self.frames * self.sets
+
+    @property
+    def run(self) -> Path:
+        """The run."""
+        return self.folder / "run"
+
+    @property
+    def sources(self) -> list[ReducedSet]:
+        """The reduced cubes."""
+        return [ReducedSet(p) for p in sorted((self.run / "reduce" / "reduced.zarr").iterdir())
+                if p.is_dir()]  # fmt: skip
+
+    def simulate(self) -> float:
+        """Write the acquisition; seconds."""
+        config = yaml.safe_load((ROOT / "configs" / "precision.yaml").read_text())
+        config["detector"]["shape"] = list(self.shape)
+        vertical = config["frames"]["fringes"][0] | {"count": self.frames}
+        crossed = vertical | {"name": "horizontal", "baseline_mm": vertical["baseline_mm"][::-1]}
+        config["frames"] |= {"fringes": [vertical, crossed][: self.sets], "per_file": 1}
+        # Calibration frames are not what is measured.
+        config["frames"] |= {"bias": 8, "flats": [{"exptime_s": 0.023, "count": 8}]}
+        self.folder.mkdir(parents=True, exist_ok=True)
+        bench = self.folder / "bench.yaml"
+        bench.write_text(yaml.safe_dump(config))
+        return seconds(
+            lambda: simulate.run(bench, self.folder / "acq", simulate.Config(), Runtime())
+        )
+
+    def ingest(self) -> float:
+        """Seconds."""
+        return seconds(
+            lambda: ingest.run(self.folder / "acq", self.run, ingest.Config(), Runtime())
+        )
+
+    def reduce(self) -> float:
+        """Seconds."""
+        return seconds(lambda: reduce.run(self.run, reduce.Config(), Runtime()))
+
+    def fit(self, threads: int) -> float:
+        """Seconds of a fit from the start; what an earlier one left is removed before."""
+        self.forget_fit()
+        return seconds(lambda: fit.run(self.run, fit.Config(), Runtime(workers=threads)))
+
+    def forget_fit(self) -> None:
+        """Remove what the fit left."""
+        for stage in ("sweep", "fit"):
+            shutil.rmtree(self.run / stage, ignore_errors=True)
+
+    def scan(self, threads: int) -> float:
+        """Seconds to decode all chunks and add their samples, shared among threads.
+
+        The barest use of the fit's own reader: one buffer for each thread.
+        """
+
+        def part(number: int) -> None:
+            for source in self.sources:
+                buffer = np.empty(source.signal.chunks, source.signal.dtype)
+                for tile in source.tiles()[number::threads]:
+                    for block in range(source.n_blocks):
+                        source.signal.read_chunk((block, *tile), buffer).sum(dtype=np.uint32)
+
+        workers = [threading.Thread(target=part, args=(n,)) for n in range(threads)]
+
+        def work() -> None:
+            for worker in workers:
+                worker.start()
+            for worker in workers:
+                worker.join()
+
+        return seconds(work)
+
+    def chill(self) -> None:
+        """Drop the reduced cubes from the page cache."""
+        os.sync()
+        for source in self.sources:
+            for file in (source.folder / "signal").rglob("*"):
+                if file.is_file():
+                    with file.open("rb") as handle:
+                        os.posix_fadvise(handle.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+MEASURE = """
+import json, sys
+from pathlib import Path
+from pixcal.engine import plan
+from pixcal.engine.run import Runtime
+from pixcal.stages import fit, ingest, reduce
+import time
+planned = []
+of = plan.Plan.total.fget
+plan.Plan.total = property(lambda self: planned.append(of(self)) or planned[-1])
+stage, run = sys.argv[1], Path(sys.argv[2])
+begin = time.perf_counter()
+if stage == "ingest":
+    ingest.run(run.parent / "acq", run, ingest.Config(), Runtime())
+else:
+    module = {"reduce": reduce, "fit": fit}[stage]
+    module.run(run, module.Config(), Runtime())
+took = time.perf_counter() - begin
+status = Path("/proc/self/status").read_text()
+peak = int(status.partition("VmHWM:")[2].split()[0]) * 1024
+# Plans that were too large for the memory allowed were made again with fewer workers.
+planned = max(p for p in planned if p <= Runtime().memory)
+print(json.dumps({"planned": planned, "peak": peak, "seconds": took}))
+"""
+
+
+def memory(stage: str, run: Path) -> dict[str, Any]:
+    """Peak of a stage in a process of its own (bytes), the largest it planned, and seconds."""
+    done = subprocess.run(
+        [sys.executable, "-c", MEASURE, stage, str(run)], check=True, capture_output=True, text=True
+    )
+    return dict(json.loads(done.stdout))

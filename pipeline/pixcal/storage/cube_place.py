@@ -1,0 +1,140 @@
+"""Where the cubes of an artefact lie: in its folder, or in one of their own elsewhere.
+
+Cubes elsewhere lie in a folder that is made for one artefact, ``<base>/<stage>-<key>-<random>``,
+laid out as the artefact is. The artefact names it in ``cubes.json``, and owns it as long as it lies
+in the run directory that it was made in: a copy of a run reads the cubes, and never removes them.
+"""
+
+import json
+import logging
+import secrets
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pixcal import __version__
+from pixcal.model.errors import DamagedError, InputError, RemoteError
+from pixcal.storage.folder import open_folder
+from pixcal.storage.place import Place, parse_place
+
+POINTER = "cubes.json"
+NOTE = "pixcal.json"
+"""File beside the cubes that tells whoever finds them what they are."""
+
+log = logging.getLogger(__name__)
+
+
+def cubes_of(artefact: Path) -> Place:
+    """The folder in which an artefact keeps its cubes (``raw.zarr``, ``reduced.zarr``).
+
+    Raises
+    ------
+    DamagedError
+        If the artefact's ``cubes.json`` cannot be understood.
+    """
+    pointer = _read(artefact)
+    return artefact if pointer is None else parse_place(pointer["place"])
+
+
+def base_of(artefact: Path) -> Place | None:
+    """The folder for all cubes that an artefact was given, or None when it keeps its own."""
+    pointer = _read(artefact)
+    return None if pointer is None else parse_place(pointer["base"])
+
+
+def chosen_base(text: str | None, run: Path, like: Path) -> Place | None:
+    """The folder for all cubes that the user wants.
+
+    Parameters
+    ----------
+    text : str or None
+        A path or URL; the run directory itself to keep cubes in the artefacts; None for the same
+        as another artefact.
+    run : Path
+        The run directory.
+    like : Path
+        That artefact.
+
+    Returns
+    -------
+    Path or UrlPath or None
+        None to keep cubes in the artefacts.
+    """
+    if text is None:
+        return base_of(like)
+    place = parse_place(text)
+    return None if place == parse_place(str(run)) else place
+
+
+def settled(artefact: Path, run: Path, base: Place | None) -> bool:
+    """Whether an artefact in the making can go on where its cubes are."""
+    pointer = _read(artefact)
+    if pointer is None:
+        return base is None
+    return parse_place(pointer["base"]) == base and _owns(run, pointer)
+
+
+def settle(artefact: Path, run: Path, base: Place | None) -> None:
+    """Make the folder for the cubes of an artefact in the making, unless it has one already.
+
+    Raises
+    ------
+    InputError
+        If nothing can be written there.
+    """
+    if base is None or _read(artefact) is not None:
+        return
+    place = base / f"{artefact.name}-{secrets.token_hex(4)}"
+    note = {"pixcal": __version__, "run": str(run.absolute()), "artefact": artefact.name}
+    # The first thing that is written: what is wrong with a place shows before any work is done.
+    _write_json(place, NOTE, note)
+    owner = run.stat().st_ino
+    _write_json(artefact, POINTER, {"base": str(base), "place": str(place), "owner": owner})
+
+
+def remove_cubes(artefact: Path, run: Path) -> None:
+    """Remove the cubes elsewhere that an artefact owns; warn when that is not possible."""
+    from pixcal.storage.cube import remove_arrays  # here: the command line does without zarr
+
+    try:
+        pointer = _read(artefact)
+        if pointer is None:
+            return
+        place = parse_place(pointer["place"])
+        if not _owns(run, pointer):
+            log.warning("%s: left there, a copy of %s may need it", place, run)
+            return
+        remove_arrays(place)
+        open_folder(place).remove([NOTE])
+    except (InputError, OSError) as error:
+        log.warning("earlier cubes could not be removed: %s", error)
+
+
+def _owns(run: Path, pointer: Mapping[str, Any]) -> bool:
+    # The number of a directory stays when it is renamed, and is another in a copy.
+    return bool(pointer["owner"] == run.stat().st_ino)
+
+
+def _read(artefact: Path) -> Mapping[str, Any] | None:
+    file = artefact / POINTER
+    try:
+        pointer = json.loads(file.read_bytes())
+    except FileNotFoundError:
+        return None
+    except (OSError, ValueError) as error:
+        raise DamagedError(f"{file}: damaged ({error}); remove its folder and run again") from error
+    if not isinstance(pointer, dict) or not {"base", "place", "owner"} <= pointer.keys():
+        raise DamagedError(f"{file}: damaged; remove its folder and run again")
+    return pointer
+
+
+def _write_json(folder: Place, name: str, data: Any) -> None:
+    try:
+        content = (json.dumps(data, indent=2) + "\n").encode()
+        open_folder(folder).write([(name, [content])], durable=True)
+    except RemoteError as error:
+        raise RemoteError(f"--cubes {error}") from error
+    except OSError as error:
+        raise InputError(
+            f"--cubes {folder}: cannot be written ({error.strerror}); choose another place"
+        ) from error

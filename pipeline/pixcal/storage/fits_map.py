@@ -1,0 +1,102 @@
+"""Maps in FITS files read block by block: one of 46 Mpix need not be in memory."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.io import fits
+from numpy.typing import NDArray
+
+from pixcal.model.errors import DamagedError
+
+_TYPES = {8: ">u1", -32: ">f4", -64: ">f8"}
+_PIECE = 8 << 20
+
+
+@dataclass(frozen=True)
+class FitsMap:
+    """One image of a FITS file.
+
+    Attributes
+    ----------
+    path : Path
+    shape : (int, int)
+        (y, x).
+    dtype : str
+        As stored.
+    data_at : int
+        Byte where the image begins.
+    """
+
+    path: Path
+    shape: tuple[int, int]
+    dtype: str
+    data_at: int
+
+    @classmethod
+    def open(cls, path: Path, extension: str | int = 0) -> "FitsMap":
+        """Read where the image is, and check that all of it is there and unaltered.
+
+        Raises
+        ------
+        DamagedError
+            If the file is missing, cut, altered (where it has a checksum), or holds no such image.
+        """
+        try:
+            with fits.open(path, memmap=True) as hdus:
+                hdu: Any = hdus[extension]
+                header = hdu.header
+                if header["NAXIS"] != 2 or "BSCALE" in header or "BZERO" in header:
+                    raise ValueError("not a plain image of two axes")
+                shape = (int(header["NAXIS2"]), int(header["NAXIS1"]))
+                found = cls(path, shape, _TYPES[header["BITPIX"]], int(hdu.fileinfo()["datLoc"]))
+                if path.stat().st_size < found.data_at + found.n_bytes:
+                    raise ValueError("cut short")
+                if "DATASUM" in header and _datasum(found) != int(header["DATASUM"]):
+                    raise ValueError("altered: its checksum does not match")
+        except (OSError, LookupError, TypeError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise DamagedError(f"{path}: not a map that this pixcal reads ({reason})") from error
+        return found
+
+    @property
+    def n_bytes(self) -> int:
+        """Bytes of the image."""
+        return self.shape[0] * self.shape[1] * np.dtype(self.dtype).itemsize
+
+    def read(self, y: tuple[int, int], x: tuple[int, int]) -> NDArray[Any]:
+        """A block, given (start, stop) of rows and of columns, in the machine's byte order."""
+        dtype = np.dtype(self.dtype)
+        block = np.empty((y[1] - y[0], x[1] - x[0]), dtype)
+        with self.path.open("rb", buffering=0) as file:
+            for row, values in zip(range(*y), block, strict=True):
+                file.seek(self.data_at + (row * self.shape[1] + x[0]) * dtype.itemsize)
+                if file.readinto(values.view(np.uint8)) != values.nbytes:
+                    raise DamagedError(f"{self.path}: cut short while it was read; fit again")
+        return block.astype(dtype.newbyteorder("="))
+
+
+def _datasum(image: FitsMap) -> int:
+    """The FITS checksum of an image: the sum of its 32-bit words in ones' complement."""
+    total, left = 0, image.n_bytes
+    with image.path.open("rb") as file:
+        file.seek(image.data_at)
+        while left:
+            piece = file.read(min(_PIECE, left))
+            left -= len(piece)
+            piece += bytes(-len(piece) % 4)
+            total += int(np.frombuffer(piece, ">u4").sum(dtype=np.uint64))
+    while total >> 32:
+        total = (total & 0xFFFFFFFF) + (total >> 32)
+    return total
+
+
+def content_digest(path: Path) -> str:
+    """SHA-256 of a file, hex, 32 characters."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()[:32]
+    except OSError as error:
+        raise DamagedError(f"{path}: cannot be read ({error.strerror})") from error

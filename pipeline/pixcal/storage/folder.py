@@ -1,0 +1,237 @@
+"""Whole files of a folder, many at a time: of this machine, or at a URL."""
+
+import errno
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from pixcal.storage.place import Place, UrlPath, explained
+
+BATCH_BYTES = 16 << 20
+"""Bytes that one task sends to a URL at the same time, and more than it reads ahead."""
+
+
+File = tuple[str, Sequence[bytes]]
+"""Name of a file below a folder, such as ``c/0/1/2``, and its content in parts."""
+
+
+class Folder(Protocol):
+    """Files by their names below a folder."""
+
+    def write(self, files: Iterable[File], *, durable: bool = False) -> None:
+        """Write files, or replace them: each is there whole or not at all.
+
+        Parameters
+        ----------
+        files : iterable of File
+            Taken a few at a time.
+        durable : bool
+            They are on the disk when this returns, not on their way to it.
+        """
+
+    def ends(self, names: Sequence[str]) -> Iterator[tuple[int, bytes]]:
+        """Size and last four bytes (fewer, if there are no more) of each file.
+
+        Raises
+        ------
+        OSError
+            With the ``filename``, if one is not there.
+        """
+
+    def children(self) -> list[str]:
+        """Names of the files and folders directly in it; none if it is not there."""
+
+    def remove(self, names: Sequence[str]) -> None:
+        """Remove those of the files that are there, and folders that are empty then."""
+
+
+def open_folder(place: Place) -> Folder:
+    """The files of a folder."""
+    return UrlFolder(place) if isinstance(place, UrlPath) else LocalFolder(place)
+
+
+def transit_bytes(*places: Place) -> int:
+    """Memory that a task needs for what is on its way to some folders, or from them."""
+    return BATCH_BYTES * sum(isinstance(place, UrlPath) for place in places)
+
+
+@dataclass(frozen=True)
+class LocalFolder:
+    """A folder of this machine. Files are written aside and renamed."""
+
+    path: Path
+
+    def write(self, files: Iterable[File], *, durable: bool = False) -> None:
+        written = []
+        for name, content in files:
+            file = self.path / name
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with _aside(file).open("wb") as out:
+                out.writelines(content)
+            written.append(file)
+        # Flushed once all are written: the disk works meanwhile (twice as fast as one by one).
+        for file in written:
+            if durable:
+                with _aside(file).open("rb") as handle:
+                    os.fdatasync(handle.fileno())
+            _aside(file).replace(file)
+
+    def ends(self, names: Sequence[str]) -> Iterator[tuple[int, bytes]]:
+        for name in names:
+            with (self.path / name).open("rb") as handle:
+                size = os.fstat(handle.fileno()).st_size
+                handle.seek(max(0, size - 4))
+                yield size, handle.read(4)
+
+    def children(self) -> list[str]:
+        return sorted(f.name for f in self.path.iterdir()) if self.path.is_dir() else []
+
+    def remove(self, names: Sequence[str]) -> None:
+        files = [self.path / name for name in names]
+        for file in files:
+            file.unlink(missing_ok=True)
+            _aside(file).unlink(missing_ok=True)
+        folders = {up for file in files for up in file.parents if up.is_relative_to(self.path)}
+        for folder in sorted(folders, reverse=True):
+            with suppress(OSError):
+                folder.rmdir()
+
+
+def read_file(path: str, size: int, later: str | None = None) -> bytes:
+    """Content of a file of this machine, but no more than a byte above its expected size.
+
+    Parameters
+    ----------
+    path : str
+    size : int
+        Bytes expected.
+    later : str, optional
+        A file that will be asked for soon: the disk fetches it meanwhile.
+
+    Raises
+    ------
+    OSError
+        If it is not there.
+    """
+    if later is not None:
+        with suppress(OSError):
+            ahead = os.open(later, os.O_RDONLY)
+            try:
+                os.posix_fadvise(ahead, 0, 0, os.POSIX_FADV_WILLNEED)
+            finally:
+                os.close(ahead)
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        body = os.read(handle, size + 1)
+        while len(body) < size and (more := os.read(handle, size + 1 - len(body))):
+            body += more
+        return body
+    finally:
+        os.close(handle)
+
+
+def _aside(file: Path) -> Path:
+    return file.with_name(f".{file.name}.aside")
+
+
+@dataclass(frozen=True)
+class UrlFolder:
+    """A folder at a URL. An object store puts an object in place when all of it has arrived."""
+
+    path: UrlPath
+
+    def write(self, files: Iterable[File], *, durable: bool = False) -> None:
+        for batch in _batches(files):
+            self._send(batch)
+
+    def _send(self, batch: Mapping[str, bytes]) -> None:
+        system, root = self.path.filesystem()
+        with explained(self.path.url):
+            if not system.async_impl:
+                # Those of the object stores are, and there are no folders to be made.
+                for folder in sorted({f"{root}/{name}".rpartition("/")[0] for name in batch}):
+                    system.makedirs(folder, exist_ok=True)
+            system.pipe({f"{root}/{name}": content for name, content in batch.items()})
+
+    def ends(self, names: Sequence[str]) -> Iterator[tuple[int, bytes]]:
+        system, root = self.path.filesystem()
+        sizes = self._sizes(names)
+        for name in names:
+            if name not in sizes:
+                raise FileNotFoundError(
+                    errno.ENOENT, os.strerror(errno.ENOENT), f"{self.path}/{name}"
+                )
+        whole = [name for name in names if sizes[name] >= 4]
+        with explained(self.path.url):
+            tails = system.cat_ranges(
+                [f"{root}/{name}" for name in whole],
+                [sizes[name] - 4 for name in whole],
+                [sizes[name] for name in whole],
+                on_error="raise",
+            )
+        tail = dict(zip(whole, tails, strict=True))
+        yield from ((sizes[name], tail.get(name, b"")) for name in names)
+
+    def children(self) -> list[str]:
+        system, root = self.path.filesystem()
+        with explained(self.path.url):
+            system.invalidate_cache()
+            try:
+                found = system.ls(root, detail=False)
+            except FileNotFoundError:
+                return []
+        return sorted(path.rstrip("/").rpartition("/")[2] for path in found)
+
+    def remove(self, names: Sequence[str]) -> None:
+        system, root = self.path.filesystem()
+        there = list(self._sizes(names))
+        with explained(self.path.url):
+            if there:
+                system.rm([f"{root}/{name}" for name in there])
+
+    def copy(self, source: UrlPath, names: Sequence[str]) -> bool:
+        """Copy files from another folder inside the store, if it is one store.
+
+        Returns
+        -------
+        bool
+            Whether it is.
+        """
+        (system, root), (other, there) = self.path.filesystem(), source.filesystem()
+        if system is not other:
+            return False
+        with explained(self.path.url):
+            have = self._sizes(names)
+            todo = [name for name in names if name not in have]
+            system.copy([f"{there}/{n}" for n in todo], [f"{root}/{n}" for n in todo])
+        return True
+
+    def _sizes(self, names: Sequence[str]) -> dict[str, int]:
+        """Sizes (bytes) of those of the files that are there, from fresh listings."""
+        system, root = self.path.filesystem()
+        found: dict[str, Any] = {}
+        with explained(self.path.url):
+            system.invalidate_cache()
+            # Each of all chunks of some frames, which are few enough to hold.
+            for below in {"/".join(name.split("/")[:2]) for name in names}:
+                found |= system.find(f"{root}/{below}", detail=True)
+            return {
+                name: facts["size"] if "size" in facts else system.size(f"{root}/{name}")
+                for name in names
+                if (facts := found.get(f"{root}/{name}")) is not None
+            }
+
+
+def _batches(files: Iterable[File]) -> Iterator[dict[str, bytes]]:
+    """Files in groups that are not much larger than `BATCH_BYTES`."""
+    batch: dict[str, bytes] = {}
+    for name, content in files:
+        batch[name] = b"".join(content)
+        if sum(map(len, batch.values())) >= BATCH_BYTES:
+            yield batch
+            batch = {}
+    if batch:
+        yield batch

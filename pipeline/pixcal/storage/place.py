@@ -1,0 +1,161 @@
+"""Where cubes may lie: in a folder of this machine, or in one at a URL that fsspec knows."""
+
+import errno
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from pixcal.model.errors import InputError, PixcalError, RemoteError
+
+_EXTRAS = {"s3": "pixcal[s3]", "s3a": "pixcal[s3]", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs"}
+"""What to install for a protocol, where its name does not tell."""
+
+
+@dataclass(frozen=True)
+class UrlPath:
+    """A file or folder at a URL, with as much of `pathlib.Path` as the reader of a cube needs.
+
+    It holds nothing but the URL, so that it can be sent to other processes and machines. The
+    settings (endpoint, credentials) are those of the environment of whoever opens it.
+
+    Attributes
+    ----------
+    url : str
+        Such as ``s3://bucket/prefix``, without a slash at its end.
+    """
+
+    url: str
+
+    def __str__(self) -> str:
+        return self.url
+
+    def __truediv__(self, name: str) -> "UrlPath":
+        return UrlPath(f"{self.url}/{name}")
+
+    def joinpath(self, *names: str) -> "UrlPath":
+        """The file or folder further down."""
+        return UrlPath("/".join([self.url, *names]))
+
+    @property
+    def name(self) -> str:
+        """Last part of the URL."""
+        return self.url.rpartition("/")[2]
+
+    @property
+    def parent(self) -> "UrlPath":
+        """The folder it is in."""
+        return UrlPath(self.url.rpartition("/")[0])
+
+    def filesystem(self) -> tuple[Any, str]:
+        """File system of fsspec that the URL belongs to, and its path there.
+
+        fsspec keeps its file systems, one for each thread and process that asks.
+        """
+        from fsspec.core import url_to_fs  # here: cubes of this machine do without
+
+        with explained(self.url):
+            found: tuple[Any, str] = url_to_fs(self.url)
+        return found
+
+    def read_bytes(self, most: int | None = None) -> bytes:
+        """Content of a file.
+
+        Parameters
+        ----------
+        most : int, optional
+            Bytes to read at most. Some file systems ask for the size first when they are not told.
+
+        Raises
+        ------
+        FileNotFoundError
+            If it is not there.
+        RemoteError
+            If that cannot be known.
+        """
+        system, path = self.filesystem()
+        with explained(self.url):
+            content: bytes = system.cat_file(path, start=None if most is None else 0, end=most)
+        return content
+
+    def exists(self) -> bool:
+        """Whether there is such a file. It is read: no listing, which may be stale, is asked."""
+        try:
+            self.read_bytes()
+        except FileNotFoundError:
+            return False
+        return True
+
+
+Place = Path | UrlPath
+"""A file or folder, here or at a URL."""
+
+
+@contextmanager
+def explained(url: str) -> Iterator[None]:
+    """Turn what the driver of a file system raises into one line that names the URL.
+
+    Raises
+    ------
+    FileNotFoundError
+        With ``strerror`` and ``filename`` (the URL), if the file or the bucket is not there.
+    RemoteError
+        In all other cases.
+    """
+    try:
+        yield
+    except (PixcalError, MemoryError):
+        raise
+    except FileNotFoundError as error:
+        told = " ".join(str(error).split())
+        # Some say no more than the path, which the URL tells already.
+        reason = told if " " in told else os.strerror(errno.ENOENT)
+        raise FileNotFoundError(errno.ENOENT, reason, url) from error
+    except ImportError as error:
+        scheme = url.partition("://")[0]
+        package = _EXTRAS.get(scheme, f"what fsspec needs for {scheme}")
+        raise RemoteError(
+            f"{url}: a package is missing ({error}); pip install '{package}'"
+        ) from error
+    except Exception as error:  # each driver has errors of its own
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RemoteError(
+            f"{url}: {reason:.300}; check the URL, the endpoint, the credentials (AWS_…, FSSPEC_…) "
+            "and the network, and run again"
+        ) from error
+
+
+def parse_place(text: str) -> Place:
+    """The folder that a user means: a path, absolute from now on, or a URL.
+
+    Raises
+    ------
+    InputError
+        If it is neither; or holds a password, which would end up in files and messages.
+    """
+    scheme, is_url, rest = text.partition("://")
+    if not is_url:
+        if not text or re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", text):
+            raise InputError(f"--cubes {text!r}: not a folder; write a path or s3://bucket/prefix")
+        return Path(os.path.abspath(text))  # noqa: PTH100 (resolve() would follow links)
+    if scheme in ("file", "local"):
+        if not rest.startswith("/"):
+            raise InputError(f"--cubes {text}: not absolute; write {scheme}:///folder")
+        return Path(os.path.abspath(rest))  # noqa: PTH100
+    if not re.fullmatch(r"[a-z][a-z0-9+._-]*", scheme):
+        raise InputError(f"--cubes {text}: {scheme!r} is no protocol; write s3://bucket/prefix")
+    if not rest.strip("/") or re.search(r"[\s*?\[\]#]", rest):
+        raise InputError(
+            f"--cubes {text}: no bucket or folder, or one with spaces, '*', '?', '#', '[' or ']'; "
+            "write s3://bucket/prefix"
+        )
+    if "@" in urlsplit(text).netloc and ":" in urlsplit(text).netloc.partition("@")[0]:
+        raise InputError(
+            f"--cubes {scheme}://…: holds a password; put it into the environment or the "
+            "configuration of fsspec"
+        )
+    return UrlPath(text.rstrip("/"))

@@ -1,0 +1,81 @@
+"""Chunks of a column fetched before they are asked for: an object store answers late, but many."""
+
+import asyncio
+from collections.abc import Sequence
+from concurrent.futures import Future
+from threading import local
+
+from pixcal.storage.place import UrlPath, explained
+
+File = tuple[str, int]
+"""Name and size (bytes)."""
+
+AHEAD = 4
+"""Files on their way while one is decoded."""
+
+_KEPT = 2 * AHEAD
+"""Files that may wait for each thread; nobody asks for those of a column that was left."""
+
+
+class ReadAhead:
+    """Reads files below a URL; those that follow are fetched meanwhile, once two came in order.
+
+    Threads may share it, each with an order of its own.
+
+    Parameters
+    ----------
+    path : UrlPath
+        The folder.
+    """
+
+    def __init__(self, path: UrlPath) -> None:
+        self.path = path
+        self._thread = local()
+
+    def __reduce__(self) -> tuple[type["ReadAhead"], tuple[UrlPath]]:
+        return ReadAhead, (self.path,)
+
+    def expected(self) -> dict[File, Future[bytes] | None]:
+        """Files that this thread may ask for next, and those of them that are on their way."""
+        found: dict[File, Future[bytes] | None] = self._thread.__dict__.setdefault("expected", {})
+        return found
+
+    def read(self, file: File, following: Sequence[File]) -> bytes:
+        """Content of a file, but not much more of it than its size should be.
+
+        Parameters
+        ----------
+        file : File
+            The one.
+        following : sequence of File
+            Those that will be read next, if this is not the only one.
+
+        Raises
+        ------
+        FileNotFoundError
+            If it is not there.
+        RemoteError
+            If that cannot be known.
+        """
+        expected = self.expected()
+        in_order = file in expected
+        fetched = expected.pop(file, None)
+        for later in following if in_order else following[:1]:
+            if expected.get(later) is None:
+                expected[later] = self._fetch(later) if in_order else None
+        while len(expected) > _KEPT:
+            expected.pop(next(iter(expected)))
+        if fetched is None:
+            return (self.path / file[0]).read_bytes(file[1] + 1)
+        with explained(f"{self.path}/{file[0]}"):
+            return fetched.result()
+
+    def _fetch(self, file: File) -> Future[bytes] | None:
+        """A read that goes on by itself, where the file system can do that."""
+        name, size = file
+        system, path = (self.path / name).filesystem()
+        if not system.async_impl:
+            return None
+        # On the loop that fsspec runs in a thread of its own.
+        reading = system._cat_file(path, start=0, end=size + 1)
+        return asyncio.run_coroutine_threadsafe(reading, system.loop)
