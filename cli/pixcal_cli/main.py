@@ -10,8 +10,11 @@ from collections.abc import Sequence
 import click
 
 from pixcal import __version__
-from pixcal.model.errors import PixcalError
+from pixcal.model.errors import ClusterError, PixcalError
 from pixcal_cli.allan import allan
+from pixcal_cli.astrometry import astrometry
+from pixcal_cli.budget import budget
+from pixcal_cli.compare import compare
 from pixcal_cli.crests import crests
 from pixcal_cli.fit import fit
 from pixcal_cli.ingest import ingest
@@ -32,7 +35,19 @@ class InOrder(click.Group):
 
 @click.group(
     cls=InOrder,
-    commands=[run, ingest, reduce, fit, allan, crests, report, simulate],
+    commands=[
+        run,
+        ingest,
+        reduce,
+        fit,
+        allan,
+        crests,
+        astrometry,
+        report,
+        compare,
+        simulate,
+        budget,
+    ],
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog=examples("pixcal run data_samples/demo --out demo"),
@@ -58,6 +73,8 @@ def explain(error: BaseException) -> tuple[int, str]:
             return 2, f"{error.format_message().rstrip('.')}; see '{path} --help'"
         case click.ClickException():
             return 2, error.format_message()
+        case ClusterError():
+            return 1, f"{error}; {again}"
         case PixcalError():
             return 2, str(error)
         case click.Abort() | KeyboardInterrupt():

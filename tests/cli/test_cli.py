@@ -31,7 +31,9 @@ from pixcal_cli.options import memory_size, region
 
 PIXCAL = Path(sys.executable).with_name("pixcal")
 STAGES = ["ingest", "reduce", "fit", "allan", "report"]
-COMMANDS = ["run", *STAGES[:-1], "crests", STAGES[-1], "simulate"]
+COMMANDS = [
+    "run", *STAGES[:-1], "crests", "astrometry", STAGES[-1], "compare", "simulate", "budget",
+]  # fmt: skip
 
 
 def shell(*args: str, **options: Any) -> subprocess.CompletedProcess[str]:

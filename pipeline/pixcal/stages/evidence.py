@@ -133,6 +133,7 @@ def _fringes(
         good=good,
         read_variance=read,
         shot_factor=shot,
+        start_s=_start(ingested, f"fringes/{name}"),
     )
 
 
@@ -161,5 +162,15 @@ def _stacks(ingested: Ingested, part: Part) -> tuple[Stack, ...]:
         times = np.asarray(table["time_s"], float)
         for exposure in np.unique(exposures):
             own = (exposures == exposure) | (np.isnan(exposures) & np.isnan(exposure))
-            found.append(Stack(kind, float(exposure), times[own], frames[own].astype(np.float32)))
+            adu, start = frames[own].astype(np.float32), _start(ingested, kind)
+            found.append(Stack(kind, float(exposure), times[own], adu, start))
     return tuple(found)
+
+
+def _start(ingested: Ingested, name: str) -> float:
+    """Time of an array's first frame after the first one of all, s; nan when unknown."""
+    stamps = [np.array(table["mjd"], float) for table in ingested.tables.values()]
+    if not len(stamps) or any(np.isnan(s).any() for s in stamps):
+        return np.nan
+    first = min(float(s.min()) for s in stamps)
+    return float(ingested.tables[name]["mjd"][0] - first) * 86400.0

@@ -52,7 +52,8 @@ from pixcal.storage.cube import INDEX, ArrayReader
 
 STAGE = "report"
 FORMAT = 1
-SHOWN_STAGES = ("ingest", "reduce", "sweep", "fit", "allan")
+SHOWN_STAGES = {"ingest": 1, "reduce": 1, "sweep": 2, "fit": 1, "allan": 1}
+"""Stages and the formats of theirs that are understood."""
 FIGURE_BYTES = 192 << 20
 """Matplotlib, one figure and the page."""
 
@@ -102,7 +103,7 @@ def _publish(run_dir: Path) -> None:
 def _manifests(run_dir: Path) -> dict[str, Manifest]:
     """Manifests of the stages that there are."""
     return {
-        stage: require(run_dir, stage, 1)
+        stage: require(run_dir, stage, SHOWN_STAGES[stage])
         for stage in SHOWN_STAGES
         if read_manifest(run_dir / stage) is not None
     }

@@ -96,12 +96,14 @@ def require(run: Path, stage: str, format: int) -> Manifest:
     if not run.is_dir():
         raise InputError(f"{run}: no such run directory; make one with 'pixcal ingest'")
     manifest = read_manifest(run / stage)
+    # The sweep is a part of the command that reads it.
+    command = f"pixcal {'fit' if stage == 'sweep' else stage} {run}"
     if manifest is None:
-        raise InputError(f"{run / stage}: not there yet; run 'pixcal {stage} {run}' first")
+        raise InputError(f"{run / stage}: not there yet; run '{command}' first")
     if manifest.stage != stage or manifest.format != format:
         raise InputError(
             f"{run / stage}: format {manifest.stage}/{manifest.format}, this pixcal reads "
-            f"{stage}/{format}; run 'pixcal {stage} {run}' again"
+            f"{stage}/{format}; run '{command}' again"
         )
     return manifest
 

@@ -11,6 +11,7 @@ with a crc of itself and of the metadata.
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from itertools import product
 from pathlib import Path
@@ -277,7 +278,8 @@ class ArrayReader:
         self.dtype: np.dtype[Any] = np.dtype(meta["data_type"])
         self.attrs: dict[str, Any] = meta["attributes"]
         self._ahead = ReadAhead(path) if isinstance(path, UrlPath) else None
-        self._folder = f"{path}/"
+        # Absolute: a reader may be sent to a process that works in another folder.
+        self._folder = f"{path if isinstance(path, UrlPath) else path.absolute()}/"
         self.chunks_read = 0
 
     @property
@@ -379,18 +381,24 @@ class ArrayReader:
 
 
 class CachedReader(ArrayReader):
-    """An `ArrayReader` that keeps chosen chunks in memory; plain again in another process."""
+    """An `ArrayReader` that keeps chosen chunks in memory.
 
-    def __init__(self, path: Place) -> None:
+    In another process it keeps none: who wants them again may be sent elsewhere.
+    """
+
+    def __init__(self, path: Place, *, keeps: bool = True) -> None:
         super().__init__(path)
+        self._keeps = keeps
         self._kept: dict[tuple[int, ...], NDArray[Any]] = {}
 
-    def __reduce__(self) -> tuple[type["CachedReader"], tuple[Place]]:
-        return CachedReader, (self.path,)
+    def __reduce__(self) -> tuple[Any, ...]:
+        return partial(CachedReader, keeps=False), (self.path,)
 
     def keep(self, index: Sequence[int]) -> NDArray[Any]:
         """Read a chunk and keep it for later calls of `read_chunk`."""
         key = tuple(index)
+        if not self._keeps:
+            return super().read_chunk(key)
         if key not in self._kept:
             self._kept[key] = super().read_chunk(key)
         return self._kept[key]

@@ -1,0 +1,197 @@
+"""``pixcal budget``."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from pixcal_cli.options import examples
+from pixcal_cli.results import show_notes, show_table
+
+LIMITS = {
+    "photons": "photons",
+    "uneven_light": "uneven light",
+    "visibility": "visibility",
+    "read_noise": "read noise",
+    "phases": "too few phases",
+}
+
+
+@click.command(
+    epilog=examples(
+        "pixcal budget configs/demo.yaml",
+        "pixcal budget configs/paper.yaml --precision 5e-4 --frames 10000 --out budget",
+    )
+)
+@click.argument("bench", metavar="BENCH.yaml", type=click.Path(path_type=Path))
+@click.option(
+    "--precision",
+    type=click.FloatRange(1e-9, 1),
+    default=None,
+    show_default="5e-5 without --frames",
+    metavar="PX",
+    help="Wanted 1-sigma error of a pixel's offset on each axis.",
+)
+@click.option(
+    "--frames",
+    type=click.IntRange(1),
+    default=None,
+    metavar="N",
+    help="Frames of each fringe set: tells the precision that they reach.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=None,
+    metavar="DIR",
+    help="Write budget.json and the picture budget.png there.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the contents of budget.json.")
+def budget(
+    bench: Path, precision: float | None, frames: int | None, out: Path | None, as_json: bool
+) -> None:
+    """Tell frames and hours that a precision takes, before any are taken.
+
+    BENCH.yaml describes a bench as for `pixcal simulate`. The numbers are the Cramér-Rao bound:
+    no unbiased estimate needs fewer frames, and the fit comes within a few percent.
+    """
+    from pixcal.stages import budget as stage  # here: for a fast `pixcal --help`
+
+    found = stage.run(bench, stage.Config(precision, frames), out)
+    if as_json:
+        click.echo(json.dumps(found, indent=2))
+        return
+    _show(found)
+    for name in ("budget.json", "budget.png") if out is not None else ():
+        click.echo(f"  {(out or Path()) / name}")
+
+
+def _show(found: Mapping[str, Any]) -> None:
+    ny, nx = found["window"]
+    noise = sum(found["variance_e2"].values()) ** 0.5
+    click.echo(
+        f"budget: {found['bench']['file']}, {nx} × {ny} px, {noise:.3g} e- rms without light"
+    )
+    _show_sets(found)
+    if found["precision_px"] is not None:
+        _show_wanted(found)
+    if found["frames"] is not None:
+        _show_given(found)
+    _show_shares(found)
+    _show_calibration(found)
+    _show_levers(found)
+    show_notes([*found["warnings"], *(f"left out: {what}" for what in found["left_out"])])
+
+
+def _show_sets(found: Mapping[str, Any]) -> None:
+    click.echo("\nfringe sets as planned")
+    rows = [
+        (
+            name,
+            f"{s['interfringe_px']:.4g}",
+            f"{s['mean_e']:.4g}",
+            f"{s['visibility']:.3g}",
+            f"{s['frame_px']['median']:.3g}",
+            f"{s['frame_px']['worst']:.3g}",
+            s["planned"]["frames"],
+            f"{s['planned']['median_px']:.3g}",
+            f"{s['planned']['worst_px']:.3g}",
+        )
+        for name, s in found["sets"].items()
+    ]
+    header = (
+        "set", "interfringe px", "mean e-", "visibility", "one frame px", "worst px", "frames",
+        "reach px", "worst px",
+    )  # fmt: skip
+    show_table(header, rows)
+
+
+def _show_wanted(found: Mapping[str, Any]) -> None:
+    click.echo(f"\nfor {found['precision_px']:g} px on each axis")
+    joint = found["joined"]
+    entries = [(f"{name} alone", s["wanted"]) for name, s in found["sets"].items()]
+    if len(found["sets"]) > 1:
+        entries += [(f"{name}, all sets", c["wanted"]) for name, c in joint["components"].items()]
+    rows = [
+        (name, w["frames"], _hours(w["hours"]), _size(w["bytes"]), w["frames_worst"])
+        for name, w in entries
+    ]
+    show_table(("", "frames", "time", "data", "frames, worst px"), rows)
+
+
+def _show_given(found: Mapping[str, Any]) -> None:
+    click.echo(f"\nwith {found['frames']} frames of each set")
+    parts = [(f"{name} alone", s["given"]) for name, s in found["sets"].items()]
+    if len(found["sets"]) > 1:
+        parts += [
+            (f"{name}, all sets", c["given"]) for name, c in found["joined"]["components"].items()
+        ]
+    rows = [(name, f"{g['median_px']:.3g}", f"{g['worst_px']:.3g}") for name, g in parts]
+    show_table(("", "median px", "worst px"), rows)
+
+
+def _show_shares(found: Mapping[str, Any]) -> None:
+    click.echo("\nwhat the frames are for: photons alone, and the factors that raise them")
+    rows = [
+        (
+            name,
+            s["shares"].get("photons_frames", "-"),
+            *(f"× {s['shares'][key]:.3g}" for key in list(LIMITS)[1:]),
+            LIMITS[s["limited_by"]],
+        )
+        for name, s in found["sets"].items()
+    ]
+    header = (
+        "set", "photons", "uneven light", "visibility", "read noise", "phases", "limited by",
+    )  # fmt: skip
+    show_table(header, rows)
+
+
+def _show_calibration(found: Mapping[str, Any]) -> None:
+    click.echo("\ncalibration frames, so that their noise costs less than 0.1 % of the frames")
+    rows = []
+    for name, s in found["sets"].items():
+        c = s["calibration"]
+        flat = "-" if c["flat_error"] is None else f"{100 * c['flat_error']:.2g} %"
+        rows.append(
+            (
+                name,
+                f"{c['bias_frames_needed']} of {c['bias_frames']} planned",
+                f"{c['flats_needed']} of {c['flats']} planned",
+                flat,
+                _percent(100 * c["flat_cost"]),
+            )
+        )
+    show_table(("set", "bias", "flat", "noise of the flats", "which costs"), rows)
+
+
+def _show_levers(found: Mapping[str, Any]) -> None:
+    click.echo("\nwhat if (all sets, the worse axis)")
+    planned = next(v for v in found["levers"] if v["name"] == "as planned")
+    rows = []
+    for lever in found["levers"]:
+        ratio = planned["variance"] * planned["period_s"] / (lever["variance"] * lever["period_s"])
+        frames = "-" if lever["frames"] is None else lever["frames"]
+        time = "-" if lever["hours"] is None else _hours(lever["hours"])
+        rows.append((lever["name"], frames, time, f"{ratio:.3g}", lever["note"]))
+    show_table(("change", "frames", "time", "times faster", ""), rows)
+
+
+def _percent(value: float) -> str:
+    return "< 0.001 %" if value < 1e-3 else f"{value:.1g} %"
+
+
+def _hours(hours: float) -> str:
+    for unit, length in (("d", 24.0), ("h", 1.0), ("min", 1 / 60)):
+        if hours >= 2 * length:
+            return f"{hours / length:.3g} {unit}"
+    return f"{3600 * hours:.3g} s"
+
+
+def _size(size: float) -> str:
+    for unit, scale in (("TB", 1e12), ("GB", 1e9)):
+        if size >= scale:
+            return f"{size / scale:.3g} {unit}"
+    return f"{size / 1e6:.3g} MB"

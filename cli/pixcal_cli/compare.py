@@ -1,0 +1,143 @@
+"""``pixcal compare``."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from pixcal.storage.artefact import read_json
+from pixcal_cli import results
+from pixcal_cli.options import examples, runtime_options
+
+if TYPE_CHECKING:
+    from pixcal.engine.run import Runtime
+
+
+@click.command(
+    epilog=examples(
+        "pixcal compare demo",
+        "pixcal compare monday tuesday --out repeatability",
+    )
+)
+@click.argument(
+    "runs", metavar="RUN [RUN]...", type=click.Path(path_type=Path), nargs=-1, required=True
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("compare"),
+    show_default=True,
+    metavar="DIR",
+    help="Directory of compare.json and compare.png.",
+)
+@click.option(
+    "--split",
+    type=click.Choice(["halves", "odd-even"]),
+    default="halves",
+    show_default=True,
+    help="Parts of a single run: its first and second half, or every other batch of frames.",
+)
+@click.option(
+    "--sigma-accuracy",
+    type=click.FloatRange(0, 0.5),
+    default=0.02,
+    show_default=True,
+    metavar="SHARE",
+    help="Relative error of the maps' SIGMA that is no difference yet.",
+)
+@runtime_options
+def compare(
+    runs: tuple[Path, ...], out: Path, split: str, sigma_accuracy: float, runtime: "Runtime"
+) -> None:
+    """Tell what maps of the same pixels have in common, and what not, scale by scale.
+
+    Two fitted runs or more of windows of the same shape, or one run against itself.
+    """
+    from pixcal.stages import compare as stage  # here: for a fast `pixcal --help`
+
+    with results.announce("compare", out):
+        stage.run(runs, out, stage.Config(split, sigma_accuracy), runtime)
+    _show(read_json(out / "compare.json"))
+    for file in sorted(out.glob("compare*.*")):
+        click.echo(f"  {file}")
+
+
+def _show(found: Mapping[str, Any]) -> None:
+    labels = [side["label"] for side in found["sides"]]
+    for pair in found["pairs"]:
+        first, second = pair["sides"]
+        click.echo(f"\n{labels[first]} | {labels[second]}")
+        _show_totals(pair["components"])
+        for name, facts in pair["components"].items():
+            click.echo(f"\n  {name} by scale")
+            _show_scales(facts)
+        results.show_notes(_sentences(pair["components"]))
+    if found["summary"] is not None:
+        _show_summary(found["summary"], labels)
+    results.show_notes(found["warnings"])
+
+
+def _sentences(components: Mapping[str, Any]) -> list[str]:
+    found = []
+    for name, facts in components.items():
+        evidence = "; ".join(facts["evidence"])
+        found.append(f"{name}: {f'beyond noise: {evidence}' if evidence else 'noise explains all'}")
+        if facts["suspicion"] is not None:
+            found.append(f"{name}: {facts['suspicion']}")
+    return found
+
+
+def _show_totals(components: Mapping[str, Any]) -> None:
+    rows = [
+        (
+            name,
+            facts["pixels"],
+            results.with_error(facts["correlation"], facts["correlation_error"]),
+            results.with_error(facts["slope"], facts["slope_error"]),
+            _amount(facts["common"]),
+            f"{facts['difference_px']:.3g}",
+            f"{facts['expected_px']:.3g}",
+            results.with_error(facts["ratio"], facts["ratio_error"]),
+            _amount(facts["beyond_noise"]),
+        )
+        for name, facts in components.items()
+    ]
+    header = (
+        "", "pixels", "correlation", "slope", "common px", "difference px", "noise px", "ratio",
+        "beyond noise px",
+    )  # fmt: skip
+    results.show_table(header, rows)
+
+
+def _show_scales(facts: Mapping[str, Any]) -> None:
+    scales = facts["scales"]
+    rows = [
+        (
+            f"{scale['side_px']} px" + (" and larger" if scale is scales[-1] else ""),
+            _amount(scale["common"]),
+            f"{scale['difference_px']:.3g}",
+            f"{scale['expected_px']:.3g}",
+            results.with_error(scale["ratio"], scale["ratio_error"]),
+            _amount(scale["beyond_noise"]),
+        )
+        for scale in scales
+    ]
+    header = ("scale", "common px", "difference px", "noise px", "ratio", "beyond noise px")
+    results.show_table(header, rows)
+
+
+def _show_summary(summary: Mapping[str, Any], labels: list[str]) -> None:
+    click.echo("\neach map's own errors beyond noise, from the differences of all pairs, px")
+    rows = [
+        (label, *(_amount(facts["own"][n]) for facts in summary.values()))
+        for n, label in enumerate(labels)
+    ]
+    results.show_table(("", *summary), rows)
+
+
+def _amount(estimate: Mapping[str, float]) -> str:
+    """A size with its error, or its upper limit (95 %) where it is not seen."""
+    if estimate["variance_px2"] < 2 * estimate["variance_error_px2"]:
+        return f"< {estimate['upper_px']:.2g}"
+    return f"{estimate['px']:.3g} ± {estimate['error_px']:.1g}"

@@ -1,0 +1,285 @@
+"""Light of a star in square pixels: the diffraction pattern of a telescope, and the fit of it.
+
+A circular aperture of diameter D, a share of it obscured from the centre, gives (Born & Wolf,
+Principles of Optics, 8.6.2) the Airy pattern, per unit of collected light and per square pixel
+
+    I(r) = pi (1 - e^2) / (4 q^2) [(J(z) - e^2 J(e z)) / (1 - e^2)]^2    J(z) = 2 J1(z) / z
+
+with z = pi r / q, r in pixels, e the diameter of the obscuration over D, and q = lambda f / (D p)
+the pixels (pitch p) in lambda / D. A pixel responds evenly over its square, so what it receives is
+that pattern averaged over the square: a function of where its centre lies from the star. It holds
+no frequency above 1/q cycles per pixel, q = 2 being Nyquist's limit (paper, section 2), and is kept
+as a cubic B-spline, fine enough that the spline does not show (`KNOTS`).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import spline_filter
+from scipy.special import j1
+
+F64 = NDArray[np.float64]
+
+KNOTS = 24
+"""Knots of the spline in lambda / D: the table is good to 1e-6 of its peak (see the tests)."""
+MAX_STEPS = 50
+PRECISION = 1e-9
+"""A fit has ended when its last step is shorter, px."""
+MARGIN = 2.0
+"""What the table goes beyond the window, px: a star off the middle, pixels off the grid."""
+
+
+@dataclass(frozen=True)
+class Psf:
+    """Share of a star's light that a pixel receives, against its centre's place from the star.
+
+    Attributes
+    ----------
+    coefficients : (n, n) float64
+        Of the cubic B-spline, (y, x); the middle one is at the star.
+    step : float
+        From knot to knot, px.
+    """
+
+    coefficients: F64
+    step: float
+
+    @property
+    def reach(self) -> float:
+        """Farthest pixel from the star along x or y, px."""
+        return float((self.coefficients.shape[0] // 2 - 2) * self.step)
+
+    @property
+    def peak(self) -> float:
+        """Share of the pixel that the star is in the middle of."""
+        return float(self.at(0.0, 0.0)[0])
+
+    def at(self, x: ArrayLike, y: ArrayLike) -> F64:
+        """Share of the light and its derivatives along x and y.
+
+        Parameters
+        ----------
+        x, y : array_like
+            Centre of the pixel minus the star, px; broadcast against each other. Beyond `reach`
+            the share is that at its edge.
+
+        Returns
+        -------
+        (3, ...) float64
+            1, 1/px, 1/px.
+        """
+        xs, ys = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
+        found = _shares(self.coefficients, self.step, xs.ravel(), ys.ravel())
+        return np.asarray(found.reshape(3, *xs.shape))
+
+
+def diffraction_psf(sampling: float, obscuration: float, half: int) -> Psf:
+    """The pattern of a telescope, averaged over square pixels.
+
+    Parameters
+    ----------
+    sampling : float
+        q, pixels in lambda / D.
+    obscuration : float
+        Diameter of the central obscuration over that of the aperture, 0 to below 1.
+    half : int
+        Half of the window's side, px: the table is for pixels so far from the star.
+    """
+    step = sampling / KNOTS
+    side = math.ceil((half + MARGIN) / step) + 3
+    at = step * np.arange(side)
+    # Gauss and Legendre's nodes over a pixel: exact for what has so few waves in it.
+    nodes, weights = np.polynomial.legendre.leggauss(8 + math.ceil(2 / sampling))
+    quadrant = np.zeros((side, side))
+    for node_y, weight_y in zip(nodes / 2, weights / 2, strict=True):
+        for node_x, weight_x in zip(nodes / 2, weights / 2, strict=True):
+            radius = np.hypot((at + node_y)[:, None], (at + node_x)[None, :])
+            quadrant += weight_y * weight_x * intensity(radius, sampling, obscuration)
+    upper = np.concatenate([quadrant[:, :0:-1], quadrant], axis=1)
+    whole = np.concatenate([upper[:0:-1], upper])
+    return Psf(np.asarray(spline_filter(whole, order=3, mode="mirror")), step)
+
+
+def intensity(radius: F64, sampling: float, obscuration: float) -> F64:
+    """The pattern itself, of unit total.
+
+    Parameters
+    ----------
+    radius : (...) float64
+        From the star, px.
+    sampling, obscuration : float
+        As in `diffraction_psf`.
+
+    Returns
+    -------
+    (...) float64
+        1/px².
+    """
+    z = np.pi * radius / sampling
+    open_area = 1 - obscuration**2
+    amplitude = (_jinc(z) - obscuration**2 * _jinc(obscuration * z)) / open_area
+    return np.asarray(np.pi * open_area / (4 * sampling**2) * amplitude**2)
+
+
+def _jinc(z: F64) -> F64:
+    small = np.abs(z) < 1e-6
+    away = np.where(small, 1.0, z)
+    return np.where(small, 1.0, 2 * j1(away) / away)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def share(coefficients: F64, step: float, x: float, y: float) -> tuple[float, float, float]:
+    """Share of the light and its derivatives at one place (px): see `Psf.at`."""
+    n = coefficients.shape[0]
+    u, v = x / step + n // 2, y / step + n // 2
+    u, v = min(max(u, 1.0), n - 2.000001), min(max(v, 1.0), n - 2.000001)
+    j, i = int(u), int(v)
+    # Weights of the four knots around, and their derivatives (cubic B-spline).
+    t = u - j
+    s = 1.0 - t
+    x0, x1, x2, x3 = (
+        s**3 / 6,
+        (3 * t * t * (t - 2) + 4) / 6,
+        (3 * s * s * (s - 2) + 4) / 6,
+        t**3 / 6,
+    )
+    dx0, dx1, dx2, dx3 = -s * s / 2, t * (1.5 * t - 2), -s * (1.5 * s - 2), t * t / 2
+    t = v - i
+    s = 1.0 - t
+    y_weight = (s**3 / 6, (3 * t * t * (t - 2) + 4) / 6, (3 * s * s * (s - 2) + 4) / 6, t**3 / 6)
+    y_slope = (-s * s / 2, t * (1.5 * t - 2), -s * (1.5 * s - 2), t * t / 2)
+    value, along_x, along_y = 0.0, 0.0, 0.0
+    for k in range(4):
+        row = coefficients[i - 1 + k, j - 1 : j + 3]
+        here = x0 * row[0] + x1 * row[1] + x2 * row[2] + x3 * row[3]
+        value += y_weight[k] * here
+        along_y += y_slope[k] * here
+        along_x += y_weight[k] * (dx0 * row[0] + dx1 * row[1] + dx2 * row[2] + dx3 * row[3])
+    return value, along_x / step, along_y / step
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _shares(coefficients: F64, step: float, x: F64, y: F64) -> F64:
+    out = np.empty((3, x.size))
+    for n in range(x.size):
+        out[0, n], out[1, n], out[2, n] = share(coefficients, step, x[n], y[n])
+    return out
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def expected_windows(
+    coefficients: F64, step: float, place: F64, offsets: F64, electrons: float, background: float
+) -> F64:
+    """Mean electrons (n, side, side): see `pixcal.estimators.centroids.Star.expected`."""
+    n, _, side, _ = offsets.shape
+    out = np.empty((n, side, side))
+    half = side // 2
+    for star in range(n):
+        for i in range(side):
+            for j in range(side):
+                x = j - half + offsets[star, 0, i, j] - place[star, 0]
+                y = i - half + offsets[star, 1, i, j] - place[star, 1]
+                out[star, i, j] = electrons * share(coefficients, step, x, y)[0] + background
+    return out
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def fit_windows(
+    coefficients: F64,
+    step: float,
+    data: F64,
+    offsets: F64,
+    good: NDArray[np.bool_],
+    read_variance: float,
+    least_variance: float,
+    start: F64,
+) -> F64:
+    """Place, electrons and background (n, 4): see `pixcal.estimators.centroids.Star.fit`."""
+    n = data.shape[0]
+    out = np.full((n, 4), np.nan)
+    for star in range(n):
+        theta = start.copy()
+        for _ in range(MAX_STEPS):
+            normal, right = _equations(
+                coefficients, step, data[star], offsets[star], good[star], read_variance,
+                least_variance, theta,
+            )  # fmt: skip
+            if not _solve(normal, right):
+                break
+            length = math.hypot(right[0], right[1])
+            # No further than half a pixel at once: the shape is not linear beyond.
+            brake = min(1.0, 0.5 / length) if length > 0 else 1.0
+            theta += brake * right
+            if not math.hypot(theta[0], theta[1]) < data.shape[1] / 2:
+                break
+            if length < PRECISION:
+                out[star] = theta
+                break
+    return out
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _equations(
+    coefficients: F64,
+    step: float,
+    data: F64,
+    offsets: F64,
+    good: NDArray[np.bool_],
+    read_variance: float,
+    least_variance: float,
+    theta: F64,
+) -> tuple[F64, F64]:
+    """Normal equations of one step, (4, 4) and (4,), the weights from the model as it stands."""
+    side = data.shape[0]
+    half = side // 2
+    normal, right, slope = np.zeros((4, 4)), np.zeros(4), np.empty(4)
+    slope[3] = 1.0
+    for i in range(side):
+        for j in range(side):
+            if not good[i, j]:
+                continue
+            value, along_x, along_y = share(
+                coefficients,
+                step,
+                j - half + offsets[0, i, j] - theta[0],
+                i - half + offsets[1, i, j] - theta[1],
+            )
+            slope[0], slope[1], slope[2] = -theta[2] * along_x, -theta[2] * along_y, value
+            mean = theta[2] * value + theta[3]
+            weight = 1 / (max(mean, 0.0) + read_variance + least_variance)
+            rest = data[i, j] - mean
+            for a in range(4):
+                right[a] += weight * slope[a] * rest
+                for b in range(a + 1):
+                    normal[a, b] += weight * slope[a] * slope[b]
+    return normal, right
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _solve(normal: F64, right: F64) -> bool:
+    """Solve in place, by Cholesky's factors of the lower triangle; False where there are none."""
+    n = len(right)
+    whole = np.diag(normal).copy()
+    for a in range(n):
+        for b in range(a + 1):
+            left = normal[a, b]
+            for k in range(b):
+                left -= normal[a, k] * normal[b, k]
+            if a > b:
+                normal[a, b] = left / normal[b, b]
+            elif left > 1e-12 * whole[a]:
+                normal[a, a] = math.sqrt(left)
+            else:
+                return False
+    for a in range(n):
+        for k in range(a):
+            right[a] -= normal[a, k] * right[k]
+        right[a] /= normal[a, a]
+    for a in range(n - 1, -1, -1):
+        for k in range(a + 1, n):
+            right[a] -= normal[k, a] * right[k]
+        right[a] /= normal[a, a]
+    return True

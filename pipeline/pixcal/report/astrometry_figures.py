@@ -1,0 +1,245 @@
+"""What the maps bring for stars, in one picture: a table, errors against effort, and where."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.transforms import Bbox
+from numpy.typing import NDArray
+
+from pixcal.report.colours import BLUE, DIVERGING, GREEN, GREY, INK, RED, SEQUENTIAL
+from pixcal.report.drawing import WIDE, Unit, finish, new_figure, unit_for
+
+F64 = NDArray[np.float64]
+
+PERFECT, MEASURED = RED, BLUE
+LABELS = {"perfect": "perfect grid", "measured": "measured maps"}
+COLOURS = {"perfect": PERFECT, "measured": MEASURED}
+
+
+@dataclass(frozen=True)
+class AstrometryView:
+    """What the picture shows.
+
+    Attributes
+    ----------
+    result : dict
+        ``astrometry.json``.
+    target_px : float
+        What the mission needs.
+    table : tuple of (str, str, str, str, str)
+        Rows: case, axis, error on a perfect grid, error with the maps, gain.
+    photons : (2, n) float64
+        Electrons, and the bound of a centroid from photon noise, px.
+    weights : (y, x) float64
+        What each pixel tells of the first axis of a star in the middle, sum 1.
+    detail : (grid, y, x) float64
+        Error along the first axis of a star in the middle of each pixel, px; NaN where none is.
+    detail_at : (int, int)
+        First row and column of it.
+    rms : (grid, y, x) float64
+        Of the errors, over blocks of the whole detector, px.
+    block : int
+        Side of the blocks, px.
+    """
+
+    result: Mapping[str, Any]
+    target_px: float
+    table: tuple[tuple[str, ...], ...]
+    photons: F64
+    weights: F64
+    detail: F64
+    detail_at: tuple[int, int]
+    rms: F64
+    block: int
+
+    @property
+    def first(self) -> Mapping[str, Any]:
+        """Entry of the first axis."""
+        return dict(next(iter(self.result["axes"].values())))
+
+    @property
+    def uas_per_px(self) -> float:
+        """Plate scale."""
+        return float(self.result["telescope"]["uas_per_px"])
+
+
+def astrometry_figure(view: AstrometryView) -> Figure:
+    """Table; errors against electrons and positions, and the weights; maps of the errors."""
+    figure = new_figure(WIDE, 14.6)
+    rows: Any = figure.subfigures(4, 1, height_ratios=[0.95, 0.95, 1.05, 1.05])
+    _table(rows[0].subplots(), view)
+    left, middle, right = rows[1].subplots(1, 3, width_ratios=[1.25, 1.1, 0.9])
+    _against_electrons(left, view)
+    _against_positions(middle, view)
+    _weights(rows[1], right, view)
+    _detail(rows[2], view)
+    _everywhere(rows[3], view)
+    return figure
+
+
+def _table(axes: Axes, view: AstrometryView) -> None:
+    axes.set_axis_off()
+    header = ["error of a star's centroid", "along", *LABELS.values(), "gain"]
+    drawn = axes.table(
+        view.table, colLabels=header, cellLoc="left", colLoc="left", edges="horizontal",
+        colWidths=[0.21, 0.07, 0.3, 0.3, 0.12], bbox=Bbox.from_bounds(0.01, 0, 0.98, 1),
+    )  # fmt: skip
+    drawn.auto_set_font_size(False)
+    drawn.set_fontsize(9)
+    for (row, column), cell in drawn.get_celld().items():
+        colour = {2: PERFECT, 3: MEASURED}.get(column, INK)
+        cell.set_text_props(color=colour, weight="bold" if column == 4 or not row else "normal")
+        cell.set_edgecolor("#d9dee5")
+    axes.set_title(_facts(view), fontsize=9.5, color=INK, loc="left", x=0.01)
+
+
+def _facts(view: AstrometryView) -> str:
+    t, s = view.result["telescope"], view.result["stars"]
+    bound = view.first["photon_bound"]
+    return (
+        f"{t['diameter_m']:g} m telescope, {t['focal_length_m']:g} m focal length, "
+        f"{t['wavelength_nm']:g} nm: {t['uas_per_px'] / 1e3:.3g} mas a pixel, "
+        f"{t['px_per_lambda_over_d']:.3g} px in λ/D\n"
+        f"{s['number']} stars, {s['positions']} positions each, {s['window_px']} × "
+        f"{s['window_px']} px fitted; photon noise alone {bound['px']:.3g} px, "
+        f"{bound['uas']:.3g} µas a position\n"
+        f"pixels of the simulated detector: {view.result['detector']['pixels']}"
+    )
+
+
+def _floors(view: AstrometryView) -> dict[str, float]:
+    """Errors without photon noise, px, those that are known."""
+    floors = {grid: view.first["floor"][grid]["px"] for grid in LABELS}
+    return {grid: float(value) for grid, value in floors.items() if value is not None}
+
+
+def _against_electrons(axes: Axes, view: AstrometryView) -> None:
+    electrons, photons = view.photons
+    axes.loglog(electrons, photons, color=GREY, linewidth=1, ls="--", label="photon noise alone")
+    for grid, floor in _floors(view).items():
+        axes.loglog(
+            electrons, np.hypot(floor, photons), color=COLOURS[grid], linewidth=1.6,
+            label=LABELS[grid],
+        )  # fmt: skip
+        found = view.first["photons"][grid]
+        if found["px"] is not None:
+            axes.errorbar(
+                view.result["stars"]["electrons"], found["px"], yerr=found["err_px"], fmt="o",
+                color=COLOURS[grid], markersize=5,
+            )  # fmt: skip
+    axes.axhline(view.target_px, color=GREEN, linewidth=1, label=f"target, {view.target_px:g} px")
+    lowest = min([view.target_px, *(f for f in _floors(view).values() if f > 0)])
+    axes.set_ylim(0.3 * lowest, 20 * float(photons[0]))
+    axes.set_xlim(electrons[0], electrons[-1])
+    axes.set(xlabel="photo-electrons of the star (e-)", ylabel="error, one position (px)")
+    axes.legend(fontsize=7.5, loc="upper right", framealpha=0.95)
+    finish(axes)
+    _on_the_sky(axes, view)
+
+
+def _against_positions(axes: Axes, view: AstrometryView) -> None:
+    found = view.first["averaging"]
+    positions = np.array(found["positions"], dtype=float)
+    values: list[float] = [view.target_px]
+    for grid, label in LABELS.items():
+        px = np.array(found[f"{grid}_px"], dtype=float)
+        error = np.nan_to_num(np.array(found[f"{grid}_err_px"], dtype=float))
+        known = np.isfinite(px)
+        if not known.any():
+            continue
+        axes.errorbar(
+            positions[known], px[known], yerr=error[known], fmt="o-", color=COLOURS[grid],
+            markersize=4, linewidth=1, label=label,
+        )  # fmt: skip
+        first = np.flatnonzero(known)[0]
+        axes.plot(
+            positions, px[first] * np.sqrt(positions[first] / positions), color=COLOURS[grid],
+            linewidth=0.8, ls=":",
+        )  # fmt: skip
+        values += px[known].tolist()
+    axes.axhline(view.target_px, color=GREEN, linewidth=1)
+    axes.set_xscale("log", base=2)
+    axes.set_yscale("log")
+    axes.set_xticks(positions, [f"{n:g}" for n in positions])
+    axes.minorticks_off()
+    axes.set_ylim(0.4 * min(values), 2 * max(values))
+    axes.set(
+        xlabel="positions averaged (dotted: independent)", ylabel="error with photon noise (px)"
+    )
+    finish(axes)
+    _on_the_sky(axes, view)
+
+
+def _on_the_sky(axes: Axes, view: AstrometryView) -> None:
+    scale = view.uas_per_px
+
+    def to_sky(px: Any) -> Any:
+        return px * scale
+
+    def to_pixels(uas: Any) -> Any:
+        return uas / scale
+
+    sky = axes.secondary_yaxis("right", functions=(to_sky, to_pixels))
+    sky.set_ylabel("µas", labelpad=-2)
+
+
+def _weights(figure: SubFigure, axes: Axes, view: AstrometryView) -> None:
+    half = view.weights.shape[0] // 2
+    top = float(np.max(np.abs(view.weights)))
+    drawn = axes.imshow(
+        view.weights, origin="lower", cmap=DIVERGING, vmin=-top, vmax=top, interpolation="nearest",
+        extent=(-half - 0.5, half + 0.5, -half - 0.5, half + 0.5),
+    )  # fmt: skip
+    name = next(iter(view.result["axes"]))
+    axes.set(xlabel="px from the star", title=f"weight of a pixel's offset, {name}")
+    axes.title.set_fontsize(9.5)
+    figure.colorbar(drawn, ax=axes, location="bottom", shrink=0.9)
+
+
+def _detail(figure: SubFigure, view: AstrometryView) -> None:
+    panels: Any = figure.subplots(1, 2)
+    finite = np.abs(view.detail[np.isfinite(view.detail)])
+    top = float(np.quantile(finite, 0.99)) if finite.size else 1.0
+    unit = unit_for([top], "px")
+    (y0, x0), (ny, nx) = view.detail_at, view.detail.shape[1:]
+    for axes, image, grid in zip(panels, view.detail, LABELS, strict=True):
+        drawn = axes.imshow(
+            unit.factor * image, origin="lower", cmap=DIVERGING, interpolation="nearest",
+            vmin=-unit.factor * top, vmax=unit.factor * top,
+            extent=(x0 - 0.5, x0 + nx - 0.5, y0 - 0.5, y0 + ny - 0.5),
+        )  # fmt: skip
+        _map_labels(axes, f"error of a star at each place, {LABELS[grid]}")
+    name = next(iter(view.result["axes"]))
+    _bar(figure, panels, drawn, unit, f"along {name}")
+
+
+def _everywhere(figure: SubFigure, view: AstrometryView) -> None:
+    panels: Any = figure.subplots(1, 2)
+    (ny, nx), side = view.rms.shape[1:], view.block
+    for axes, image, grid in zip(panels, view.rms, LABELS, strict=True):
+        finite = image[np.isfinite(image)]
+        low, high = np.quantile(finite, [0.01, 0.99]) if finite.size else (0.0, 1.0)
+        unit = unit_for([high], "px")
+        drawn = axes.imshow(
+            unit.factor * image, origin="lower", cmap=SEQUENTIAL, interpolation="nearest",
+            vmin=unit.factor * low, vmax=unit.factor * max(high, low * 1.001 + 1e-12),
+            extent=(-0.5, nx * side - 0.5, -0.5, ny * side - 0.5),
+        )  # fmt: skip
+        height, width = view.result["detector"]["shape"]
+        axes.set_xlim(-0.5, width - 0.5)
+        axes.set_ylim(-0.5, height - 0.5)
+        _map_labels(axes, f"rms of {side} × {side} px, {LABELS[grid]}")
+        _bar(figure, axes, drawn, unit, "rms")
+
+
+def _map_labels(axes: Axes, title: str) -> None:
+    axes.set(xlabel="x (px)", ylabel="y (px)", title=title)
+    axes.title.set_fontsize(9.5)
+
+
+def _bar(figure: SubFigure, axes: Any, drawn: Any, unit: Unit, label: str) -> None:
+    figure.colorbar(drawn, ax=axes, pad=0.02).set_label(f"{label} ({unit.label})")

@@ -1,0 +1,195 @@
+"""The picture of a budget: precision against frames, and what would help most."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
+from numpy.typing import NDArray
+
+from pixcal.report.colours import BAR, BLUE, GREEN, GREY, INK, MARKS, RED
+from pixcal.report.drawing import WIDE, finish, new_figure
+from pixcal.report.text import duration, number
+
+F64 = NDArray[np.float64]
+
+COLOURS = (BLUE, GREEN, *MARKS)
+
+
+@dataclass(frozen=True)
+class Line:
+    """Precision against frames: one over their root.
+
+    Attributes
+    ----------
+    label : str
+    median, worst : float
+        After one frame, px, of the median and of the worst pixel.
+    planned : int
+        Frames of the bench.
+    """
+
+    label: str
+    median: float
+    worst: float
+    planned: int
+
+
+@dataclass(frozen=True)
+class BudgetView:
+    """What the figure shows.
+
+    Attributes
+    ----------
+    name : str
+        Of the bench file.
+    sets, joined : tuple of Line
+        Of each set; of the components of all sets, against the frames of all.
+    precision : float or None
+        Wanted, px.
+    frames : int or None
+        Given, of each set.
+    period_s : float
+        From frame to frame.
+    levers : tuple of (str, float, float)
+        Name, variance of one frame (px²) and period (s) of each change.
+    """
+
+    name: str
+    sets: tuple[Line, ...]
+    joined: tuple[Line, ...]
+    precision: float | None
+    frames: int | None
+    period_s: float
+    levers: tuple[tuple[str, float, float], ...]
+
+
+def budget_figure(view: BudgetView) -> Figure:
+    """Precision against frames on the left, time with each change of the bench on the right."""
+    figure = new_figure(WIDE, 4.9)
+    left, right = figure.subplots(1, 2, width_ratios=[1.25, 1])
+    _precision(left, view)
+    _levers(right, view)
+    return figure
+
+
+def _span(view: BudgetView) -> F64:
+    """Frames from well before to well after all that is marked."""
+    marks = [float(line.planned) for line in (*view.sets, *view.joined)]
+    if view.frames:
+        marks.append(float(view.frames))
+    if view.precision:
+        marks += [(line.median / view.precision) ** 2 for line in (*view.sets, *view.joined)]
+        marks += [(line.worst / view.precision) ** 2 for line in view.sets]
+    low, high = np.log10(max(min(marks) / 5, 1.0)), np.log10(max(marks) * 4)
+    return np.logspace(low, high, 61)
+
+
+def _precision(axes: Axes, view: BudgetView) -> None:
+    frames = _span(view)
+    for order, (line, colour) in enumerate(zip(view.sets, _cycle(len(view.sets)), strict=True)):
+        # Sets are often alike: the later ones are thinner, so that none is hidden.
+        width = 2.0 + 3.0 * (len(view.sets) - 1 - order)
+        axes.plot(
+            frames, line.median / np.sqrt(frames), color=colour, linewidth=width, label=line.label
+        )
+        if line.worst > 1.01 * line.median:
+            ends = (line.median / np.sqrt(frames), line.worst / np.sqrt(frames))
+            axes.fill_between(frames, *ends, color=colour, alpha=0.18, linewidth=0)
+        axes.plot(
+            line.planned, line.median / np.sqrt(line.planned), "o", color=colour,
+            markersize=8 + 3 * (len(view.sets) - 1 - order),
+        )  # fmt: skip
+    for line, colour, style in zip(view.joined, (INK, GREY), ("-", "--"), strict=False):
+        axes.plot(
+            frames, line.median / np.sqrt(frames), color=colour, ls=style, linewidth=1.4,
+            label=f"{line.label}, frames of all sets",
+        )  # fmt: skip
+    if view.precision:
+        axes.axhline(view.precision, color=RED, linewidth=1.2)
+        axes.annotate(
+            f"wanted {number(view.precision)} px", (frames[0], view.precision), xytext=(4, 4),
+            textcoords="offset points", color=RED, fontsize=10,
+        )  # fmt: skip
+        for line in (*view.sets, *view.joined):
+            axes.plot((line.median / view.precision) ** 2, view.precision, "s", color=RED)
+    if view.frames:
+        axes.axvline(view.frames, color=RED, linewidth=1.2)
+        axes.annotate(
+            f"{number(view.frames)} frames of each set", (view.frames, 0.02),
+            xycoords=("data", "axes fraction"), xytext=(-5, 0), textcoords="offset points",
+            ha="right", color=RED, fontsize=10,
+        )  # fmt: skip
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlim(frames[0], frames[-1])
+    axes.set(xlabel="frames", ylabel="1σ bound of a pixel's offset (px)")
+    _plain(axes)
+    _clock(axes, view.period_s)
+    finish(axes)
+    axes.plot([], [], "o", color=GREY, label="planned")
+    if any(line.worst > 1.01 * line.median for line in view.sets):
+        axes.fill_between([], [], [], color=GREY, alpha=0.25, label="median to worst pixel")
+    axes.legend(fontsize=9, framealpha=0.9, loc="upper right")
+
+
+def _cycle(number: int) -> list[str]:
+    return [COLOURS[n % len(COLOURS)] for n in range(number)]
+
+
+def _plain(axes: Axes) -> None:
+    """Ticks at 1, 2 and 5 of each decade where there are few decades."""
+    for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        few = np.log10(limits[1] / limits[0]) < 2.6
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if few else (1,), numticks=12))
+        axis.set_major_formatter(FuncFormatter(lambda v, _: number(v, 1)))
+        axis.set_minor_formatter(NullFormatter())
+
+
+def _clock(axes: Axes, period: float) -> None:
+    """Time on top."""
+
+    def seconds(frames: Any) -> Any:
+        return np.asarray(frames) * period
+
+    def back(time: Any) -> Any:
+        return np.asarray(time) / period
+
+    top = axes.secondary_xaxis("top", functions=(seconds, back))
+    places = [10.0, 60.0, 600.0, 3600.0, 36000.0, 8.64e4, 8.64e5, 8.64e6]
+    low, high = (period * f for f in axes.get_xlim())
+    top.xaxis.set_major_locator(FixedLocator([p for p in places if low <= p <= high]))
+    names = ("10 s", "1 min", "10 min", "1 h", "10 h", "1 d", "10 d", "100 d")
+    named = dict(zip(places, names, strict=True))
+    top.xaxis.set_major_formatter(FuncFormatter(lambda v, _: named.get(v, "")))
+    top.xaxis.set_minor_locator(NullLocator())
+
+
+def _levers(axes: Axes, view: BudgetView) -> None:
+    """Time for the same precision, relative to the plan."""
+    planned = next(v * p for name, v, p in view.levers if name == "as planned")
+    names = [name for name, _, _ in view.levers][::-1]
+    share = np.array([v * p / planned for _, v, p in view.levers])[::-1]
+    colours = [INK if name == "as planned" else RED if s > 1 else BLUE
+               for name, s in zip(names, share, strict=True)]  # fmt: skip
+    at = np.arange(len(names))
+    axes.barh(at, share, color=[BAR if c == BLUE else c for c in colours], height=0.62)
+    for y, name, value in zip(at, names, share, strict=True):
+        axes.annotate(
+            name, (0, y + 0.34), xytext=(1, 0), textcoords="offset points", fontsize=9,
+            va="bottom", color=INK,
+        )  # fmt: skip
+        text = f"{100 * value:.3g} %"
+        if view.precision:
+            text += f"   {duration(value * planned / view.precision**2)}"
+        axes.annotate(
+            text, (value, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=9
+        )
+    axes.set_yticks([])
+    axes.set_xlim(0, 1.45 * float(share.max()))
+    axes.set_ylim(-0.6, len(names) - 0.1)
+    axes.set(xlabel="time for the same precision / as planned", title="What if")
+    finish(axes, grid=False)
+    axes.spines["left"].set_visible(False)

@@ -1,0 +1,151 @@
+"""The error of a star's centroid at every place of the detector, to first order, by convolution.
+
+A star in the middle of each pixel; its error is the sum of the displacements around it, weighted
+as `pixcal.estimators.centroids.Star.weights` says. Masked pixels have no part in it, and the
+others their weight (exact but for how they share it).
+"""
+
+from dataclasses import dataclass
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import irfft2, next_fast_len, rfft2
+
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.centroids import Star
+from pixcal.stages.astrometry.detector import Detector
+from pixcal.stages.astrometry.simulation import MOST_LOST
+from pixcal.storage.cube import ArrayWriter, create_array, create_group
+
+F64 = NDArray[np.float64]
+
+TILE = 512
+"""Side of a task's part of the map, about, px."""
+SHOWN = 96
+"""Most blocks along the longer side of the pictures of the whole detector."""
+LEAST_BLOCK = 8
+"""Least side of such a block, px: a few independent places, for its rms to mean something."""
+GRIDS = ("perfect", "measured")
+
+
+@dataclass(frozen=True)
+class ErrorMaps:
+    """Error of a star in the middle of every pixel whose window lies on the detector.
+
+    Attributes
+    ----------
+    squares : (grid, component, y, x) float64
+        Sum of squares over blocks, px²: pixels taken for a perfect grid, or where the maps say.
+    places : (y, x) float64
+        Pixels of the blocks that count.
+    block : int
+        Side of the blocks, px.
+    """
+
+    squares: F64
+    places: F64
+    block: int
+
+    @property
+    def mean_square(self) -> F64:
+        """Over the whole detector, (grid, component), px²; NaN where no place counts."""
+        places = float(self.places.sum())
+        return np.asarray(
+            self.squares.sum(axis=(2, 3)) / places if places else self.squares * np.nan
+        )
+
+    @property
+    def rms(self) -> F64:
+        """Of each block, (grid, component, y, x), px; NaN where no place counts."""
+        empty = np.full(self.squares.shape, np.nan)
+        there = self.places > 0
+        return np.asarray(np.sqrt(np.divide(self.squares, self.places, out=empty, where=there)))
+
+
+def tile_side(shape: tuple[int, int]) -> tuple[int, int]:
+    """Side of a task's part, and of the blocks that it holds a whole number of, px."""
+    block = max(LEAST_BLOCK, -(-max(shape) // SHOWN))
+    return block * max(1, TILE // block), block
+
+
+def error_maps(folder: Path, detector: Detector, star: Star, runtime: Runtime) -> ErrorMaps:
+    """Write the error at every place, and sum it up.
+
+    Writes arrays (y, x), float32, px: ``perfect_<component>`` and ``measured_<component>``; NaN at
+    places that do not count.
+    """
+    ny, nx = detector.shape
+    side, block = tile_side(detector.shape)
+    create_group(folder)
+    writers = [
+        create_array(
+            folder / f"{grid}_{component.name}", (ny, nx), "<f4", dims=("y", "x"),
+            chunks=(min(side, ny), min(side, nx)), fill_value=np.nan, attrs={"units": "pixel"},
+        )
+        for grid in GRIDS
+        for component in detector.components
+    ]  # fmt: skip
+    corners = list(product(range(0, ny, side), range(0, nx, side)))
+    task = partial(_tile, detector, star, writers, side, block)
+    parts = run_tasks(task, corners, runtime, label="error maps")
+    for writer in writers:
+        writer.finish()
+    places = np.zeros((-(-ny // block), -(-nx // block)))
+    squares = np.zeros((len(GRIDS), len(detector.components), *places.shape))
+    for (y, x), (square, count) in zip(corners, parts, strict=True):
+        i, j = y // block, x // block
+        at = (slice(i, i + count.shape[0]), slice(j, j + count.shape[1]))
+        squares[:, :, *at], places[at] = square, count
+    return ErrorMaps(squares, places, block)
+
+
+def _tile(
+    detector: Detector,
+    star: Star,
+    writers: list[ArrayWriter],
+    side: int,
+    block: int,
+    corner: tuple[int, int],
+) -> tuple[F64, F64]:
+    """Write a part of the maps; squares (grid, component, y, x) and places of its blocks."""
+    y, x = ((a, min(a + side, n)) for a, n in zip(corner, detector.shape, strict=True))
+    errors = place_errors(detector, star, y, x)
+    for writer, values in zip(writers, errors.reshape(-1, *errors.shape[2:]), strict=True):
+        writer.write(corner, values.astype(np.float32))
+    good = np.isfinite(errors[0, 0])
+    return _blocks(np.where(good, errors, 0.0) ** 2, block), _blocks(good.astype(float), block)
+
+
+def place_errors(detector: Detector, star: Star, y: tuple[int, int], x: tuple[int, int]) -> F64:
+    """Errors (grid, component, y, x), px, of stars in the middle of some pixels."""
+    half, (ny, nx) = star.half, detector.shape
+    patch = detector.patch((y[0] - half, y[1] + half), (x[0] - half, x[1] + half))
+    shape = (y[1] - y[0], x[1] - x[0])
+    size = tuple(next_fast_len(n + 2 * half, real=True) for n in shape)
+    axes = detector.axes
+    weights = np.einsum("ka,abyx,lb->klyx", axes, star.weights(np.zeros(2)), axes)
+    kernels = np.conj(rfft2(weights, size))
+
+    def sums(kernel: NDArray[np.complex128], values: F64) -> F64:
+        """Sum of the values about each place, (kernel of sums) weighted."""
+        spectrum = np.einsum("kl...,l...->k...", kernel, rfft2(values, size))
+        return np.asarray(irfft2(spectrum, size)[:, : shape[0], : shape[1]])
+
+    errors = np.stack([sums(kernels, away) for away in (patch.true, patch.true - patch.known)])
+    rows, columns = np.arange(*y)[:, None], np.arange(*x)[None, :]
+    counts = (rows >= half) & (rows < ny - half) & (columns >= half) & (columns < nx - half)
+    if not patch.good.all():
+        own = np.stack([[kernels[k, k]] for k in range(len(axes))])
+        kept = -sums(own, patch.good.astype(float)[None])
+        counts = counts & (kept >= 1 - MOST_LOST).all(axis=0)
+        errors /= np.maximum(kept, 1 - MOST_LOST)
+    return np.where(counts, errors, np.nan)
+
+
+def _blocks(values: F64, side: int) -> F64:
+    """Sums over blocks of the last two axes."""
+    across = np.add.reduceat(values, np.arange(0, values.shape[-1], side), axis=-1)
+    return np.asarray(np.add.reduceat(across, np.arange(0, values.shape[-2], side), axis=-2))

@@ -1,0 +1,320 @@
+"""``pixcal astrometry``: what the maps bring for the centroids of stars.
+
+``astrometry.json`` holds ``schema`` and ``pixcal``; ``detector`` (what the simulated pixels are,
+and with a truth the rms of the modes that it was freed from); ``telescope``; ``stars``; ``axes``,
+for ``x`` and ``y`` (or ``fringe``) errors in px and µas:
+
+- ``floor``: no photon noise; ``photons``: with it; ``averaged``: the mean over all positions of a
+  star, with photon noise; ``separation``: the difference of two stars' means. Each for a
+  ``perfect`` grid, for the ``measured`` maps, and the ``gain``, the one over the other;
+- ``photon_bound``: the Cramér-Rao bound of one position; ``averaging``: errors against the number
+  of positions; ``positions_to_target``: how many the target takes if they are independent;
+- ``second_order_px``: by how much the fits differ from the first order (rms), and
+  ``everywhere``: errors of the first order at all places, a star in the middle of each pixel;
+
+and ``warnings`` (sentences). Errors are 1 sigma, of the simulation: other stars, the same detector.
+What is not seen above the maps' own errors is null. ``astrometry.zarr`` holds the maps of errors.
+"""
+
+import shutil
+from collections.abc import Mapping
+from dataclasses import asdict, astuple, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal import __version__
+from pixcal.engine.plan import make_plan
+from pixcal.engine.run import Runtime
+from pixcal.estimators.centroids import Star
+from pixcal.kernels.psf import Psf
+from pixcal.model.acquisition import Acquisition
+from pixcal.model.config import parse, quantity
+from pixcal.model.errors import InputError
+from pixcal.report.astrometry_figures import AstrometryView, astrometry_figure
+from pixcal.report.drawing import png
+from pixcal.stages.astrometry.detector import Component, Detector, generator, open_components
+from pixcal.stages.astrometry.error_map import ErrorMaps, error_maps, place_errors, tile_side
+from pixcal.stages.astrometry.modes import Modes, SetModes
+from pixcal.stages.astrometry.simulation import Observation, core_weights, observe
+from pixcal.stages.astrometry.summary import TARGET_PX, axis_facts, table
+from pixcal.stages.astrometry.telescope import Telescope, exposures, star
+from pixcal.stages.astrometry.truth import BAND, free_from_modes
+from pixcal.storage.artefact import (
+    Build,
+    Manifest,
+    artefact_key,
+    build,
+    lock,
+    read_json,
+    require,
+    up_to_date,
+    write_json,
+)
+from pixcal.storage.fits_map import content_digest
+
+STAGE = "astrometry"
+FORMAT = 1
+SCHEMA = "pixcal/astrometry/1"
+
+MOST_ELECTRONS = 1e15
+"""The Poisson generator counts so far."""
+CURVE = np.geomspace(1e4, 1e12, 49)
+"""Electrons of the curve of errors."""
+DETAIL = 128
+"""Side of the part of the error maps that is shown place by place, px."""
+FIGURE_BYTES = 160 << 20
+"""Matplotlib and one figure."""
+_BYTES_PER_PIXEL = 180
+"""Peak of a task for each pixel that it looks at (measured)."""
+_BYTES_PER_PIXEL_AND_MODE = 13
+"""What each mode adds where there is a truth (measured)."""
+_BYTES_PER_FITTED_MODE = 28
+"""Peak of a task of the fit of the modes, for each pixel and mode (measured)."""
+_BYTES_PER_WINDOW_PIXEL = 200
+"""Peak of a task of the stars, for each pixel of a star's windows (measured)."""
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Config:
+    """Truth, telescope and stars; the telescope is by default that of the paper, section 2."""
+
+    truth: Path | None = None
+    diameter_m: float = quantity(7.0, unit="m", above=0, doc="entrance pupil")
+    focal_length_m: float = quantity(130.0, unit="m", above=0, doc="focal length")
+    wavelength_nm: float = quantity(600.0, unit="nm", above=0, doc="of the stars' light")
+    obscuration: float = quantity(0.0, low=0, high=0.9, doc="in the middle, of the diameter")
+    electrons: float = quantity(1e8, unit="e-", above=0, doc="of a star at each position")
+    background_e: float = quantity(0.0, unit="e-", low=0, doc="of each pixel at each position")
+    window: int | None = quantity(None, unit="px", low=3, doc="side of the fit's window, odd")
+    stars: int = quantity(1000, low=2, doc="stars, all over the detector")
+    positions: int = quantity(16, low=1, doc="positions of each star")
+    dither_px: float = quantity(32.0, unit="px", low=0, doc="distance of positions from the first")
+    seed: int = quantity(0, low=0, doc="of the random numbers")
+
+    def __post_init__(self) -> None:
+        if self.window is not None and self.window % 2 == 0:
+            raise InputError(f"--window {self.window}: even; a window has a middle pixel")
+        if self.electrons + self.background_e > MOST_ELECTRONS:
+            raise InputError(
+                f"--electrons, --background: more than {MOST_ELECTRONS:g} e- cannot be counted"
+            )
+
+
+def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
+    """Hold centroids on a perfect grid against centroids on the measured maps.
+
+    Reads the maps in ``RUN/products``; makes ``RUN/astrometry`` and the products
+    ``astrometry.json`` and ``astrometry.png``.
+
+    Raises
+    ------
+    InputError
+        If fit has not been run, the maps are too small for a star, or the truth is not that of
+        this detector.
+    """
+    fitted = require(run_dir, "fit", 1)
+    described = run_dir / "ingest" / "acquisition.json"
+    acquisition = parse(Acquisition, read_json(described), str(described))
+    telescope = Telescope(
+        config.diameter_m, config.focal_length_m, config.wavelength_nm, config.obscuration,
+        acquisition.detector.pitch_um,
+    )  # fmt: skip
+    with lock(run_dir):
+        fit = read_json(run_dir / "fit" / "fit.json")
+        components = open_components(run_dir, fit, config.truth)
+        inputs = {"fit": fitted.key}
+        for component in components:
+            inputs[component.delta.path.name] = content_digest(component.delta.path)
+            for _, image in component.truth:
+                inputs[f"truth/{image.path.name}"] = content_digest(image.path)
+        plain = asdict(config) | {"truth": None}
+        key = artefact_key(STAGE, FORMAT, plain, inputs)
+        if up_to_date(run_dir, STAGE, key) is None:
+            with build(run_dir, STAGE, FORMAT, plain, inputs) as made:
+                _measure(made, components, fit, acquisition, telescope, config, runtime)
+        _publish(run_dir)
+        return require(run_dir, STAGE, FORMAT)
+
+
+def _publish(run_dir: Path) -> None:
+    for name in ("astrometry.json", "astrometry.png"):
+        aside = run_dir / "products" / f".{name}.aside"
+        shutil.copyfile(run_dir / STAGE / name, aside)
+        aside.replace(run_dir / "products" / name)
+
+
+def _measure(
+    made: Build,
+    components: list[Component],
+    fit: Mapping[str, Any],
+    acquisition: Acquisition,
+    telescope: Telescope,
+    config: Config,
+    runtime: Runtime,
+) -> None:
+    """Everything; writes the artefact's files."""
+    psf, half = telescope.psf(config.window)
+    seen = star(psf, half, config.electrons, config.background_e, acquisition.detector)
+    shape = components[0].delta.shape
+    if seen.side > min(shape):
+        raise InputError(
+            f"--window: {seen.side} px do not fit maps of {shape[1]} × {shape[0]} px (x × y); "
+            f"give an odd number up to {min(shape)}"
+        )
+    sets = [SetModes.of_fit(shape, facts, acquisition) for facts in fit["sets"].values()]
+    modes = Modes(shape, tuple(sets)).number if config.truth is not None else 0
+    need = planned(shape, modes, seen.side, config)
+    runtime = runtime.with_workers(make_plan("astrometry", *need, runtime).workers)
+    removed = None
+    if config.truth is not None:
+        components, removed = free_from_modes(components, sets, runtime)
+    detector = Detector(tuple(components), config.seed)
+    maps = error_maps(made.folder / "astrometry.zarr", detector, seen, runtime)
+    if not maps.places.any():
+        raise InputError(
+            f"{components[0].delta.path}: masked pixels leave no place for a star and its window "
+            f"of {seen.side} px; try a smaller --window"
+        )
+    plan = Observation(seen, config.stars, config.positions, config.dither_px)
+    errors = observe(detector, plan, runtime)
+    result = {
+        "schema": SCHEMA,
+        "pixcal": __version__,
+        "detector": _detector_facts(detector, maps, config, removed),
+        "telescope": telescope.facts(),
+        "stars": {
+            "number": config.stars,
+            "positions": config.positions,
+            "positions_used": int(np.isfinite(errors).all(axis=(2, 3)).sum()),
+            "dither_px": config.dither_px,
+            "electrons": config.electrons,
+            "exposures": exposures(psf, config.electrons, acquisition.detector),
+            "background_e": config.background_e,
+            "read_noise_e": acquisition.detector.read_noise_e,
+            "window_px": seen.side,
+            "seed": config.seed,
+        },
+        "axes": _axes(detector, seen, errors, maps, telescope),
+    }
+    result["warnings"] = _warnings(result)
+    write_json(made.folder / "astrometry.json", result)
+    view = _view(result, detector, seen, maps, _curve(psf, half, acquisition, config))
+    (made.folder / "astrometry.png").write_bytes(png(astrometry_figure(view)))
+    made.summary = {"warnings": result["warnings"]}
+
+
+def planned(shape: tuple[int, int], modes: int, side: int, config: Config) -> tuple[int, int]:
+    """Bytes of a task and of what this process holds.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Of the detector.
+    modes : int
+        That a truth is freed from; 0 without one.
+    side : int
+        Of a star's window, px.
+    config : Config
+    """
+    per_pixel = _BYTES_PER_PIXEL + _BYTES_PER_PIXEL_AND_MODE * modes
+    reach = min(int(2 * config.dither_px) + 1, max(shape)) + side
+    task = max(
+        (tile_side(shape)[0] + side) ** 2 * per_pixel,
+        reach**2 * per_pixel + config.positions * side**2 * _BYTES_PER_WINDOW_PIXEL,
+        BAND * shape[1] * modes * _BYTES_PER_FITTED_MODE,
+    )
+    # All errors of the stars, and their copies while they are averaged.
+    return task, FIGURE_BYTES + 4 * 8 * 12 * config.stars * config.positions
+
+
+def _detector_facts(
+    detector: Detector, maps: ErrorMaps, config: Config, removed: dict[str, dict[str, float]] | None
+) -> dict[str, Any]:
+    return {
+        "pixels": "maps and a draw of their errors" if detector.drawn else "truth",
+        "truth": None if config.truth is None else str(config.truth),
+        "shape": list(detector.shape),
+        "places": int(maps.places.sum()),
+        "modes_removed_px": removed,
+    }
+
+
+def _axes(
+    detector: Detector, seen: Star, errors: F64, maps: ErrorMaps, telescope: Telescope
+) -> dict[str, Any]:
+    bounds = np.sqrt((detector.axes**2) @ seen.bound() ** 2)
+    facts = {}
+    for n, component in enumerate(detector.components):
+        rng = generator(detector.seed, 3, n)
+        facts[component.name] = axis_facts(
+            errors[..., n], float(bounds[n]), telescope.uas_per_px, drawn=detector.drawn, rng=rng
+        )
+        perfect, measured = maps.mean_square[:, n]
+        perfect -= 2 * measured if detector.drawn else 0.0
+        facts[component.name]["everywhere"] = {
+            "perfect_px": float(np.sqrt(perfect)) if perfect > 0 else None,
+            "measured_px": float(np.sqrt(measured)) if np.isfinite(measured) else None,
+        }
+    return facts
+
+
+def _warnings(result: Mapping[str, Any]) -> list[str]:
+    found = []
+    stars = result["stars"]
+    lost = stars["number"] * stars["positions"] - stars["positions_used"]
+    if lost:
+        found.append(f"{lost} positions are too near to masked pixels and were left out")
+    for name, axis in result["axes"].items():
+        gain = axis["floor"]["gain"]["value"]
+        if axis["floor"]["perfect"]["px"] is None:
+            found.append(
+                f"{name}: the pixels' own offsets are not seen above the maps' errors; these maps "
+                "do stars no good, more frames are needed"
+            )
+        elif gain is not None and gain < 1:
+            found.append(
+                f"{name}: the maps' errors exceed the offsets themselves; these maps do stars harm"
+            )
+    if "fringe" in result["axes"]:
+        found.append(
+            "offsets are known along one axis only: those across it, taken as zero here, move "
+            "stars along it too"
+        )
+    if result["detector"]["modes_removed_px"] is None:
+        found.append(
+            "without a truth, errors of the maps are what SIGMA says: systematic ones are not seen"
+        )
+    return found
+
+
+def _curve(psf: Psf, half: int, acquisition: Acquisition, config: Config) -> F64:
+    """Photon noise (px, the mean of both axes) against electrons, (2, n)."""
+    bounds = [
+        star(psf, half, n, config.background_e * n / config.electrons, acquisition.detector).bound()
+        for n in CURVE
+    ]
+    return np.stack([CURVE, np.sqrt(np.mean(np.square(bounds), axis=1))])
+
+
+def _view(
+    result: dict[str, Any], detector: Detector, seen: Star, maps: ErrorMaps, photons: F64
+) -> AstrometryView:
+    """What the picture shows."""
+    ny, nx = detector.shape
+    y, x = ((max(0, (n - DETAIL) // 2), min(n, (n + DETAIL) // 2)) for n in (ny, nx))
+    return AstrometryView(
+        result=result,
+        target_px=TARGET_PX,
+        table=tuple(astuple(row) for row in table(result)),
+        photons=photons,
+        weights=core_weights(seen, detector.axes)[0],
+        detail=place_errors(detector, seen, y, x)[:, 0],
+        detail_at=(y[0], x[0]),
+        rms=np.sqrt(np.mean(maps.rms**2, axis=1)),
+        block=maps.block,
+    )

@@ -1,0 +1,67 @@
+"""Freeing a truth from the modes that no fringes can tell from the bench."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.stages.astrometry.detector import Component
+from pixcal.stages.astrometry.modes import Modes, SetModes
+
+F64 = NDArray[np.float64]
+
+ENOUGH = 4_000_000
+"""Pixels that tell the modes; of larger detectors some bands are left out."""
+BAND = 16
+"""Rows of a task."""
+
+
+def free_from_modes(
+    components: Sequence[Component], sets: Sequence[SetModes], runtime: Runtime
+) -> tuple[list[Component], dict[str, dict[str, float]]]:
+    """Fit the modes to truth minus maps, and have them taken off the truth.
+
+    Returns
+    -------
+    list of Component
+    dict
+        For each component the rms (px) of the ``smooth`` and of the ``fringe`` modes taken off.
+    """
+    shape = components[0].delta.shape
+    modes = Modes(shape, tuple(sets))
+    # An odd step: bands must not keep pace with fringes.
+    step = (shape[0] * shape[1] // ENOUGH) | 1
+    bands = [(y, min(y + BAND, shape[0])) for y in range(0, shape[0], BAND * step)]
+    task = partial(_sums, tuple(components), modes)
+    parts = run_tasks(task, bands, runtime, label="modes of the truth")
+    freed, removed = [], {}
+    for n, component in enumerate(components):
+        normal, right, count = (sum(part[n][k] for part in parts) for k in range(3))
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        # Modes of two sets overlap: of all combinations that do, the least.
+        scaled = np.asarray(normal) / np.outer(scale, scale)
+        found = np.linalg.lstsq(scaled, right / scale, rcond=1e-10)[0] / scale
+        freed.append(replace(component, modes=replace(modes, coefficients=tuple(found.tolist()))))
+        kinds = {"smooth": slice(modes.n_smooth), "fringe": slice(modes.n_smooth, None)}
+        removed[component.name] = {
+            kind: float(np.sqrt(found[p] @ np.asarray(normal)[p, p] @ found[p] / max(count, 1)))
+            for kind, p in kinds.items()
+        }
+    return freed, removed
+
+
+def _sums(
+    components: tuple[Component, ...], modes: Modes, y: tuple[int, int]
+) -> list[tuple[F64, F64, int]]:
+    """Normal equations of the modes in truth minus map over a band, for each component."""
+    x = (0, modes.shape[1])
+    basis, sums = modes.basis(y, x), []
+    for component in components:
+        away = component.true(y, x) - component.delta.read(y, x)
+        good = np.isfinite(away) & (component.mask.read(y, x) == 0)
+        chosen = basis[:, good]
+        sums.append((chosen @ chosen.T, chosen @ away[good], int(good.sum())))
+    return sums

@@ -1,0 +1,287 @@
+"""The sides of a comparison: fitted runs, or some batches of one, read tile by tile.
+
+A side gives the offset along any direction that its fringe sets measure, its variance, and the
+modes that this side's fit took off, as they come out in that direction.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.combine import axes_span_plane, combine_parallel, combine_sets
+from pixcal.estimators.gauge import fringe_modes
+from pixcal.estimators.models import FringeShape
+from pixcal.estimators.models.hyperbolic import Hyperbolic
+from pixcal.estimators.models.paraxial import Paraxial
+from pixcal.kernels.optics import PARAMETERS, Geometry
+from pixcal.model.acquisition import Acquisition
+from pixcal.model.config import parse
+from pixcal.model.errors import InputError
+from pixcal.storage.artefact import read_json, require
+from pixcal.storage.cube import ArrayReader
+
+F64 = NDArray[np.float64]
+Range = tuple[int, int]
+Tile = tuple[Range, Range]
+Vector = tuple[float, float]
+
+FIT_FORMAT = 1
+PART_OF = 1e-3
+"""A set whose share in a direction is below this brings no modes of its own there."""
+
+
+@dataclass(frozen=True)
+class FittedSet:
+    """One fringe set of a fitted run.
+
+    Attributes
+    ----------
+    name : str
+    folder : Path
+        ``fit.zarr/<set name>``.
+    shape : FringeShape
+        Of the fringes, as fitted.
+    batches : tuple of int or None
+        Those that count; None for the whole run.
+    """
+
+    name: str
+    folder: Path
+    shape: FringeShape
+    batches: tuple[int, ...] | None = None
+
+    def vector(self, tile: Tile) -> Vector:
+        """Fringe vector (kx, ky) at the middle of a tile, rad/px."""
+        (y0, y1), (x0, x1) = tile
+        return self.shape.vector((y0 + y1 - 1) / 2, (x0 + x1 - 1) / 2)
+
+    def axis(self, tile: Tile) -> Vector:
+        """Unit vector along which the set measures."""
+        kx, ky = self.vector(tile)
+        return kx / float(np.hypot(kx, ky)), ky / float(np.hypot(kx, ky))
+
+    def delta(self, tile: Tile) -> tuple[F64, F64]:
+        """Offset along the axis and its error (y, x), px; NaN where there is none."""
+        if self.batches is None:
+            delta, sigma = (self._map(name, tile) for name in ("delta", "sigma"))
+            return delta, sigma
+        whole = (0, ArrayReader(self.folder / "batch_delta").shape[0])
+        chosen = list(self.batches)
+        delta, sigma = (
+            ArrayReader(self.folder / f"batch_{name}").read(whole, *tile)[chosen].astype(float)
+            for name in ("delta", "sigma")
+        )
+        good = np.isfinite(delta) & (sigma > 0)
+        weight = np.where(good, 1 / np.where(good, sigma, 1.0) ** 2, 0.0)
+        total = weight.sum(axis=0)
+        there = total > 0
+        mean = (weight * np.where(good, delta, 0.0)).sum(axis=0) / np.where(there, total, 1.0)
+        error = 1 / np.sqrt(np.where(there, total, 1.0))
+        return np.where(there, mean, np.nan), np.where(there, error, np.nan)
+
+    def modes(self, tile: Tile) -> F64:
+        """What the fit took off the set's map, (mode, y, x), px but for a factor."""
+        (y0, y1), (x0, x1) = tile
+        y, x = np.arange(y0, y1, dtype=float)[:, None], np.arange(x0, x1, dtype=float)[None, :]
+        iota, alpha = self._map("iota", tile), self._map("alpha", tile)
+        lit = (alpha > 0) & (iota > 0)
+        ratio = float(np.median(iota[lit] / alpha[lit])) if lit.any() else 1.0
+        gauge = fringe_modes(self.shape.phase(y, x), np.asarray(ratio))
+        both = np.concatenate([self.shape.modes(y, x), np.stack(gauge)])
+        return np.asarray(both / np.hypot(*self.vector(tile)))
+
+    def _map(self, name: str, tile: Tile) -> F64:
+        return ArrayReader(self.folder / name).read(*tile).astype(float)
+
+
+@dataclass(frozen=True)
+class SideTile:
+    """A part of one side along one direction.
+
+    Attributes
+    ----------
+    delta, variance : (y, x) float64
+        px and px²; NaN where there is none.
+    modes : (mode, y, x) float64
+    """
+
+    delta: F64
+    variance: F64
+    modes: F64
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side of a comparison.
+
+    Attributes
+    ----------
+    label : str
+    run : Path
+    key : str
+        Of its fit.
+    sets : tuple of FittedSet
+    window : (int, int)
+        (y, x), px.
+    chunk : (int, int)
+        Of its maps on disk.
+    facts : dict
+        What to say of it.
+    """
+
+    label: str
+    run: Path
+    key: str
+    sets: tuple[FittedSet, ...]
+    window: tuple[int, int]
+    chunk: tuple[int, int]
+    facts: dict[str, Any]
+
+    @property
+    def whole(self) -> Tile:
+        """The window as one tile."""
+        return (0, self.window[0]), (0, self.window[1])
+
+    @property
+    def axes(self) -> list[Vector]:
+        """Of the sets, at the middle of the window."""
+        return [s.axis(self.whole) for s in self.sets]
+
+    @property
+    def both(self) -> bool:
+        """Whether it measures both components."""
+        return axes_span_plane(self.axes)
+
+    def sets_along(self, direction: Vector) -> tuple[FittedSet, ...]:
+        """The sets whose modes are felt along a direction."""
+        ones = np.ones((len(self.sets), 1))
+        shares = self._shares(self.axes, ones, direction)
+        return tuple(
+            s for s, share in zip(self.sets, shares[:, 0], strict=True) if abs(share) > PART_OF
+        )
+
+    def read(self, tile: Tile, direction: Vector) -> SideTile:
+        """Offset along a unit vector (x, y), its variance, and its modes, on a tile."""
+        found = [s.delta(tile) for s in self.sets]
+        delta, sigma = (np.stack([f[n] for f in found]) for n in (0, 1))
+        shares = self._shares([s.axis(tile) for s in self.sets], sigma, direction)
+        lacking = ~np.isfinite(shares).all(axis=0)
+        known = np.isfinite(sigma)
+        value = np.where(known, shares * np.where(known, delta, 0.0), 0.0).sum(axis=0)
+        variance = np.where(known, (shares * np.where(known, sigma, 0.0)) ** 2, 0.0).sum(axis=0)
+        used = self.sets_along(direction)
+        modes = np.concatenate(
+            [
+                np.nan_to_num(share) * s.modes(tile)
+                for share, s in zip(shares, self.sets, strict=True)
+                if s in used
+            ]
+        )
+        return SideTile(
+            np.where(lacking, np.nan, value), np.where(lacking, np.nan, variance), modes
+        )
+
+    def _shares(self, axes: Sequence[Vector], sigma: F64, direction: Vector) -> F64:
+        """What each set's map counts in a direction (set, ...): the fit's own weights."""
+        shares = np.empty_like(sigma)
+        for n in range(len(axes)):
+            unit = np.zeros_like(sigma)
+            unit[n] = 1.0
+            if self.both:
+                x, y = combine_sets(axes, unit, sigma)[0]
+                shares[n] = direction[0] * x + direction[1] * y
+            else:
+                # The mean of parallel sets has the sign of the first.
+                sign = np.sign(np.dot(axes[0], direction))
+                shares[n] = sign * combine_parallel(axes, unit, sigma)[0]
+        return shares
+
+
+def whole_run(run: Path, label: str | None = None) -> Side:
+    """A fitted run as a side.
+
+    Raises
+    ------
+    InputError
+        If the run has not been fitted, or by a model that this comparison does not know.
+    """
+    manifest = require(run, "fit", FIT_FORMAT)
+    result = read_json(run / "fit" / "fit.json")
+    plain = read_json(run / "ingest" / "acquisition.json")
+    acquisition = parse(Acquisition, plain, str(run / "ingest" / "acquisition.json"))
+    group = run / "fit" / "fit.zarr"
+    first = ArrayReader(group / next(iter(result["sets"])) / "delta")
+    window = (first.shape[0], first.shape[1])
+    sets = tuple(
+        FittedSet(name, group / name, _shape(run, facts, acquisition, window))
+        for name, facts in result["sets"].items()
+    )
+    told = {
+        name: {key: facts[key] for key in ("frames", "interfringe_px", "model", "axis")}
+        for name, facts in result["sets"].items()
+    }
+    facts = {"run": str(run), "key": manifest.key, "sets": told}
+    return Side(
+        label or run.name or str(run), run, manifest.key, sets, window,
+        (first.chunks[0], first.chunks[1]), facts,
+    )  # fmt: skip
+
+
+def _shape(
+    run: Path, facts: dict[str, Any], acquisition: Acquisition, window: tuple[int, int]
+) -> FringeShape:
+    """The fringes as fitted, from pixel (0, 0)."""
+    phase, origin = facts["phase_at_origin_rad"], (0.0, 0.0)
+    if facts["model"] == "paraxial":
+        return Paraxial(phase, facts["kx"], facts["ky"], origin, max(window) / 2)
+    if facts["model"] != "hyperbolic":
+        raise InputError(
+            f"{run}: fitted with {facts['model']!r} fringes, whose modes are not known"
+        )
+    geometry = Geometry(
+        acquisition.optics.wavelength_nm * 1e-6,
+        acquisition.detector.pitch_um * 1e-3,
+        *(facts["geometry"][f"{name}_mm"] for name in PARAMETERS),
+    )
+    return Hyperbolic(phase, geometry, tuple(geometry.vector()), (1.0,) * len(PARAMETERS), origin)
+
+
+def parts_of(run: Path, *, interleaved: bool) -> tuple[Side, Side]:
+    """Two parts of a run: the first and the second half of its batches, or every other one.
+
+    Raises
+    ------
+    InputError
+        If the run has not been fitted, or a set has fewer than two batches.
+    """
+    side = whole_run(run)
+    labels = ("odd batches", "even batches") if interleaved else ("first half", "second half")
+    halves: list[list[FittedSet]] = [[], []]
+    counts: list[dict[str, int]] = [{}, {}]
+    for s in side.sets:
+        count = ArrayReader(s.folder / "batch_count").read()
+        filled = np.flatnonzero(count > 0)
+        if len(filled) < 2:
+            raise InputError(
+                f"{run}: set {s.name!r} has too few batches of frames ({len(filled)}) to be "
+                "compared with itself; name two runs, or take more frames"
+            )
+        middle = len(filled) // 2
+        chosen = (filled[::2], filled[1::2]) if interleaved else (filled[:middle], filled[middle:])
+        for n, batches in enumerate(chosen):
+            halves[n].append(replace(s, batches=tuple(int(b) for b in batches)))
+            counts[n][s.name] = int(count[batches].sum())
+    first, second = (
+        replace(
+            side,
+            label=f"{side.label}, {label}",
+            sets=tuple(sets),
+            facts=side.facts | {"part": label, "frames_of_part": frames},
+        )
+        for label, sets, frames in zip(labels, halves, counts, strict=True)
+    )
+    return first, second

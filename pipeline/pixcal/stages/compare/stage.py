@@ -1,0 +1,275 @@
+"""``pixcal compare``: what two maps of the same pixels have in common, and what not.
+
+``compare.json`` holds ``schema``, ``pixcal``, ``sides`` (label, run, key of its fit, fringe sets)
+and ``pairs``: for each two sides their numbers and, for each component, what
+`pixcal.stages.compare.facts` says of it, sizes in px at all ``scales`` together and one by one
+(``side_px``: the part that blocks of that side show and blocks of twice the side do not; the last
+holds all larger ones). The sizes of the scales add up in squares. With three sides or more
+``summary`` says what each holds of its own (from the differences of all pairs).
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm
+
+from pixcal import __version__
+from pixcal.engine.run import Runtime
+from pixcal.estimators.agreement import SIGMA_ACCURACY, Estimate, three_cornered_hat
+from pixcal.model.config import quantity
+from pixcal.model.errors import InputError
+from pixcal.report.compare_figures import ComponentView, PairView, compare_figure
+from pixcal.report.drawing import png
+from pixcal.stages.compare.facts import describe, estimate_facts
+from pixcal.stages.compare.pair import (
+    DISAGREE,
+    Outlying,
+    Pair,
+    Pixels,
+    Places,
+    Sums,
+    read_pixels,
+    read_sums,
+)
+from pixcal.stages.compare.sides import Side, Vector, parts_of, whole_run
+from pixcal.storage.artefact import (
+    MANIFEST,
+    Manifest,
+    artefact_key,
+    lock,
+    read_manifest,
+    write_json,
+)
+
+STAGE = "compare"
+FORMAT = 1
+SCHEMA = "pixcal/compare/1"
+RESULT = "compare.json"
+STRAY = 0.05
+"""Pixels of a window that may be left out by chance."""
+FEWEST = 50
+"""Pixels in common that are needed."""
+PARALLEL_DEG = 10.0
+"""Axes of single sets that differ by more have nothing in common."""
+NOTED_DEG = 0.5
+"""From here on it is said that the axes differ."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of the comparison."""
+
+    split: str = quantity(
+        "halves",
+        choices=("halves", "odd-even"),
+        doc="of one run: its first and second half, or every other batch",
+    )
+    sigma_accuracy: float = quantity(
+        SIGMA_ACCURACY, low=0, high=0.5, doc="relative error of SIGMA that is no difference yet"
+    )
+
+
+def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Manifest:
+    """Compare the maps of two runs or more, or of two parts of one.
+
+    Parameters
+    ----------
+    runs : sequence of Path
+        Fitted runs of windows of the same shape, whose pixels are taken to be the same.
+    out : Path
+        Directory for ``compare.json`` and the pictures.
+    config : Config
+    runtime : Runtime
+
+    Raises
+    ------
+    InputError
+        If a run has not been fitted, the windows differ, the runs have no component in common, or
+        the directory is not one that a comparison may write to.
+    """
+    if not 0 <= config.sigma_accuracy <= 0.5:
+        raise InputError(f"--sigma-accuracy {config.sigma_accuracy}: not between 0 and 0.5")
+    sides = _sides(runs, config)
+    components = _components(sides)
+    inputs = {f"{n} {side.run}": side.key for n, side in enumerate(sides)}
+    key = artefact_key(STAGE, FORMAT, asdict(config), inputs)
+    _check_out(out)
+    with lock(out):
+        ready = read_manifest(out)
+        if ready is not None and ready.key == key and (out / RESULT).exists():
+            return ready
+        (out / MANIFEST).unlink(missing_ok=True)
+        result, views = _compare_all(sides, components, config, runtime)
+        for picture in out.glob("compare*.png"):
+            picture.unlink()
+        for name, view in _names(views):
+            aside = out / f".{name}.aside"
+            aside.write_bytes(png(compare_figure(view)))
+            aside.replace(out / name)
+        write_json(out / RESULT, result)
+        manifest = Manifest(STAGE, FORMAT, key, asdict(config), inputs)
+        write_json(out / MANIFEST, asdict(manifest))
+        return manifest
+
+
+def _check_out(out: Path) -> None:
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise InputError(f"--out {out}: a file is in the way; choose another directory")
+    made = read_manifest(out)
+    if (made is not None and made.stage != STAGE) or (out / "ingest").exists():
+        raise InputError(f"--out {out}: holds something else of pixcal; choose another directory")
+
+
+def _names(views: Sequence[PairView]) -> list[tuple[str, PairView]]:
+    if len(views) == 1:
+        return [("compare.png", views[0])]
+    return [(f"compare-{v.numbers[0]}-{v.numbers[1]}.png", v) for v in views]
+
+
+def _sides(runs: Sequence[Path], config: Config) -> list[Side]:
+    if len(runs) == 1:
+        return list(parts_of(runs[0], interleaved=config.split == "odd-even"))
+    # Runs of the same name in different places are told apart by their paths.
+    alike = len({run.name for run in runs}) < len(runs)
+    sides = [whole_run(run, str(run) if alike else None) for run in runs]
+    first = sides[0]
+    for side in sides[1:]:
+        if side.window != first.window:
+            (ny, nx), (my, mx) = first.window, side.window
+            raise InputError(
+                f"{side.run}: a window of {mx} x {my} px, {first.run} has {nx} x {ny}; windows of "
+                "the same shape are needed, with the same pixels"
+            )
+    return sides
+
+
+def _components(sides: Sequence[Side]) -> dict[str, Vector]:
+    """Directions along which all sides measure."""
+    single = next((side for side in sides if not side.both), None)
+    if single is None:
+        return {"delta_x": (1.0, 0.0), "delta_y": (0.0, 1.0)}
+    direction = single.axes[0]
+    for side in sides:
+        if not side.both and _angle(side.axes[0], direction) > PARALLEL_DEG:
+            raise InputError(
+                f"{side.run}: its fringes are turned by {_angle(side.axes[0], direction):.0f} "
+                f"degrees against those of {single.run}; they measure different components"
+            )
+    return {"delta_fringe": direction}
+
+
+def _angle(a: Vector, b: Vector) -> float:
+    """Between two axes, degrees; their sense does not matter."""
+    return float(np.degrees(np.arccos(min(1.0, abs(float(np.dot(a, b)))))))
+
+
+def _compare_all(
+    sides: Sequence[Side], components: dict[str, Vector], config: Config, runtime: Runtime
+) -> tuple[dict[str, Any], list[PairView]]:
+    pairs, views = [], []
+    for i, j in combinations(range(len(sides)), 2):
+        found, parts = {}, []
+        for name, direction in components.items():
+            pair = Pair(sides[i], sides[j], name, direction)
+            facts, view = compare_pair(pair, config.sigma_accuracy, runtime)
+            found[name] = facts
+            parts.append(view)
+        pairs.append({"sides": [i, j], "components": found})
+        labels = sides[i].label, sides[j].label
+        views.append(PairView((i + 1, j + 1), labels, tuple(parts)))
+    result = {
+        "schema": SCHEMA,
+        "pixcal": __version__,
+        "sides": [{"label": side.label} | side.facts for side in sides],
+        "window": list(sides[0].window),
+        "sigma_accuracy": config.sigma_accuracy,
+        "pairs": pairs,
+        "summary": _summary(pairs, components) if len(sides) > 2 else None,
+        "warnings": _warnings(sides, components),
+    }
+    return result, views
+
+
+def compare_pair(
+    pair: Pair, accuracy: float, runtime: Runtime
+) -> tuple[dict[str, Any], ComponentView]:
+    """Two sides along one direction: what to say, and what to show.
+
+    Raises
+    ------
+    InputError
+        If they have hardly a pixel in common.
+    """
+    runtime = pair.plan(runtime)
+    everything = read_sums(pair, None, runtime)
+    if everything.pixels < FEWEST:
+        raise InputError(
+            f"{pair.first.run} and {pair.second.run}: {everything.pixels} pixels have {pair.name} "
+            f"in both; {FEWEST} are needed"
+        )
+    pixels = read_pixels(pair, everything, runtime)
+    # Where all pixels scatter more than noise, or are many, few of those far off are outliers.
+    chance = float(norm.isf(STRAY / everything.pixels))
+    limit = max(DISAGREE, chance) * max(1.0, pixels.spread)
+    sums = everything
+    if any(abs(d / e) > limit for _, _, d, e in pixels.far):
+        sums = read_sums(pair, Outlying(everything.projection, limit), runtime)
+    places = Places.of(pair, sums, pixels)
+    facts = describe(pair, sums, pixels, places, limit, accuracy)
+    return facts, _view(pair, sums, pixels, places, facts)
+
+
+def _view(
+    pair: Pair, sums: Sums, pixels: Pixels, places: Places, facts: dict[str, Any]
+) -> ComponentView:
+    profiles = [tuple(np.ravel(v) for v in sums.differences(b)) for b in (sums.columns, sums.rows)]
+    return ComponentView(
+        name=pair.name,
+        window=pair.window,
+        picture=pixels.picture,
+        reach=pixels.reach,
+        slope=facts["slope"],
+        scales=tuple(facts["scales"]),
+        side=places.side,
+        shift=places.shift,
+        scatter=places.scatter,
+        columns=(profiles[0][0], profiles[0][1]),
+        rows=(profiles[1][0], profiles[1][1]),
+        far=tuple((y, x) for y, x, d, e in pixels.far if abs(d / e) > DISAGREE),
+    )
+
+
+def _summary(pairs: list[dict[str, Any]], components: dict[str, Vector]) -> dict[str, Any]:
+    """What each side holds of its own, from all pairs."""
+    numbers = [(p["sides"][0], p["sides"][1]) for p in pairs]
+    told: dict[str, Any] = {}
+    for name in components:
+        excess = [
+            Estimate(e["variance_px2"], e["variance_error_px2"])
+            for e in (p["components"][name]["beyond_noise"] for p in pairs)
+        ]
+        told[name] = {
+            "ratio": [p["components"][name]["ratio"] for p in pairs],
+            "own": [estimate_facts(e) for e in three_cornered_hat(numbers, excess)],
+        }
+    return told
+
+
+def _warnings(sides: Sequence[Side], components: dict[str, Vector]) -> list[str]:
+    found = []
+    if "delta_fringe" in components:
+        for side in sides:
+            turned = 0.0 if side.both else _angle(side.axes[0], components["delta_fringe"])
+            if turned > NOTED_DEG:
+                share = np.sin(np.radians(turned))
+                found.append(
+                    f"{side.label}: fringes turned by {turned:.1f} degrees: {100 * share:.1g} % of "
+                    "the offsets along the fringes count as a difference"
+                )
+    return found
