@@ -8,10 +8,10 @@ TOOLS := $(VENV)/.installed-tools
 PIP := $(BIN)/python -m pip --quiet install --no-compile
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint smoke precision bench clean
+.PHONY: help install demo test lint smoke precision bench bench-full clean
 
 help: ## list these commands
-	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 10
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12
 
 install: $(TOOLS) ## make the environment .venv (the others do so when needed)
 
@@ -45,9 +45,13 @@ smoke: $(INSTALLED) ## run every shell command once on a small simulated acquisi
 precision: $(INSTALLED) ## 12 000 simulated frames against their truth (half a minute, 1 GB of disk)
 	$(BIN)/python benchmarks/precision.py
 
-bench: $(INSTALLED) ## speed of ingest, reduce and fit against a bare scan (a minute, 3 GB of disk)
+bench: $(INSTALLED) ## speed against a bare scan, and beside other methods (6 minutes, 30 GB of disk)
 	$(BIN)/python benchmarks/throughput.py
+	$(BIN)/python benchmarks/comparison.py
+
+bench-full: $(INSTALLED) ## the same for 46 Mpix: time and memory (20 minutes, 60 GB of disk)
+	$(BIN)/python benchmarks/throughput.py --full
 
 clean: ## remove the environment, the demo and all caches
 	rm -rf .venv demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
-	find pipeline cli tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find pipeline cli tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -6,6 +6,7 @@ ratios less. The scan decodes every chunk with the fit's own reader and adds its
 """
 
 import argparse
+import shutil
 import statistics
 import tempfile
 from pathlib import Path
@@ -88,6 +89,7 @@ def curve(scratch: Path, largest: Workload) -> None:
         work.reduce()
         work.fit(2)
         found.append((work.shape, frames, min(work.fit(2) for _ in range(2))))
+        shutil.rmtree(work.folder)
     print("fit, two threads, warm:      px   frames        s   ns a sample   of a plane")
     cost, fixed = plane(found)
     for (ny, nx), frames, took in sorted(found):
@@ -147,6 +149,8 @@ def full(scratch: Path) -> None:
             f"{used['peak'] / 2**20:.0f} MiB, planned {used['planned'] / 2**20:.0f}, "
             f"limit {LIMIT_MIB}"
         )
+        if stage == "ingest":
+            work.forget_frames()
     scans = work.scan(2)
     again = work.fit(2)
     print(

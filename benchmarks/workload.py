@@ -81,10 +81,16 @@ class Workload:
         )
 
     def ingest(self) -> float:
-        """Seconds."""
-        return seconds(
+        """Seconds; the frames are removed afterwards."""
+        took = seconds(
             lambda: ingest.run(self.folder / "acq", self.run, ingest.Config(), Runtime())
         )
+        self.forget_frames()
+        return took
+
+    def forget_frames(self) -> None:
+        """Remove the acquisition: the run has it."""
+        shutil.rmtree(self.folder / "acq", ignore_errors=True)
 
     def reduce(self) -> float:
         """Seconds."""

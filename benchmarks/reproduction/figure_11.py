@@ -1,0 +1,160 @@
+"""Figure 11: Allan deviations of the offset maps over two long runs of diagonal fringes."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from pixcal.report.colours import BLUE, GREEN, GREY, INK, RED
+from pixcal.report.drawing import WIDE, finish, new_figure, png
+from pixcal.report.text import number, with_error
+from reproduction.draw import logarithmic
+from reproduction.lab import Lab, Scene, facts, read_set
+from reproduction.outcome import Outcome, Row
+from reproduction.paper import MEASURED_FRAMES, MEASURED_PX, STABLE_S
+
+BATCH_FRAMES = 500
+"""Section 4.3."""
+QUICK_FRAMES = 20_000
+
+
+@dataclass(frozen=True)
+class Stability:
+    """One set.
+
+    Attributes
+    ----------
+    name : str
+    allan : dict
+        Its part of ``allan.json``.
+    frames : int
+    error, bound : float
+        Of the map of all frames, against the truth, px.
+    interfringe : float
+        px.
+    """
+
+    name: str
+    allan: dict[str, Any]
+    frames: int
+    error: float
+    bound: float
+    interfringe: float
+
+    def at(self, frames: int) -> float:
+        """Deviation of so many frames, px, by the square-root law through the first point."""
+        first, deviation = self.allan["frames"][0], self.allan["adev_px"][0]
+        return float(deviation * np.sqrt(first / frames))
+
+
+def measure(scene: Scene, batch_frames: int = BATCH_FRAMES) -> list[Stability]:
+    """Allan deviations of all sets, and the errors of their whole maps."""
+    curves = scene.allan(batch_frames)
+    run = scene.fit(batch_frames=batch_frames)
+    found = []
+    for scan in scene.bench.frames.fringes:
+        truth = scene.truth(scan.name)
+        (delta,) = read_set(run, scan.name, "delta")
+        period = facts(run, scan.name)["interfringe_px"]
+        error = truth.error(delta)
+        found.append(
+            Stability(scan.name, curves[scan.name], scan.count, error, truth.bound, period)
+        )
+    return found
+
+
+def draw(found: list[Stability], period_s: float) -> Figure:
+    """A panel for each set."""
+    figure = new_figure(WIDE, 4.4)
+    for axes, one in zip(figure.subplots(1, 2, sharey=True), found, strict=True):
+        _panel(axes, one, period_s)
+    figure.axes[0].set_ylabel("Allan deviation of δ (px)")
+    return figure
+
+
+def _panel(axes: Axes, one: Stability, period_s: float) -> None:
+    curve = one.allan
+    frames, deviation = np.array(curve["frames"]), np.array(curve["adev_px"])
+    axes.errorbar(
+        frames, deviation, yerr=curve["adev_err_px"], fmt="o", color=INK, markersize=5,
+        label="Allan deviation, median pixel",
+    )  # fmt: skip
+    ends = np.array([frames[0], max(one.frames, MEASURED_FRAMES)])
+    middle = float(np.exp(np.mean(np.log(frames))))
+    level = float(np.exp(np.mean(np.log(deviation))))
+    slope = with_error(curve["slope"], curve["slope_err"])
+    fitted = level * (ends / middle) ** curve["slope"]
+    axes.plot(ends, fitted, color=RED, linewidth=1.2, label=f"power law, slope {slope}")
+    axes.plot(
+        ends, one.bound * np.sqrt(one.frames / ends), color=GREEN, ls="--", linewidth=1.2,
+        label="Cramér–Rao bound, square-root law",
+    )  # fmt: skip
+    axes.plot(one.frames, one.error, "s", color=BLUE, label="error of all frames against the truth")
+    axes.plot(MEASURED_FRAMES, MEASURED_PX, "*", color=GREY, markersize=12, label="paper's bench")
+    logarithmic(axes)
+    axes.set(xlabel="frames", title=f"{one.name}, {one.interfringe:.3g} px")
+    top = axes.secondary_xaxis(
+        "top",
+        functions=(
+            lambda n: np.asarray(n) * period_s / 60,
+            lambda t: np.asarray(t) * 60 / period_s,
+        ),
+    )
+    top.set_xlabel("minutes", fontsize=8.5)
+    axes.legend(fontsize=8, framealpha=0.9, loc="lower left")
+    finish(axes)
+    axes.spines["top"].set_visible(True)
+
+
+def make(lab: Lab) -> Outcome:
+    """Simulate, fit, take the deviations and draw."""
+    bench = lab.sized("figure-11", frames=QUICK_FRAMES)
+    scene = lab.scene("figure-11", bench)
+    found = measure(scene)
+    frames, period = bench.frames.fringes[0].count, bench.frames.period_s
+    at = float(np.mean([one.at(MEASURED_FRAMES) for one in found]))
+    rows = [
+        Row(f"slope, {one.name}", with_error(one.allan["slope"], one.allan["slope_err"]), "slope")
+        for one in found
+    ]
+    knees = [one.allan["knee_frames"] for one in found]
+    rise = "none" if not any(knees) else ", ".join(f"{number(k)} frames" for k in knees if k)
+    rows += [
+        Row("knee, where the deviation leaves the law", rise, "rise"),
+        Row(f"deviation of {number(MEASURED_FRAMES)} frames", f"{number(at)} px", "allan"),
+        Row("the paper's bench over this simulation", number(MEASURED_PX / at), "gap"),
+        Row("error of all frames over the Cramér–Rao bound",
+            ", ".join(f"{one.error / one.bound:.3f}" for one in found)),
+    ]  # fmt: skip
+    lasts = frames * period
+    return Outcome(
+        figure="11",
+        title="Allan deviations",
+        run=f"Two sets of {number(frames)} frames of {bench.detector.shape[0]} × "
+        f"{bench.detector.shape[1]} px, batches of {BATCH_FRAMES}: {number(lasts / 60)} minutes "
+        "of the bench" + ("." if lab.full else ", where the paper has two hours."),
+        caption="Allan deviation of the maps of batches (black) with its power law (red) over the "
+        "bound (green). The star is what the paper's bench reaches by its own Allan deviations.",
+        rows=tuple(rows),
+        difference="The law is the same. The level is not: the paper's bench lies "
+        f"{number(MEASURED_PX / at)} times above a simulation with photon and read noise only, "
+        "which is the discrepancy that it leaves open. The estimator does not explain it (without "
+        "weights the level would rise by a third), so it is in the bench. The rise after "
+        f"{number(STABLE_S / 60)} minutes is no part of a stable bench and is not simulated here: "
+        "a slow change of the phase, of the power or of the fringe vector does not give it, since "
+        "these are free in every frame.",
+        numbers={
+            one.name: {
+                "slope": one.allan["slope"], "slope_err": one.allan["slope_err"],
+                "frames": one.allan["frames"], "adev_px": one.allan["adev_px"],
+                "adev_err_px": one.allan["adev_err_px"],
+                "white_expected_px": one.allan["white_expected_px"],
+                "knee_frames": one.allan["knee_frames"], "error_px": one.error,
+                "bound_px": one.bound, "at_10000_frames_px": one.at(MEASURED_FRAMES),
+            }
+            for one in found
+        },
+        picture=png(draw(found, period)),
+    )  # fmt: skip

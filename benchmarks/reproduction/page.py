@@ -1,0 +1,84 @@
+"""The page: every figure with its picture, beside what the paper states."""
+
+import json
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from pixcal import __version__
+from reproduction.lab import CONFIGS
+from reproduction.outcome import Outcome, Row
+from reproduction.paper import STATEMENTS
+
+LEAD = """\
+Figures of Rousset et al., "Pixel-Level Calibration for Space-Based High Precision Astrometry Using
+Young's Fringes", simulated and analysed again from the benches in [`configs/paper`]({configs}).
+This page is written by `{command}` ({version}): every number in the columns "here" is measured in
+that run, and [numbers.json](numbers.json) holds all of them. {size}
+"""
+QUICK = (
+    "Windows and frames are those of some minutes on two cores; `make reproduce-full` takes the "
+    "paper's own."
+)
+FULL = "Windows and frames are the paper's own."
+
+
+def write(folder: Path, outcomes: Sequence[Outcome], *, full: bool) -> Path:
+    """Write ``README.md``, ``numbers.json`` and the pictures; returns the page."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lead = LEAD.format(
+        configs=Path(os.path.relpath(CONFIGS, folder)).as_posix(),
+        command="make reproduce-full" if full else "make reproduce",
+        version=f"pixcal {__version__}",
+        size=FULL if full else QUICK,
+    )
+    parts = ["# The paper's figures, made again\n", lead, _contents(outcomes)]
+    for outcome in outcomes:
+        name = f"figure-{outcome.figure}.png"
+        (folder / name).write_bytes(outcome.picture)
+        parts.append(_section(outcome, name))
+    page = folder / "README.md"
+    page.write_text("\n".join(parts), encoding="utf-8")
+    numbers = {outcome.figure: outcome.numbers for outcome in outcomes}
+    (folder / "numbers.json").write_text(
+        json.dumps({"pixcal": __version__, "full": full, "figures": numbers}, indent=1),
+        encoding="utf-8",
+    )
+    return page
+
+
+def _contents(outcomes: Sequence[Outcome]) -> str:
+    lines = [f"- [Figure {o.figure}](#{_anchor(o)}): {o.title.lower()}" for o in outcomes]
+    return "\n".join(lines) + "\n"
+
+
+def _heading(outcome: Outcome) -> str:
+    plural = "s" if "-" in outcome.figure else ""
+    return f"Figure{plural} {outcome.figure}: {outcome.title}"
+
+
+def _anchor(outcome: Outcome) -> str:
+    kept = (c for c in _heading(outcome).lower() if c.isalnum() or c in " -")
+    return "".join(kept).replace(" ", "-")
+
+
+def _section(outcome: Outcome, picture: str) -> str:
+    table = ["| | the paper | where | here |", "|---|---|---|---|"]
+    table += [_line(row) for row in outcome.rows]
+    return "\n".join(
+        [
+            f"## {_heading(outcome)}\n",
+            f"{outcome.run}\n",
+            f"![{_heading(outcome)}]({picture})\n",
+            f"{outcome.caption}\n",
+            *table,
+            f"\n**The difference.** {outcome.difference}\n",
+        ]
+    )
+
+
+def _line(row: Row) -> str:
+    said = STATEMENTS.get(row.paper)
+    text, place = (said.text, said.place) if said else ("–", "–")
+    cells = (row.quantity, text, place, row.here)
+    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
