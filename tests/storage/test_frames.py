@@ -79,7 +79,8 @@ def test_one_stamp_for_all_is_none() -> None:
 
 
 @pytest.mark.parametrize(
-    ("period", "exptime", "source"), [(0.5, 9.0, "frame_period_s"), (None, 0.5, "exptime_s")]
+    ("period", "exptime", "source"),
+    [(0.5, 0.02, "frame_period_s"), (0.14, 0.5, "exptime_s"), (None, 0.5, "exptime_s")],
 )
 def test_planes_of_stamped_cubes(period: float | None, exptime: float, source: str) -> None:
     files = [frame_file(n, 60000 + t * SECOND, 3, exptime) for n, t in (("a", 0), ("b", 10))]

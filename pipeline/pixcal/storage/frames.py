@@ -73,17 +73,20 @@ def tabulate(
         Sentences on what is odd about the times.
     """
     ordered, stamped, warnings = _order(files)
-    steps = [frame_period_s or file.exptime_s for file in ordered]
+    # No frame is over before its exposure: darks are longer than the pace of the fringes.
+    steps = [max(frame_period_s or 0.0, file.exptime_s or 0.0) for file in ordered]
     if stamped and any(f.shape[0] > 1 and not s for f, s in zip(ordered, steps, strict=True)):
         stamped = False
         warnings.append(
             "a cube has neither EXPTIME nor is optics.frame_period_s given, so frames are numbered"
         )
     if stamped:
-        step_source: TimeSource = "frame_period_s" if frame_period_s else "exptime_s"
-        frames = _stamped_frames(ordered, [step or 0.0 for step in steps], step_source)
-        if any(b.time_s < a.time_s for a, b in pairwise(frames)):
-            warnings.append(f"a cube lasts beyond the next file's time stamp by its {step_source}")
+        frames = _stamped_frames(ordered, steps, frame_period_s)
+        late = next((a for a, b in pairwise(frames) if b.time_s < a.time_s), None)
+        if late is not None:
+            warnings.append(
+                f"a cube lasts beyond the next file's time stamp by its {late.time_source}"
+            )
     else:
         frames = _counted_frames(ordered, frame_period_s)
     return frames, [f"{array}: {sentence}" for sentence in warnings]
@@ -132,16 +135,17 @@ def _order(files: Sequence[FrameFile]) -> tuple[list[FrameFile], bool, list[str]
 
 
 def _stamped_frames(
-    files: Sequence[FrameFile], steps: Sequence[float], step_source: TimeSource
+    files: Sequence[FrameFile], steps: Sequence[float], frame_period_s: float | None
 ) -> list[Frame]:
     first = files[0].mjd or 0.0
     frames = []
     for file, step in zip(files, steps, strict=True):
         start = file.mjd or 0.0
+        source: TimeSource = "frame_period_s" if step == frame_period_s else "exptime_s"
         for plane in range(file.shape[0]):
             mjd = start + plane * step / _SECONDS_A_DAY
             time_s = (start - first) * _SECONDS_A_DAY + plane * step
-            frames.append(Frame(file, plane, mjd, time_s, step_source if plane else "header"))
+            frames.append(Frame(file, plane, mjd, time_s, source if plane else "header"))
     return frames
 
 
