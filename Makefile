@@ -8,10 +8,10 @@ TOOLS := $(VENV)/.installed-tools
 PIP := $(BIN)/python -m pip --quiet install --no-compile
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint smoke precision bench bench-full clean
+.PHONY: help install demo test lint smoke precision bench bench-full effect-pictures reproduce reproduce-full clean
 
 help: ## list these commands
-	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 12
+	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 17
 
 install: $(TOOLS) ## make the environment .venv (the others do so when needed)
 
@@ -52,6 +52,15 @@ bench: $(INSTALLED) ## speed against a bare scan, and beside other methods (6 mi
 bench-full: $(INSTALLED) ## the same for 46 Mpix: time and memory (20 minutes, 60 GB of disk)
 	$(BIN)/python benchmarks/throughput.py --full
 
+effect-pictures: $(INSTALLED) ## what every effect does to the offsets, for docs/effects (two minutes)
+	$(BIN)/python benchmarks/effect_pictures.py
+
+reproduce: $(INSTALLED) ## the paper's figures into docs/reproduction (minutes, 4 GB of disk)
+	$(BIN)/python benchmarks/reproduce.py
+
+reproduce-full: $(INSTALLED) ## the same in the paper's own sizes (much longer, 12 GB of disk)
+	$(BIN)/python benchmarks/reproduce.py --full
+
 clean: ## remove the environment, the demo and all caches
-	rm -rf .venv demo build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv demo work/reproduction build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find pipeline cli tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

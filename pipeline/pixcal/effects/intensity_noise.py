@@ -4,83 +4,128 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pixcal.estimators.damping import Damping, best_damping
 from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.frame_light import OFFSETS, FrameLight, light_of
+from pixcal.estimators.spectral_line import Line
+from pixcal.estimators.variance_components import (
+    Components,
+    joint_log_chance,
+    log_chance,
+    log_chance_of_any,
+    sigmas,
+)
+from pixcal.kernels.processes import damped_walk, swing
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
 
+SURE = 4.0
+"""Standard deviations from which a change is taken for correlated in time."""
+PARTS = ("power", "power_walk", "contrast", "contrast_walk", *OFFSETS)
+DAMPED = ("power_damped", "contrast", "contrast_walk", *OFFSETS)
+
 
 @dataclass(frozen=True)
 class IntensityNoise(Effect):
-    """Intensity B and amplitude A of every frame, multiplied by the same random factor.
+    """Intensity B and amplitude A of every frame, multiplied by the same factor.
 
     White from frame to frame, or correlated over ``correlation_s`` (a first-order autoregression,
-    which is what a damped random walk is at equal steps).
+    which is what a damped random walk is at equal steps), and a line of one frequency. Nothing of
+    it is constant in time, so maps alone do not tell of it; the fit leaves every frame its own
+    intensity.
     """
 
     name = "intensity_noise"
     title = "intensity changing from frame to frame"
     stage = Stage.LIGHT
     domains = ("time",)
-    strengths = ("rms",)
+    strengths = ("rms", "line")
     sources = (
         "Rousset et al., section on simulations: 2 % fluctuations of the laser (design/paper.txt)",
+        "Thorlabs manual 12112-S01 (HRP350 He-Ne laser): modes that sweep through the gain curve "
+        "change the power at below 1 Hz to some kHz, the mains at 50 and 100 Hz",
     )
 
     rms: float = quantity(0.02, low=0, high=0.5, doc="relative, of the mean intensity")
     correlation_s: float = quantity(0.0, unit="s", low=0, high=1e6, doc="0: white")
+    line: float = quantity(0.0, low=0, high=0.5, doc="relative amplitude of a line")
+    line_hz: float = quantity(
+        100.0, unit="Hz", low=0, high=1e4, doc="its frequency; an exposure of whole periods does "
+        "not see it"
+    )  # fmt: skip
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         """As in `Effect.states`."""
         drawn = recording.rng(self.name).standard_normal(recording.count)
         keep = np.exp(-recording.period_s / self.correlation_s) if self.correlation_s else 0.0
-        walk = np.empty(recording.count)
-        last = drawn[0] if len(drawn) else 0.0
-        for n, step in enumerate(drawn):
-            last = keep * last + np.sqrt(1 - keep**2) * step if n else step
-            walk[n] = last
-        factor = np.maximum(1 + self.rms * walk, 0.0)
+        time = np.arange(recording.count) * recording.period_s
+        phase = 2 * np.pi * recording.rng(self.name, 1).random()
+        change = self.rms * damped_walk(drawn, keep)
+        change += self.line * swing(time, self.line_hz, phase, recording.exptime_s)
+        factor = np.maximum(1 + change, 0.0)
         return replace(states, level=states.level * factor, amplitude=states.amplitude * factor)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Scatter of B over the frames of all sets, less what the noise of the samples gives."""
-        variance = information = lagged = weight = chance = 0.0
-        times = []
-        for found in evidence.fringes.values():
-            b = found.free[:, 0]
-            noise = found.free_covariance[:, 0, 0] / b.mean() ** 2
-            x = b / b.mean() - 1
-            n = len(x)
-            measured = float((x @ x) / (n - 1) - noise.mean())
-            # Variance of a sample variance: of the excess with its own scatter, and of nothing.
-            total = max(measured, 0.0) + noise.mean()
-            w = n / (2 * total**2)
-            variance, information = variance + w * measured, information + w
-            chance += n / (2 * noise.mean() ** 2)
-            lagged += float(x[1:] @ x[:-1])
-            weight += float(n - 1)
-            times.append(float(np.median(np.diff(found.time_s))) if n > 1 else 0.0)
-        if not information:
+        """What B and A of all frames do together, beyond the noise; and the line in its spectrum.
+
+        What B does alone (an offset) and A alone (the contrast) does not count. The noise is
+        measured, from two halves of the pixels (`FringeEvidence.halves`).
+        """
+        light = light_of(evidence)
+        if light is None:
             return None
-        variance /= information
-        significance = variance * np.sqrt(chance)
-        rms = float(np.sqrt(max(variance, 0.0)))
-        error = float(1 / (2 * max(rms, information**-0.25) * np.sqrt(information)))
-        keep = float(np.clip(lagged / weight / variance, 0.0, 0.999)) if rms else 0.0
-        keep_error = float(np.sqrt((1 - keep**2) / weight))
-        period = float(np.mean(times))
-        correlation, correlation_error = 0.0, period
-        if keep > 3 * keep_error and period > 0:
-            correlation = -period / np.log(keep)
-            correlation_error = correlation**2 / (period * keep) * keep_error
-            # Neighbours that resemble each other tell less of their scatter.
-            error *= float(np.sqrt((1 + keep**2) / (1 - keep**2)))
+        there = light.components(PARTS)
+        none = light.components(PARTS, absent=PARTS[:2])
+        changes = joint_log_chance(there, none, there.size[:2])
+        line = 0.0 if light.line is None else light.line.log_chance
+        step = float(np.mean([s.step_s for s in light.sets]))
+        damping = _damping(light)
+        values, errors = _change(damping, step)
+        if light.line is not None and light.line.sure:
+            values, errors = _with_line(values, errors, light.line, light.sets[0].exptime_s)
         return Estimate(
-            cls(min(rms, 0.5), correlation),
-            {"rms": error, "correlation_s": correlation_error},
-            float(significance),
-            "scatter of the mean intensity from frame to frame beyond the noise of the samples",
-            {"neighbours": keep},
+            cls(**values),
+            errors,
+            sigmas(log_chance_of_any([changes, line])),
+            "what intensity and fringe amplitude of the frames do together, beyond the noise that "
+            "two halves of the pixels do not share",
+            {"change_sigmas": sigmas(changes), "line_sigmas": sigmas(line)},
         )
+
+
+def _damping(light: FrameLight) -> Damping:
+    def fit(keep: float, start: Components | None) -> Components:
+        return light.components(DAMPED, keep, start=start)
+
+    return best_damping(fit, 0, 2.0 * max(map(len, light.sets)))
+
+
+def _change(damping: Damping, step: float) -> tuple[dict[str, float], dict[str, float]]:
+    """Size of the change and its correlation time, without a line; values and errors."""
+    if sigmas(log_chance(damping.growth)) < SURE or not damping.rms:
+        rms, error = damping.white.root(0)
+        # Less than a frame is not told from none.
+        return (
+            {"rms": min(rms, 0.5), "correlation_s": 0.0, "line": 0.0},
+            {"rms": error, "correlation_s": step},
+        )
+    time = damping.time * step
+    return (
+        {"rms": min(damping.rms, 0.5), "correlation_s": time, "line": 0.0},
+        {"rms": damping.rms_error, "correlation_s": time * damping.log_time_error},
+    )
+
+
+def _with_line(
+    values: dict[str, float], errors: dict[str, float], line: Line, exptime_s: float
+) -> tuple[dict[str, float], dict[str, float]]:
+    """With amplitude and frequency of the line, the smear of the exposure taken off."""
+    smear = float(np.sinc(line.hz * (exptime_s if np.isfinite(exptime_s) else 0.0)))
+    size, error = float(line.amplitude[0]) / smear, float(line.amplitude_error[0]) / smear
+    return (
+        values | {"line": min(size, 0.5), "line_hz": line.hz},
+        errors | {"line": error, "line_hz": line.hz_error},
+    )

@@ -14,6 +14,11 @@ from pixcal.kernels.bilinear import frame_sums
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+STRIPE = 4
+"""Rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves."""
+NO_SAMPLE = -(1 << 30)
+"""Electrons that stand for a sample without weight."""
+
 
 @dataclass(frozen=True)
 class FringeEvidence:
@@ -54,6 +59,8 @@ class FringeEvidence:
     good : (y, x) bool
     read_variance, shot_factor : (y, x) float64
         Variance of a sample: ``shot_factor * model + read_variance`` (e-²).
+    start_s : float
+        Time of the set's first frame after that of the acquisition; nan when unknown.
     """
 
     name: str
@@ -75,6 +82,7 @@ class FringeEvidence:
     good: NDArray[np.bool_]
     read_variance: F64
     shot_factor: F64
+    start_s: float = np.nan
 
     @cached_property
     def model(self) -> F32:
@@ -106,6 +114,23 @@ class FringeEvidence:
         """Phase of each frame, rad."""
         return np.arctan2(self.g[:, 2], self.g[:, 1])
 
+    @cached_property
+    def halves(self) -> tuple[tuple[F64, F64], tuple[F64, F64]]:
+        """``free`` and ``free_covariance`` of each half of the pixels, taken by stripes of rows.
+
+        The bench is common to both, the noise of the samples is not, that of whole rows included.
+        """
+        own = stripes(self.good.shape)
+        codes = np.where(np.isnan(self.electrons), np.float32(NO_SAMPLE), self.electrons)
+        one, other = (
+            free_frames(
+                codes, Coding(1.0, 0.0, NO_SAMPLE), self.g, self.dk, self.theta,
+                self.read_variance, self.shot_factor, self.good & half,
+            )
+            for half in (own, ~own)
+        )  # fmt: skip
+        return one, other
+
 
 @dataclass(frozen=True)
 class Stack:
@@ -120,12 +145,15 @@ class Stack:
     time_s : (t,) float64
         Time of each frame, from the first of its kind.
     adu : (t, y, x) float32
+    start_s : float
+        Time of the first of its kind after the first frame of the acquisition; nan when unknown.
     """
 
     kind: str
     exptime_s: float
     time_s: F64
     adu: F32
+    start_s: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -149,6 +177,8 @@ class Evidence:
     saturation_adu : float
     pitch_um, wavelength_nm, distance_mm : float
         Nominal bench.
+    origin : (int, int)
+        Row and column of the part's first pixel in the window.
     """
 
     fringes: Mapping[str, FringeEvidence]
@@ -164,14 +194,31 @@ class Evidence:
     wavelength_nm: float
     distance_mm: float
     notes: tuple[str, ...] = field(default=())
+    origin: tuple[int, int] = (0, 0)
+
+    def level(self, fringes: FringeEvidence, signal: F32) -> F32:
+        """Electrons in the pixels for a signal (t, y, x) of a set: the flat and the dark put back."""
+        seconds = fringes.exptime_s if np.isfinite(fringes.exptime_s) else 0.0
+        dark = np.maximum(self.dark_rate, 0) * seconds
+        return signal * self.flat.astype(np.float32) + dark.astype(np.float32)
 
     def of_kind(self, kind: str) -> tuple[Stack, ...]:
         """Stacks of a kind, by exposure time."""
         return tuple(sorted((s for s in self.stacks if s.kind == kind), key=lambda s: s.exptime_s))
 
 
+def stripes(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """One half of a window by stripes of rows, to broadcast against (y, x); columns if rows are few.
+
+    The sequence of Thue and Morse: it has no period that a fringe could fall in with.
+    """
+    axis = 0 if shape[0] >= 2 * STRIPE else 1
+    half = np.bitwise_count(np.arange(shape[axis]) // STRIPE) % 2 == 0
+    return np.expand_dims(half, 1 - axis)
+
+
 def free_frames(
-    codes: NDArray[np.uint16],
+    codes: NDArray[np.generic],
     coding: Coding,
     g: F64,
     dk: F64,
@@ -184,7 +231,8 @@ def free_frames(
 
     Parameters
     ----------
-    codes : (t, y, x) uint16
+    codes : (t, y, x) uint16 or float32
+        Samples as they are stored, or in electrons.
     coding : Coding
     g, dk : (t, 3), (t, 2) float64
         Start, at the middle of the part.

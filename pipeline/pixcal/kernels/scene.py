@@ -1,6 +1,9 @@
 """What a bench looks like: its detector, its light and its frames, as arrays for `synthesis`."""
 
+import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +60,44 @@ def detector_maps(detector: SimulatedDetector, rows: Rows) -> DetectorMaps:
             for field in fields(DetectorMaps):
                 getattr(maps, field.name)[window] = getattr(tile, field.name)[inside]
     return maps
+
+
+def chip_map(
+    detector: SimulatedDetector,
+    rows: Rows,
+    effect: str,
+    draw: Callable[[np.random.Generator], NDArray[Any]],
+) -> Float32:
+    """What an effect does to each pixel of the chip, on rows of the window (first, one after).
+
+    Parameters
+    ----------
+    detector : SimulatedDetector
+    rows : tuple of int
+    effect : str
+        Whose random numbers.
+    draw : callable
+        From a generator, the values of a tile of the chip, of shape `TILE`; the same chip has the
+        same values in every window.
+
+    Returns
+    -------
+    (y, x) float32
+    """
+    (row, column), width = detector.origin, detector.shape[1]
+    y0, y1, x0, x1 = row + rows[0], row + rows[1], column, column + width
+    out = np.empty((y1 - y0, width), np.float32)
+    name = zlib.crc32(effect.encode())
+    for ty in range(y0 // TILE[0], -(-y1 // TILE[0])):
+        for tx in range(x0 // TILE[1], -(-x1 // TILE[1])):
+            top, left = ty * TILE[0], tx * TILE[1]
+            part_y = slice(max(y0, top), min(y1, top + TILE[0]))
+            part_x = slice(max(x0, left), min(x1, left + TILE[1]))
+            tile = draw(generator(detector.seed, Stream.EFFECT, name, ty, tx))
+            out[_shift(part_y, y0), _shift(part_x, x0)] = tile[
+                _shift(part_y, top), _shift(part_x, left)
+            ]
+    return out
 
 
 def _shift(part: slice, by: int) -> slice:

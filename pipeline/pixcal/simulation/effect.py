@@ -41,7 +41,9 @@ class Stage(IntEnum):
     SIGNAL = 4
     """Voltages: coupling between pixels, response of the amplifier."""
     READOUT = 5
-    """Noise and drift of the electronics, the converter."""
+    """Noise and drift of the electronics."""
+    CONVERTER = 6
+    """Analogue to digital: the last of all."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +58,15 @@ class FringeMaps:
         Fringe vector (kx, ky) at the centre, rad/px.
     origin : (int, int)
         First row and column of these maps in the detector's window.
+    flat : (y, x) float64, optional
+        Relative response as flats show it, which samples were divided by; None without flats. An
+        effect that acts on flats as well changes it.
     """
 
     theta: F64
     k: tuple[float, float]
     origin: tuple[int, int] = (0, 0)
+    flat: F64 | None = None
 
 
 @dataclass(frozen=True)
@@ -129,6 +135,11 @@ class Effect:
         """Rows above and below a piece of the window that the piece depends on."""
         return 0
 
+    @property
+    def frames_back(self) -> int:
+        """Frames before a frame whose charge the frame depends on."""
+        return 0
+
     # What it does to the frames.
 
     def check(self, bench: Bench) -> None:
@@ -153,7 +164,10 @@ class Effect:
         return mean
 
     def charge(self, charge: F32, shot: Shot) -> F32:
-        """Collected electrons (y, x), shot noise and full well included."""
+        """Collected electrons (y, x), shot noise and full well included.
+
+        What is given is kept for later frames: give back another array, or the same unchanged.
+        """
         return charge
 
     def signal(self, signal: F32, shot: Shot) -> F32:

@@ -28,9 +28,6 @@ from pixcal.simulation.recording import Recording
 
 F32 = NDArray[np.float32]
 
-KEPT = 4
-"""Charges of earlier frames that are kept for effects that ask for them."""
-
 
 class Camera:
     """Some rows of a bench, with its effects.
@@ -120,15 +117,16 @@ class _Shot:
         """Random numbers of an effect in this frame."""
         return self.recording.rng(effect, self.frame, *key)
 
-    def normals(self, effect: str) -> F32:
-        """Standard normals (y, x) of an effect in this frame, the same however rows are cut."""
+    def normals(self, effect: str, frame: int | None = None) -> F32:
+        """Standard normals (y, x) of an effect, the same however rows are cut."""
+        frame = self.frame if frame is None else frame
         first, last = self.rows
         width = self.bench.detector.shape[1]
         begin, end = first // BLOCK_ROWS, -(-last // BLOCK_ROWS)
         out = np.empty(((end - begin) * BLOCK_ROWS, width), np.float32)
         for block in range(begin, end):
             at = (block - begin) * BLOCK_ROWS
-            fill_normal(self.rng(effect, block), out[at : at + BLOCK_ROWS])
+            fill_normal(self.recording.rng(effect, frame, block), out[at : at + BLOCK_ROWS])
         skip = first - begin * BLOCK_ROWS
         return out[skip : skip + last - first]
 
@@ -143,6 +141,8 @@ class _Chain:
         self.dark = camera.maps.dark_rate * np.float32(recording.exptime_s)
         self.well = np.inf if d.full_well_e is None else d.full_well_e
         self._charges: dict[tuple[int, int], F32] = {}
+        # Of a frame and of those before it, each before and after the effect that looks back.
+        self._kept = 2 * (1 + max((e.frames_back for e in self.effects), default=0))
         self._samples = np.empty(self.dark.shape, np.uint16)
 
     @cached_property
@@ -185,11 +185,17 @@ class _Chain:
         shot = self._normals(frame)[0]
         synthesis.collect(light, self.dark, shot, bench.shot_noise, self.well, charge)
         for at, effect in enumerate(self.effects[:upto]):
+            if effect.frames_back:
+                self._keep((frame, at), charge)
             charge = effect.charge(charge, _Shot(self, frame, at))
-        while len(self._charges) >= KEPT:
+        self._keep(key, charge)
+        return charge
+
+    def _keep(self, key: tuple[int, int], charge: F32) -> None:
+        """For effects that ask for it in later frames."""
+        while len(self._charges) >= self._kept:
             self._charges.pop(next(iter(self._charges)))
         self._charges[key] = charge
-        return charge
 
     def samples(self, frame: int) -> NDArray[np.uint16]:
         """Codes of a frame."""

@@ -55,5 +55,8 @@ class Shot(Protocol):
     def rng(self, effect: str, *key: int) -> np.random.Generator:
         """Random numbers of an effect in this frame, the same for all rows."""
 
-    def normals(self, effect: str) -> F32:
-        """Standard normals (y, x) of an effect in this frame, the same however rows are cut."""
+    def normals(self, effect: str, frame: int | None = None) -> F32:
+        """Standard normals (y, x) of an effect, the same however rows are cut.
+
+        Of this frame, or of another one of the recording.
+        """

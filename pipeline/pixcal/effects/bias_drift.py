@@ -1,0 +1,190 @@
+"""Offset of the whole frame: it jumps from frame to frame, wanders, and settles as things warm."""
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.frame_offset import (
+    OffsetSeries,
+    dark_offsets,
+    fringe_offsets,
+    offset_modes,
+)
+from pixcal.estimators.variance_components import (
+    MAX_STEPS,
+    Components,
+    estimate_components,
+    joint_log_chance,
+    log_chance,
+    log_chance_of_any,
+    sigmas,
+)
+from pixcal.kernels.processes import brownian
+from pixcal.kernels.synthesis import Stream, generator
+from pixcal.model.config import quantity
+from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.shot import Shot
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+HOUR_S = 3600.0
+SURE = 4.0
+"""Standard deviations from which a settling is told from a ramp and a walk."""
+SETTLINGS = 8
+"""Time constants tried, from some steps to the length of the run."""
+WORTH = 0.3
+"""Fringes count where their mean offset is as well known as this, of a sample's read noise."""
+_KEY = 1000
+"""First key of the walk's random numbers: no recording has it."""
+
+
+@dataclass(frozen=True)
+class BiasDrift(Effect):
+    """A constant added to all pixels of a frame; time runs from the acquisition's first frame.
+
+    Slow changes are those of the temperature: a ramp, a settling after power-on, a random walk.
+    The fit takes up by B, the intensity of a frame, as much of an offset as looks like light; the
+    rest is pattern, where the light is uneven or samples were divided by a flat. Maps alone do not
+    tell: the fit's mean intensity hides a constant offset, and nothing else is constant in time.
+    """
+
+    name = "bias_drift"
+    title = "offset of the whole frame, changing"
+    stage = Stage.READOUT
+    domains = ("time", "noise")
+    strengths = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e")
+    sources = (
+        "Rauscher 2015, PASP 127, 1144: pedestal drift of 4 e- rms at 5 e- of read noise",
+        "M. Richmond, WIYN HDI technical note 6 (2014): level of the overscan changes by 5 to 20 "
+        "ADU in a night, 7 ADU between darks five hours apart",
+        "Nordic Optical Telescope, CCD7 pre-commissioning report: 1 ADU in two hours",
+    )
+
+    jitter_rms: float = quantity(2.0, unit="e-", low=0, high=1e5, doc="white from frame to frame")
+    ramp_e_h: float = quantity(1.5, unit="e-/h", low=-1e6, high=1e6, doc="steady change")
+    walk_e_h: float = quantity(1.0, unit="e-/h^0.5", low=0, high=1e6, doc="random walk")
+    settle_e: float = quantity(
+        5.0, unit="e-", low=-1e5, high=1e5, doc="what decays from the first frame on"
+    )
+    settle_s: float = quantity(600.0, unit="s", above=0, high=1e7, doc="time constant of the decay")
+
+    def trend(self, time_s: F64) -> F64:
+        """Offset (t,), e-, that is not random; of an acquisition's times."""
+        fade = np.exp(-time_s / self.settle_s)
+        return np.asarray(self.ramp_e_h * time_s / HOUR_S + self.settle_e * fade)
+
+    def offset(self, time_s: float, seed: int, rng: np.random.Generator) -> float:
+        """Offset of a frame, e-: of the bench's seed, and of the frame's random numbers."""
+        offset = float(self.trend(np.array(time_s))) + self.jitter_rms * rng.standard_normal()
+        if self.walk_e_h:
+            name = zlib.crc32(self.name.encode())
+
+            def normal(level: int, place: int) -> float:
+                own = generator(seed, Stream.EFFECT, name, _KEY + level, place)
+                return float(own.standard_normal())
+
+            offset += self.walk_e_h * brownian(time_s, normal) / np.sqrt(HOUR_S)
+        return offset
+
+    def readout(self, adu: F32, shot: Shot) -> F32:
+        """As in `Effect.readout`."""
+        offset = self.offset(shot.time_s, shot.bench.seed, shot.rng(self.name))
+        return adu + np.float32(offset / shot.bench.detector.gain_e_per_adu)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Estimate | None:
+        """Levels of frames without light against time; of fringes what is not light.
+
+        A change of the dark current would look the same in one stack of darks; where there are bias
+        frames, they hold it down.
+        """
+        every = _all_series(evidence)
+        if not every:
+            return None
+        ramp = [_ramp(s) for s in every]
+        full = estimate_components(offset_modes(every, ramp))
+        none = estimate_components(offset_modes(every, ramp), absent=(0, 1))
+        changes = [joint_log_chance(full, none, full.size[:2])]
+        best, settling = _settling(every, full)
+        changes.append(settling)
+        found = best[1] if best else full
+        slope = float(found.beta[0])
+        slope_error = float(np.sqrt(found.shape_covariance((1,))[0, 0]))
+        changes.append(log_chance((slope / slope_error) ** 2 / 2))
+        (jitter, jitter_error), (walk, walk_error) = found.root(0), found.root(1)
+        per_hour = float(np.sqrt(HOUR_S))
+        values = {"jitter_rms": jitter, "ramp_e_h": slope, "walk_e_h": walk * per_hour}
+        errors = {
+            "jitter_rms": jitter_error, "ramp_e_h": slope_error, "walk_e_h": walk_error * per_hour
+        }  # fmt: skip
+        values["settle_e"] = 0.0
+        if best:
+            time, fit, time_error = best
+            own = float(np.sqrt(fit.shape_covariance((1,))[1, 1]))
+            values |= {"settle_e": float(fit.beta[1]), "settle_s": time}
+            errors |= {"settle_e": own, "settle_s": time_error}
+        return Estimate(
+            cls(**values),
+            errors,
+            sigmas(log_chance_of_any(changes)),
+            "levels of " + ", ".join(dict.fromkeys(s.name for s in every)) + " against time, beyond"
+            " the noise of pixels, rows and columns",
+            {"noise_sigmas": sigmas(changes[0]), "settling_sigmas": sigmas(changes[1]),
+             "ramp_sigmas": slope / slope_error},
+        )  # fmt: skip
+
+
+def _all_series(evidence: Evidence) -> list[OffsetSeries]:
+    stacks = [s for s in evidence.stacks if s.kind in ("bias", "dark")]
+    dark = [dark_offsets(s, evidence.good, evidence.gain, evidence.read_noise) for s in stacks]
+    every = [s for s in dark if s is not None]
+    for fringes in evidence.fringes.values():
+        series = fringe_offsets(fringes, evidence.flat)
+        if series is None:
+            continue
+        if np.sqrt(series.noise[0] / len(series)) < WORTH * evidence.read_noise:
+            every.append(series)
+    return every
+
+
+def _ramp(series: OffsetSeries) -> F64:
+    return np.asarray(series.time_s[:, None] / HOUR_S)
+
+
+def _settling(
+    every: Sequence[OffsetSeries], plain: Components
+) -> tuple[tuple[float, Components, float] | None, float]:
+    """Time constant, components and the time constant's error, where a settling is sure; chance."""
+    step = min(s.step_s for s in every)
+    length = max(s.time_s[-1] for s in every) - min(s.time_s[0] for s in every)
+    times = np.geomspace(3 * step, max(length, 6 * step), SETTLINGS)
+    last = plain
+
+    def fit(time: float, steps: int = 6) -> Components:
+        shapes = [np.hstack([_ramp(s), np.exp(-s.time_s / time)[:, None]]) for s in every]
+        return estimate_components(offset_modes(every, shapes), start=last, steps=steps)
+
+    fits = [fit(time) for time in times]
+    best = int(np.argmax([f.profile for f in fits]))
+    # Every other of the time constants is as good as a trial of its own.
+    chance = log_chance_of_any(
+        [log_chance(max(fits[best].profile - plain.profile, 0.0))] * (SETTLINGS // 2)
+    )
+    if sigmas(chance) < SURE:
+        return None, chance
+    log_time, width = float(np.log(times[best])), float(np.log(times[1] / times[0]))
+    bend = 1e-9
+    for _ in range(5):
+        # Parabola through three, ever closer.
+        last = fit(float(np.exp(log_time)), MAX_STEPS)
+        below, above = (fit(float(np.exp(log_time + w))).profile for w in (-width, width))
+        bend = max(2 * last.profile - below - above, 1e-9)
+        log_time += float(np.clip((above - below) / (2 * bend), -1, 1)) * width
+        error, width = width / np.sqrt(bend), width / 2
+    time = float(np.exp(log_time))
+    return (time, fit(time, MAX_STEPS), time * min(float(error), 3.0)), chance

@@ -1,0 +1,122 @@
+"""Bright pixels shrink: charge that was collected turns away what comes after it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.middle import middle
+from pixcal.estimators.neighbours import shared_charge
+from pixcal.estimators.response import fit_response
+from pixcal.kernels.boundaries import REACH, area_changes, boundary_shifts, moved_charge
+from pixcal.model.config import quantity
+from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.shot import Shot
+
+F32 = NDArray[np.float32]
+
+LEVEL = 5e4
+"""Electrons at which powers of the level are one."""
+
+_DISAGREE = 4.0
+
+
+@dataclass(frozen=True)
+class BrighterFatter(Effect):
+    """Boundaries of pixels that move with the charge around them (`pixcal.kernels.boundaries`).
+
+    It is not linear in the intensity, so maps alone tell neither what it does nor what would be
+    without it; `restored` undoes it on frames.
+    """
+
+    name = "brighter_fatter"
+    title = "pixels that shrink as they fill"
+    stage = Stage.CHARGE
+    domains = ("intensity", "noise", "space")
+    strengths = ("shift_px_per_e",)
+    sources = (
+        "Antilogus et al. 2014, JINST 9, C03048: spots grow by up to 2 % over the full range; "
+        "thinned sensors have it too",
+        "Guyonnet et al. 2015, A&A 575, A41: boundaries that shift in proportion to the charges",
+        "Astier et al. 2019, A&A 629, A36: covariance of flats, C_ij = a_ij mu^2",
+        "Plazas et al. 2018, PASP 130, 065004: the same in a CMOS-read H2RG",
+    )
+
+    shift_px_per_e: float = quantity(
+        2.0e-7,
+        unit="px/e-",
+        low=0,
+        high=1e-5,
+        doc="shift of a pixel's own boundaries by an electron in it",
+    )
+    falloff_px: float = quantity(
+        0.5, unit="px", above=0, high=10, doc="distance over which the shift falls by a factor e"
+    )
+
+    @property
+    def halo(self) -> int:
+        """As in `Effect.halo`."""
+        return REACH
+
+    @property
+    def _shifts(self) -> NDArray[np.float64]:
+        return self.shift_px_per_e * boundary_shifts(self.falloff_px)
+
+    def charge(self, charge: F32, shot: Shot) -> F32:
+        """As in `Effect.charge`."""
+        return charge + moved_charge(charge, self._shifts)
+
+    def restored(self, charge: F32) -> F32:
+        """Charge as it would be with boundaries that stay.
+
+        Parameters
+        ----------
+        charge : (y, x) float32
+            e-, with the effect.
+
+        Returns
+        -------
+        (y, x) float32
+            e-; the same sum.
+        """
+        found = charge
+        for _ in range(4):  # each turn gains the size of the effect, a few per cent
+            found = charge - moved_charge(found, self._shifts)
+        return found
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Estimate | None:
+        """Shared noise of neighbours, and what sets of other fringe spacing have otherwise.
+
+        The noise alone tells it from a nonlinear response: a response couples no pixels. From
+        crosstalk between pixels it differs because it rises with the square of the level. In the
+        fringes it makes a second harmonic that depends on their spacing, which a response cannot;
+        that is far more precise, and is used as long as it does not contradict the noise.
+        """
+        evidence = middle(evidence)
+        falloff = cls().falloff_px
+        shifts = boundary_shifts(falloff)
+        noise = shared_charge(evidence, shifts)
+        if noise is None:
+            return None
+        size, variance = noise
+        details = {"of_noise": size, "of_noise_error": float(np.sqrt(variance))}
+        why = "noise that neighbours share rises with the square of the level"
+        if evidence.fringes:
+            sizes, covariance = fit_response(evidence, LEVEL, 3, shifts)
+            harmonic, spread = float(sizes[-1]), float(covariance[-1, -1])
+            details |= {"of_harmonics": harmonic, "of_harmonics_error": float(np.sqrt(spread))}
+            if abs(harmonic - size) < _DISAGREE * np.sqrt(variance + spread):
+                size = (size / variance + harmonic / spread) / (1 / variance + 1 / spread)
+                variance = 1 / (1 / variance + 1 / spread)
+                why += ", and the second harmonic of the fringes depends on their spacing"
+        details["a_00"] = size * float(area_changes(falloff)[REACH, REACH])
+        error = float(np.sqrt(variance))
+        return Estimate(
+            cls(float(np.clip(size, 0, 1e-5)), falloff),
+            {"shift_px_per_e": error},
+            float(size / error),
+            why,
+            details,
+        )

@@ -1,0 +1,138 @@
+"""Fringes that wash out, a little, differently in every frame."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pixcal.estimators.damping import Damping, best_damping
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.frame_light import OFFSETS, FrameLight, light_of
+from pixcal.estimators.variance_components import (
+    Components,
+    joint_log_chance,
+    log_chance,
+    sigmas,
+)
+from pixcal.kernels.processes import damped_walk
+from pixcal.kernels.scene import FrameStates
+from pixcal.model.config import quantity
+from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.recording import Recording
+
+SURE = 4.0
+"""Standard deviations from which a slow change is told from a white one."""
+POWERS = ("power", "power_walk", *OFFSETS)
+PARTS = ("contrast", "contrast_walk", *POWERS)
+
+
+@dataclass(frozen=True)
+class ContrastNoise(Effect):
+    """Fringe amplitude A of every frame, multiplied by a factor of its own; B stays.
+
+    Within an exposure, a vibration of rms phase s smears the fringes by exp(-s²/2). That of a
+    resonance comes and goes: its energy in a frame is exponentially distributed, so the factor is
+    ``exp(-e vibration_rad² / 2)``, e exponential of mean 1, white, and never above 1. The
+    polarisations of the two fibres turn against each other slowly: a factor ``1 + polarisation u``,
+    u a damped random walk over ``polarisation_s``. Two fibres cannot interfere by more than all of
+    their light. Nothing of it but the mean loss is constant in time, and that is a visibility; so
+    maps alone do not tell of it, and the fit leaves every frame its own amplitude.
+    """
+
+    name = "contrast_noise"
+    title = "visibility changing from frame to frame"
+    stage = Stage.LIGHT
+    domains = ("time",)
+    strengths = ("vibration_rad", "polarisation")
+    sources = (
+        "Rousset et al., section 4.2: micro-vibrations within a frame are still to be looked at",
+        "Colavita 1999, PASP 111, 111: the visibility falls by exp(-s²/2) for a phase of rms s "
+        "within the integration; 20 nm of path are 0.2 rad at 633 nm",
+        "Stowe, Moore & Priest 1982, IEEE Trans. MTT 30, 1632: polarisation in fibres that do not "
+        "keep it follows temperature and handling, down to complete fading",
+    )
+
+    vibration_rad: float = quantity(
+        0.2, unit="rad", low=0, high=2, doc="rms phase within an exposure, over all frames"
+    )
+    polarisation: float = quantity(0.005, low=0, high=0.5, doc="relative rms of a slow change")
+    polarisation_s: float = quantity(
+        600.0, unit="s", low=0, high=1e6, doc="time over which it changes; 0: white"
+    )
+
+    def states(self, states: FrameStates, recording: Recording) -> FrameStates:
+        """As in `Effect.states`."""
+        energy = recording.rng(self.name).standard_exponential(recording.count)
+        drawn = recording.rng(self.name, 1).standard_normal(recording.count)
+        keep = np.exp(-recording.period_s / self.polarisation_s) if self.polarisation_s else 0.0
+        factor = np.exp(-energy * self.vibration_rad**2 / 2)
+        factor *= np.maximum(1 + self.polarisation * damped_walk(drawn, keep), 0.0)
+        most = states.level / recording.bench.optics.visibility
+        return replace(states, amplitude=np.minimum(states.amplitude * factor, most))
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Estimate | None:
+        """Scatter of A/B over all frames, beyond the noise: its white part and its slow one.
+
+        What an offset of B makes of it is told by B itself and by frames without light. The noise
+        is measured, from two halves of the pixels (`FringeEvidence.halves`).
+        """
+        light = light_of(evidence)
+        if light is None:
+            return None
+        there = light.components(PARTS)
+        none = light.components(PARTS, absent=PARTS[:2])
+        damping = _damping(light)
+        slow = sigmas(log_chance(damping.growth))
+        values, errors = _shaken(light, damping.components if slow > SURE else None)
+        if slow > SURE:
+            drift = _drifting(damping, float(np.mean([s.step_s for s in light.sets])))
+            values, errors = values | drift[0], errors | drift[1]
+        return Estimate(
+            cls(**({"polarisation": 0.0} | values)),
+            errors,
+            sigmas(joint_log_chance(there, none, there.size[:2])),
+            "scatter of the fringe amplitudes over the intensities of all frames, beyond the noise "
+            "that two halves of the pixels do not share",
+            {"slow_sigmas": slow, "skewness": _skewness(light, values["vibration_rad"])},
+        )
+
+
+def _damping(light: FrameLight) -> Damping:
+    parts = ("contrast", "contrast_damped", *POWERS)
+
+    def fit(keep: float, start: Components | None) -> Components:
+        return light.components(parts, keep, start=start)
+
+    return best_damping(fit, 1, 2.0 * max(map(len, light.sets)))
+
+
+def _shaken(
+    light: FrameLight, found: Components | None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Vibration within the exposures, from the variance of log A/B that is white.
+
+    The logarithm is exponentially distributed: its rms is half the phase's square, and its variance
+    scatters as its fourth moment says, four times as much as a normal one's.
+    """
+    found = light.components(("contrast", *POWERS)) if found is None else found
+    rms, own = found.root(0)
+    error = np.hypot(own, rms * np.sqrt(1.5 / sum(map(len, light.sets))))
+    size = float(np.sqrt(2 * rms))
+    return {"vibration_rad": min(size, 2.0)}, {"vibration_rad": np.sqrt(2 * (rms + error)) - size}
+
+
+def _drifting(damping: Damping, step: float) -> tuple[dict[str, float], dict[str, float]]:
+    """Slow change: its size and its time."""
+    time = damping.time * step
+    return (
+        {"polarisation": min(damping.rms, 0.5), "polarisation_s": time},
+        {"polarisation": damping.rms_error, "polarisation_s": time * damping.log_time_error},
+    )
+
+
+def _skewness(light: FrameLight, vibration_rad: float) -> float:
+    """Skewness of log A/B without the noise: -2 of vibrations, 0 of what goes either way."""
+    if not vibration_rad:
+        return 0.0
+    scatter = np.concatenate([series.values[:, 1] for series in light.sets])
+    return float((scatter**3).mean() / (vibration_rad**2 / 2) ** 3)

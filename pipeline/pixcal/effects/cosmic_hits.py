@@ -1,0 +1,299 @@
+"""Particles that leave their charge in one frame: muons, and electrons of radioactive decay."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, stats
+from scipy.optimize import brentq
+
+from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
+from pixcal.kernels.significance import sigmas_of_count
+from pixcal.kernels.tracks import add_tracks, draw_tracks
+from pixcal.model.config import quantity
+from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.shot import Shot
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+MARGIN_PX = 16
+"""How far beside the window tracks may begin."""
+
+THRESHOLD = 6.5
+"""Standard deviations of the noise from which a sample is an outlier."""
+
+JOINED = 3.0
+"""Standard deviations from which samples join outliers that lie near each other."""
+
+Samples = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]
+
+_STRAGGLING = 0.15
+_DRAWN = 1500
+_TILE = 32
+_MIN_FRAMES = 5
+_MIN_HITS = 5
+_OFTEN = 2
+_RARE = 0.01
+_BRIGHTEST = 4
+_SKEW = 5.0
+"""Outliers of the noise itself over those of a Gaussian: shot noise of faint light is skewed."""
+
+
+@dataclass(frozen=True)
+class CosmicHits(Effect):
+    """Straight tracks through the sensitive layer, as many as the exposure is long.
+
+    A track leaves charge in proportion to its length, with the fluctuations of thin layers, and the
+    charge spreads before it is collected. Nothing of it is constant in time, so maps of the fit
+    neither show it nor can be mended; the samples that are hit have to be left out.
+    """
+
+    name = "cosmic_hits"
+    title = "particles that hit the detector"
+    stage = Stage.CHARGE
+    domains = ("noise",)
+    strengths = ("rate_cm2_s",)
+    sources = (
+        "Particle Data Group, Review of Particle Physics, Cosmic Rays: about one muon per cm^2 and "
+        "minute through a horizontal detector at sea level",
+        "Groom 2002, Experimental Astronomy 14, 45: Compton electrons of radioactive decay hit "
+        "astronomical CCDs as often as muons",
+        "Bichsel 1988, Rev. Mod. Phys. 60, 663: energy loss and its fluctuations in thin silicon",
+        "Moyal 1955, Phil. Mag. 46, 263: closed form of the distribution of the energy loss",
+    )
+
+    rate_cm2_s: float = quantity(
+        0.03, unit="/(cm² s)", low=0, high=1e7, doc="particles through the detector's plane"
+    )
+    electrons_per_um: float = quantity(
+        70.0, unit="e-/um", above=0, high=1e4, doc="most probable charge for a length of track"
+    )
+    thickness_um: float = quantity(8.0, unit="um", above=0, high=1e3, doc="of the sensitive layer")
+    diffusion_um: float = quantity(
+        1.5, unit="um", above=0, high=100, doc="rms by which charge spreads until it is collected"
+    )
+
+    def charge(self, charge: F32, shot: Shot) -> F32:
+        """As in `Effect.charge`."""
+        detector = shot.bench.detector
+        pitch = detector.pitch_um
+        area = np.prod([(n + 2 * MARGIN_PX) * pitch * 1e-4 for n in detector.shape])
+        rng = shot.rng(self.name)
+        count = int(rng.poisson(self.rate_cm2_s * area * shot.recording.exptime_s))
+        if not count:
+            return charge
+        found = charge.copy()
+        tracks = self.tracks(rng, count, pitch, detector.shape)
+        add_tracks(found, tracks, self.diffusion_um / pitch, shot.rows[0])
+        full = np.inf if detector.full_well_e is None else detector.full_well_e
+        return np.minimum(found, np.float32(full))
+
+    def tracks(
+        self,
+        rng: np.random.Generator,
+        count: int,
+        pitch_um: float,
+        shape: tuple[int, int],
+        margin_px: int = MARGIN_PX,
+    ) -> F64:
+        """Draw tracks as `pixcal.kernels.tracks.draw_tracks` does, for pixels of some pitch."""
+        return draw_tracks(
+            rng,
+            count,
+            shape,
+            margin_px,
+            self.thickness_um / pitch_um,
+            self.electrons_per_um * pitch_um,
+            _STRAGGLING,
+        )
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Estimate | None:
+        """Outliers upwards in single frames, less those downwards, in darks and fringe frames.
+
+        A pixel that does it again is not hit but noisy, and does not count. Tracks are drawn to
+        know how many stay below the noise.
+        """
+        searches = [s for s in _searches(evidence) if s.exposure > 0]
+        if not searches:
+            return None
+        drawn = _Drawn(cls(), evidence.pitch_um)
+        # Where the noise differs from pixel to pixel a track is not found by its brightest one.
+        even = [s for s in searches if s.even] or searches
+        scale, scale_error = _scale(even, drawn)
+        seen = sum(
+            float(s.exposure * np.mean([drawn.seen(scale, sigma, s.limit) for sigma in s.sigmas]))
+            for s in searches
+        )
+        if seen <= 0:
+            return None
+        chance = _SKEW * sum(s.samples for s in searches) * float(stats.norm.sf(THRESHOLD))
+        chance = max(chance, float(sum(s.downwards for s in searches)))
+        count = sum(len(s.peaks) for s in searches)
+        default = cls().electrons_per_um
+        errors = {"rate_cm2_s": float(np.sqrt(max(count, 1)) / seen)}
+        if scale_error is not None:
+            errors["electrons_per_um"] = default * scale_error
+        return Estimate(
+            cls(max(count - chance, 0.0) / seen, default * scale),
+            errors,
+            sigmas_of_count(count, chance),
+            "samples of single frames far above what the pixel has in all others",
+            {"hits": count, "expected_by_chance": chance, "seen_cm2_s": seen},
+        )
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Outliers of a sequence of frames.
+
+    Attributes
+    ----------
+    exposure : float
+        Area times time, cm² s.
+    samples : int
+    limit : float
+        From how many sigmas on a sample is an outlier.
+    peaks, noise : (hit,) float64
+        Brightest sample of each hit upwards, and sigma there; e-.
+    downwards : int
+        Hits downwards.
+    sigmas : (q,) float64
+        Quantiles of sigma, e-.
+    even : bool
+        Whether sigma is about the same in all pixels.
+    """
+
+    exposure: float
+    samples: int
+    limit: float
+    peaks: F64
+    noise: F64
+    downwards: int
+    sigmas: F64
+    even: bool
+
+
+def _searches(evidence: Evidence) -> Iterator[_Search]:
+    area = (evidence.pitch_um * 1e-4) ** 2
+    for fringes in evidence.fringes.values():
+        yield _of_fringes(fringes, area)
+    for stack in evidence.of_kind("dark"):
+        if len(stack.adu) >= _MIN_FRAMES:
+            yield _of_darks(stack, evidence, area)
+
+
+def _of_fringes(fringes: FringeEvidence, area: float) -> _Search:
+    residual = np.where(fringes.good, fringes.residual, np.nan)
+    return _search(residual, np.sqrt(fringes.variance), area * np.nan_to_num(fringes.exptime_s))
+
+
+def _of_darks(stack: Stack, evidence: Evidence, area: float) -> _Search:
+    rest = (stack.adu - np.median(stack.adu, axis=0)) * evidence.gain
+    rest = np.where(evidence.good, rest, np.nan)
+    rest -= np.nanmedian(rest, axis=(1, 2), keepdims=True) if evidence.good.any() else 0
+    seconds = np.nan_to_num(stack.exptime_s)
+    sigma = np.sqrt(evidence.read_noise**2 + np.maximum(evidence.dark_rate, 0) * seconds)
+    return _search(
+        rest.astype(np.float32),
+        np.broadcast_to(sigma, rest.shape).astype(np.float32),
+        area * seconds,
+    )
+
+
+def _search(residual: F32, sigma: F32, exposure: float) -> _Search:
+    """Outliers of residuals (t, y, x) with some sigma; ``exposure`` is that of a sample, cm² s."""
+    ratio = residual / sigma
+    usable = np.isfinite(ratio)
+    # Of every seventh sample: what the noise is beyond what was predicted.
+    some = np.abs(ratio.ravel()[::7])
+    wide = 1.4826 * float(np.nanmedian(some)) if np.isfinite(some).any() else 1.0
+    limit = np.float32(THRESHOLD * max(wide, 1.0))
+    up, down = ratio > limit, ratio < -limit
+    often = np.count_nonzero(up | down, axis=0) > _OFTEN
+    up &= ~often
+    down &= ~often
+    hits = _hits(up, ratio > JOINED)
+    n = int(np.count_nonzero(usable))
+    sigmas = np.quantile(sigma[usable][::97], np.linspace(0.02, 0.98, 25)) if n else np.ones(1)
+    return _Search(
+        exposure * n,
+        n,
+        float(limit),
+        np.array([residual[hit].max() for hit in hits]),
+        np.array([sigma[hit].mean() for hit in hits]),
+        len(_hits(down, ratio < -JOINED)),
+        sigmas,
+        bool(sigmas[-1] < 1.5 * sigmas[0]),
+    )
+
+
+def _hits(outliers: NDArray[np.bool_], joined: NDArray[np.bool_]) -> list[Samples]:
+    """The samples (frame, row, column) of each group of outliers that lie together in a frame.
+
+    Fainter samples join what noise tears apart of a long track.
+    """
+    found = []
+    for frame in np.flatnonzero(outliers.any(axis=(1, 2))):
+        together = ndimage.binary_dilation(joined[frame] | outliers[frame], np.ones((3, 3)))
+        labels, _ = ndimage.label(together, np.ones((3, 3)))
+        rows, columns = np.nonzero(outliers[frame])
+        groups = labels[rows, columns]
+        for group in np.unique(groups):
+            own = groups == group
+            found.append((np.full(own.sum(), frame), rows[own], columns[own]))
+    return found
+
+
+class _Drawn:
+    """The brightest pixels of tracks, for hits of any charge in noise of any size."""
+
+    def __init__(self, effect: CosmicHits, pitch_um: float) -> None:
+        rng = np.random.default_rng(0)
+        tracks = effect.tracks(rng, _DRAWN, pitch_um, (1, 1), 0)
+        tracks[:, :2] += _TILE // 2
+        self._charges = np.empty((_DRAWN, _BRIGHTEST))
+        for n in range(_DRAWN):
+            tile = np.zeros((_TILE, _TILE), np.float32)
+            add_tracks(tile, tracks[n : n + 1], effect.diffusion_um / pitch_um, 0)
+            self._charges[n] = np.partition(tile.ravel(), -_BRIGHTEST)[-_BRIGHTEST:]
+        self._noise = rng.standard_normal(self._charges.shape)
+
+    def peaks(self, scale: float, sigma: float) -> F64:
+        """Brightest sample (e-) of each track, for a charge ``scale`` times as large."""
+        return np.asarray((scale * self._charges + sigma * self._noise).max(axis=1))
+
+    def seen(self, scale: float, sigma: float, limit: float) -> float:
+        """Share of the tracks that are found."""
+        return float(np.mean(self.peaks(scale, sigma) > limit * sigma))
+
+
+def _scale(searches: list[_Search], drawn: _Drawn) -> tuple[float, float | None]:
+    """Charge of the hits over that of the tracks drawn, and its error (None: too few hits)."""
+    hits = [(p, n, s.limit) for s in searches for p, n in zip(s.peaks, s.noise, strict=True)]
+    if len(hits) < _MIN_HITS:
+        return 1.0, None
+
+    def rank(log_scale: float) -> float:
+        """Mean rank of the hits among the drawn tracks above the limit, less one half."""
+        found = {}
+        ranks = []
+        for peak, noise, limit in hits:
+            # Tracks are drawn for noise in steps of 10 %.
+            step = round(np.log(noise) * 10)
+            if step not in found:
+                found[step] = np.sort(drawn.peaks(np.exp(log_scale), np.exp(step / 10)))
+            below, above = np.searchsorted(found[step], (peak, limit * noise)) / _DRAWN
+            # Where hardly a drawn track is seen, the hit is brighter than they can explain.
+            ranks.append(1.0 if 1 - above < _RARE else (below - above) / (1 - above))
+        return float(np.mean(ranks)) - 0.5
+
+    low, high = np.log(0.05), np.log(20.0)
+    if rank(low) * rank(high) >= 0:
+        return 1.0, None
+    found = float(brentq(rank, low, high, xtol=1e-3))
+    slope = abs(rank(found + 0.2) - rank(found - 0.2)) / 0.4
+    scale = float(np.exp(found))
+    return scale, scale / (max(slope, 0.05) * np.sqrt(12 * len(hits)))

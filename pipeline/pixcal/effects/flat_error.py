@@ -1,0 +1,176 @@
+"""A flat that is not the pixels' response to the light of the fringes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.evidence import Evidence, FringeEvidence
+from pixcal.estimators.map_fit import (
+    gauge_terms,
+    half_theta,
+    neighbour_products,
+    polynomial,
+    without,
+)
+from pixcal.kernels.scene import TILE, DetectorMaps, LightMaps, Rows, chip_map
+from pixcal.model.bench import SimulatedDetector
+from pixcal.model.config import quantity
+from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.recording import Recording
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+WAVES = 6
+"""Plane waves that make up the smooth part."""
+
+_CLIP = 5.0
+_MIN_PIXELS = 200
+_MIN_FRAMES = 8
+
+
+@dataclass(frozen=True)
+class FlatError(Effect):
+    """Response in the fringe frames over that in the flats: from pixel to pixel, and smooth.
+
+    Flats by a lamp of another colour, another angle or another polarisation. Mean and fringe of a
+    pixel change by the same factor: iota and alpha show it, divided by the flat, in the same pixels
+    in all sets; the offsets do not move. The pattern belongs to the chip, so maps alone do not hold
+    what `predict` would need; `corrected` takes a measured pattern out.
+    """
+
+    name = "flat_error"
+    title = "flat that is not the response to the fringes' light"
+    stage = Stage.PIXEL
+    domains = ("space",)
+    strengths = ("pixel_rms", "smooth_rms")
+    sources = (
+        "EMVA Standard 1288, release 4.0 (2021): nonuniformity is told with the wavelength and the "
+        "f-number of the light that it was measured with",
+        "Stubbs & Tonry 2006, ApJ 646, 1436: flats of a broad band are not those of a narrow one; "
+        "a per cent is common",
+    )
+
+    pixel_rms: float = quantity(0.002, low=0, high=0.5, doc="relative, from pixel to pixel")
+    smooth_rms: float = quantity(0.005, low=0, high=0.5, doc="relative, of the smooth part")
+    scale_px: float = quantity(
+        8.0, unit="px", above=1, high=1e5, doc="wavelength of the smooth part over 2 pi"
+    )
+
+    def ratio(self, detector: SimulatedDetector, rows: Rows) -> F32:
+        """Response to the fringes over the flat (y, x), on rows of the window."""
+        pixels = chip_map(detector, rows, self.name, lambda rng: rng.standard_normal(TILE))
+        error = self.pixel_rms * pixels + self.smooth_rms * self._smooth(detector, rows)
+        return np.asarray(np.maximum(1 + error, 0), np.float32)
+
+    def _smooth(self, detector: SimulatedDetector, rows: Rows) -> F64:
+        """Waves of random direction and phase, rms one, fixed to the chip."""
+        rng = np.random.default_rng([detector.seed, WAVES])
+        direction, phase = 2 * np.pi * rng.random((2, WAVES))
+        y = np.arange(*rows)[:, None] + detector.origin[0]
+        x = np.arange(detector.shape[1]) + detector.origin[1]
+        waves = [
+            np.cos((np.cos(d) * x + np.sin(d) * y) / self.scale_px + p)
+            for d, p in zip(direction, phase, strict=True)
+        ]
+        return np.asarray(np.sum(waves, axis=0) * np.sqrt(2 / WAVES))
+
+    def light(
+        self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
+    ) -> LightMaps:
+        """As in `Effect.light`."""
+        if recording.kind != "fringes":
+            return light
+        ratio = self.ratio(recording.bench.detector, rows)
+        return LightMaps(light.iota * ratio, light.alpha_sin * ratio, light.alpha_cos * ratio)
+
+    @staticmethod
+    def corrected(theta: F64, ratio: F64) -> F64:
+        """Maps (3, y, x) of a fit without a pattern (y, x); the phases stay."""
+        return np.asarray(theta / ratio)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Estimate | None:
+        """What iota and alpha share, divided by flats, beyond their light's shape.
+
+        iota is of some frames of the fringes over some of the flats, alpha of the others over the
+        others, and of another set where there is one: their product holds no noise. A ghost that
+        stands still is in iota alone; one that follows the modulator, and crosstalk, are in alpha
+        alone. What neighbours share is smooth, as far as it is no parabola, which beams make too;
+        its scale is not fitted.
+        """
+        flats = _two_flats(evidence)
+        sets = [f for f in evidence.fringes.values() if len(f.g) >= _MIN_FRAMES]
+        good = evidence.good & np.all([f.good for f in sets], axis=0)
+        if flats is None or not sets or np.count_nonzero(good) < _MIN_PIXELS:
+            return None
+        good &= (flats[0] > 0) & (flats[1] > 0)
+        iotas, alphas = zip(*(_structure(f, evidence.flat, flats, good) for f in sets), strict=True)
+        n = len(sets)
+        pairs = [(iotas[i], alphas[j]) for i in range(n) for j in range(n) if i != j or n == 1]
+        near = np.mean([neighbour_products(a, b, good) for a, b in pairs], axis=0)
+        weight = int(np.count_nonzero(good))
+        all_of_it = near[0][good]
+        smooth = (4 * near[1] - near[2]) / 3
+        pixel_error = float(np.std((near[0] - smooth)[good]) / np.sqrt(weight))
+        rms, errors = _roots(
+            np.array([(near[0] - smooth)[good].mean(), smooth[good].mean()]),
+            np.array([pixel_error, _smooth_error(pairs, weight)]),
+        )
+        return Estimate(
+            cls(min(float(rms[0]), 0.5), min(float(rms[1]), 0.5)),
+            {"pixel_rms": float(errors[0]), "smooth_rms": float(errors[1])},
+            float(all_of_it.mean() / all_of_it.std() * np.sqrt(weight)),
+            "structure that mean light and fringe amplitude share after division by the flat",
+            {"variance": float(all_of_it.mean())},
+        )
+
+
+def _two_flats(evidence: Evidence) -> tuple[F64, F64] | None:
+    """Flats (y, x) from every other frame and from the rest, e-; None with too few."""
+    halves = [np.zeros(evidence.good.shape), np.zeros(evidence.good.shape)]
+    count = 0
+    for stack in evidence.of_kind("flat"):
+        seconds = stack.exptime_s if np.isfinite(stack.exptime_s) else 0.0
+        if len(stack.adu) < 2 or np.median(stack.adu) >= evidence.saturation_adu:
+            continue
+        for n in (0, 1):
+            frames = stack.adu[n::2].astype(float)
+            halves[n] += frames.sum(axis=0) - len(frames) * evidence.bias
+            halves[n] -= len(frames) * evidence.dark_rate * seconds / evidence.gain
+        count += len(stack.adu)
+    return (halves[0], halves[1]) if count >= _MIN_FRAMES else None
+
+
+def _structure(
+    found: FringeEvidence, flat: F64, flats: tuple[F64, F64], good: Mask
+) -> tuple[F64, F64]:
+    """Logarithms of iota and alpha over the flats, less what is smooth; each of half the frames."""
+    free = np.concatenate([polynomial(good.shape, 2), gauge_terms(found)])[:, good].T
+    maps = []
+    for n in (0, 1):
+        theta = half_theta(found, n, good)
+        size = theta[0] if n == 0 else np.hypot(theta[1], theta[2])
+        ratio = np.log(np.maximum(size * flat[good] / flats[n][good], 1e-12))
+        rest = without(ratio[:, None], free)[:, 0]
+        limit = _CLIP * 1.4826 * np.median(np.abs(rest - np.median(rest)))
+        out = np.zeros(good.shape)
+        out[good] = np.where(np.abs(rest) < limit, rest, 0.0)
+        maps.append(out)
+    return maps[0], maps[1]
+
+
+def _smooth_error(pairs: list[tuple[F64, F64]], pixels: int) -> float:
+    """Of what two maps share: each wave of the window is one draw, of the scatter it shows."""
+    power = np.mean(
+        [(np.fft.fft2(a) * np.conj(np.fft.fft2(b))).real for a, b in pairs], axis=0
+    ) / (pixels * pairs[0][0].size)  # fmt: skip
+    return float(np.sqrt(2 * (power**2).sum()))
+
+
+def _roots(variances: F64, errors: F64) -> tuple[F64, F64]:
+    """Standard deviations and their errors from variances and theirs."""
+    rms = np.sqrt(np.maximum(variances, 0))
+    return rms, errors / (2 * np.maximum(rms, np.sqrt(errors)))

@@ -1,0 +1,187 @@
+"""Pixels that have a width: the fringe is averaged over their response."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.evidence import Evidence, FringeEvidence
+from pixcal.estimators.map_fit import gauge_terms, half_theta, neighbour_products, without
+from pixcal.kernels import optics
+from pixcal.kernels.scene import TILE, DetectorMaps, LightMaps, Rows, chip_map, geometry
+from pixcal.model.config import quantity
+from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
+from pixcal.simulation.recording import Recording
+
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+REPEAT = 0.002
+"""To what part the visibility of two pairs of fibres is taken to be the same."""
+
+_MIN_PIXELS = 200
+_APART = 1.1
+_CLIP = 5.0
+_TURNS = 60
+
+
+@dataclass(frozen=True)
+class IntraPixelResponse(Effect):
+    """A response of uniform height and a width along x and y, of its own in every pixel.
+
+    The fringe's amplitude is multiplied by ``sin(u) / u`` with ``u = K width / 2`` along each axis:
+    the visibility falls, the more the closer the fringes; the mean light stays, and so do the
+    offsets, since the box is symmetric about the pixel's centre. `predict` and `undo` take
+    the mean width; that of each pixel belongs to the chip, which maps alone do not tell.
+    """
+
+    name = "intra_pixel_response"
+    title = "pixels of a width"
+    stage = Stage.PIXEL
+    domains = ("space",)
+    strengths = ("width_px", "width_rms_px")
+    sources = (
+        "Janesick, Scientific Charge-Coupled Devices (SPIE 2001), chapter 4: the aperture of a "
+        "pixel has the transfer function sin(u) / u",
+        "Barron et al. 2007, PASP 119, 466: the response within pixels, measured by spots, is "
+        "nearly a box, blurred by diffusion",
+    )
+
+    width_px: tuple[float, float] = quantity(
+        (0.95, 0.95), unit="px", low=0, high=3, doc="of the response along x and y"
+    )
+    width_rms_px: float = quantity(
+        0.005, unit="px", low=0, high=0.5, doc="of the width from pixel to pixel, each axis"
+    )
+
+    def light(
+        self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
+    ) -> LightMaps:
+        """As in `Effect.light`."""
+        if recording.kind != "fringes":
+            return light
+        detector = recording.bench.detector
+        k = optics.paraxial_vector(geometry(recording.bench, recording.number))
+        factor = np.ones(light.iota.shape)
+        for axis, (width, rate) in enumerate(zip(self.width_px, k, strict=True)):
+            own = chip_map(detector, rows, f"{self.name}-{axis}", lambda r: r.standard_normal(TILE))
+            factor *= transfer(rate, np.maximum(width + self.width_rms_px * own, 0))
+        kept = factor.astype(np.float32)
+        return replace(light, alpha_sin=light.alpha_sin * kept, alpha_cos=light.alpha_cos * kept)
+
+    def predict(self, maps: FringeMaps) -> FringeMaps:
+        """As in `Effect.predict`."""
+        return replace(maps, theta=maps.theta * self._factors(maps)[:, None, None])
+
+    def undo(self, maps: FringeMaps) -> FringeMaps:
+        """As in `Effect.undo`."""
+        return replace(maps, theta=maps.theta / self._factors(maps)[:, None, None])
+
+    def _factors(self, maps: FringeMaps) -> F64:
+        kept = np.prod([transfer(k, w) for k, w in zip(maps.k, self.width_px, strict=True)])
+        return np.array([1.0, kept, kept])
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Estimate | None:
+        """Width, the same along both axes, from the visibility of sets of other fringe spacing.
+
+        The laser's own visibility is taken to be the same in all sets, to `REPEAT`. Crosstalk to
+        all neighbours alike lowers the visibility in nearly the same way and is not told apart
+        here: the noise of neighbours does that. The scatter of the width is what two halves of the
+        frames share in the visibility of single pixels, beyond what neighbours, rows and columns
+        share, as far as it grows with the fourth power of the fringe vector: lag, which scatters
+        too, does not.
+        """
+        sets = [f for f in evidence.fringes.values() if np.count_nonzero(f.good) > _MIN_PIXELS]
+        spacing = [np.hypot(*f.k) for f in sets]
+        if not sets or max(spacing) < _APART * min(spacing):
+            return None
+        k = np.array([f.k for f in sets])
+        square, error = _width(k, np.array([_log_visibility(f) for f in sets]))
+        width = float(np.sqrt(np.clip(square, 0, 9)))
+        scatter, its_error = _scatter(sets, max(width, 0.5), _bias_variance(evidence))
+        rms = float(np.sqrt(max(scatter, 0.0)))
+        width_error = error / (2 * max(width, np.sqrt(error)))
+        return Estimate(
+            cls((width, width), min(rms, 0.5)),
+            {
+                "width_px[0]": float(width_error),
+                "width_px[1]": float(width_error),
+                "width_rms_px": float(its_error / (2 * max(rms, np.sqrt(its_error)))),
+            },
+            float(max(square / error, scatter / its_error)),
+            "visibility that falls with closer fringes, and its scatter from pixel to pixel",
+            {"of_width": float(square / error), "of_scatter": float(scatter / its_error)},
+        )
+
+
+def transfer(k: Any, width: Any) -> Any:
+    """Visibility that a box of a width (px) leaves of fringes of k rad/px."""
+    return np.sinc(k * width / (2 * np.pi))
+
+
+def _log_visibility(found: FringeEvidence) -> float:
+    alpha = np.hypot(found.theta[1], found.theta[2])[found.good]
+    return float(np.log(np.median(alpha / found.theta[0][found.good])))
+
+
+def _width(k: F64, seen: F64) -> tuple[float, float]:
+    """Square of the width and its error, px², from the logarithms of the visibilities."""
+    square = 0.0
+    for _ in range(_TURNS):
+        width = np.sqrt(np.clip(square, 1e-6, 9))
+        model = np.log(np.abs(transfer(k, width)).prod(axis=1))
+        more = np.log(np.abs(transfer(k, np.sqrt(width**2 + 1e-4))).prod(axis=1))
+        slope = (more - model) / 1e-4
+        # Below nothing the law goes on in a straight line, so that chance is not one-sided.
+        model = model + slope * (square - width**2)
+        slope = slope - slope.mean()
+        rest = seen - model
+        information = float(slope @ slope) / REPEAT**2
+        step = float(slope @ (rest - rest.mean())) / REPEAT**2 / information
+        square += float(np.clip(step, -1, 1))
+        if abs(step) < 1e-9:
+            break
+    return square, float(1 / np.sqrt(information))
+
+
+def _bias_variance(evidence: Evidence) -> float:
+    """Of the bias that was taken off every frame, e-²: it is in both halves of them."""
+    counts = [len(s.adu) for s in evidence.of_kind("bias")]
+    return evidence.read_noise**2 / sum(counts) if counts else 0.0
+
+
+def _scatter(sets: list[FringeEvidence], width: float, bias_variance: float) -> tuple[float, float]:
+    """Variance of the width from pixel to pixel and its error, px²."""
+    normal, right = np.zeros((2, 2)), np.zeros(2)
+    for found in sets:
+        one, other = (_structure(found, half) for half in (0, 1))
+        products = neighbour_products(one, other, found.good)
+        white = (products[0] - (4 * products[1] - products[2]) / 3)[found.good]
+        error = white.std() / np.sqrt(len(white))
+        of_bias = bias_variance / float(np.median(found.theta[0][found.good])) ** 2
+        # Widths along both axes scatter by themselves; what does not depend on the fringe is free.
+        gain = ((np.array(found.k) ** 2 * width / 12) ** 2).sum()
+        terms = np.array([gain, 1.0])
+        normal += np.outer(terms, terms) / error**2
+        right += terms * (float(white.mean()) - of_bias) / error**2
+    scale = np.sqrt(np.diag(normal))
+    covariance = np.linalg.pinv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
+    return float(covariance[0] @ right), float(np.sqrt(covariance[0, 0]))
+
+
+def _structure(found: FringeEvidence, half: int) -> F64:
+    """Logarithm of the visibility (y, x) of half the frames, without rows, columns, fringes."""
+    good = found.good
+    theta = half_theta(found, half, good)
+    ratio = np.hypot(theta[1], theta[2]) / np.maximum(theta[0], 1e-9)
+    rest = np.log(np.maximum(ratio, 1e-9))
+    rest = without((rest - rest.mean())[:, None], gauge_terms(found)[:, good].T)[:, 0]
+    for index in np.nonzero(good):
+        count = np.maximum(np.bincount(index), 1)
+        rest = rest - (np.bincount(index, rest) / count)[index]
+    limit = _CLIP * 1.4826 * np.median(np.abs(rest))
+    out = np.zeros(good.shape)
+    out[good] = np.where(np.abs(rest) < limit, rest, 0.0)
+    return out

@@ -1,0 +1,254 @@
+"""Crosstalk between pixels: part of a pixel's signal is read at others, near or a few away.
+
+Capacitance between pixels (inter-pixel capacitance, IPC) or coupling in the read-out circuit. It
+acts on collected charge, shot noise included, so the noise of neighbours becomes alike.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.crosstalk.joined import Kernel, measure
+from pixcal.estimators.crosstalk.maps import map_periods
+from pixcal.estimators.evidence import Evidence
+from pixcal.kernels.crosstalk import (
+    Coupling,
+    couple,
+    couple_fringes,
+    filled,
+    largest_outflow,
+    noise_shares,
+    uncouple,
+    uncouple_fringes,
+)
+from pixcal.model.config import quantity
+from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
+from pixcal.simulation.shot import Shot
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+MIN_FLAT = 0.01
+"""Least response that maps are divided by."""
+
+FOUR_ROWS = (
+    # Rows in pairs, unequal ones, and one that skips a row: the paper finds 2 to 3 % up and down,
+    # repeating every four rows, "sparse", and not always between closest neighbours.
+    Coupling(1, 0, 0.030, every_rows=4, row=0),
+    Coupling(-1, 0, 0.025, every_rows=4, row=1),
+    Coupling(1, 0, 0.020, every_rows=4, row=2),
+    Coupling(-2, 0, 0.025, every_rows=4, row=3),
+    # And 0.6 % to the left and right, a little less to the left of two rows in four.
+    Coupling(0, 1, 0.006),
+    Coupling(0, -1, 0.006, every_rows=4, row=0),
+    Coupling(0, -1, 0.006, every_rows=4, row=1),
+    Coupling(0, -1, 0.004, every_rows=4, row=2),
+    Coupling(0, -1, 0.004, every_rows=4, row=3),
+)
+"""A kernel of the size and kind that the paper finds on its GIGAPYX-4600."""
+
+
+@dataclass(frozen=True)
+class Ipc(Effect):
+    """Couplings between pixels: any kernel, sparse or dense, of any period of rows and columns.
+
+    What a pixel gives it loses: the total signal stays, and a flat keeps its level (its pixels only
+    where every pixel gets what it gives). Nothing passes the edge of the window.
+    """
+
+    name = "ipc"
+    title = "crosstalk between pixels"
+    stage = Stage.SIGNAL
+    domains = ("space", "noise")
+    strengths = ("couplings",)
+    sources = (
+        "Rousset et al., section 5.1: period of four rows, 2-3 % vertical, 0.6 % horizontal, "
+        "sparse (design/paper.txt)",
+        "Moore, Ninkov & Forrest, Proc. SPIE 5167, 204 (2004): deterministic, conserves the signal",
+        "Donlon, Ninkov & Baum, PASP 130, 074503 (2018): 0.68 to 1.45 % over the well of an H2RG",
+        "Le Graët et al., Proc. SPIE 12191 (2022): the kernel changes over the array",
+    )
+
+    couplings: tuple[Coupling, ...] = quantity(
+        FOUR_ROWS,
+        doc="list of dy, dx (px, from source to receiver), share, every_rows, row, every_columns, "
+        "column (which pixels are sources), per_ke (change of the share with the signal, 1/ke-)",
+    )
+
+    def __post_init__(self) -> None:
+        most = largest_outflow(self.couplings)
+        if most >= 0.5:
+            raise InputError(
+                f"couplings: some pixels give away {most:.2f} of their signal; it must be below 0.5"
+            )
+
+    @classmethod
+    def nearest(cls, share: float, diagonal: float = 0.0) -> Self:
+        """The same share to each of the four nearest pixels, and another to those diagonal."""
+        weights = np.array([[diagonal, share, diagonal], [share, 0, share]])
+        return cls.of_kernel(np.stack([weights[0], weights[1], weights[0]]))
+
+    @classmethod
+    def of_kernel(cls, kernel: F64) -> Self:
+        """A dense kernel, the same for all pixels.
+
+        Parameters
+        ----------
+        kernel : (odd, odd) float64
+            ``kernel[c + dy, c + dx]`` is what the pixel (dy, dx) away reads of a unit; the centre
+            is not used: a pixel keeps the rest.
+        """
+        return cls(tuple(_couplings_of(np.asarray(kernel, float))))
+
+    @classmethod
+    def of_rows(cls, kernels: Sequence[F64]) -> Self:
+        """A dense kernel for the sources of each of n rows, repeating; each as in `of_kernel`."""
+        n = len(kernels)
+        return cls(
+            tuple(
+                replace(coupling, every_rows=n, row=row)
+                for row, kernel in enumerate(kernels)
+                for coupling in _couplings_of(np.asarray(kernel, float))
+            )
+        )
+
+    def scaled(self, factor: float) -> Self:
+        """The same kernel with all shares ``factor`` times as large."""
+        return replace(self, couplings=tuple(c.scaled(factor) for c in self.couplings))
+
+    @property
+    def is_null(self) -> bool:
+        """Whether all shares are zero."""
+        return all(c.share == 0 for c in self.couplings)
+
+    @property
+    def halo(self) -> int:
+        """Rows that the longest coupling reaches over."""
+        return max((abs(c.dy) for c in self.couplings), default=0)
+
+    def signal(self, signal: F32, shot: Shot) -> F32:
+        """As in `Effect.signal`."""
+        return couple(signal, self.couplings, (shot.rows[0], 0))
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Estimate | None:
+        """Kernel from hot pixels in darks, the noise of flats and fringes, and the maps, joined.
+
+        Couplings, their periods (up to 8 rows by 8 columns) and their reach (up to 5 pixels) are
+        found by evidence. The details hold what each way of measuring gives for each coupling.
+        """
+        kernel = measure(evidence)
+        if kernel is None:
+            return None
+        sigma = np.sqrt(np.diag(kernel.covariance))
+        errors = {f"couplings[{n}].share": float(s) for n, s in enumerate(sigma)}
+        if kernel.per_ke:
+            errors |= {f"couplings[{n}].per_ke": kernel.per_ke_error for n in range(len(sigma))}
+        return Estimate(
+            cls(kernel.couplings), errors, kernel.significance, _why(kernel),
+            {
+                "by": {
+                    way: [
+                        {"share": float(k), "error": float(s)}
+                        for k, s in zip(shares, own, strict=True)
+                    ]
+                    for way, (shares, own) in kernel.by.items()
+                },
+                "covariance": kernel.covariance.tolist(),
+                "hot_pixels": kernel.hot_pixels,
+                "per_ke": kernel.per_ke,
+                "map_periods": map_periods(evidence),
+            },
+        )  # fmt: skip
+
+    def predict(self, maps: FringeMaps) -> FringeMaps:
+        """Maps with the couplings on: ``L (flat theta) / L flat`` (physics note, section 5).
+
+        Shares that change with the signal are taken at intensity and amplitude 1, of the flat at
+        small signals. Pixels without data (NaN) stay so; to their neighbours they are like those
+        around them.
+        """
+        return _on_charge(
+            maps,
+            lambda theta: couple_fringes(theta, self.couplings, maps.origin),
+            lambda flat: couple(flat, self._at_small_signals, maps.origin),
+        )
+
+    def undo(self, maps: FringeMaps) -> FringeMaps:
+        """Maps without the couplings: the inverse of `predict`, to rounding.
+
+        A piece of the window needs `undo_halo` more rows and columns around it than are wanted,
+        except where the window ends.
+        """
+        return _on_charge(
+            maps,
+            lambda theta: uncouple_fringes(theta, self.couplings, maps.origin),
+            lambda flat: uncouple(flat, self._at_small_signals, maps.origin),
+        )
+
+    @property
+    def undo_halo(self) -> int:
+        """Pixels around a piece that undoing it to 1e-8 depends on."""
+        reach = max((max(abs(c.dy), abs(c.dx)) for c in self.couplings), default=0)
+        most = 2 * largest_outflow(self.couplings)
+        return reach * math.ceil(math.log(1e-8) / math.log(most)) if 0 < most < 1 else 0
+
+    def noise_factor(self, charge: float, read_noise: float, maps: FringeMaps) -> F64:
+        """Error (y, x) of a pixel after `undo` over that before.
+
+        Coupled pixels share their shot noise and so show less of it; undoing gives it back, and
+        makes the read noise, which came after the couplings, a little larger.
+
+        Parameters
+        ----------
+        charge, read_noise : float
+            Mean signal and read noise, e-.
+        maps : FringeMaps
+            That are undone.
+        """
+        shape = (maps.theta.shape[1], maps.theta.shape[2])
+        shot, read = noise_shares(self._at_small_signals, shape, maps.origin)
+        before, after = charge * shot + read_noise**2, charge + read_noise**2 * read
+        # A fit scales its errors to the noise that pixels have on average.
+        return np.asarray(np.sqrt(after / np.mean(before)))
+
+    @property
+    def _at_small_signals(self) -> tuple[Coupling, ...]:
+        return tuple(replace(c, per_ke=0.0) for c in self.couplings)
+
+
+def _couplings_of(kernel: F64) -> list[Coupling]:
+    rows, columns = kernel.shape
+    if rows % 2 == 0 or columns % 2 == 0:
+        raise InputError(f"a kernel has a pixel in its middle, not {rows} x {columns} pixels")
+    return [
+        Coupling(int(y) - rows // 2, int(x) - columns // 2, float(kernel[y, x]))
+        for y, x in np.argwhere(kernel)
+        if (y, x) != (rows // 2, columns // 2)
+    ]
+
+
+def _on_charge(
+    maps: FringeMaps, of_theta: Callable[[F64], F64], of_flat: Callable[[F64], F64]
+) -> FringeMaps:
+    """Act on the charge: what samples were before they were divided by the flat."""
+    before = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat
+    after = before if maps.flat is None else np.maximum(of_flat(before), MIN_FLAT)
+    theta = of_theta(filled(maps.theta * before, maps.k)) / after
+    theta[:, ~np.isfinite(maps.theta).all(axis=0)] = np.nan
+    return replace(maps, theta=theta, flat=None if maps.flat is None else after)
+
+
+def _why(kernel: Kernel) -> str:
+    if not kernel.couplings:
+        return "neither neighbours of hot pixels, nor noise that neighbours share, stand out"
+    rows = max(c.every_rows for c in kernel.couplings)
+    columns = max(c.every_columns for c in kernel.couplings)
+    ways = " and ".join(way for way in kernel.by if way != "maps")
+    repeats = f"repeating every {rows} rows and {columns} columns"
+    return f"{len(kernel.couplings)} couplings, {repeats}, in {ways}"

@@ -1,0 +1,358 @@
+"""Charge that stays behind in the pixel and comes out with later frames."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from pixcal.estimators.distortions import Freedom
+from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.middle import middle
+from pixcal.kernels.scene import TILE, Rows, chip_map
+from pixcal.kernels.significance import sigmas_of_best
+from pixcal.model.bench import SimulatedDetector
+from pixcal.model.config import quantity
+from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.shot import Shot
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+TAIL = 1e-3
+"""Share of the charge left behind whose release is brought forward to the last frame."""
+
+LAGS = 6
+"""Frames back that are looked at."""
+
+HARMONICS = 5
+"""Of the phase that pixels are free to have, so that a bent response is not taken for lag."""
+
+CONTROLS = 8
+"""Frames after a frame that are compared with the one before it."""
+
+_MAX_DECAY = 3.0
+_CLIP = 5.0
+_MIN_FRAMES = 20
+_MIN_FLATS = 8
+_ROUNDS = 2
+_CLEAR = 4.0
+
+
+@dataclass(frozen=True)
+class Lag(Effect):
+    """Incomplete transfer: each electron stays behind with a chance of ``share``.
+
+    It comes out with the next frame, or over several. No charge is lost, and before the first frame
+    of a recording the pixels were dark and empty.
+
+    A fit of the fringes takes up what all pixels have in common: the frame before is a sum of the
+    same maps, so every frame only gets another amplitude and phase. So maps show nothing of it;
+    `restored` undoes it on frames.
+    """
+
+    name = "lag"
+    title = "charge left behind in the next frames"
+    stage = Stage.CHARGE
+    domains = ("time", "intensity")
+    strengths = ("share",)
+    sources = (
+        "Bonjour, Blanc and Kayal 2012, IEEE Electron Device Letters 33(12), 1735: lag of pinned "
+        "photodiodes by barriers, pockets and traps of the transfer gate",
+        "Fossum and Hondongwa 2014, IEEE J. Electron Devices Soc. 2(3), 33: review of the pinned "
+        "photodiode; lag of a few per mille and below",
+    )
+
+    share: float = quantity(
+        0.002, low=0, high=0.5, doc="of a frame's charge, left behind for later frames"
+    )
+    decay_frames: float = quantity(
+        0.0,
+        unit="frames",
+        low=0,
+        high=_MAX_DECAY,
+        doc="in which what comes out falls by a factor e; 0: all with the next frame",
+    )
+    spread: float = quantity(
+        0.1, low=0, high=1, doc="of the share from pixel to pixel, relative (rms)"
+    )
+
+    @property
+    def releases(self) -> F64:
+        """Share of what stayed behind that comes out 1, 2, ... frames later; their sum is one."""
+        if not self.decay_frames:
+            return np.ones(1)
+        keep = np.exp(-1 / self.decay_frames)
+        count = int(np.ceil(np.log(TAIL) / np.log(keep)))
+        releases: F64 = (1 - keep) * keep ** np.arange(count)
+        return np.asarray(releases / releases.sum())
+
+    @property
+    def frames_back(self) -> int:
+        """As in `Effect.frames_back`."""
+        return len(self.releases)
+
+    def charge(self, charge: F32, shot: Shot) -> F32:
+        """As in `Effect.charge`."""
+        found = charge - self._left_behind(charge, shot, shot.frame)
+        for back, release in enumerate(self.releases, start=1):
+            before = shot.charge(shot.frame - back)
+            if before is None:
+                break
+            found += np.float32(release) * self._left_behind(before, shot, shot.frame - back)
+        return found
+
+    def _left_behind(self, charge: F32, shot: Shot, frame: int) -> F32:
+        """Electrons of a frame that stay: each by its own chance, so that noise stays white."""
+        share = np.full_like(charge, self.share)
+        if self.spread:
+            pixels = _pixels(shot.bench.detector, shot.rows)
+            share *= np.clip(1 + np.float32(self.spread) * pixels, 0, 1 / self.share)
+        left = share * charge
+        if shot.bench.shot_noise:
+            chance = np.sqrt(np.maximum(left * (1 - share), 0))
+            left += chance * shot.normals(self.name, frame)
+        return np.asarray(np.clip(left, 0, np.maximum(charge, 0)))
+
+    def restored(self, frames: F32) -> F32:
+        """Frames without lag, from those with it.
+
+        Parameters
+        ----------
+        frames : (t, y, x) float32
+            e-, in the order of time without gaps; the first one after darkness.
+
+        Returns
+        -------
+        (t, y, x) float32
+            e-; the scatter of the share from pixel to pixel is left.
+        """
+        found = np.empty_like(frames)
+        for n, frame in enumerate(frames):
+            late = np.zeros_like(frame)
+            for back, release in enumerate(self.releases[:n], start=1):
+                late += np.float32(self.share * release) * found[n - back]
+            found[n] = (frame - late) / np.float32(1 - self.share)
+        return found
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Estimate | None:
+        """Contrast of a frame by the step of the phase since the one before; pixels that differ.
+
+        What stays of a fringe of another phase lowers the contrast of the frame by
+        ``share (1 - cos step)``: random phases show it even where the contrast is noisy. Phases
+        that rise by equal steps show nothing. Pixels with another share than the rest leave the
+        frame before in their residuals; the frame after is the control. Without fringes the first
+        frame of each flat tells, which lacks what the dark before it could not give.
+        """
+        if not evidence.fringes:
+            return _of_flats(evidence)
+        fringes = tuple(evidence.fringes.values())
+        found = cls(0.0)
+        for _ in range(_ROUNDS):
+            steps = [s for f in fringes if (s := _contrast_steps(f, found)) is not None]
+            if not steps:
+                return None
+            share, keep, share_error, keep_error, sigmas = _decay(steps)
+            found = cls(float(np.clip(share, 0, 0.5)), -1 / np.log(keep) if keep else 0.0)
+        part = middle(evidence)
+        uneven, uneven_error = _mean(
+            [p for f in part.fringes.values() if (p := uneven_pixels(f)) is not None]
+        )
+        # What the pixels have in common is no less than how much they differ by.
+        rms = float(np.sqrt(max(uneven, 0.0))) / (1 - keep)
+        least = rms if uneven > _CLEAR * uneven_error else 0.0
+        share = float(np.clip(share, least, 0.5))
+        spread, spread_error = 0.0, 1.0
+        if share > 0:
+            spread = rms / share
+            size = max(rms, np.sqrt(uneven_error) / (1 - keep))
+            spread_error = uneven_error / (1 - keep) ** 2 / (2 * size)
+            spread_error = float(np.hypot(spread_error, spread * share_error) / share)
+        decay = -1 / np.log(keep) if keep else 0.0
+        decay_error = keep_error * decay**2 / keep if keep else -1 / np.log(min(keep_error, 0.9))
+        return Estimate(
+            cls(share, min(float(decay), _MAX_DECAY), min(spread, 1.0)),
+            {
+                "share": share_error,
+                "decay_frames": float(decay_error),
+                "spread": min(spread_error, 1.0),
+            },
+            sigmas_of_best(sigmas, uneven / uneven_error),
+            "the contrast falls with the step of the phase since the frame before"
+            + (", and pixels keep it unevenly" if uneven > _CLEAR * uneven_error else ""),
+            {"by_contrast_sigmas": sigmas, "by_pixels_sigmas": uneven / uneven_error},
+        )
+
+
+@lru_cache(maxsize=4)
+def _pixels(detector: SimulatedDetector, rows: Rows) -> F32:
+    """Standard normals of the chip's pixels on these rows."""
+    return chip_map(detector, rows, Lag.name, lambda rng: rng.standard_normal(TILE))
+
+
+def _contrast_steps(fringes: FringeEvidence, lag: Lag) -> tuple[F64, F64] | None:
+    """Shares (lag,) that come out 1, 2, ... frames later, and their information (lag, lag).
+
+    Linear about a lag that is known in part: its share is taken out of the frames first.
+    """
+    b, a_cos, a_sin = lag.restored(fringes.free[:, :3].astype(np.float32)).astype(float).T
+    count = len(b)
+    if count < _MIN_FRAMES + LAGS:
+        return None
+    phase = np.arctan2(a_sin, a_cos)
+    contrast = np.hypot(a_cos, a_sin) / b
+    contrast = contrast / np.median(contrast)
+    terms = np.zeros((LAGS, count))
+    for back in range(1, LAGS + 1):
+        light = b[:-back] / b[back:]
+        terms[back - 1, back:] = light * (np.cos(phase[:-back] - phase[back:]) - 1)
+    time = np.linspace(-1, 1, count)
+    # What a wrong gauge of the fit and slow changes do to the contrast.
+    other = [np.ones(count), time, time**2]
+    for n in (1, 2):
+        other += [np.cos(n * phase), np.sin(n * phase)]
+    basis, size, _ = np.linalg.svd(np.stack(other).T, full_matrices=False)
+    basis = basis[:, size > 1e-6 * size[0]]
+    used = np.ones(count, bool)
+    for _ in range(2):
+        inside = np.linalg.qr(basis[used])[0]
+        rest = terms[:, used] - (terms[:, used] @ inside) @ inside.T
+        y = contrast[used] - inside @ (inside.T @ contrast[used])
+        normal = rest @ rest.T
+        if np.any(np.diag(normal) < 1e-3 * used.sum()):
+            return None
+        shares = np.linalg.solve(normal, rest @ y)
+        left = y - shares @ rest
+        scatter = np.sqrt(left @ left / (used.sum() - LAGS - basis.shape[1]))
+        spread = 1.4826 * np.median(np.abs(left))
+        used[used] = np.abs(left) <= _CLIP * max(spread, 1e-12)
+    known = np.zeros(LAGS)
+    known[: len(lag.releases)] = (lag.share * lag.releases)[:LAGS]
+    return known + shares, normal / scatter**2
+
+
+def _decay(steps: list[tuple[F64, F64]]) -> tuple[float, float, float, float, float]:
+    """Share, what is kept from frame to frame, their errors, and how significant the share is."""
+    information = np.sum([n for _, n in steps], axis=0)
+    right = np.sum([n @ w for w, n in steps], axis=0)
+    power = np.arange(LAGS)
+
+    def release(keep: float) -> F64:
+        return np.asarray((1 - keep) * keep**power)
+
+    def gain(keep: float) -> float:
+        """Significance of the share, with its sign."""
+        u = release(keep)
+        return float(u @ right / np.sqrt(u @ information @ u))
+
+    highest = float(np.exp(-1 / _MAX_DECAY))
+    best = float(minimize_scalar(lambda k: -gain(k), bounds=(0, highest), method="bounded").x)
+    # Without lag the decay has no meaning; it must show.
+    if gain(best) ** 2 < gain(0.0) ** 2 + _CLEAR**2:
+        best = 0.0
+    u = release(best)
+    share = float(u @ right / (u @ information @ u))
+    slope = power * (1 - best) * best ** np.maximum(power - 1, 0) - best**power
+    jacobian = np.stack([u, max(share, 1e-9) * slope])
+    covariance = np.linalg.inv(jacobian @ information @ jacobian.T)
+    errors = np.sqrt(np.diag(covariance))
+    if not best:
+        errors[0] = 1 / np.sqrt(u @ information @ u)
+    return share, best, float(errors[0]), float(errors[1]), gain(best)
+
+
+def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
+    """Mean square deviation of the pixels' shares from their mean, and its error.
+
+    From the frame before, less what the frames after give: they have no part in the frame, but as
+    much of everything else.
+    """
+    if len(fringes.g) < _MIN_FRAMES + CONTROLS:
+        return None
+    freedom = Freedom(fringes, HARMONICS)
+    residual = freedom.left_over(freedom.of_good(fringes.residual))
+    before = _square_of_shares(fringes, freedom, residual, 1)
+    after = [_square_of_shares(fringes, freedom, residual, -n) for n in range(1, CONTROLS + 1)]
+    value, error = np.array(after).T
+    noise = np.hypot(before[1], np.sqrt((error**2).mean() / CONTROLS))
+    scatter = value.std(ddof=1) * np.sqrt(1 + 1 / CONTROLS)
+    return before[0] - float(value.mean()), float(max(noise, scatter))
+
+
+def _square_of_shares(
+    fringes: FringeEvidence, freedom: Freedom, residual: F32, step: int
+) -> tuple[float, float]:
+    """Mean square of the pixels' shares of another frame, less that of their noise; its error."""
+    other = np.roll(fringes.g, step, axis=0).T.astype(np.float32)
+    other[:, slice(0, step) if step > 0 else slice(step, None)] = 0
+    own, weight, theta = freedom.of_time, freedom.weight, fringes.theta[:, freedom.good]
+    k = len(own)
+    mixed = ((own[:, None] * other).reshape(3 * k, -1) @ weight).reshape(k, 3, -1)
+    upper = np.triu_indices(3)
+    squares = np.empty((3, 3, weight.shape[1]))
+    squares[upper] = squares[upper[::-1]] = (other[upper[0]] * other[upper[1]]) @ weight
+    # The other frame is a sum of the pixel's maps, less what the pixel can have of its own; of that
+    # nothing is left in the residuals.
+    along = np.einsum("kin,in->kn", mixed, theta)
+    taken = np.einsum("nij,jn->in", freedom.pixel_inverse, along)
+    information = np.einsum("in,ijn,jn->n", theta, squares, theta)
+    information -= np.einsum("kn,kn->n", along, taken)
+    right = np.einsum("in,in->n", theta, other @ (weight * residual))
+    told = information > 1e-3 * np.median(information)
+    share, variance = right[told] / information[told], 1 / information[told]
+    square = share**2 - variance
+    trust = 1 / (variance**2 + np.median(variance) ** 2)
+    # Particles leave wild values in a few pixels.
+    trust *= np.abs(square) < _CLIP**2 * np.median(np.abs(square))
+    total = trust.sum()
+    mean = float(trust @ square / total)
+    return mean, float(np.sqrt(trust**2 @ (square - mean) ** 2) / total)
+
+
+def _mean(values: list[tuple[float, float]]) -> tuple[float, float]:
+    """Weighted mean and its error; of an empty list one that says nothing."""
+    if not values:
+        return 0.0, 1.0
+    value, error = np.array(values).T
+    weight = error**-2
+    return float(weight @ value / weight.sum()), float(weight.sum() ** -0.5)
+
+
+def _of_flats(evidence: Evidence) -> Estimate | None:
+    """The first frame of each flat against the rest, over the level; any offset of first frames is
+    taken from stacks without light."""
+    levels, steps, errors = [], [], []
+    for stack in evidence.stacks:
+        found = _first_frame(stack, evidence)
+        if found is not None:
+            levels.append(found[0])
+            steps.append(found[1])
+            errors.append(found[2])
+    level, step, error = np.array(levels), np.array(steps), np.array(errors)
+    if len(level) < 2 or np.ptp(level) < 10 * error.min():
+        return None
+    design = np.stack([-level, np.ones_like(level)]) / error
+    covariance = np.linalg.inv(design @ design.T)
+    share = float((covariance @ (design @ (step / error)))[0])
+    share_error = float(np.sqrt(covariance[0, 0]))
+    return Estimate(
+        Lag(float(np.clip(share, 0, 0.5)), 0.0, 0.0),
+        {"share": share_error},
+        share / share_error,
+        "the first frame of flats after darkness lacks a share of the light",
+        {"share": share},
+    )
+
+
+def _first_frame(stack: Stack, evidence: Evidence) -> tuple[float, float, float] | None:
+    """Level of a stack, how much its first frame differs from the others, and the error; e-."""
+    if len(stack.adu) < _MIN_FLATS:
+        return None
+    light = (stack.adu - evidence.bias)[:, evidence.good] * evidence.gain
+    means = light.mean(axis=1)
+    rest = means[1:]
+    # What the lamp did from frame to frame is measured by the frames themselves.
+    error = rest.std(ddof=2) * np.sqrt(1 + 1 / len(rest))
+    return float(rest.mean()), float(means[0] - rest.mean()), float(error)

@@ -1,0 +1,191 @@
+"""The converter: steps that are coarser than the file's, and codes that are not equally wide."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.code_density import (
+    CodeWidths,
+    code_widths,
+    converter_counts,
+    histogram,
+    step_of,
+)
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.variance_components import sigmas
+from pixcal.kernels.significance import sigmas_of_best
+from pixcal.kernels.synthesis import Stream, generator
+from pixcal.model.config import quantity
+from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.shot import Shot
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+SURE = 4.0
+"""Standard deviations from which a ripple is told."""
+FARTHEST = 0.98
+"""A step between codes moves by less than a code, so that only its neighbours need be asked."""
+_KEY = 997
+
+
+@dataclass(frozen=True)
+class Quantisation(Effect):
+    """A converter of step ``1 + coarse_adu``, whose steps between codes are displaced.
+
+    One converter, or one ramp, for all columns. Displacements that are independent leave the
+    response straight: codes differ in width, by chance and by a ripple, and one of no width is
+    missing. The round-off itself is no more than noise of step²/12 as long as the noise before it
+    spans half a step; so maps do not show it, unless read noise is lower than that.
+    """
+
+    name = "quantisation"
+    title = "steps and uneven codes of the converter"
+    stage = Stage.CONVERTER
+    domains = ("noise", "intensity")
+    strengths = ("coarse_adu", "dnl_rms", "ripple")
+    sources = (
+        "IEEE Std 1241-2010: code widths from histograms; round-off of step/sqrt(12) rms",
+        "Widrow and Kollar 2008, Quantization Noise, Cambridge University Press: when round-off is "
+        "noise that does not depend on the signal",
+        "cameras of 14 bits that write 16 shift their codes by 2: steps of 4 ADU; differential "
+        "nonlinearity of 0.3 to 0.5 codes is what data sheets of converters promise",
+    )
+
+    coarse_adu: float = quantity(
+        3.0, unit="ADU", low=0, high=4095, doc="step of the converter beyond 1 ADU"
+    )
+    dnl_rms: float = quantity(
+        0.3, unit="codes", low=0, high=1, doc="scatter of the code widths (differential "
+        "nonlinearity)"
+    )  # fmt: skip
+    ripple: float = quantity(
+        0.1, unit="codes", low=0, high=0.9, doc="amplitude of widths that rise and fall"
+    )
+    ripple_codes: float = quantity(
+        2.0, unit="codes", low=2, high=16, doc="period of the ripple; 2: even and odd codes"
+    )
+    ripple_phase_rad: float = quantity(
+        0.0, unit="rad", low=-7, high=7, doc="phase of the ripple at code zero"
+    )
+
+    @property
+    def step_adu(self) -> float:
+        """Mean width of a code."""
+        return 1 + self.coarse_adu
+
+    def thresholds(self, specimen: int, codes: int) -> F64:
+        """Where codes 0 to ``codes - 1`` begin, in steps; those of code n near ``n - 1/2``.
+
+        Parameters
+        ----------
+        specimen : int
+            Seed of the detector.
+        codes : int
+        """
+        number = np.arange(codes)
+        shift = np.zeros(codes)
+        if self.dnl_rms:
+            rng = generator(specimen, Stream.EFFECT, _KEY)
+            shift += self.dnl_rms / np.sqrt(2) * rng.standard_normal(codes)
+        turn = 2 * np.pi / self.ripple_codes
+        # Sum of the ripple of all codes below.
+        phase = turn * (number - 0.5) + self.ripple_phase_rad
+        shift += self.ripple * np.sin(phase) / (2 * np.sin(turn / 2))
+        return np.asarray(number - 0.5 + np.clip(shift, -FARTHEST, FARTHEST))
+
+    def converted(self, adu: F32, specimen: int, top_adu: float) -> F32:
+        """Codes in ADU: each sample passes the thresholds that it reaches.
+
+        Thresholds that have changed places leave a code out, as in a flash converter that counts.
+        """
+        codes = int(top_adu / self.step_adu) + 3
+        begins = _thresholds(self, specimen, codes)
+        level = np.clip(adu / np.float32(self.step_adu), 0, np.float32(codes - 2))
+        nearest = (level + np.float32(0.5)).astype(np.int32)
+        passed = nearest - 1 + (level >= begins[nearest])
+        passed += level >= begins[nearest + 1]
+        return np.asarray(np.maximum(passed, 0) * np.float32(self.step_adu), np.float32)
+
+    def readout(self, adu: F32, shot: Shot) -> F32:
+        """As in `Effect.readout`."""
+        detector = shot.bench.detector
+        return self.converted(adu, detector.seed, detector.top_adu)
+
+    def restored(self, samples: F32, specimen: int) -> F32:
+        """Samples in the middle of what their code spans: straight, as far as widths are known.
+
+        Parameters
+        ----------
+        samples : ndarray of float32
+            ADU, of `converted`.
+        specimen : int
+            Seed of the detector; without random widths it does not matter.
+        """
+        number = np.rint(samples / np.float32(self.step_adu)).astype(np.int64)
+        begins = np.sort(self.thresholds(specimen, int(number.max(initial=0)) + 2))
+        middle = (begins[number] + begins[number + 1]) / 2
+        return np.asarray(middle * self.step_adu, np.float32)
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Estimate | None:
+        """Step by the codes that never come, widths by how often the others do.
+
+        None where samples are no whole numbers, or too few. Where the noise is below one step the
+        light is no smooth function of the code, so widths are not told.
+        """
+        frames = [s.adu for s in evidence.stacks] + [f.adu for f in evidence.fringes.values()]
+        counts = histogram(frames, evidence.good) if frames else None
+        if counts is None or not counts.any():
+            return None
+        step, step_error = step_of(counts)
+        own = converter_counts(counts, step)
+        widths = code_widths(own, evidence.read_noise / evidence.gain / step)
+        values = {"coarse_adu": step - 1, "dnl_rms": 0.0, "ripple": 0.0}
+        errors = {"coarse_adu": step_error}
+        found = [-1.0 if step == 1 else min((step - 1) / step_error, 1e6)]
+        if widths is not None:
+            known, its_errors, chances = _uneven(widths)
+            values, errors = values | known, errors | its_errors
+            found += chances
+        elif step == 1:
+            return None
+        return Estimate(
+            cls(**values),
+            errors,
+            sigmas_of_best(*found),
+            "codes that never come, and counts of codes against those around",
+            {"sigmas": found, "codes": 0 if widths is None else len(widths.number)},
+        )
+
+
+@lru_cache(maxsize=4)
+def _thresholds(effect: Quantisation, specimen: int, codes: int) -> F32:
+    return effect.thresholds(specimen, codes).astype(np.float32)
+
+
+def _uneven(widths: CodeWidths) -> tuple[dict[str, float], dict[str, float], list[float]]:
+    """Scatter and ripple of the widths, their errors, and how sure they are."""
+    variance, error, scatter_sigmas = widths.scatter()
+    line = widths.ripple(variance)
+    sure = sigmas(line.log_chance)
+    values, errors = {"ripple": 0.0}, {"ripple": line.amplitude_error}
+    if sure > SURE:
+        share = 1.0 if line.period == 2 else 0.5
+        for _ in range(2):
+            rest = variance - share * line.amplitude**2
+            line = widths.ripple(rest)
+        variance = variance - share * line.amplitude**2
+        error = float(np.hypot(error, 2 * share * line.amplitude * line.amplitude_error))
+        values = {
+            "ripple": min(line.amplitude, 0.9),
+            "ripple_codes": min(line.period, 16.0),
+            "ripple_phase_rad": line.phase,
+        }
+        errors = {"ripple": line.amplitude_error}
+    top = max(variance, 0.0)
+    values["dnl_rms"] = min(float(np.sqrt(top)), 1.0)
+    errors["dnl_rms"] = float(np.sqrt(top + error) - np.sqrt(top))
+    return values, errors, [scatter_sigmas, sure]

@@ -1,0 +1,124 @@
+"""Rows that are exposed one after the other while the phase modulator steps."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.row_ramp import RowRamp, enough_for_rows
+from pixcal.model.bench import Bench
+from pixcal.model.config import quantity
+from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.shot import Shot
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+_MODEL = 0.01
+"""Relative error of the slope: what the frames' own parameters absorb is known to about that."""
+
+
+@dataclass(frozen=True)
+class RollingShutter(Effect):
+    """Row y is exposed ``line_time_us * y`` later than the window's first row.
+
+    The modulator goes to the next phase ``delay_us`` after the first row's exposure ends: rows that
+    are still exposed hold a share of the next frame's light, which grows with the row. A delay of
+    nearly a frame is a step that comes late: then the first rows hold a share of the last frame's.
+    It depends on the order of the phases, so maps alone do not tell; of random phases the fit loses
+    a little contrast in these rows, and the rest is left in the residuals.
+    """
+
+    name = "rolling_shutter"
+    title = "rows exposed while the phase steps"
+    stage = Stage.LIGHT
+    domains = ("time", "space")
+    strengths = ("line_time_us",)
+    sources = (
+        "Pyxalis GIGAPYX-4600 as in Rousset et al.: 5456 rows at 152 frames/s are 1.2 us a row; at "
+        "the 7 frames/s of the paper's bench 26 us",
+        "El Gamal & Eltoukhy 2005, IEEE Circuits and Devices Magazine 21(3), 6: rows of a CMOS "
+        "sensor are reset and read one after the other",
+    )
+
+    line_time_us: float = quantity(
+        1.2, unit="us", low=0, high=1e5, doc="from the start of a row to that of the next"
+    )
+    delay_us: float = quantity(
+        0.0, unit="us", low=0, high=1e10, doc="from the end of the first row's exposure to the step"
+    )
+
+    def check(self, bench: Bench) -> None:
+        """As in `Effect.check`."""
+        frames = bench.frames
+        last = self.line_time_us * (bench.detector.shape[0] - 1) * 1e-6
+        if last > frames.period_s:
+            raise InputError(
+                f"effects.rolling_shutter: line_time_us: the last row starts {last:g} s after the "
+                f"first, later than the next frame (frames.period_s: {frames.period_s:g} s)"
+            )
+        if self.delay_us * 1e-6 > frames.period_s:
+            raise InputError(
+                "effects.rolling_shutter: delay_us: longer than frames.period_s "
+                f"({frames.period_s:g} s)"
+            )
+
+    def shares(self, rows: F64, exptime_s: float, period_s: float) -> tuple[F64, F64]:
+        """Shares of the next and of the last phase in the exposure of rows of the window."""
+        start = self.line_time_us * 1e-6 * rows
+        step = exptime_s + self.delay_us * 1e-6
+        after = np.clip((start + exptime_s - step) / exptime_s, 0, 1)
+        before = np.clip((step - period_s - start) / exptime_s, 0, 1)
+        return after, before
+
+    def photons(self, mean: F32, shot: Shot) -> F32:
+        """As in `Effect.photons`."""
+        recording = shot.recording
+        if recording.kind != "fringes":
+            return mean
+        shares = self.shares(
+            np.arange(*shot.rows, dtype=float), recording.exptime_s, recording.period_s
+        )
+        mixed = mean
+        for share, frame in zip(shares, (shot.frame + 1, shot.frame - 1), strict=True):
+            other = shot.mean(frame) if share.any() else None
+            # Before the first frame and after the last one the modulator stands still.
+            if other is not None:
+                mixed = mixed + share.astype(np.float32)[:, None] * (other - mean)
+        return mixed
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Estimate | None:
+        """Share of the next frame's model in the residuals, growing with the row.
+
+        A share that is the same in all rows goes into the frame's own phase and amplitude, so it is
+        free; lag, which is of the last frame and of no row, does not look alike. Phases in equal
+        steps tell nothing: there the next frame is what the fit takes for the pixel's own phase.
+        """
+        sets = [f for f in evidence.fringes.values() if enough_for_rows(f)]
+        if not sets:
+            return None
+        sums = [RowRamp.of(sets, way) for way in (1, -1)]
+        following, last = (s.slope / s.error for s in sums)
+        ramp, found = sums[int(last > max(following, 4.0))], sets[0]
+        per_row = found.exptime_s * 1e6
+        period = float(np.median(np.diff(found.time_s)))
+        late = max(period - found.exptime_s, 0.0) * 1e6 if ramp.way < 0 else 0.0
+        line = max(ramp.slope, 0.0) * per_row
+        error = float(np.hypot(ramp.error * per_row, _MODEL * line))
+        return Estimate(
+            cls(min(line, 1e5), line * ramp.knee + late),
+            {
+                "line_time_us": error,
+                "delay_us": max(line, error) * ramp.knee_error + error * ramp.knee,
+            },
+            float(ramp.slope / ramp.error),
+            f"the {'next' if ramp.way > 0 else 'last'} frame's light in the residuals, by row",
+            {
+                "share_per_row_of_next": sums[0].slope,
+                "share_per_row_of_last": sums[1].slope,
+                "errors": [float(s.error) for s in sums],
+            },
+        )

@@ -1,0 +1,196 @@
+"""Random telegraph noise: pixels whose level jumps between two values."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.distortions import Freedom
+from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.telegraph import Series, Telegraph, find_telegraph
+from pixcal.kernels.scene import TILE, chip_map
+from pixcal.kernels.synthesis import BLOCK_ROWS
+from pixcal.model.bench import SimulatedDetector
+from pixcal.model.config import quantity
+from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.shot import Shot
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+HARMONICS = 5
+"""Of the phase that are taken out of fringe residuals before they count as noise."""
+
+_MIN_FRAMES = 10
+_ENOUGH = 20
+_LEAST_NOISE_ADU = 0.8
+_HOT = 4.0
+_WIDE = 16
+_FRAMES_AT_ONCE = 256
+
+
+@dataclass(frozen=True)
+class TelegraphNoise(Effect):
+    """A trap near the source follower of some pixels that is full or empty.
+
+    Both states are equally likely; the level lies half an amplitude above or below its mean.
+    Amplitudes have an exponential distribution. Nothing of it is constant in time, so maps of the
+    fit neither show it nor can be mended; the pixels are those that `reduce` flags as noisy.
+    """
+
+    name = "telegraph_noise"
+    title = "pixels that jump between two levels"
+    stage = Stage.READOUT
+    domains = ("noise",)
+    strengths = ("amplitude_e",)
+    sources = (
+        "Ozdogru et al. 2025, Proc. SPIE 13527, 135270V (arXiv:2505.24540): telegraph noise in 1 "
+        "to 5 % of the pixels of two scientific CMOS cameras",
+        "Janesick, Andrews and Elliott 2006, Proc. SPIE 6276: it limits the noise of CMOS arrays, "
+        "and differs widely from pixel to pixel",
+        "Chao et al. 2017, Sensors 17(12), 2704: amplitudes and time constants of 8.3 million "
+        "pixels; the distribution of amplitudes has an exponential tail",
+    )
+
+    share: float = quantity(0.02, low=0, high=1, doc="of the pixels that have it")
+    amplitude_e: float = quantity(
+        30.0, unit="e-", low=0, high=1e6, doc="mean distance of the two levels"
+    )
+    switching_s: float = quantity(
+        0.5, unit="s", low=0, high=1e6, doc="mean stay in a level; 0: another draw in every frame"
+    )
+
+    def readout(self, adu: F32, shot: Shot) -> F32:
+        """As in `Effect.readout`."""
+        found = adu.copy()
+        detector, recording = shot.bench.detector, shot.recording
+        keep = float(np.exp(-2 * recording.period_s / self.switching_s)) if self.switching_s else 0
+        first, last = shot.rows
+        for block in range(first // BLOCK_ROWS, -(-last // BLOCK_ROWS)):
+            rows, columns, amplitudes = _pixels(detector, block, self.share)
+            if not len(rows):
+                continue
+            seed = int(recording.rng(self.name, block).integers(1 << 62))
+            states = _states(seed, recording.count, len(rows), keep)
+            up = np.unpackbits(states[shot.frame], count=len(rows))
+            step = (up - np.float32(0.5)) * amplitudes * np.float32(self.amplitude_e)
+            inside = (rows >= first) & (rows < last)
+            at = rows[inside] - first, columns[inside]
+            found[at] += step[inside] / np.float32(detector.gain_e_per_adu)
+        return found
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Estimate | None:
+        """Pixels noisier than the rest whose noise is telegraph noise by its shape.
+
+        How many and how strong from the distribution of the pixels' variances; that they jump,
+        rather than being noisier, from two signs that Gaussian noise of any size has not: a flat
+        top (negative kurtosis), and neighbouring frames that resemble each other. Each is summed
+        over the noisy pixels, so nothing is to be corrected for having looked at many of them.
+        Bias and dark frames; without enough of them the residuals of fringes.
+        """
+        series = tuple(_series(evidence))
+        if not series:
+            return None
+        found = find_telegraph(series)
+        if found is None:
+            return None
+        return _estimate(cls, found)
+
+
+def _estimate(cls: type[TelegraphNoise], found: Telegraph) -> Estimate:
+    return Estimate(
+        cls(found.share, found.amplitude, found.switching_s),
+        {
+            "share": found.share_error,
+            "amplitude_e": found.amplitude_error,
+            "switching_s": found.switching_error,
+        },
+        found.significance,
+        "noisy pixels have two levels or stay in one from frame to frame",
+        {"flat_top_sigmas": found.flat_top, "staying_sigmas": found.staying, "noisy": found.noisy},
+    )
+
+
+@lru_cache(maxsize=4)
+def _pixels(
+    detector: SimulatedDetector, block: int, share: float
+) -> tuple[NDArray[np.intp], NDArray[np.intp], F32]:
+    """Rows and columns of the pixels of a block that have it, and amplitudes of mean one."""
+    rows = block * BLOCK_ROWS, min((block + 1) * BLOCK_ROWS, detector.shape[0])
+
+    def draw(rng: np.random.Generator) -> F64:
+        chance, amplitude = rng.random(TILE), rng.standard_exponential(TILE)
+        return np.where(chance < share, amplitude, 0)
+
+    amplitudes = chip_map(detector, rows, TelegraphNoise.name, draw)
+    y, x = np.nonzero(amplitudes)
+    return y + rows[0], x, amplitudes[y, x]
+
+
+@lru_cache(maxsize=4)
+def _states(seed: int, frames: int, pixels: int, keep: float) -> NDArray[np.uint8]:
+    """Whether each pixel is in its upper level, in bits: (frame, pixel / 8)."""
+    rng = np.random.default_rng(seed)
+    up = np.zeros(pixels, bool)
+    packed = []
+    for first in range(0, frames, _FRAMES_AT_ONCE):
+        count = min(_FRAMES_AT_ONCE, frames - first)
+        drawn = rng.random((count, 2, pixels), np.float32)
+        states = np.empty((count, pixels), bool)
+        for n, (anew, coin) in enumerate(drawn):
+            draw = anew >= keep if first + n else np.ones(pixels, bool)
+            up = np.where(draw, coin < 0.5, up)
+            states[n] = up
+        packed.append(np.packbits(states, axis=1))
+    return np.concatenate(packed)
+
+
+def _series(evidence: Evidence) -> Iterator[Series]:
+    dark = [s for s in evidence.stacks if s.kind != "flat" and len(s.adu) >= _MIN_FRAMES]
+    if sum(len(s.adu) for s in dark) >= _ENOUGH:
+        for stack in dark:
+            if (series := _of_stack(stack, evidence)) is not None:
+                yield series
+        return
+    for fringes in evidence.fringes.values():
+        if len(fringes.g) >= _ENOUGH:
+            yield _of_fringes(fringes, evidence)
+
+
+def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
+    """Bias or dark frames; without what rows have in common, and without hot pixels."""
+    seconds = float(np.nan_to_num(stack.exptime_s))
+    dark = np.maximum(evidence.dark_rate, 0) * seconds
+    pixels = (dark < _HOT * evidence.read_noise**2) & (stack.adu < evidence.saturation_adu).all(0)
+    rest = (stack.adu - np.median(stack.adu, axis=0)).astype(float)
+    wide = rest.shape[2] >= _WIDE
+    rest -= np.median(rest, axis=2 if wide else (1, 2), keepdims=True)
+    rest = rest[:, pixels] * evidence.gain
+    if rest.shape[1] < _ENOUGH:
+        return None
+    spread = 1.4826 * float(np.median(np.abs(rest)))
+    if spread < _LEAST_NOISE_ADU * evidence.gain:
+        # Of noise below a step of the converter the shape is that of the steps.
+        return None
+    return Series(
+        rest / spread, np.flatnonzero(pixels), spread, max(_period(stack.time_s), seconds)
+    )
+
+
+def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Series:
+    # With the pixels that the fit turned away for their noise: they are the ones.
+    every = evidence.good & np.isfinite(fringes.theta).all(axis=0)
+    fringes = replace(fringes, good=every)
+    freedom = Freedom(fringes, HARMONICS)
+    left = freedom.left_over(freedom.of_good(fringes.residual))
+    root = np.sqrt(freedom.weight)
+    noise = np.where(root > 0, left * root, np.nan).astype(float)
+    sigma = float(freedom.weight[freedom.weight > 0].mean() ** -0.5)
+    return Series(noise, np.flatnonzero(freedom.good), sigma, _period(fringes.time_s))
+
+
+def _period(time_s: F64) -> float:
+    return float(np.median(np.diff(time_s)))

@@ -1,0 +1,151 @@
+"""A laser whose colour drifts or hops: fringes that open and close like an accordion."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.frame_series import FrameSeries
+from pixcal.estimators.fringe_motion import Hop, Motion, motion_of, ramps_and_colour
+from pixcal.estimators.variance_components import log_chance_of_any, sigmas, signed_sigmas
+from pixcal.kernels import optics
+from pixcal.kernels.scene import FrameStates, geometry
+from pixcal.model.config import quantity
+from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.recording import Recording
+
+F64 = NDArray[np.float64]
+
+HOUR_S = 3600.0
+
+
+@dataclass(frozen=True)
+class WavelengthDrift(Effect):
+    """Relative change of the wavelength: a ramp, a random walk, and hops to another mode and back.
+
+    A change by epsilon takes ``epsilon K / (1 + epsilon)`` off the fringe vector of every set, K
+    being its own: along the fringe axis, the more the closer the fringes. That of the refractive
+    index of air, or of the distance to the detector, does the same. The time of each set runs from
+    its first frame. Nothing here is constant in time, so maps alone do not tell of it; the fit
+    leaves the vector free in each frame where it moves.
+    """
+
+    name = "wavelength_drift"
+    title = "wavelength drifting, or hopping between modes"
+    stage = Stage.LIGHT
+    domains = ("time",)
+    strengths = ("ramp", "walk", "hop")
+    sources = (
+        "CIPM 2007, Recommendation 2, and Stone et al. 2009, Metrologia 46, 11: an unstabilised "
+        "He-Ne laser at 633 nm keeps its wavelength to 1.5e-6",
+        "neighbouring modes of a 30 cm tube are c / (2 x 0.3 m) = 500 MHz apart, 1.1e-6",
+        "Wieman & Hollberg 1991, Rev. Sci. Instrum. 62, 1: free diode lasers follow temperature by "
+        "some 0.25 nm/K, in hops: 1e-4 and more",
+        "air of 1 K more has an index lower by 1e-6 (Edlen's equation)",
+    )
+
+    ramp: float = quantity(1e-6, unit="1/h", low=-1, high=1, doc="relative change in an hour")
+    walk: float = quantity(
+        5e-7, unit="h^-0.5", low=0, high=1, doc="relative random walk, rms after an hour"
+    )
+    hop: float = quantity(1.1e-6, low=-0.1, high=0.1, doc="relative difference of the two modes")
+    hops_per_h: float = quantity(
+        12.0, unit="1/h", low=0, high=1e6, doc="hops to the other mode or back, at random times"
+    )
+
+    def states(self, states: FrameStates, recording: Recording) -> FrameStates:
+        """As in `Effect.states`."""
+        bench, count = recording.bench, recording.count
+        hours = recording.period_s / HOUR_S
+        steps = recording.rng(self.name).standard_normal(count)
+        hops = recording.rng(self.name, 1).poisson(self.hops_per_h * hours, count)
+        change = self.ramp * hours * np.arange(count) + self.walk * np.sqrt(hours) * steps.cumsum()
+        change = change + self.hop * (np.cumsum(hops) % 2)
+        # One over the wavelength, less what it was.
+        shrunk = -change / (1 + change)
+        ny, nx = bench.detector.shape
+        where, place = geometry(bench, recording.number), ((nx - 1) / 2, (ny - 1) / 2)
+        if bench.optics.fringes == "exact":
+            kx, ky = optics.fringe_vector(*place, where)
+            phase = optics.phase(*place, where)
+        else:
+            kx, ky = (np.asarray(k) for k in optics.paraxial_vector(where))
+            phase = optics.paraxial_phase(*place, where)
+        return replace(
+            states,
+            phi=states.phi + shrunk * phase,
+            dkx=states.dkx + shrunk * kx,
+            dky=states.dky + shrunk * ky,
+        )
+
+    @classmethod
+    def estimate(cls, evidence: Evidence) -> Estimate | None:
+        """Slow part and jumps of the frames' own vectors along those of the sets.
+
+        With fringes of different directions, against motions that are the same for all sets; with
+        one direction, against the motion across the fringes' axis.
+        """
+        motion = motion_of(evidence)
+        if motion is None:
+            return None
+        parts = ["jitter_x", "jitter_y", "walk_x", "walk_y", "walk_k"]
+        if not motion.crossed:
+            parts[2:4] = ["walk"]
+        slow = motion.components(parts, raw=True)
+        steady = motion.components(parts, absent=["walk_k"], raw=True)
+        drifts = signed_sigmas(slow.likelihood - steady.likelihood, float(slow.size[-1]))
+        values, errors = _slow_parameters(motion, parts)
+        ramps = abs(values["ramp"] / errors["ramp"])
+        jumps = [hop for hops in motion.hops.values() for hop in hops]
+        if jumps:
+            hopping = _hops(motion, jumps)
+            values, errors = values | hopping[0], errors | hopping[1]
+        # A ramp goes either way.
+        chance = log_chance_of_any([log_ndtr(-drifts), np.log(2) + log_ndtr(-ramps)])
+        sharpest = max((hop.sigmas for hop in jumps), default=-np.inf)
+        return Estimate(
+            cls(**({"hop": 0.0} | values)),
+            errors,
+            max(sigmas(chance), sharpest),
+            "slow part of the fringe vectors of all frames along those of their sets"
+            + ("" if motion.crossed else "; a motion of the fibres along the axis could do it too"),
+            {"walk_sigmas": drifts, "ramp_sigmas": ramps, "hops": len(jumps)},
+        )
+
+
+def _slow_parameters(
+    motion: Motion, parts: Sequence[str]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Ramp and walk, beside ramps of the fringe vector where sets tell them apart."""
+    known = ramps_and_colour if motion.crossed else _colour
+    found = motion.components(parts, known)
+    at = known(motion.series[0]).shape[2] - 1
+    walk, error = found.root(len(parts) - 1)
+    return (
+        {"ramp": float(found.beta[at]) * HOUR_S, "walk": walk * HOUR_S**0.5},
+        {
+            "ramp": float(np.sqrt(found.shape_covariance(range(2, len(parts)))[at, at])) * HOUR_S,
+            "walk": error * HOUR_S**0.5,
+        },
+    )
+
+
+def _colour(series: FrameSeries) -> F64:
+    return ramps_and_colour(series)[..., 2:]
+
+
+def _hops(motion: Motion, jumps: Sequence[Hop]) -> tuple[dict[str, float], dict[str, float]]:
+    """Size and rate of the hops; up and down count alike."""
+    size, error = np.array([abs(h.size) for h in jumps]), np.array([h.error for h in jumps])
+    weight = 1 / error**2
+    hours = sum(float(np.ptp(s.time_s)) + s.step_s for s in motion.raw) / HOUR_S
+    return (
+        {"hop": float(size @ weight / weight.sum()), "hops_per_h": len(jumps) / hours},
+        {
+            "hop": float(1 / np.sqrt(weight.sum())),
+            "hops_per_h": float(np.sqrt(len(jumps)) / hours),
+        },
+    )

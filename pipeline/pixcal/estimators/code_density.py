@@ -1,0 +1,262 @@
+"""How wide the codes of a converter are, by how often each comes up.
+
+Noise of a code or more makes the light that falls on a code a smooth function of the code. So what
+changes quickly from code to code is the converter: the counts against a local fit of themselves.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d, uniform_filter1d
+from scipy.optimize import minimize_scalar
+from scipy.signal import savgol_coeffs, savgol_filter
+from scipy.special import log_ndtr
+
+F64 = NDArray[np.float64]
+
+MAX_CODES = 1 << 17
+FEWEST_COUNTS = 5.0
+"""Expected counts of a code that counts."""
+FEWEST_CODES = 24
+POPULATED = 20.0
+"""Counts of codes around from which an empty one is a gap."""
+NEAR = 0.1
+"""How far the share of codes that come up may be from one over the step."""
+LEAST_AGREEMENT = 0.5
+TIE = 0.01
+"""Of a code: multiples of the step this near half-way may be rounded up or down."""
+_ORDER = 3
+_LEAST_HALF, _MOST_HALF = 4, 12
+_CALM = 101
+LOWEST_RIPPLE = 1 / 16
+"""Turns a code."""
+
+
+def histogram(frames: Iterable[NDArray[np.generic]], good: NDArray[np.bool_]) -> F64 | None:
+    """Counts of the codes 0, 1, ... of frames (t, y, x); None where samples are no codes.
+
+    Samples at either end may have been clipped, so they do not count.
+    """
+    counts = np.zeros(MAX_CODES)
+    for stack in frames:
+        samples = stack[:, good]
+        if samples.dtype.kind == "f":
+            whole = np.rint(samples)
+            if not np.array_equal(whole, samples):
+                return None
+            samples = whole
+        if not samples.size or samples.min() < 0 or samples.max() >= MAX_CODES:
+            return None
+        found = np.bincount(samples.ravel().astype(np.int64), minlength=MAX_CODES)
+        highest = int(np.flatnonzero(found)[-1])
+        found[[0, highest]] = 0
+        counts += found
+    return counts
+
+
+def step_of(counts: F64) -> tuple[float, float]:
+    """Step of the converter in codes of the file, from the codes that never come; and its error.
+
+    A step is the same all over the range: gaps that are not at multiples of one are missing codes
+    of a converter of step 1.
+    """
+    there = np.flatnonzero(counts)
+    if len(there) < FEWEST_CODES:
+        return 1.0, 1.0
+    half = max(16, int(4 * np.ptp(there) / len(there)))
+    around = uniform_filter1d(counts, 2 * half + 1, mode="constant")
+    # Within the runs of populated codes, not at their ends.
+    codes = np.flatnonzero(minimum_filter1d(around, 2 * half + 1, mode="constant") > POPULATED)
+    if len(codes) < FEWEST_CODES:
+        return 1.0, 1.0
+    taken = counts[codes] > 0
+    none = 1.0, 0.5 / float(codes[-1])
+    if taken.all():
+        return none
+    found = _period(codes, taken)
+    # A whole number of steps often makes a whole number of codes: of that the spectrum is not sure.
+    simple = [float(Fraction(found).limit_denominator(n)) for n in (1, 2, 4, 16, 128, 1024)]
+    trials = [t for t in (*simple, found) if t >= 1]
+    agreed = [_agreement(codes, taken, trial) for trial in trials]
+    if max(agreed) < LEAST_AGREEMENT:
+        return none
+    step = trials[int(np.argmax(agreed))]
+    return step, 0.5 * step / float(codes[-1])
+
+
+def converter_counts(counts: F64, step: float) -> F64:
+    """Counts of the codes of a converter whose step, in codes of the file, is known."""
+    number = np.rint(np.arange(len(counts)) / step).astype(np.int64)
+    return np.asarray(np.bincount(number, weights=counts))
+
+
+def _period(codes: NDArray[np.int64], there: NDArray[np.bool_]) -> float:
+    """Step of a comb, by its spectrum about the frequency that the share of its teeth tells."""
+    share = float(there.mean())
+    value = there - share
+
+    def power(frequency: float) -> float:
+        return float(np.abs(value @ np.exp(-2j * np.pi * frequency * codes)))
+
+    spread = np.zeros(codes[-1] + 1)
+    spread[codes] = value
+    spectrum = np.abs(np.fft.fft(spread, 4 * 2 ** int(np.ceil(np.log2(len(spread))))))
+    # Of steps below two the frequency is above half a turn a code: the other side of the spectrum.
+    frequency = np.arange(len(spectrum)) / len(spectrum)
+    near = np.abs(frequency - share) < min(NEAR * share, (1 - share) / 2)
+    best = float(frequency[near][np.argmax(spectrum[near])])
+    return 1 / _highest(power, best, 1 / len(spectrum))
+
+
+def _highest(power: Callable[[float], float], start: float, width: float) -> float:
+    found = minimize_scalar(
+        lambda f: -power(f), bounds=(start - width, start + width), method="bounded",
+        options={"xatol": 1e-6 * width},
+    )  # fmt: skip
+    return float(found.x)
+
+
+def _agreement(codes: NDArray[np.int64], there: NDArray[np.bool_], step: float) -> float:
+    """Share of the gaps that a step foresees, less that of codes it says cannot come."""
+    # The next multiple rounds to the code, or just so: halves go either way.
+    distance = np.abs(codes - np.rint(codes / step) * step)
+    gaps = ~there
+    found = float((distance[gaps] > 0.5 - TIE).mean()) if gaps.any() else 0.0
+    wrong = float((distance[there] > 0.5 + TIE).mean()) if there.any() else 0.0
+    return found - wrong
+
+
+@dataclass(frozen=True)
+class Ripple:
+    """The strongest line in the widths.
+
+    Attributes
+    ----------
+    period : float
+        Codes.
+    amplitude, amplitude_error : float
+    phase : float
+        At code zero, rad.
+    log_chance : float
+        Logarithm of the chance of one as strong anywhere.
+    """
+
+    period: float
+    amplitude: float
+    amplitude_error: float
+    phase: float
+    log_chance: float
+
+
+@dataclass(frozen=True)
+class CodeWidths:
+    """Relative widths of codes, less one and less what a local fit takes.
+
+    Attributes
+    ----------
+    number : (n,) int
+        Of the converter's codes.
+    width : (n,) float64
+    variance : (n,) float64
+        Of the counts by chance, relative.
+    kernel : (m,) float64
+        What multiplies the true widths: one less the local fit.
+    """
+
+    number: NDArray[np.int64]
+    width: F64
+    variance: F64
+    kernel: F64
+
+    def kept(self, frequency: float) -> float:
+        """Share of a line's amplitude that the local fit leaves; frequency in turns a code."""
+        at = np.arange(len(self.kernel)) - len(self.kernel) // 2
+        return float(self.kernel @ np.cos(2 * np.pi * frequency * at))
+
+    def scatter(self) -> tuple[float, float, float]:
+        """Variance of the true widths, its error, and its significance.
+
+        Of thresholds that are displaced independently: neighbouring widths are related by -1/2.
+        """
+        square = float(self.kernel @ self.kernel)
+        more = (square - float(self.kernel[1:] @ self.kernel[:-1])) / square
+        excess = self.width**2 / square - self.variance
+        size = 0.0
+        for _ in range(4):
+            weight = 1 / (2 * (self.variance + max(size, 0.0)) ** 2 + self.variance**3)
+            size = float(weight @ excess / weight.sum())
+        # Neighbours' squares are related by up to a quarter.
+        error = float(np.sqrt(1.5 / weight.sum()))
+        chance = 1 / (2 * self.variance**2 + self.variance**3)
+        sigmas = float(chance @ excess / np.sqrt(chance.sum()))
+        return size / more, error / more, sigmas
+
+    def ripple(self, scatter: float) -> Ripple:
+        """The strongest line, over chance and a scatter of the widths (variance)."""
+        weight = 1 / (self.variance + max(scatter, 0.0))
+        value = weight * self.width
+        total, noise = float(weight.sum()), float(weight**2 @ self.variance)
+        own = float(weight @ weight) * max(scatter, 0.0)
+
+        def line(frequency: float) -> complex:
+            turn = np.exp(-2j * np.pi * frequency * self.number)
+            return complex(value @ turn) / self.kept(frequency)
+
+        def power(frequency: float) -> float:
+            return float(np.abs(line(frequency)) ** 2 / level(frequency))
+
+        def level(frequency: float) -> float:
+            """Mean power without a line: of displaced thresholds it rises with the frequency."""
+            return noise + own * 2 * float(np.sin(np.pi * frequency)) ** 2
+
+        count = int(np.ptp(self.number)) + 1
+        spread = np.zeros(4 << (count - 1).bit_length())
+        spread[self.number - self.number[0]] = value
+        spectrum = np.abs(np.fft.rfft(spread)) ** 2
+        frequency = np.arange(len(spectrum)) / len(spread)
+        # Below, the local fit takes it; close to the end it cannot be told from the end.
+        seen = (frequency > LOWEST_RIPPLE) & (frequency < 0.5 - 2 / count)
+        levels = noise + own * 2 * np.sin(np.pi * frequency[seen]) ** 2
+        best = float(frequency[seen][np.argmax(spectrum[seen] / levels)])
+        best = _highest(power, best, 1 / len(spread))
+        # Even and odd codes have a cosine alone.
+        ends = float(np.real(line(0.5)))
+        top = float(np.log(2) + log_ndtr(-abs(ends) * self.kept(0.5) / np.sqrt(level(0.5))))
+        free = np.log(2 * count) - power(best) * self.kept(best) ** 2
+        if top < free:
+            error = np.sqrt(level(0.5)) / total
+            phase = 0.0 if ends > 0 else np.pi
+            return Ripple(2.0, abs(ends) / total, float(error), phase, min(top + np.log(2), 0.0))
+        found = 2 * line(best) / total
+        error = np.sqrt(2 * level(best)) / total / self.kept(best)
+        chance = float(min(free + np.log(2), 0.0))
+        return Ripple(1 / best, abs(found), float(error), float(np.angle(found)), chance)
+
+
+def code_widths(counts: F64, noise: float) -> CodeWidths | None:
+    """Widths from the counts of a converter's codes; None where too few came up.
+
+    Parameters
+    ----------
+    counts : (n,) float64
+    noise : float
+        Least noise of a sample, in codes.
+    """
+    half = int(np.clip(noise / 2, _LEAST_HALF, _MOST_HALF))
+    if noise < 1 or len(counts) < 2 * _CALM:
+        return None
+    length = 2 * half + 1
+    expected = savgol_filter(counts, length, _ORDER)
+    # Weights that hardly depend on the code's own count.
+    calm = uniform_filter1d(expected, length)
+    used = (uniform_filter1d(counts, length) > FEWEST_COUNTS) & (calm > FEWEST_COUNTS)
+    used &= expected > 0
+    if np.count_nonzero(used) < FEWEST_CODES:
+        return None
+    kernel = -savgol_coeffs(length, _ORDER)
+    kernel[half] += 1
+    width = (counts - expected)[used] / calm[used]
+    return CodeWidths(np.flatnonzero(used), width, expected[used] / calm[used] ** 2, kernel)

@@ -1,0 +1,179 @@
+"""What is known of the shares of every link, for classes of pixels of any period.
+
+Each class of pixels has two unknown shares for a link, there and back. Noise and hot pixels are
+joined here as least-squares sums of the same unknowns.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.crosstalk.covariance import NORMAL, Products
+from pixcal.estimators.crosstalk.hot_pixels import HotPixels
+from pixcal.estimators.crosstalk.links import Classes, Place, class_sums, sums_of
+from pixcal.estimators.crosstalk.residuals import UNIT
+
+F64 = NDArray[np.float64]
+
+BRIGHTER_FATTER = 1e-6
+"""How large the covariance of neighbours over the square of their charge may well be, 1/e-."""
+ONE_WAY = 0.01
+"""How much the shares there and back may well differ."""
+LARGEST = 0.1
+"""How large a share may well be."""
+DOUBT = 0.25
+"""Error of what a single hot pixel shows, as a share of it: a neighbour may be warm by itself."""
+MARKED = 4.0
+"""Sigmas beyond which two numbers differ, or one is not zero."""
+BACKED = 2.5
+"""Sigmas of the noise's own share that back a single hot pixel."""
+
+
+@dataclass(frozen=True)
+class Information:
+    """Least-squares sums of shares, by way of measuring.
+
+    Attributes
+    ----------
+    normal, right : mapping of str to (..., u, u), (..., u) float64
+        Unknown ``2 c`` is what pixels of class c give over the link, ``2 c + 1`` what their
+        partners give back. With a leading axis for many links.
+    """
+
+    normal: dict[str, F64]
+    right: dict[str, F64]
+
+    def of(self, link: int) -> "Information":
+        """That of one link, where arrays hold many."""
+        return Information(
+            {way: m[link] for way, m in self.normal.items()},
+            {way: r[link] for way, r in self.right.items()},
+        )
+
+    def only(self, unknowns: NDArray[np.intp]) -> "Information":
+        """Of some of the unknowns, the others being zero."""
+        at = np.ix_(unknowns, unknowns)
+        return Information(
+            {way: m[at] for way, m in self.normal.items()},
+            {way: r[unknowns] for way, r in self.right.items()},
+        )
+
+    @property
+    def total(self) -> tuple[F64, F64]:
+        """All ways together."""
+        return np.sum([*self.normal.values()], axis=0), np.sum([*self.right.values()], axis=0)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What was measured of some links, freed of what is known already (second order).
+
+    Attributes
+    ----------
+    products : Products or None
+    hot : HotPixels or None
+    links : tuple of (int, int)
+    shape, first : (int, int)
+        Rows and columns of the arrays; their first in the window.
+    """
+
+    products: Products | None
+    hot: HotPixels | None
+    links: tuple[Place, ...]
+    shape: Place
+    first: Place
+
+    def of(self, numbers: Sequence[int]) -> "Measured":
+        """Some of the links."""
+        at, products, hot = list(numbers), self.products, self.hot
+        if products is not None:
+            products = replace(products, right=products.right[at], normal=products.normal[at])
+        if hot is not None:
+            hot = replace(hot, value=hot.value[:, at], sigma=hot.sigma[:, at])
+        return replace(self, products=products, hot=hot, links=tuple(self.links[n] for n in at))
+
+    @property
+    def _sums(self) -> F64:
+        if self.products is None:
+            return np.zeros((len(self.links), 0, *self.shape))
+        return np.concatenate([self.products.right, self.products.normal], axis=1)
+
+    def every_period(self) -> Iterator[tuple[Classes, Information]]:
+        """All links for each period; single hot pixels are taken with `DOUBT`."""
+        for classes, sums in class_sums(self._sums, self.first):
+            normal, right = self._of_noise(sums)
+            if self.hot is not None:
+                value, information, _ = self.hot.by_class(classes, self.links, DOUBT)
+                normal["hot pixels"], right["hot pixels"] = _separate(value, information)
+            yield classes, Information(normal, right)
+
+    def of_period(self, classes: Classes) -> Information:
+        """All links for one period, hot pixels taken at their word where they agree.
+
+        A hot pixel that is alone in its class counts where the noise says the same.
+        """
+        normal, right = self._of_noise(sums_of(self._sums, classes))
+        if self.hot is not None:
+            value, information, count = self.hot.by_class(classes, self.links)
+            alone = (count == 1) & (value**2 * information > MARKED**2)
+            if "covariance" in normal:
+                alone &= ~_backed(value, normal["covariance"], right["covariance"])
+            information[alone] = 0.0
+            normal["hot pixels"], right["hot pixels"] = _separate(value, information)
+        return Information(normal, right)
+
+    def _of_noise(self, sums: F64) -> tuple[dict[str, F64], dict[str, F64]]:
+        if self.products is None:
+            return {}, {}
+        normal, right = _shares(sums[:, :4], sums[:, 4:], self.products.read)
+        return {"covariance": normal}, {"covariance": right}
+
+
+def _separate(value: F64, information: F64) -> tuple[F64, F64]:
+    """Sums (link, u, u), (link, u) of shares measured each by itself, (link, class, 2)."""
+    flat = information.reshape(len(information), -1)
+    return flat[:, :, None] * np.eye(flat.shape[1]), flat * value.reshape(flat.shape)
+
+
+def _backed(value: F64, normal: F64, right: F64) -> NDArray[np.bool_]:
+    """Whether the noise shows shares (link, class, 2) and agrees with their values."""
+    apart = np.kron(np.eye(value.shape[1]), [[1.0, -1.0], [-1.0, 1.0]]) / ONE_WAY**2
+    covariance = np.linalg.inv(normal + apart + np.eye(len(apart)) / LARGEST**2)
+    share = np.einsum("luv,lv->lu", covariance, right).reshape(value.shape)
+    error = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)).reshape(value.shape)
+    return np.asarray((share > BACKED * error) & (np.abs(value - share) < MARKED * error))
+
+
+def _shares(right: F64, normal: F64, read: float) -> tuple[F64, F64]:
+    """Sums of the shares alone (link, u, u), the constant and brighter-fatter having been freed.
+
+    Parameters
+    ----------
+    right, normal : (link, 4, class), (link, 9, class) float64
+        As in `Products`.
+    read : float
+        Variance without light, which the constant may well reach.
+    """
+    links, _, count = right.shape
+
+    def block(i: int, j: int) -> F64:
+        return normal[:, NORMAL[min(i, j), max(i, j)]]
+
+    own: F64 = np.zeros((links, count, 2, count, 2))
+    at = np.arange(count)
+    cross: F64 = np.empty((links, count, 2, 2))
+    for i in range(2):
+        for j in range(2):
+            own[:, at, i, at, j] = block(i, j)
+            cross[:, :, i, j] = block(i, 2 + j)
+    nuisance = np.stack(
+        [np.stack([block(2 + i, 2 + j).sum(-1) for j in range(2)], -1) for i in range(2)], -2
+    )
+    nuisance += np.diag([read**-2, (BRIGHTER_FATTER * UNIT) ** -2])
+    cross = cross.reshape(links, 2 * count, 2)
+    taken = cross @ np.linalg.inv(nuisance)
+    shares = right[:, :2].swapaxes(1, 2).reshape(links, -1)
+    free = shares - np.einsum("lun,ln->lu", taken, right[:, 2:].sum(-1))
+    return own.reshape(links, 2 * count, -1) - taken @ cross.swapaxes(1, 2), free

@@ -1,0 +1,117 @@
+"""Pairs of pixels that may couple, and classes of pixels that may couple in the same way."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.kernels.crosstalk import Coupling
+
+F64 = NDArray[np.float64]
+Place = tuple[int, int]
+
+REACH = 5
+"""Rows and columns within which couplings are looked for."""
+MAX_PERIOD = 8
+"""Longest period of a kernel that is looked for, rows and columns."""
+MAX_CLASSES = 16
+"""Most classes of pixels that a period in both directions may make."""
+MIN_REPEATS = 4
+"""Periods that the window must hold at least."""
+
+
+def links(shape: Place, reach: int = REACH) -> tuple[Place, ...]:
+    """Steps (dy, dx) from a pixel to a partner; the opposite ones are the same pairs."""
+    high, wide = min(reach, shape[0] // 2), min(reach, shape[1] // 2)
+    return tuple(
+        (dy, dx)
+        for dy in range(high + 1)
+        for dx in range(-wide, wide + 1)
+        if dy > 0 or (dy == 0 and dx > 0)
+    )
+
+
+@dataclass(frozen=True)
+class Classes:
+    """Pixels whose row and column leave the same rest by the period.
+
+    Attributes
+    ----------
+    rows, columns : int
+        Period.
+    first : (int, int)
+        First row and column of the arrays, in the window.
+    """
+
+    rows: int
+    columns: int
+    first: Place
+
+    @property
+    def count(self) -> int:
+        """Number of classes."""
+        return self.rows * self.columns
+
+    def of(self, y: NDArray[np.intp], x: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Class of pixels of the arrays."""
+        row, column = (y + self.first[0]) % self.rows, (x + self.first[1]) % self.columns
+        return np.asarray(row * self.columns + column)
+
+    def shifted(self, number: int, by: Place) -> int:
+        """Class of the pixel so many rows and columns from one of class ``number``."""
+        row, column = divmod(number, self.columns)
+        return (row + by[0]) % self.rows * self.columns + (column + by[1]) % self.columns
+
+    def divisors(self) -> list["Classes"]:
+        """Classes of all periods that divide this one, the shortest first."""
+        found = [
+            replace(self, rows=n, columns=m)
+            for n in range(1, self.rows + 1)
+            for m in range(1, self.columns + 1)
+            if self.rows % n == 0 and self.columns % m == 0
+        ]
+        return sorted(found, key=lambda classes: classes.count)
+
+    def groups_of(self, finer: "Classes") -> NDArray[np.intp]:
+        """Own class of each class of a finer period, which this one divides."""
+        row, column = np.divmod(np.arange(finer.count), finer.columns)
+        return np.asarray(row % self.rows * self.columns + column % self.columns)
+
+    def coupling(self, number: int, step: Place, share: float) -> Coupling:
+        """Of the pixels of a class, with those a step away."""
+        row, column = divmod(number, self.columns)
+        return Coupling(*step, share, self.rows, row, self.columns, column)
+
+
+def periods(shape: Place, longest: int = MAX_PERIOD) -> list[Place]:
+    """Periods (rows, columns) that a window can tell, the shortest first."""
+    rows = range(1, max(1, min(longest, shape[0] // MIN_REPEATS)) + 1)
+    columns = range(1, max(1, min(longest, shape[1] // MIN_REPEATS)) + 1)
+    both = ((n, m) for n in rows for m in columns if n * m <= MAX_CLASSES)
+    return sorted(both, key=lambda p: (p[0] * p[1], p))
+
+
+def class_sums(values: F64, first: Place) -> Iterator[tuple[Classes, F64]]:
+    """Sums (..., class) of maps (..., y, x) over the pixels of each class, for every period.
+
+    Rows first, then columns of those sums: the cost is that of the row periods.
+    """
+    wanted = periods((values.shape[-2], values.shape[-1]))
+    by_rows = {
+        n: np.stack([values[..., (a - first[0]) % n :: n, :].sum(-2) for a in range(n)], -2)
+        for n in {n for n, _ in wanted}
+    }
+    for n, m in wanted:
+        rows = by_rows[n]
+        both = np.stack([rows[..., (b - first[1]) % m :: m].sum(-1) for b in range(m)], -1)
+        yield Classes(n, m, first), both.reshape(*both.shape[:-2], n * m)
+
+
+def sums_of(values: F64, classes: Classes) -> F64:
+    """Sums (..., class) of maps (..., y, x) over the pixels of each class."""
+    (n, m), (y, x) = (classes.rows, classes.columns), classes.first
+    return np.stack(
+        [values[..., (a - y) % n :: n, (b - x) % m :: m].sum((-2, -1))
+         for a in range(n) for b in range(m)], -1
+    )  # fmt: skip

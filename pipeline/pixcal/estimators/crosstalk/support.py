@@ -1,0 +1,197 @@
+"""Which couplings there are: links, periods and classes of pixels that stand out of the noise.
+
+Every pair of pixels a step apart, and every period of rows and columns, is tried. For a link to be
+taken it must stand out by so much that, with all that was tried, chance takes anything at all in
+one acquisition of a hundred. A capacitance couples both ways alike, and a kernel repeats; so shares
+there and back, and of many classes, are one number until the data tell them apart.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri_exp
+from scipy.stats import norm
+
+from pixcal.estimators.crosstalk.information import Information, Measured
+from pixcal.estimators.crosstalk.links import Classes, Place, periods
+from pixcal.kernels.crosstalk import Coupling
+
+F64 = NDArray[np.float64]
+
+FALSE_ALARM = 0.01
+"""Chance that noise alone gives any coupling."""
+INDEPENDENT = 0.35
+"""Share of the looks that are as good as independent: periods have pixels in common. Measured: it
+makes the median significance of acquisitions without couplings about zero."""
+WORTH = 10.0
+"""Fall in chi-square for which a period is given another number."""
+APART = 5.0
+"""Fall in chi-square for which shares are told apart, once links and period are known."""
+ZERO = 2.0
+"""Sigmas below which a share is none."""
+NOTHING = 1e-6
+"""Weight of a share below which it is not measured at all."""
+
+
+@dataclass(frozen=True)
+class Pick:
+    """Couplings of a link that are taken, and what is known of their shares.
+
+    Attributes
+    ----------
+    couplings : tuple of Coupling
+        Without shares.
+    basis : (coupling, number) float64
+        Shares are about this times numbers that are free: some are alike.
+    information : Information
+        Of these couplings only.
+    """
+
+    couplings: tuple[Coupling, ...]
+    basis: F64
+    information: Information
+
+
+@dataclass(frozen=True)
+class Choice:
+    """All that is taken, and how far the best of it is from chance.
+
+    Attributes
+    ----------
+    picks : tuple of Pick
+    best : float
+        Largest chi-square of one number.
+    looks : int
+        Numbers that were tried.
+    """
+
+    picks: tuple[Pick, ...]
+    best: float
+    looks: int
+
+    @property
+    def significance(self) -> float:
+        """Sigmas of a normal variate as rare as the best of so many looks."""
+        looks = INDEPENDENT * self.looks
+        one = np.log(2) + norm.logsf(np.sqrt(self.best))
+        none = looks * np.log1p(-np.exp(one))
+        if none < -0.5:
+            return float(ndtri_exp(none))
+        # A small chance, which looks multiply.
+        return float(-ndtri_exp(np.log(-np.expm1(none)) if none < -1e-9 else one + np.log(looks)))
+
+
+def choose(measured: Measured) -> Choice:
+    """Take what stands out.
+
+    First the links that do, at any period; then the one period that serves all of them best, the
+    shortest that is good enough; then, for that period, which classes differ.
+    """
+    every = periods(measured.shape)
+    looks = len(measured.links) * sum(3 * n * m for n, m in every)
+    critical = float(norm.isf(FALSE_ALARM / looks / 2) ** 2)
+    gains = np.stack([_best_gains(*i.total) for _, i in measured.every_period()])
+    best = max(float(gains.max()), 1e-9)
+    there = np.nonzero(gains.max(axis=0) > critical)[0]
+    if not len(there):
+        return Choice((), best, looks)
+    present = measured.of(there.tolist())
+    classes = _period(present, critical)
+    directions, information = _directions(classes), present.of_period(classes)
+    picks = []
+    for n, step in enumerate(present.links):
+        own = information.of(n)
+        basis, gain = _greedy(*own.total, directions, APART)
+        if gain > critical:
+            picks.append(_pick(own, classes, step, basis))
+    return Choice(tuple(picks), best, looks)
+
+
+def _period(present: Measured, critical: float) -> Classes:
+    """The shortest period that is good enough for all links together."""
+    scores = []
+    for classes, information in present.every_period():
+        directions = _directions(classes)
+        score = 0.0
+        for n in range(len(present.links)):
+            basis, gain = _greedy(*information.of(n).total, directions, WORTH)
+            score += gain - WORTH * basis.shape[1]
+        scores.append((score, classes))
+    enough = max(score for score, _ in scores) - critical
+    return next(classes for score, classes in scores if score >= enough)
+
+
+def _directions(classes: Classes) -> F64:
+    """Numbers that shares may be made of, (u, direction): each has some shares alike.
+
+    There, back and both, of each class of every period that divides the one at hand.
+    """
+    every = []
+    for coarse in classes.divisors():
+        groups = (coarse.groups_of(classes) == np.arange(coarse.count)[:, None]).astype(float)
+        there, back = np.zeros((2, coarse.count, 2 * classes.count))
+        there[:, ::2] = back[:, 1::2] = groups
+        every += [there + back, there, back]
+    return np.concatenate(every).T
+
+
+def _best_gains(normal: F64, right: F64) -> F64:
+    """Largest fall in chi-square (link,) that one class gives: there, back or both."""
+    own = np.diagonal(normal, axis1=-2, axis2=-1)
+    mixed = np.diagonal(normal, 1, axis1=-2, axis2=-1)[..., ::2]
+    weight = np.concatenate([own[..., ::2] + own[..., 1::2] + 2 * mixed, own], axis=-1)
+    value = np.concatenate([right[..., ::2] + right[..., 1::2], right], axis=-1)
+    return np.asarray(_fall(value, weight).max(axis=-1))
+
+
+def _fall(value: F64, weight: F64) -> F64:
+    return np.where(weight > NOTHING, value**2 / np.maximum(weight, NOTHING), 0.0)
+
+
+def _greedy(normal: F64, right: F64, directions: F64, worth: float) -> tuple[F64, float]:
+    """Directions worth a number (u, number), the strongest first, and the fall in chi-square."""
+    weight = np.einsum("ud,ud->d", directions, normal @ directions)
+    # Of equals the plainest: many shares alike, both ways.
+    plain = np.count_nonzero(directions, axis=0) / len(directions)
+    basis = np.zeros((len(right), 0))
+    gain, rest = 0.0, right
+    while basis.shape[1] < len(right):
+        each = _fall(rest @ directions, weight)
+        n = int(np.argmax(each + plain))
+        if each[n] < worth:
+            break
+        wider = np.column_stack([basis, directions[:, n]])
+        inner = wider.T @ normal @ wider
+        solved = np.linalg.lstsq(inner, wider.T @ right, rcond=1e-9)[0]
+        now = float(solved @ wider.T @ right)
+        if now - gain < worth:
+            break
+        basis, gain, rest = wider, now, right - normal @ wider @ solved
+    return _without_zeros(normal, right, basis, gain), gain
+
+
+def _without_zeros(normal: F64, right: F64, basis: F64, gain: float) -> F64:
+    """A basis without the shares that have a number of their own and are none within its error."""
+    for u in np.nonzero(np.any(basis, axis=1))[0]:
+        fewer = basis.copy()
+        fewer[u] = 0.0
+        fewer = fewer[:, np.any(fewer, axis=0)]
+        solved = np.linalg.lstsq(fewer.T @ normal @ fewer, fewer.T @ right, rcond=1e-9)[0]
+        now = float(solved @ fewer.T @ right)
+        numbers = np.linalg.matrix_rank(basis) - np.linalg.matrix_rank(fewer)
+        if numbers and now > gain - numbers * ZERO**2:
+            basis, gain = fewer, now
+    return basis
+
+
+def _pick(information: Information, classes: Classes, step: Place, basis: F64) -> Pick:
+    used = np.nonzero(np.any(basis, axis=1))[0]
+    couplings = (_coupling(classes, *divmod(int(u), 2), step) for u in used)
+    return Pick(tuple(couplings), basis[used], information.only(used))
+
+
+def _coupling(classes: Classes, number: int, back: int, step: Place) -> Coupling:
+    if not back:
+        return classes.coupling(number, step, 0.0)
+    return classes.coupling(classes.shifted(number, step), (-step[0], -step[1]), 0.0)

@@ -1,0 +1,79 @@
+"""From collected light to signal: boundaries that move with the charge, and a bent response.
+
+The two are fitted together to what the fringe fit leaves, because both make a second harmonic of
+the phase: a response the same for all fringes, moving boundaries (brighter-fatter) one that depends
+on the fringes' spacing.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.distortions import fit_distortions
+from pixcal.estimators.evidence import Evidence, FringeEvidence
+from pixcal.kernels.boundaries import REACH, moved_charge
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+UNIT = 1e-7
+"""Shift of boundaries (px per electron) that is fitted as one."""
+
+
+def fit_response(
+    evidence: Evidence,
+    level_e: float,
+    powers: int,
+    shifts: F64,
+    known_shift: tuple[float, float] | None = None,
+) -> tuple[F64, F64]:
+    """Coefficients of the response and the shift of the boundaries, from all fringe sets.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        With fringes.
+    level_e : float
+        Electrons for which u is one.
+    powers : int
+        Terms of the relative response 1 + c_1 u + c_2 u² + ...
+    shifts : float64 array
+        `pixcal.kernels.boundaries.boundary_shifts`, of size one.
+    known_shift : (float, float), optional
+        Shift by an electron (px) and its variance as they are known from the noise of neighbours.
+
+    Returns
+    -------
+    sizes : (powers + 1,) float64
+        c_1, c_2, ...; the shift by an electron, px.
+    covariance : (powers + 1, powers + 1) float64
+    """
+
+    def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> tuple[F32, Sequence[F32]]:
+        level = evidence.level(fringes, signal)
+        gained = np.stack([moved_charge(frame, UNIT * shifts) for frame in level])
+        charge = level + np.float32(sizes[-1]) * gained
+        u = charge / np.float32(level_e)
+        flat = evidence.flat.astype(np.float32)
+        bent, steepness, power = charge, np.ones_like(charge), charge
+        slopes: list[F32] = []
+        for n, size in enumerate(sizes[:-1].astype(np.float32), start=1):
+            power = power * u
+            bent = bent + size * power
+            steepness += size * np.float32(n + 1) * u**n
+            slopes.append(np.asarray(power / flat, np.float32))
+        slopes.append(steepness * gained / flat)
+        return (bent - level) / flat, slopes
+
+    prior = None
+    if known_shift is not None:
+        value, information = np.zeros(powers + 1), np.zeros(powers + 1)
+        value[-1], information[-1] = known_shift[0] / UNIT, UNIT**2 / known_shift[1]
+        prior = value, information
+    sizes, covariance = fit_distortions(
+        tuple(evidence.fringes.values()), distortion, powers + 1, margin=REACH, prior=prior
+    )
+    scale = np.ones(powers + 1)
+    scale[-1] = UNIT
+    return sizes * scale, covariance * np.outer(scale, scale)

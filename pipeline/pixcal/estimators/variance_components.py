@@ -1,0 +1,305 @@
+"""How much of a series is white and how much wanders: components of its variance.
+
+Series of a run at equal steps are taken to their cosine transform (DCT-II) without the mean. Its
+modes are the eigenvectors of a random walk's covariance, so that white noise and a walk together
+are independent from mode to mode, exactly; other stationary noise is so but for the ends. Each mode
+is then a normal vector of covariance ``sum_i size_i part_i`` about ``known @ beta``. The
+sizes are those of restricted maximum likelihood (Patterson & Thompson 1971, Biometrika 58, 545), by
+Fisher scoring.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dct
+from scipy.optimize import brentq
+from scipy.special import ndtri_exp
+
+from pixcal.kernels.variance_sums import gram, sandwich, trace_products
+
+F64 = NDArray[np.float64]
+
+MAX_STEPS = 60
+CONVERGED = 1e-5
+"""Growth of the log-likelihood at which scoring ends."""
+
+
+def cosine_modes(series: F64) -> F64:
+    """Orthonormal cosine transform of series (t, ...) without their mean: (t - 1, ...)."""
+    return np.asarray(dct(series, type=2, norm="ortho", axis=0)[1:])
+
+
+def walk_power(frames: int) -> F64:
+    """Variance (t - 1) of the cosine modes of a random walk of unit steps."""
+    angle = np.pi * np.arange(1, frames) / (2 * frames)
+    return np.asarray(1 / (4 * np.sin(angle) ** 2))
+
+
+def damped_power(frames: int, keep: float) -> F64:
+    """Variance (t - 1) of the cosine modes of a first-order autoregression of unit variance.
+
+    Parameters
+    ----------
+    frames : int
+    keep : float
+        Correlation of neighbours, 0 to below 1.
+    """
+    angle = np.pi * np.arange(1, frames) / frames
+    return np.asarray((1 - keep**2) / (1 + keep**2 - 2 * keep * np.cos(angle)))
+
+
+@dataclass(frozen=True)
+class Modes:
+    """Cosine modes of one series or more of ``c`` channels, and what their covariance is made of.
+
+    Attributes
+    ----------
+    values : (n, c) float64
+    known : (n, c, p) float64
+        Shapes that are fitted, each by a coefficient.
+    parts : (m, n, c, c) float64
+        What unit sizes add to the covariance of each mode.
+    start, least : (m,) float64
+        Sizes to begin with and lowest ones; below zero, so that what is not there may come out
+        either side of nothing.
+    """
+
+    values: F64
+    known: F64
+    parts: F64
+    start: F64
+    least: F64
+
+
+@dataclass(frozen=True)
+class Components:
+    """Sizes found, and how well.
+
+    Attributes
+    ----------
+    size : (m,) float64
+    covariance : (m, m) float64
+        Of ``size``; zero for those that were held.
+    beta, beta_covariance : (p,), (p, p) float64
+        Coefficients of the known shapes.
+    likelihood : float
+        Logarithm, restricted; comparable where the known shapes are the same.
+    profile : float
+        Logarithm, not restricted; comparable whatever the known shapes.
+    modes : Modes
+        That it is of.
+    """
+
+    size: F64
+    covariance: F64
+    beta: F64
+    beta_covariance: F64
+    likelihood: float
+    profile: float
+    modes: Modes
+
+    def above(self, part: int) -> float:
+        """1-sigma error of a size, upwards: where the likelihood has fallen by exp(-1/2).
+
+        A walk shows in few modes: a small one found in them may well be a large one.
+        """
+        sizes = self.size.copy()
+        sizes[part] = value = max(float(sizes[part]), 0.0)
+        top = _State(self.modes, sizes).likelihood
+
+        def left(above: float) -> float:
+            sizes[part] = value + above
+            return _State(self.modes, sizes).likelihood - top + 0.5
+
+        width = max(float(np.sqrt(self.covariance[part, part])), 1e-300)
+        while left(width) > 0:
+            width *= 2
+        return width * float(brentq(lambda share: left(share * width), 0.0, 1.0, xtol=1e-3))
+
+    def root(self, part: int) -> tuple[float, float]:
+        """Standard deviation of a part, and its error by `above`."""
+        value = max(float(self.size[part]), 0.0)
+        return float(np.sqrt(value)), float(np.sqrt(value + self.above(part)) - np.sqrt(value))
+
+    def shape_covariance(self, uncertain: Sequence[int]) -> F64:
+        """Covariance (p, p) of ``beta``, some sizes being no better known than they are.
+
+        Two thirds of that at the sizes found and a third of that at their upper limits: so shapes
+        beside a walk scatter, and those without one (by simulation).
+        """
+        sizes = np.maximum(self.size, 0.0)
+        for part in uncertain:
+            sizes[part] += self.above(part)
+        return np.asarray((2 * self.beta_covariance + _State(self.modes, sizes).spread) / 3)
+
+
+def estimate_components(
+    modes: Modes,
+    absent: Sequence[int] = (),
+    start: Components | None = None,
+    steps: int = MAX_STEPS,
+) -> Components:
+    """Sizes of the parts by restricted maximum likelihood.
+
+    Parameters
+    ----------
+    modes : Modes
+    absent : sequence of int
+        Parts that are held at zero.
+    start : Components, optional
+        Of the same parts, to begin with.
+    steps : int
+        At most; with none the sizes are those of the start, and only the known shapes are fitted.
+    """
+    free = np.ones(len(modes.parts), bool)
+    free[list(absent)] = False
+    size = np.where(free, modes.start, 0.0)
+    state = _State(modes, size)
+    if start is not None:
+        try:
+            state = _State(modes, np.where(free, np.maximum(start.size, modes.least), 0.0))
+            size = state.size
+        except np.linalg.LinAlgError:
+            pass  # Sizes below zero elsewhere may be too low here: from the beginning.
+    for _ in range(steps):
+        score, information = state.score(), state.information()
+        held = ~free | ((size <= modes.least) & (score <= 0))
+        step = np.zeros(len(size))
+        step[~held] = _solve(information[np.ix_(~held, ~held)], score[~held])
+        moved = state
+        for _ in range(12):
+            try:
+                moved = _State(modes, np.maximum(size + step, np.where(free, modes.least, 0.0)))
+            except np.linalg.LinAlgError:
+                moved = state
+            if moved.likelihood > state.likelihood:
+                break
+            step /= 2
+        gain = moved.likelihood - state.likelihood
+        if gain <= 0:
+            break
+        state, size = moved, moved.size
+        if gain < CONVERGED:
+            break
+    covariance = np.zeros((len(size), len(size)))
+    inside = np.ix_(free, free)
+    covariance[inside] = _inverse(state.information()[inside])
+    return Components(
+        size, covariance, state.beta, state.spread, state.likelihood, state.profile, modes
+    )
+
+
+class _State:
+    """Likelihood of the modes at given sizes, and its slope.
+
+    Raises numpy's LinAlgError where a covariance is not positive.
+    """
+
+    def __init__(self, modes: Modes, size: F64) -> None:
+        self.modes, self.size = modes, size
+        covariance = np.einsum("i,inab->nab", size, modes.parts)
+        root = np.linalg.cholesky(covariance)
+        inverse = np.linalg.inv(root)
+        self.weight = np.einsum("nba,nbc->nac", inverse, inverse)
+        self.weighted = np.einsum("nab,nbp->nap", self.weight, modes.known)
+        normal = gram(modes.known, self.weighted)
+        self.spread = _inverse(normal)
+        self.beta = self.spread @ np.einsum("nap,na->p", self.weighted, modes.values)
+        rest = modes.values - np.einsum("nap,p->na", modes.known, self.beta)
+        self.pull = np.einsum("nab,nb->na", self.weight, rest)
+        self.profile = -0.5 * float(
+            2 * np.log(np.einsum("naa->na", root)).sum() + np.einsum("na,na->", rest, self.pull)
+        )
+        self.likelihood = self.profile - 0.5 * _log_determinant(normal)
+
+    def score(self) -> F64:
+        """Slope of the log-likelihood (m,)."""
+        parts = self.modes.parts
+        seen = np.einsum("ina,na->i", np.einsum("inab,nb->ina", parts, self.pull), self.pull)
+        # What the fit of the known shapes takes away of the scatter.
+        lost = sandwich(self.weighted, self.spread)
+        expected = np.einsum("inab,nab->i", parts, self.weight - lost)
+        return np.asarray((seen - expected) / 2)
+
+    def information(self) -> F64:
+        """Fisher's information of the sizes (m, m)."""
+        return np.asarray(trace_products(self.weight, self.modes.parts) / 2)
+
+
+def _scale(matrix: F64) -> F64:
+    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    return np.where(scale > 0, scale, 1.0)
+
+
+def _inverse(matrix: F64) -> F64:
+    """Inverse of a symmetric matrix; zero along what it does not tell."""
+    scale = _scale(matrix)
+    both = np.outer(scale, scale)
+    return np.asarray(np.linalg.pinv(matrix / both, rcond=1e-9, hermitian=True) / both)
+
+
+def _solve(matrix: F64, right: F64) -> F64:
+    return np.asarray(_inverse(matrix) @ right)
+
+
+def _log_determinant(matrix: F64) -> float:
+    """Logarithm of the determinant, without what `_inverse` leaves out."""
+    scale = _scale(matrix)
+    values = np.linalg.eigvalsh(matrix / np.outer(scale, scale))
+    kept = values > 1e-9 * values.max(initial=0.0)
+    return float(np.log(values[kept]).sum() + 2 * np.log(scale).sum())
+
+
+def signed_sigmas(growth: float, size: float) -> float:
+    """Standard deviations by which one part is there; negative where its size is below zero.
+
+    Parameters
+    ----------
+    growth : float
+        Of the log-likelihood when the part is let in.
+    size : float
+    """
+    return float(np.copysign(np.sqrt(max(2 * growth, 0.0)), size))
+
+
+def log_chance(growth: float, pairs: int = 1) -> float:
+    """Logarithm of the chance of such a growth of the log-likelihood by ``2 * pairs`` parameters.
+
+    Also of a power, in units of its mean, summed over as many ``pairs`` of cosine and sine.
+    """
+    # Tail of chi-square with an even number of degrees of freedom: a finite sum.
+    x = max(growth, 0.0)
+    terms = np.cumprod(np.concatenate([[1.0], x / np.arange(1, pairs)]))
+    return float(np.log(terms.sum()) - x)
+
+
+def joint_log_chance(full: Components, less: Components, sizes: F64) -> float:
+    """Logarithm of the chance of two parts that are not there coming out as they did.
+
+    Parameters
+    ----------
+    full, less : Components
+        With the two parts and without.
+    sizes : (2,) float64
+        Of the two, in ``full``.
+    """
+    growth = full.likelihood - less.likelihood
+    # One time in four both come out below nothing.
+    if np.any(sizes > 0):
+        return float(np.log(0.75)) + log_chance(growth)
+    return float(np.log1p(-0.25 * np.exp(-max(growth, 0.0))))
+
+
+def log_chance_of_any(log_chances: Sequence[float]) -> float:
+    """Logarithm of the chance that the rarest of several independent findings is as rare."""
+    rarest, number = min(*log_chances, 0.0), len(log_chances)
+    if rarest < -30:
+        return float(rarest + np.log(number))
+    return float(np.log(-np.expm1(number * np.log1p(-min(np.exp(rarest), 1 - 1e-12)))))
+
+
+def sigmas(log_chance: float) -> float:
+    """Standard deviations of a normal variable beyond which lies a chance, by its logarithm."""
+    return -float(ndtri_exp(min(log_chance, -1e-6)))

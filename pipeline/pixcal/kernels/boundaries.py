@@ -1,0 +1,213 @@
+"""Charge that collected charge turns away from the pixels' boundaries into their neighbours.
+
+Electrons in a pixel repel those that follow, so that the boundaries around it move inwards: by an
+amount in proportion to the charge, smaller with distance, along the line from the charge. Of the
+light that falls between the old and the new boundary the neighbour gets the charge. A charge that
+grows steadily through the exposure acts with half of its final value on average (Antilogus et al.
+2014, JINST 9 C03048; Guyonnet et al. 2015, A&A 575, A41; Astier et al. 2019, A&A 629, A36).
+
+Nothing moves where the charge is the same everywhere, and no charge is lost.
+"""
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+REACH = 2
+"""Pixels on either side of a boundary whose charge acts on it."""
+
+
+def boundary_shifts(falloff_px: float) -> F64:
+    """Shift of the boundary between a pixel and the next one along x, by the charges around it.
+
+    Parameters
+    ----------
+    falloff_px : float
+        Distance over which the shift falls by a factor e.
+
+    Returns
+    -------
+    (2 REACH + 1, 2 REACH) float64
+        For the charges at rows ``-REACH`` to ``REACH`` and columns ``1 - REACH`` to ``REACH`` from
+        the pixel; in units of the shift by the pixel's own charge, positive to the right.
+    """
+    y = np.arange(-REACH, REACH + 1)[:, None]
+    x = 0.5 - np.arange(1 - REACH, REACH + 1)[None, :]
+    distance = np.hypot(y, x)
+    shift: F64 = -np.exp(-(distance - 0.5) / falloff_px) * x / distance
+    return shift
+
+
+def area_changes(falloff_px: float) -> F64:
+    """Area that a pixel gains by a charge in its neighbour: a_ij of Astier et al. 2019.
+
+    In flats the covariance of two pixels is this, times the shift by an electron, times the mean
+    charge squared; that of a pixel with itself is the mean charge and this.
+
+    Returns
+    -------
+    (2 REACH + 1, 2 REACH + 1) float64
+        For the charges at rows and columns ``-REACH`` to ``REACH`` from the pixel, in units of the
+        shift by an electron in px; of charges at the rim only the nearer boundaries.
+    """
+    size = 2 * REACH + 1
+    right = np.pad(boundary_shifts(falloff_px), ((0, 0), (1, 0)))
+    left = right[:, ::-1]
+    across = right + left
+    area: F64 = across + across.T
+    assert area.shape == (size, size)
+    return area
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _push(charge: Any, shifts: Any, along_x: bool, out: Any) -> None:
+    """Mean shift of the boundaries after each pixel, of a frame with a margin of `REACH`."""
+    ny, nx = out.shape
+    high, wide = shifts.shape
+    for y in range(ny):
+        for x in range(nx):
+            out[y, x] = 0
+        for i in range(high):
+            for j in range(wide):
+                s = np.float32(0.5 * shifts[i, j])
+                dy, dx = (i, j + 1) if along_x else (j + 1, i)
+                for x in range(nx):
+                    out[y, x] += s * charge[y + dy, x + dx]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _move(charge: Any, push_x: Any, push_y: Any, out: Any) -> None:
+    ny, nx = charge.shape
+    half = np.float32(0.5)
+    out[:] = 0
+    for y in range(ny):
+        for x in range(nx - 1):
+            flow = half * (charge[y, x] + charge[y, x + 1]) * push_x[y, x]
+            out[y, x] += flow
+            out[y, x + 1] -= flow
+    for y in range(ny - 1):
+        for x in range(nx):
+            flow = half * (charge[y, x] + charge[y + 1, x]) * push_y[y, x]
+            out[y, x] += flow
+            out[y + 1, x] -= flow
+
+
+def _pushes(charge: F32, shifts: F64) -> tuple[F32, F32]:
+    """Mean shift of the boundaries to the right of and below each pixel (y, x)."""
+    around = np.pad(charge, REACH, mode="edge")
+    push_x, push_y = np.empty_like(charge), np.empty_like(charge)
+    _push(around, shifts, True, push_x)
+    _push(around, shifts, False, push_y)
+    return push_x, push_y
+
+
+def moved_charge(charge: F32, shifts: F64) -> F32:
+    """What each pixel gains.
+
+    Parameters
+    ----------
+    charge : (y, x) float32
+        e-, as it would be with boundaries that stay. Beyond the edges the charge goes on as it is
+        at them; through the edges nothing moves.
+    shifts : (2 REACH + 1, 2 REACH) float64
+        From `boundary_shifts`, times the shift by an electron (px).
+
+    Returns
+    -------
+    (y, x) float32
+        e-; its sum is zero. Of rows within `REACH` of the first and last row it is wrong, unless
+        these are the edges of the window.
+    """
+    charge = np.ascontiguousarray(charge, np.float32)
+    push_x, push_y = _pushes(charge, shifts)
+    out = np.empty_like(charge)
+    _move(charge, push_x, push_y, out)
+    return out
+
+
+def boundary_pushes(charge: F32, shifts: F64) -> tuple[F32, F32]:
+    """Mean shift (px) of the boundaries to the right of and below each pixel, in frames (t, y, x).
+
+    Parameters
+    ----------
+    charge : (t, y, x) float32
+    shifts
+        As in `moved_charge`.
+    """
+    x, y = zip(*(_pushes(frame, shifts) for frame in charge), strict=True)
+    return np.stack(x), np.stack(y)
+
+
+def shared_noise(charge: F32, pushes: tuple[F32, F32], shifts: F64, dy: int, dx: int) -> F32:
+    """Covariance of the shot noise of each pixel and the one at (dy, dx) from it.
+
+    To first order in the shift, for any scene.
+
+    Parameters
+    ----------
+    charge : (t, y, x) float32
+        Mean charge, e-.
+    pushes
+        From `boundary_pushes`.
+    shifts
+        As in `moved_charge`.
+    dy, dx : int
+
+    Returns
+    -------
+    (t, y, x) float32
+        e-²; zero for pixels within `REACH` of the edges, or with the other one there.
+    """
+    out = np.zeros_like(charge)
+    _, ny, nx = charge.shape
+    rows = _between(ny, dy)
+    columns = _between(nx, dx)
+    if rows.start < rows.stop and columns.start < columns.stop:
+        v, u = _moved(rows, dy), _moved(columns, dx)
+        gain = _gain(charge, pushes, shifts, (rows, columns), dy, dx)
+        back = _gain(charge, pushes, shifts, (v, u), -dy, -dx)
+        out[:, rows, columns] = gain * charge[:, v, u] + back * charge[:, rows, columns]
+    return out
+
+
+def _between(size: int, step: int) -> slice:
+    return slice(REACH + max(0, -step), size - REACH - max(0, step))
+
+
+def _moved(part: slice, by: int) -> slice:
+    return slice(part.start + by, part.stop + by)
+
+
+def _gain(
+    q: F32, pushes: tuple[F32, F32], shifts: F64, part: tuple[slice, slice], dy: int, dx: int
+) -> F32:
+    """Derivative of what pixels gain by the charge of the one at (dy, dx) from each."""
+
+    def slope(y: int, x: int) -> np.float32:
+        i, j = y + REACH, x + REACH - 1
+        inside = 0 <= i < shifts.shape[0] and 0 <= j < shifts.shape[1]
+        return np.float32(0.25 * shifts[i, j] if inside else 0)
+
+    rows, columns = part
+    above, left = _moved(rows, -1), _moved(columns, -1)
+    here = q[:, rows, columns]
+    total: F32 = slope(dy, dx) * (here + q[:, rows, _moved(columns, 1)])
+    total -= slope(dy, dx + 1) * (here + q[:, rows, left])
+    total += slope(dx, dy) * (here + q[:, _moved(rows, 1), columns])
+    total -= slope(dx, dy + 1) * (here + q[:, above, columns])
+    half = np.float32(0.5)
+    # The neighbour across a boundary also widens what the shift of the boundary takes.
+    if (dy, dx) == (0, 1):
+        total += half * pushes[0][:, rows, columns]
+    elif (dy, dx) == (0, -1):
+        total -= half * pushes[0][:, rows, left]
+    elif (dy, dx) == (1, 0):
+        total += half * pushes[1][:, rows, columns]
+    elif (dy, dx) == (-1, 0):
+        total -= half * pushes[1][:, above, columns]
+    return total

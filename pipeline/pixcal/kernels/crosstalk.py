@@ -1,0 +1,236 @@
+"""Coupling between pixels: what a pixel gives to another it loses, so the total stays.
+
+Couplings are directed and sparse: the pixels of every n-th row and every m-th column give a share
+of their signal to the pixel so many rows and columns away. Nothing passes the edge of the window: a
+pixel whose partner lies beyond keeps its own (as at the edge of the chip).
+
+A uniform light stays uniform only where every pixel gets what it gives; a kernel that differs from
+row to row leaves rows in a flat.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from pixcal.model.config import quantity
+from pixcal.model.errors import InputError
+
+F64 = NDArray[np.float64]
+Place = tuple[slice, slice]
+
+STEPS = 60
+"""Most steps of the inverse; each gains a factor of one over the shares that leave a pixel."""
+CONVERGED = 1e-13
+FILL_PX = 2.0
+"""Radius of the neighbourhood that stands in for a pixel without data, px."""
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """A share of the signal of some pixels that is read at others.
+
+    Rows and columns are counted from the window's first. The source loses what it gives.
+    """
+
+    dy: int = quantity(unit="px", low=-1024, high=1024, doc="rows from source to receiver")
+    dx: int = quantity(unit="px", low=-1024, high=1024, doc="columns from source to receiver")
+    share: float = quantity(low=-0.2, high=0.2, doc="of the source's signal, at small signals")
+    every_rows: int = quantity(1, low=1, high=1024, doc="sources lie in every n-th row")
+    row: int = quantity(0, low=0, high=1023, doc="the first of these rows")
+    every_columns: int = quantity(1, low=1, high=1024, doc="and in every n-th column")
+    column: int = quantity(0, low=0, high=1023, doc="the first of these columns")
+    per_ke: float = quantity(
+        0.0, unit="1/ke-", low=-0.02, high=0.02,
+        doc="relative change of the share with the source's signal",
+    )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        if self.dy == 0 and self.dx == 0:
+            raise InputError("dy and dx are both 0: a pixel does not couple to itself")
+        if self.row >= self.every_rows:
+            raise InputError(f"row: {self.row} is not below every_rows ({self.every_rows})")
+        if self.column >= self.every_columns:
+            raise InputError(
+                f"column: {self.column} is not below every_columns ({self.every_columns})"
+            )
+
+    def scaled(self, factor: float) -> "Coupling":
+        """The same with another share."""
+        return replace(self, share=self.share * factor)
+
+    def places(self, shape: tuple[int, int], first: tuple[int, int]) -> tuple[Place, Place]:
+        """Sources and receivers on a piece of the window, where both lie on it.
+
+        Parameters
+        ----------
+        shape : (int, int)
+            Rows and columns of the piece.
+        first : (int, int)
+            Its first row and column in the window.
+        """
+        rows = _spans(shape[0], first[0], self.every_rows, self.row, self.dy)
+        columns = _spans(shape[1], first[1], self.every_columns, self.column, self.dx)
+        return (rows[0], columns[0]), (rows[1], columns[1])
+
+
+def _spans(size: int, first: int, every: int, at: int, step: int) -> tuple[slice, slice]:
+    low, high = max(0, -step), size - max(0, step)
+    begin = low + (at - first - low) % every
+    if begin >= high:
+        return slice(0, 0), slice(0, 0)
+    return slice(begin, high, every), slice(begin + step, high + step, every)
+
+
+def couple(
+    signal: NDArray[Any], couplings: Sequence[Coupling], first: tuple[int, int] = (0, 0)
+) -> NDArray[Any]:
+    """Signal that is read, from the signal collected.
+
+    Parameters
+    ----------
+    signal : (..., y, x) float
+        Electrons (where shares change with the signal; else any unit).
+    couplings : sequence of Coupling
+    first : (int, int)
+        First row and column of the array in the window.
+    """
+    out = signal.copy()
+    for c in couplings:
+        here, there = c.places((signal.shape[-2], signal.shape[-1]), first)
+        source = signal[(..., *here)]
+        moved = source * signal.dtype.type(c.share)
+        if c.per_ke:
+            moved *= 1 + source * signal.dtype.type(c.per_ke * 1e-3)
+        out[(..., *here)] -= moved
+        out[(..., *there)] += moved
+    return out
+
+
+def couple_fringes(
+    theta: F64, couplings: Sequence[Coupling], first: tuple[int, int] = (0, 0)
+) -> F64:
+    """What becomes of the three maps of a fit (physics note, section 5).
+
+    A share that changes with the signal is taken at frames of intensity and amplitude 1: the mean
+    takes the mean of the squared signal, ``iota² + alpha² / 2``, the fringe its slope,
+    ``2 iota alpha``; the second harmonic is not in the maps.
+
+    Parameters
+    ----------
+    theta : (3, y, x) float64
+        (iota, alpha sin psi, alpha cos psi), e-, as collected: not divided by a flat.
+    couplings : sequence of Coupling
+    first : (int, int)
+        First row and column of the maps in the window.
+    """
+    out = theta.copy()
+    for c in couplings:
+        here, there = c.places((theta.shape[1], theta.shape[2]), first)
+        source = theta[(slice(None), *here)]
+        moved = c.share * source
+        if c.per_ke:
+            iota, square = source[0], source[1] ** 2 + source[2] ** 2
+            moved[0] += c.share * c.per_ke * 1e-3 * (iota**2 + square / 2)
+            moved[1:] *= 1 + 2e-3 * c.per_ke * iota
+        out[(slice(None), *here)] -= moved
+        out[(slice(None), *there)] += moved
+    return out
+
+
+def uncouple(signal: F64, couplings: Sequence[Coupling], first: tuple[int, int] = (0, 0)) -> F64:
+    """Signal collected, from the signal that is read: the inverse of `couple`."""
+    return _inverse(signal, lambda found: couple(found, couplings, first))
+
+
+def uncouple_fringes(
+    theta: F64, couplings: Sequence[Coupling], first: tuple[int, int] = (0, 0)
+) -> F64:
+    """The inverse of `couple_fringes`."""
+    return _inverse(theta, lambda found: couple_fringes(found, couplings, first))
+
+
+def _inverse(data: F64, forward: Callable[[F64], F64]) -> F64:
+    """By fixed point: what is left over is given back.
+
+    Each step shrinks the rest by the shares that leave a pixel: for kernels of a tenth, some 15
+    steps to the last digit. It exists for any kernel that leaves every pixel most of its own.
+    """
+    found = data.copy()
+    size = float(np.max(np.abs(data), initial=0.0))
+    for _ in range(STEPS):
+        rest = data - forward(found)
+        found += rest
+        if float(np.max(np.abs(rest), initial=0.0)) <= CONVERGED * size:
+            break
+    return found
+
+
+def outflow(
+    couplings: Sequence[Coupling], shape: tuple[int, int], first: tuple[int, int] = (0, 0)
+) -> F64:
+    """Share (y, x) of its signal that each pixel loses."""
+    out = np.zeros(shape)
+    for c in couplings:
+        out[c.places(shape, first)[0]] += c.share
+    return out
+
+
+def largest_outflow(couplings: Sequence[Coupling]) -> float:
+    """Largest sum of absolute shares that can leave a pixel."""
+    rows = {(c.every_rows, c.row, c.every_columns, c.column) for c in couplings}
+
+    def meets(a: Coupling, of: tuple[int, int, int, int]) -> bool:
+        return bool(
+            (a.row - of[1]) % np.gcd(a.every_rows, of[0]) == 0
+            and (a.column - of[3]) % np.gcd(a.every_columns, of[2]) == 0
+        )
+
+    return max((sum(abs(c.share) for c in couplings if meets(c, of)) for of in rows), default=0.0)
+
+
+def noise_shares(
+    couplings: Sequence[Coupling], shape: tuple[int, int], first: tuple[int, int] = (0, 0)
+) -> tuple[F64, F64]:
+    """Variance of a pixel read through the couplings, and of one after they are undone.
+
+    Returns
+    -------
+    read : (y, x) float64
+        Of the sum of squares of what a pixel keeps and gets: shot noise after the couplings, for
+        shot noise of 1 in every pixel.
+    undone : (y, x) float64
+        The same of the inverse, to second order in the shares: read noise after undoing.
+    """
+    kept, got = 1 - outflow(couplings, shape, first), np.zeros(shape)
+    for c in couplings:
+        got[c.places(shape, first)[1]] += c.share**2
+    return kept**2 + got, 1 / kept**2 + got
+
+
+def filled(theta: F64, k: tuple[float, float]) -> F64:
+    """Maps with pixels that have no data (NaN) taken from their neighbours, turned as fringes are.
+
+    Parameters
+    ----------
+    theta : (3, y, x) float64
+        (iota, alpha sin psi, alpha cos psi).
+    k : (float, float)
+        Fringe vector (kx, ky), rad/px.
+    """
+    good = np.isfinite(theta).all(axis=0)
+    if good.all() or not good.any():
+        return np.where(good, theta, 0.0)
+    ny, nx = good.shape
+    carrier = np.exp(1j * (k[1] * np.arange(ny)[:, None] + k[0] * np.arange(nx)))
+    iota = np.where(good, theta[0], 0.0)
+    fringe = np.where(good, theta[2] + 1j * theta[1], 0.0) * carrier.conj()
+    around = {"sigma": FILL_PX, "mode": "constant", "truncate": 8.0}
+    weight = np.maximum(gaussian_filter(good.astype(float), **around), 1e-300)
+    smooth = gaussian_filter(fringe.real, **around) + 1j * gaussian_filter(fringe.imag, **around)
+    smooth = smooth / weight * carrier
+    light = gaussian_filter(iota, **around) / weight
+    return np.where(good, theta, np.stack([light, smooth.imag, smooth.real]))

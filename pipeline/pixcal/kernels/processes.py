@@ -1,0 +1,65 @@
+"""Random and periodic processes, sampled at equal steps; more samples leave the first ones."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+F64 = NDArray[np.float64]
+
+HORIZON, LEVELS = 2.0**24, 30
+"""Longest time of `brownian`, s (half a year), and its halvings (to 16 ms)."""
+
+
+def damped_walk(normals: F64, keep: float) -> F64:
+    """First-order autoregression of unit variance: a random walk that is drawn back to zero.
+
+    Parameters
+    ----------
+    normals : (t,) float64
+        Independent standard normals.
+    keep : float
+        Correlation of neighbours, 0 (white) to below 1.
+    """
+    if not len(normals):
+        return normals
+    step = np.sqrt(1 - keep**2)
+    walk, _ = lfilter([step], [1.0, -keep], normals, zi=[(1 - step) * normals[0]])
+    return np.asarray(walk)
+
+
+def swing(time_s: F64, hz: float, phase: float, exptime_s: float = 0.0) -> F64:
+    """Sine of unit amplitude, as its mean over an exposure that starts at each time.
+
+    Parameters
+    ----------
+    time_s : (t,) float64
+    hz, phase : float
+        Frequency, and phase at time zero, rad.
+    exptime_s : float
+    """
+    middle = 2 * np.pi * hz * (time_s + exptime_s / 2) + phase
+    return np.asarray(np.sinc(hz * exptime_s) * np.sin(middle))
+
+
+def brownian(time: float, normal: Callable[[int, int], float]) -> float:
+    """Random walk of unit variance a unit of time, at one time from 0 to `HORIZON`.
+
+    Lévy's construction by ever finer hats: any time can be asked for by itself. Straight between
+    multiples of ``HORIZON / 2**LEVELS``.
+
+    Parameters
+    ----------
+    time : float
+    normal : callable
+        Standard normal of a level and a place in it, the same whenever it is asked for.
+    """
+    at = min(max(time / HORIZON, 0.0), 1.0)
+    value = at * normal(0, 0)
+    for level in range(LEVELS):
+        place, inside = divmod(at * 2**level, 1.0)
+        height = 0.5 - abs(inside - 0.5)
+        if height:
+            value += 2 ** (-level / 2) * height * normal(level + 1, int(place))
+    return float(np.sqrt(HORIZON) * value)

@@ -1,0 +1,55 @@
+"""How far from chance: probabilities and chi-squares in standard deviations of a normal."""
+
+import math
+
+import numpy as np
+from scipy.special import log_ndtr, ndtri_exp
+from scipy.stats import chi2, poisson
+
+_LARGE = 1000.0
+
+
+def sigmas_of_chi2(value: float, dof: int) -> float:
+    """Standard deviations of a normal that are as rare as a chi-square this large.
+
+    Under chance the result is a standard normal; of a small chi-square it is negative.
+    """
+    if value > _LARGE:
+        # The logarithm of so small a probability underflows; this is its leading order.
+        return math.sqrt(value - (dof - 1) * math.log(value / dof))
+    return -float(ndtri_exp(min(float(chi2.logsf(value, dof)), -1e-300)))
+
+
+def sigmas_of_count(count: int, expected: float) -> float:
+    """Standard deviations of a normal that are as rare as more events than these.
+
+    Half of the chance of just as many counts as more: so that none, where none are expected, is no
+    deviation at all.
+
+    Parameters
+    ----------
+    count : int
+    expected : float
+        Mean of the Poisson distribution, above zero.
+    """
+    log_equal = float(poisson.logpmf(count, expected))
+    log_chance = log_equal + math.log(0.5)
+    log_more = float(poisson.logsf(count, expected))
+    if math.isfinite(log_more):
+        log_chance = float(np.logaddexp(log_chance, log_more))
+    return -float(ndtri_exp(min(log_chance, -1e-300)))
+
+
+def sigmas_of_best(*sigmas: float) -> float:
+    """Standard deviations that the largest of several independent normals is worth.
+
+    Parameters
+    ----------
+    *sigmas : float
+        Each a standard normal under chance.
+    """
+    chance = float(log_ndtr(-max(sigmas)))
+    # One minus the chance that none of them is as large.
+    none = len(sigmas) * math.log1p(-math.exp(min(chance, -1e-300)))
+    log_any = math.log(-math.expm1(none)) if none < -1e-12 else chance + math.log(len(sigmas))
+    return -float(ndtri_exp(log_any))

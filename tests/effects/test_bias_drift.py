@@ -1,0 +1,189 @@
+"""Bias drift: frames move as given, and it is told from noise of rows, columns and light."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pixcal.effects.bias_drift import BiasDrift
+from pixcal.effects.row_noise import RowNoise
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.frame_offset import fringe_offsets
+from pixcal.kernels.processes import brownian
+from pixcal.model.bench import Bench
+from pixcal.simulation.effect import Effect
+from pixcal.simulation.exposure import frames_of
+from pixcal.simulation.recording import recordings
+
+
+def in_the_dark(evidence: Evidence, bench: Bench, *on: Effect) -> Evidence:
+    """The same evidence with bias and dark frames made anew, and no others."""
+    made = {r.kind: r for r in recordings(bench)}
+    stacks = []
+    for stack in evidence.stacks:
+        if stack.kind in ("bias", "dark"):
+            r = made[stack.kind]
+            frames = frames_of(bench, r, on).astype(np.float32)
+            time = np.arange(r.count) * r.period_s
+            stacks.append(replace(stack, adu=frames, time_s=time, start_s=r.start_s))
+    return replace(evidence, stacks=tuple(stacks), fringes={})
+
+
+def test_the_walk_spreads_with_the_root_of_time_and_remembers() -> None:
+    times = (3.0, 50.0, 7200.0)
+    walks = np.empty((1500, len(times)))
+    for seed in range(len(walks)):
+        drawn: dict[tuple[int, int], float] = {}
+        rng = np.random.default_rng(seed)
+
+        def normal(
+            level: int,
+            place: int,
+            drawn: dict[tuple[int, int], float] = drawn,
+            rng: np.random.Generator = rng,
+        ) -> float:
+            return drawn.setdefault((level, place), float(rng.standard_normal()))
+
+        walks[seed] = [brownian(t, normal) for t in times]
+    expected = np.minimum.outer(times, times)
+    scale = np.sqrt(np.outer(times, times))
+    covariance = walks.T @ walks / len(walks)
+    np.testing.assert_allclose(covariance / scale, expected / scale, atol=4 * np.sqrt(2 / 1500))
+
+
+def test_frames_move_as_a_whole_through_all_recordings(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    bench = make_effect_bench({"detector.gain_e_per_adu": 0.5})
+    effect = BiasDrift(0.0, 3600.0, 0.0, -200.0, 4.0)
+    for recording in recordings(bench):
+        if recording.kind not in ("bias", "dark"):
+            continue
+        change = frames_of(bench, recording, [effect]).astype(float) - frames_of(bench, recording)
+        time = recording.start_s + np.arange(recording.count) * recording.period_s
+        expected = (time - 200 * np.exp(-time / 4.0)) / 0.5
+        # Samples are cut at zero where they would fall below.
+        seen = expected > -400
+        assert seen.any()
+        np.testing.assert_allclose(change.mean(axis=(1, 2))[seen], expected[seen], atol=0.05)
+
+
+def test_the_walk_goes_on_from_recording_to_recording(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    bench, effect = make_effect_bench(), BiasDrift(0.0, 0.0, 600.0, 0.0)
+    found = [r for r in recordings(bench) if r.kind in ("bias", "dark")]
+    ends = [
+        [
+            effect.offset(r.start_s + n * r.period_s, bench.seed, r.rng("bias_drift", n))
+            for n in range(r.count)
+        ]
+        for r in found
+    ]
+    step = 10.0 * np.sqrt(0.14)
+    assert abs(ends[1][0] - ends[0][-1]) < 4 * step
+    assert np.diff(ends[0]).std() == pytest.approx(step, rel=4 / np.sqrt(2 * 59))
+
+
+@pytest.mark.parametrize("jitter", [0.6, 2.0, 20.0])
+def test_jitter_is_found(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench], jitter: float
+) -> None:
+    effect = BiasDrift(jitter, 0.0, 0.0, 0.0)
+    found = BiasDrift.estimate(in_the_dark(acquired(), make_effect_bench(), effect))
+    assert found is not None
+    assert isinstance(found.effect, BiasDrift)
+    assert found.errors["jitter_rms"] < 0.15 * jitter
+    assert abs(found.effect.jitter_rms - jitter) < 4 * found.errors["jitter_rms"]
+    assert found.significance > 5
+    assert found.effect.walk_e_h < 4 * found.errors["walk_e_h"]
+    assert abs(found.effect.ramp_e_h) < 4 * found.errors["ramp_e_h"]
+
+
+def test_a_ramp_is_found(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
+) -> None:
+    effect = BiasDrift(0.0, 3000.0, 0.0, 0.0)
+    found = BiasDrift.estimate(in_the_dark(acquired(), make_effect_bench(), effect))
+    assert found is not None
+    assert isinstance(found.effect, BiasDrift)
+    assert abs(found.effect.ramp_e_h - 3000) < 4 * found.errors["ramp_e_h"] < 2000
+    assert found.significance > 5
+
+
+def test_a_walk_is_found(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
+) -> None:
+    effect = BiasDrift(0.0, 0.0, 120.0, 0.0)
+    found = BiasDrift.estimate(in_the_dark(acquired(), make_effect_bench(), effect))
+    assert found is not None
+    assert isinstance(found.effect, BiasDrift)
+    assert abs(found.effect.walk_e_h - 120) < 4 * found.errors["walk_e_h"] < 100
+    assert found.significance > 5
+
+
+def test_a_settling_is_found(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
+) -> None:
+    effect = BiasDrift(0.2, 0.0, 0.0, 8.0, 3.0)
+    found = BiasDrift.estimate(in_the_dark(acquired(), make_effect_bench(), effect))
+    assert found is not None
+    assert isinstance(found.effect, BiasDrift)
+    assert abs(found.effect.settle_e - 8) < 4 * found.errors["settle_e"] < 4
+    assert abs(found.effect.settle_s - 3) < 4 * found.errors["settle_s"] < 3
+    assert found.significance > 5
+
+
+def test_row_and_column_noise_is_not_taken_for_it(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
+) -> None:
+    noise = RowNoise(5.0, 2.0, 2.0, 5.0)
+    found = BiasDrift.estimate(in_the_dark(acquired(), make_effect_bench(), noise))
+    assert found is not None
+    assert found.significance < 4
+    both = BiasDrift.estimate(
+        in_the_dark(acquired(), make_effect_bench(), noise, BiasDrift(3.0, 0.0, 0.0, 0.0))
+    )
+    assert both is not None
+    assert isinstance(both.effect, BiasDrift)
+    assert abs(both.effect.jitter_rms - 3) < 4 * both.errors["jitter_rms"] < 2
+    assert both.significance > 5
+
+
+def test_light_that_changes_is_not_taken_for_it(acquired: Callable[..., Evidence]) -> None:
+    found = BiasDrift.estimate(acquired(None, {"intensity_noise": {"rms": 0.02}}))
+    assert found is not None
+    assert found.significance < 4
+
+
+def test_fringes_hold_what_is_no_light(acquired: Callable[..., Evidence]) -> None:
+    evidence = acquired()
+    fringes = evidence.fringes["vertical"]
+    offsets = np.random.default_rng(4).normal(0, 3000, len(fringes.g)).astype(np.float32)
+    pattern = (1 / evidence.flat).astype(np.float32)
+    moved = replace(fringes, electrons=fringes.electrons + offsets[:, None, None] * pattern)
+    before, after = (fringe_offsets(f, evidence.flat) for f in (fringes, moved))
+    assert before is not None
+    assert after is not None
+    # Linear: the offset itself, whatever the noise.
+    np.testing.assert_allclose((after.values - before.values)[:, 0], offsets, rtol=0.02, atol=20)
+    # And the noise is what is foreseen.
+    assert before.values[:, 0].var() == pytest.approx(before.noise[0], rel=6 / np.sqrt(2 * 300))
+
+
+def test_fringes_of_even_light_alone_say_nothing(acquired: Callable[..., Evidence]) -> None:
+    assert BiasDrift.estimate(replace(acquired(), stacks=())) is None
+
+
+def test_evidence_tells_when_each_part_began(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
+) -> None:
+    begun = {r.stem: r.start_s for r in recordings(make_effect_bench())}
+    evidence = acquired()
+    for fringes in evidence.fringes.values():
+        assert fringes.start_s == pytest.approx(begun[fringes.name], abs=2e-3)
+    for stack in evidence.stacks:
+        if stack.kind != "flat":
+            stem = {"bias": "bias", "dark": "dark-0"}[stack.kind]
+            assert stack.start_s == pytest.approx(begun[stem], abs=2e-3)

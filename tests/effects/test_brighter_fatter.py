@@ -1,0 +1,162 @@
+"""Brighter-fatter: charge moves as published, flats get its covariance, its size is found again."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pixcal.effects.brighter_fatter import BrighterFatter
+from pixcal.estimators.evidence import Evidence
+from pixcal.kernels.boundaries import (
+    REACH,
+    area_changes,
+    boundary_pushes,
+    boundary_shifts,
+    moved_charge,
+    shared_noise,
+)
+from pixcal.model.bench import Bench
+from pixcal.simulation.exposure import frames_of
+from pixcal.simulation.recording import recordings
+
+RNG = np.random.default_rng(12)
+SCENE = (20_000 + 15_000 * np.sin(1.3 * np.arange(15) + np.arange(13)[:, None])).astype(np.float32)
+STRONG = 1e-6
+
+
+def moved_by_definition(charge: np.ndarray, falloff: float) -> np.ndarray:
+    """Guyonnet et al. 2015: flux over each boundary, boundary after boundary."""
+    ny, nx = charge.shape
+    out = np.zeros((ny, nx))
+    for along in (0, 1):
+        step = (1, 0) if along == 0 else (0, 1)
+        for y in range(ny - step[0]):
+            for x in range(nx - step[1]):
+                shift = 0.0
+                for v in range(y - 4, y + 5):
+                    for u in range(x - 4, x + 5):
+                        gap = (y + step[0] / 2 - v, x + step[1] / 2 - u)
+                        if abs(gap[along]) > REACH or abs(gap[1 - along]) > REACH:
+                            continue
+                        r = np.hypot(*gap)
+                        there = charge[min(max(v, 0), ny - 1), min(max(u, 0), nx - 1)]
+                        shift -= (
+                            0.5 * STRONG * np.exp(-(r - 0.5) / falloff) * gap[along] / r * there
+                        )
+                flux = shift * (charge[y, x] + charge[y + step[0], x + step[1]]) / 2
+                out[y, x] += flux
+                out[y + step[0], x + step[1]] -= flux
+    return out
+
+
+def test_charge_moves_over_the_boundaries_as_defined() -> None:
+    moved = moved_charge(SCENE, STRONG * boundary_shifts(0.7))
+    np.testing.assert_allclose(moved, moved_by_definition(SCENE, 0.7), atol=0.05)
+    assert np.abs(moved).max() > 200
+    assert abs(moved.sum(dtype=float)) < 1e-4 * np.abs(moved).sum()
+    # Bright pixels lose what dark ones gain.
+    assert np.corrcoef(moved.ravel(), SCENE.ravel())[0, 1] < -0.8
+
+
+def test_nothing_moves_in_an_even_scene() -> None:
+    even = np.full((9, 11), 30_000, np.float32)
+    assert np.abs(moved_charge(even, STRONG * boundary_shifts(0.5))).max() < 0.02
+    assert area_changes(0.5).sum() == pytest.approx(0, abs=1e-12)
+    assert area_changes(0.5)[REACH, REACH] == pytest.approx(-4)
+
+
+def test_the_covariance_of_flats_is_that_of_the_area_changes() -> None:
+    mean, size, shift = 20_000.0, 64, 5e-7
+    sums = np.zeros(3)
+    frames = 300
+    for _ in range(frames):
+        charge = RNG.poisson(mean, (size, size)).astype(np.float32)
+        noise = (charge + moved_charge(charge, shift * boundary_shifts(0.5)))[4:-4, 4:-4] - mean
+        sums += (
+            (noise**2).mean(),
+            (noise[1:] * noise[:-1]).mean() / 2 + (noise[:, 1:] * noise[:, :-1]).mean() / 2,
+            (noise[1:, 1:] * noise[:-1, :-1]).mean(),
+        )
+    found, a = sums / frames, shift * area_changes(0.5)
+    error = mean / np.sqrt(frames * (size - 8) ** 2)
+    assert found[0] == pytest.approx(mean + a[2, 2] * mean**2, abs=6 * error + 0.02 * mean * 0.04)
+    assert found[1] == pytest.approx(a[2, 3] * mean**2, abs=4 * error)
+    assert found[2] == pytest.approx(a[3, 3] * mean**2, abs=4 * error)
+    assert a[2, 3] * mean**2 > 5 * error
+
+
+def test_shared_noise_is_the_jacobian_of_the_moved_charge() -> None:
+    shifts = STRONG * boundary_shifts(0.5)
+    pushes = boundary_pushes(SCENE[None], shifts)
+    y, x, by = 6, 7, np.float32(500)
+    for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2)):
+
+        def slope(of: tuple[int, int], to: tuple[int, int]) -> float:
+            up, down = SCENE.copy(), SCENE.copy()
+            up[to] += by
+            down[to] -= by
+            change = moved_charge(up, shifts) - moved_charge(down, shifts)
+            return float(change[of] / (2 * by))
+
+        here, there = (y, x), (y + dy, x + dx)
+        expected = slope(here, there) * SCENE[there] + slope(there, here) * SCENE[here]
+        found = shared_noise(SCENE[None], pushes, shifts, dy, dx)[0]
+        assert found[here] == pytest.approx(expected, rel=0.01, abs=1)
+        assert found[1].max() == found[:, -2].max() == 0
+
+
+def test_what_moved_is_brought_back() -> None:
+    effect = BrighterFatter(STRONG)
+    charge = (SCENE * RNG.uniform(0.9, 1.1, SCENE.shape)).astype(np.float32)
+    changed = charge + moved_charge(charge, STRONG * boundary_shifts(effect.falloff_px))
+    assert np.abs(changed - charge).max() > 200
+    np.testing.assert_allclose(effect.restored(changed), charge, atol=0.1)
+
+
+def test_frames_lose_contrast_with_their_level(make_effect_bench: Callable[..., Bench]) -> None:
+    losses = []
+    for peak in (10_000, 40_000):
+        bench = replace(
+            make_effect_bench({"frames.fringes.0.peak_e": peak, "frames.fringes.0.count": 12,
+                               "detector.read_noise_e": 0.0}),
+            shot_noise=False,
+        )  # fmt: skip
+        fringes = next(r for r in recordings(bench) if r.kind == "fringes")
+        plain = frames_of(bench, fringes).astype(float)
+        changed = frames_of(bench, fringes, [BrighterFatter()])
+        losses.append(1 - changed[:, 5:-5, 5:-5].std() / plain[:, 5:-5, 5:-5].std())
+    assert losses[0] > 1e-4
+    assert losses[1] / losses[0] == pytest.approx(4, rel=0.1)
+
+
+@pytest.mark.parametrize("size", [2.0e-7, 2.0e-8])
+def test_its_size_is_found(acquired: Callable[..., Evidence], size: float) -> None:
+    found = BrighterFatter.estimate(acquired(None, {"brighter_fatter": {"shift_px_per_e": size}}))
+    assert found is not None
+    assert isinstance(found.effect, BrighterFatter)
+    assert abs(found.effect.shift_px_per_e - size) < 4 * found.errors["shift_px_per_e"] < 1e-8
+    assert found.significance > 8
+    assert abs(found.details["of_noise"] - size) < 4 * found.details["of_noise_error"]
+
+
+def test_noise_alone_tells_it_when_it_is_large(acquired: Callable[..., Evidence]) -> None:
+    evidence = acquired(None, {"brighter_fatter": {"shift_px_per_e": 1e-6}})
+    found = BrighterFatter.estimate(evidence)
+    assert found is not None
+    value, error = found.details["of_noise"], found.details["of_noise_error"]
+    assert abs(value - 1e-6) < 4 * error < 4e-7
+    flats = BrighterFatter.estimate(replace(evidence, fringes={}))
+    assert flats is not None
+    assert isinstance(flats.effect, BrighterFatter)
+    assert abs(flats.effect.shift_px_per_e - 1e-6) < 4 * flats.errors["shift_px_per_e"]
+    assert BrighterFatter.estimate(replace(evidence, fringes={}, stacks=())) is None
+
+
+@pytest.mark.parametrize("other", ["nonlinearity", "ipc"])
+def test_what_looks_like_it_is_not_taken_for_it(
+    acquired: Callable[..., Evidence], other: str
+) -> None:
+    found = BrighterFatter.estimate(acquired(None, {other: {}}))
+    assert found is not None
+    assert found.significance < 4

@@ -1,0 +1,122 @@
+"""Cosmic hits: rate, tracks and charge are those given, one frame each, and are found again."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.special import erf
+
+from pixcal.effects.cosmic_hits import CosmicHits
+from pixcal.estimators.evidence import Evidence
+from pixcal.kernels.tracks import GRAZING, add_tracks, draw_tracks
+from pixcal.model.bench import Bench
+from pixcal.simulation.exposure import frames_of
+from pixcal.simulation.recording import recordings
+
+RNG = np.random.default_rng(3)
+
+
+def test_tracks_have_the_length_of_an_even_flux_and_the_charge_of_moyal() -> None:
+    n, depth = 20_000, 2.0
+    tracks = draw_tracks(RNG, n, (50, 70), 5, depth, 300.0, 0.15)
+    length = np.hypot(np.hypot(tracks[:, 2], tracks[:, 3]), depth)
+    # Through a plane the chance of a cosine c is 2 c: lengths above l have a share (depth / l)².
+    for longer in (1.5, 3.0, 10.0):
+        share = longer**-2
+        error = np.sqrt(share * (1 - share) / n)
+        assert np.mean(length > longer * depth) == pytest.approx(share, abs=4 * error)
+    assert length.max() <= depth / GRAZING * 1.0001
+    deviates = (tracks[:, 4] / (300 * length) - 1) / 0.15
+    assert stats.kstest(deviates[deviates > -6], stats.moyal.cdf).pvalue > 1e-3
+    for column, size in ((0, 50), (1, 70)):
+        assert stats.kstest(tracks[:, column], stats.uniform(-5.5, size + 10).cdf).pvalue > 1e-3
+
+
+def test_a_track_lays_its_charge_along_its_way() -> None:
+    frame = np.zeros((31, 41), np.float32)
+    sigma = 0.4
+    add_tracks(frame, np.array([[15.0, 20.0, 0.0, 0.0, 1000.0]]), sigma, 0)
+    assert frame.sum() == pytest.approx(1000, rel=1e-3)
+    inside = erf(0.5 / (np.sqrt(2) * sigma))
+    assert frame[15, 20] == pytest.approx(1000 * inside**2, rel=1e-3)
+    frame[:] = 0
+    add_tracks(frame, np.array([[5.0, 5.0, 0.0, 20.0, 8000.0]]), sigma, 0)
+    assert frame.sum() == pytest.approx(8000, rel=1e-3)
+    np.testing.assert_allclose(frame[:, 8:22].sum(axis=0), 400, rtol=0.02)
+    assert np.argmax(frame.sum(axis=1)) == 5
+    part = np.zeros((10, 41), np.float32)
+    add_tracks(part, np.array([[5.0, 5.0, 0.0, 20.0, 8000.0]]), sigma, 2)
+    assert np.array_equal(part, frame[2:12])
+
+
+def test_the_rate_is_that_of_area_and_time(make_effect_bench: Callable[..., Bench]) -> None:
+    rate = 4000.0
+    bench = make_effect_bench({"detector.shape": [64, 61], "frames.darks": [
+        {"exptime_s": 0.5, "count": 150}]})  # fmt: skip
+    by_kind = {r.kind: r for r in recordings(bench)}
+    hits = CosmicHits(rate)
+    bias = by_kind["bias"]
+    assert np.array_equal(frames_of(bench, bias, [hits]), frames_of(bench, bias))
+    dark = by_kind["dark"]
+    added = frames_of(bench, dark, [hits]).astype(float) - frames_of(bench, dark)
+    assert added.min() >= 0
+    area = 64 * 61 * (4.4e-4) ** 2
+    expected = rate * area * 0.5 * dark.count
+    # Charge of a track: 70 e-/um times 2 x 8 um of mean length, times the mean of Moyal's factor.
+    mean_length = 2 * 8.0 * (1 - GRAZING / 2)
+    mean = 70 * mean_length * (1 + 0.15 * stats.moyal.mean())
+    assert added.sum() / mean == pytest.approx(expected, abs=5 * 1.7 * np.sqrt(expected))
+    frames_hit = np.count_nonzero(added.max(axis=(1, 2)) > 100)
+    chance = 1 - np.exp(-expected / dark.count)
+    error = np.sqrt(dark.count * chance * (1 - chance))
+    assert frames_hit == pytest.approx(dark.count * chance, abs=4.5 * error)
+
+
+def test_charge_stops_at_the_full_well(make_effect_bench: Callable[..., Bench]) -> None:
+    bench = make_effect_bench({"detector.full_well_e": 900.0, "detector.read_noise_e": 0.0})
+    dark = next(r for r in recordings(bench) if r.kind == "dark")
+    frames = frames_of(bench, dark, [CosmicHits(3e5)]).astype(float)
+    assert np.sort((frames - frames.min(axis=0)).ravel())[-1] <= 905
+    assert np.count_nonzero(frames > 1380) > 20
+
+
+@pytest.mark.parametrize(("rate", "charge"), [(2_000.0, 70.0), (20_000.0, 120.0)])
+def test_rate_and_charge_are_found(
+    acquired: Callable[..., Evidence], rate: float, charge: float
+) -> None:
+    effects = {"cosmic_hits": {"rate_cm2_s": rate, "electrons_per_um": charge}}
+    found = CosmicHits.estimate(acquired(None, effects))
+    assert found is not None
+    assert isinstance(found.effect, CosmicHits)
+    assert abs(found.effect.rate_cm2_s - rate) < 4 * found.errors["rate_cm2_s"]
+    off = found.effect.electrons_per_um - charge
+    assert abs(off) < 4 * found.errors["electrons_per_um"] < 0.5 * charge
+    assert found.errors["rate_cm2_s"] < 0.35 * rate
+    assert found.significance > 10
+
+
+def test_one_hit_is_no_claim_and_two_are(acquired: Callable[..., Evidence]) -> None:
+    evidence = acquired()
+    (dark,) = evidence.of_kind("dark")
+    for hits in (1, 2):
+        adu = dark.adu.copy()
+        y, x = np.argwhere(evidence.good)[[500, 2500][:hits]].T
+        adu[np.arange(hits) + 4, y, x] += 800
+        stacks = tuple(s for s in evidence.stacks if s is not dark)
+        found = CosmicHits.estimate(replace(evidence, stacks=(*stacks, replace(dark, adu=adu))))
+        assert found is not None
+        assert found.details["hits"] == hits
+        assert (found.significance > 4) == (hits > 1)
+
+
+def test_what_comes_again_in_a_pixel_is_no_hit(acquired: Callable[..., Evidence]) -> None:
+    effects = {"telegraph_noise": {"amplitude_e": 100.0, "switching_s": 3.0}}
+    found = CosmicHits.estimate(acquired(None, effects))
+    assert found is not None
+    assert found.significance < 4
+
+
+def test_without_darks_and_fringes_nothing_is_said(acquired: Callable[..., Evidence]) -> None:
+    assert CosmicHits.estimate(replace(acquired(), fringes={}, stacks=())) is None

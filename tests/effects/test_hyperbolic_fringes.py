@@ -1,0 +1,104 @@
+"""Hyperbolic fringes: those of the exact bench; the foot of the fibres is found again."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pixcal.effects.hyperbolic_fringes import HyperbolicFringes, bending
+from pixcal.estimators.evidence import Evidence
+from pixcal.kernels import optics
+from pixcal.kernels.optics import Geometry
+from pixcal.kernels.scene import detector_maps, electrons_per_unit, light_maps
+from pixcal.model.bench import Bench
+from pixcal.model.errors import InputError
+from pixcal.simulation.recording import recordings
+
+WINDOW = {"detector.shape": [101, 107]}
+PAPER = Geometry(632.8e-6, 4.4e-3, 18.0, 18.0, 400.0, 6.0, 0.0)
+
+
+def test_all_of_the_bending_makes_the_exact_bench(make_effect_bench: Callable[..., Bench]) -> None:
+    chip = {"detector.shape": [31, 37], "detector.chip": [3000, 4000]}
+    straight = make_effect_bench(chip | {"optics.offset_mm": [3.0, -7.0]})
+    exact = replace(straight, optics=replace(straight.optics, fringes="exact"))
+    rows = (5, 31)
+    maps = detector_maps(straight.detector, rows)
+    for recording in recordings(straight):
+        if recording.kind == "fringes":
+            e = electrons_per_unit(straight, recording.number)
+            plain = light_maps(straight, recording.number, rows, maps, e)
+            made = HyperbolicFringes((3.0, -7.0)).light(plain, recording, rows, maps)
+            wanted = light_maps(exact, recording.number, rows, maps, e)
+            for name in ("iota", "alpha_sin", "alpha_cos"):
+                np.testing.assert_allclose(getattr(made, name), getattr(wanted, name), atol=0.02)
+
+
+def test_the_bending_has_its_leading_order_and_in_pixels_no_baseline() -> None:
+    """Phase and px both: half the baseline bends half as much in phase, the same in px."""
+    y, x = np.mgrid[0:400:20, 0:400:20].astype(float)
+    qx, qy = x * 4.4e-3 - 18, y * 4.4e-3 - 18
+    bent = []
+    for baseline in (6.0, 3.0):
+        where = replace(PAPER, baseline_x=baseline)
+        k = optics.paraxial_vector(where)[0] / 4.4e-3
+        found = bending(x, y, where)
+        # The baseline's own term is a plane, which is no bending to a fit.
+        plane = -k * qx * baseline**2 / (8 * 400.0**2)
+        leading = -k * qx * (qx**2 + qy**2) / (2 * 400.0**2)
+        np.testing.assert_allclose(found, leading + plane, rtol=5e-3)
+        bent.append(found - plane)
+    np.testing.assert_allclose(bent[0], 2 * bent[1], rtol=1e-3)
+
+
+def test_a_share_of_it_is_that_share(make_effect_bench: Callable[..., Bench]) -> None:
+    bench = make_effect_bench({"detector.shape": [31, 37]})
+    recording = next(r for r in recordings(bench) if r.kind == "fringes")
+    maps = detector_maps(bench.detector, (0, 31))
+    plain = light_maps(bench, 0, (0, 31), maps, 20_000.0)
+    start = np.angle(plain.alpha_cos + 1j * plain.alpha_sin)
+    turns = []
+    for share in (0.1, 1.0):
+        bent = HyperbolicFringes(share=share).light(plain, recording, (0, 31), maps)
+        turn = np.exp(-1j * start) * (bent.alpha_cos + 1j * bent.alpha_sin)
+        turns.append(np.unwrap(np.angle(turn), axis=1))
+    slope = [np.gradient(t, axis=1).mean() for t in turns]
+    assert slope[0] == pytest.approx(0.1 * slope[1], rel=1e-3)
+
+
+def test_maps_are_straightened() -> None:
+    y, x = np.mgrid[:31, :37].astype(float)
+    psi = optics.phase(x, y, PAPER)
+    theta = 2e4 * np.stack([np.ones_like(psi), np.sin(psi), np.cos(psi)])
+    flat = HyperbolicFringes().straightened(theta, PAPER)
+    np.testing.assert_allclose(
+        np.exp(1j * np.arctan2(flat[1], flat[2])),
+        np.exp(1j * optics.paraxial_phase(x, y, PAPER)),
+        atol=1e-9,
+    )
+
+
+def test_a_bench_that_is_exact_already_is_refused(make_effect_bench: Callable[..., Bench]) -> None:
+    exact = make_effect_bench({"optics.fringes": "exact"})
+    with pytest.raises(InputError, match="hyperbolic_fringes: the bench's fringes are exact"):
+        HyperbolicFringes().check(exact)
+    HyperbolicFringes(share=0.0).check(exact)
+
+
+@pytest.mark.parametrize("foot", [(18.0, 18.0), (-9.0, 4.0)])
+def test_the_foot_is_found(acquired: Callable[..., Evidence], foot: tuple[float, float]) -> None:
+    evidence = acquired(WINDOW, {"hyperbolic_fringes": {"foot_mm": list(foot)}})
+    found = HyperbolicFringes.estimate(evidence)
+    assert found is not None
+    assert isinstance(found.effect, HyperbolicFringes)
+    for n in (0, 1):
+        error = found.errors[f"foot_mm[{n}]"]
+        assert abs(found.effect.foot_mm[n] - foot[n]) < 4 * error < 4.0
+    assert found.significance > 10
+
+
+def test_a_ghost_is_not_taken_for_it(acquired: Callable[..., Evidence]) -> None:
+    found = HyperbolicFringes.estimate(acquired(None, {"ghost_fringes": {}}))
+    assert found is not None
+    assert found.significance < 4

@@ -1,0 +1,81 @@
+"""Intra-pixel response: visibility of a box; its width and scatter are found with two baselines."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from pixcal.effects.intra_pixel_response import IntraPixelResponse, transfer
+from pixcal.estimators.evidence import Evidence
+from pixcal.kernels.scene import detector_maps, light_maps
+from pixcal.model.bench import Bench
+from pixcal.simulation.effect import FringeMaps
+from pixcal.simulation.recording import recordings
+
+FIVE = 2 * np.pi / 5
+
+
+@pytest.mark.parametrize("width", [0.3, 1.0, 1.7])
+def test_a_box_averages_the_fringe(width: float) -> None:
+    places = (np.arange(1000) + 0.5) / 1000 * width - width / 2
+    assert transfer(FIVE, width) == pytest.approx(np.cos(FIVE * places).mean(), rel=1e-5)
+
+
+def test_amplitudes_fall_by_it_and_all_else_stays(make_effect_bench: Callable[..., Bench]) -> None:
+    bench, rows = make_effect_bench({"detector.shape": [120, 130]}), (0, 120)
+    effect = IntraPixelResponse((0.9, 0.4), 0.02)
+    maps = detector_maps(bench.detector, rows)
+    for r in recordings(bench):
+        if r.kind != "fringes":
+            continue
+        plain = light_maps(bench, r.number, rows, maps, 2e4)
+        on = effect.light(plain, r, rows, maps)
+        np.testing.assert_array_equal(on.iota, plain.iota)
+        ratio = (on.alpha_cos + 1j * on.alpha_sin) / (plain.alpha_cos + 1j * plain.alpha_sin)
+        np.testing.assert_allclose(np.angle(ratio), 0, atol=1e-6)
+        axis = r.number
+        baseline = bench.frames.fringes[axis].baseline_mm[axis]
+        k = 2 * np.pi / 632.8e-6 * 4.4e-3 * baseline / 400
+        width = effect.width_px[axis]
+        assert np.abs(ratio).mean() == pytest.approx(transfer(k, width), rel=2e-4)
+        # The law's slope times the scatter of the widths.
+        slope = (transfer(k, width + 1e-4) - transfer(k, width - 1e-4)) / 2e-4
+        expected = abs(slope) * 0.02
+        assert np.abs(ratio).std() == pytest.approx(expected, rel=0.04)
+
+
+def test_maps_lose_what_the_mean_width_takes() -> None:
+    theta = np.random.default_rng(1).random((3, 4, 5))
+    seen = IntraPixelResponse((0.9, 0.5)).predict(FringeMaps(theta, (1.2, 0.3))).theta
+    np.testing.assert_array_equal(seen[0], theta[0])
+    np.testing.assert_allclose(seen[1:], theta[1:] * transfer(1.2, 0.9) * transfer(0.3, 0.5))
+
+
+@pytest.mark.parametrize(("width", "rms"), [(0.95, 0.005), (0.95, 0.02), (0.6, 0.01)])
+def test_width_and_scatter_are_found(
+    acquired: Callable[..., Evidence], width: float, rms: float
+) -> None:
+    on = {"intra_pixel_response": {"width_px": [width, width], "width_rms_px": rms}}
+    found = IntraPixelResponse.estimate(acquired(None, on))
+    assert found is not None
+    assert isinstance(found.effect, IntraPixelResponse)
+    assert abs(found.effect.width_px[0] - width) < 4 * found.errors["width_px[0]"] < 0.4 * width
+    # The scatter goes with the width that is found.
+    allowed = found.errors["width_rms_px"] + rms * found.errors["width_px[0]"] / width
+    assert abs(found.effect.width_rms_px - rms) < 4 * allowed
+    assert found.errors["width_rms_px"] < 0.2 * rms
+    assert found.significance > 5
+
+
+@pytest.mark.parametrize("other", ["ipc", "ghost_fringes", "nonlinearity", "flat_error", "lag"])
+def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: str) -> None:
+    found = IntraPixelResponse.estimate(acquired(None, {other: {}}))
+    assert found is not None
+    assert found.significance < 4
+
+
+def test_one_interfringe_tells_nothing(acquired: Callable[..., Evidence]) -> None:
+    evidence = acquired()
+    one = {"vertical": evidence.fringes["vertical"]}
+    bare = type(evidence)(**{**vars(evidence), "fringes": one})
+    assert IntraPixelResponse.estimate(bare) is None

@@ -1,0 +1,160 @@
+"""Lag: no charge is lost, noise stays white, frames are as published; its share is found again."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import galsim
+import numpy as np
+import pytest
+
+from pixcal.effects.lag import Lag
+from pixcal.estimators.evidence import Evidence
+from pixcal.model.bench import Bench
+from pixcal.simulation.exposure import Camera, frames_of
+from pixcal.simulation.recording import Recording, recordings
+
+SMALL = {"detector.shape": [23, 19], "frames.fringes.0.count": 40}
+FLATS = {"detector.shape": [64, 61], "frames.flats": [{"exptime_s": 0.02, "count": 40}]}
+
+
+def of_kind(bench: Bench, kind: str) -> Recording:
+    return next(r for r in recordings(bench) if r.kind == kind)
+
+
+def quiet(bench: Bench) -> Bench:
+    return replace(bench, shot_noise=False, detector=replace(bench.detector, read_noise_e=0.0))
+
+
+@pytest.mark.parametrize("decay", [0.0, 1.2])
+def test_frames_are_those_of_published_persistence(
+    make_effect_bench: Callable[..., Bench], decay: float
+) -> None:
+    bench, lag = quiet(make_effect_bench(SMALL)), Lag(0.03, decay, 0.0)
+    fringes = of_kind(bench, "fringes")
+    plain = frames_of(bench, fringes) - bench.detector.bias_adu
+    bias = frames_of(bench, replace(of_kind(bench, "bias"), count=1))[0].astype(float)
+    made = frames_of(bench, fringes, [lag])
+    plain = frames_of(bench, fringes) - bias
+    for n in (0, 1, 25):
+        image = galsim.Image((0.97 * plain[n]).copy())
+        before = [galsim.Image(plain[k]) for k in range(n - 1, -1, -1)][: lag.frames_back]
+        image.applyPersistence(before, list(0.03 * lag.releases[: len(before)]))
+        np.testing.assert_allclose(made[n] - bias, image.array, atol=1.6)
+    assert lag.releases.sum() == pytest.approx(1)
+    if decay:
+        ratio = lag.releases[1:] / lag.releases[:-1]
+        np.testing.assert_allclose(ratio, np.exp(-1 / decay))
+
+
+def test_noise_stays_white_and_poisson(make_effect_bench: Callable[..., Bench]) -> None:
+    bench = make_effect_bench({**FLATS, "detector.read_noise_e": 0.0, "detector.prnu_rms": 0.0})
+    flat = of_kind(bench, "flat")
+    frames = frames_of(bench, flat, [Lag(0.2, 0.0, 0.0)])[2:].astype(float)
+    noise = frames - frames.mean(axis=(0))
+    n = noise.size
+    kept = 1 - 1 / len(noise)
+    assert noise.var() / kept == pytest.approx(flat.electrons, rel=4 * np.sqrt(2 / n))
+    neighbours = (noise[1:] * noise[:-1]).mean() / noise.var()
+    assert neighbours == pytest.approx(-1 / len(noise), abs=4 / np.sqrt(n))
+
+
+def test_the_first_frame_lacks_what_stays(make_effect_bench: Callable[..., Bench]) -> None:
+    bench = quiet(make_effect_bench({**FLATS, "detector.dark_e_s": 0.0}))
+    flat = of_kind(bench, "flat")
+    plain = frames_of(bench, flat).astype(float) - 500
+    made = frames_of(bench, flat, [Lag(0.05, 0.0, 0.0)]).astype(float) - 500
+    assert made[0].mean() / plain[0].mean() == pytest.approx(0.95, abs=2e-3)
+    np.testing.assert_allclose(made[1:], plain[1:], atol=1.1)
+
+
+def test_pixels_differ_by_the_spread(make_effect_bench: Callable[..., Bench]) -> None:
+    bench = quiet(make_effect_bench({**FLATS, "detector.dark_e_s": 0.0}))
+    flat = of_kind(bench, "flat")
+    plain = frames_of(bench, flat)[0].astype(float) - 500
+    made = frames_of(bench, flat, [Lag(0.1, 0.0, 0.3)])[0].astype(float) - 500
+    shares = 1 - made / plain
+    assert shares.mean() == pytest.approx(0.1, abs=4 * 0.03 / np.sqrt(shares.size))
+    assert shares.std() == pytest.approx(0.03, rel=4 / np.sqrt(2 * shares.size))
+
+
+def test_long_lag_does_not_depend_on_where_one_begins(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    bench, lag = make_effect_bench(SMALL), Lag(0.05, 2.5, 0.1)
+    fringes = of_kind(bench, "fringes")
+    whole = frames_of(bench, fringes, [lag])
+    for n, samples in Camera(bench, (5, 18), [lag]).expose(fringes, range(31, 35)):
+        assert np.array_equal(samples, whole[n, 5:18])
+
+
+@pytest.mark.parametrize("lag", [Lag(0.02, 0.0, 0.0), Lag(0.05, 1.5, 0.0)])
+def test_frames_are_restored(make_effect_bench: Callable[..., Bench], lag: Lag) -> None:
+    bench = quiet(make_effect_bench(SMALL))
+    fringes = of_kind(bench, "fringes")
+    bias = frames_of(bench, replace(of_kind(bench, "bias"), count=1))[0].astype(np.float32)
+    plain = frames_of(bench, fringes) - bias
+    made = frames_of(bench, fringes, [lag]) - bias
+    assert np.abs(made - plain).max() > 200
+    np.testing.assert_allclose(lag.restored(made), plain, atol=3)
+
+
+@pytest.mark.parametrize("truth", [Lag(), Lag(2e-4, 0.0, 0.1), Lag(0.005, 1.5, 0.1)])
+def test_its_share_is_found(acquired: Callable[..., Evidence], truth: Lag) -> None:
+    parameters = {"share": truth.share, "decay_frames": truth.decay_frames, "spread": truth.spread}
+    found = Lag.estimate(acquired(None, {"lag": parameters}))
+    assert found is not None
+    assert isinstance(found.effect, Lag)
+    for name in parameters:
+        off = getattr(found.effect, name) - getattr(truth, name)
+        assert abs(off) < 4 * found.errors[name], name
+    assert found.errors["share"] < 0.03 * truth.share
+    assert found.significance > 20
+
+
+def test_pixels_that_differ_tell_where_the_contrast_is_noisy(
+    acquired: Callable[..., Evidence],
+) -> None:
+    noisy = {
+        "optics.visibility": 0.9,
+        "frames.fringes.0.visibility_jitter_rms": 0.03,
+        "frames.fringes.1.visibility_jitter_rms": 0.03,
+    }
+    found = Lag.estimate(acquired(noisy, {"lag": {"share": 0.004, "spread": 0.2}}))
+    assert found is not None
+    assert isinstance(found.effect, Lag)
+    assert 1e-3 < found.errors["share"] < 4e-3
+    assert abs(found.effect.share - 0.004) < 4 * found.errors["share"]
+    assert found.details["by_pixels_sigmas"] > 10
+    assert found.significance > 10
+    nothing = Lag.estimate(acquired(noisy))
+    assert nothing is not None
+    assert nothing.significance < 4
+
+
+def test_flats_tell_where_there_are_no_fringes(acquired: Callable[..., Evidence]) -> None:
+    found = Lag.estimate(replace(acquired(None, {"lag": {}}), fringes={}))
+    assert found is not None
+    assert isinstance(found.effect, Lag)
+    assert abs(found.effect.share - Lag().share) < 4 * found.errors["share"] < 4e-4
+    assert found.significance > 8
+    nothing = Lag.estimate(replace(acquired(), fringes={}))
+    assert nothing is not None
+    assert nothing.significance < 4
+    assert Lag.estimate(replace(acquired(), fringes={}, stacks=())) is None
+
+
+def test_equal_steps_of_the_phase_tell_nothing(acquired: Callable[..., Evidence]) -> None:
+    evidence = acquired()
+    name, one = next(iter(evidence.fringes.items()))
+    step = 0.7 * np.arange(len(one.free))
+    free = one.free.copy()
+    free[:, 1], free[:, 2] = 0.9 * np.cos(step), 0.9 * np.sin(step)
+    assert Lag.estimate(replace(evidence, fringes={name: replace(one, free=free)})) is None
+
+
+def test_a_bent_response_is_not_taken_for_it(acquired: Callable[..., Evidence]) -> None:
+    evidence = acquired(None, {"nonlinearity": {}})
+    for sets in (evidence.fringes, dict([*evidence.fringes.items()][:1])):
+        found = Lag.estimate(replace(evidence, fringes=sets))
+        assert found is not None
+        assert found.significance < 4

@@ -1,0 +1,150 @@
+"""Nonlinearity: its polynomial, the harmonics it makes, its inverse, and its coefficients again."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import galsim
+import numpy as np
+import pytest
+
+from pixcal.effects.nonlinearity import Nonlinearity
+from pixcal.estimators.evidence import Evidence
+from pixcal.model.bench import Bench
+from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Estimate
+from pixcal.simulation.exposure import frames_of
+from pixcal.simulation.recording import recordings
+
+QUIET = {
+    "detector.shape": [9, 7], "detector.read_noise_e": 0.0, "detector.prnu_rms": 0.0,
+    "detector.hot_fraction": 0.0, "detector.bias_pixel_rms_adu": 0.0, "detector.dark_e_s": 0.0,
+    "frames.fringes.0.count": 90, "frames.fringes.0.phase_law": "ramp",
+    "frames.fringes.0.phase_step_rad": 2 * np.pi / 30,
+}  # fmt: skip
+
+
+def quiet(make: Callable[..., Bench]) -> Bench:
+    return replace(make(QUIET), shot_noise=False)
+
+
+def assert_recovered(found: Estimate | None, truth: Nonlinearity) -> None:
+    assert found is not None
+    assert isinstance(found.effect, Nonlinearity)
+    for name in ("quadratic", "cubic"):
+        off = getattr(found.effect, name) - getattr(truth, name)
+        assert abs(off) < 4 * found.errors[name], name
+
+
+def test_the_response_is_the_published_polynomial() -> None:
+    effect = Nonlinearity(-0.02, 0.006)
+    charge = np.linspace(0, 60_000, 77, dtype=np.float32).reshape(7, 11)
+    image = galsim.Image(charge.copy())
+    w = effect.level_e
+    image.applyNonlinearity(lambda s: s - 0.02 * s**2 / w + 0.006 * s**3 / w**2)
+    np.testing.assert_allclose(effect.response(charge), image.array, rtol=1e-6)
+    assert effect.response(np.float32([50_000]))[0] == pytest.approx(50_000 * (1 - 0.02 + 0.006))
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [Nonlinearity(), Nonlinearity(-0.1, 0.05), Nonlinearity(0.2, 0.1), Nonlinearity(0.0, -0.3)],
+)
+def test_the_inverse_gives_the_charge_back(effect: Nonlinearity) -> None:
+    charge = np.linspace(-200, 60_000, 999, dtype=np.float32)
+    charge = charge[charge < 0.9 * effect.turns_at * effect.level_e]
+    assert len(charge) > 700
+    np.testing.assert_allclose(effect.linearised(effect.response(charge)), charge, atol=0.05)
+
+
+def test_beyond_its_top_the_response_stays_there() -> None:
+    effect = Nonlinearity(-0.3, -0.3)
+    top = effect.turns_at * effect.level_e
+    above = np.float32([1.1 * top, 3 * top])
+    np.testing.assert_allclose(effect.response(above), effect.response(np.float32([top]))[0])
+    np.testing.assert_allclose(effect.linearised(above), top, rtol=1e-3)
+    assert np.isnan(effect.linearised(np.float32([np.nan]))[0])
+
+
+def test_a_well_beyond_the_top_is_refused(make_effect_bench: Callable[..., Bench]) -> None:
+    bench = make_effect_bench({"detector.full_well_e": 60_000.0})
+    Nonlinearity().check(bench)
+    with pytest.raises(InputError, match=r"effects.nonlinearity: .* no longer rises from 3"):
+        Nonlinearity(-0.3, -0.3).check(bench)
+
+
+def test_fringes_get_the_harmonics_of_the_polynomial(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    bench = quiet(make_effect_bench)
+    effect = Nonlinearity(-0.03, 0.02)
+    fringes = next(r for r in recordings(bench) if r.kind == "fringes")
+    made = frames_of(bench, fringes, [effect]).astype(float) - bench.detector.bias_adu
+    plain = frames_of(bench, fringes).astype(float) - bench.detector.bias_adu
+    phase = 2 * np.pi / 30 * np.arange(90)
+
+    def harmonic(frames: np.ndarray, n: int) -> np.ndarray:
+        return np.abs(np.tensordot(np.exp(-1j * n * phase), frames, 1)) * 2 / len(phase)
+
+    iota, alpha, w = plain.mean(axis=0), harmonic(plain, 1), effect.level_e
+    second = alpha**2 / 2 * np.abs(effect.quadratic / w + 3 * effect.cubic * iota / w**2)
+    third = alpha**3 / 4 * abs(effect.cubic) / w**2
+    # Rounding to whole ADU leaves 0.3 / sqrt(90 / 2) in each.
+    np.testing.assert_allclose(harmonic(made, 2), second, atol=0.3)
+    np.testing.assert_allclose(harmonic(made, 3), third, atol=0.3)
+    assert second.min() > 3
+    assert third.min() > 5
+
+
+@pytest.mark.parametrize("truth", [Nonlinearity(), Nonlinearity(0.003, 0.0)])
+def test_its_coefficients_are_found(acquired: Callable[..., Evidence], truth: Nonlinearity) -> None:
+    effects = {"nonlinearity": {"quadratic": truth.quadratic, "cubic": truth.cubic}}
+    found = Nonlinearity.estimate(acquired(None, effects))
+    assert_recovered(found, truth)
+    assert found is not None
+    assert max(found.errors.values()) < 3e-4
+    assert found.significance > 15
+
+
+def test_bad_samples_do_not_matter(acquired: Callable[..., Evidence]) -> None:
+    evidence = acquired(None, {"nonlinearity": {}})
+    fringes = {}
+    for name, one in evidence.fringes.items():
+        electrons, good = one.electrons.copy(), one.good.copy()
+        electrons[7, 30:40] = np.nan
+        electrons[:, 20, 11] = np.nan
+        good[20, 11] = good[3:7, 50] = False
+        fringes[name] = replace(one, electrons=electrons, good=good)
+    assert_recovered(Nonlinearity.estimate(replace(evidence, fringes=fringes)), Nonlinearity())
+
+
+def test_one_set_tells_less(acquired: Callable[..., Evidence]) -> None:
+    """With one spacing of fringes a response and moving boundaries differ by their noise only."""
+    evidence = acquired(None, {"nonlinearity": {}})
+    name, one = next(iter(evidence.fringes.items()))
+    found = Nonlinearity.estimate(replace(evidence, fringes={name: one}))
+    assert_recovered(found, Nonlinearity())
+    both = Nonlinearity.estimate(evidence)
+    assert found is not None
+    assert both is not None
+    assert found.errors["quadratic"] > 5 * both.errors["quadratic"]
+    assert found.significance > 4
+
+
+def test_flats_tell_where_there_are_no_fringes(acquired: Callable[..., Evidence]) -> None:
+    evidence = replace(acquired(None, {"nonlinearity": {}}), fringes={})
+    found = Nonlinearity.estimate(evidence)
+    assert_recovered(found, Nonlinearity())
+    assert found is not None
+    assert max(found.errors.values()) < 1e-3
+    assert found.significance > 15
+    nominal = Nonlinearity.estimate(replace(acquired(), fringes={}))
+    assert nominal is not None
+    assert nominal.significance < 4
+    two = tuple(s for s in evidence.stacks if s.kind != "flat" or s.exptime_s < 0.025)
+    assert Nonlinearity.estimate(replace(evidence, stacks=two)) is None
+
+
+def test_moving_boundaries_are_not_taken_for_it(acquired: Callable[..., Evidence]) -> None:
+    found = Nonlinearity.estimate(acquired(None, {"brighter_fatter": {"shift_px_per_e": 1e-6}}))
+    assert found is not None
+    assert found.significance < 4

@@ -1,0 +1,145 @@
+"""The converter: codes as published packages make them; steps and widths are found again."""
+
+from collections.abc import Callable
+
+import galsim
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pixcal.effects.quantisation import Quantisation
+from pixcal.estimators.code_density import histogram, step_of
+from pixcal.estimators.evidence import Evidence
+
+TOP = 65535.0
+
+
+def ramp(first: float, last: float, per_code: int = 400) -> NDArray[np.float32]:
+    return np.arange(first, last, 1 / per_code, dtype=np.float32)
+
+
+@pytest.mark.parametrize("step", [4.0, 1.5, 64.0])
+def test_even_codes_are_those_of_galsim(step: float) -> None:
+    adu = np.random.default_rng(2).uniform(0, 60000, (50, 70)).astype(np.float32)
+    image = galsim.Image(adu.copy() / np.float32(step))
+    image.quantize()
+    ours = Quantisation(step - 1, 0.0, 0.0).converted(adu, 0, TOP)
+    # Halves go up here, to even numbers there.
+    clear = np.abs(adu / step % 1 - 0.5) > 1e-3
+    assert clear.mean() > 0.99
+    np.testing.assert_allclose(ours[clear], image.array[clear] * step, atol=1e-2)
+
+
+def test_codes_are_as_wide_as_their_thresholds_are_apart() -> None:
+    effect = Quantisation(0.0, 0.2, 0.1, 5.0, 0.7)
+    codes = effect.converted(ramp(100, 200), 9, TOP).astype(int)
+    counts = np.bincount(codes)[110:190] / 400
+    begins = effect.thresholds(9, 300)
+    np.testing.assert_allclose(counts, np.diff(begins)[110:190], atol=0.01)
+    even = Quantisation(0.0, 0.0, 0.2, 8.0, 0.3).thresholds(0, 100)
+    number = np.arange(99)
+    np.testing.assert_allclose(np.diff(even), 1 + 0.2 * np.cos(2 * np.pi * number / 8 + 0.3))
+
+
+def test_widths_scatter_as_given_and_leave_the_response_straight() -> None:
+    begins = Quantisation(0.0, 0.3, 0.0).thresholds(4, 60000)
+    assert np.diff(begins).std() == pytest.approx(0.3, rel=0.02)
+    assert np.abs(begins - np.arange(60000) + 0.5).max() < 1
+
+
+def test_a_threshold_beyond_the_next_leaves_a_code_out() -> None:
+    effect = Quantisation(0.0, 1.0, 0.0)
+    begins = effect.thresholds(1, 2000)
+    codes = np.unique(effect.converted(ramp(100, 1900, 100), 1, TOP).astype(int))
+    assert np.all(np.diff(begins)[codes[1:-1]] > -2)
+    # As many codes as thresholds are passed, whatever their order.
+    for sample in (500.3, 777.7, 1000.0):
+        code = effect.converted(np.array([[sample]], np.float32), 1, TOP)[0, 0]
+        assert code == np.count_nonzero(begins[1:] <= np.float32(sample))
+    missing = np.diff(begins)[codes[0] : codes[-1]] < 0
+    assert missing.sum() > 50
+    assert len(codes) < codes[-1] - codes[0]
+
+
+def test_rounding_adds_a_twelfth_of_the_steps_square() -> None:
+    rng = np.random.default_rng(5)
+    adu = (20000 + 30 * rng.standard_normal((300, 400))).astype(np.float32)
+    error = Quantisation(15.0, 0.0, 0.0).converted(adu, 0, TOP) - adu
+    assert error.std() == pytest.approx(16 / np.sqrt(12), rel=0.01)
+    assert error.mean() == pytest.approx(0, abs=4 * 16 / np.sqrt(12 * adu.size))
+
+
+def test_ever_weaker_it_becomes_plain_rounding() -> None:
+    adu = np.random.default_rng(6).uniform(0, 500, (100, 100)).astype(np.float32)
+    plain = np.floor(adu + np.float32(0.5))
+    away = []
+    for factor in (1.0, 0.1, 1e-2, 1e-6):
+        codes = Quantisation().scaled(factor).converted(adu, 3, TOP)
+        written = np.floor(codes + np.float32(0.5))
+        away.append(float(np.mean(np.abs(written - plain))))
+    assert away[0] > away[1] > away[2] > away[3]
+    assert away[3] < 5e-3
+
+
+def test_known_widths_are_undone() -> None:
+    adu = np.random.default_rng(7).uniform(100, 900, (200, 200)).astype(np.float32)
+    effect = Quantisation(1.0, 0.0, 0.8, 4.0, 0.5)
+    codes = effect.converted(adu, 0, TOP)
+    before, after = (codes - adu), (effect.restored(codes, 0) - adu)
+    # Uniform within codes of these widths: what no correction can do better than.
+    widths = 2 * np.diff(effect.thresholds(0, 400))
+    best = np.sqrt(np.mean(widths**3) / np.mean(widths) / 12)
+    assert after.std() == pytest.approx(best, rel=0.02)
+    assert after.std() < 0.9 * before.std()
+
+
+@pytest.mark.parametrize("step", [2.0, 1.5, 3.1, 16.0])
+def test_steps_are_found_from_gaps(step: float) -> None:
+    rng = np.random.default_rng(8)
+    adu = rng.normal(6000, 900, (100, 50, 60)).astype(np.float32)
+    codes = Quantisation(step - 1, 0.1, 0.0).converted(adu, 2, TOP)
+    counts = histogram([np.floor(codes + 0.5).astype(np.uint16)], np.ones((50, 60), bool))
+    assert counts is not None
+    found, error = step_of(counts)
+    assert abs(found - step) < 2 * error < 2e-3 * step
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"coarse_adu": 3.0, "dnl_rms": 0.3, "ripple": 0.1},
+        {"coarse_adu": 0.0, "dnl_rms": 0.05, "ripple": 0.02},
+        {"coarse_adu": 0.37, "dnl_rms": 0.1, "ripple": 0.08, "ripple_codes": 3.7},
+    ],
+)
+def test_step_and_widths_are_found(
+    acquired: Callable[..., Evidence], given: dict[str, float]
+) -> None:
+    found = Quantisation.estimate(acquired(None, {"quantisation": given}))
+    assert found is not None
+    assert found.significance > 10
+    for name in Quantisation.strengths:
+        value, error = getattr(found.effect, name), found.errors[name]
+        assert abs(value - given[name]) < 4 * error, name
+        assert error < 0.12 * max(given[name], 0.05), name
+    if given["ripple"]:
+        assert isinstance(found.effect, Quantisation)
+        assert found.effect.ripple_codes == pytest.approx(given.get("ripple_codes", 2), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [{"nonlinearity": {}}, {"row_noise": {"row_rms": 5.0}}, {"intensity_noise": {"rms": 0.02}}],
+    ids=lambda e: next(iter(e)),
+)
+def test_other_effects_are_not_taken_for_it(
+    acquired: Callable[..., Evidence], other: dict[str, dict[str, float]]
+) -> None:
+    found = Quantisation.estimate(acquired(None, other))
+    assert found is not None
+    assert found.significance < 4
+
+
+def test_samples_that_are_no_codes_say_nothing() -> None:
+    frames = np.random.default_rng(1).normal(500, 9, (5, 8, 8)).astype(np.float32)
+    assert histogram([frames], np.ones((8, 8), bool)) is None

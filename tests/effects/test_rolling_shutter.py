@@ -1,0 +1,82 @@
+"""Rolling shutter: rows hold the next frame's light by their time; its times are found again."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pixcal.effects.rolling_shutter import RollingShutter
+from pixcal.estimators.evidence import Evidence
+from pixcal.model.bench import Bench
+from pixcal.model.errors import InputError
+from pixcal.simulation.exposure import frames_of
+from pixcal.simulation.recording import recordings
+
+LATE = 120_000.0
+"""us: the frame's period less its exposure."""
+
+
+@pytest.mark.parametrize(("delay", "way"), [(100.0, 1), (LATE + 100.0, -1)])
+def test_rows_are_mixed_with_the_next_or_the_last_frame(
+    make_effect_bench: Callable[..., Bench], delay: float, way: int
+) -> None:
+    bench = make_effect_bench({"detector.shape": [40, 30], "frames.fringes.0.count": 6})
+    bench = replace(bench, shot_noise=False, detector=replace(bench.detector, read_noise_e=0.0))
+    fringes = next(r for r in recordings(bench) if r.kind == "fringes")
+    plain = frames_of(bench, fringes).astype(float)
+    on = frames_of(bench, fringes, [RollingShutter(20.0, delay)]).astype(float)
+    row = np.arange(40)
+    share = np.maximum(20.0 * row - 100, 0) if way > 0 else np.maximum(100 - 20.0 * row, 0)
+    share = share[:, None] * 1e-6 / 0.02
+    for frame in (1, 2, 4):
+        mixed = (1 - share) * plain[frame] + share * plain[frame + way]
+        np.testing.assert_allclose(on[frame], mixed, atol=2.0)
+    still = 5 if way > 0 else 0
+    np.testing.assert_array_equal(on[still], plain[still])
+
+
+def test_calibration_frames_are_left_alone(make_effect_bench: Callable[..., Bench]) -> None:
+    bench = make_effect_bench({"detector.shape": [40, 30]})
+    flat = next(r for r in recordings(bench) if r.kind == "flat")
+    np.testing.assert_array_equal(
+        frames_of(bench, flat), frames_of(bench, flat, [RollingShutter(50.0)])
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "delay"), [(0.1, 0.0), (1.2, 0.0), (5.0, 100.0), (5.0, LATE + 100.0)]
+)
+def test_its_times_are_found(acquired: Callable[..., Evidence], line: float, delay: float) -> None:
+    on = {"rolling_shutter": {"line_time_us": line, "delay_us": delay}}
+    found = RollingShutter.estimate(acquired(None, on))
+    assert found is not None
+    assert isinstance(found.effect, RollingShutter)
+    error = found.errors["line_time_us"]
+    assert abs(found.effect.line_time_us - line) < 4 * error < 0.25 * line
+    assert abs(found.effect.delay_us - delay) < 4 * found.errors["delay_us"]
+    assert found.significance > 10
+
+
+@pytest.mark.parametrize("other", ["lag", "fringe_jitter", "intensity_noise"])
+def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: str) -> None:
+    found = RollingShutter.estimate(acquired(None, {other: {}}))
+    assert found is not None
+    assert found.significance < 4
+
+
+def test_phases_in_equal_steps_tell_nothing(acquired: Callable[..., Evidence]) -> None:
+    ramp = {f"frames.fringes.{n}.phase_law": "ramp" for n in (0, 1)}
+    ramp |= {f"frames.fringes.{n}.phase_step_rad": 0.3 for n in (0, 1)}
+    found = RollingShutter.estimate(acquired(ramp, {"rolling_shutter": {"line_time_us": 26.0}}))
+    assert found is not None
+    assert found.errors["line_time_us"] > 5
+    assert found.significance < 4
+
+
+@pytest.mark.parametrize("times", [{"line_time_us": 3000.0}, {"delay_us": 2e5}])
+def test_times_longer_than_a_frame_are_refused(
+    make_effect_bench: Callable[..., Bench], times: dict[str, float]
+) -> None:
+    with pytest.raises(InputError, match=rf"rolling_shutter: {next(iter(times))}: .*period_s"):
+        RollingShutter(**times).check(make_effect_bench())

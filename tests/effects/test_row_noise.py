@@ -1,0 +1,153 @@
+"""Row noise: rows and columns have what is given in common, and it is told from all else."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pixcal.effects.bias_drift import BiasDrift
+from pixcal.effects.row_noise import RowNoise
+from pixcal.effects.telegraph_noise import TelegraphNoise
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.line_noise import line_spectrum
+from pixcal.kernels.flicker import flicker, flicker_power
+from pixcal.model.bench import Bench
+from pixcal.simulation.effect import Effect
+from pixcal.simulation.exposure import frames_of
+from pixcal.simulation.recording import recordings
+
+NAMES = RowNoise.strengths
+
+
+def in_the_dark(evidence: Evidence, bench: Bench, *on: Effect) -> Evidence:
+    """The same evidence with bias and dark frames made anew, and no others."""
+    made = {r.kind: r for r in recordings(bench)}
+    stacks = [s for s in evidence.stacks if s.kind in ("bias", "dark")]
+    frames = [frames_of(bench, made[s.kind], on).astype(np.float32) for s in stacks]
+    remade = tuple(replace(s, adu=a) for s, a in zip(stacks, frames, strict=True))
+    return replace(evidence, stacks=remade, fringes={})
+
+
+@pytest.mark.parametrize("count", [61, 64])
+def test_flicker_has_the_power_that_is_foreseen(count: int) -> None:
+    rng = np.random.default_rng(3)
+    lines = np.array([flicker(rng, count) for _ in range(4000)])
+    np.testing.assert_allclose(lines.mean(axis=1), 0, atol=1e-12)
+    seen = np.abs(np.fft.rfft(lines, norm="ortho")) ** 2
+    ratio = seen.mean(axis=0)[1:] / flicker_power(count)[1:]
+    np.testing.assert_allclose(ratio, 1, atol=5 * np.sqrt(2 / 4000))
+
+
+def test_every_octave_of_flicker_has_the_same_variance() -> None:
+    count = 4096
+    power = flicker_power(count)
+    octaves = [2 * power[m : 2 * m].sum() / count for m in (16, 64, 256)]
+    np.testing.assert_allclose(octaves, 1, rtol=0.05)
+
+
+def test_rows_and_columns_move_as_a_whole(make_effect_bench: Callable[..., Bench]) -> None:
+    bench = make_effect_bench()
+    bias = next(r for r in recordings(bench) if r.kind == "bias")
+    effect = RowNoise(6.0, 0.0, 4.0, 3.0)
+    change = frames_of(bench, bias, [effect]).astype(float) - frames_of(bench, bias)
+    rows, columns = change.mean(axis=2), change.mean(axis=1)
+    plane = rows[:, :, None] + columns[:, None] - change.mean(axis=(1, 2))[:, None, None]
+    # What is left is rounding, twice.
+    assert (change - plane).std() == pytest.approx(np.sqrt(1 / 6), rel=0.1)
+    assert columns.std() == pytest.approx(3.0, rel=0.05)
+    steps = np.diff(rows, axis=1)
+    even, odd = steps[:, ::2].mean(axis=1), steps[:, 1::2].mean(axis=1)
+    apart = (odd - even) / 4
+    assert apart.std() == pytest.approx(np.hypot(4.0, 6.0 / np.sqrt(61)), rel=4 / np.sqrt(120))
+
+
+@pytest.mark.parametrize(
+    ("given", "errors"),
+    [
+        ((1.6, 0.5, 0.5, 0.8), (0.1, 0.06, 0.1, 0.1)),
+        ((0.6, 0.0, 0.0, 0.6), (0.2, 0.2, 0.2, 0.2)),
+        ((0.0, 1.0, 1.0, 0.0), (0.4, 0.06, 0.15, 0.4)),
+        ((8.0, 3.0, 5.0, 4.0), (0.5, 0.3, 0.8, 0.2)),
+    ],
+)
+def test_sizes_are_found(
+    acquired: Callable[..., Evidence],
+    make_effect_bench: Callable[..., Bench],
+    given: tuple[float, ...],
+    errors: tuple[float, ...],
+) -> None:
+    found = RowNoise.estimate(in_the_dark(acquired(), make_effect_bench(), RowNoise(*given)))
+    assert found is not None
+    assert found.significance > 5
+    for name, value, error in zip(NAMES, given, errors, strict=True):
+        assert found.errors[name] < error, name
+        # Near zero only the upper side of a root is known.
+        allowed = 4 * found.errors[name] if value else 1.0
+        assert abs(getattr(found.effect, name) - value) < allowed, name
+
+
+@pytest.mark.parametrize(
+    "other",
+    [BiasDrift(20.0, 100.0, 50.0, 30.0, 5.0), TelegraphNoise().scaled(3.0)],
+    ids=lambda e: e.name,
+)
+def test_other_noise_is_not_taken_for_it(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench], other: Effect
+) -> None:
+    found = RowNoise.estimate(in_the_dark(acquired(), make_effect_bench(), other))
+    assert found is not None
+    assert found.significance < 4
+
+
+def test_crosstalk_is_not_taken_for_it(acquired: Callable[..., Evidence]) -> None:
+    # Of noise before the pixels are coupled; here a share of the left neighbour's read noise.
+    evidence = acquired()
+    stacks = tuple(
+        replace(s, adu=s.adu + np.float32(0.2) * np.roll(s.adu, 1, axis=2))
+        for s in evidence.stacks
+        if s.kind == "bias"
+    )
+    found = RowNoise.estimate(replace(evidence, stacks=stacks))
+    assert found is not None
+    assert found.significance < 4
+
+
+def test_significance_is_that_of_chance() -> None:
+    rng = np.random.default_rng(8)
+    good = rng.random((41, 50)) > 0.02
+    pulls = []
+    for _ in range(60):
+        noise = rng.standard_normal((30, 41, 50)).astype(np.float32)
+        spectrum = line_spectrum(noise - noise.mean(axis=0), good)
+        assert spectrum is not None
+        pulls += list(spectrum.power / np.sqrt(spectrum.variance(np.zeros(len(spectrum.power)))))
+    assert np.mean(pulls) == pytest.approx(0, abs=4 / np.sqrt(len(pulls)))
+    assert np.std(pulls) == pytest.approx(1, abs=0.1)
+
+
+def test_without_frames_in_the_dark_fringes_tell(acquired: Callable[..., Evidence]) -> None:
+    def with_rows(rms: float) -> Evidence:
+        rng = np.random.default_rng(6)
+        fringes = {}
+        for name, f in acquired().fringes.items():
+            rows: NDArray[np.float32] = rng.standard_normal((len(f.g), f.good.shape[0], 1)).astype(
+                np.float32
+            )
+            fringes[name] = replace(f, electrons=f.electrons + np.float32(rms) * rows)
+        return replace(acquired(), stacks=(), fringes=fringes)
+
+    found = RowNoise.estimate(with_rows(20.0))
+    assert found is not None
+    assert isinstance(found.effect, RowNoise)
+    assert found.effect.row_rms == pytest.approx(20.0, abs=4 * found.errors["row_rms"])
+    assert found.errors["row_rms"] < 2.0
+    assert found.significance > 5
+    nothing = RowNoise.estimate(with_rows(0.0))
+    assert nothing is not None
+    assert nothing.significance < 4
+
+
+def test_without_frames_nothing_is_said(acquired: Callable[..., Evidence]) -> None:
+    assert RowNoise.estimate(replace(acquired(), stacks=(), fringes={})) is None

@@ -1,0 +1,132 @@
+"""Telegraph noise: two levels, as long in each as given, in the same pixels; found again."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pixcal.effects.telegraph_noise import TelegraphNoise
+from pixcal.estimators.evidence import Evidence
+from pixcal.model.bench import Bench
+from pixcal.simulation.exposure import frames_of
+from pixcal.simulation.recording import Recording, recordings
+
+LONG = {
+    "detector.shape": [70, 61], "detector.read_noise_e": 0.0, "detector.bias_pixel_rms_adu": 0.0,
+    "detector.bias_adu": 9000, "detector.gain_e_per_adu": 0.5, "frames.bias": 400,
+}  # fmt: skip
+
+
+def bias_of(bench: Bench) -> Recording:
+    return next(r for r in recordings(bench) if r.kind == "bias")
+
+
+@pytest.mark.parametrize("switching", [0.0, 0.5, 3.0])
+def test_pixels_have_two_levels_and_stay_in_them(
+    make_effect_bench: Callable[..., Bench], switching: float
+) -> None:
+    bench = make_effect_bench(LONG)
+    effect = TelegraphNoise(0.1, 400.0, switching)
+    frames = frames_of(bench, bias_of(bench), [effect]).astype(float)
+    lively = np.ptp(frames, axis=0) > 1
+    n = lively.size
+    assert lively.mean() == pytest.approx(0.1, abs=4 * np.sqrt(0.09 / n))
+    series = frames[:, lively]
+    for pixel in series.T:
+        assert len(np.unique(pixel)) == 2
+    amplitude = 0.5 * np.ptp(series, axis=0)
+    assert amplitude.mean() == pytest.approx(400, abs=4 * 400 / np.sqrt(len(amplitude)))
+    assert np.median(amplitude) == pytest.approx(400 * np.log(2), rel=0.3)
+    state = np.where(series > series.mean(axis=0), 1.0, -1.0)
+    keep = np.exp(-2 * 0.14 / switching) if switching else 0.0
+    error = np.sqrt((1 - keep**2) / state.size)
+    assert (state[1:] * state[:-1]).mean() == pytest.approx(keep, abs=4 * error)
+    middle = (series.max(axis=0) + series.min(axis=0)) / 2
+    np.testing.assert_allclose(middle, 9000, atol=1)
+
+
+def test_it_belongs_to_the_pixels_of_the_chip(make_effect_bench: Callable[..., Bench]) -> None:
+    chip = {"detector.chip": [150, 300], "frames.bias": 30}
+    effect = TelegraphNoise(0.1, 400.0, 0.0)
+    lively = []
+    for origin, shape in (([10, 20], [120, 250]), ([60, 100], [47, 53])):
+        bench = make_effect_bench(
+            {**LONG, **chip, "detector.origin_px": origin, "detector.shape": shape}
+        )
+        frames = frames_of(bench, bias_of(bench), [effect]).astype(float)
+        lively.append(np.ptp(frames, axis=0) > 1)
+    assert np.array_equal(lively[0][50:97, 80:133], lively[1])
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [TelegraphNoise(), TelegraphNoise(0.005, 60.0, 0.0), TelegraphNoise(0.02, 100.0, 3.0)],
+)
+def test_share_amplitude_and_time_are_found(
+    acquired: Callable[..., Evidence], truth: TelegraphNoise
+) -> None:
+    parameters = {n: getattr(truth, n) for n in ("share", "amplitude_e", "switching_s")}
+    found = TelegraphNoise.estimate(acquired(None, {"telegraph_noise": parameters}))
+    assert found is not None
+    assert isinstance(found.effect, TelegraphNoise)
+    for name, value in parameters.items():
+        assert abs(getattr(found.effect, name) - value) < 4 * found.errors[name], name
+    assert found.errors["share"] < 0.4 * truth.share
+    assert found.errors["amplitude_e"] < 0.4 * truth.amplitude_e
+    assert found.significance > 5
+
+
+def test_strong_jumps_show_in_fringes_alone(acquired: Callable[..., Evidence]) -> None:
+    # With so few bias frames the noisy pixels were not left out of the fit.
+    few = {"frames.bias": 4, "frames.darks": []}
+    evidence = acquired(few, {"telegraph_noise": {"amplitude_e": 300.0}})
+    found = TelegraphNoise.estimate(evidence)
+    assert found is not None
+    assert isinstance(found.effect, TelegraphNoise)
+    assert abs(found.effect.amplitude_e - 300) < 4 * found.errors["amplitude_e"] < 300
+    assert abs(found.effect.share - 0.02) < 4 * found.errors["share"] < 0.04
+    assert found.significance > 10
+    nothing = TelegraphNoise.estimate(replace(acquired(), stacks=()))
+    assert nothing is not None
+    assert nothing.significance < 4
+    assert TelegraphNoise.estimate(replace(evidence, stacks=(), fringes={})) is None
+
+
+def with_noise(evidence: Evidence, gain: np.ndarray) -> Evidence:
+    """Pixels as noisy as before, times a map."""
+    stacks = []
+    for stack in evidence.stacks:
+        mean = stack.adu.mean(axis=0)
+        stacks.append(replace(stack, adu=np.round(mean + gain * (stack.adu - mean))))
+    return replace(evidence, stacks=tuple(stacks))
+
+
+def test_pixels_that_are_only_noisier_are_not_taken_for_it(
+    acquired: Callable[..., Evidence],
+) -> None:
+    evidence = acquired()
+    rng = np.random.default_rng(8)
+    shape = evidence.good.shape
+    some = np.where(rng.random(shape) < 0.05, 1 + 2 * rng.exponential(size=shape), 1.0)
+    for gain in (some, rng.lognormal(0, 0.2, shape)):
+        found = TelegraphNoise.estimate(with_noise(evidence, gain))
+        assert found is not None
+        assert found.significance < 4
+        assert found.details["noisy"] > 100
+
+
+@pytest.mark.parametrize("other", [{"cosmic_hits": {"rate_cm2_s": 30_000.0}}, {"row_noise": {}}])
+def test_what_looks_like_it_is_not_taken_for_it(
+    acquired: Callable[..., Evidence], other: dict[str, dict[str, float]]
+) -> None:
+    found = TelegraphNoise.estimate(acquired(None, other))
+    assert found is not None
+    assert found.significance < 4
+
+
+def test_noise_below_a_step_of_the_converter_says_nothing(
+    acquired: Callable[..., Evidence],
+) -> None:
+    evidence = acquired()
+    assert TelegraphNoise.estimate(with_noise(evidence, np.full(evidence.good.shape, 0.02))) is None

@@ -1,0 +1,37 @@
+"""Significances: under chance they are standard normals."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from pixcal.kernels.significance import sigmas_of_best, sigmas_of_chi2, sigmas_of_count
+
+RNG = np.random.default_rng(4)
+
+
+@pytest.mark.parametrize("dof", [1, 2, 7])
+def test_of_chi2_chance_is_normal(dof: int) -> None:
+    drawn = [sigmas_of_chi2(v, dof) for v in RNG.chisquare(dof, 3000)]
+    assert stats.kstest(drawn, "norm").pvalue > 1e-3
+
+
+def test_of_chi2_far_tails_join() -> None:
+    assert sigmas_of_chi2(25.0, 1) == pytest.approx(stats.norm.isf(stats.norm.sf(5) * 2))
+    below, above = sigmas_of_chi2(999.9, 3), sigmas_of_chi2(1000.1, 3)
+    assert above == pytest.approx(below, rel=2e-3)
+    assert sigmas_of_chi2(1e8, 2) == pytest.approx(1e4, rel=1e-3)
+
+
+def test_of_the_best_of_some_chance_is_normal() -> None:
+    drawn = [sigmas_of_best(*row) for row in RNG.standard_normal((3000, 3))]
+    assert stats.kstest(drawn, "norm").pvalue > 1e-3
+    assert sigmas_of_best(2.0) == pytest.approx(2.0)
+    assert sigmas_of_best(300.0, 1.0) == pytest.approx(300, abs=0.01)
+
+
+def test_of_counts() -> None:
+    drawn = [sigmas_of_count(int(n), 400.0) for n in RNG.poisson(400, 3000)]
+    assert stats.kstest(drawn, "norm").pvalue > 1e-4
+    assert sigmas_of_count(0, 1e-4) == pytest.approx(0, abs=1e-3)
+    assert sigmas_of_count(1, 1e-3) < 4 < sigmas_of_count(2, 1e-3)
+    assert np.isfinite(sigmas_of_count(5000, 1e-6))
