@@ -58,6 +58,8 @@ class FrameSeries:
         what follows the phase of the fringes, which is no noise.
     noise, apart_noise : (2, 2) float64
         Covariance that the noise model predicts of them, mean over frames.
+    share : float
+        Of the frames' freedom that is left.
     """
 
     name: str
@@ -69,6 +71,7 @@ class FrameSeries:
     apart: F64
     noise: F64
     apart_noise: F64
+    share: float = 1.0
 
     def __len__(self) -> int:
         return len(self.values)
@@ -131,7 +134,8 @@ def _series(
     inside = slice(1, -1)
     time = found.time_s[use][inside]
     own = np.hstack([taken[0], (taken[1] - taken[2]) / 2])[inside]
-    rest = without(own, _follows_phase(np.arctan2(found.free[use, 2], found.free[use, 1])))
+    shapes = _follows_phase(np.arctan2(found.free[use, 2], found.free[use, 1]))
+    rest = without(own, shapes)
     return FrameSeries(
         name=found.name,
         k=found.k,
@@ -142,6 +146,7 @@ def _series(
         apart=rest[:, 2:],
         noise=noises[0],
         apart_noise=(noises[1] + noises[2]) / 4,
+        share=1 - np.linalg.matrix_rank(shapes) / len(time) if shapes.size else 1.0,
     )
 
 
@@ -184,8 +189,8 @@ def _follows_phase(phase: F64) -> F64:
     angles = angles[: max(1, int(len(own) * SPENT / 2))]
     shapes = np.stack([turn(angle) for angle in angles for turn in (np.cos, np.sin)], axis=1)
     power = cosine_modes(shapes) ** 2
-    slow = power[:SLOW].sum(axis=0) > power.sum(axis=0) / 2
-    return np.asarray(shapes[:, ~slow])
+    fast = power[SLOW:].sum(axis=0) > np.maximum(power.sum(axis=0) / 2, 1e-9)
+    return np.asarray(shapes[:, fast])
 
 
 def assemble(
@@ -230,6 +235,7 @@ def assemble(
         parts=stacked,
         start=np.concatenate([np.zeros(m), np.ones(3 * len(every))]),
         least=np.concatenate([least, of_noise]),
+        share=float(np.average([s.share for s in every], weights=[len(s) for s in every])),
     )
 
 

@@ -121,9 +121,10 @@ class FringeSums:
         self.series = self.weights.series(1)
         self.excess = ratio - self.weights.rho
         # Variance of a sample over the weights' own, the mean over phases.
-        self.spread = scale * (1 + self.excess * self.series[0].real)
+        self.spread = (scale * (1 + self.excess * self.series[0].real)).astype(np.float32)
         self.level, self.scale = level, scale
         self.psi = np.angle(smooth).ravel().astype(np.float32)
+        self.place = np.remainder(self.psi / np.float32(2 * np.pi), np.float32(1))
         # One visibility for the tile, so that the normal matrix depends on the phase alone.
         self.s = np.float32(self.weights.visibility) * np.sin(self.psi)
         self.c = np.float32(self.weights.visibility) * np.cos(self.psi)
@@ -164,7 +165,7 @@ class FringeSums:
         if (part := self._end_part()) is not None:
             table = normal_table(self.moments.sums(part), self.series, BATCH_TABLE)
             close_fringes(
-                table, self.psi, self.level, self.s, self.c, self.part, self.lost, self.any_lost,
+                table, self.place, self.level, self.s, self.c, self.part, self.lost, self.any_lost,
                 self.spread, turn, sigma,
             )  # fmt: skip
         self.part[:] = 0

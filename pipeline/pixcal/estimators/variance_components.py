@@ -64,6 +64,8 @@ class Modes:
     start, least : (m,) float64
         Sizes to begin with and lowest ones; below zero, so that what is not there may come out
         either side of nothing.
+    share : float
+        Of the modes that are independent: the likelihood counts no more.
     """
 
     values: F64
@@ -71,6 +73,7 @@ class Modes:
     parts: F64
     start: F64
     least: F64
+    share: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -209,10 +212,10 @@ class _State:
         self.beta = self.spread @ np.einsum("nap,na->p", self.weighted, modes.values)
         rest = modes.values - np.einsum("nap,p->na", modes.known, self.beta)
         self.pull = np.einsum("nab,nb->na", self.weight, rest)
-        self.profile = -0.5 * float(
+        self.profile = -0.5 * modes.share * float(
             2 * np.log(np.einsum("naa->na", root)).sum() + np.einsum("na,na->", rest, self.pull)
         )
-        self.likelihood = self.profile - 0.5 * _log_determinant(normal)
+        self.likelihood = self.profile - 0.5 * modes.share * _log_determinant(normal)
 
     def score(self) -> F64:
         """Slope of the log-likelihood (m,)."""
@@ -221,11 +224,11 @@ class _State:
         # What the fit of the known shapes takes away of the scatter.
         lost = sandwich(self.weighted, self.spread)
         expected = np.einsum("inab,nab->i", parts, self.weight - lost)
-        return np.asarray((seen - expected) / 2)
+        return np.asarray(self.modes.share * (seen - expected) / 2)
 
     def information(self) -> F64:
         """Fisher's information of the sizes (m, m)."""
-        return np.asarray(trace_products(self.weight, self.modes.parts) / 2)
+        return np.asarray(self.modes.share * trace_products(self.weight, self.modes.parts) / 2)
 
 
 def _scale(matrix: F64) -> F64:

@@ -330,8 +330,8 @@ def fringe_block(
 
     Parameters
     ----------
-    codes : (t, p) array of unsigned integers
-        Stored samples of p pixels; other facts as in `sweep_block`.
+    codes : (t, p) uint16
+        Stored samples of p pixels.
     scale, offset, fill
         As in `sweep_block`.
     g : (t, 3) float32
@@ -355,7 +355,9 @@ def fringe_block(
     n = codes.shape[1]
     p = [np.empty(GROUP, np.float32) for _ in range(5)]
     sc, of, rh = np.float32(scale), np.float32(offset), np.float32(rho)
-    filled = _holds(codes, fill)
+    # As wide as the codes: comparing wider numbers takes four times as long.
+    mark = np.uint16(fill)
+    filled = _holds(codes, mark)
     for first in range(0, n, GROUP):
         stop = min(first + GROUP, n)
         for k in range(5):
@@ -365,7 +367,7 @@ def fringe_block(
             c[first:stop], p[0], p[1], p[2], p[3],
         )  # fmt: skip
         if filled:
-            _count_fill(codes, first, stop, fill, p[4])
+            _count_fill(codes, first, stop, mark, p[4])
             for i in range(stop - first):
                 if p[4][i] > 0:
                     at = first + i
@@ -406,17 +408,17 @@ def _without_fill(
     p[0][i], p[1][i], p[2][i], p[3][i] = b0, b1, b2, rr
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def close_fringes(
     table: F64,
-    psi: F32,
+    place: F32,
     level: F32,
     s: F32,
     c: F32,
     sums: F64,
     missing: F64,
     filled: bool,
-    spread: F64,
+    spread: F32,
     turn: F32,
     sigma: F32,
 ) -> None:
@@ -426,53 +428,80 @@ def close_fringes(
     ----------
     table : (6, size) float64
         Normal sums over one turn of the pixel's phase (`pixcal.estimators.harmonics`).
-    psi : (p,) float32
-        Phase of the start model, rad.
+    place : (p,) float32
+        Phase of the start model in turns, from 0 to 1.
     level, s, c, sums, missing
         As in `fringe_block`.
     filled : bool
         Whether ``missing`` holds anything.
-    spread : (p,) float64
+    spread : (p,) float32
         Variance of the samples over that of the weights.
     turn, sigma : (p,) float32
         Written: rad.
     """
-    size = table.shape[1]
-    per_rad = size / (2 * np.pi)
-    m = np.empty(6)
-    for p in range(psi.size):
-        place = psi[p] * per_rad
-        below = np.floor(place)
-        part = place - below
-        i = int(below) % size
-        j = i + 1 if i + 1 < size else 0
-        for k in range(6):
-            m[k] = table[k, i] * (1 - part) + table[k, j] * part
+    n = place.size
+    m = np.empty((6, min(GROUP, n)))
+    for first in range(0, n, GROUP):
+        stop = min(first + GROUP, n)
+        _look_up(table, place[first:stop], m)
         if filled:
             for k in range(6):
-                m[k] -= missing[k, p]
-        i00, i01, i02 = (
-            m[3] * m[5] - m[4] * m[4],
-            m[2] * m[4] - m[1] * m[5],
-            m[1] * m[4] - m[2] * m[3],
-        )
-        i11, i12, i22 = (
-            m[0] * m[5] - m[2] * m[2],
-            m[1] * m[2] - m[0] * m[4],
-            m[0] * m[3] - m[1] * m[1],
-        )
-        det = m[0] * i00 + m[1] * i01 + m[2] * i02
-        if not det > SINGULAR * m[0] * m[3] * m[5]:
-            turn[p], sigma[p] = np.nan, np.nan
-            continue
-        r0, r1, r2 = sums[0, p] / det, sums[1, p] / det, sums[2, p] / det
-        ms, mc = level[p] * s[p], level[p] * c[p]
-        ts = ms + i01 * r0 + i11 * r1 + i12 * r2
-        tc = mc + i02 * r0 + i12 * r1 + i22 * r2
-        turn[p] = _angle(ts * mc - tc * ms, tc * mc + ts * ms)
+                for i in range(stop - first):
+                    m[k, i] -= missing[k, first + i]
+        part = slice(first, stop)
+        _turns(
+            m[0], m[1], m[2], m[3], m[4], m[5], level[part], s[part], c[part],
+            sums[0, part], sums[1, part], sums[2, part], spread[part], turn[part], sigma[part],
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _look_up(table: F64, place: F32, out: F64) -> None:
+    """Linear interpolation of tables (k, size) of one turn at places (p,), in turns."""
+    size = table.shape[1]
+    for i in range(place.size):
+        at = place[i] * size
+        below = int(at)
+        part = at - below
+        j = below % size
+        k = j + 1 if j + 1 < size else 0
+        for q in range(6):
+            out[q, i] = table[q, j] + part * (table[q, k] - table[q, j])
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _solve_turns(
+    n00: Any, n01: Any, n02: Any, n11: Any, n12: Any, n22: Any, level: Any, s: Any, c: Any,
+    b0: Any, b1: Any, b2: Any, y: Any, x: Any, variance: Any,
+) -> None:  # fmt: skip
+    # Without a branch, so that it vectorises.
+    for i in range(level.size):
+        i00, i01 = n11[i] * n22[i] - n12[i] * n12[i], n02[i] * n12[i] - n01[i] * n22[i]
+        i02, i11 = n01[i] * n12[i] - n02[i] * n11[i], n00[i] * n22[i] - n02[i] * n02[i]
+        i12, i22 = n01[i] * n02[i] - n00[i] * n12[i], n00[i] * n11[i] - n01[i] * n01[i]
+        det = n00[i] * i00 + n01[i] * i01 + n02[i] * i02
+        one = 1.0 / det if det > SINGULAR * n00[i] * n11[i] * n22[i] else np.nan
+        ms, mc = level[i] * s[i], level[i] * c[i]
+        ts = ms + (i01 * b0[i] + i11 * b1[i] + i12 * b2[i]) * one
+        tc = mc + (i02 * b0[i] + i12 * b1[i] + i22 * b2[i]) * one
+        y[i] = ts * mc - tc * ms
+        x[i] = tc * mc + ts * ms
         power = ts * ts + tc * tc
-        variance = (tc * tc * i11 - 2 * tc * ts * i12 + ts * ts * i22) / (det * power * power)
-        sigma[p] = np.sqrt(max(variance, 0.0) * spread[p])
+        v = (tc * tc * i11 - 2 * tc * ts * i12 + ts * ts * i22) * one
+        variance[i] = v / (power * power)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _turns(
+    n00: Any, n01: Any, n02: Any, n11: Any, n12: Any, n22: Any, level: Any, s: Any, c: Any,
+    b0: Any, b1: Any, b2: Any, spread: Any, turn: Any, sigma: Any,
+) -> None:  # fmt: skip
+    n = level.size
+    y, x, variance = np.empty(n), np.empty(n), np.empty(n)
+    _solve_turns(n00, n01, n02, n11, n12, n22, level, s, c, b0, b1, b2, y, x, variance)
+    for i in range(n):
+        turn[i] = _angle(y[i], x[i])
+        sigma[i] = np.sqrt(max(variance[i], 0.0) * spread[i])
 
 
 @njit(cache=True, nogil=True, inline="always")  # type: ignore[untyped-decorator]

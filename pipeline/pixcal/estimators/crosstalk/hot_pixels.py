@@ -59,10 +59,20 @@ class HotPixels:
     shape: Place
 
     def corrected(self, outflow: F64, per_ke: float) -> "HotPixels":
-        """Shares of what a hot pixel had, at small signals; they were measured of what it kept."""
-        factor = (1 - outflow[self.y, self.x]) / (1 + per_ke * self.charge)
-        at = factor[:, None, None]
-        return replace(self, value=self.value * at, sigma=self.sigma * np.abs(at))
+        """Shares of what a hot pixel had, at small signals; they were measured of what it kept.
+
+        Parameters
+        ----------
+        outflow : (y, x) float64
+            Share that each pixel gives away, at small signals.
+        per_ke : float
+            Relative change of shares with the charge, 1/ke-.
+        """
+        lost = outflow[self.y, self.x]
+        charge = self.charge / (1 - lost * (1 + per_ke * self.charge))
+        kept = (1 - lost * (1 + per_ke * charge)) / (1 + per_ke * charge)
+        at = kept[:, None, None]
+        return replace(self, charge=charge, value=self.value * at, sigma=self.sigma * np.abs(at))
 
     def by_class(
         self, classes: Classes, links: tuple[Place, ...], doubt: float = 0.0
@@ -91,7 +101,7 @@ class HotPixels:
         Each coupling has its own share; the change is common to all. Noise would tell it with fewer
         hot pixels, but there brighter-fatter looks the same. The error is infinite without any.
         """
-        right = weight = 0.0
+        right = weight = level = 0.0
         for c in couplings:
             step, side = ((c.dy, c.dx), 0) if (c.dy, c.dx) in links else ((-c.dy, -c.dx), 1)
             classes = Classes(c.every_rows, c.every_columns, first)
@@ -102,10 +112,16 @@ class HotPixels:
             if near.sum() < MIN_LEVELS:
                 continue
             w, charge = sigma[near] ** -2, self.charge[own][near]
-            slope = c.share * (charge - np.average(charge, weights=w))
+            mean = np.average(charge, weights=w)
+            slope = c.share * (charge - mean)
             right += float((w * slope) @ value[near])
             weight += float(w @ slope**2)
-        return (right / weight, weight**-0.5) if weight > 0 else (0.0, np.inf)
+            level += float(w @ slope**2 * mean)
+        if not weight:
+            return 0.0, np.inf
+        # Shares are those at the mean signal so far.
+        at_small_signals = 1 / (1 - right / weight * level / weight)
+        return right / weight * at_small_signals, weight**-0.5 * at_small_signals**2
 
 
 def hot_pixels(evidence: Evidence, links: tuple[Place, ...]) -> HotPixels | None:

@@ -77,11 +77,16 @@ def measure(evidence: Evidence) -> Kernel | None:
         return Kernel((), np.zeros((0, 0)), found.significance, {}, pixels, 0.0, np.inf)
     per_ke, per_ke_error = 0.0, np.inf
     if hot is not None:
-        per_ke, per_ke_error = hot.level_dependence(known, search.steps, search.first)
+        lost = outflow(known, search.shape, search.first)
+        per_ke, per_ke_error = hot.corrected(lost, 0.0).level_dependence(
+            known, search.steps, search.first
+        )
     if abs(per_ke) <= CERTAIN * per_ke_error:
         per_ke = 0.0
-    # Once more, with the charge as it was collected.
-    search = _Search.of(evidence, hot, known) or search
+    # Once more, with the charge as it was collected. Shares that change with it make more of the
+    # contrast of fringes than brighter-fatter does; flats have none.
+    again = replace(evidence, fringes={}) if per_ke else evidence
+    search = _Search.of(again, hot, known) or search
     found, known = search.couplings(known, per_ke)
     ways = _ways(found.picks, search.noise, known)
     for _ in range(MAP_STEPS):

@@ -1,8 +1,9 @@
 """Frames less what they should be, as noise that can be correlated between pixels.
 
-Of every frame that is taken off which all pixels have in common: light, offset, phase, fringe
-vector, and the harmonics that a curved response makes. That correlates what is left by itself, with
-the negative of the modes' products; the modes are kept, so that this can be made good.
+Taken off are what is common to the pixels of a frame (light, offset, phase, fringe vector) and what
+is common to the frames of a pixel (its level; its light and fringe, and the harmonics that a curved
+response makes). The first correlates what is left, with the negative of the modes' products; the
+modes are kept, so that this can be made good. The second makes it smaller, which is made good here.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,17 +20,19 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 UNIT = 1e4
-"""Electrons that charge is counted in; variances in its square's root, 10⁴ e-²."""
+"""Electrons that charge is counted in; variances are in 10⁴ e-²."""
 CLIP = 6.0
 """Residuals beyond so many sigmas (particles, telegraph noise) do not count."""
-BLOCK = 1 << 19
-"""Samples that are taken at once."""
-MOST = 1 << 23
-"""Samples of one sequence that are used at most; of longer ones blocks spread over it."""
-MIN_FRAMES = 8
+MOST = 6_000_000
+"""Samples of one sequence that are used at most; of longer ones frames spread over it."""
+MIN_FRAMES = 16
 """Fewest frames of a fringe set that leave residuals."""
 STRIDE = 8
 """Every so many frames the modes are kept; they change little, and only their products count."""
+STEPS = 4
+"""Times that what is common to pixels and to frames is taken off in turn, till it is both."""
+LEAST = 0.1
+"""Least share of a sample's noise that is left, of those that count."""
 
 
 @dataclass(frozen=True)
@@ -65,14 +68,13 @@ class Residuals:
     @property
     def taken(self) -> tuple[F32, F32, F32]:
         """Modes as if they were frames, and their charge and one, (m s, y, x)."""
-        charge, one = (
-            np.tile(a[::STRIDE], (len(self.modes), 1, 1)) for a in (self.charge, self.one)
-        )
+        times = (len(self.modes), 1, 1)
+        charge, one = (np.tile(a[::STRIDE], times) for a in (self.charge, self.one))
         return self.modes.reshape(one.shape), charge, one
 
 
 def all_residuals(evidence: Evidence, known: Sequence[Coupling]) -> Iterator[Residuals]:
-    """Residuals of all frames, block by block.
+    """Residuals of each sequence of frames.
 
     Parameters
     ----------
@@ -83,58 +85,58 @@ def all_residuals(evidence: Evidence, known: Sequence[Coupling]) -> Iterator[Res
     shape = (evidence.good.shape[0], evidence.good.shape[1])
     kept = noise_shares(known, shape, evidence.origin)[0].astype(np.float32)
     for stack in evidence.stacks:
-        yield from _of_stack(stack, evidence, known, kept)
+        if len(stack.adu) > 1:
+            yield _of_stack(stack, evidence, known, kept)
     for fringes in evidence.fringes.values():
-        yield from _of_fringes(fringes, known, kept)
+        if len(fringes.g) >= MIN_FRAMES:
+            yield _of_fringes(fringes, known, kept)
 
 
-def _blocks(frames: int, pixels: int) -> list[slice]:
-    size = max(2, min(frames, BLOCK // pixels))
-    starts = np.arange(0, frames, size)
-    keep = max(1, MOST // (size * pixels))
-    chosen = starts[np.unique(np.linspace(0, len(starts) - 1, keep).astype(int))]
-    return [slice(int(s), min(int(s) + size, frames)) for s in chosen]
+def _spread(frames: int, pixels: int) -> NDArray[np.intp]:
+    few = max(MIN_FRAMES, MOST // pixels)
+    return np.unique(np.linspace(0, frames - 1, min(frames, few)).astype(int))
 
 
 def _of_stack(
     stack: Stack, evidence: Evidence, known: Sequence[Coupling], kept: F32
-) -> Iterator[Residuals]:
-    """Bias, darks or flats less the mean of all; level and offset of each frame are free."""
-    n = len(stack.adu)
-    if n < 2:
-        return
-    light = (stack.adu.mean(axis=0) - evidence.bias).astype(float)
+) -> Residuals:
+    """Bias, darks or flats; offset and level of each frame are free, and the level of each pixel."""
+    at = _spread(len(stack.adu), evidence.good.size)
+    signal = (stack.adu[at] - evidence.bias) * evidence.gain
+    light = signal.mean(axis=0)
     used = evidence.good & (stack.adu.max(axis=0) < evidence.saturation_adu)
+    rest = np.where(used, (signal - light) / UNIT**0.5, np.nan).astype(np.float32)
     collected = np.maximum(uncouple(light, known, evidence.origin), 0)
-    charge = (collected * evidence.gain / UNIT).astype(np.float32)[None]
-    read = np.full_like(charge, evidence.read_noise**2 / UNIT)
-    mended = evidence.gain / UNIT**0.5 * np.sqrt(n / (n - 1))
-    design = [np.ones_like(charge)] + ([charge] if stack.kind == "flat" else [])
-    for block in _blocks(n, used.size):
-        rest = mended * (stack.adu[block] - evidence.bias - light)
-        yield _freed(np.where(used, rest, np.nan), charge, read, kept, design)
+    charge = np.broadcast_to((collected / UNIT).astype(np.float32), rest.shape)
+    common = [np.ones_like(charge)] + ([charge] if stack.kind == "flat" else [])
+    read = np.full(used.shape, evidence.read_noise**2 / UNIT, np.float32)
+    return _noise(rest, charge, read, kept, common, np.ones((len(at), 1)))
 
 
-def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> Iterator[Residuals]:
-    """Frames less the fit, as they were before they were divided by the flat."""
-    n = len(found.g)
-    if n < MIN_FRAMES:
-        return
+def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> Residuals:
+    """Fringe frames less the fit, as they were before they were divided by the flat.
+
+    A curved response makes second and third harmonics of the fringes, not the same for all pixels.
+    """
+    at = _spread(len(found.g), found.good.size)
     flat = 1 / found.shot_factor
     theta = filled(np.where(found.good, found.theta, np.nan) * flat, found.k)
-    collected = uncouple_fringes(theta, known, found.origin).astype(np.float32)
-    read = (found.read_variance * flat**2 / UNIT).astype(np.float32)[None]
-    mended = (flat * np.sqrt(n / (n - 3)) / UNIT**0.5).astype(np.float32)
-    for block in _blocks(n, found.good.size):
-        g, dk = found.g[block], found.dk[block]
-        charge = _model(collected, g, dk)[0]
-        rest = np.where(found.good, found.residual[block] * mended, np.float32(np.nan))
-        design = _design(theta.astype(np.float32), g, dk)
-        yield _freed(rest, np.maximum(charge / np.float32(UNIT), 0), read, kept, design)
+    collected = uncouple_fringes(theta, known, found.origin)
+    charge, _, _ = _model(collected, found.g[at], found.dk[at])
+    light, fringe, slope = _model(theta, found.g[at], found.dk[at])
+    y, x = (a.astype(np.float32) for a in grid((flat.shape[0], flat.shape[1])))
+    common = [light - fringe, fringe, slope, x * slope, y * slope]
+    rest = np.where(found.good, found.residual[at] * flat / UNIT**0.5, np.nan).astype(np.float32)
+    read = (found.read_variance * flat**2 / UNIT).astype(np.float32)
+    turn = np.exp(1j * found.phi[at])
+    powers = np.column_stack([turn**n for n in (1, 2, 3)])
+    own = np.column_stack([np.ones(len(at)), powers.real, powers.imag])
+    return _noise(rest, np.maximum(charge / np.float32(UNIT), 0), read, kept, common, own)
 
 
-def _model(theta: F32, g: F64, dk: F64) -> tuple[F32, F32, F32]:
+def _model(theta: F64, g: F64, dk: F64) -> tuple[F32, F32, F32]:
     """Frames (t, y, x) of maps, their fringes, and how these change with the phase; e-."""
+    theta = theta.astype(np.float32)
     b, c, s = g.T.astype(np.float32)[:, :, None, None]
     fringe, slope = c * theta[1] + s * theta[2], c * theta[2] - s * theta[1]
     if np.any(dk):
@@ -145,36 +147,86 @@ def _model(theta: F32, g: F64, dk: F64) -> tuple[F32, F32, F32]:
     return b * theta[0] + fringe, fringe, slope
 
 
-def _design(theta: F32, g: F64, dk: F64) -> list[F32]:
-    """What is free in each frame: light, fringe, fringe vector, and two harmonics."""
-    y, x = (a.astype(np.float32) for a in grid((theta.shape[1], theta.shape[2])))
-    _, fringe, slope = _model(theta, g, dk)
-    size = np.sqrt(np.maximum(fringe**2 + slope**2, np.float32(1)))
-    sine, cosine = fringe / size, slope / size
-    double = (cosine**2 - sine**2, 2 * sine * cosine)
-    triple = (cosine * (4 * cosine**2 - 3), sine * (3 - 4 * sine**2))
-    return [theta[:1], fringe, slope, x * slope, y * slope, *double, *triple]
+def _noise(
+    rest: F32, charge: F32, read: F32, kept: F32, common: list[F32], own: F64
+) -> Residuals:
+    """Residuals in units of their noise, without what is common to pixels and to frames.
 
-
-def _freed(rest: F32 | F64, charge: F32, read: F32, kept: F32, design: list[F32]) -> Residuals:
-    """Residuals in units of their noise, without what ``design`` (each (t or 1, y, x)) spans."""
-    variance = charge * kept + read
+    Parameters
+    ----------
+    rest, charge : (t, y, x) float32
+    read, kept : (y, x) float32
+        Variance without light; variance of the shot noise over the charge.
+    common : list of (t, y, x) float32
+        What is free in each frame.
+    own : (t, m) float64
+        What is free in each pixel.
+    """
+    shot = charge * kept
+    variance = shot + read
     good = rest**2 < CLIP**2 * variance
     one = np.where(good, 1 / np.sqrt(variance), np.float32(0)).astype(np.float32)
-    e = np.where(good, rest, 0).astype(np.float32) * one
-    t, *shape = e.shape
-    x = np.stack([np.broadcast_to(d, rest.shape) * one for d in design], axis=1)
-    x = x.reshape(t, len(design), -1)
-    x /= np.sqrt(np.maximum(np.einsum("tmp,tmp->tm", x, x), np.float32(1e-20)))[:, :, None]
-    gram = (x @ x.swapaxes(1, 2)).astype(float) + 1e-6 * np.eye(len(design))
-    modes = np.linalg.inv(np.linalg.cholesky(gram)).astype(np.float32) @ x
-    flat = e.reshape(t, -1, 1)
-    flat -= modes.swapaxes(1, 2) @ (modes @ flat)
-    some = modes[::STRIDE] * np.float32(np.sqrt(t / len(modes[::STRIDE])))
+    e = np.where(good, rest, np.float32(0)) * one
+    modes = _orthonormal(np.stack([c * one for c in common], axis=1).reshape(len(e), len(common), -1))
+    pixels = _PixelModes.of(own, one.reshape(len(e), -1))
+    flat = e.reshape(len(e), -1)
+    for _ in range(STEPS):
+        flat -= np.einsum("tmp,tm->tp", modes, np.einsum("tmp,tp->tm", modes, flat))
+        flat -= pixels.part_of(flat)
+    e /= np.sqrt(np.maximum(1 - pixels.taken(), LEAST)).astype(np.float32).reshape(e.shape)
     # Noise beyond what is known makes every product count for less.
     excess = max(1.0, float(np.sum(e * e, dtype=float)) / max(int(np.count_nonzero(one)), 1))
     less = np.float32(excess**-0.5)
-    return Residuals(
-        e * less, charge * one * less, charge * kept * one * less, one * less,
-        some.swapaxes(0, 1).reshape(len(design), -1, *shape) * less,
-    )  # fmt: skip
+    some = modes[::STRIDE] * (less * np.float32(np.sqrt(len(e) / len(modes[::STRIDE]))))
+    some = some.swapaxes(0, 1).reshape(len(common), -1, *e.shape[1:])
+    one *= less
+    return Residuals(e * less, charge * one, shot * one, one, some)
+
+
+def _orthonormal(modes: F32) -> F32:
+    """Modes (t, m, pixel) of each frame, orthonormal over its pixels."""
+    size = np.sqrt(np.maximum(np.einsum("tmp,tmp->tm", modes, modes), np.float32(1e-20)))
+    modes /= size[:, :, None]
+    gram = (modes @ modes.swapaxes(1, 2)).astype(float) + 1e-6 * np.eye(modes.shape[1])
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(gram)).astype(np.float32) @ modes)
+
+
+@dataclass(frozen=True)
+class _PixelModes:
+    """What is free in each pixel: modes over the frames, weighted with one over sigma.
+
+    Attributes
+    ----------
+    modes : (t, m) float32
+        Orthonormal without weights.
+    one : (t, pixel) float32
+    covariance : (pixel, m, m) float64
+    """
+
+    modes: F32
+    one: F32
+    covariance: F64
+
+    @classmethod
+    def of(cls, modes: F64, one: F32) -> "_PixelModes":
+        modes = np.linalg.qr(modes)[0]
+        t, m = modes.shape
+        squares = np.einsum("ti,tj->tij", modes, modes).reshape(t, -1).astype(np.float32)
+        normal = ((one * one).T @ squares).astype(float).reshape(-1, m, m)
+        trace = np.trace(normal, axis1=1, axis2=2)[:, None, None]
+        return cls(
+            modes.astype(np.float32), one, np.linalg.inv(normal + (1e-9 * trace + 1e-12) * np.eye(m))
+        )
+
+    def part_of(self, e: F32) -> F32:
+        """What the modes explain of residuals (t, pixel) in units of their noise."""
+        right = (e * self.one).T @ self.modes
+        size = np.einsum("pij,pj->pi", self.covariance, right).astype(np.float32)
+        return self.one * (self.modes @ size.T)
+
+    def taken(self) -> F32:
+        """Share (t, pixel) of the noise that they take off."""
+        t, m = self.modes.shape
+        squares = np.einsum("ti,tj->tij", self.modes, self.modes).reshape(t, -1)
+        covariance = self.covariance.reshape(-1, m * m).astype(np.float32)
+        return np.asarray(squares @ covariance.T * self.one**2)

@@ -25,9 +25,9 @@ INDEPENDENT = 0.35
 """Share of the looks that are as good as independent: periods have pixels in common. Measured: it
 makes the median significance of acquisitions without couplings about zero."""
 WORTH = 10.0
-"""Fall in chi-square for which a period is given another number."""
+"""Fall in chi-square for which another share is taken, once a link is known to couple."""
 APART = 5.0
-"""Fall in chi-square for which shares are told apart, once links and period are known."""
+"""Fall in chi-square for which shares are told apart, once the period is known."""
 ZERO = 2.0
 """Sigmas below which a share is none."""
 NOTHING = 1e-6
@@ -149,23 +149,31 @@ def _fall(value: F64, weight: F64) -> F64:
     return np.where(weight > NOTHING, value**2 / np.maximum(weight, NOTHING), 0.0)
 
 
-def _greedy(normal: F64, right: F64, directions: F64, worth: float) -> tuple[F64, float]:
-    """Directions worth a number (u, number), the strongest first, and the fall in chi-square."""
+def _greedy(normal: F64, right: F64, directions: F64, apart: float) -> tuple[F64, float]:
+    """Directions that are worth it (u, number), the strongest first, and the fall in chi-square.
+
+    Parameters
+    ----------
+    normal, right : (u, u), (u,) float64
+    directions : (u, direction) float64
+    apart : float
+        Least fall for telling shares apart that are there; one that is not yet needs `WORTH`.
+    """
     weight = np.einsum("ud,ud->d", directions, normal @ directions)
     # Of equals the plainest: many shares alike, both ways.
     plain = np.count_nonzero(directions, axis=0) / len(directions)
     basis = np.zeros((len(right), 0))
     gain, rest = 0.0, right
     while basis.shape[1] < len(right):
-        each = _fall(rest @ directions, weight)
+        absent = ~np.any(basis, axis=1)
+        least = np.where(np.any(directions[absent], axis=0), WORTH, apart)
+        each = _fall(rest @ directions, weight) - least
         n = int(np.argmax(each + plain))
-        if each[n] < worth:
-            break
         wider = np.column_stack([basis, directions[:, n]])
         inner = wider.T @ normal @ wider
         solved = np.linalg.lstsq(inner, wider.T @ right, rcond=1e-9)[0]
         now = float(solved @ wider.T @ right)
-        if now - gain < worth:
+        if each[n] < 0 or now - gain < least[n]:
             break
         basis, gain, rest = wider, now, right - normal @ wider @ solved
     return _without_zeros(normal, right, basis, gain), gain

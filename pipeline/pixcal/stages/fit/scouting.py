@@ -23,7 +23,7 @@ SCOUT_TILES = 5
 """Tiles that the scout reads where they can be kept in memory."""
 CACHE_BYTES = 384 << 20
 """Memory for the scout's tiles; fixed, so that results do not depend on ``--memory``."""
-PRIME_BYTES = 96 << 20
+PRIME_BYTES = 48 << 20
 """Memory for the codes of the scout's first look."""
 LOOKS = 16
 """Chunks along time that the first look takes frames from: one may hold little of a slow scan."""
