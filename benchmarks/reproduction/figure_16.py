@@ -7,7 +7,7 @@ import numpy as np
 
 from pixcal.kernels.optics import Geometry
 from pixcal.kernels.scene import geometry
-from pixcal.report.text import number, with_error
+from pixcal.report.text import number
 from pixcal.storage.artefact import read_json
 from reproduction.lab import Lab, Scene
 from reproduction.outcome import Outcome, Row
@@ -73,10 +73,8 @@ def make(lab: Lab) -> Outcome:
                 "points", "paths"),
             Row("one minimum as far as the maps go", "yes" if facts["unique_minimum"] else "no",
                 "minimum"),
-            Row("distance D", f"{with_error(distance[0], distance[1])} mm, true "
-                f"{number(distance[2], 4)} mm", "accurate"),
-            Row("baseline B", f"{with_error(baseline[0], baseline[1])} mm, true "
-                f"{number(baseline[2], 4)} mm", "accurate"),
+            Row("distance D", _apart(*distance), "accurate"),
+            Row("baseline B", _apart(*baseline), "accurate"),
             Row("relative error of D, and of B/D",
                 f"{number(alone, 2)} and {number(abs(found.ratio_error), 2)}", "correlated"),
             Row("evaluations of the model", number(facts["evaluations"])),
@@ -95,3 +93,7 @@ def make(lab: Lab) -> Outcome:
         },
         picture=found.picture,
     )  # fmt: skip
+
+
+def _apart(value: float, sigma: float, true: float) -> str:
+    return f"off by {number(value - true, 2)} mm of {number(true)}, sigma {number(sigma, 2)} mm"

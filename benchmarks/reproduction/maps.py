@@ -28,6 +28,15 @@ def harmonics(shape: tuple[int, int], vector: tuple[float, float]) -> F64:
     return np.stack([np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)])
 
 
+def sloping_harmonics(shape: tuple[int, int], vector: tuple[float, float]) -> F64:
+    """The same, and with strengths that grow along x and y (12, y, x).
+
+    A fringe vector that is held while it moves leaves the latter (physics note, section 2).
+    """
+    waves, slopes = harmonics(shape, vector), plane(shape)
+    return np.asarray((slopes[:, None] * waves).reshape(-1, *shape))
+
+
 def teeth(values: F64, period: int, edge: int = 2) -> F64:
     """Mean (period,) of rows that are whole periods apart, less the mean of all.
 

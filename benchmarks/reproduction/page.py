@@ -8,7 +8,7 @@ from pathlib import Path
 from pixcal import __version__
 from reproduction.lab import CONFIGS
 from reproduction.outcome import Outcome, Row
-from reproduction.paper import STATEMENTS
+from reproduction.paper import STATEMENTS, Statement
 
 LEAD = """\
 Figures of Rousset et al., "Pixel-Level Calibration for Space-Based High Precision Astrometry Using
@@ -48,7 +48,7 @@ def write(folder: Path, outcomes: Sequence[Outcome], *, full: bool) -> Path:
 
 
 def _contents(outcomes: Sequence[Outcome]) -> str:
-    lines = [f"- [Figure {o.figure}](#{_anchor(o)}): {o.title.lower()}" for o in outcomes]
+    lines = [f"- [{_heading(o)}](#{_anchor(o)})" for o in outcomes]
     return "\n".join(lines) + "\n"
 
 
@@ -78,7 +78,6 @@ def _section(outcome: Outcome, picture: str) -> str:
 
 
 def _line(row: Row) -> str:
-    said = STATEMENTS.get(row.paper)
-    text, place = (said.text, said.place) if said else ("–", "–")
-    cells = (row.quantity, text, place, row.here)
+    said = STATEMENTS[row.paper] if row.paper else Statement("–", "–")
+    cells = (row.quantity, said.text, said.place, row.here)
     return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

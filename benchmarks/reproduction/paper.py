@@ -32,6 +32,7 @@ class Statement:
 
 STATEMENTS = {
     "straight": Statement("valid for detectors of small size", "section 3.2"),
+    "periods": Statement("7 to 57 px for baselines of 6 to 1 mm at 40 cm", "section 4.1"),
     "curved": Statement("hyperbolic fringes at the first and last 25 columns", "figure 5"),
     "target": Statement("5 × 10⁻⁵ px with approximately 20 000 frames", "section 7"),
     "finer": Statement(

@@ -68,7 +68,7 @@ PAGES_WITH_SHELL = [p for p in PAGES if any(b.language in SHELL for b in blocks_
 
 
 def targets() -> set[str]:
-    return set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    return set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
 
 
 @pytest.fixture
@@ -158,7 +158,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 def test_the_commands_named_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert set(re.findall(r"`pixcal ([a-z]+)", text)) <= set(cli.commands)
-    assert set(re.findall(r"`make ([a-z]+)", text)) <= targets()
+    assert set(re.findall(r"`make ([a-z-]+)", text)) <= targets()
 
 
 def test_the_readme_names_every_command() -> None:

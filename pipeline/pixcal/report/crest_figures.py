@@ -16,6 +16,8 @@ F64 = NDArray[np.float64]
 
 SHOWN_PATHS = 4
 """Paths of each end (paper, figure 16)."""
+LONG_TITLE = 10
+"""Points, so that numbers of many digits stay within their panel."""
 CREST, VALLEY = RED, BLUE
 
 
@@ -219,6 +221,7 @@ def _pulls(axes: Axes, view: CrestView) -> None:
         xlabel="residual / error", ylabel="density",
         title=f"{view.used.sum()} points, good to {np.median(view.sigma_px):.1e} px",
     )  # fmt: skip
+    axes.title.set_fontsize(LONG_TITLE)
     finish(axes)
 
 
@@ -261,4 +264,5 @@ def _valley(axes: Axes, view: CrestView) -> None:
         xlabel="D (mm)", ylabel="cost above its least",
         title=f"{view.best[0]:.{decimals}f} ± {error:.{decimals}f} mm{origin}",
     )  # fmt: skip
+    axes.title.set_fontsize(LONG_TITLE)
     finish(axes)
