@@ -8,6 +8,12 @@ from pixcal.model.errors import PlanError
 BASE_BYTES = 350 << 20
 """Interpreter with all libraries loaded and kernels compiled (measured, see the tests)."""
 
+DASK_WORKER_BYTES = 420 << 20
+"""The same of a Dask worker, which lives on from stage to stage."""
+
+USABLE = 0.8
+"""Share of its memory limit above which a Dask worker starts no task (Dask's default)."""
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -20,7 +26,7 @@ class Plan:
     shared_bytes : int
         Held by the coordinating process during the whole stage.
     workers : int
-        Tasks that run at the same time.
+        Tasks that run at the same time; on a Dask cluster, in each of its workers.
     """
 
     bytes_per_task: int
@@ -36,11 +42,16 @@ class Plan:
 def make_plan(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtime) -> Plan:
     """Choose the number of workers so that the work fits the memory allowed.
 
+    On a Dask cluster the tasks must fit the memory limits of its workers; ``--memory`` holds for
+    this process alone.
+
     Raises
     ------
     PlanError
         If not even one worker fits; the message holds both numbers.
     """
+    if runtime.remote:
+        return _plan_on_cluster(what, bytes_per_task, shared_bytes, runtime)
     if runtime.cluster == "processes":
         # Each has an interpreter of its own.
         bytes_per_task += BASE_BYTES
@@ -52,3 +63,25 @@ def make_plan(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtim
         need, have = plan.total / 2**20, runtime.memory / 2**20
         raise PlanError(f"--memory: {what} needs {need:.0f} MiB, {have:.0f} MiB are allowed")
     return plan
+
+
+def _plan_on_cluster(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtime) -> Plan:
+    """As many tasks at a time in each worker as the one with the least memory can hold."""
+    # Here, not at the top: it takes long to import, and starts threads.
+    from pixcal.engine.cluster import workers_of
+
+    make_plan(what, 0, shared_bytes, Runtime(memory=runtime.memory))
+    workers = workers_of(runtime.cluster, quiet=runtime.quiet)
+    at_once = runtime.workers or max(worker.threads for worker in workers)
+    for worker in workers:
+        if not worker.memory:
+            continue
+        have, need = int(USABLE * worker.memory), DASK_WORKER_BYTES + bytes_per_task
+        if need > have:
+            raise PlanError(
+                f"--cluster {runtime.cluster}: {what} needs {need >> 20} MiB in a worker, "
+                f"{worker.address} may use {have >> 20} MiB ({USABLE:.0%} of its limit); start it "
+                "with a larger --memory-limit"
+            )
+        at_once = min(at_once, (have - DASK_WORKER_BYTES) // max(bytes_per_task, 1))
+    return Plan(bytes_per_task, shared_bytes, at_once)

@@ -2,16 +2,12 @@
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
-from multiprocessing import get_context
 from typing import Any, TypeVar
 
-import dask
-from dask.callbacks import Callback
 from threadpoolctl import threadpool_limits
 
+from pixcal.engine.local import run_here, run_in_processes, run_in_threads
 from pixcal.engine.progress import Progress
 from pixcal.model.errors import InputError
 
@@ -27,9 +23,10 @@ class Runtime:
     cluster : str
         ``threads``, ``processes``, ``sync``, or the address ``tcp://…`` of a Dask scheduler.
     workers : int
-        Local threads or processes; 0 means as many as there are cores.
+        Local threads or processes; 0 means as many as there are cores. On a Dask cluster, tasks
+        that each of its workers does at the same time; 0 means as many as it has threads.
     memory : int
-        Bytes that the whole stage may use.
+        Bytes that the whole stage may use on this machine. Dask workers have their own limits.
     quiet : bool
         No progress on stderr.
     """
@@ -41,10 +38,15 @@ class Runtime:
 
     def __post_init__(self) -> None:
         known = ("threads", "processes", "sync")
-        if self.cluster not in known and "://" not in self.cluster:
+        if self.cluster not in known and not self.remote:
             raise InputError(
                 f"--cluster {self.cluster}: not one of {', '.join(known)}, nor an address tcp://…"
             )
+
+    @property
+    def remote(self) -> bool:
+        """Whether tasks go to the workers of a Dask scheduler."""
+        return "://" in self.cluster
 
     @property
     def n_workers(self) -> int:
@@ -65,17 +67,6 @@ def one_blas_thread() -> threadpool_limits:
     threads shared it.
     """
     return threadpool_limits(limits=1, user_api="blas")
-
-
-class _InWorker:
-    """A task for another process, where nobody else limits BLAS."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.function = function
-
-    def __call__(self, item: Any) -> Any:
-        with one_blas_thread():
-            return self.function(item)
 
 
 def run_tasks(
@@ -105,75 +96,27 @@ def run_tasks(
     list
         Results in the order of the items.
     """
+    results: dict[int, R] = {}
     with Progress(label, len(items), quiet=runtime.quiet) as progress, one_blas_thread():
-        if "://" in runtime.cluster:
-            return _run_distributed(function, items, runtime, progress, done)
-        if runtime.cluster == "sync" or (len(items) == 1 and runtime.cluster == "threads"):
-            results = []
-            for number, item in enumerate(items):
-                results.append(function(item))
-                if done is not None:
-                    done(number, results[-1])
-                progress.advance()
-            return results
-        return _run_local(function, items, runtime, progress, done)
 
-
-@lru_cache(maxsize=1)
-def _process_pool(workers: int) -> ProcessPoolExecutor:
-    """Worker processes, kept: each takes seconds to import what the tasks need."""
-    return ProcessPoolExecutor(workers, mp_context=get_context("spawn"))
-
-
-def _run_local(
-    function: Callable[..., R],
-    items: Sequence[Any],
-    runtime: Runtime,
-    progress: Progress,
-    done: Callable[[int, R], None] | None,
-) -> list[R]:
-    options: dict[str, Any] = {"num_workers": runtime.n_workers}
-    if runtime.cluster == "processes":
-        function = _InWorker(function)
-        options["pool"] = _process_pool(runtime.n_workers)
-    names = [f"task-{n}" for n in range(len(items))]
-    # Bound to the function: inside a graph Dask would take some items for keys or tasks.
-    graph = {name: (partial(function, item),) for name, item in zip(names, items, strict=True)}
-    number = {name: n for n, name in enumerate(names)}
-
-    def ended(key: Any, result: Any, _dsk: Any, _state: Any, _worker: Any) -> None:
-        if key in number:
+        def ended(number: int, result: R) -> None:
+            results[number] = result
             if done is not None:
-                done(number[key], result)
+                done(number, result)
             progress.advance()
 
-    get = dask.base.get_scheduler(scheduler=runtime.cluster)
-    with Callback(posttask=ended):
-        return list(get(graph, names, **options))
+        if runtime.remote:
+            # Here, not at the top: it takes long to import, and starts threads.
+            from pixcal.engine.cluster import run_on_cluster
 
-
-def _run_distributed(
-    function: Callable[..., R],
-    items: Sequence[Any],
-    runtime: Runtime,
-    progress: Progress,
-    done: Callable[[int, R], None] | None,
-) -> list[R]:
-    from distributed import Client, as_completed  # starts threads on import
-
-    try:
-        client = Client(runtime.cluster, timeout="10s", set_as_default=False)
-    except (OSError, TimeoutError, ValueError) as error:
-        raise InputError(f"--cluster {runtime.cluster}: no Dask scheduler answers there") from error
-    with client:
-        futures = client.map(_InWorker(function), items, pure=False)
-        number = {future.key: n for n, future in enumerate(futures)}
-        results: dict[int, R] = {}
-        for future in as_completed(futures, loop=client.loop):
-            n = number[future.key]
-            results[n] = future.result()
-            future.release()
-            if done is not None:
-                done(n, results[n])
-            progress.advance()
-    return [results[n] for n in range(len(items))]
+            run_on_cluster(
+                runtime.cluster, function, items, ended,
+                label=label, at_once=runtime.workers, quiet=runtime.quiet,
+            )  # fmt: skip
+        elif runtime.cluster == "processes":
+            run_in_processes(function, items, runtime.n_workers, ended)
+        elif runtime.cluster == "threads" and len(items) > 1:
+            run_in_threads(function, items, runtime.n_workers, ended)
+        else:
+            run_here(function, items, ended)
+    return [results[number] for number in range(len(items))]

@@ -91,7 +91,7 @@ def scout_set(
 
     # The chunks kept; the first look's codes, copies of a tile's share, and its Gram matrix.
     kept = len(places) * tile_bytes if keep else 0
-    make_plan(f"the scout of {name}", 3 * PRIME_BYTES, kept, runtime.with_workers(1))
+    make_plan(f"the scout of {name}", 0, 3 * PRIME_BYTES + kept, runtime.with_workers(1))
     first = _first_look(source, PRIME_BYTES // (len(places) * chunk_bytes))
     looks = [[codes[some] for codes in lookout.codes(n)] for n, some in first]
     with one_blas_thread():

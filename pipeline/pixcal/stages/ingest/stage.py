@@ -311,7 +311,7 @@ def _fill(made: Build, tables: Mapping[str, Sequence[Frame]], runtime: Runtime) 
         label="ingest",
         done=lambda number, _: made.note(todo[number].step),
     )
-    scratch.rmdir()
+    shutil.rmtree(scratch, ignore_errors=True)
 
 
 def _create(cubes: Place, array: str, frames: Sequence[Frame]) -> ArrayWriter:

@@ -1,0 +1,258 @@
+"""Tasks on a cluster of Dask workers, reached by the address of its scheduler.
+
+The scheduler sees a bounded number of tasks at a time, each as a few kilobytes. When a worker dies
+it gives that worker's tasks to others (`distributed.scheduler.allowed-failures` times).
+"""
+
+import logging
+import pickle
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import lru_cache, partial
+from itertools import islice
+from pathlib import Path
+from tempfile import NamedTemporaryFile
+from typing import Any
+from uuid import uuid4
+
+from distributed import Client, Future, KilledWorker, Security, as_completed
+from distributed.comm import CommClosedError
+
+from pixcal.engine.parcel import Errand, Job, abandon, pack, versions
+from pixcal.model.errors import ClusterError, InputError
+
+CONNECT = "10s"
+AHEAD = 4
+"""Tasks handed to the scheduler for each thread: it takes a while to hear that one ended."""
+LEAST_AHEAD = 32
+"""Tasks handed over however few threads there are: a cluster that grows does so by demand."""
+LOOK_S = 5.0
+"""Time between two looks at how many threads there are."""
+LOCK = ".lock"
+"""File by which a run directory is known (`pixcal.storage.artefact`)."""
+
+Ended = Callable[[int, Any], None]
+
+
+@dataclass(frozen=True)
+class DaskWorker:
+    """A worker of a cluster; ``memory`` (bytes) is its limit, 0 when it has none."""
+
+    address: str
+    threads: int
+    memory: int
+
+
+def workers_of(address: str, *, quiet: bool) -> list[DaskWorker]:
+    """The workers that a cluster has now, at least one: it is waited for.
+
+    Raises
+    ------
+    InputError
+        If no scheduler answers at the address.
+    """
+    with _connect(address, quiet=quiet) as client:
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+        if not workers and not quiet:
+            print(f"no workers at {address} yet: dask worker {address}", file=sys.stderr)
+        while not workers:
+            time.sleep(0.2)
+            workers = client.scheduler_info(n_workers=-1)["workers"]
+    return [
+        DaskWorker(where, facts["nthreads"], facts["memory_limit"] or 0)
+        for where, facts in workers.items()
+    ]
+
+
+def run_on_cluster(
+    address: str,
+    function: Callable[[Any], Any],
+    items: Sequence[Any],
+    ended: Ended,
+    *,
+    label: str,
+    at_once: int,
+    quiet: bool,
+) -> None:
+    """Do tasks on a cluster.
+
+    Parameters
+    ----------
+    address : str
+        Of the scheduler, ``tcp://…`` or ``tls://…``.
+    function, items : callable, sequence
+        Called with each item; both are pickled.
+    ended : callable
+        Gets the number and the result of each task.
+    label : str
+        What the dashboard calls the tasks.
+    at_once : int
+        Tasks that one worker process may do at the same time; 0 for as many as it has threads.
+    quiet : bool
+        Print nothing.
+
+    Raises
+    ------
+    InputError
+        If no scheduler answers there, or workers lack files or versions; or as a task raised it.
+    ClusterError
+        If the scheduler is lost, or workers die again and again at the same task.
+    """
+    if not items:
+        return
+    packed = pack(function)
+    with (
+        _connect(address, quiet=quiet) as client,
+        _witness(packed.paths + pack(items[0]).paths) as witness,
+    ):
+        job = Job(packed.data, packed.paths + witness, at_once, versions())
+        tasks = _Tasks(client, address, job, items, f"{label}-{uuid4().hex[:8]}")
+        try:
+            for number, result in tasks.results():
+                ended(number, result)
+        except (CommClosedError, CancelledError) as error:
+            message = f"--cluster {address}: the connection to the scheduler was lost"
+            raise ClusterError(message) from error
+        finally:
+            tasks.cancel()
+
+
+@contextmanager
+def _connect(address: str, *, quiet: bool) -> Iterator[Client]:
+    if address.startswith("tls:") and not Security().get_connection_args("client")["ssl_context"]:
+        raise InputError(
+            f"--cluster {address}: Dask's configuration names no certificates "
+            "(distributed.comm.tls)"
+        )
+    # What it says of a lost connection, and in how many lines, an exception says in one.
+    log = logging.getLogger("distributed.client")
+    disabled, log.disabled = log.disabled, True
+    try:
+        try:
+            client = Client(address, timeout=CONNECT, set_as_default=False, name="pixcal")
+        except (OSError, TimeoutError, ValueError) as error:
+            raise InputError(
+                f"--cluster {address}: no Dask scheduler answers there ({_first_line(error)})"
+            ) from error
+        with client:
+            with suppress(KeyError):
+                _announce(client.dashboard_link, quiet)
+            yield client
+    finally:
+        log.disabled = disabled
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+@lru_cache
+def _announce(dashboard: str, quiet: bool) -> None:
+    """Print, once, where to watch."""
+    if not quiet:
+        print(f"dashboard {dashboard}", file=sys.stderr)
+
+
+@contextmanager
+def _witness(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
+    """A file in the run directory, while it is worked on: who does not see it has another disk.
+
+    A directory of the same name on the worker's own disk would do for all other checks.
+    """
+    runs = (up for path in paths for up in path.parents if (up / LOCK).is_file())
+    run = next(runs, None)
+    if run is None:
+        yield ()
+        return
+    for left in run.glob(".cluster-*"):
+        left.unlink(missing_ok=True)
+    with NamedTemporaryFile(dir=run, prefix=".cluster-") as file:
+        yield (Path(file.name),)
+
+
+class _Tasks:
+    """Tasks of a job on a cluster, some of them at a time."""
+
+    def __init__(
+        self, client: Client, address: str, job: Job, items: Sequence[Any], name: str
+    ) -> None:
+        self._client, self._address, self._job, self._items = client, address, job, items
+        self._name = name
+        self._do = partial(pickle.loads, buffers=[job.function])
+        self._waiting = iter(range(len(items)))
+        self._running: set[Future] = set()
+        self._room, self._look_again = 0, 0.0
+
+    def results(self) -> Iterator[tuple[int, Any]]:
+        """Number and result of every task, in the order in which they end."""
+        ended = as_completed(self._submit(), loop=self._client.loop)
+        while self._running:
+            batch = self._wait(ended)
+            self._running.difference_update(batch)
+            good = [future for future in batch if future.status != "error"]
+            for future, result in zip(good, self._client.gather(good), strict=True):
+                yield future.key[1], result
+            for future in batch:
+                if future.status == "error":
+                    raise self._failure(future.exception(), future.traceback())
+                future.release()
+            ended.update(self._submit())
+
+    def _wait(self, ended: as_completed) -> list[Future]:
+        """The tasks that have ended since, at least one; as long as there is a scheduler."""
+        while not ended.has_ready():
+            if self._client.status != "running":
+                raise CommClosedError
+            with ended.thread_condition:
+                ended.thread_condition.wait(0.1)
+        batch: list[Future] = ended.next_batch(block=False)
+        return batch
+
+    def _submit(self) -> list[Future]:
+        numbers = list(islice(self._waiting, max(0, self._window() - len(self._running))))
+        if not numbers:
+            return []
+        errands = [Errand(self._job, pack(self._items[n])).dumps() for n in numbers]
+        # Keys in pairs: the dashboard groups tasks by the first, and shows it up to the dash.
+        keys = [(self._name, n) for n in numbers]
+        futures: list[Future] = self._client.map(self._do, errands, key=keys, pure=False)
+        self._running.update(futures)
+        return futures
+
+    def _window(self) -> int:
+        """Tasks that the scheduler may know of; more as workers come."""
+        if time.monotonic() >= self._look_again:
+            at_once = self._job.at_once
+            threads = self._client.nthreads().values()
+            slots = sum(min(n, at_once) if at_once else n for n in threads)
+            self._room = max(AHEAD * slots, LEAST_AHEAD)
+            self._look_again = time.monotonic() + LOOK_S
+        return self._room
+
+    def _failure(self, error: BaseException, trace: Any) -> BaseException:
+        """The exception to raise for a task that failed: its own, unless Dask made it."""
+        where = f"--cluster {self._address}"
+        if isinstance(error, KilledWorker):
+            return ClusterError(
+                f"{where}: {error.allowed_failures + 1} workers died at the same task, the last "
+                f"was {error.last_worker.address} (out of memory? their logs tell); give them a "
+                "larger --memory-limit, or pixcal fewer --workers"
+            )
+        if isinstance(error, ModuleNotFoundError) and str(error.name).startswith("pixcal"):
+            return InputError(f"{where}: a worker has no pixcal; install it wherever workers run")
+        if type(error).__module__.startswith("distributed."):
+            return ClusterError(f"{where}: {_first_line(error)}")
+        return error.with_traceback(trace)
+
+    def cancel(self) -> None:
+        """Take back what has not begun, and wait for the rest: two must not write one chunk."""
+        if not self._running or self._client.status != "running":
+            return
+        with suppress(OSError, TimeoutError, CancelledError):
+            self._client.cancel(list(self._running), force=True)
+            while any(self._client.run(abandon, self._job.name, on_error="ignore").values()):
+                time.sleep(0.1)

@@ -1,0 +1,98 @@
+"""Tasks on this machine: one after the other, or by Dask's schedulers in threads or processes."""
+
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import lru_cache, partial
+from multiprocessing import get_context
+from typing import Any
+
+import dask
+from dask.callbacks import Callback
+
+from pixcal.engine.parcel import Job, call, pack
+from pixcal.model.errors import ClusterError
+
+DEATHS = 3
+"""Deaths of workers in a row, without a task done in between, that are put up with."""
+
+Ended = Callable[[int, Any], None]
+
+
+def run_here(function: Callable[[Any], Any], items: Sequence[Any], ended: Ended) -> None:
+    """Do the tasks in this thread; ``ended`` gets the number and the result of each."""
+    for number, item in enumerate(items):
+        ended(number, function(item))
+
+
+def run_in_threads(
+    function: Callable[[Any], Any], items: Sequence[Any], workers: int, ended: Ended
+) -> None:
+    """Do the tasks in threads."""
+    # Bound to the function: inside a graph Dask would take some items for keys or tasks.
+    tasks = {number: partial(function, item) for number, item in enumerate(items)}
+    _run_graph(tasks, ended, "threads", num_workers=workers)
+
+
+def run_in_processes(
+    function: Callable[[Any], Any], items: Sequence[Any], workers: int, ended: Ended
+) -> None:
+    """Do the tasks in processes; those that a killed one had in hand are done again.
+
+    Raises
+    ------
+    ClusterError
+        If processes die again and again at the same tasks.
+    """
+    packed = pack(function)
+    job = Job(packed.data, packed.paths)
+    left = dict(enumerate(items))
+    deaths = 0
+
+    def noted(number: int, result: Any) -> None:
+        nonlocal deaths
+        del left[number]
+        deaths = 0
+        ended(number, result)
+
+    while left:
+        tasks = {number: partial(call, job, pack(item)) for number, item in left.items()}
+        try:
+            # One by one: a task is noted when it ends, not when some others do.
+            _run_graph(
+                tasks, noted, "processes",
+                num_workers=workers, pool=_process_pool(workers), chunksize=1,
+            )  # fmt: skip
+        except BrokenProcessPool as error:
+            _process_pool.cache_clear()
+            deaths += 1
+            if deaths > DEATHS:
+                raise ClusterError(
+                    "--cluster processes: worker processes were killed again and again (out of "
+                    "memory?); give fewer --workers"
+                ) from error
+
+
+def _run_graph(
+    tasks: Mapping[int, Callable[[], Any]], ended: Ended, scheduler: str, **options: Any
+) -> None:
+    names = {f"task-{number}": number for number in tasks}
+    graph = {name: (tasks[number],) for name, number in names.items()}
+
+    def posttask(key: Any, result: Any, _dsk: Any, _state: Any, _worker: Any) -> None:
+        if key in names:
+            ended(names[key], result)
+
+    get = dask.base.get_scheduler(scheduler=scheduler)
+    with Callback(posttask=posttask):
+        get(graph, list(names), **options)
+
+
+@lru_cache(maxsize=1)
+def _process_pool(workers: int) -> ProcessPoolExecutor:
+    """Worker processes, kept: each takes seconds to import what the tasks need."""
+    # Ctrl-C reaches them too; what to do about it is this process's business.
+    return ProcessPoolExecutor(
+        workers, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
+    )

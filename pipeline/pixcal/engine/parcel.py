@@ -1,0 +1,209 @@
+"""Tasks made ready for other processes, and what those do with them."""
+
+import hashlib
+import pickle
+import platform
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from functools import lru_cache
+from importlib.metadata import version
+from io import BytesIO
+from pathlib import Path
+from threading import BoundedSemaphore, Lock
+from typing import Any
+from uuid import uuid4
+
+import cloudpickle
+from threadpoolctl import threadpool_limits
+
+import pixcal
+from pixcal.engine.malloc import keep_freed_memory
+from pixcal.model.errors import ClusterError, InputError
+
+PATIENCE_S = 1.0
+"""Time in which a file made on one machine must show on the others."""
+KEPT = 2
+"""Functions that a worker keeps unpacked: those of so many runs at the same time."""
+PACKAGES = ("numpy", "scipy", "numba", "numcodecs", "zarr", "astropy")
+"""Libraries on which the last bit of a result may depend."""
+CODE, MACHINE = "code of pixcal", "machine"
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """An object for another process.
+
+    Attributes
+    ----------
+    data : bytes
+        The object pickled, its paths made absolute: elsewhere the current folder is another one.
+    paths : tuple of Path
+        The files and folders among those paths that exist, which must exist there as well.
+    """
+
+    data: bytes
+    paths: tuple[Path, ...]
+
+
+class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
+    """Makes paths absolute, and remembers them."""
+
+    def __init__(self, file: BytesIO) -> None:
+        super().__init__(file)
+        self.paths: dict[Path, None] = {}
+
+    def reducer_override(self, obj: Any) -> Any:
+        if isinstance(obj, Path):
+            path = obj.absolute()
+            self.paths[path] = None
+            return type(path), (str(path),)
+        return super().reducer_override(obj)
+
+
+def pack(obj: Any) -> Parcel:
+    """Pickle an object for another process."""
+    file = BytesIO()
+    pickler = _Pickler(file)
+    pickler.dump(obj)
+    return Parcel(file.getvalue(), tuple(path for path in pickler.paths if path.exists()))
+
+
+@dataclass(frozen=True)
+class Job:
+    """What the tasks of one run have in common; unpacked once in every process.
+
+    Attributes
+    ----------
+    function : bytes
+        Pickled; called with the item of a task.
+    paths : tuple of Path
+        Files and folders that must exist where it is called.
+    at_once : int
+        Tasks that one process may do at the same time; 0 for as many as it likes.
+    versions : dict
+        What must be installed there (see `versions`).
+    """
+
+    function: bytes = field(compare=False)
+    paths: tuple[Path, ...] = field(compare=False)
+    at_once: int = field(default=0, compare=False)
+    versions: dict[str, str] = field(default_factory=dict, compare=False)
+    name: str = field(default_factory=lambda: uuid4().hex)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        function = pickle.PickleBuffer(self.function)
+        return Job, (function, self.paths, self.at_once, self.versions, self.name)
+
+
+@dataclass(frozen=True)
+class Errand:
+    """A task to be done where it is unpickled.
+
+    Schedulers, and workers that have another pixcal or none, can hold its bytes, as they could not
+    hold a pixcal function.
+    """
+
+    job: Job
+    item: Parcel
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return call, (self.job, self.item)
+
+    def dumps(self) -> bytes:
+        """For ``pickle.loads(…, buffers=[job.function])``, whose value is the task's result."""
+        apart: list[pickle.PickleBuffer] = []
+        return pickle.dumps(self, protocol=5, buffer_callback=apart.append)
+
+
+_opening, _counting = Lock(), Lock()
+_going_on: Counter[str] = Counter()
+_abandoned: set[str] = set()
+
+
+def call(job: Job, item: Parcel) -> Any:
+    """Do one task of a job, in the process that was chosen for it.
+
+    Raises
+    ------
+    InputError
+        If other versions are installed where this runs, or files of the task cannot be seen there.
+    """
+    with _counting:
+        if job.name in _abandoned:
+            raise ClusterError("the run was ended elsewhere")
+        _going_on[job.name] += 1
+    try:
+        with _opening:
+            function, turn = _open(job)
+        _see(item.paths)
+        with turn:
+            return function(cloudpickle.loads(item.data))
+    finally:
+        with _counting:
+            _going_on[job.name] -= 1
+
+
+def abandon(name: str) -> int:
+    """Begin no more tasks of a job in this process; returns how many are still going on."""
+    with _counting:
+        _abandoned.add(name)
+        return _going_on[name]
+
+
+@lru_cache(maxsize=KEPT)
+def _open(job: Job) -> tuple[Callable[[Any], Any], AbstractContextManager[Any]]:
+    """The function of a job, and what to hold while it runs."""
+    _compare(job.versions)
+    _see(job.paths)
+    function = cloudpickle.loads(job.function)
+    # For good, as Dask's own workers have it: nobody can tell which task ends last. Now, not
+    # earlier: the libraries that the function needs are loaded.
+    threadpool_limits(limits=1, user_api="blas")
+    keep_freed_memory()
+    return function, BoundedSemaphore(job.at_once) if job.at_once else nullcontext()
+
+
+def _see(paths: tuple[Path, ...]) -> None:
+    """Refuse work on files that are not there; network disks may show them a little late."""
+    begin = time.monotonic()
+    for path in paths:
+        while not path.exists():
+            if time.monotonic() > begin + PATIENCE_S:
+                raise InputError(
+                    f"{path}: the worker on {platform.node()} does not see it; all workers need "
+                    "the disk with the data, under the same path"
+                )
+            time.sleep(0.1)
+
+
+@lru_cache(maxsize=1)
+def versions() -> dict[str, str]:
+    """What must be the same wherever tasks run, lest results differ."""
+    code = hashlib.sha256()
+    root = Path(pixcal.__file__).parent
+    for file in sorted(root.rglob("[a-z_]*.py")):
+        code.update(f"{file.relative_to(root)}\0".encode() + file.read_bytes())
+    return {
+        "Python": ".".join(platform.python_version_tuple()[:2]),
+        "pixcal": pixcal.__version__,
+        **{package: version(package) for package in PACKAGES},
+        CODE: code.hexdigest()[:8],
+        MACHINE: platform.node(),
+    }
+
+
+def _compare(wanted: dict[str, str]) -> None:
+    if not wanted:
+        return
+    there = versions()
+    # On one machine the code is one, only edited since; two may have other clones of one version.
+    free = {MACHINE, CODE} if there[MACHINE] == wanted[MACHINE] else {MACHINE}
+    for name, here in wanted.items():
+        if name not in free and there[name] != here:
+            raise InputError(
+                f"the worker on {there[MACHINE]} has {name} {there[name]}, this process {here}; "
+                "install the same there and start it again"
+            )

@@ -1,0 +1,38 @@
+"""Workers of a Dask nanny do not fetch every buffer from the kernel anew."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+CODE = """
+import resource
+import numpy as np
+from pixcal.engine.malloc import keep_freed_memory
+
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        np.ones(1 << 20)  # 8 MiB: 2048 pages
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+faults()
+first = faults()
+keep_freed_memory()
+faults()
+print(first, faults())
+"""
+
+
+@pytest.mark.parametrize(("setting", "kept"), [("65536", True), ("65537", False)])
+def test_buffers_are_reused_where_only_the_nanny_has_chosen(setting: str, kept: bool) -> None:
+    env = os.environ | {"MALLOC_TRIM_THRESHOLD_": setting}
+    for name in ("MALLOC_MMAP_THRESHOLD_", "MALLOC_MMAP_MAX_", "MALLOC_TOP_PAD_", "LD_PRELOAD"):
+        env.pop(name, None)
+    told = subprocess.run([sys.executable, "-c", CODE], env=env, capture_output=True, check=True)
+    before, after = map(int, told.stdout.split())
+    # Huge pages may make it fewer than one fault a page.
+    if before < 1000:
+        pytest.skip("this C library keeps what was freed, or pages are huge")
+    assert (after < before / 10) == kept
