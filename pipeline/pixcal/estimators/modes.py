@@ -17,6 +17,9 @@ from pixcal.estimators.tile_sums import N_LOCAL, Carrier, TileSums
 
 F64 = NDArray[np.float64]
 
+TILES_AT_ONCE = 256
+"""Tiles whose modes are held together."""
+
 
 @dataclass(frozen=True)
 class ModeBasis:
@@ -63,13 +66,21 @@ class ModeBasis:
 
         Of the phases less the shape's.
         """
-        modes, phase = self._local(tiles.planes)
-        right = tiles.right.copy()
-        moved = np.einsum("tij,tj->ti", tiles.normal, phase)
-        square = tiles.square + (phase * (moved - 2 * right[:, :, 0])).sum(axis=1)
-        right[:, :, 0] -= moved
-        normal = np.einsum("tmi,tni->mn", modes @ tiles.normal, modes)
-        return normal, np.einsum("tmi,tib->mb", modes, right), float(square.sum())
+        size = len(self.names)
+        normal, rights = np.zeros((size, size)), np.zeros((size, tiles.right.shape[2]))
+        square = 0.0
+        # Some tiles at a time: their modes are many numbers.
+        for first in range(0, len(tiles.planes), TILES_AT_ONCE):
+            part = slice(first, first + TILES_AT_ONCE)
+            modes, phase = self._local(tiles.planes[part])
+            right = tiles.right[part].copy()
+            moved = np.einsum("tij,tj->ti", tiles.normal[part], phase)
+            square += float((phase * (moved - 2 * right[:, :, 0])).sum())
+            square += float(tiles.square[part].sum())
+            right[:, :, 0] -= moved
+            normal += np.einsum("tmi,tni->mn", modes @ tiles.normal[part], modes)
+            rights += np.einsum("tmi,tib->mb", modes, right)
+        return normal, rights, square
 
     def removed(self, planes: list[TilePlane], coefficients: F64) -> F64:
         """What to take off each tile's phases, in its local modes.
@@ -85,10 +96,13 @@ class ModeBasis:
         (tile, local, 1 + batch) float64
             The first column is relative to the tile's plane and holds the shape as well.
         """
-        modes, phase = self._local(planes)
-        removed = np.einsum("tmi,mb->tib", modes, coefficients)
-        removed[:, :, 0] += phase
-        return np.asarray(removed)
+        removed = np.empty((len(planes), N_LOCAL, coefficients.shape[1]))
+        for first in range(0, len(planes), TILES_AT_ONCE):
+            part = slice(first, first + TILES_AT_ONCE)
+            modes, phase = self._local(planes[part])
+            removed[part] = np.einsum("tmi,mb->tib", modes, coefficients)
+            removed[part, :, 0] += phase
+        return removed
 
     def solve(self, normal: F64, right: F64, spread: float) -> F64:
         """Coefficients (mode, n) of maps from their sums, with what the shape knows beforehand.

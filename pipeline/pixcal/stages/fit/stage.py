@@ -11,7 +11,7 @@ from pixcal.model.config import quantity
 from pixcal.stages.fit import sweep
 from pixcal.stages.fit.fringe_set import describe, fit_set
 from pixcal.stages.fit.maps import write_maps
-from pixcal.stages.fit.products import publish, published
+from pixcal.stages.fit.products import plan_products, publish, published
 from pixcal.stages.fit.sweep import load_run
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import (
@@ -56,6 +56,9 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         If reduce has not been run, or the frames hold no fringes that can be fitted.
     """
     require(run_dir, "reduce", 1)
+    acquisition, _ = load_run(run_dir)
+    if sets := [listed.name for listed in acquisition.frames.fringes]:
+        plan_products(run_dir, sets, runtime)
     with lock(run_dir):
         swept = sweep.run(run_dir, sweep.Config(config.batch_frames, config.chi2_limit), runtime)
         inputs = {"sweep": swept.key}
