@@ -36,13 +36,40 @@ def test_the_factor_is_the_same_for_mean_and_fringe_and_has_the_size_given(
     assert (x[1:] @ x[:-1]) / (x @ x) == pytest.approx(step, abs=4 / np.sqrt(len(x)))
 
 
-@pytest.mark.parametrize("rms", [0.002, 0.02])
+@pytest.mark.parametrize("rms", [1e-4, 0.002, 0.02])
 def test_its_size_is_found(acquired: Callable[..., Evidence], rms: float) -> None:
     found = IntensityNoise.estimate(acquired(None, {"intensity_noise": {"rms": rms}}))
     assert found is not None
     assert isinstance(found.effect, IntensityNoise)
     assert abs(found.effect.rms - rms) < 4 * found.errors["rms"]
-    assert found.errors["rms"] < 0.05 * rms
+    assert found.errors["rms"] < max(0.05 * rms, 1e-5)
+    assert found.significance > (20 if rms > 1e-3 else 4)
+
+
+def test_a_line_is_the_mean_of_a_sine_over_the_exposure(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    frames = recording(make_effect_bench(), 5000)
+    plain = states_of(frames, ())
+    for hz, share in ((11.0, np.sinc(0.22)), (100.0, 0.0)):
+        swung = states_of(frames, (IntensityNoise(0.0, 0.0, 0.01, hz),))
+        assert (swung.level / plain.level).std() * np.sqrt(2) == pytest.approx(
+            0.01 * share, rel=0.01, abs=1e-12
+        )
+
+
+def test_a_line_is_found_folded_below_half_the_frame_rate(
+    acquired: Callable[..., Evidence],
+) -> None:
+    found = IntensityNoise.estimate(
+        acquired(None, {"intensity_noise": {"rms": 0.0, "line": 1e-3, "line_hz": 11.0}})
+    )
+    assert found is not None
+    assert isinstance(found.effect, IntensityNoise)
+    folded = abs(11.0 - 2 / 0.14)
+    assert abs(found.effect.line_hz - folded) < 4 * found.errors["line_hz"] < 0.01
+    size = 1e-3 * np.sinc(0.22) / np.sinc(0.02 * folded)
+    assert abs(found.effect.line - size) < 4 * found.errors["line"] < 1e-4
     assert found.significance > 20
 
 
@@ -58,3 +85,20 @@ def test_a_correlation_is_found(acquired: Callable[..., Evidence]) -> None:
 def test_nothing_is_found_where_there_is_nothing(acquired: Callable[..., Evidence]) -> None:
     found = IntensityNoise.estimate(acquired())
     assert found is None or found.significance < 4
+
+
+@pytest.mark.parametrize(
+    "alike",
+    [
+        {"contrast_noise": {"vibration_rad": 0.2, "polarisation": 0.0}},
+        {"bias_drift": {}},
+        {"row_noise": {}},
+        {"lag": {"share": 0.01}},
+    ],
+)
+def test_what_looks_like_it_is_not_taken_for_it(
+    acquired: Callable[..., Evidence], alike: dict[str, dict[str, float]]
+) -> None:
+    found = IntensityNoise.estimate(acquired(None, alike))
+    assert found is not None
+    assert found.significance < 4

@@ -117,8 +117,8 @@ def _shaken(
     found = light.components(("contrast", *POWERS)) if found is None else found
     rms, own = found.root(0)
     error = np.hypot(own, rms * np.sqrt(1.5 / sum(map(len, light.sets))))
-    size = float(np.sqrt(2 * rms))
-    return {"vibration_rad": min(size, 2.0)}, {"vibration_rad": np.sqrt(2 * (rms + error)) - size}
+    size, above = float(np.sqrt(2 * rms)), float(np.sqrt(2 * (rms + error)))
+    return {"vibration_rad": min(size, 2.0)}, {"vibration_rad": above - size}
 
 
 def _drifting(damping: Damping, step: float) -> tuple[dict[str, float], dict[str, float]]:

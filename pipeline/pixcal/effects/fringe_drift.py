@@ -11,12 +11,7 @@ from scipy.optimize import minimize_scalar
 
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.frame_series import FrameSeries
-from pixcal.estimators.fringe_motion import (
-    Motion,
-    motion_of,
-    ramps,
-    ramps_and_colour,
-)
+from pixcal.estimators.fringe_motion import Motion, motion_of, ramps, ramps_and_colour
 from pixcal.estimators.spectral_line import Line
 from pixcal.estimators.variance_components import (
     MAX_STEPS,
@@ -38,8 +33,8 @@ HOUR_S = 3600.0
 SURE = 4.0
 """Standard deviations from which a settling is told from a ramp and a walk."""
 SETTLINGS = 10
-"""Time constants tried at first, from some steps to some lengths of the run."""
-QUICKEST, LONGEST = 3.0, 1.0
+"""Time constants tried at first, from `QUICKEST` frames to the length of the run."""
+QUICKEST = 3.0
 PARTS = ("jitter_x", "jitter_y", "walk_x", "walk_y")
 
 
@@ -100,7 +95,7 @@ class FringeDrift(Effect):
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         """As in `Effect.states`."""
-        time = np.arange(recording.count) * recording.period_s
+        time = np.arange(recording.count, dtype=float) * recording.period_s
         steps = recording.rng(self.name).standard_normal((recording.count, 2))
         walk = np.cumsum(steps, axis=0) * np.sqrt(recording.period_s / HOUR_S)
         phase = 2 * np.pi * recording.rng(self.name, 1).random()
@@ -128,7 +123,7 @@ class FringeDrift(Effect):
             swung = _vibration(motion.line, motion.series[0].exptime_s)
             values, errors = values | swung[0], errors | swung[1]
         return Estimate(
-            replace(cls.none(), **values),
+            replace(cls().scaled(0.0), **values),
             errors,
             sigmas(log_chance_of_any([walks, ramped, line])),
             "slow part of the fringe vectors of all frames, beside their white part"
@@ -140,11 +135,6 @@ class FringeDrift(Effect):
             },
         )
 
-    @classmethod
-    def none(cls) -> "FringeDrift":
-        """A fringe vector that stays."""
-        return cls().scaled(0.0)
-
 
 def _slow_parameters(
     motion: Motion, parts: Sequence[str]
@@ -155,7 +145,7 @@ def _slow_parameters(
     """
     plain = motion.components(parts, partial(_shapes, motion.crossed, None))
     ramp = plain.beta[:2]
-    ramped = log_chance(float(ramp @ np.linalg.solve(plain.beta_covariance[:2, :2], ramp)) / 2)
+    ramped = log_chance(float(ramp @ np.linalg.pinv(plain.beta_covariance[:2, :2]) @ ramp) / 2)
     tau, found = _settling(motion, parts, plain)
     error = np.sqrt(np.diag(found.shape_covariance(range(2, len(parts)))))
     walk, walk_error = np.array([found.root(2), found.root(3)]).T
@@ -186,7 +176,7 @@ def _settling(
         known = partial(_shapes, motion.crossed, (tau, None))
         return motion.components(parts, known, start=plain, steps=steps)
 
-    trials = np.geomspace(QUICKEST * step, LONGEST * length, SETTLINGS)
+    trials = np.geomspace(QUICKEST * step, length, SETTLINGS)
     tau = float(max(trials, key=lambda t: fitted(t, 0).profile))
     if sigmas(log_chance(fitted(tau, MAX_STEPS).profile - plain.profile, 2)) < SURE - 1:
         return None, plain

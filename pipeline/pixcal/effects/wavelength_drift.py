@@ -109,7 +109,7 @@ class WavelengthDrift(Effect):
         return Estimate(
             cls(**({"hop": 0.0} | values)),
             errors,
-            max(sigmas(chance), sharpest),
+            float(max(sigmas(chance), sharpest)),
             "slow part of the fringe vectors of all frames along those of their sets"
             + ("" if motion.crossed else "; a motion of the fibres along the axis could do it too"),
             {"walk_sigmas": drifts, "ramp_sigmas": ramps, "hops": len(jumps)},

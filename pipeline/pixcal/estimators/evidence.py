@@ -197,7 +197,7 @@ class Evidence:
     origin: tuple[int, int] = (0, 0)
 
     def level(self, fringes: FringeEvidence, signal: F32) -> F32:
-        """Electrons in the pixels for a signal (t, y, x) of a set: the flat and the dark put back."""
+        """Electrons in the pixels for a signal (t, y, x) of a set: flat and dark put back."""
         seconds = fringes.exptime_s if np.isfinite(fringes.exptime_s) else 0.0
         dark = np.maximum(self.dark_rate, 0) * seconds
         return signal * self.flat.astype(np.float32) + dark.astype(np.float32)
@@ -208,7 +208,7 @@ class Evidence:
 
 
 def stripes(shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """One half of a window by stripes of rows, to broadcast against (y, x); columns if rows are few.
+    """One half of a window by stripes of rows (columns if rows are few), to broadcast to (y, x).
 
     The sequence of Thue and Morse: it has no period that a fringe could fall in with.
     """

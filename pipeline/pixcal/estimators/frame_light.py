@@ -109,7 +109,7 @@ class FrameLight:
 def light_of(evidence: Evidence) -> FrameLight | None:
     """Light of all sets with frames enough; None without any."""
     found = {f.name: light_series(f) for f in evidence.fringes.values()}
-    sets = [s for s in found.values() if s is not None]
+    sets = [s.cleaned() for s in found.values() if s is not None]
     if not sets:
         return None
     level = {
@@ -165,6 +165,7 @@ def _dark_series(stack: Stack, number: int, evidence: Evidence) -> FrameSeries |
         exptime_s=stack.exptime_s,
         values=np.stack([whole, nothing], axis=1).astype(float),
         apart=np.stack([(one - other) / 2, nothing], axis=1).astype(float),
+        shapes=np.zeros((len(whole), 0)),
         noise=np.diag([max(noise[0], 1e-12), 1.0]),
         apart_noise=np.diag([max(noise[1] + noise[2], 1e-12) / 4, 1.0]),
     )

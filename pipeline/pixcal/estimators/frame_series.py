@@ -6,7 +6,7 @@ is fitted beside the series: no model of the noise stands between them.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,8 +54,9 @@ class FrameSeries:
     exptime_s : float
         nan when unknown.
     values, apart : (t, 2) float64
-        The quantities, and the half difference of theirs from two halves of the pixels; without
-        what follows the phase of the fringes, which is no noise.
+        The quantities, and the half difference of theirs from two halves of the pixels.
+    shapes : (t, p) float64
+        What follows the phase of the fringes, which is no noise.
     noise, apart_noise : (2, 2) float64
         Covariance that the noise model predicts of them, mean over frames.
     share : float
@@ -69,12 +70,26 @@ class FrameSeries:
     exptime_s: float
     values: F64
     apart: F64
+    shapes: F64
     noise: F64
     apart_noise: F64
     share: float = 1.0
 
     def __len__(self) -> int:
         return len(self.values)
+
+    def cleaned(self) -> "FrameSeries":
+        """The series without its shapes."""
+        if not self.shapes.size:
+            return self
+        rest = without(np.hstack([self.values, self.apart]), self.shapes)
+        return replace(
+            self,
+            values=rest[:, :2],
+            apart=rest[:, 2:],
+            shapes=self.shapes[:, :0],
+            share=self.share * (1 - np.linalg.matrix_rank(self.shapes) / len(self)),
+        )
 
 
 def motion_series(found: FringeEvidence) -> FrameSeries | None:
@@ -130,23 +145,23 @@ def _series(
         jacobian = slopes(free[use])
         taken.append(values(free[use]))
         noises.append(np.einsum("tai,tij,tbj->ab", jacobian, covariance[use], jacobian) / use.sum())
-    # The end frames have no neighbour there, and what is laid to neighbours cannot be told.
+    # A window of one row tells nothing of ky.
+    if min(np.diag(noise).min() for noise in noises) <= 0:
+        return None
+    # What neighbours leave in a frame is told from all but the end frames.
     inside = slice(1, -1)
     time = found.time_s[use][inside]
-    own = np.hstack([taken[0], (taken[1] - taken[2]) / 2])[inside]
-    shapes = _follows_phase(np.arctan2(found.free[use, 2], found.free[use, 1]))
-    rest = without(own, shapes)
     return FrameSeries(
         name=found.name,
         k=found.k,
         time_s=time,
         step_s=float((time[-1] - time[0]) / (len(time) - 1)) or 1.0,
         exptime_s=found.exptime_s,
-        values=rest[:, :2],
-        apart=rest[:, 2:],
+        values=taken[0][inside],
+        apart=((taken[1] - taken[2]) / 2)[inside],
+        shapes=_follows_phase(np.arctan2(found.free[use, 2], found.free[use, 1])),
         noise=noises[0],
         apart_noise=(noises[1] + noises[2]) / 4,
-        share=1 - np.linalg.matrix_rank(shapes) / len(time) if shapes.size else 1.0,
     )
 
 

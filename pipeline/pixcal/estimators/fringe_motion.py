@@ -63,7 +63,7 @@ class Motion:
     series : tuple of FrameSeries
         Without hops and a sure line.
     raw : tuple of FrameSeries
-        As found.
+        With them.
     hops : mapping of str to tuple of Hop
         Of each set.
     line : Line, optional
@@ -111,11 +111,12 @@ class Motion:
 
 def motion_of(evidence: Evidence) -> Motion | None:
     """Motion of the fringes in all sets with frames enough; None without any."""
-    raw = [s for s in map(motion_series, evidence.fringes.values()) if s is not None]
-    if not raw:
+    found = [s for s in map(motion_series, evidence.fringes.values()) if s is not None]
+    if not found:
         return None
-    hops = {s.name: find_hops(s) for s in raw}
-    still = [_without_hops(s, hops[s.name]) for s in raw]
+    hops = {s.name: find_hops(s) for s in found}
+    # A hop is in all cosine modes: what follows the phase is sought where none is left.
+    still = [_with_hops(s, hops[s.name], -1.0).cleaned() for s in found]
     line = find_line(still, _level)
     cleared = still
     if line is not None and line.sure:
@@ -126,10 +127,10 @@ def motion_of(evidence: Evidence) -> Motion | None:
         cleared = [without_line(s, line) for s in still]
     return Motion(
         series=tuple(cleared),
-        raw=tuple(raw),
+        raw=tuple(_with_hops(s, hops[s.name], 1.0) for s in still),
         hops=hops,
         line=line,
-        crossed=_crossed(raw),
+        crossed=_crossed(found),
     )
 
 
@@ -195,9 +196,7 @@ def _measured(along: F64, found: dict[int, float]) -> tuple[Hop, ...]:
     slope = float(np.median(along[width:] - along[:-width])) / width if len(along) > width else 0.0
     scatter = float(1.4826 * np.median(np.abs(steps - np.median(steps)))) / np.sqrt(2)
     hops, frames = [], sorted(found)
-    for at, before, after in zip(
-        frames, [0, *frames[:-1]], [*frames[1:], len(along)], strict=True
-    ):
+    for at, before, after in zip(frames, [0, *frames[:-1]], [*frames[1:], len(along)], strict=True):
         first, last = max(before, at - width), min(after, at + width)
         apart = (last - first) / 2
         size = along[at:last].mean() - along[first:at].mean() - slope * apart
@@ -215,11 +214,12 @@ def _differences(values: F64, width: int) -> tuple[F64, float]:
     return change, float(1.4826 * np.median(np.abs(change))) or 1e-300
 
 
-def _without_hops(series: FrameSeries, hops: Sequence[Hop]) -> FrameSeries:
+def _with_hops(series: FrameSeries, hops: Sequence[Hop], times: float) -> FrameSeries:
+    """The series with its hops added so many times."""
     colour = np.zeros(len(series))
     for hop in hops:
-        colour += hop.size * (np.arange(len(series)) >= hop.frame)
-    return replace(series, values=series.values + colour[:, None] * np.array(series.k))
+        colour += times * hop.size * (np.arange(len(series)) >= hop.frame)
+    return replace(series, values=series.values - colour[:, None] * np.array(series.k))
 
 
 def _part(name: str, series: FrameSeries) -> F64:

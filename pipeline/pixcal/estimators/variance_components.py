@@ -212,8 +212,12 @@ class _State:
         self.beta = self.spread @ np.einsum("nap,na->p", self.weighted, modes.values)
         rest = modes.values - np.einsum("nap,p->na", modes.known, self.beta)
         self.pull = np.einsum("nab,nb->na", self.weight, rest)
-        self.profile = -0.5 * modes.share * float(
-            2 * np.log(np.einsum("naa->na", root)).sum() + np.einsum("na,na->", rest, self.pull)
+        self.profile = (
+            -0.5
+            * modes.share
+            * float(
+                2 * np.log(np.einsum("naa->na", root)).sum() + np.einsum("na,na->", rest, self.pull)
+            )
         )
         self.likelihood = self.profile - 0.5 * modes.share * _log_determinant(normal)
 

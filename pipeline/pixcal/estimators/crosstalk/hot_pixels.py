@@ -18,7 +18,7 @@ from scipy.ndimage import maximum_filter, median_filter
 from pixcal.estimators.crosstalk.links import REACH, Classes, Place
 from pixcal.estimators.detector import median_and_sigma
 from pixcal.estimators.evidence import Evidence
-from pixcal.kernels.crosstalk import Coupling
+from pixcal.kernels.crosstalk import Coupling, couple, outflow
 
 F64 = NDArray[np.float64]
 
@@ -26,10 +26,16 @@ MIN_SIGMAS = 40.0
 """Dark signal of a hot pixel over the noise of the others."""
 OVERLAP = 0.01
 """Another hot pixel near the receiver, of this share of the source, spoils it."""
+OVERLAP_KNOWN = 1.0
+"""The same where what it gives is known and taken off."""
 OWN_RING = 0.2
 """A pixel below this share of a neighbour may be read from it: no source."""
 CLIP = 5.0
 """Values beyond so many errors from the median of their class are left out, if they are few."""
+RISE = 1e-4
+"""How much brighter-fatter may well make a share rise with the charge, 1/ke-."""
+ENOUGH = 4
+"""Values beyond the first that tell a rise with the charge from disagreement."""
 MIN_LEVELS = 3
 """Hot pixels of a coupling that tell whether its share changes with the signal."""
 MOST = 4000
@@ -76,8 +82,8 @@ class HotPixels:
 
     def by_class(
         self, classes: Classes, links: tuple[Place, ...], doubt: float = 0.0
-    ) -> tuple[F64, F64, NDArray[np.int64]]:
-        """Shares, their information (1 / sigma²) and the hot pixels used, (link, class, 2).
+    ) -> "ClassShares":
+        """What the hot pixels of each class show together.
 
         The second of a pair is ordered by the class of the receiver, which is the first pixel of
         the link. Each value has an error of ``doubt`` times itself as well.
@@ -87,21 +93,20 @@ class HotPixels:
         x = np.stack([np.broadcast_to(self.x[:, None], (len(self.x), len(step)))] * 2, -1)
         y[:, :, 1] -= step[:, 0]
         x[:, :, 1] -= step[:, 1]
-        value = np.zeros((len(links), classes.count, 2))
-        information, count = np.zeros_like(value), np.zeros(value.shape, np.int64)
+        found = np.zeros((6, len(links), classes.count, 2))
         sigma = np.hypot(self.sigma, doubt * self.value)
-        _by_class(self.value, sigma, classes.of(y, x), value, information, count)
-        return value, information, count
+        _by_class(self.value, sigma, self.charge, classes.of(y, x), found)
+        return ClassShares(*found)
 
     def level_dependence(
         self, couplings: Sequence[Coupling], links: Sequence[Place], first: Place
     ) -> tuple[float, float]:
         """Relative change of the shares with the signal of the hot pixels, 1/ke-, and its error.
 
-        Each coupling has its own share; the change is common to all. Noise would tell it with fewer
-        hot pixels, but there brighter-fatter looks the same. The error is infinite without any.
+        Each coupling has its own share; the change is common to all. The error is infinite where
+        none has enough hot pixels.
         """
-        right = weight = level = 0.0
+        right = weight = 0.0
         for c in couplings:
             step, side = ((c.dy, c.dx), 0) if (c.dy, c.dx) in links else ((-c.dy, -c.dx), 1)
             classes = Classes(c.every_rows, c.every_columns, first)
@@ -112,47 +117,122 @@ class HotPixels:
             if near.sum() < MIN_LEVELS:
                 continue
             w, charge = sigma[near] ** -2, self.charge[own][near]
-            mean = np.average(charge, weights=w)
-            slope = c.share * (charge - mean)
+            slope = c.share * (charge - np.average(charge, weights=w))
             right += float((w * slope) @ value[near])
             weight += float(w @ slope**2)
-            level += float(w @ slope**2 * mean)
-        if not weight:
-            return 0.0, np.inf
-        # Shares are those at the mean signal so far.
-        at_small_signals = 1 / (1 - right / weight * level / weight)
-        return right / weight * at_small_signals, weight**-0.5 * at_small_signals**2
+        return (right / weight, weight**-0.5) if weight > 0 else (0.0, np.inf)
 
 
-def hot_pixels(evidence: Evidence, links: tuple[Place, ...]) -> HotPixels | None:
-    """Find hot pixels and what their neighbours show; None where no dark signal was measured."""
+@dataclass(frozen=True)
+class ClassShares:
+    """Shares that hot pixels show, (link, class, 2) each: there and back.
+
+    Attributes
+    ----------
+    weight, value, charge
+        Information (1 / sigma²), weighted means of the share and of the charge (10³ e-).
+    square, product
+        Weighted sums, about the means, of the charge squared and of charge times share.
+    count
+        Hot pixels used.
+    """
+
+    weight: F64
+    value: F64
+    charge: F64
+    square: F64
+    product: F64
+    count: F64
+
+    def without(self, some: NDArray[np.bool_]) -> "ClassShares":
+        """The same with some of no weight."""
+        return replace(
+            self,
+            weight=np.where(some, 0.0, self.weight),
+            square=np.where(some, 0.0, self.square),
+            product=np.where(some, 0.0, self.product),
+        )
+
+    def sums(self) -> tuple[F64, F64]:
+        """Least-squares sums (link, u, u), (link, u) of the shares at small signals.
+
+        What brighter-fatter makes of hot pixels rises with their charge, alike in all of a link; it
+        is free, up to `RISE`.
+        """
+        links = len(self.weight)
+        weight, value, charge = (
+            a.reshape(links, -1) for a in (self.weight, self.value, self.charge)
+        )
+        cross = weight * charge
+        rise = (cross * charge).sum(1) + self.square.reshape(links, -1).sum(1) + RISE**-2
+        risen = (cross * value).sum(1) + self.product.reshape(links, -1).sum(1)
+        normal = weight[:, :, None] * np.eye(weight.shape[1])
+        normal -= cross[:, :, None] * cross[:, None, :] / rise[:, None, None]
+        return normal, weight * value - cross * (risen / rise)[:, None]
+
+
+def hot_pixels(
+    evidence: Evidence, links: tuple[Place, ...], known: Sequence[Coupling] = ()
+) -> HotPixels | None:
+    """Find hot pixels and what their neighbours show; None where no dark signal was measured.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    links : sequence of (int, int)
+    known : sequence of Coupling
+        What is known of the couplings: with it a receiver is freed of what other hot pixels give,
+        and need not be left out.
+    """
     exposures = [s.exptime_s for s in evidence.of_kind("dark") if np.isfinite(s.exptime_s)]
-    rate = evidence.dark_rate
-    if not exposures or not np.any(rate):
+    if not exposures or not np.any(evidence.dark_rate):
         return None
-    rest = rate - median_filter(rate, 2 * REACH + 5, mode="reflect")
+    signal = evidence.dark_rate * max(exposures)
+    rest = signal - median_filter(signal, 2 * REACH + 5, mode="reflect")
     _, noise = median_and_sigma(rest)
     if not noise > 0:
         return None
-    usable = _unsaturated(evidence)
-    peak = maximum_filter(rest, 2 * REACH + 1, mode="constant")
-    hot = (rest > MIN_SIGMAS * noise) & (rest > OWN_RING * peak) & usable
-    others = (rest > MIN_SIGMAS * noise / 10) & (rest > OWN_RING * peak)
-    y, x = np.nonzero(hot)
+    highest = rest > OWN_RING * maximum_filter(rest, 2 * REACH + 1, mode="constant")
+    y, x = np.nonzero((rest > MIN_SIGMAS * noise) & highest & _unsaturated(evidence))
     order = np.argsort(-rest[y, x], kind="stable")[:MOST]
     y, x = y[order], x[order]
     if not len(y):
         return None
     charge = rest[y, x]
-    value, clean = _patches(rest, np.where(others, rest, 0.0), y, x)
+    warm = np.where((rest > MIN_SIGMAS * noise / 10) & highest, rest, 0.0)
+    got, shares = _given(warm, y, x, links, known, evidence.origin)
+    value, clean = _patches(rest - got, warm, y, x, OVERLAP_KNOWN if known else OVERLAP)
     step = np.array(links)
     at = REACH + np.stack([step, -step], 1)
-    value = value[:, at[..., 0], at[..., 1]] / charge[:, None, None]
+    value = value[:, at[..., 0], at[..., 1]] / charge[:, None, None] + shares
     clean = clean[:, at[..., 0], at[..., 1]]
     sigma = np.where(clean, noise / charge[:, None, None], np.inf)
-    return HotPixels(
-        y, x, charge * max(exposures) * 1e-3, np.where(clean, value, 0.0), sigma, rate.shape
-    )
+    shape = (rest.shape[0], rest.shape[1])
+    return HotPixels(y, x, charge * 1e-3, np.where(clean, value, 0.0), sigma, shape)
+
+
+def _given(
+    warm: F64,
+    y: NDArray[np.intp],
+    x: NDArray[np.intp],
+    links: tuple[Place, ...],
+    known: Sequence[Coupling],
+    first: Place,
+) -> tuple[F64, F64]:
+    """What pixels (y, x) get of all hot ones, e-, and the share (h, link, 2) of each in it."""
+    shape = (warm.shape[0], warm.shape[1])
+    kept = 1 - outflow(known, shape, first)
+    collected = warm / kept
+    lost = collected - couple(np.where(warm > 0, collected, 0.0), known, first)
+    got = np.where(warm > 0, 0.0, -lost)
+    shares = np.zeros((len(y), len(links), 2))
+    for c in known:
+        source = np.zeros(shape)
+        source[c.places(shape, first)[0]] = c.share
+        step, side = ((c.dy, c.dx), 0) if (c.dy, c.dx) in links else ((-c.dy, -c.dx), 1)
+        level = 1 + c.per_ke * 1e-3 * collected[y, x]
+        shares[:, links.index(step), side] += source[y, x] * level / kept[y, x]
+    return got, shares
 
 
 def _unsaturated(evidence: Evidence) -> NDArray[np.bool_]:
@@ -164,52 +244,46 @@ def _unsaturated(evidence: Evidence) -> NDArray[np.bool_]:
 
 
 def _patches(
-    rest: F64, disturbing: F64, y: NDArray[np.intp], x: NDArray[np.intp]
+    rest: F64, warm: F64, y: NDArray[np.intp], x: NDArray[np.intp], overlap: float
 ) -> tuple[F64, NDArray[np.bool_]]:
     """Surroundings (h, row, column) of hot pixels within `REACH`, and where they can be trusted.
 
-    Flags do not matter here: what a hot pixel gives makes its neighbours hot as well.
+    That is where no other hot pixel is near that has ``overlap`` times the charge. Flags do not
+    matter: what a hot pixel gives makes its neighbours hot as well.
     """
     size = 2 * REACH
     around = np.arange(-size, size + 1)
     rows, columns = y[:, None, None] + size + around[:, None], x[:, None, None] + size + around
     patch = np.pad(rest, size, constant_values=np.nan)[rows, columns]
-    others = np.pad(disturbing, size)[rows, columns]
+    others = np.pad(warm, size)[rows, columns]
     others[:, size, size] = 0.0
     strongest = maximum_filter(others, (1, size + 1, size + 1), mode="constant")
     inner = (slice(None), slice(REACH, -REACH), slice(REACH, -REACH))
-    charge = rest[y, x][:, None, None]
+    charge = warm[y, x][:, None, None]
     with np.errstate(invalid="ignore"):
-        clean = (patch[inner] < OWN_RING * charge) & (strongest[inner] < OVERLAP * charge)
+        clean = (patch[inner] < OWN_RING * charge) & (strongest[inner] < overlap * charge)
     return patch[inner], clean
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _by_class(value: Any, sigma: Any, classes: Any, mean: Any, information: Any, used: Any) -> None:
+def _by_class(value: Any, sigma: Any, charge: Any, classes: Any, found: Any) -> None:
     pixels, links, sides = value.shape
-    of_class, count = np.empty(pixels, np.int64), mean.shape[1]
+    v, s, q = np.empty(pixels), np.empty(pixels), np.empty(pixels)
     for link in range(links):
         for side in range(sides):
-            for number in range(count):
+            for number in range(found.shape[2]):
                 n = 0
                 for h in range(pixels):
                     if classes[h, link, side] == number and sigma[h, link, side] < np.inf:
-                        of_class[n] = h
+                        v[n], s[n], q[n] = value[h, link, side], sigma[h, link, side], charge[h]
                         n += 1
-                used[link, number, side] = n
-                if n == 0:
-                    continue
-                chosen = of_class[:n]
-                v, s = np.empty(n), np.empty(n)
-                for i in range(n):
-                    v[i] = value[chosen[i], link, side]
-                    s[i] = sigma[chosen[i], link, side]
-                mean[link, number, side], information[link, number, side] = _agreed(v, s)
+                if n:
+                    _agreed(v[:n], s[:n], q[:n], found[:, link, number, side])
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _agreed(v: Any, s: Any) -> tuple[float, float]:
-    """Mean of values and its information: less where they disagree by more than chance."""
+def _agreed(v: Any, s: Any, q: Any, found: Any) -> None:
+    """Sums of values: of less weight where they disagree by more than chance."""
     w = 1 / s**2
     order = np.argsort(v)
     half, at = 0.5 * w.sum(), 0.0
@@ -222,12 +296,17 @@ def _agreed(v: Any, s: Any) -> tuple[float, float]:
     near = np.abs(v - middle) < CLIP * s
     if near.sum() < 2 or 2 * near.sum() <= len(v):
         near[:] = True
-    total = (w * near).sum()
-    mean = (w * near * v).sum() / total
-    freedom = near.sum() - 1
-    if freedom == 0:
-        return mean, total
-    scatter = (w * near * (v - mean) ** 2).sum() / freedom
-    # Reduced chi-square that chance passes once in a thousand (Wilson and Hilferty's cube).
-    usual = (1 - 2 / (9 * freedom) + 3.09 * np.sqrt(2 / (9 * freedom))) ** 3
-    return mean, total / scatter if scatter > usual else total
+    w = w * near
+    mean, charge = (w * v).sum() / w.sum(), (w * q).sum() / w.sum()
+    square, product = (w * (q - charge) ** 2).sum(), (w * (q - charge) * (v - mean)).sum()
+    freedom, rest = near.sum() - 1, (w * (v - mean) ** 2).sum()
+    if freedom >= ENOUGH and square > 0:
+        # What rises with the charge is told apart later.
+        freedom, rest = freedom - 1, rest - product**2 / square
+    if freedom > 0:
+        # Reduced chi-square that chance passes once in a thousand (Wilson and Hilferty's cube).
+        usual = (1 - 2 / (9 * freedom) + 3.09 * np.sqrt(2 / (9 * freedom))) ** 3
+        less = freedom / rest if rest > usual * freedom else 1.0
+        w, square, product = w * less, square * less, product * less
+    found[0], found[1], found[2], found[3], found[4] = w.sum(), mean, charge, square, product
+    found[5] = len(v)

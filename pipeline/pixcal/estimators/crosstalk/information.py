@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.crosstalk.covariance import NORMAL, Products
+from pixcal.estimators.crosstalk.covariance import NORMAL, TERMS, Products
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels
 from pixcal.estimators.crosstalk.links import Classes, Place, class_sums, sums_of
 from pixcal.estimators.crosstalk.residuals import UNIT
@@ -105,8 +105,8 @@ class Measured:
         for classes, sums in class_sums(self._sums, self.first):
             normal, right = self._of_noise(sums)
             if self.hot is not None:
-                value, information, _ = self.hot.by_class(classes, self.links, DOUBT)
-                normal["hot pixels"], right["hot pixels"] = _separate(value, information)
+                shown = self.hot.by_class(classes, self.links, DOUBT)
+                normal["hot pixels"], right["hot pixels"] = shown.sums()
             yield classes, Information(normal, right)
 
     def of_period(self, classes: Classes) -> Information:
@@ -116,25 +116,18 @@ class Measured:
         """
         normal, right = self._of_noise(sums_of(self._sums, classes))
         if self.hot is not None:
-            value, information, count = self.hot.by_class(classes, self.links)
-            alone = (count == 1) & (value**2 * information > MARKED**2)
+            shown = self.hot.by_class(classes, self.links)
+            alone = (shown.count == 1) & (shown.value**2 * shown.weight > MARKED**2)
             if "covariance" in normal:
-                alone &= ~_backed(value, normal["covariance"], right["covariance"])
-            information[alone] = 0.0
-            normal["hot pixels"], right["hot pixels"] = _separate(value, information)
+                alone &= ~_backed(shown.value, normal["covariance"], right["covariance"])
+            normal["hot pixels"], right["hot pixels"] = shown.without(alone).sums()
         return Information(normal, right)
 
     def _of_noise(self, sums: F64) -> tuple[dict[str, F64], dict[str, F64]]:
         if self.products is None:
             return {}, {}
-        normal, right = _shares(sums[:, :4], sums[:, 4:], self.products.read)
+        normal, right = _shares(sums[:, :TERMS], sums[:, TERMS:], self.products.read)
         return {"covariance": normal}, {"covariance": right}
-
-
-def _separate(value: F64, information: F64) -> tuple[F64, F64]:
-    """Sums (link, u, u), (link, u) of shares measured each by itself, (link, class, 2)."""
-    flat = information.reshape(len(information), -1)
-    return flat[:, :, None] * np.eye(flat.shape[1]), flat * value.reshape(flat.shape)
 
 
 def _backed(value: F64, normal: F64, right: F64) -> NDArray[np.bool_]:
@@ -151,29 +144,27 @@ def _shares(right: F64, normal: F64, read: float) -> tuple[F64, F64]:
 
     Parameters
     ----------
-    right, normal : (link, 4, class), (link, 9, class) float64
+    right, normal : (link, term, class), (link, sum, class) float64
         As in `Products`.
     read : float
         Variance without light, which the constant may well reach.
     """
     links, _, count = right.shape
+    free = range(2, TERMS)
 
     def block(i: int, j: int) -> F64:
         return normal[:, NORMAL[min(i, j), max(i, j)]]
 
     own: F64 = np.zeros((links, count, 2, count, 2))
     at = np.arange(count)
-    cross: F64 = np.empty((links, count, 2, 2))
     for i in range(2):
         for j in range(2):
             own[:, at, i, at, j] = block(i, j)
-            cross[:, :, i, j] = block(i, 2 + j)
-    nuisance = np.stack(
-        [np.stack([block(2 + i, 2 + j).sum(-1) for j in range(2)], -1) for i in range(2)], -2
-    )
-    nuisance += np.diag([read**-2, (BRIGHTER_FATTER * UNIT) ** -2])
-    cross = cross.reshape(links, 2 * count, 2)
+    cross = np.stack([np.stack([block(i, j) for j in free], -1) for i in range(2)], -2)
+    cross = cross.reshape(links, 2 * count, -1)
+    nuisance = np.stack([np.stack([block(i, j).sum(-1) for j in free], -1) for i in free], -2)
+    nuisance += np.diag([read**-2] + [(BRIGHTER_FATTER * UNIT) ** -2] * 2)
     taken = cross @ np.linalg.inv(nuisance)
     shares = right[:, :2].swapaxes(1, 2).reshape(links, -1)
-    free = shares - np.einsum("lun,ln->lu", taken, right[:, 2:].sum(-1))
-    return own.reshape(links, 2 * count, -1) - taken @ cross.swapaxes(1, 2), free
+    rest = shares - np.einsum("lun,ln->lu", taken, right[:, 2:].sum(-1))
+    return own.reshape(links, 2 * count, -1) - taken @ cross.swapaxes(1, 2), rest

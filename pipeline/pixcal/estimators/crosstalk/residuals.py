@@ -27,9 +27,9 @@ MOST = 6_000_000
 """Samples of one sequence that are used at most; of longer ones frames spread over it."""
 MIN_FRAMES = 16
 """Fewest frames of a fringe set that leave residuals."""
-STRIDE = 8
+STRIDE = 16
 """Every so many frames the modes are kept; they change little, and only their products count."""
-STEPS = 4
+STEPS = 3
 """Times that what is common to pixels and to frames is taken off in turn, till it is both."""
 LEAST = 0.1
 """Least share of a sample's noise that is left, of those that count."""
@@ -97,10 +97,8 @@ def _spread(frames: int, pixels: int) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, frames - 1, min(frames, few)).astype(int))
 
 
-def _of_stack(
-    stack: Stack, evidence: Evidence, known: Sequence[Coupling], kept: F32
-) -> Residuals:
-    """Bias, darks or flats; offset and level of each frame are free, and the level of each pixel."""
+def _of_stack(stack: Stack, evidence: Evidence, known: Sequence[Coupling], kept: F32) -> Residuals:
+    """Bias, darks or flats; offset and level of each frame are free, and each pixel's level."""
     at = _spread(len(stack.adu), evidence.good.size)
     signal = (stack.adu[at] - evidence.bias) * evidence.gain
     light = signal.mean(axis=0)
@@ -147,9 +145,7 @@ def _model(theta: F64, g: F64, dk: F64) -> tuple[F32, F32, F32]:
     return b * theta[0] + fringe, fringe, slope
 
 
-def _noise(
-    rest: F32, charge: F32, read: F32, kept: F32, common: list[F32], own: F64
-) -> Residuals:
+def _noise(rest: F32, charge: F32, read: F32, kept: F32, common: list[F32], own: F64) -> Residuals:
     """Residuals in units of their noise, without what is common to pixels and to frames.
 
     Parameters
@@ -167,7 +163,9 @@ def _noise(
     good = rest**2 < CLIP**2 * variance
     one = np.where(good, 1 / np.sqrt(variance), np.float32(0)).astype(np.float32)
     e = np.where(good, rest, np.float32(0)) * one
-    modes = _orthonormal(np.stack([c * one for c in common], axis=1).reshape(len(e), len(common), -1))
+    modes = _orthonormal(
+        np.stack([c * one for c in common], axis=1).reshape(len(e), len(common), -1)
+    )
     pixels = _PixelModes.of(own, one.reshape(len(e), -1))
     flat = e.reshape(len(e), -1)
     for _ in range(STEPS):
@@ -215,14 +213,16 @@ class _PixelModes:
         normal = ((one * one).T @ squares).astype(float).reshape(-1, m, m)
         trace = np.trace(normal, axis1=1, axis2=2)[:, None, None]
         return cls(
-            modes.astype(np.float32), one, np.linalg.inv(normal + (1e-9 * trace + 1e-12) * np.eye(m))
+            modes.astype(np.float32),
+            one,
+            np.linalg.inv(normal + (1e-9 * trace + 1e-12) * np.eye(m)),
         )
 
     def part_of(self, e: F32) -> F32:
         """What the modes explain of residuals (t, pixel) in units of their noise."""
         right = (e * self.one).T @ self.modes
         size = np.einsum("pij,pj->pi", self.covariance, right).astype(np.float32)
-        return self.one * (self.modes @ size.T)
+        return np.asarray(self.one * (self.modes @ size.T))
 
     def taken(self) -> F32:
         """Share (t, pixel) of the noise that they take off."""

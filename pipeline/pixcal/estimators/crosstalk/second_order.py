@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.crosstalk.covariance import NORMAL, Products
+from pixcal.estimators.crosstalk.covariance import NORMAL, TERMS, Products
 from pixcal.estimators.crosstalk.links import Place
 from pixcal.estimators.crosstalk.residuals import UNIT
 from pixcal.kernels.crosstalk import Coupling, outflow
@@ -49,8 +49,8 @@ def to_first_order(
         # Beyond the border there are no products, so that what rolls over does not count.
         partner = np.roll(kept, (-step[0], -step[1]), (0, 1))
         shared = third.get(step, np.zeros(shape)) / 2
-        offsets = {0: there * (kept - 1) + shared, 1: back * (partner - 1) + shared, 3: curved}
-        for i in range(4):
+        offsets = {0: there * (kept - 1) + shared, 1: back * (partner - 1) + shared, 4: curved / 2}
+        for i in range(TERMS):
             for j, offset in offsets.items():
                 right[n, i] -= found.normal[n, NORMAL[min(i, j), max(i, j)]] * offset
     return replace(found, right=right)

@@ -6,7 +6,7 @@ one acquisition of a hundred. A capacitance couples both ways alike, and a kerne
 there and back, and of many classes, are one number until the data tell them apart.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ APART = 5.0
 """Fall in chi-square for which shares are told apart, once the period is known."""
 ZERO = 2.0
 """Sigmas below which a share is none."""
+TOLD = 6.0
+"""Errors of a share in the largest of its link, from which on it may be none."""
 NOTHING = 1e-6
 """Weight of a share below which it is not measured at all."""
 
@@ -60,6 +62,10 @@ class Choice:
     Attributes
     ----------
     picks : tuple of Pick
+    links : tuple of int
+        That stand out.
+    classes : Classes
+        Of the period.
     best : float
         Largest chi-square of one number.
     looks : int
@@ -67,8 +73,15 @@ class Choice:
     """
 
     picks: tuple[Pick, ...]
+    links: tuple[int, ...]
+    classes: Classes
     best: float
     looks: int
+
+    @property
+    def critical(self) -> float:
+        """Chi-square that chance passes in `FALSE_ALARM` of the cases."""
+        return _critical(self.looks)
 
     @property
     def significance(self) -> float:
@@ -88,24 +101,33 @@ def choose(measured: Measured) -> Choice:
     First the links that do, at any period; then the one period that serves all of them best, the
     shortest that is good enough; then, for that period, which classes differ.
     """
-    every = periods(measured.shape)
-    looks = len(measured.links) * sum(3 * n * m for n, m in every)
-    critical = float(norm.isf(FALSE_ALARM / looks / 2) ** 2)
+    looks = len(measured.links) * sum(3 * n * m for n, m in periods(measured.shape))
+    critical = _critical(looks)
     gains = np.stack([_best_gains(*i.total) for _, i in measured.every_period()])
-    best = max(float(gains.max()), 1e-9)
-    there = np.nonzero(gains.max(axis=0) > critical)[0]
-    if not len(there):
-        return Choice((), best, looks)
-    present = measured.of(there.tolist())
-    classes = _period(present, critical)
-    directions, information = _directions(classes), present.of_period(classes)
+    there = tuple(int(n) for n in np.nonzero(gains.max(axis=0) > critical)[0])
+    none = Classes(1, 1, measured.first)
+    classes = _period(measured.of(there), critical) if there else none
+    return again(Choice((), there, classes, max(float(gains.max()), 1e-9), looks), measured)
+
+
+def again(choice: Choice, measured: Measured) -> Choice:
+    """The same links and period, with shares of what is measured now."""
+    if not choice.links:
+        return choice
+    present = measured.of(choice.links)
+    information, directions = present.of_period(choice.classes), _directions(choice.classes)
     picks = []
     for n, step in enumerate(present.links):
         own = information.of(n)
         basis, gain = _greedy(*own.total, directions, APART)
-        if gain > critical:
-            picks.append(_pick(own, classes, step, basis))
-    return Choice(tuple(picks), best, looks)
+        if gain > choice.critical:
+            basis = _without_zeros(*own.total, basis, gain)
+            picks.append(_pick(own, choice.classes, step, basis))
+    return replace(choice, picks=tuple(picks))
+
+
+def _critical(looks: int) -> float:
+    return float(norm.isf(FALSE_ALARM / looks / 2) ** 2)
 
 
 def _period(present: Measured, critical: float) -> Classes:
@@ -176,19 +198,28 @@ def _greedy(normal: F64, right: F64, directions: F64, apart: float) -> tuple[F64
         if each[n] < 0 or now - gain < least[n]:
             break
         basis, gain, rest = wider, now, right - normal @ wider @ solved
-    return _without_zeros(normal, right, basis, gain), gain
+    return basis, gain
 
 
 def _without_zeros(normal: F64, right: F64, basis: F64, gain: float) -> F64:
-    """A basis without the shares that have a number of their own and are none within its error."""
-    for u in np.nonzero(np.any(basis, axis=1))[0]:
+    """A basis without the shares that are none, as far as the data can tell them from others.
+
+    Those have a number of their own that is small beside its error, and the error is small beside
+    the largest share.
+    """
+    solved = np.linalg.lstsq(basis.T @ normal @ basis, basis.T @ right, rcond=1e-9)[0]
+    largest = float(np.max(np.abs(basis @ solved)))
+    told = np.diag(normal) > (TOLD / largest) ** 2
+    for u in np.nonzero(np.any(basis, axis=1) & told)[0]:
         fewer = basis.copy()
         fewer[u] = 0.0
+        numbers = np.linalg.matrix_rank(basis) - np.linalg.matrix_rank(fewer)
+        if not numbers:
+            continue
         fewer = fewer[:, np.any(fewer, axis=0)]
         solved = np.linalg.lstsq(fewer.T @ normal @ fewer, fewer.T @ right, rcond=1e-9)[0]
         now = float(solved @ fewer.T @ right)
-        numbers = np.linalg.matrix_rank(basis) - np.linalg.matrix_rank(fewer)
-        if numbers and now > gain - numbers * ZERO**2:
+        if now > gain - numbers * ZERO**2:
             basis, gain = fewer, now
     return basis
 

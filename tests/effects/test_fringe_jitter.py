@@ -1,0 +1,101 @@
+"""Fringe jitter: its size is the one given, whatever the window, and is told from drifts."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pixcal.effects.fringe_jitter import FringeJitter
+from pixcal.estimators.evidence import Evidence
+from pixcal.model.bench import Bench
+from pixcal.simulation.exposure import frames_of, states_of
+from pixcal.simulation.recording import recordings
+
+Benches = Callable[..., Bench]
+Acquired = Callable[..., Evidence]
+OFF: dict[str, Any] = {"ramp": [0, 0], "settle": [0, 0], "walk": [0, 0], "vibration": [0, 0]}
+
+
+def test_the_vector_has_the_size_given_and_no_memory_whatever_the_window(
+    make_effect_bench: Benches,
+) -> None:
+    counts = {"frames.fringes.0.count": 20_000}
+    large = make_effect_bench({"detector.shape": [31, 200], **counts})
+    small = make_effect_bench({"detector.shape": [40, 50], **counts})
+    found = []
+    for bench in (large, small):
+        frames = next(r for r in recordings(bench) if r.kind == "fringes")
+        plain, moved = states_of(frames, ()), states_of(frames, (FringeJitter((3e-5, 1e-5)),))
+        np.testing.assert_array_equal(moved.phi, plain.phi)
+        found.append(np.stack([moved.dkx, moved.dky]))
+    np.testing.assert_array_equal(found[0], found[1])
+    assert found[0].std(axis=1) == pytest.approx([3e-5, 1e-5], rel=0.03)
+    assert abs(np.corrcoef(found[0])[0, 1]) < 0.03
+    assert abs(np.corrcoef(found[0][0, 1:], found[0][0, :-1])[0, 1]) < 0.03
+
+
+def test_frames_turn_about_the_middle_of_the_window(make_effect_bench: Benches) -> None:
+    bench = make_effect_bench(
+        {"shot_noise": False, "detector.read_noise_e": 0.0, "detector.delta_rms_px": 0.0,
+         "detector.hot_fraction": 0.0, "frames.fringes.0.count": 3}
+    )  # fmt: skip
+    recording = next(r for r in recordings(bench) if r.kind == "fringes")
+    jitter = FringeJitter((1e-3, 0.0))
+    change = states_of(recording, (jitter,)).dkx
+    difference = frames_of(bench, recording, [jitter]).astype(float) - frames_of(bench, recording)
+    column = np.abs(difference).mean(axis=1)
+    assert np.all(column[:, 33] < 0.6)
+    # Where the fringes are steep, the light changes by the amplitude times the turn.
+    edge = np.abs(difference[:, :, [0, 1, 2, 3, 4]]).max(axis=(1, 2))
+    np.testing.assert_allclose(edge, 0.95 * 45_000 / 1.95 * np.abs(change) * 33, rtol=0.15)
+
+
+@pytest.mark.parametrize("rms", [(6e-6, 4e-6), (2.5e-5, 2.5e-5), (3e-4, 1e-4)])
+def test_its_size_is_found(acquired: Acquired, rms: tuple[float, float]) -> None:
+    found = FringeJitter.estimate(acquired(None, {"fringe_jitter": {"rms": list(rms)}}))
+    assert found is not None
+    assert isinstance(found.effect, FringeJitter)
+    for axis in range(2):
+        error = found.errors[f"rms[{axis}]"]
+        assert abs(found.effect.rms[axis] - rms[axis]) < 4 * error
+        assert error < max(0.06 * rms[axis], 1.2e-6)
+    assert found.significance > 4
+
+
+@pytest.mark.parametrize(
+    "alike",
+    [
+        {"fringe_drift": OFF | {"ramp": [1e-2, -5e-3]}},
+        {"fringe_drift": OFF | {"walk": [3e-4, 2e-4]}},
+        {"fringe_drift": OFF | {"vibration": [3e-5, 1e-5], "vibration_hz": 20.3}},
+        {"wavelength_drift": {"ramp": 0.0, "walk": 0.0, "hop": 3e-4, "hops_per_h": 250.0}},
+        {"rolling_shutter": {}},
+        {"lag": {"share": 0.01}},
+    ],
+)
+def test_what_looks_like_it_is_not_taken_for_it(acquired: Acquired, alike: dict[str, Any]) -> None:
+    found = FringeJitter.estimate(acquired(None, alike))
+    assert found is not None
+    assert found.significance < 4
+
+
+def test_it_is_found_beside_a_drift(acquired: Acquired) -> None:
+    found = FringeJitter.estimate(
+        acquired(
+            None,
+            {
+                "fringe_jitter": {"rms": [2e-5, 2e-5]},
+                "fringe_drift": OFF | {"walk": [3e-4, 1e-4], "ramp": [5e-3, 0]},
+            },
+        )
+    )
+    assert found is not None
+    assert isinstance(found.effect, FringeJitter)
+    for axis in range(2):
+        assert abs(found.effect.rms[axis] - 2e-5) < 4 * found.errors[f"rms[{axis}]"] < 8e-6
+
+
+def test_without_fringes_there_is_no_word(acquired: Acquired) -> None:
+    assert FringeJitter.estimate(replace(acquired(), fringes={})) is None

@@ -1,0 +1,151 @@
+"""The parts of the crosstalk's measurement, by themselves."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from pixcal.estimators.corrected import (
+    corrected_offsets,
+    offsets,
+    phase_change,
+    phase_sums,
+    straight_modes,
+)
+from pixcal.estimators.crosstalk.hot_pixels import HotPixels
+from pixcal.estimators.crosstalk.links import Classes, class_sums, links, periods, sums_of
+from pixcal.estimators.crosstalk.support import Choice
+from pixcal.estimators.modes import solve_modes
+
+
+def test_every_pair_of_pixels_within_reach_is_one_link():
+    found = links((61, 67), 3)
+    steps = set(itertools.product(range(-3, 4), range(-3, 4))) - {(0, 0)}
+    assert {s for dy, dx in found for s in ((dy, dx), (-dy, -dx))} == steps
+    assert len(found) == len(steps) / 2
+
+
+def test_sums_of_classes_are_those_of_their_pixels():
+    rng = np.random.default_rng(1)
+    values, first = rng.random((2, 37, 41)), (5, 3)
+    y, x = np.indices((37, 41))
+    seen = []
+    for classes, sums in class_sums(values, first):
+        number = classes.of(y, x)
+        for n in range(classes.count):
+            np.testing.assert_allclose(sums[:, n], values[:, number == n].sum(-1))
+        np.testing.assert_allclose(sums, sums_of(values, classes))
+        seen.append((classes.rows, classes.columns))
+    assert seen == periods((37, 41))
+    assert (8, 1) in seen
+    assert (1, 8) in seen
+    assert (4, 4) in seen
+
+
+@pytest.mark.parametrize("step", [(1, 0), (-2, 3), (5, -5)])
+def test_a_partner_has_the_class_that_is_told(step):
+    classes = Classes(4, 3, (2, 1))
+    y, x = np.indices((20, 20))
+    here, there = classes.of(y, x), classes.of(y + step[0], x + step[1])
+    for n in range(classes.count):
+        assert set(there[here == n]) == {classes.shifted(n, step)}
+    coarse = Classes(2, 3, (2, 1))
+    np.testing.assert_array_equal(coarse.groups_of(classes)[here], coarse.of(y, x))
+
+
+def test_significance_is_that_of_the_best_of_many_looks():
+    """The largest of N squares of normals; a million draws against the formula's quantiles."""
+
+    def of(best, looks):
+        return Choice((), (), Classes(1, 1, (0, 0)), best, looks).significance
+
+    rng = np.random.default_rng(2)
+    looks, drawn = 1000, []
+    for _ in range(400):
+        drawn.append(of(float((rng.standard_normal(350) ** 2).max()), looks))
+    assert np.mean(drawn) == pytest.approx(0, abs=0.2)
+    assert np.std(drawn) == pytest.approx(1, abs=0.15)
+    # Far out the looks matter less and less, and nothing overflows.
+    assert of(40.0**2, 10**5) == pytest.approx(39.8, abs=0.1)
+    ladder = [of(x**2, 10**5) for x in np.linspace(3, 60, 400)]
+    assert np.all(np.diff(ladder) > 0)
+
+
+def hot(value, charge=None, sigma=2e-4):
+    """Hot pixels at the first class, with one link."""
+    value = np.asarray(value, float)
+    n = len(value)
+    charge = np.full(n, 15.0) if charge is None else np.asarray(charge, float)
+    shares = np.zeros((n, 1, 2))
+    shares[:, 0, 0] = value
+    sigmas = np.full((n, 1, 2), np.inf)
+    sigmas[:, 0, 0] = sigma
+    return HotPixels(4 * np.arange(n), np.zeros(n, int), charge, shares, sigmas, (80, 10))
+
+
+def shown(pixels):
+    return pixels.by_class(Classes(4, 1, (0, 0)), ((1, 0),))
+
+
+def test_hot_pixels_that_agree_are_averaged():
+    found = shown(hot([0.0302, 0.0298, 0.0300, 0.0304]))
+    assert found.value[0, 0, 0] == pytest.approx(0.0301)
+    assert found.weight[0, 0, 0] == pytest.approx(4 / 2e-4**2)
+    assert np.count_nonzero(found.weight) == 1
+
+
+def test_a_warm_neighbour_among_several_is_left_out_and_of_two_neither_is_believed():
+    found = shown(hot([0.0001, -0.0001, 0.05, 0.0002, 0.0]))
+    assert abs(found.value[0, 0, 0]) < 2e-4
+    assert found.weight[0, 0, 0] == pytest.approx(4 / 2e-4**2)
+    found = shown(hot([0.0, 0.03]))
+    assert found.value[0, 0, 0] * np.sqrt(found.weight[0, 0, 0]) < 2
+
+
+def test_what_rises_with_the_charge_is_not_taken_for_a_share():
+    """Brighter-fatter moves more of a brighter hot pixel: the share at small signals is none."""
+    charge = np.linspace(8, 40, 12)
+    for share in (0.0, 0.006):
+        normal, right = shown(hot(share + 5e-5 * charge, charge, 1e-4)).sums()
+        found, error = right[0, 0] / normal[0, 0, 0], normal[0, 0, 0] ** -0.5
+        assert abs(found - share) < 2.5e-4
+        assert 1e-5 < error < 3e-4
+
+
+def test_offsets_follow_a_change_of_the_maps_less_its_modes():
+    rng = np.random.default_rng(4)
+    shape, k = (45, 52), (0.9, 0.3)
+    y, x = np.indices(shape)
+    delta = 0.002 * rng.standard_normal(shape)
+    length = float(np.hypot(*k))
+    psi = k[0] * x + k[1] * y + length * delta
+
+    def maps(phase):
+        return np.stack([np.full(shape, 2e4), 1.8e4 * np.sin(phase), 1.8e4 * np.cos(phase)])
+
+    modes = straight_modes(maps(psi), k)
+    spoilt = 0.02 * np.where(y % 4 == 1, 1.0, -0.5)
+    before = maps(psi + spoilt)
+    sigma = np.full(shape, 3e-4)
+    delta[3, 7] = np.nan
+    found = corrected_offsets(
+        delta + spoilt / length, sigma, phase_change(before, maps(psi)), modes, length
+    )
+    good = np.isfinite(delta)
+    assert np.array_equal(np.isfinite(found), good)
+    free = np.linalg.lstsq(modes[:, good].T, delta[good], rcond=None)[0]
+    np.testing.assert_allclose(found, delta - np.tensordot(free, modes, 1), atol=1e-7)
+
+
+def test_offsets_of_pieces_are_those_of_the_whole():
+    rng = np.random.default_rng(5)
+    delta, change = rng.standard_normal((2, 31, 29))
+    sigma = 1 + rng.random((31, 29))
+    modes = rng.standard_normal((7, 31, 29))
+    whole = corrected_offsets(delta, sigma, change, modes, 0.7)
+    pieces = [np.s_[:13], np.s_[13:]]
+    sums = [phase_sums(modes[:, p], delta[p], sigma[p], change[p], 0.7) for p in pieces]
+    coefficients = solve_modes(*(sum(s) for s in zip(*sums, strict=True)))
+    for p in pieces:
+        part = offsets(modes[:, p], coefficients, delta[p], change[p], 0.7)
+        np.testing.assert_allclose(part, whole[p], atol=1e-12)

@@ -1,0 +1,170 @@
+"""Components of variance: white noise and walks told apart, with honest errors."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, norm
+
+from pixcal.estimators.damping import best_damping
+from pixcal.estimators.variance_components import (
+    Components,
+    Modes,
+    _State,
+    cosine_modes,
+    damped_power,
+    estimate_components,
+    joint_log_chance,
+    log_chance,
+    log_chance_of_any,
+    sigmas,
+    signed_sigmas,
+    walk_power,
+)
+from pixcal.kernels.processes import damped_walk
+
+T = 199
+
+
+def modes_of(series: np.ndarray, *powers: np.ndarray, known: np.ndarray | None = None) -> Modes:
+    """One channel of unit noise, and parts of some powers."""
+    n = len(series) - 1
+    parts = np.stack([*powers])[..., None, None]
+    return Modes(
+        values=cosine_modes(series)[:, None],
+        known=np.zeros((n, 1, 0)) if known is None else cosine_modes(known)[:, None, :],
+        parts=parts,
+        start=np.array([1.0] + [0.0] * (len(powers) - 1)),
+        least=np.array([0.05] + [-0.1 / power.max() for power in powers[1:]]),
+    )
+
+
+def white_and_walk(rng: np.random.Generator, step: float) -> np.ndarray:
+    return rng.standard_normal(T) + step * np.cumsum(rng.standard_normal(T))
+
+
+def test_modes_of_white_noise_and_a_walk_are_independent_and_of_the_power_that_is_said() -> None:
+    # The covariance itself, by the transform of the identity and of a walk's steps.
+    white = cosine_modes(np.eye(31))
+    walk = cosine_modes(np.tril(np.ones((31, 31))))
+    np.testing.assert_allclose(white @ white.T, np.eye(30), atol=1e-12)
+    np.testing.assert_allclose(walk @ walk.T, np.diag(walk_power(31)), atol=1e-10)
+
+
+def test_a_damped_walk_has_the_power_that_is_said() -> None:
+    rng = np.random.default_rng(3)
+    power = np.mean(
+        [cosine_modes(damped_walk(rng.standard_normal(400), 0.9)) ** 2 for _ in range(400)], axis=0
+    )
+    ratio = power / damped_power(400, 0.9)
+    blocks = ratio[: 19 * 21].reshape(19, 21).mean(axis=1)
+    np.testing.assert_allclose(blocks, 1.0, atol=0.1)
+
+
+def test_the_slope_of_the_likelihood_is_its_derivative() -> None:
+    rng = np.random.default_rng(4)
+    time = np.linspace(-1, 1, T)
+    modes = modes_of(
+        white_and_walk(rng, 0.3) + 5 * time, np.ones(T - 1), walk_power(T), known=time[:, None]
+    )
+    size = np.array([1.3, 0.05])
+    score = _State(modes, size).score()
+    for part, step in enumerate((1e-4, 1e-5)):
+        up, down = size.copy(), size.copy()
+        up[part] += step
+        down[part] -= step
+        slope = (_State(modes, up).likelihood - _State(modes, down).likelihood) / (2 * step)
+        assert score[part] == pytest.approx(slope, rel=1e-3, abs=1e-3)
+
+
+def test_a_variance_by_itself_is_the_sample_variance() -> None:
+    series = 3 * np.random.default_rng(5).standard_normal(T)
+    found = estimate_components(modes_of(series, np.ones(T - 1)))
+    assert found.size[0] == pytest.approx(series.var(ddof=1))
+    assert np.sqrt(found.covariance[0, 0]) == pytest.approx(series.var(ddof=1) * np.sqrt(2 / 198))
+
+
+def test_sizes_and_errors_are_honest() -> None:
+    rng, step = np.random.default_rng(6), 0.1
+    pulls, ramps = [], []
+    time = np.linspace(-1, 1, T)
+    for _ in range(100):
+        series = white_and_walk(rng, step) + 2.0 * time
+        modes = modes_of(series, np.ones(T - 1), walk_power(T), known=time[:, None])
+        found = estimate_components(modes)
+        rms, error = found.root(1)
+        pulls.append((rms - step) / error)
+        ramps.append((found.beta[0] - 2.0) / np.sqrt(found.shape_covariance([1])[0, 0]))
+    assert abs(np.mean(pulls)) < 0.7
+    assert 0.6 < np.std(pulls) < 1.4
+    # The walk is known from a handful of modes: more tails than a normal.
+    assert 0.5 < np.mean(np.abs(ramps) < 1) < 0.85
+    assert np.mean(np.abs(ramps) < 2) > 0.8
+
+
+def test_chances_are_those_of_chi_square_and_sigmas_those_of_a_normal() -> None:
+    for pairs in (1, 2, 5):
+        for growth in (0.1, 3.0, 40.0):
+            assert log_chance(growth, pairs) == pytest.approx(chi2.logsf(2 * growth, 2 * pairs))
+    for size in (-1.0, 0.0, 3.0, 12.0):
+        assert sigmas(norm.logsf(size)) == pytest.approx(size, abs=1e-6)
+    assert sigmas(-1e6) > 1000
+    assert signed_sigmas(2.0, -1.0) == -2.0
+    two = log_chance_of_any([np.log(0.3), np.log(0.5)])
+    assert two == pytest.approx(np.log(1 - 0.7**2))
+    assert log_chance_of_any([-500.0, 0.0]) == pytest.approx(-500 + np.log(2))
+
+
+def test_what_is_not_there_comes_out_normal() -> None:
+    rng = np.random.default_rng(7)
+    found = []
+    for _ in range(150):
+        modes = modes_of(white_and_walk(rng, 0.0), np.ones(T - 1), walk_power(T))
+        full, less = estimate_components(modes), estimate_components(modes, absent=[1])
+        found.append(signed_sigmas(full.likelihood - less.likelihood, full.size[1]))
+        assert less.size[1] == 0
+        assert full.likelihood >= less.likelihood - 1e-6
+    assert max(found) < 4
+    assert abs(np.mean(found)) < 0.4
+    assert 0.5 < np.std(found) < 1.2
+
+
+def test_two_parts_together_are_as_rare_as_they_should_be() -> None:
+    rng = np.random.default_rng(8)
+    chances = []
+    for _ in range(150):
+        series = rng.standard_normal((T, 2))
+        unit = np.ones((T - 1, 1, 1))
+        x, y = np.diag([1.0, 0.0]) * unit, np.diag([0.0, 1.0]) * unit
+        half = np.zeros_like(x)
+        # Noise is seen alone in a second series.
+        modes = Modes(
+            values=cosine_modes(np.hstack([series, rng.standard_normal((T, 2))])).reshape(-1, 2),
+            known=np.zeros((2 * (T - 1), 2, 0)),
+            parts=np.stack(
+                [
+                    np.stack([part, other], axis=1).reshape(-1, 2, 2)
+                    for part, other in ((x, half), (y, half), (x, x), (y, y))
+                ]
+            ),
+            start=np.array([0.0, 0.0, 1.0, 1.0]),
+            least=np.array([-0.3, -0.3, 0.05, 0.05]),
+        )
+        full, less = estimate_components(modes), estimate_components(modes, absent=[0, 1])
+        chances.append(np.exp(joint_log_chance(full, less, full.size[:2])))
+    assert np.quantile(chances, [0.1, 0.5, 0.9]) == pytest.approx([0.1, 0.5, 0.9], abs=0.12)
+
+
+def test_a_time_constant_is_found() -> None:
+    rng = np.random.default_rng(9)
+    pulls = []
+    for _ in range(6):
+        series = rng.standard_normal(600) + 2 * damped_walk(rng.standard_normal(600), np.exp(-0.1))
+
+        def fit(keep: float, start: Components | None, series: np.ndarray = series) -> Components:
+            power = damped_power(600, keep)
+            return estimate_components(modes_of(series, np.ones(599), power), start=start)
+
+        found = best_damping(fit, 1, 1200.0)
+        assert found.growth > 10
+        pulls.append(np.log(found.time / 10) / found.log_time_error)
+        assert abs(found.rms - 2) < 4 * found.rms_error < 2.0
+    assert np.max(np.abs(pulls)) < 3.5
