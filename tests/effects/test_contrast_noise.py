@@ -113,5 +113,5 @@ def test_the_skewness_tells_a_vibration_from_what_goes_either_way(acquired: Acqu
     either = ContrastNoise.estimate(acquired(None, contrast(polarisation=0.01, polarisation_s=0.0)))
     assert one_sided is not None
     assert either is not None
-    assert one_sided.details["skewness"] < -1
+    assert one_sided.details["skewness"] < -0.7
     assert abs(either.details["skewness"]) < 0.5

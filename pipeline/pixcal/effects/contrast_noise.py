@@ -131,7 +131,10 @@ def _drifting(damping: Damping, step: float) -> tuple[dict[str, float], dict[str
 
 
 def _skewness(light: FrameLight, vibration_rad: float) -> float:
-    """Skewness of log A/B without the noise: -2 of vibrations, 0 of what goes either way."""
+    """Skewness of log A/B without the noise: well below 0 of vibrations, 0 of what goes either way.
+
+    That of one frame is -2; to be cleaned of what follows the phase mixes some frames.
+    """
     if not vibration_rad:
         return 0.0
     scatter = np.concatenate([series.values[:, 1] for series in light.sets])

@@ -18,8 +18,8 @@ SLOWEST = 4.0
 """Fewest swings of a line within a run; what is slower is drift."""
 SURE = 4.0
 """Standard deviations from which a line is taken for one."""
-TRIALS = 2.0
-"""Independent looks for each frequency that a series tells apart."""
+TRIALS = 4.0
+"""Looks for each frequency that a series tells apart: the highest place lies between any two."""
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,11 @@ MIN_SIGMAS = 40.0
 """Dark signal of a hot pixel over the noise of the others."""
 OVERLAP = 0.01
 """Another hot pixel near the receiver, of this share of the source, spoils it."""
-OVERLAP_KNOWN = 1.0
+OVERLAP_KNOWN = 0.5
 """The same where what it gives is known and taken off."""
-OWN_RING = 0.2
+UNSURE = 0.3
+"""Error of what is taken off, as a share of it."""
+OWN_RING = 0.1
 """A pixel below this share of a neighbour may be read from it: no source."""
 CLIP = 5.0
 """Values beyond so many errors from the median of their class are left out, if they are few."""
@@ -198,17 +200,25 @@ def hot_pixels(
     y, x = y[order], x[order]
     if not len(y):
         return None
-    charge = rest[y, x]
-    warm = np.where((rest > MIN_SIGMAS * noise / 10) & highest, rest, 0.0)
+    least = MIN_SIGMAS * noise / 10
+    warm = np.where((rest > least) & highest, rest, 0.0)
     got, shares = _given(warm, y, x, links, known, evidence.origin)
-    value, clean = _patches(rest - got, warm, y, x, OVERLAP_KNOWN if known else OVERLAP)
+    if known:
+        # Pixels that show much more than what they are given are warm by themselves.
+        warm = np.where((warm > 0) | (rest - got > np.maximum(least, got)), rest, 0.0)
+        got, shares = _given(warm, y, x, links, known, evidence.origin)
+    rest = rest - got
+    charge = rest[y, x]
     step = np.array(links)
-    at = REACH + np.stack([step, -step], 1)
-    value = value[:, at[..., 0], at[..., 1]] / charge[:, None, None] + shares
-    clean = clean[:, at[..., 0], at[..., 1]]
-    sigma = np.where(clean, noise / charge[:, None, None], np.inf)
+    at = (slice(None), REACH + np.stack([step[:, 0], -step[:, 0]], 1),
+          REACH + np.stack([step[:, 1], -step[:, 1]], 1))  # fmt: skip
+    around, clean = _patches(rest, warm, y, x, OVERLAP_KNOWN if known else OVERLAP)
+    others = _surroundings(got, y, x, REACH)[at] / charge[:, None, None] - shares
+    value = around[at] / charge[:, None, None] + shares
+    sigma = np.hypot(noise / charge[:, None, None], UNSURE * others)
+    value, sigma = np.where(clean[at], value, 0.0), np.where(clean[at], sigma, np.inf)
     shape = (rest.shape[0], rest.shape[1])
-    return HotPixels(y, x, charge * 1e-3, np.where(clean, value, 0.0), sigma, shape)
+    return HotPixels(y, x, charge * 1e-3, value, sigma, shape)
 
 
 def _given(
@@ -223,8 +233,7 @@ def _given(
     shape = (warm.shape[0], warm.shape[1])
     kept = 1 - outflow(known, shape, first)
     collected = warm / kept
-    lost = collected - couple(np.where(warm > 0, collected, 0.0), known, first)
-    got = np.where(warm > 0, 0.0, -lost)
+    got = couple(collected, known, first) - collected * kept
     shares = np.zeros((len(y), len(links), 2))
     for c in known:
         source = np.zeros(shape)
@@ -252,17 +261,21 @@ def _patches(
     matter: what a hot pixel gives makes its neighbours hot as well.
     """
     size = 2 * REACH
-    around = np.arange(-size, size + 1)
-    rows, columns = y[:, None, None] + size + around[:, None], x[:, None, None] + size + around
-    patch = np.pad(rest, size, constant_values=np.nan)[rows, columns]
-    others = np.pad(warm, size)[rows, columns]
+    near = _surroundings(rest, y, x, REACH)
+    others = np.nan_to_num(_surroundings(warm, y, x, size))
     others[:, size, size] = 0.0
     strongest = maximum_filter(others, (1, size + 1, size + 1), mode="constant")
-    inner = (slice(None), slice(REACH, -REACH), slice(REACH, -REACH))
-    charge = warm[y, x][:, None, None]
+    strongest = strongest[:, REACH:-REACH, REACH:-REACH]
+    charge = rest[y, x][:, None, None]
     with np.errstate(invalid="ignore"):
-        clean = (patch[inner] < OWN_RING * charge) & (strongest[inner] < overlap * charge)
-    return patch[inner], clean
+        return near, (near < OWN_RING * charge) & (strongest < overlap * charge)
+
+
+def _surroundings(values: F64, y: NDArray[np.intp], x: NDArray[np.intp], size: int) -> F64:
+    """Values (h, row, column) up to ``size`` pixels around pixels; NaN beyond the border."""
+    step = np.arange(2 * size + 1)
+    padded = np.pad(values, size, constant_values=np.nan)
+    return np.asarray(padded[y[:, None, None] + step[:, None], x[:, None, None] + step])
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

@@ -114,6 +114,8 @@ class _Search:
     def of(cls, evidence: Evidence, known: Sequence[Coupling] = ()) -> "_Search | None":
         shape = _shape(evidence)
         steps = links(shape)
+        if not steps:
+            return None
         noise, hot = products(evidence, steps, known), hot_pixels(evidence, steps, known)
         if noise is None and hot is None:
             return None

@@ -24,7 +24,7 @@ FALSE_ALARM = 0.01
 INDEPENDENT = 0.35
 """Share of the looks that are as good as independent: periods have pixels in common. Measured: it
 makes the median significance of acquisitions without couplings about zero."""
-WORTH = 10.0
+WORTH = 16.0
 """Fall in chi-square for which another share is taken, once a link is known to couple."""
 APART = 5.0
 """Fall in chi-square for which shares are told apart, once the period is known."""
