@@ -1,6 +1,8 @@
 """Small acquisitions with effects, simulated, reduced and fitted, as evidence."""
 
+import shutil
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -65,18 +67,24 @@ def make_effect_bench() -> Callable[..., Bench]:
 @pytest.fixture(scope="session")
 def acquired(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Evidence]:
     """Simulate, reduce and fit: ``acquired(changes, effects)``; each made once."""
-    made: dict[str, Evidence] = {}
+    runs: dict[str, Path] = {}
+
+    # In memory each is large.
+    @lru_cache(maxsize=4)
+    def evidence(run: Path) -> Evidence:
+        return load_evidence(run)
 
     def make(changes: Change | None = None, effects: dict[str, Any] | None = None) -> Evidence:
         text = yaml.safe_dump(plain_bench(changes, effects))
-        if text not in made:
+        if text not in runs:
             folder: Path = tmp_path_factory.mktemp("acquired")
             (folder / "bench.yaml").write_text(text)
             simulate.run(folder / "bench.yaml", folder / "acq", simulate.Config(), SYNC)
             ingest.run(folder / "acq", folder / "run", ingest.Config(), SYNC)
             reduce.run(folder / "run", reduce.Config(), SYNC)
             fit.run(folder / "run", fit.Config(), SYNC)
-            made[text] = load_evidence(folder / "run")
-        return made[text]
+            shutil.rmtree(folder / "acq")
+            runs[text] = folder / "run"
+        return evidence(runs[text])
 
     return make
