@@ -17,6 +17,7 @@ import zarr
 from astropy.io import fits
 from distributed import LocalCluster
 
+from pixcal.engine import local as local_engine
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError, RemoteError
 from pixcal.stages import fit, ingest, reduce
@@ -80,6 +81,8 @@ def runtime(request: pytest.FixtureRequest) -> Runtime:
     if request.param == "cluster":
         found: Runtime = request.getfixturevalue("cluster")
         return found
+    # Those kept from earlier tests began without the credentials of the bucket.
+    local_engine._process_pool.cache_clear()
     return Runtime(request.param, workers=2)
 
 
