@@ -337,7 +337,7 @@ def test_a_share_that_falls_with_the_signal_is_noticed(acquired: Acquired) -> No
     assert np.abs(pulls(found, Ipc(couplings))).max() < 5
 
 
-LOOK_ALIKES = ("row_noise", "brighter_fatter", "nonlinearity", "lag", "telegraph_noise")
+LOOK_ALIKES = ("row_noise", "brighter_fatter", "nonlinearity", "lag", "rolling_shutter")
 
 
 @pytest.mark.parametrize("name", LOOK_ALIKES)

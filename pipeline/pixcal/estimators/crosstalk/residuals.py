@@ -1,9 +1,10 @@
 """Frames less what they should be, as noise that can be correlated between pixels.
 
-Taken off are what is common to the pixels of a frame (light, offset, phase, fringe vector) and what
-is common to the frames of a pixel (its level; its light and fringe, and the harmonics that a curved
-response makes). The first correlates what is left, with the negative of the modes' products; the
-modes are kept, so that this can be made good. The second makes it smaller, which is made good here.
+Taken off are what is common to the pixels of a frame (offset; light, contrast and phase, the same
+over the window or growing along it) and what is common to the frames of a pixel (its level; its
+light and fringe, and the harmonics that a curved response makes). The first correlates what is
+left, with the negative of the modes' products; the modes are kept, so that this can be made good.
+The second makes it smaller, which is made good here.
 """
 
 from collections.abc import Iterator, Sequence
@@ -123,7 +124,9 @@ def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> 
     charge, _, _ = _model(collected, found.g[at], found.dk[at])
     light, fringe, slope = _model(theta, found.g[at], found.dk[at])
     y, x = (a.astype(np.float32) for a in grid((flat.shape[0], flat.shape[1])))
-    common = [light - fringe, fringe, slope, x * slope, y * slope]
+    whole = (light - fringe, fringe, slope)
+    # Also what changes along the window: a fringe vector that moves, rows that are exposed later.
+    common = [*whole, *(x * part for part in whole), *(y * part for part in whole)]
     rest = np.where(found.good, found.residual[at] * flat / UNIT**0.5, np.nan).astype(np.float32)
     read = (found.read_variance * flat**2 / UNIT).astype(np.float32)
     turn = np.exp(1j * found.phi[at])
