@@ -4,11 +4,14 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 TOOLS := $(VENV)/.installed-tools
+DOCS := $(VENV)/.installed-docs
+# Of the whole blind examination; each is used once (docs/blind.md).
+SEED ?= 2001
 # Compiled on first use: most of what is installed is never imported.
 PIP := $(BIN)/python -m pip --quiet install --no-compile
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint smoke precision bench bench-full effect-pictures reproduce reproduce-full clean
+.PHONY: help install demo test lint smoke wheel-check docs doc-pages precision bench bench-full fuzz effect-pictures reproduce reproduce-full blind blind-full clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 17
@@ -28,6 +31,10 @@ $(TOOLS): $(INSTALLED)
 	$(PIP) --group dev
 	@touch $@
 
+$(DOCS): $(INSTALLED)
+	$(PIP) --group docs
+	@touch $@
+
 demo: $(INSTALLED) ## calibrate the sample acquisition into demo/
 	$(BIN)/pixcal run data_samples/demo --out demo
 
@@ -42,6 +49,15 @@ lint: $(TOOLS) ## check style and types
 smoke: $(INSTALLED) ## run every shell command once on a small simulated acquisition
 	PATH="$(abspath $(BIN)):$$PATH" .ci/smoke
 
+wheel-check: $(TOOLS) ## build sdist and wheel, install the wheel elsewhere, run the demo there (minutes)
+	.ci/wheel-check $(VENV)
+
+docs: $(DOCS) ## build the documentation into site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet --site-dir site
+
+doc-pages: $(INSTALLED) ## write again what is generated in docs/: help texts, the picture of the layers
+	$(BIN)/python benchmarks/doc_pages.py
+
 precision: $(INSTALLED) ## 12 000 simulated frames against their truth (half a minute, 1 GB of disk)
 	$(BIN)/python benchmarks/precision.py
 
@@ -52,6 +68,12 @@ bench: $(INSTALLED) ## speed against a bare scan, and beside other methods (6 mi
 bench-full: $(INSTALLED) ## the same for 46 Mpix: time and memory (20 minutes, 60 GB of disk)
 	$(BIN)/python benchmarks/throughput.py --full
 
+fuzz: $(INSTALLED) ## bad input in thousands of cases, for docs/fuzz.md (half an hour)
+	$(BIN)/python benchmarks/fuzz.py --write
+
+torture: $(TOOLS) ## faults of all kinds done on purpose, for docs/torture.md (a quarter of an hour)
+	$(BIN)/python benchmarks/torture.py
+
 effect-pictures: $(INSTALLED) ## what every effect does to the offsets, for docs/effects (two minutes)
 	$(BIN)/python benchmarks/effect_pictures.py
 
@@ -61,6 +83,19 @@ reproduce: $(INSTALLED) ## the paper's figures into docs/reproduction (minutes, 
 reproduce-full: $(INSTALLED) ## the same in the paper's own sizes (much longer, 12 GB of disk)
 	$(BIN)/python benchmarks/reproduce.py --full
 
+blind: $(TOOLS) ## ten small cases whose effects are withheld, diagnosed and scored (minutes)
+	[ -e work/blind ] || \
+	  $(BIN)/pixcal blind make --cases 10 --seed 1001 --out work/blind --sealed work/blind-truth.json
+	$(BIN)/pixcal blind run work/blind
+	$(BIN)/pixcal blind score work/blind --sealed work/blind-truth.json
+
+blind-full: $(TOOLS) ## 200 cases of 128 x 128 pixels (hours, 15 GB of disk); another SEED for another examination
+	[ -e work/blind-full ] || \
+	  $(BIN)/pixcal blind make --cases 200 --seed $(SEED) --size standard \
+	  --out work/blind-full --sealed work/blind-full-truth.json
+	$(BIN)/pixcal blind run work/blind-full
+	$(BIN)/pixcal blind score work/blind-full --sealed work/blind-full-truth.json --oracle
+
 clean: ## remove the environment, the demo and all caches
-	rm -rf .venv demo work/reproduction build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv demo site work/reproduction build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find pipeline cli tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -4,7 +4,7 @@ import itertools
 import logging
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -198,6 +198,20 @@ def bench() -> Callable[..., Bench]:
 def make_bench() -> Callable[..., Bench]:
     """As `bench`, for fixtures that live longer."""
     return Bench
+
+
+@pytest.fixture(scope="session")
+def reseal() -> Callable[..., None]:
+    """Make artefacts that a test has altered look as if they had been written so."""
+    from pixcal.storage.artefact import read_manifest, write_manifest
+
+    def change(*folders: Path) -> None:
+        for folder in folders:
+            manifest = read_manifest(folder)
+            assert manifest is not None
+            write_manifest(folder, replace(manifest, files={}))
+
+    return change
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import click
 
@@ -13,9 +14,11 @@ from pixcal import __version__
 from pixcal.model.errors import ClusterError, PixcalError
 from pixcal_cli.allan import allan
 from pixcal_cli.astrometry import astrometry
+from pixcal_cli.blind import blind
 from pixcal_cli.budget import budget
 from pixcal_cli.compare import compare
 from pixcal_cli.crests import crests
+from pixcal_cli.diagnose import diagnose
 from pixcal_cli.fit import fit
 from pixcal_cli.ingest import ingest
 from pixcal_cli.options import examples
@@ -24,6 +27,9 @@ from pixcal_cli.report import report
 from pixcal_cli.run import run
 from pixcal_cli.simulate import simulate
 
+LONG_WORD = 600
+"""Characters of a word, such as a value that makes no sense, that are not shown in full."""
+
 
 class InOrder(click.Group):
     """Lists its commands in the order in which the data take them."""
@@ -31,6 +37,13 @@ class InOrder(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Names of the commands."""
         return list(self.commands)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; click itself would print an empty line at Ctrl-C."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt as error:
+            raise click.Abort from error
 
 
 @click.group(
@@ -42,11 +55,13 @@ class InOrder(click.Group):
         fit,
         allan,
         crests,
+        diagnose,
         astrometry,
         report,
         compare,
         simulate,
         budget,
+        blind,
     ],
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -84,6 +99,8 @@ def explain(error: BaseException) -> tuple[int, str]:
         case OSError(errno=errno.ENOSPC | errno.EDQUOT):
             place = f"{error.filename}: " if error.filename else ""
             return 1, f"{place}disk full; what was complete is kept: make room and {again}"
+        case OSError(errno=errno.ENAMETOOLONG | errno.ELOOP, filename=str() | os.PathLike()):
+            return 2, f"{error.filename}: cannot be used ({error.strerror}); choose another path"
         case PermissionError(filename=str() | os.PathLike()):
             return 2, f"{error.filename}: no permission; change its owner or mode"
         case OSError(filename=str() | os.PathLike()):
@@ -92,6 +109,12 @@ def explain(error: BaseException) -> tuple[int, str]:
             return 1, "out of memory; lower --memory or --workers"
     name = type(error).__name__
     return 1, f"internal error: {name}: {error} (PIXCAL_DEBUG=1 shows where)"
+
+
+def one_line(message: str) -> str:
+    """A message as one line that a terminal takes as it is, with long words cut in their middle."""
+    words = ("".join(c if c.isprintable() else "�" for c in word) for word in message.split())
+    return " ".join(w if len(w) < LONG_WORD else f"{w[:150]}…{w[-150:]}" for w in words)
 
 
 def invoke(args: Sequence[str]) -> int:
@@ -110,7 +133,7 @@ def invoke(args: Sequence[str]) -> int:
             traceback.print_exc()
         code, message = explain(error)
         if message:
-            click.echo(f"pixcal: {' '.join(message.split())}", err=True)
+            click.echo(f"pixcal: {one_line(message)}", err=True)
     return code or 0
 
 

@@ -121,14 +121,59 @@ def _allan_row(curve: Mapping[str, Any]) -> tuple[str, ...]:
     )
 
 
+def show_diagnosis(run: Path) -> None:
+    """Print the verdict, the causes, and where the gap is, worst first."""
+    found = read_json(run / "diagnose" / "diagnosis.json")
+    gap = found["gap"]
+    low, high = gap["interval"]
+    click.echo(
+        f"  {found['verdict']}: of the gap {gap['after']:.2f} [{low:.2f}, {high:.2f}] is left"
+    )
+    causes = [
+        (
+            cause["effect"],
+            "{:.3f} [{:.3f}, {:.3f}]".format(cause["gap_closed"], *cause["gap_closed_interval"]),
+            f"{cause['gain_over_rest']:.3f}",
+            f"{cause['p_value']:.1e}",
+            ", ".join(cause["not_told_apart_from"]) or "-",
+        )
+        for cause in found["causes"]
+    ]
+    if causes:
+        show_table(("cause", "gap closed", "over the rest", "p", "or else"), causes)
+    rows = [
+        (
+            f"{entry['domain']}: {entry['title']}",
+            entry["place"],
+            f"{_number(entry['measured'], 3)} {entry['unit']}".strip(),
+            _number(entry["simulated"], 3),
+            _number(entry["after"], 3),
+            f"{entry['significance']:.1f}",
+        )
+        for entry in gap["where"][:MOST_ROWS]
+    ]
+    if rows:
+        show_table(("where", "place", "measured", "nominal", "with causes", "sigma"), rows)
+        if len(gap["where"]) > MOST_ROWS:
+            click.echo(f"  and {len(gap['where']) - MOST_ROWS} more in diagnosis.json")
+
+
+MOST_ROWS = 8
+"""Differences that are printed."""
+
+
 def show_report(run: Path) -> None:
     """Print where the page is."""
     click.echo(f"  {run / 'products' / 'report.html'}")
 
 
-def show_run(run: Path, *, fitted: bool) -> None:
+def show_run(run: Path, *, fitted: bool, diagnosed: bool) -> None:
     """Print the results of all steps, and where the products are."""
+    if warnings := read_json(run / "ingest" / MANIFEST)["summary"]["warnings"]:
+        click.echo("\ningest")
+        show_notes(warnings)
     steps = {"reduce": show_reduce} | ({"fit": show_fit, "allan": show_allan} if fitted else {})
+    steps |= {"diagnose": show_diagnosis} if diagnosed else {}
     for stage, show in steps.items():
         click.echo(f"\n{stage}")
         show(run)

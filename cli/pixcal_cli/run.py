@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import click
 
 from pixcal.model.acquisition import load_acquisition
+from pixcal.model.errors import InputError
 from pixcal_cli import results
 from pixcal_cli.options import (
     acquisition_argument,
@@ -29,6 +30,13 @@ if TYPE_CHECKING:
 @gain_option
 @model_option
 @cubes_option
+@click.option(
+    "--diagnose/--no-diagnose",
+    "diagnosed",
+    default=True,
+    show_default=True,
+    help="Tell where the frames differ from a simulation of the bench, and why: takes the longest.",
+)
 @runtime_options
 def run(
     acquisition: Path,
@@ -37,11 +45,12 @@ def run(
     gain: str,
     model: str,
     cubes: str | None,
+    diagnosed: bool,
     runtime: "Runtime",
 ) -> None:
     """Do all steps, from the acquisition ACQ to the report under RUN."""
     # Here, not at the top: for a fast `pixcal --help`.
-    from pixcal.stages import allan, fit, ingest, reduce, report
+    from pixcal.stages import allan, diagnose, fit, ingest, reduce, report
 
     with results.announce("ingest", run / "ingest"):
         ingest.run(acquisition, run, ingest.Config(overwrite=overwrite, cubes=cubes), runtime)
@@ -53,6 +62,14 @@ def run(
             fit.run(run, fit.Config(model=model), runtime)
         with results.announce("allan", run / "allan"):
             allan.run(run, allan.Config(), runtime)
+    if diagnosed:
+        try:
+            with results.announce("diagnose", run / "diagnose"):
+                diagnose.run(run, diagnose.Config(), runtime)
+        except InputError as error:
+            # The maps are good without it.
+            click.echo(f"diagnose: not possible: {error}")
+            diagnosed = False
     with results.announce("report", run / "report"):
         report.run(run, report.Config(), runtime)
-    results.show_run(run, fitted=fringes)
+    results.show_run(run, fitted=fringes, diagnosed=diagnosed)

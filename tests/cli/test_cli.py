@@ -32,7 +32,8 @@ from pixcal_cli.options import memory_size, region
 PIXCAL = Path(sys.executable).with_name("pixcal")
 STAGES = ["ingest", "reduce", "fit", "allan", "report"]
 COMMANDS = [
-    "run", *STAGES[:-1], "crests", "astrometry", STAGES[-1], "compare", "simulate", "budget",
+    "run", *STAGES[:-1], "crests", "diagnose", "astrometry", STAGES[-1], "compare", "simulate",
+    "budget", "blind",
 ]  # fmt: skip
 
 

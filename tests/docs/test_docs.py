@@ -1,10 +1,15 @@
-"""Every block of code in the documentation is run or read; links and commands exist."""
+"""Every block of code in the documentation is run or read; links and commands exist.
+
+A block with a title (``yaml title="night/acquisition.yaml"``) is a file that the reader writes.
+"""
 
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,8 +27,10 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").r
 SHELL = ("bash", "console")
 DATA = ("yaml", "json")
 READ_ONLY = ("", "text")
-NOT_RUN = re.compile(r"(make|git clone|cd|source) ")
-"""Lines that need a clone of their own; the targets of make are looked up."""
+NOT_RUN = re.compile(r"(make|git clone|cd|source|pip install) ")
+"""Lines that need a clone or a network; the targets of make are looked up."""
+WARM = Path(__file__).with_name("warm.py")
+DEMO = "pixcal run data_samples/demo --out demo"
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,8 @@ class Block:
     line: int
     language: str
     text: str
+    title: str = ""
+    """File that the reader writes it to."""
 
     def __str__(self) -> str:
         return f"{self.page.relative_to(ROOT)}:{self.line}"
@@ -48,14 +57,14 @@ class Block:
 
 def blocks_of(page: Path) -> list[Block]:
     found: list[Block] = []
-    fence, language, start = "", "", 0
+    fence, language, title, start = "", "", "", 0
     lines: list[str] = []
     for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), start=1):
-        mark = re.match(r"\s*(`{3,})\s*(\S*)\s*$", line)
+        mark = re.match(r'\s*(`{3,})\s*(\w*)(?:\s+title="([^"]+)")?\s*$', line)
         if not fence and mark:
-            fence, language, start, lines = mark[1], mark[2], number, []
+            fence, language, title, start, lines = mark[1], mark[2], mark[3] or "", number, []
         elif fence and line.strip() == fence:
-            found.append(Block(page, start, language, "\n".join(lines)))
+            found.append(Block(page, start, language, "\n".join(lines) + "\n", title))
             fence = ""
         elif fence:
             lines.append(line)
@@ -64,7 +73,7 @@ def blocks_of(page: Path) -> list[Block]:
 
 
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
-PAGES_WITH_SHELL = [p for p in PAGES if any(b.language in SHELL for b in blocks_of(p))]
+PAGES_TO_RUN = [p for p in PAGES if any(b.language in (*SHELL, "python") for b in blocks_of(p))]
 
 
 def targets() -> set[str]:
@@ -74,25 +83,52 @@ def targets() -> set[str]:
 @pytest.fixture
 def workspace(tmp_path: Path) -> Path:
     """A directory where the documentation's commands find what they name."""
-    for name in ("configs", "data_samples", "tests"):
+    for name in ("configs", "data_samples", "docs", "tests"):
         (tmp_path / name).symlink_to(ROOT / name)
     return tmp_path
 
 
-def shell(script: str, folder: Path) -> str:
+@pytest.fixture(scope="session")
+def programs(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with ``pixcal`` and ``python`` that begin at once: see `WARM`."""
+    folder = tmp_path_factory.mktemp("warm")
+    with subprocess.Popen([sys.executable, WARM, folder], stdout=subprocess.PIPE) as server:
+        assert server.stdout is not None
+        assert server.stdout.readline() == b"ready\n"
+        yield folder
+        server.terminate()
+
+
+Shell = Callable[[str, Path], str]
+
+
+@pytest.fixture(scope="session")
+def shell(programs: Path) -> Shell:
     """Run lines as a user with the environment on the path; returns stdout."""
-    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    found = subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", script],
-        cwd=folder,
-        env=os.environ | {"PATH": path},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert found.returncode == 0, found.stderr
-    return found.stdout
+    folders = [str(programs), str(Path(sys.executable).parent), os.environ["PATH"]]
+
+    def run(script: str, folder: Path) -> str:
+        found = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", script],
+            cwd=folder,
+            env=os.environ | {"PATH": os.pathsep.join(folders)},
+            capture_output=True,
+            text=True,
+            timeout=300,
+            check=False,
+        )
+        assert found.returncode == 0, found.stderr
+        return found.stdout
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def demo(shell: Shell, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The run of `make demo`, made once, and what it printed."""
+    folder = tmp_path_factory.mktemp("demo")
+    (folder / "data_samples").symlink_to(ROOT / "data_samples")
+    return folder / "demo", shell(f"{DEMO} --quiet", folder)
 
 
 def test_the_blocks_are_found() -> None:
@@ -108,30 +144,44 @@ def test_a_block_says_what_it_is(block: Block) -> None:
         assert not re.search(r"^(\$ |pixcal |make )", block.text, re.MULTILINE)
 
 
-@pytest.mark.parametrize("page", PAGES_WITH_SHELL, ids=lambda page: page.name)
-def test_shell_blocks_run(page: Path, workspace: Path) -> None:
-    lines = [c for b in blocks_of(page) if b.language in SHELL for c in b.commands()]
-    for line in lines:
-        if line.startswith("make "):
-            assert set(line.split()[1:]) <= targets(), line
-    shell("\n".join(line for line in lines if not NOT_RUN.match(line)), workspace)
+def run_block(block: Block, folder: Path, shell: Shell) -> None:
+    """Do what a reader does: write the file, type the commands, run the program."""
+    if block.title:
+        file = folder / block.title
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(block.text, encoding="utf-8")
+    elif block.language in SHELL:
+        for line in block.commands():
+            if line.startswith("make "):
+                assert set(line.split()[1:]) <= targets(), line
+        shell("\n".join(line for line in block.commands() if not NOT_RUN.match(line)), folder)
+    elif block.language == "python":
+        (folder / "block.py").write_text(block.text, encoding="utf-8")
+        shell("python block.py", folder)
 
 
-def test_the_readme_shows_what_the_demo_prints(workspace: Path) -> None:
+@pytest.mark.parametrize("page", PAGES_TO_RUN, ids=lambda page: page.name)
+def test_the_blocks_of_a_page_run_one_after_the_other(
+    page: Path, workspace: Path, shell: Shell, request: pytest.FixtureRequest
+) -> None:
+    blocks = blocks_of(page)
+    if any({DEMO, "make demo"} & set(block.commands()) for block in blocks):
+        # The command has nothing left to do: the same is not calibrated for every page.
+        shutil.copytree(request.getfixturevalue("demo")[0], workspace / "demo")
+    for block in blocks:
+        run_block(block, workspace, shell)
+
+
+def test_the_readme_shows_what_the_demo_prints(demo: tuple[Path, str]) -> None:
     """All words and lines; numbers may differ in their last digits from machine to machine."""
 
     def words(text: str) -> list[list[str]]:
         return [re.sub(r"-?\d[\d.]*(e-\d+)?", "#", line).split() for line in text.splitlines()]
 
     (command,) = re.findall(r"^demo:.*\n\t\$\(BIN\)/(.*)$", (ROOT / "Makefile").read_text(), re.M)
+    assert command == DEMO
     (shown,) = (b.text for b in blocks_of(ROOT / "README.md") if b.language == "text")
-    assert words(shell(f"{command} --quiet", workspace).strip()) == words(shown)
-
-
-def test_python_blocks_run(workspace: Path) -> None:
-    for block in (b for b in BLOCKS if b.language == "python"):
-        (workspace / "block.py").write_text(block.text, encoding="utf-8")
-        shell("python block.py", workspace)
+    assert words(demo[1].strip()) == words(shown)
 
 
 @pytest.mark.parametrize("block", [b for b in BLOCKS if b.language in DATA], ids=str)

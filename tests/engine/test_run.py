@@ -9,8 +9,10 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from functools import partial
+from pathlib import Path
 from typing import Any
 
+import cloudpickle
 import pytest
 from distributed import LocalCluster
 
@@ -105,6 +107,30 @@ def test_threads_are_threads_and_processes_processes() -> None:
 
 def _pid(_item: None) -> int:
     return os.getpid()
+
+
+def _fail_or_mark(folder: Path, item: int) -> None:
+    (folder / f"{item}.begun").touch()
+    if item == 0:
+        while not (folder / "1.begun").exists():
+            threading.Event().wait(0.01)
+        raise ValueError
+    threading.Event().wait(0.4)
+    (folder / f"{item}.ended").touch()
+
+
+@pytest.mark.parametrize("place", ["threads", "processes"])
+def test_what_has_begun_has_ended_when_a_failure_comes_out(place: str, tmp_path: Path) -> None:
+    """The caller gives up its lock then: two must not write one chunk."""
+    cloudpickle.register_pickle_by_value(sys.modules[__name__])
+    # Dask begins with the last of the tasks.
+    items = [5, 4, 3, 2, 1, 0]
+    with pytest.raises(ValueError):
+        run_tasks(partial(_fail_or_mark, tmp_path), items, Runtime(place, 2), label="test")
+    begun, ended = (
+        {file.stem for file in tmp_path.glob(f"*.{state}")} for state in ("begun", "ended")
+    )
+    assert begun - ended == {"0"}
 
 
 @pytest.mark.parametrize("workers", [1, 3])

@@ -65,7 +65,7 @@ def test_optional_keys_may_be_absent() -> None:
 
 MISTAKES: list[tuple[list[Any], Any, list[str]]] = [
     (["schema"], "pixcal/acquisition/9", ["schema", "pixcal/acquisition/9", SCHEMA]),
-    (["detector", "pitch_um"], 0, ["detector.pitch_um", "greater than 0 um"]),
+    (["detector", "pitch_um"], 0, ["detector.pitch_um", "below 0.01 um"]),
     (["detector", "pitch_um"], "4.4 um", ["detector.pitch_um", "um"]),
     (["detector", "pitch_mm"], 1, ["detector", "pitch_mm", "pitch_um"]),
     (["detector", "read_noise_e"], -1, ["detector.read_noise_e", "below 0 e-"]),

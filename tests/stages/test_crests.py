@@ -91,12 +91,13 @@ def test_crests_and_fit_agree(fitted: Path, name: str) -> None:
     assert agreement["phase_rms_px"] < 3 * agreement["phase_sigma_px"] < 1e-3
 
 
-def test_a_wrong_fit_shows(fitted: Path, tmp_path: Path) -> None:
+def test_a_wrong_fit_shows(fitted: Path, tmp_path: Path, reseal: Any) -> None:
     run = tmp_path / "run"
     shutil.copytree(fitted, run)
     facts = read_json(run / "fit" / "fit.json")
     facts["sets"]["vertical"]["geometry"]["baseline_y_mm"] += 0.05
     write_json(run / "fit" / "fit.json", facts)
+    reseal(run / "fit")
     crests.run(run, Config(frames=7), SYNC)
     agreement = found(run)["vertical"]["agreement"]
     assert abs(agreement["parameters"]["baseline_y"]["difference_sigma"]) > 10

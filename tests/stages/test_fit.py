@@ -185,7 +185,7 @@ def test_a_damaged_chunk_is_named(fitted, tmp_path):
         fit.run(again, fit.Config(), Runtime())
 
 
-def test_masked_pixels_are_nan_with_their_flag(make_bench, write_reduced, tmp_path):
+def test_masked_pixels_are_nan_with_their_flag(make_bench, write_reduced, reseal, tmp_path):
     bench = make_bench(shape=(40, 45), frames=100, sets={"only": (4.0, 4.0)}, interfringe=6.0)
     run = write_reduced(bench, tmp_path / "run")
     group = run / "reduce" / "reduced.zarr" / "only"
@@ -193,6 +193,7 @@ def test_masked_pixels_are_nan_with_their_flag(make_bench, write_reduced, tmp_pa
     mask[3, 4], mask[10, 11] = PixelFlag.HOT, PixelFlag.DEAD
     shutil.rmtree(group / "mask")
     write_array(group / "mask", mask, dims=("y", "x"), chunks=(128, 128))
+    reseal(run / "reduce")
     fit.run(run, fit.Config(), Runtime())
     data, sigma, flags, header = read_map(run / "products" / "delta_fringe.fits")
     np.testing.assert_array_equal(flags, mask)
@@ -204,7 +205,7 @@ def test_masked_pixels_are_nan_with_their_flag(make_bench, write_reduced, tmp_pa
     assert np.nanstd(error) / bench.bound("only", 31) < 1.07
 
 
-def test_hyperbolic_fringes_are_seen_and_fitted(make_bench, write_reduced, tmp_path):
+def test_hyperbolic_fringes_are_seen_and_fitted(make_bench, write_reduced, reseal, tmp_path):
     """Fibres 18 mm aside and 10 mm farther than nominal, baseline 5 % longer."""
     bench = make_bench(
         shape=(120, 140), frames=150, distance=410.0, offset=(18.0, -18.0),
@@ -216,6 +217,7 @@ def test_hyperbolic_fringes_are_seen_and_fitted(make_bench, write_reduced, tmp_p
     for number, nominal in enumerate(([6.0, 0.0], [0.0, 6.0])):
         acquisition["frames"]["fringes"][number]["baseline_mm"] = nominal
     config.write_text(json.dumps(acquisition))
+    reseal(run / "ingest")
     fit.run(run, fit.Config(), Runtime())
     result = json.loads((run / "products" / "fit.json").read_text())
     for name, product in SETS.items():
@@ -290,13 +292,14 @@ def remask(run, name, mask):
         ((150, 9), np.s_[3:5, :]),
     ],
 )
-def test_tiles_of_few_good_pixels(make_bench, write_reduced, tmp_path, shape, masked):
+def test_tiles_of_few_good_pixels(make_bench, write_reduced, reseal, tmp_path, shape, masked):
     name, baseline = ("vertical", (6.0, 0.0)) if shape[1] > 9 else ("horizontal", (0.0, 6.0))
     bench = make_bench(shape=shape, frames=80, sets={name: baseline})
     run = write_reduced(bench, tmp_path / "run")
     mask = np.zeros(shape, np.uint8)
     mask[masked] = PixelFlag.DEAD
     remask(run, name, mask)
+    reseal(run / "reduce")
     fit.run(run, fit.Config(), Runtime())
     data, sigma, flags, _ = read_map(run / "products" / "delta_fringe.fits")
     np.testing.assert_array_equal(flags > 0, mask > 0)
@@ -357,7 +360,7 @@ def test_a_set_without_a_pixel_that_can_be_fitted_is_named(fitted, tmp_path, mon
 
 
 def test_the_consistency_of_sets_counts_pixels_that_one_set_lacks(
-    make_bench, write_reduced, tmp_path
+    make_bench, write_reduced, reseal, tmp_path
 ):
     bench = make_bench(
         shape=(50, 55), frames=80,
@@ -367,6 +370,7 @@ def test_the_consistency_of_sets_counts_pixels_that_one_set_lacks(
     mask = np.zeros(bench.shape, np.uint8)
     mask[5:] = PixelFlag.DEAD
     remask(run, "c", mask)
+    reseal(run / "reduce")
     fit.run(run, fit.Config(), Runtime())
     result = json.loads((run / "products" / "fit.json").read_text())
     # Nine pixels of ten have two sets, which cannot disagree.

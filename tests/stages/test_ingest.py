@@ -295,6 +295,30 @@ def test_file_changed_while_read(
     assert not (tmp_path / "run/ingest").exists()
 
 
+def test_file_written_to_while_read_is_not_noted_as_done(
+    acquisition: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Put back with its own time, the file looks as ever: what was read of it must be forgotten."""
+    file, read_exactly = acquisition / "v/f3.fits", fits_rows._read_exactly
+    body, facts = file.read_bytes(), file.stat()
+
+    def disturbed(handle: Any, start: int, raw: NDArray[Any], path: Path) -> None:
+        if path == file:
+            file.write_bytes(body[::-1])
+        read_exactly(handle, start, raw, path)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(fits_rows, "_read_exactly", disturbed)
+        with pytest.raises(InputError, match=r"v/f3\.fits: changed while it was being read"):
+            ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+    (journal,) = (tmp_path / "run").glob(".partial/*/journal.jsonl")
+    assert "vertical 0:64" not in journal.read_text()
+    file.write_bytes(body)
+    os.utime(file, ns=(facts.st_atime_ns, facts.st_mtime_ns))
+    ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+    np.testing.assert_array_equal(read(tmp_path / "run"), noise((70, 67, 131)))
+
+
 def test_chunk_that_vanished_does_not_block_the_next_run(
     acquisition: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -14,13 +14,14 @@ from PIL import Image
 
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import DamagedError, InputError
-from pixcal.report import page as page_module
+from pixcal.report import blocks as blocks_module
 from pixcal.stages import report
 from pixcal.storage.artefact import build, read_manifest, write_json
 from pixcal.storage.cube import create_group, write_array
 
 SECTIONS = (
-    "maps", "levels", "temporal", "noise", "allan", "detector", "masks", "removed", "provenance",
+    "diagnosis", "maps", "levels", "temporal", "noise", "allan", "detector", "masks", "removed",
+    "provenance",
 )  # fmt: skip
 RUNTIME = Runtime(cluster="sync")
 NASTY = "<script>alert('x')</script> & \"quotes\""
@@ -36,7 +37,7 @@ def make_run(
     shape: tuple[int, int] = (67, 131),
     sets: tuple[str, ...] = ("vertical", "horizontal"),
     *,
-    stages: tuple[str, ...] = ("ingest", "reduce", "sweep", "fit", "allan"),
+    stages: tuple[str, ...] = ("ingest", "reduce", "sweep", "fit", "allan", "diagnose"),
     name: str = "CHIP",
     moving: bool = False,
     masked: bool = True,
@@ -59,6 +60,8 @@ def make_run(
         write_fit(run, shape, mask, sets, keys["sweep"], moving, rng)
     if "allan" in stages and "fit" in stages:
         write_allan(run, sets)
+    if "diagnose" in stages:
+        write_diagnose(run)
     return run
 
 
@@ -184,6 +187,35 @@ def write_allan(run: Path, sets: tuple[str, ...]) -> None:
         )
 
 
+def write_diagnose(run: Path, verdict: str = "explained", effects: tuple[str, ...] = ()) -> None:
+    """A cause that ``effects`` names, or lag; and the curve that gave it away."""
+    band = {"value": [0.0, 1.0], "low": [-0.1, 0.9], "high": [0.1, 1.1]}
+    curve = {
+        "statistic": "contrast_by_step", "set": "one", "title": "contrast by step",
+        "kind": "linear", "domain": "time", "unit": "", "x_label": "frames before", "x": [1.0, 2.0],
+        "measured": [2.0, 1.0], "nominal": band, "with_effects": band, "z": [9.0, 0.0],
+        "z_after": [0.5, 0.0], "in_gap": True, "left": 0.0, "weight": 81.0, "significance": 9.0,
+        "significance_after": -37.0,
+    }  # fmt: skip
+    cause = {
+        "effect": "lag", "title": "left behind", "parameters": {"share": 0.002},
+        "uncertainty": {"share": 1e-5}, "gap_closed": 0.97, "gap_closed_interval": [0.95, 0.98],
+        "gain_over_rest": 0.97, "p_value": 1e-30, "sigmas": 30.0, "why": NASTY,
+        "given_away_by": [{"statistic": "contrast_by_step", "set": "one"}],
+        "not_told_apart_from": [],
+    }  # fmt: skip
+    facts = {
+        "schema": "pixcal/diagnosis/1", "verdict": verdict, "statistics": 1, "candidates": [],
+        "causes": [cause | {"effect": name} for name in effects or ("lag",)],
+        "gap": {"total": 1.0, "after": 0.03, "interval": [0.02, 0.05], "where": [], "absolute": [],
+                "domains": {"time": [1.0, 0.03]}},
+    }  # fmt: skip
+    inputs = {"reduce": read_manifest(run / "reduce").key}
+    with build(run, "diagnose", 1, {"effects": list(effects), "nominal": {}}, inputs) as made:
+        write_json(made.folder / "diagnosis.json", facts)
+        write_json(made.folder / "curves.json", [curve])
+
+
 def page_of(run: Path) -> str:
     report.run(run, report.Config(), RUNTIME)
     return (run / "products" / "report.html").read_text(encoding="utf-8")
@@ -200,7 +232,7 @@ def section(page: str, name: str) -> str:
 @pytest.fixture
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests of words: drawing takes most of the time."""
-    monkeypatch.setattr(page_module, "png", lambda _figure: b"")
+    monkeypatch.setattr(blocks_module, "png", lambda _figure: b"")
 
 
 @pytest.fixture(scope="module")
@@ -262,7 +294,7 @@ def test_modes_and_flags_are_in_words(page: str) -> None:
 
 def test_numbers_and_keys_are_listed(page: str, whole: Path) -> None:
     provenance = section(page, "provenance")
-    for stage in ("ingest", "reduce", "sweep", "fit", "allan"):
+    for stage in ("ingest", "reduce", "sweep", "fit", "allan", "diagnose"):
         assert read_manifest(whole / stage).key in provenance
     for key in set_facts(0):
         assert key in provenance or key in ("removed_modes", "geometry")
@@ -279,7 +311,7 @@ def test_it_is_skipped_until_an_input_changes(whole: Path) -> None:
     assert (whole / "report" / "manifest.json").stat().st_mtime_ns == before
     assert (whole / "products" / "report.html").exists()
     assert manifest.inputs["allan"] == read_manifest(whole / "allan").key
-    assert set(manifest.inputs) == {"ingest", "reduce", "sweep", "fit", "allan"}
+    assert set(manifest.inputs) == {"ingest", "reduce", "sweep", "fit", "allan", "diagnose"}
 
 
 @pytest.mark.slow
@@ -301,6 +333,27 @@ def test_a_new_fit_makes_a_new_page_and_an_old_allan_is_pointed_out(tmp_path: Pa
     text = words(page_of(run))
     assert "Allan was made from an earlier fit: run 'pixcal allan' again." in text
     assert "Fit was made from an earlier sweep: run 'pixcal fit' again." in text
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_another_diagnosis_makes_another_page(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", (23, 29), ("one",), stages=("ingest", "reduce"))
+    assert "Not measured: run 'pixcal diagnose RUN'" in words(section(page_of(run), "diagnosis"))
+    write_diagnose(run)
+    found = words(section(page_of(run), "diagnosis"))
+    assert "left behind (lag) accounts for" in found
+    # What an effect is and its parameters' meaning come from the effect itself.
+    assert "each electron stays behind" in found
+    assert "of a frame's charge, left behind for later frames" in found
+    assert NASTY in found
+    shutil.rmtree(run / "diagnose")
+    write_diagnose(run, "partly explained", ("lag", "own_effect"))
+    assert "(lag) and left behind (own_effect) close" in words(page_of(run))
+    shutil.rmtree(run / "reduce")
+    write_reduce(run, (23, 29), np.zeros((23, 29), np.uint8), (), "k", np.random.default_rng(0))
+    assert "Diagnose was made from an earlier reduce: run 'pixcal diagnose' again." in (
+        words(page_of(run))
+    )
 
 
 def test_one_set_gives_the_fringe_axis(tmp_path: Path) -> None:
@@ -334,10 +387,11 @@ def test_without_a_fit_the_detector_is_shown(tmp_path: Path, sets: tuple[str, ..
 
 
 @pytest.mark.usefixtures("without_figures")
-def test_without_calibration_maps_the_page_says_so(tmp_path: Path) -> None:
+def test_without_calibration_maps_the_page_says_so(tmp_path: Path, reseal: Any) -> None:
     run = make_run(tmp_path / "run", (20, 20), ("one",))
     shutil.rmtree(run / "reduce" / "calibration.zarr")
     (run / "reduce" / "reduce.json").unlink()
+    reseal(run / "reduce")
     assert "Not measured: the reduction left no calibration maps" in words(page_of(run))
 
 

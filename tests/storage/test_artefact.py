@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,9 @@ def test_a_complete_artefact(tmp_path: Path) -> None:
         assert not made.resumed
     assert sorted(f.name for f in (tmp_path / "fit").iterdir()) == ["data", MANIFEST]
     key = artefact_key("fit", 1, CONFIG, INPUTS)
-    assert require(tmp_path, "fit", 1) == Manifest("fit", 1, key, CONFIG, INPUTS, __version__, {})
+    files = {"data": sha256(b"x").hexdigest()[:32]}
+    expected = Manifest("fit", 1, key, CONFIG, INPUTS, __version__, {}, files)
+    assert require(tmp_path, "fit", 1) == expected
     assert not list((tmp_path / ".partial").iterdir())
 
 

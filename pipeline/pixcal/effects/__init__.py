@@ -8,12 +8,13 @@ import importlib
 import importlib.util
 import inspect
 import pkgutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from pixcal.effects._own import checked
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
@@ -46,13 +47,30 @@ def effect_of_file(path: Path) -> type[Effect]:
     module = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(module)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise InputError(f"{path}: cannot be imported ({reason:.200})") from error
+        raise InputError(f"{path}: cannot be imported ({reason:.200}); mend it") from error
     try:
-        return _only_effect(module)
+        return checked(_only_effect(module), path)
     except TypeError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def known_effects(own: Iterable[Path] = ()) -> dict[str, type[Effect]]:
+    """All effects by name, those of the user's own files among them.
+
+    Raises
+    ------
+    InputError
+        If a file holds no effect, or one whose name is taken.
+    """
+    known = dict(effects())
+    for file in own:
+        effect = effect_of_file(file)
+        if effect.name in known:
+            raise InputError(f"{file}: there is an effect {effect.name!r} already; rename this one")
+        known[effect.name] = effect
+    return known
 
 
 def parse_effects(

@@ -125,7 +125,7 @@ def run_on_cluster(
 def _connect(address: str, *, quiet: bool) -> Iterator[Client]:
     if address.startswith("tls:") and not Security().get_connection_args("client")["ssl_context"]:
         raise InputError(
-            f"--cluster {address}: Dask's configuration names no certificates "
+            f"--cluster {address}: Dask's configuration names no certificates; give them there "
             "(distributed.comm.tls)"
         )
     # What it says of a lost connection, and in how many lines, an exception says in one.
@@ -136,7 +136,8 @@ def _connect(address: str, *, quiet: bool) -> Iterator[Client]:
             client = Client(address, timeout=CONNECT, set_as_default=False, name="pixcal")
         except (OSError, TimeoutError, ValueError) as error:
             raise InputError(
-                f"--cluster {address}: no Dask scheduler answers there ({_first_line(error)})"
+                f"--cluster {address}: no Dask scheduler answers there ({_first_line(error)}); "
+                "start one with 'dask scheduler', or correct the address"
             ) from error
         with client:
             with suppress(KeyError):

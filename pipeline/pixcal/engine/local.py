@@ -2,7 +2,7 @@
 
 import signal
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import lru_cache, partial
 from multiprocessing import get_context
@@ -29,10 +29,11 @@ def run_here(function: Callable[[Any], Any], items: Sequence[Any], ended: Ended)
 def run_in_threads(
     function: Callable[[Any], Any], items: Sequence[Any], workers: int, ended: Ended
 ) -> None:
-    """Do the tasks in threads."""
+    """Do the tasks in threads; when one fails, or at Ctrl-C, those that have begun still end."""
     # Bound to the function: inside a graph Dask would take some items for keys or tasks.
     tasks = {number: partial(function, item) for number, item in enumerate(items)}
-    _run_graph(tasks, ended, "threads", num_workers=workers)
+    with ThreadPoolExecutor(workers) as pool:
+        _run_graph(tasks, ended, "threads", num_workers=workers, pool=pool)
 
 
 def run_in_processes(
@@ -57,12 +58,13 @@ def run_in_processes(
         ended(number, result)
 
     while left:
+        pool = _process_pool(workers)
         tasks = {number: partial(call, job, pack(item)) for number, item in left.items()}
         try:
             # One by one: a task is noted when it ends, not when some others do.
             _run_graph(
                 tasks, noted, "processes",
-                num_workers=workers, pool=_process_pool(workers), chunksize=1,
+                num_workers=workers, pool=pool, chunksize=1,
             )  # fmt: skip
         except BrokenProcessPool as error:
             _process_pool.cache_clear()
@@ -72,6 +74,11 @@ def run_in_processes(
                     "--cluster processes: worker processes were killed again and again (out of "
                     "memory?); give fewer --workers"
                 ) from error
+        except BaseException:
+            # What has begun ends while this process holds its lock: two must not write one chunk.
+            _process_pool.cache_clear()
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def _run_graph(

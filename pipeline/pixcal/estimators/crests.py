@@ -433,9 +433,16 @@ def find_crests(
         weight += precision
     use = weight > 0
     if use.sum() < MIN_POINTS:
-        raise InputError(f"no fringes found: {use.sum()} windows of {use.size} show them")
+        raise InputError(_too_few(int(use.sum()), use.size))
     rest = np.where(use, total, 0.0) / np.where(use, weight, 1.0) + np.nan_to_num(phi[0])
     return _points(windows, carrier.phase, rest, weight, phi - np.nan_to_num(phi[0]), (kx, ky))
+
+
+def _too_few(windows: int, of: int) -> str:
+    return (
+        f"no fringes found in enough windows: {windows} of {of} show them, at least {MIN_POINTS} "
+        "are needed; give a shorter --segment, or more --frames"
+    )
 
 
 def _wrapped(phase: F64) -> F64:
@@ -497,7 +504,7 @@ def _follow(windows: Windows, phase: F64, sigma: F64, before: Smooth) -> Smooth:
     """
     use = np.isfinite(sigma)
     if use.sum() < MIN_POINTS:
-        raise InputError(f"no fringes found: {use.sum()} windows of {use.size} show them")
+        raise InputError(_too_few(int(use.sum()), use.size))
     cy, cx = (c[use] for c in windows.centres)
     y, x = before.scaled(cy, cx)
     measured, precision = phase[use], 1 / sigma[use]

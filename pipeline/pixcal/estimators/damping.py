@@ -77,7 +77,7 @@ def best_damping(
     error = min(error, FARTHEST)
     rms, own = found.root(part)
     # What the variance owes to the time constant that it was found with.
-    owed = slope * error / (2 * max(rms, own))
+    owed = slope * error / (2 * max(rms, own, 1e-300))
     return Damping(
         time=float(np.exp(log_time)),
         log_time_error=float(error),

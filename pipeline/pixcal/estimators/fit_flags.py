@@ -7,13 +7,20 @@ from pixcal.model.flags import PixelFlag
 
 F32 = NDArray[np.float32]
 
-MAX_SIGMA_RAD = 0.5
-"""Largest error of a phase that is told from its neighbours on the circle."""
+MAX_SIGMA_RAD = 0.2
+"""Largest error of a phase: beyond it errors are no longer Gaussian, and 6 sigma are seen (with
+0.3 rad one pixel in 500 was further from the truth)."""
+MAX_VISIBILITY = 1.05
+"""Light is never below zero: fringes that go there by more have the wrong bias, and the variance of
+their samples is not known."""
+CHANCE = 6.0
+"""Errors by which a visibility may be larger still by chance."""
 
 
 def fit_flags(
     mask: NDArray[np.uint8],
     iota: F32,
+    alpha: F32,
     sigma: F32,
     chi2: F32,
     count: F32,
@@ -26,8 +33,9 @@ def fit_flags(
     ----------
     mask : (y, x) uint8
         Flags of the reduction.
-    iota, sigma, chi2, count : (y, x) float32
-        Maps of the sweep: mean (e-), error of the phase (rad), reduced chi-square, samples.
+    iota, alpha, sigma, chi2, count : (y, x) float32
+        Maps of the sweep: mean and amplitude (e-), error of the phase (rad), reduced chi-square,
+        samples.
     noise : float
         Usual reduced chi-square: where the noise model is off by a factor, all pixels are.
     chi2_limit : float
@@ -40,6 +48,10 @@ def fit_flags(
     with np.errstate(invalid="ignore"):
         good = np.isfinite(sigma) & (chi2 / noise < np.maximum(chi2_limit, 1 + chance))
         good &= (iota > 0) & (sigma < MAX_SIGMA_RAD)
+        # Noise that makes an amplitude larger makes its error look smaller: the usual one tells.
+        usual = np.nanmedian((alpha / iota)[good]) if good.any() else np.float32(1.0)
+        good &= sigma * alpha < MAX_SIGMA_RAD * usual * iota
+        good &= alpha < MAX_VISIBILITY * iota + CHANCE * sigma * alpha
     flags[~good] |= np.uint8(PixelFlag.BAD_FIT)
     return flags
 

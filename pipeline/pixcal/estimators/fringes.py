@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
 from scipy.optimize import minimize
 
 from pixcal.estimators.harmonics import FrameMoments
@@ -20,6 +21,11 @@ MIN_FRINGES = 1.5
 HONEST_FRINGES = 1.95
 """Fewest fringes for maps with honest errors: with 1.3 to 1.8 the gauge takes true offsets for
 fringes, and errors were 2 to 4 times what SIGMA says (measured on 80 x 80 px)."""
+SHORTEST_PX = 2.2
+"""Shortest period along x and y: below 2 px fringes look like wider ones of another direction, and
+nominal vectors are good to some 10 %."""
+MOST_TURNED = 0.5
+"""Least cosine between the fringes' axis and the nominal one: the nominal vector gives the sign."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +114,15 @@ def find_fringe_vector(
     Raises
     ------
     InputError
-        If no peak stands out: the frames hold no fringes, or fewer than `MIN_FRINGES`.
+        If no peak stands out: the frames hold no fringes, or fewer than `MIN_FRINGES`; if fringes
+        are nominally narrower than `SHORTEST_PX`, or lie across the nominal ones.
     """
+    if max(map(abs, nominal)) * SHORTEST_PX > 2 * np.pi:
+        raise InputError(
+            f"baseline_mm and optics give fringes of {2 * np.pi / np.hypot(*nominal):.2g} px: "
+            f"pixels show them from {SHORTEST_PX:g} px on along x and y; correct the numbers, or "
+            "use a shorter baseline"
+        )
     shape = maps.shape[1:]
     window = np.hanning(shape[0] + 2)[1:-1, None] * np.hanning(shape[1] + 2)[None, 1:-1]
     weight = window * good
@@ -129,8 +142,11 @@ def find_fringe_vector(
     near = np.hypot(2 * np.pi * fx - nominal[0], 2 * np.pi * fy - nominal[1])
     reach = 0.25 * np.hypot(*nominal) + 2 * np.pi * 1.5 / min(shape)
     floor = np.median(power[allowed]) if allowed.any() else np.inf
+    # The foot of a peak beyond is none, nor are its side lobes.
+    within = np.where(allowed, power, 0.0)
+    crest = (power >= maximum_filter(within, 3, mode="wrap")) & (power > 0.1 * within.max())
     peak = None
-    for region in (allowed & (near < reach), allowed):
+    for region in (allowed & crest & (near < reach), allowed):
         if region.any():
             candidate = int(np.argmax(np.where(region, power, -1)))
             if power.flat[candidate] > 50 * floor:
@@ -139,7 +155,8 @@ def find_fringe_vector(
     if peak is None:
         raise InputError(
             "no fringes found: the frames are constant in phase or without contrast, or the "
-            f"fringes are wider than the window of {shape[1]} x {shape[0]} px allows"
+            f"fringes are wider than the window of {shape[1]} x {shape[0]} px allows; look at the "
+            "frames, and at which files the set lists"
         )
 
     def minus_power(k: F64) -> float:
@@ -158,7 +175,13 @@ def find_fringe_vector(
             "fatol": 1e-12,
         },
     ).x
-    sign = 1.0 if found @ np.array(nominal) >= 0 else -1.0
+    cosine = found @ np.array(nominal) / max(np.hypot(*found) * np.hypot(*nominal), 1e-300)
+    if abs(cosine) < MOST_TURNED:
+        raise InputError(
+            f"the fringes lie {np.degrees(np.arccos(abs(cosine))):.0f} degrees from where "
+            "baseline_mm says; correct it, or list the files of the right set"
+        )
+    sign = np.sign(cosine)
     return float(sign * found[0]), float(sign * found[1])
 
 

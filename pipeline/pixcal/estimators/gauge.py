@@ -59,7 +59,8 @@ def gauge_matrix(tiles: list[tuple[F64, NDArray[np.bool_], C128]]) -> F64:
         psi, ratio = np.angle(s), 1 / np.abs(s)
         modes = np.stack(fringe_modes(psi, ratio), axis=1)
         light = np.stack([np.cos(psi), np.sin(psi)], axis=1)
-        level = iota[good] / np.median(iota[good])
+        # Light is even but for some pixels, whose response is not known: they must not outvote all.
+        level = np.clip(iota[good] / np.median(iota[good]), 0.0, 2.0)
         # Each tile has its own smooth phase and light: take them off before the tiles are joined.
         q, _ = np.linalg.qr(own)
         rows.append(modes - q @ (q.T @ modes))

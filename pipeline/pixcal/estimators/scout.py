@@ -32,6 +32,16 @@ MAX_PIXELS = 20_000
 """Pixels that frames are solved with: their noise then adds some 2e-4 to a map's variance."""
 MIN_FRAMES = 6
 """Three unknowns a pixel, and as many again to tell whether they fit."""
+ODD_VISIBILITY = 12.0
+"""Departure from the visibility of a tile's pixels, over the usual one, of a pixel not to learn
+from; some 8 standard deviations."""
+MANY = 20.0
+"""Mean light over that of most pixels, or the reverse, of pixels not to learn from."""
+FOLLOWS_RAD = 0.8
+"""Most of the usual distance of the pixels' phases from smooth ones; random ones have 1.57."""
+ABOVE_NOISE = 1.5
+"""Least power of the weakest of three components over the next, which is noise: frames of two
+phases only have no third component, and noise in its place would pass for the fringes' shape."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +141,8 @@ class Scout:
         """
         n_frames = codes[0].shape[0]
         if n_frames < MIN_FRAMES:
-            raise InputError(f"{n_frames} frames: at least {MIN_FRAMES} are needed")
+            raise InputError(f"{n_frames} frames: at least {MIN_FRAMES} are needed; take more")
+        self._drop_odd_levels(codes)
         self._require_pixels()
         g = self._subspace(codes)
         frames = FrameParameters(g, np.zeros((n_frames, 2)), self.reference)
@@ -184,7 +195,8 @@ class Scout:
         if sum(int(t.good.sum()) for t in self.tiles) < 30:
             raise InputError(
                 "fewer than 30 good pixels are left to find the fringes with: the others are "
-                "masked, saturated too often, or do not fit the fringes"
+                "masked, saturated too often, or do not fit the fringes; look at the mask, the "
+                "bias frames and the level of the light"
             )
 
     def _picked(self, tile: Tile) -> NDArray[np.intp]:
@@ -208,6 +220,16 @@ class Scout:
             electrons = np.where(lost, electrons.max(axis=0), electrons)
         return np.asarray(electrons, np.float32)
 
+    def _drop_odd_levels(self, codes: Sequence[NDArray[np.uint16]]) -> None:
+        """Leave out pixels whose mean light is far from that of most: few would outweigh all."""
+        for tile, block in zip(self.tiles, codes, strict=True):
+            parts = _parts(np.flatnonzero(tile.good))
+            if not parts:
+                continue
+            level = np.concatenate([self._electrons(block, p).mean(axis=0) for p in parts])
+            usual = np.median(level)
+            tile.good.flat[np.concatenate(parts)] = (level > usual / MANY) & (level < MANY * usual)
+
     def _subspace(self, codes: Sequence[NDArray[np.uint16]]) -> F64:
         """First frame parameters: rank three, then turned by means of the fringe vector."""
         gram: F64 = np.zeros((len(codes[0]), len(codes[0])))
@@ -216,10 +238,13 @@ class Scout:
                 electrons = self._electrons(block, part)
                 gram += electrons @ electrons.T
         last = len(gram) - 1
-        values, vectors = eigh(gram, subset_by_index=(last - 2, last), overwrite_a=True)
-        if values[0] <= 0 or values[0] < 1e-12 * values[2]:
-            raise InputError("the frames do not differ: the phase was not scanned")
-        g = vectors[:, ::-1]
+        values, vectors = eigh(gram, subset_by_index=(last - 3, last), overwrite_a=True)
+        if values[1] <= 1e-12 * values[3] or values[1] < ABOVE_NOISE * values[0]:
+            raise InputError(
+                "no fringes found, or their phase was scanned too little: what differs from frame "
+                "to frame is noise; look at the frames, and scan evenly over a turn or more"
+            )
+        g = vectors[:, :0:-1]
         first, block = self.tiles[0], codes[0]
         every = _parts(np.arange(first.good.size))
         maps = np.hstack([g.T @ self._electrons(block, part) for part in every])
@@ -236,16 +261,26 @@ class Scout:
         light = np.linalg.lstsq(span / level, np.ones(len(span)), rcond=None)[0]
         mix = np.stack([light, fringe.imag, fringe.real])
         if not np.linalg.cond(mix) < 1e6:
-            raise InputError("the frames do not differ enough: the phase was scanned too little")
+            raise InputError(
+                "the frames do not differ enough: the phase was scanned too little; scan it evenly "
+                "over a turn or more"
+            )
         g = g @ np.linalg.inv(mix)
         return np.asarray(g / self._norm(g))
 
     def _count_fringes(self) -> None:
-        """Refuse fringes too wide for the window (their vector is well known only by now)."""
+        """Refuse what is no fringe, and fringes too wide (their vector is well known by now)."""
         tile, theta = self.tiles[0], self.theta[0]
         level = np.where(tile.good, theta[0], 1.0)
         phasor = np.where(tile.good, theta[2] + 1j * theta[1], 0.0) / level
-        kx, ky = smooth_phasor(np.asarray(phasor, complex), tile.good, self.k).k
+        smooth = smooth_phasor(np.asarray(phasor, complex), tile.good, self.k)
+        away = np.abs(np.angle(phasor * smooth.map.conj()))[tile.good]
+        if not np.median(away) < FOLLOWS_RAD:
+            raise InputError(
+                "no fringes found that the pixels follow; look at the frames, at the bias frames, "
+                "and at which files the set lists"
+            )
+        kx, ky = smooth.k
         ny, nx = tile.shape
         across = float(np.hypot(kx * nx, ky * ny)) / (2 * np.pi)
         if across < HONEST_FRINGES:
@@ -270,7 +305,7 @@ class Scout:
             thetas.append(theta)
             smooths.append(smooth)
         goods = [
-            t.good & np.isfinite(theta).all(axis=0) & (theta[0] > 0)
+            _like_most(theta, t.good & np.isfinite(theta).all(axis=0) & (theta[0] > 0))
             for t, theta in zip(self.tiles, thetas, strict=True)
         ]
         q = gauge_matrix(list(zip(thetas, goods, smooths, strict=True)))
@@ -350,6 +385,17 @@ class Scout:
                 ]
             )
         )
+
+
+def _like_most(theta: F64, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Those of the pixels (y, x) with about the visibility of the others.
+
+    Others have the wrong bias: the weights of their samples, too, and all frames would feel it.
+    """
+    visibility = np.hypot(theta[1], theta[2]) / np.where(good, theta[0], 1.0)
+    away = np.abs(visibility - np.median(visibility[good])) if good.any() else visibility
+    usual = np.median(away[good]) if good.any() else 0.0
+    return np.asarray(good & (away < ODD_VISIBILITY * usual + 1e-9))
 
 
 def _parts(pixels: NDArray[np.intp]) -> list[NDArray[np.intp]]:

@@ -127,7 +127,7 @@ def sum_row(
     weight = np.where(usable, 1 / np.where(usable, sigma.ravel(), 1.0).astype(float) ** 2, 0.0)
     maps = np.zeros((1 + len(batches), phase.size))
     maps[0] = wrapped(phase - plane.on(shape)).ravel()
-    maps[1:] = batches.reshape(len(batches), -1)
+    maps[1:] = batches.reshape(len(batches), phase.size)
     maps[:, ~usable] = 0.0
     np.nan_to_num(maps, copy=False)
     weighted = modes * weight

@@ -50,7 +50,9 @@ class Coupling:
 
     def __post_init__(self) -> None:
         if self.dy == 0 and self.dx == 0:
-            raise InputError("dy and dx are both 0: a pixel does not couple to itself")
+            raise InputError(
+                "dy and dx are both 0: a pixel does not couple to itself; give steps to another"
+            )
         if self.row >= self.every_rows:
             raise InputError(f"row: {self.row} is not below every_rows ({self.every_rows})")
         if self.column >= self.every_columns:

@@ -17,13 +17,17 @@ SCHEMA = "pixcal/acquisition/1"
 class Detector:
     """The detector as declared by its owner."""
 
-    pitch_um: float = quantity(unit="um", above=0, high=1000, doc="pixel pitch")
-    gain_e_per_adu: float = quantity(unit="e-/ADU", above=0, high=1e6, doc="conversion gain")
+    pitch_um: float = quantity(unit="um", low=0.01, high=1000, doc="pixel pitch")
+    gain_e_per_adu: float = quantity(unit="e-/ADU", low=1e-6, high=1e6, doc="conversion gain")
     read_noise_e: float = quantity(unit="e-", low=0, high=1e6, doc="read noise, rms")
     name: str = quantity("", doc="free text")
-    full_well_e: float | None = quantity(None, unit="e-", above=0, doc="full well")
+    full_well_e: float | None = quantity(None, unit="e-", low=1, high=1e12, doc="full well")
     saturation_adu: float | None = quantity(
-        None, unit="ADU", above=0, doc="samples at or above this level are saturated"
+        None,
+        unit="ADU",
+        above=0,
+        high=1e12,
+        doc="samples at or above this level are saturated",
     )
 
 
@@ -31,10 +35,14 @@ class Detector:
 class Optics:
     """The bench's nominal optics."""
 
-    wavelength_nm: float = quantity(unit="nm", above=0, high=1e6, doc="laser wavelength")
-    distance_mm: float = quantity(unit="mm", above=0, high=1e7, doc="fibres to detector, nominal")
+    wavelength_nm: float = quantity(unit="nm", low=1, high=1e6, doc="laser wavelength")
+    distance_mm: float = quantity(unit="mm", low=0.1, high=1e7, doc="fibres to detector, nominal")
     frame_period_s: float | None = quantity(
-        None, unit="s", above=0, doc="used where the headers hold no time stamps"
+        None,
+        unit="s",
+        low=1e-9,
+        high=1e9,
+        doc="used where the headers hold no time stamps",
     )
 
 
@@ -65,7 +73,10 @@ class FringeSet:
             raise InputError("files: the list is empty")
         _check_globs("files", self.files)
         if self.baseline_mm == (0.0, 0.0):
-            raise InputError("baseline_mm: both components are zero, so there are no fringes")
+            raise InputError(
+                "baseline_mm: both components are zero, so there are no fringes; give the vector "
+                "from fibre A to fibre B"
+            )
 
 
 @dataclass(frozen=True)
@@ -96,10 +107,10 @@ class Acquisition:
         names = [s.name for s in self.frames.fringes]
         for name in names:
             if names.count(name) > 1:
-                raise InputError(f"frames.fringes: two sets are named {name!r}")
+                raise InputError(f"frames.fringes: two sets are named {name!r}; rename one")
         kinds = (self.frames.bias, self.frames.dark, self.frames.flat, self.frames.fringes)
         if not any(kinds):
-            raise InputError("frames: no files are listed")
+            raise InputError("frames: no files are listed; give globs")
 
 
 def load_acquisition(path: Path) -> Acquisition:

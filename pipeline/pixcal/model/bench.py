@@ -28,8 +28,8 @@ class SimulatedDetector:
     shape: tuple[int, int] = quantity(
         unit="px", low=1, high=65536, doc="window that is read: [rows, columns]"
     )
-    pitch_um: float = quantity(unit="um", above=0, high=1000, doc="pixel pitch")
-    gain_e_per_adu: float = quantity(unit="e-/ADU", above=0, high=1e6, doc="conversion gain")
+    pitch_um: float = quantity(unit="um", low=0.01, high=1000, doc="pixel pitch")
+    gain_e_per_adu: float = quantity(unit="e-/ADU", low=1e-6, high=1e6, doc="conversion gain")
     read_noise_e: float = quantity(unit="e-", low=0, high=1e6, doc="read noise, rms")
     name: str = quantity("", doc="free text")
     seed: int = quantity(0, low=0, high=10**18, doc="which specimen of the chip this is")
@@ -48,7 +48,7 @@ class SimulatedDetector:
         None, unit="ADU", above=0, doc="samples are clipped here; default: the converter's end"
     )
     full_well_e: float | None = quantity(
-        None, unit="e-", above=0, high=1e7, doc="charge is clipped here; default: never"
+        None, unit="e-", low=1, high=1e7, doc="charge is clipped here; default: never"
     )
     bias_adu: float = quantity(500.0, unit="ADU", low=0, high=65535, doc="mean bias")
     bias_pixel_rms_adu: float = quantity(
@@ -126,13 +126,13 @@ class SimulatedDetector:
 class SimulatedOptics:
     """Laser, fibres and their light; lengths on the detector are from the chip's centre."""
 
-    wavelength_nm: float = quantity(unit="nm", above=0, high=1e6, doc="laser wavelength")
-    distance_mm: float = quantity(unit="mm", above=0, high=1e7, doc="fibres to detector, true")
+    wavelength_nm: float = quantity(unit="nm", low=1, high=1e6, doc="laser wavelength")
+    distance_mm: float = quantity(unit="mm", low=0.1, high=1e7, doc="fibres to detector, true")
     beam_radius_mm: float = quantity(
-        unit="mm", above=0, high=1e7, doc="1/e² radius of each fibre's light on the detector"
+        unit="mm", low=1e-3, high=1e7, doc="1/e² radius of each fibre's light on the detector"
     )
     nominal_distance_mm: float | None = quantity(
-        None, unit="mm", above=0, high=1e7, doc="what the acquisition declares; default: the truth"
+        None, unit="mm", low=0.1, high=1e7, doc="what the acquisition declares; default: the truth"
     )
     offset_mm: tuple[float, float] = quantity(
         (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="foot of the fibres' centre: [x, y]"
@@ -143,7 +143,7 @@ class SimulatedOptics:
     pointing_b_mm: tuple[float, float] = quantity(
         (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="peak of B's light from the foot of B"
     )
-    power_ratio: float = quantity(1.0, above=0, high=1e3, doc="power of B over that of A")
+    power_ratio: float = quantity(1.0, low=1e-3, high=1e3, doc="power of B over that of A")
     visibility: float = quantity(
         1.0, above=0, high=1, doc="contrast where both fibres give the same light"
     )
@@ -168,7 +168,7 @@ class SimulatedSet:
     count: int = quantity(low=1, high=MAX_FRAMES, doc="number of frames")
     peak_e: float = quantity(
         unit="e-",
-        above=0,
+        low=1e-3,
         high=1e7,
         doc="brightest fringe in the window, unit response, mean power",
     )
@@ -193,9 +193,14 @@ class SimulatedSet:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", self.name):
             raise InputError(f"name: {self.name!r:.80} is not made of letters, digits, '-' and '_'")
         if self.name in CALIBRATIONS:
-            raise InputError(f"name: {self.name!r} is the folder of calibration frames")
+            raise InputError(
+                f"name: {self.name!r} is the folder of calibration frames; choose another"
+            )
         if self.baseline_mm == (0.0, 0.0):
-            raise InputError("baseline_mm: both components are zero, so there are no fringes")
+            raise InputError(
+                "baseline_mm: both components are zero, so there are no fringes; give the vector "
+                "from fibre A to fibre B"
+            )
         if self.phase_law == "ramp" and self.phase_step_rad == 0:
             raise InputError("phase_step_rad: zero, so the ramp never moves; give its step")
 
@@ -212,9 +217,9 @@ class Rung:
 class SimulatedFrames:
     """What is recorded, in the order bias, dark, flat, fringes, and how it is filed."""
 
-    exptime_s: float = quantity(unit="s", above=0, high=1e6, doc="of the fringe frames")
+    exptime_s: float = quantity(unit="s", low=1e-9, high=1e6, doc="of the fringe frames")
     period_s: float = quantity(
-        unit="s", above=0, high=1e6, doc="frame to frame; longer exposures take their own time"
+        unit="s", low=1e-9, high=1e6, doc="frame to frame; longer exposures take their own time"
     )
     start: str = quantity("2026-01-01T00:00:00", doc="of the first frame, ISO 8601, UTC")
     per_file: int = quantity(1, low=1, high=100_000, doc="1: 2-D frames; more: 3-D cubes")
@@ -224,7 +229,7 @@ class SimulatedFrames:
     darks: tuple[Rung, ...] = quantity((), doc="dark frames, one entry for each exposure time")
     flats: tuple[Rung, ...] = quantity((), doc="flats under a steady lamp: a ladder of levels")
     flat_rate_e_s: float | None = quantity(
-        None, unit="e-/s", above=0, high=1e12, doc="the lamp, for unit response"
+        None, unit="e-/s", low=1e-3, high=1e12, doc="the lamp, for unit response"
     )
     fringes: tuple[SimulatedSet, ...] = quantity((), doc="the fringe sets")
 
@@ -232,7 +237,7 @@ class SimulatedFrames:
         names = [*CALIBRATIONS, *(s.name for s in self.fringes)]
         for name in names:
             if names.count(name) > 1:
-                raise InputError(f"fringes: two sets are named {name!r}")
+                raise InputError(f"fringes: two sets are named {name!r}; rename one")
         for name in self.compress:
             if name not in names:
                 raise InputError(f"compress: {name!r} is not one of {', '.join(names)}")
@@ -243,7 +248,7 @@ class SimulatedFrames:
         if self.flats and self.flat_rate_e_s is None:
             raise InputError("flat_rate_e_s: missing (in e-/s), and there are flats")
         if not (self.bias or self.darks or self.flats or self.fringes):
-            raise InputError("bias, darks, flats, fringes: no frames at all")
+            raise InputError("bias, darks, flats, fringes: no frames at all; give some")
         if self.period_s < self.exptime_s:
             raise InputError(f"period_s: shorter than exptime_s ({self.exptime_s:g} s)")
         try:

@@ -124,15 +124,22 @@ def read_yaml(path: Path) -> dict[str, Any]:
         reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
         raise InputError(f"{path}: cannot be read ({reason})") from error
     try:
-        data = yaml.load(text, Loader=_StrictLoader)  # noqa: S506 (a SafeLoader, made stricter)
+        data = _StrictLoader(text).get_single_data()
     except RecursionError as error:
         raise InputError(f"{path}: not a configuration: nested too deeply") from error
     except (yaml.YAMLError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not valid YAML: {reason}") from error
+        raise InputError(f"{path}: not valid YAML: {_reason(error)}") from error
     if not isinstance(data, dict):
         raise InputError(f"{path}: expected keys and values at the top level")
     return data
+
+
+def _reason(error: Exception) -> str:
+    """What is wrong with a text and where, in one line."""
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem and error.problem_mark:
+        mark = error.problem_mark
+        return f"{error.problem} (line {mark.line + 1}, column {mark.column + 1})"
+    return " ".join(str(error).split())
 
 
 def parse(cls: type[T], data: Any, where: str, *, key: str = "") -> T:

@@ -10,7 +10,28 @@ class InputError(PixcalError):
 
 
 class DamagedError(InputError):
-    """Something that pixcal wrote is missing or altered; the message names it."""
+    """Something that pixcal wrote is missing or altered; the message names it.
+
+    Parameters
+    ----------
+    message : str
+        What is damaged, and how.
+    path : Path or str
+        The file or folder.
+
+    Attributes
+    ----------
+    advice : str
+        What mends it; whoever knows the run that it belongs to says so more exactly.
+    """
+
+    def __init__(self, message: str, path: object = "") -> None:
+        super().__init__(message)
+        self.path = str(path)
+        self.advice = "run the command that wrote it again"
+
+    def __str__(self) -> str:
+        return f"{self.args[0]}; {self.advice}"
 
 
 class PlanError(InputError):

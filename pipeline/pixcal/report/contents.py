@@ -1,5 +1,6 @@
 """What a report shows, as plain data: read by the stage, drawn by the page."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -104,6 +105,45 @@ class Detector:
 
 
 @dataclass(frozen=True)
+class EffectWords:
+    """What an effect is, for people.
+
+    Attributes
+    ----------
+    title, about : str
+        In a few words, and in a sentence.
+    parameters : mapping
+        Unit and meaning of each parameter.
+    """
+
+    title: str
+    about: str = ""
+    parameters: Mapping[str, tuple[str, str]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What ``pixcal diagnose`` found.
+
+    Attributes
+    ----------
+    facts : dict
+        ``diagnosis.json``.
+    curves : sequence of dict
+        ``curves.json``: each statistic as measured, as simulated, and with the effects.
+    effects : mapping
+        Words for effects, by name; of those that are not known there are none.
+    noticed : float
+        Significance (sigma) from which a statistic counts as different, all being looked at.
+    """
+
+    facts: dict[str, Any]
+    curves: Sequence[dict[str, Any]]
+    effects: Mapping[str, EffectWords]
+    noticed: float
+
+
+@dataclass(frozen=True)
 class StageRecord:
     """What a stage's manifest says."""
 
@@ -142,6 +182,8 @@ class Contents:
         ``fit.json``.
     flags : FlagSummary, optional
         Of the products.
+    diagnosis : Diagnosis, optional
+        Where the run was diagnosed.
     warnings : tuple of str
         Sentences that the stages left.
     """
@@ -155,6 +197,7 @@ class Contents:
     sets: tuple[FringeSet, ...] = ()
     flags: FlagSummary | None = None
     allan_measured: bool = False
+    diagnosis: Diagnosis | None = None
     warnings: tuple[str, ...] = ()
 
     @property

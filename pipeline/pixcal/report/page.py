@@ -1,20 +1,15 @@
 """The page: contents in, one HTML document out."""
 
-import base64
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
-from matplotlib.figure import Figure
 
 from pixcal import __version__
 from pixcal.report import detector_figures, map_figures, set_figures
-from pixcal.report.contents import (
-    Contents,
-    OffsetMap,
-)
-from pixcal.report.drawing import DPI, png
+from pixcal.report.blocks import Block, Plate, Section, plate
+from pixcal.report.contents import Contents, OffsetMap
+from pixcal.report.diagnosis import diagnosis
 from pixcal.report.summary import FlagSummary
 from pixcal.report.tables import (
     Table,
@@ -46,28 +41,6 @@ DETECTOR_MAPS = {
 """Title and unit of each map of the reduction."""
 
 
-@dataclass(frozen=True)
-class Plate:
-    """A figure with its title, and a caption that says what to see and what would be bad."""
-
-    title: str
-    caption: str
-    picture: str
-    width: int
-    height: int
-    kind: str = "plate"
-
-
-@dataclass(frozen=True)
-class Section:
-    """A chapter of the page."""
-
-    id: str
-    title: str
-    lead: str
-    blocks: Sequence[Plate | Table]
-
-
 def render(contents: Contents) -> str:
     """Draw all figures and write the page.
 
@@ -82,6 +55,7 @@ def render(contents: Contents) -> str:
         HTML without any reference to something outside it.
     """
     sections = [
+        diagnosis(contents),
         _maps(contents),
         _levels(contents),
         _temporal(contents),
@@ -106,15 +80,6 @@ def render(contents: Contents) -> str:
         sections=sections,
         version=__version__,
     )
-
-
-def _plate(title: str, caption: str, figure: Figure) -> Plate:
-    body = png(figure)
-    # The size in the page is the figure's in inches at 106 px an inch: text of 10 pt is 15 px.
-    width, height = (round(v * 106) for v in figure.get_size_inches())
-    data = base64.b64encode(body).decode("ascii")
-    assert figure.dpi == DPI
-    return Plate(title, caption, f"data:image/png;base64,{data}", width, height)
 
 
 def _subtitle(contents: Contents) -> str:
@@ -144,7 +109,7 @@ def _maps(contents: Contents) -> Section:
         "Offset of each pixel's response barycentre from the perfect grid; positive towards larger "
         "x (y). Grey pixels are masked."
     )
-    blocks: list[Plate | Table] = []
+    blocks: list[Block] = []
     for offset in contents.offsets:
         blocks += _offset_plates(offset, contents)
     if not blocks:
@@ -154,7 +119,7 @@ def _maps(contents: Contents) -> Section:
 
 def _offset_plates(offset: OffsetMap, contents: Contents) -> Iterator[Plate]:
     name, n = NAMES[offset.name], offset.delta.block
-    yield _plate(
+    yield plate(
         f"Map of {name}",
         (f"Each point is the mean of {n} × {n} px. " if n > 1 else "")
         + "Colours span ±3 robust standard deviations. The profiles are means over whole columns "
@@ -167,13 +132,13 @@ def _offset_plates(offset: OffsetMap, contents: Contents) -> Iterator[Plate]:
     )
     if offset.detail is not None:
         (y0, x0), part = offset.detail.start, offset.detail.delta
-        yield _plate(
+        yield plate(
             f"Middle of the map of {name}, pixel by pixel",
             f"Rows {y0} to {y0 + part.shape[0] - 1}, columns {x0} to {x0 + part.shape[1] - 1}, "
             "without averaging: patterns of few pixels, which the means above wash out, show here.",
             map_figures.offsets(offset.name, part, offset.detail.sigma, offset.detail.start),
         )
-    yield _plate(
+    yield plate(
         f"Errors and distribution of {name}",
         "Left: 1-sigma error; it follows the illumination and the visibility; faint fringes (a few "
         "per cent) are the chance of how the phases fell. Right: all offsets against a normal law "
@@ -185,7 +150,7 @@ def _offset_plates(offset: OffsetMap, contents: Contents) -> Iterator[Plate]:
         vectors = {s.name: (s.facts["kx"], s.facts["ky"]) for s in contents.sets}
         windows = offset.spectrum.windows
         my, mx = offset.spectrum.power.shape
-        yield _plate(
+        yield plate(
             f"Power spectrum of {name}",
             f"Mean of {windows} window{'s' if windows > 1 else ''} of {mx} × {my} px. Left: power "
             "over that of the white noise which the errors predict. Circles mark the fringe "
@@ -200,7 +165,7 @@ def _offset_plates(offset: OffsetMap, contents: Contents) -> Iterator[Plate]:
 def _levels(contents: Contents) -> Section:
     lead = "Mean level and visibility of the fringes in each pixel."
     blocks = [
-        _plate(
+        plate(
             f"Set {s.name}: mean level ι and visibility α/ι",
             "Both should follow the smooth light of the fibres. A ring or a speck is dust; a "
             "pattern of rows in the visibility is crosstalk; visibility above 1 is impossible and "
@@ -223,7 +188,7 @@ def _temporal(contents: Contents) -> Section:
         "median of α/ι), phase φ, and the change of the fringe vector where it moves."
     )
     blocks = [
-        _plate(
+        plate(
             f"Set {s.name}: parameters of the frames",
             "Right: how often each value occurs; for the phase, the dashed line and its band are a "
             "uniform coverage and its chance (±2σ). Good: phases all over the turn, constant "
@@ -246,7 +211,7 @@ def _temporal(contents: Contents) -> Section:
 def _residuals(contents: Contents) -> Section:
     lead = "What is left after the fit, over the noise that gain and read noise predict."
     blocks = [
-        _plate(
+        plate(
             f"Set {s.name}: reduced χ²",
             "Good: a map without pattern and a histogram on the dashed law. A histogram shifted "
             "as a whole (red) means that gain or read noise are off by that factor, or that the "
@@ -268,8 +233,8 @@ def _allan(contents: Contents) -> Section:
         "frames are averaged, without knowing the true offsets."
     )
     measured = [s for s in contents.sets if s.allan is not None and s.allan.get("frames")]
-    blocks: list[Plate | Table] = [
-        _plate(
+    blocks: list[Block] = [
+        plate(
             f"Set {s.name}: Allan deviation",
             "Median over the pixels. Good: points on the square-root law, which is what the errors "
             "of the fit predict, and that law close to the Cramér–Rao bound (short batches lie a "
@@ -293,10 +258,10 @@ def _detector(contents: Contents) -> Section:
         for key, (title, unit) in DETECTOR_MAPS.items()
         if key in detector.maps
     ]
-    blocks: list[Plate | Table] = []
+    blocks: list[Block] = []
     if panels:
         blocks.append(
-            _plate(
+            plate(
                 "Calibration maps",
                 "Colours span the 0.5th to the 99.5th percentile. Good: smooth or random maps. "
                 "Bad: rows, columns or blocks in the read noise, fringes in the flat (coherent "
@@ -313,7 +278,7 @@ def _detector(contents: Contents) -> Section:
     linearity = detector.facts.get("linearity") or {}
     if is_table(linearity.get("levels")):
         blocks.append(
-            _plate(
+            plate(
                 "Linearity",
                 "Departure of each flat level from the straight line over exposure time. Good: "
                 "within a few tenths of a per cent, without trend. Bad: a curve that grows towards "
@@ -337,10 +302,10 @@ def _masks(contents: Contents) -> Section:
         panels.append(("products", contents.flags))
     if not panels:
         return Section("masks", "Masks", f"{NOT_MEASURED}: there are no masks.", [])
-    blocks: list[Plate | Table] = []
+    blocks: list[Block] = []
     if any(summary.masked for _, summary in panels):
         blocks.append(
-            _plate(
+            plate(
                 "Flags of the pixels",
                 "Maps that are the same are drawn once. Good: few, scattered pixels. Bad: whole "
                 "rows, columns or blocks, or masks that follow the fringes (saturation at the "
@@ -379,7 +344,7 @@ def _removed(contents: Contents) -> Section:
 
 
 def _provenance(contents: Contents) -> Section:
-    blocks: list[Plate | Table] = []
+    blocks: list[Block] = []
     if contents.fit is not None:
         blocks += fit_tables(contents.fit)
     if contents.arrays:

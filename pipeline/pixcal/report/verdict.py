@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.report.contents import Contents, FringeSet
+from pixcal.report.contents import Contents, Diagnosis, FringeSet
+from pixcal.report.diagnosis_words import level, with_interval
 from pixcal.report.text import NAMES, duration, number, share, with_error
 
 TARGET_PX = 5e-5
@@ -85,8 +86,23 @@ def cards(contents: Contents) -> list[Card]:
         )
         if fringes.allan is not None and fringes.allan.get("slope") is not None:
             made.append(_allan_card(fringes.name, fringes.allan))
+    if contents.diagnosis is not None:
+        made.append(_diagnosis_card(contents.diagnosis))
     made.append(_mask_card(contents))
     return made
+
+
+def _diagnosis_card(diagnosis: Diagnosis) -> Card:
+    verdict, gap = diagnosis.facts["verdict"], diagnosis.facts["gap"]
+    causes = ", ".join(c["effect"] for c in diagnosis.facts["causes"])
+    left = f"{with_interval(gap['after'], gap['interval'])} of the gap is left"
+    detail = "nothing differs by more than chance" if verdict == "no gap" else left
+    return Card(
+        "data against simulation",
+        verdict,
+        f"{causes}: {detail}" if causes else detail,
+        level(verdict),
+    )
 
 
 def _allan_card(name: str, measured: dict[str, Any]) -> Card:

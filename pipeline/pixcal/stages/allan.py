@@ -363,7 +363,7 @@ def _noise_levels(path: Path, region: Region) -> F64:
     values = ArrayReader(path).read(region[:2], region[2:])
     values = values[np.isfinite(values) & (values > 0)]
     if not len(values):
-        raise DamagedError(f"{path}: no errors of batches; remove RUN/fit and run 'pixcal fit'")
+        raise DamagedError(f"{path}: no errors of batches", path)
     levels = np.quantile(values, NOISE_LEVELS, overwrite_input=True)
     return np.asarray(levels, dtype=np.float64)
 

@@ -52,13 +52,13 @@ from pixcal.report.drawing import png
 from pixcal.stages.fit.sweep import load_run, nominal_vector
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import (
+    MANIFEST,
     Build,
     Manifest,
     artefact_key,
     build,
     lock,
     read_json,
-    read_manifest,
     require,
     up_to_date,
     write_json,
@@ -108,11 +108,13 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """
     acquisition, reduced = load_run(run_dir)
     if not acquisition.frames.fringes:
-        raise InputError(f"{run_dir}: the acquisition lists no fringes (frames.fringes), no crests")
+        raise InputError(
+            f"{run_dir}: the acquisition lists no fringes; crests need some, in frames.fringes"
+        )
     with lock(run_dir):
-        inputs, fitted = {"reduce": reduced.key}, read_manifest(run_dir / "fit")
+        inputs = {"reduce": reduced.key}
         facts: dict[str, Any] = {}
-        if fitted is not None:
+        if (run_dir / "fit" / MANIFEST).exists():
             inputs["fit"] = require(run_dir, "fit", 1).key
             facts = read_json(run_dir / "fit" / "fit.json")["sets"]
         key = artefact_key(STAGE, FORMAT, asdict(config), inputs)

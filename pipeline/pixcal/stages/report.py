@@ -1,22 +1,27 @@
 """Report: one HTML page on everything that a run holds."""
 
+import inspect
 import os
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pixcal.effects import effects
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.gap import CHANCE, sigmas_of
 from pixcal.report.contents import (
     ArrayRecord,
     Contents,
     Detail,
     Detector,
+    Diagnosis,
+    EffectWords,
     FringeSet,
     OffsetMap,
     Series,
@@ -38,21 +43,23 @@ from pixcal.report.summary import (
     summarise,
     summarise_flags,
 )
+from pixcal.simulation.effect import Effect
 from pixcal.storage.artefact import (
+    MANIFEST,
     Manifest,
     artefact_key,
     build,
     lock,
     read_json,
-    read_manifest,
     require,
     up_to_date,
 )
-from pixcal.storage.cube import INDEX, ArrayReader
+from pixcal.storage.cube import ArrayReader
+from pixcal.storage.folder import INDEX
 
 STAGE = "report"
 FORMAT = 1
-SHOWN_STAGES = {"ingest": 1, "reduce": 1, "sweep": 2, "fit": 1, "allan": 1}
+SHOWN_STAGES = {"ingest": 1, "reduce": 1, "sweep": 2, "fit": 1, "allan": 1, "diagnose": 1}
 """Stages and the formats of theirs that are understood."""
 FIGURE_BYTES = 192 << 20
 """Matplotlib, one figure and the page."""
@@ -105,7 +112,7 @@ def _manifests(run_dir: Path) -> dict[str, Manifest]:
     return {
         stage: require(run_dir, stage, SHOWN_STAGES[stage])
         for stage in SHOWN_STAGES
-        if read_manifest(run_dir / stage) is not None
+        if (run_dir / stage / MANIFEST).exists()
     }
 
 
@@ -137,6 +144,7 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
         offsets=_offsets(fit, results),
         sets=sets,
         flags=results.get("flags/products"),
+        diagnosis=_diagnosis(run_dir / "diagnose") if "diagnose" in manifests else None,
         warnings=_warnings(manifests, facts),
     )
 
@@ -249,6 +257,24 @@ def _sets(
 
 def _column(path: Path) -> NDArray[np.float64]:
     return ArrayReader(path).read().astype(float)
+
+
+# The diagnosis
+
+
+def _diagnosis(folder: Path) -> Diagnosis:
+    facts, curves = read_json(folder / "diagnosis.json"), read_json(folder / "curves.json")
+    chance = np.log(CHANCE / max(facts["statistics"], 1))
+    words = {name: _effect_words(kind) for name, kind in effects().items()}
+    return Diagnosis(facts, curves, words, sigmas_of(chance))
+
+
+def _effect_words(kind: type[Effect]) -> EffectWords:
+    about, _, _ = (inspect.getdoc(kind) or "").partition("\n")
+    parameters = {
+        f.name: (f.metadata.get("unit", ""), f.metadata.get("doc", "")) for f in fields(kind)
+    }
+    return EffectWords(kind.title, about.replace("`", ""), parameters)
 
 
 # Words and tables

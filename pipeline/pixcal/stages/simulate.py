@@ -10,16 +10,18 @@ and its frames (``B``, ``A``, ``phi``, ``dkx``, ``dky``); and the bench file.
 """
 
 import shutil
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
 from datetime import datetime, timedelta
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pixcal.effects import parse_effects
+from pixcal.effects import known_effects, parse_effects
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels import optics, synthesis
@@ -38,7 +40,9 @@ from pixcal.storage.artefact import (
     lock,
     read_manifest,
     write_json,
+    write_manifest,
 )
+from pixcal.storage.fits_map import content_digest
 from pixcal.storage.fits_out import COMPRESSED, FrameWriter
 
 STAGE = "simulate"
@@ -66,12 +70,27 @@ class Config:
     ----------
     truth : Path, optional
         Where the truth goes; default: beside the acquisition, ``<out>-truth``.
+    own : tuple of Path
+        Python files with effects of the user's own, which the bench file may name.
     """
 
     truth: Path | None = None
+    own: tuple[Path, ...] = ()
 
 
 Effects = tuple[Effect, ...]
+
+
+class Exposes(Protocol):
+    """Some rows of a bench, as `Camera`."""
+
+    def expose(
+        self, recording: Recording, frames: range
+    ) -> Iterator[tuple[int, NDArray[np.uint16]]]:
+        """Frames as in `Camera.expose`."""
+
+
+Cameras = Callable[[Bench, Rows, Effects], Exposes]
 
 Span = tuple[Recording, range, dict[int, FrameWriter]]
 """Some frames of a recording, and the files (by number) that they go to."""
@@ -100,26 +119,62 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
         If the bench file is wrong, or a directory holds what simulate did not put there.
     """
     plan = load_bench(bench)
-    out = out.resolve()
-    truth = (config.truth or out.with_name(f"{out.name}-truth")).resolve()
+    out = _resolved(out, "--out")
+    truth = _resolved(config.truth or out.with_name(f"{out.name}-truth"), "--truth")
     if truth.is_relative_to(out) or out.is_relative_to(truth):
         raise InputError(f"--truth {truth}: one inside the other with {out}; keep the truth apart")
-    key = artefact_key(STAGE, FORMAT, to_plain(plan), {})
+    effects = _checked_effects(plan, bench, config.own)
+    own = {f"effect {file.name}": content_digest(file) for file in config.own}
+    key = artefact_key(STAGE, FORMAT, to_plain(plan), own)
     before, truth_before = _standing(out, STAGE, "--out"), _standing(truth, TRUTH, "--truth")
     if before and truth_before and _whole(out, before, key) and _whole(truth, truth_before, key):
         return before
     aside, truth_aside = (p.with_name(f".{p.name}.partial") for p in (out, truth))
     with lock(aside):
         try:
-            return _build(plan, bench, key, (aside, out), (truth_aside, truth), runtime)
+            sources = (bench, *config.own)
+            return _build(plan, effects, sources, key, (aside, out), (truth_aside, truth), runtime)
         finally:
             for folder in (aside, truth_aside):
                 shutil.rmtree(folder, ignore_errors=True)
 
 
+def _resolved(folder: Path, option: str) -> Path:
+    """Where a directory is, or will be made."""
+    try:
+        folder = folder.resolve()
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    except (OSError, RuntimeError) as error:  # the latter for links in a circle
+        raise InputError(f"{option} {folder}: cannot be made ({error}); choose another") from error
+    return folder
+
+
+def acquire(
+    bench: Bench, effects: Effects, folder: Path, runtime: Runtime, camera: Cameras = Camera
+) -> None:
+    """Write an acquisition, without manifest or truth.
+
+    Parameters
+    ----------
+    bench : Bench
+    effects : tuple of Effect
+        Of the camera; those named in the bench are not looked at.
+    folder : Path
+        Empty.
+    runtime : Runtime
+    camera : callable
+        Makes the frames of some rows, called with bench, rows and effects.
+    """
+    recorded = recordings(bench)
+    runtime = _fitting(bench, recorded, runtime)
+    _write_frames(bench, effects, recorded, folder, runtime, camera)
+    _write_description(bench, folder)
+
+
 def _build(
     plan: Bench,
-    source: Path,
+    effects: Effects,
+    sources: tuple[Path, ...],
     key: str,
     acquisition: tuple[Path, Path],
     truth: tuple[Path, Path],
@@ -132,10 +187,12 @@ def _build(
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
     recorded = recordings(plan)
-    effects = checked_effects(plan, source)
     runtime = _fitting(plan, recorded, runtime)
     _write_truth(plan, effects, recorded, truth_made, runtime)
-    shutil.copyfile(source, truth_made / "bench.yaml")
+    bench, *own = sources
+    shutil.copyfile(bench, truth_made / "bench.yaml")
+    for file in own:
+        shutil.copyfile(file, truth_made / file.name)
     _write_frames(plan, effects, recorded, made, runtime)
     _write_description(plan, made)
     _put(truth_made, truth_out, Manifest(TRUTH, FORMAT, key, to_plain(plan), {}))
@@ -175,7 +232,7 @@ def _sizes(folder: Path) -> dict[str, int]:
 def _put(made: Path, final: Path, manifest: Manifest) -> Manifest:
     """Write the manifest and put a complete directory in place of what stood there."""
     manifest.summary["files"] = _sizes(made)
-    write_json(made / MANIFEST, asdict(manifest))
+    write_manifest(made, manifest)
     if final.exists():
         old = made.with_name("replaced")
         shutil.rmtree(old, ignore_errors=True)
@@ -184,9 +241,9 @@ def _put(made: Path, final: Path, manifest: Manifest) -> Manifest:
     return manifest
 
 
-def checked_effects(bench: Bench, where: Path) -> Effects:
+def _checked_effects(bench: Bench, where: Path, own: tuple[Path, ...]) -> Effects:
     """Effects of a bench file, which must go together with the bench."""
-    found = parse_effects(bench.effects, str(where))
+    found = parse_effects(bench.effects, str(where), known_effects(own))
     for effect in found:
         try:
             effect.check(bench)
@@ -214,7 +271,12 @@ def _fitting(bench: Bench, recorded: list[Recording], runtime: Runtime) -> Runti
 
 
 def _write_frames(
-    bench: Bench, effects: Effects, recorded: list[Recording], folder: Path, runtime: Runtime
+    bench: Bench,
+    effects: Effects,
+    recorded: list[Recording],
+    folder: Path,
+    runtime: Runtime,
+    camera: Cameras = Camera,
 ) -> None:
     spans: list[Span] = []
     ready: list[tuple[FrameWriter, bool]] = []
@@ -223,7 +285,7 @@ def _write_frames(
         ready += [(file, recording.folder in bench.frames.compress) for file in files]
         spans += _spans(recording, files, bench.frames.per_file)
     pieces = list(product(_blocks(bench), _batches(spans)))
-    run_tasks(partial(_write_piece, bench, effects), pieces, runtime, label="frames")
+    run_tasks(partial(_write_piece, bench, effects, camera), pieces, runtime, label="frames")
     run_tasks(_finish, ready, runtime, label="files")
 
 
@@ -280,11 +342,13 @@ def _cards(bench: Bench, recording: Recording, frame: int) -> dict[str, Any]:
     }
 
 
-def _write_piece(bench: Bench, effects: Effects, piece: tuple[Rows, list[Span]]) -> None:
+def _write_piece(
+    bench: Bench, effects: Effects, camera: Cameras, piece: tuple[Rows, list[Span]]
+) -> None:
     rows, spans = piece
-    camera = Camera(bench, rows, effects)
+    there = camera(bench, rows, effects)
     for recording, frames, files in spans:
-        for frame, samples in camera.expose(recording, frames):
+        for frame, samples in there.expose(recording, frames):
             number, plane = divmod(frame, bench.frames.per_file)
             files[number].write_rows(rows[0], samples, plane)
 

@@ -4,6 +4,10 @@ An artefact is a directory ``RUN/<stage>`` with a ``manifest.json``. It is built
 ``RUN/.partial/<stage>-<key>``, and renamed when complete, so that a directory that exists is whole.
 The key is a digest of everything the result depends on: a build with the same key that was killed
 is found again and resumed. Unfinished builds with other keys are removed when one completes.
+
+The manifest is sealed, and holds a digest of every other file but the chunks of arrays, which have
+checksums of their own. What turns out to be damaged is noted in the artefact (`lock`): it is not up
+to date from then on, and its stage makes it again.
 """
 
 import fcntl
@@ -12,7 +16,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
@@ -20,10 +24,16 @@ from typing import Any
 
 from pixcal import __version__
 from pixcal.model.errors import DamagedError, InputError
-from pixcal.storage.cube_place import cubes_of, remove_cubes, settle, settled
+from pixcal.storage.cube_place import POINTER, cubes_of, remove_cubes, settle, settled
+from pixcal.storage.folder import DISK_FULL, INDEX
 from pixcal.storage.place import Place
 
 MANIFEST = "manifest.json"
+JOURNAL = "journal.jsonl"
+SCRATCH = "scratch"
+DAMAGE = "damage.json"
+"""Names of the files of an artefact that turned out to be damaged, found when they were read."""
+_NOT_LISTED = (MANIFEST, JOURNAL, DAMAGE)
 _KEY_IN_NAME = 16
 
 
@@ -39,6 +49,8 @@ class Manifest:
     """Key of each artefact (or file set) that this one was made from."""
     pixcal: str = __version__
     summary: dict[str, Any] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
+    """Digest of each file of the artefact, but for chunks of arrays."""
 
 
 def digest(*parts: Any) -> str:
@@ -47,12 +59,22 @@ def digest(*parts: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
+def file_digest(path: Path) -> str:
+    """SHA-256 (hex, 32 characters) of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:32]
+
+
+def _json(data: Any) -> str:
+    return json.dumps(data, indent=2, allow_nan=False) + "\n"
+
+
 def write_json(path: Path, data: Any) -> None:
     """Write JSON aside, flush it to the disk, and rename it into place."""
     aside = path.with_name(f".{path.name}.aside")
+    text = _json(data)
     with aside.open("w", encoding="utf-8") as file:
-        json.dump(data, file, indent=2, allow_nan=False)
-        file.write("\n")
+        file.write(text)
         file.flush()
         os.fsync(file.fileno())
     aside.replace(path)
@@ -66,23 +88,102 @@ def read_json(path: Path) -> Any:
     DamagedError
         If the file is missing or does not parse.
     """
+    return _parse(path, _text(path))
+
+
+def _text(path: Path) -> str:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return path.read_text(encoding="utf-8")
     except OSError as error:
-        raise DamagedError(f"{path}: cannot be read ({error.strerror})") from error
+        raise DamagedError(f"{path}: cannot be read ({error.strerror})", path) from error
     except ValueError as error:
-        raise DamagedError(f"{path}: damaged ({error}); remove its folder and run again") from error
+        raise DamagedError(f"{path}: damaged ({error})", path) from error
+
+
+def _parse(path: Path, text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise DamagedError(f"{path}: damaged ({error})", path) from error
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Write the manifest of an artefact, sealed with its own digest."""
+    # As it will be read: JSON has lists for tuples, and strings for all keys.
+    data = json.loads(_json(asdict(manifest)))
+    write_json(folder / MANIFEST, data | {"seal": digest(data)})
 
 
 def read_manifest(folder: Path) -> Manifest | None:
-    """Manifest of an artefact, or None when there is no artefact."""
-    if not (folder / MANIFEST).exists():
+    """Manifest of an artefact, or None when there is no artefact.
+
+    Raises
+    ------
+    DamagedError
+        If it does not parse, or was altered (those of earlier versions have no seal).
+    """
+    path = folder / MANIFEST
+    if not path.exists():
         return None
-    data = read_json(folder / MANIFEST)
+    text = _text(path)
+    data = _parse(path, text)
     try:
+        sealed = data.pop("seal", None) is not None
+        if sealed and text != _json(data | {"seal": digest(data)}):
+            raise DamagedError(f"{path}: altered since it was written", path)
         return Manifest(**data)
-    except TypeError as error:
-        raise DamagedError(f"{folder / MANIFEST}: not a manifest that this pixcal reads") from error
+    except (AttributeError, TypeError) as error:
+        raise DamagedError(f"{path}: not a manifest that this pixcal reads", path) from error
+
+
+def _listed(folder: Path) -> Iterator[str]:
+    """Names of the files of an artefact whose digests its manifest holds."""
+    for at, folders, names in os.walk(folder):
+        here = Path(at).relative_to(folder)
+        if INDEX in names:
+            folders.clear()  # of an array: its chunks
+        if here == Path():
+            folders[:] = [name for name in folders if name != SCRATCH]
+            names = [name for name in names if name not in _NOT_LISTED]
+        yield from ((here / name).as_posix() for name in names if not name.startswith("."))
+
+
+def check_intact(folder: Path, manifest: Manifest) -> None:
+    """Hold the files of an artefact against its manifest; chunks are checked when they are read.
+
+    Raises
+    ------
+    DamagedError
+        Naming the first file that is missing or altered, or was found to be so earlier.
+    """
+    for name in damaged_files(folder):
+        raise DamagedError(f"{folder / name}: damaged", folder / name)
+    for name, expected in manifest.files.items():
+        try:
+            same = file_digest(folder / name) == expected
+        except OSError as error:
+            reason = f"cannot be read ({error.strerror})"
+            raise DamagedError(f"{folder / name}: {reason}", folder / name) from error
+        if not same:
+            raise DamagedError(f"{folder / name}: altered since it was written", folder / name)
+
+
+def damaged_files(folder: Path) -> list[str]:
+    """Names of the files of an artefact that were found to be damaged as they were read."""
+    if not (folder / DAMAGE).exists():
+        return []
+    try:
+        return [str(name) for name in read_json(folder / DAMAGE)["files"]]
+    except (DamagedError, LookupError, TypeError):
+        return [DAMAGE]
+
+
+def _command(run: Path, stage: str) -> str:
+    """What to type to have an artefact made."""
+    if stage == "ingest":
+        return f"pixcal ingest ACQ --out {run}"
+    # The sweep is a part of the command that reads it.
+    return f"pixcal {'fit' if stage == 'sweep' else stage} {run}"
 
 
 def require(run: Path, stage: str, format: int) -> Manifest:
@@ -92,17 +193,24 @@ def require(run: Path, stage: str, format: int) -> Manifest:
     ------
     InputError
         If the stage has not been run, or its format is another one.
+    DamagedError
+        If the artefact is damaged.
     """
     if not run.is_dir():
         raise InputError(f"{run}: no such run directory; make one with 'pixcal ingest'")
-    manifest = read_manifest(run / stage)
-    # The sweep is a part of the command that reads it.
-    command = f"pixcal {'fit' if stage == 'sweep' else stage} {run}"
+    folder, command = run / stage, _command(run, stage)
+    try:
+        manifest = read_manifest(folder)
+        if manifest is not None:
+            check_intact(folder, manifest)
+    except DamagedError as error:
+        error.advice = f"make it again with '{command}'"
+        raise
     if manifest is None:
-        raise InputError(f"{run / stage}: not there yet; run '{command}' first")
+        raise InputError(f"{folder}: not there yet; run '{command}' first")
     if manifest.stage != stage or manifest.format != format:
         raise InputError(
-            f"{run / stage}: format {manifest.stage}/{manifest.format}, this pixcal reads "
+            f"{folder}: format {manifest.stage}/{manifest.format}, this pixcal reads "
             f"{stage}/{format}; run '{command}' again"
         )
     return manifest
@@ -131,6 +239,11 @@ class Build:
     summary: dict[str, Any] = field(default_factory=dict)
     durable: bool = False
 
+    @property
+    def scratch(self) -> Path:
+        """Folder for what only the build itself needs."""
+        return self.folder / SCRATCH
+
     def discard(self) -> None:
         """Remove all that was written: the next run begins again."""
         _discard(self.folder, self.folder.parents[1])
@@ -141,11 +254,11 @@ class Build:
         Unless the build is durable, only those of this run of the machine: after a power failure
         nobody knows what reached the disk.
         """
-        path = self.folder / "journal.jsonl"
+        path = self.folder / JOURNAL
         if not path.exists():
             return set()
         done = set()
-        for line in path.read_text(encoding="utf-8").splitlines():
+        for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
             # The last line may have been cut by a kill: what does not parse was not done.
             try:
                 step = json.loads(line)
@@ -157,7 +270,7 @@ class Build:
 
     def note(self, step: str) -> None:
         """Note a step as done. Call it when all that the step wrote is in place."""
-        with (self.folder / "journal.jsonl").open("a", encoding="utf-8") as file:
+        with (self.folder / JOURNAL).open("a", encoding="utf-8") as file:
             file.write("\n" + json.dumps({"done": step, "boot": _boot()}) + "\n")
             if self.durable:
                 file.flush()
@@ -179,9 +292,15 @@ def artefact_key(stage: str, format: int, config: dict[str, Any], inputs: dict[s
 
 
 def up_to_date(run: Path, stage: str, key: str) -> Manifest | None:
-    """The manifest of ``RUN/<stage>`` when it was made from just these inputs, else None."""
-    manifest = read_manifest(run / stage)
-    return manifest if manifest is not None and manifest.key == key else None
+    """The manifest of ``RUN/<stage>`` when it was made from just these inputs and is whole."""
+    try:
+        manifest = read_manifest(run / stage)
+        if manifest is None or manifest.key != key:
+            return None
+        check_intact(run / stage, manifest)
+    except DamagedError:
+        return None
+    return manifest
 
 
 @contextmanager
@@ -226,8 +345,9 @@ def build(
     yield made
     # What is called complete must be on the disk, not on its way to it.
     os.sync()
-    manifest = Manifest(stage, format, key, config, inputs, summary=made.summary)
-    write_json(folder / MANIFEST, asdict(manifest))
+    files = {name: file_digest(folder / name) for name in sorted(_listed(folder))}
+    manifest = Manifest(stage, format, key, config, inputs, summary=made.summary, files=files)
+    write_manifest(folder, manifest)
     final = run / stage
     old = run / ".partial" / f"{stage}-replaced"
     if old.exists():
@@ -236,7 +356,7 @@ def build(
         final.rename(old)
     folder.rename(final)
     # Only now: killed before, the build is resumed, with every step noted as done.
-    (final / "journal.jsonl").unlink(missing_ok=True)
+    _tidy(final)
     for left in [old, *folder.parent.glob(f"{stage}-{'[0-9a-f]' * _KEY_IN_NAME}")]:
         _discard(left, run)
 
@@ -247,17 +367,73 @@ def _discard(folder: Path, run: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def _put_back(run: Path) -> None:
-    """Put back the artefacts that a kill left aside before the new one was in place."""
+def _tidy(folder: Path) -> None:
+    """Remove from a complete artefact what only its build needed."""
+    (folder / JOURNAL).unlink(missing_ok=True)
+    shutil.rmtree(folder / SCRATCH, ignore_errors=True)
+
+
+def _settle_killed(run: Path) -> None:
+    """End what a kill left half-done: artefacts put aside, or not cleaned up."""
     for old in run.glob(".partial/*-replaced"):
         final = run / old.name.removesuffix("-replaced")
-        if not final.exists():
+        if final.exists():
+            _discard(old, run)
+        else:
             old.rename(final)
+    for manifest in run.glob(f"*/{MANIFEST}"):
+        _tidy(manifest.parent)
+
+
+def _note_damage(run: Path, error: DamagedError) -> None:
+    """See to it that what is damaged is made again by the next run of its stage."""
+    if _name_within(run / "products", error.path) is not None:
+        error.advice = f"write it again with '{_command(run, 'fit')}'"
+        return
+    for folder in [*run.glob(".partial/*/"), *(file.parent for file in run.glob(f"*/{MANIFEST}"))]:
+        name = _name_within(folder, error.path)
+        if name is None:
+            continue
+        if folder.parent != run:
+            _discard(folder, run)
+            error.advice = "run the same command again"
+            return
+        if name != POINTER:
+            error.advice = f"make it again with '{_command(run, folder.name)}'"
+        with suppress(OSError):
+            write_json(folder / DAMAGE, {"files": sorted({*damaged_files(folder), name})})
+
+
+def _name_within(folder: Path, path: str) -> str | None:
+    """Name of a file relative to an artefact, or to its cubes elsewhere; None when not of it."""
+    try:
+        cubes = cubes_of(folder)
+    except DamagedError:
+        cubes = folder
+    for place in (folder, folder.absolute(), cubes):
+        if path.startswith(f"{place}/"):
+            return path.removeprefix(f"{place}/")
+    return None
+
+
+@contextmanager
+def damage_noted(*runs: Path) -> Iterator[None]:
+    """Do what `lock` does about damage, for runs that are only read."""
+    try:
+        yield
+    except DamagedError as error:
+        for run in runs:
+            with suppress(InputError, OSError), lock(run):
+                _note_damage(run, error)
+        raise
 
 
 @contextmanager
 def lock(run: Path) -> Iterator[None]:
     """Hold a run directory: a second process on it is refused, not mixed in.
+
+    When something of the run that the block reads turns out to be damaged, that is noted: the
+    artefact is not up to date any more, an unfinished build is removed.
 
     Raises
     ------
@@ -270,11 +446,19 @@ def lock(run: Path) -> Iterator[None]:
     except (FileExistsError, NotADirectoryError) as error:
         raise InputError(f"{run}: not a directory; choose another RUN") from error
     except OSError as error:
-        raise InputError(f"{run}: cannot be written ({error.strerror})") from error
+        if error.errno in DISK_FULL:
+            raise
+        raise InputError(
+            f"{run}: cannot be written ({error.strerror}); choose another place"
+        ) from error
     with handle:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise InputError(f"{run}: another pixcal is working there; wait for it") from error
-        _put_back(run)
-        yield
+        _settle_killed(run)
+        try:
+            yield
+        except DamagedError as error:
+            _note_damage(run, error)
+            raise

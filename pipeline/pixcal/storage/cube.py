@@ -8,6 +8,7 @@ so that a chunk that is missing, cut or exchanged is refused and never read as z
 with a crc of itself and of the metadata.
 """
 
+import errno
 import json
 import math
 from collections.abc import Iterator, Sequence
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec
 
 from pixcal.model.errors import DamagedError
-from pixcal.storage.folder import File, open_folder, read_file
+from pixcal.storage.folder import INDEX, File, open_folder, read_file
 from pixcal.storage.links import copy_files, link_files
 from pixcal.storage.place import Place, UrlPath
 from pixcal.storage.read_ahead import AHEAD, ReadAhead
@@ -34,7 +35,8 @@ from pixcal.storage.read_ahead import AHEAD, ReadAhead
 CHUNK = (64, 128, 128)
 """Samples of a chunk along (time, y, x): 2 MiB of uint16."""
 
-INDEX = "chunks.npy"
+_LOST = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EIO)
+"""Errors of the system that mean that a file is damaged; others may pass."""
 _RESIDUE = 0x48674BC7
 """CRC-32C of anything that ends with its own CRC-32C, least byte first."""
 _INDEX_DTYPE = np.dtype([("size", "<u4"), ("crc", "<u4")])
@@ -212,10 +214,14 @@ class ArrayWriter:
             try:
                 for name, (size, tail) in zip(names, folder.ends(names), strict=True):
                     if len(tail) < 4:
-                        raise DamagedError(f"{self.path}/{name}: chunk cut short")
+                        path = f"{self.path}/{name}"
+                        raise DamagedError(f"{path}: chunk cut short", path)
                     rows.append((size, int.from_bytes(tail, "little")))
             except OSError as error:
-                raise DamagedError(f"{error.filename}: chunk missing ({error.strerror})") from error
+                if error.errno not in _LOST:
+                    raise
+                path = str(error.filename)
+                raise DamagedError(f"{path}: chunk missing ({error.strerror})", path) from error
             index[first] = np.array(rows, _INDEX_DTYPE).reshape(grid[1:])
         body = BytesIO()
         np.save(body, index)
@@ -275,9 +281,11 @@ class ArrayReader:
             begin = len(body) - 4 - count * _INDEX_DTYPE.itemsize
             self._index = np.frombuffer(body, _INDEX_DTYPE, count, begin).reshape(grid)
         except (OSError, ValueError, KeyError, TypeError) as error:
+            if isinstance(error, OSError) and error.errno not in _LOST:
+                raise
+            reason = " ".join(str(error).split())
             raise DamagedError(
-                f"{path}: not a complete array ({' '.join(str(error).split())}); "
-                "remove the artefact that holds it and run its stage again"
+                f"{path}: not a complete array ({reason})", path / "zarr.json"
             ) from error
         self.shape: tuple[int, ...] = tuple(meta["shape"])
         self.chunks: tuple[int, ...] = tuple(meta["chunk_grid"]["configuration"]["chunk_shape"])
@@ -312,7 +320,7 @@ class ArrayReader:
         size, crc = self._index[tuple(index)].item()
 
         def damaged(what: str) -> DamagedError:
-            return DamagedError(f"{self.path / name}: {what}; run the stage that wrote it again")
+            return DamagedError(f"{self.path / name}: {what}", self.path / name)
 
         try:
             if self._ahead is None:
@@ -320,6 +328,8 @@ class ArrayReader:
             else:
                 body = self._fetch(self._ahead, index)
         except OSError as error:
+            if error.errno not in _LOST:
+                raise
             raise damaged(f"chunk missing ({error.strerror})") from error
         if len(body) != size:
             raise damaged(f"{len(body)} bytes where {size} were written")

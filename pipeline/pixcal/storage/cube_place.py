@@ -122,10 +122,16 @@ def _read(artefact: Path) -> Mapping[str, Any] | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
-        raise DamagedError(f"{file}: damaged ({error}); remove its folder and run again") from error
+        raise _damaged(file, f" ({error})") from error
     if not isinstance(pointer, dict) or not {"base", "place", "owner"} <= pointer.keys():
-        raise DamagedError(f"{file}: damaged; remove its folder and run again")
+        raise _damaged(file, "")
     return pointer
+
+
+def _damaged(file: Path, reason: str) -> DamagedError:
+    error = DamagedError(f"{file}: damaged{reason}", file)
+    error.advice = "say where cubes go with --cubes (--cubes RUN: in RUN), and they are made again"
+    return error
 
 
 def _write_json(folder: Place, name: str, data: Any) -> None:

@@ -21,7 +21,9 @@ def integer(header: fits.Header, key: str, default: int | None = None) -> int:
     """Whole number of a key; ValueError when it is something else."""
     found = header.get(key, default)
     if isinstance(found, bool) or not isinstance(found, int):
-        raise ValueError(f"header key {key} is missing or not a whole number")
+        raise ValueError(
+            f"header key {key} is missing or not a whole number; copy the file again, or remove it"
+        )
     return found
 
 

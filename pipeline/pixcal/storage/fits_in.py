@@ -7,6 +7,7 @@ hours of reading begin. The samples are read by `pixcal.storage.fits_rows`.
 import gzip
 import io
 import math
+import sys
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -147,9 +148,13 @@ def inspect(source: SourceFile) -> FrameFile:
             return found
         except (EOFError, zlib.error, gzip.BadGzipFile) as error:
             raise damaged_gzip(source.path, error) from error
-        except (fits.VerifyError, ValueError) as error:
-            reason = " ".join(str(error).split())
-            raise InputError(f"{source.path}: {reason}") from error
+        except fits.VerifyError as error:
+            reason = " ".join(str(error).split()).partition(",")[0]
+            raise InputError(
+                f"{source.path}: damaged header ({reason}); copy it again, or remove it"
+            ) from error
+        except ValueError as error:
+            raise InputError(f"{source.path}: {' '.join(str(error).split())}") from error
         except OSError as error:
             raise unreadable(source.path, error) from error
 
@@ -161,7 +166,7 @@ def damaged_gzip(path: Path, error: Exception) -> InputError:
 
 
 def _inspect_stream(source: SourceFile, stream: _Stream, container: Container) -> FrameFile:
-    header, primary, hdu = _first_image(stream)
+    header, primary, hdu = _first_image(source, stream)
     offset = stream.tell()
     tiled = _is_tiled(header)
     if tiled and container == "gzip":
@@ -181,15 +186,34 @@ def _inspect_stream(source: SourceFile, stream: _Stream, container: Container) -
         temperature_c=temperature_c(headers),
     )
     needed = offset + (_data_bytes(header) if tiled else file.data_bytes)
-    if file.container != "gzip" and source.size < needed:
+    if file.container != "gzip":
+        _require(source, needed)
+        _check_rest(stream, needed)
+    return file
+
+
+def _require(source: SourceFile, needed: int) -> None:
+    if source.size < needed:
         raise ValueError(
             f"cut short: {source.size} bytes where its header calls for {needed}; copy it again, "
             "or remove it"
         )
-    return file
 
 
-def _first_image(stream: _Stream) -> tuple[fits.Header, fits.Header, int]:
+def _check_rest(stream: _Stream, end: int) -> None:
+    """Refuse data after the image: its header calls for less than there is, and tells no truth."""
+    stream.seek(end)
+    fill, following = stream.read(-end % _BLOCK), stream.read(_BLOCK)
+    extension = following.startswith(b"XTENSION")
+    # Fill of any one value is no data: zeros by the standard, blanks of some writers.
+    if len(set(fill)) > 1 or (len(set(following)) > 1 and not extension):
+        raise ValueError(
+            f"its header calls for {end} bytes, and there are more data; mend NAXISn and BITPIX, "
+            "or remove it"
+        )
+
+
+def _first_image(source: SourceFile, stream: _Stream) -> tuple[fits.Header, fits.Header, int]:
     """Header of the first image with data, primary header, and number of the former.
 
     The stream is left where the image's data begin.
@@ -201,8 +225,10 @@ def _first_image(stream: _Stream) -> tuple[fits.Header, fits.Header, int]:
     while header is not None:
         if _is_tiled(header) or _is_image(header):
             return header, primary, hdu
-        padded = -(-_data_bytes(header) // _BLOCK) * _BLOCK
-        stream.seek(stream.tell() + padded)
+        following = stream.tell() + -(-_data_bytes(header) // _BLOCK) * _BLOCK
+        if isinstance(stream, io.BufferedReader):
+            _require(source, following)
+        stream.seek(min(following, sys.maxsize))
         header = _read_header(stream, b"XTENSION")
         hdu += 1
     raise ValueError("holds no image; remove it, or narrow the glob that lists it")
@@ -237,7 +263,7 @@ def _axes(header: fits.Header, prefix: str = "") -> list[int]:
     count = integer(header, f"{prefix}NAXIS")
     axes = [integer(header, f"{prefix}NAXIS{n + 1}") for n in range(count)]
     if min(axes, default=0) < 0:
-        raise ValueError("header key NAXISn is negative")
+        raise ValueError(f"header key {prefix}NAXISn is negative; copy it again, or remove it")
     return axes
 
 
@@ -245,11 +271,15 @@ def _data_bytes(header: fits.Header) -> int:
     axes = _axes(header)
     samples = math.prod(axes) if axes else 0
     groups, extra = integer(header, "GCOUNT", 1), integer(header, "PCOUNT", 0)
+    if min(groups, extra) < 0:
+        raise ValueError("header key GCOUNT or PCOUNT is negative; copy it again, or remove it")
     return abs(integer(header, "BITPIX")) // 8 * groups * (extra + samples)
 
 
 def _frames_shape(axes: list[int]) -> tuple[int, int, int]:
     """(planes, y, x) of a frame or a cube; axes of length 1 after the second are dropped."""
+    if 0 in axes:
+        raise ValueError("an axis of no length; copy it again, or remove it")
     later = [n for n in axes[2:] if n != 1]
     if len(axes) < 2 or len(later) > 1:
         lengths = " × ".join(map(str, axes))
@@ -276,8 +306,10 @@ def _coding(header: fits.Header, prefix: str) -> Coding:
             f"BITPIX {bitpix}; frames are 8-, 16- or 32-bit integers or 32-bit floats: convert it"
         )
     scale, zero = number(header, "BSCALE", 1.0), number(header, "BZERO", 0.0)
-    if scale is None or zero is None:
-        raise ValueError("header key BSCALE or BZERO is not a number")
+    if not scale or zero is None:
+        raise ValueError(
+            "header key BSCALE is zero, or BSCALE or BZERO is not a number; mend the header"
+        )
     # Only integers have a BLANK; ZBLANK is the name that compressors give it.
     key = "BLANK" if "BLANK" in header else "ZBLANK"
     blank = integer(header, key) if bitpix > 0 and key in header else None
@@ -296,12 +328,11 @@ def _check_gzip_length(file: FrameFile, handle: io.FileIO) -> None:
     if length in (needed % 2**32, -(-needed // _BLOCK) * _BLOCK % 2**32):
         return
     handle.seek(0)
-    held = 0
     with gzip.GzipFile(fileobj=handle) as stream:
-        while part := stream.read(1 << 20):
-            held += len(part)
-    if held < needed:
-        raise ValueError(
-            f"cut short: {held} bytes once unpacked where its header calls for {needed}; copy it "
-            "again, or remove it"
-        )
+        held = stream.seek(min(needed, sys.maxsize))
+        if held < needed:
+            raise ValueError(
+                f"cut short: {held} bytes once unpacked where its header calls for {needed}; copy "
+                "it again, or remove it"
+            )
+        _check_rest(stream, needed)

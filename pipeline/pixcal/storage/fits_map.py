@@ -54,11 +54,14 @@ class FitsMap:
                 found = cls(path, shape, _TYPES[header["BITPIX"]], int(hdu.fileinfo()["datLoc"]))
                 if path.stat().st_size < found.data_at + found.n_bytes:
                     raise ValueError("cut short")
-                if "DATASUM" in header and _datasum(found) != int(header["DATASUM"]):
+                if "DATASUM" in header and int(header["DATASUM"]) != word_sum(
+                    path, found.data_at, found.n_bytes
+                ):
                     raise ValueError("altered: its checksum does not match")
         except (OSError, LookupError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())
-            raise DamagedError(f"{path}: not a map that this pixcal reads ({reason})") from error
+            message = f"{path}: not a map that this pixcal reads ({reason})"
+            raise DamagedError(message, path) from error
         return found
 
     @property
@@ -74,15 +77,15 @@ class FitsMap:
             for row, values in zip(range(*y), block, strict=True):
                 file.seek(self.data_at + (row * self.shape[1] + x[0]) * dtype.itemsize)
                 if file.readinto(values.view(np.uint8)) != values.nbytes:
-                    raise DamagedError(f"{self.path}: cut short while it was read; fit again")
+                    raise DamagedError(f"{self.path}: cut short while it was read", self.path)
         return block.astype(dtype.newbyteorder("="))
 
 
-def _datasum(image: FitsMap) -> int:
-    """The FITS checksum of an image: the sum of its 32-bit words in ones' complement."""
-    total, left = 0, image.n_bytes
-    with image.path.open("rb") as file:
-        file.seek(image.data_at)
+def word_sum(path: Path, start: int, n_bytes: int) -> int:
+    """Sum of the 32-bit words of a part of a file in ones' complement (FITS 4.0, appendix J)."""
+    total, left = 0, n_bytes
+    with path.open("rb") as file:
+        file.seek(start)
         while left:
             piece = file.read(min(_PIECE, left))
             left -= len(piece)
@@ -99,4 +102,4 @@ def content_digest(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()[:32]
     except OSError as error:
-        raise DamagedError(f"{path}: cannot be read ({error.strerror})") from error
+        raise DamagedError(f"{path}: cannot be read ({error.strerror})", path) from error

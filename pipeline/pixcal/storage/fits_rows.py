@@ -62,6 +62,8 @@ def read_rows(
                 _turn_sign(raw, coding)
             if stored is not None:
                 target[...] = raw.view(coding.dtype) if coding.exact else _scale(raw, coding)
+        # Written to since it was opened, it is partly another file.
+        file.source.check_read(handle)
 
 
 def _read_exactly(handle: io.FileIO, start: int, raw: NDArray[Any], path: Path) -> None:
@@ -119,6 +121,7 @@ def unpack(file: FrameFile, target: Path) -> FrameFile:
             _unpack_gzip(file, handle, out)
         else:
             _unpack_tiles(file, out)
+        file.source.check_read(handle)
     facts = target.stat()
     if facts.st_size != file.data_bytes:
         raise InputError(

@@ -10,6 +10,10 @@ from typing import Any, Protocol
 
 from pixcal.storage.place import Place, UrlPath, explained
 
+INDEX = "chunks.npy"
+"""File that an array has beside its metadata: sizes and checksums of its chunks."""
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
+"""Errors of the system that are no fault of the file."""
 BATCH_BYTES = 16 << 20
 """Bytes that one task sends to a URL at the same time, and more than it reads ahead."""
 

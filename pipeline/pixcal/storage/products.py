@@ -1,18 +1,23 @@
 """The maps that other programs read: FITS, written aside and renamed."""
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.io import fits
+from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from pixcal import __version__
 from pixcal.model.errors import DamagedError
 from pixcal.model.flags import PixelFlag
+from pixcal.storage.fits_map import word_sum
 
 Card = tuple[str, Any, str]
+_NOT_A_MAP = (OSError, KeyError, TypeError, ValueError, AstropyUserWarning, fits.VerifyError)
 
 
 def write_map(
@@ -50,10 +55,39 @@ def write_map(
     flags = fits.ImageHDU(mask, name="MASK")
     for flag in PixelFlag:
         flags.header[f"FLAG{flag.value.bit_length()}"] = (flag.value, (flag.name or "").lower())
+    hdus = fits.HDUList([primary, errors, flags])
+    for hdu in hdus:
+        # Not by writeto, which would put the time into the comment: equal maps, equal bytes.
+        hdu.add_checksum(when="by pixcal")
     path.parent.mkdir(parents=True, exist_ok=True)
     aside = path.with_name(f".{path.name}.aside")
-    fits.HDUList([primary, errors, flags]).writeto(aside, overwrite=True, checksum=True)
+    with aside.open("wb") as file:
+        hdus.writeto(file)
     aside.replace(path)
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a map is there and unaltered, header and data."""
+    try:
+        with _checked(path):
+            return True
+    except _NOT_A_MAP:
+        return False
+
+
+@contextmanager
+def _checked(path: Path) -> Iterator[fits.HDUList]:
+    """The images of a file, every bit of which is as it was written."""
+    # CHECKSUM makes the sum of each header and data unit, and so of the file, minus zero.
+    if word_sum(path, 0, path.stat().st_size) != 0xFFFFFFFF:
+        raise ValueError("altered: its checksum does not match")
+    with warnings.catch_warnings():
+        # How astropy tells of a file that is cut.
+        warnings.simplefilter("error", AstropyUserWarning)
+        with fits.open(path) as hdus:
+            if [hdu.name for hdu in hdus] != ["PRIMARY", "SIGMA", "MASK"]:
+                raise ValueError("not the images that pixcal writes")
+            yield hdus
 
 
 def read_map(
@@ -67,13 +101,13 @@ def read_map(
         If the file is missing, cut or altered.
     """
     try:
-        with fits.open(path, checksum=True) as hdus:
+        with _checked(path) as hdus:
             header = {
                 k: v for k, v in hdus[0].header.items() if k not in ("HISTORY", "COMMENT", "")
             }
             data = np.array(hdus[0].data, dtype=np.float32)
             sigma = np.array(hdus["SIGMA"].data, dtype=np.float32)
             mask = np.array(hdus["MASK"].data, dtype=np.uint8)
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise DamagedError(f"{path}: not a map that this pixcal reads ({error})") from error
+    except _NOT_A_MAP as error:
+        raise DamagedError(f"{path}: not a map that this pixcal reads ({error})", path) from error
     return data, sigma, mask, header

@@ -1,6 +1,5 @@
 """The files of an acquisition: which there are, and whether they are still the same."""
 
-import glob
 import io
 import os
 import stat
@@ -47,11 +46,15 @@ class SourceFile:
         except OSError as error:
             raise unreadable(self.path, error) from error
         try:
-            self._compare(os.fstat(handle.fileno()))
+            self.check_read(handle)
         except BaseException:
             handle.close()
             raise
         return handle
+
+    def check_read(self, handle: io.FileIO) -> None:
+        """Raise InputError if the file behind a handle is not as it was found."""
+        self._compare(os.fstat(handle.fileno()))
 
     def check_unchanged(self) -> None:
         """Raise InputError if the file is gone or is not as it was found."""
@@ -125,20 +128,33 @@ def _globs(frames: Frames) -> list[tuple[str, str, tuple[str, ...]]]:
 def _matches(pattern: str, description: Path, place: str) -> set[str]:
     if ".." in PurePosixPath(pattern).parts:
         raise InputError(
-            f"{place}: {pattern!r} leaves the folder of the acquisition; write it without '..' "
+            f"{place}: {pattern!r:.80} leaves the folder of the acquisition; write it without '..' "
             "(a symbolic link may lead elsewhere)"
         )
     folder = description.parent
-    # Not Path.glob, which takes hidden files too, such as the '._…' that some systems leave.
-    matches = glob.glob(pattern, root_dir=folder, recursive=True)  # noqa: PTH207
-    names = {os.path.normpath(name) for name in matches}
-    names = {name for name in names if not (folder / name).is_dir()}
+    parts = PurePosixPath(pattern).parts
+    try:
+        # Not glob.glob, whose '**' follows links to folders, in circles too.
+        paths = [path for path in folder.glob(pattern) if not path.is_dir()] if parts else []
+    except (ValueError, OSError, RecursionError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(
+            f"{place}: {pattern!r:.80} cannot be used ({reason!s:.80}); correct it"
+        ) from error
+    names = {path.relative_to(folder) for path in paths}
+    if not any(map(_hidden, parts)):
+        # Such as the '._…' that some systems leave.
+        names = {name for name in names if not any(map(_hidden, name.parts))}
     if not names:
         raise InputError(
-            f"{place}: {pattern!r} matches no file in {folder}; correct it, or remove it from the "
-            "list"
+            f"{place}: {pattern!r:.80} matches no file in {folder}; correct it, or remove it from "
+            "the list"
         )
-    return names
+    return {name.as_posix() for name in names}
+
+
+def _hidden(part: str) -> bool:
+    return part.startswith(".")
 
 
 def _source(

@@ -101,7 +101,8 @@ class Config:
             raise InputError(f"--window {self.window}: even; a window has a middle pixel")
         if self.electrons + self.background_e > MOST_ELECTRONS:
             raise InputError(
-                f"--electrons, --background: more than {MOST_ELECTRONS:g} e- cannot be counted"
+                f"--electrons, --background: more than {MOST_ELECTRONS:g} e- cannot be counted; "
+                "give less"
             )
 
 

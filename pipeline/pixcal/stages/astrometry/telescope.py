@@ -34,7 +34,7 @@ class Telescope:
         if not low <= self.sampling <= high:
             raise InputError(
                 f"--focal-length, --wavelength, --diameter: {self.sampling:.3g} px in lambda/D, "
-                f"from {low:g} to {high:g} can be done"
+                f"from {low:g} to {high:g} can be done; change one of them"
             )
 
     @property

@@ -40,9 +40,11 @@ from pixcal.storage.artefact import (
     MANIFEST,
     Manifest,
     artefact_key,
+    damage_noted,
     lock,
     read_manifest,
     write_json,
+    write_manifest,
 )
 
 STAGE = "compare"
@@ -93,11 +95,16 @@ def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Ma
     """
     if not 0 <= config.sigma_accuracy <= 0.5:
         raise InputError(f"--sigma-accuracy {config.sigma_accuracy}: not between 0 and 0.5")
-    sides = _sides(runs, config)
+    _check_out(out)
+    with damage_noted(*runs):
+        sides = _sides(runs, config)
+        return _run(sides, out, config, runtime)
+
+
+def _run(sides: Sequence[Side], out: Path, config: Config, runtime: Runtime) -> Manifest:
     components = _components(sides)
     inputs = {f"{n} {side.run}": side.key for n, side in enumerate(sides)}
     key = artefact_key(STAGE, FORMAT, asdict(config), inputs)
-    _check_out(out)
     with lock(out):
         ready = read_manifest(out)
         if ready is not None and ready.key == key and (out / RESULT).exists():
@@ -112,7 +119,7 @@ def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Ma
             aside.replace(out / name)
         write_json(out / RESULT, result)
         manifest = Manifest(STAGE, FORMAT, key, asdict(config), inputs)
-        write_json(out / MANIFEST, asdict(manifest))
+        write_manifest(out, manifest)
         return manifest
 
 

@@ -1,5 +1,6 @@
 """The maps of all sets and what they give together: one pass over the sweep's maps."""
 
+import shutil
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -120,6 +121,9 @@ def _tile_task(
 ) -> _Told:
     at, removed = job
     y, x = fitted[0].source.ranges(at)
+    for f in fitted:
+        for name in SAME_AS_SWEPT:
+            ArrayReader(f.swept / name).read_chunk(at)  # linked: damage would be there for good
     found = [_write_set(f, at, removed[f.name], writers[f.name]) for f in fitted]
     delta, sigma = (np.stack([m[n] for m in found]).astype(float) for n in (0, 1))
     masks = np.stack([m[2] for m in found])
@@ -185,6 +189,8 @@ def _create_set(folder: Path, fitted: FittedSet) -> dict[str, ArrayWriter]:
     """The set's folder: what is the sweep's is linked; writers of the rest."""
     create_group(folder)
     for name in SAME_AS_SWEPT:
+        # Those that a killed fit has linked may be of a sweep that was damaged.
+        shutil.rmtree(folder / name, ignore_errors=True)
         link_files(fitted.swept / name, folder / name)
     _write_frames(folder, fitted.swept)
     (cy, cx), shape = fitted.source.signal.chunks[1:], fitted.source.shape

@@ -12,7 +12,7 @@ from pixcal.model.errors import DamagedError
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader
-from pixcal.storage.products import Card, write_map
+from pixcal.storage.products import Card, is_whole, write_map
 
 PIXEL_BYTES = 9
 """A map, its errors and its flags, whole, for each pixel."""
@@ -34,14 +34,14 @@ def plan_products(run_dir: Path, sets: list[str], runtime: Runtime) -> None:
 
 
 def published(run_dir: Path) -> bool:
-    """Whether the products are there and are those of the present fit."""
+    """Whether the products are there, unaltered, and are those of the present fit."""
     try:
         product = read_json(run_dir / "products" / "fit.json")
         same = product == read_json(run_dir / "fit" / "fit.json")
     except DamagedError:
         return False
     return same and all(
-        (run_dir / "products" / f"{name}.fits").exists() for name in product["outputs"]
+        is_whole(run_dir / "products" / f"{name}.fits") for name in product["outputs"]
     )
 
 

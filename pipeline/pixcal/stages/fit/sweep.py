@@ -31,6 +31,7 @@ from pixcal.storage.artefact import (
     Manifest,
     artefact_key,
     build,
+    file_digest,
     read_json,
     require,
     up_to_date,
@@ -82,7 +83,9 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """
     acquisition, reduced = load_run(run_dir)
     if not acquisition.frames.fringes:
-        raise InputError(f"{run_dir}: the acquisition lists no fringes (frames.fringes), no fit")
+        raise InputError(
+            f"{run_dir}: the acquisition lists no fringes; a fit needs some, in frames.fringes"
+        )
     inputs = {"reduce": reduced.key}
     key = artefact_key("sweep", FORMAT, asdict(config), inputs)
     if (ready := up_to_date(run_dir, "sweep", key)) is not None:
@@ -130,11 +133,11 @@ def _sweep_set(
 ) -> dict[str, Any]:
     folder = made.folder / "sweep.zarr" / name
     create_group(folder)
-    done = made.journal()
-    if f"{name}:scout" not in done:
+    done, scouted = made.journal(), folder / "scout.json"
+    if not scouted.exists() or f"{name}:scout {file_digest(scouted)}" not in done:
         scout_set(source, nominal, folder, runtime, name)
-        made.note(f"{name}:scout")
-    facts: dict[str, Any] = read_json(folder / "scout.json")
+        made.note(f"{name}:scout {file_digest(scouted)}")
+    facts: dict[str, Any] = read_json(scouted)
     frames = read_frames(folder)
     batches = plan_batches(source.time_s(), config.batch_frames)
     prime = frames_to_prime(frames, source.block)
@@ -231,7 +234,9 @@ def _sweep_task(job: _Job, at: tuple[int, int]) -> None:
         writers[name].write(start, getattr(maps, name))
     for name in BATCH_MAPS if "batch_phase" in writers else ():
         writers[name].write((0, *start), getattr(maps, name))
-    flags = fit_flags(mask, maps.iota, maps.sigma, maps.chi2, maps.count, job.noise, job.chi2_limit)
+    flags = fit_flags(
+        mask, maps.iota, maps.alpha, maps.sigma, maps.chi2, maps.count, job.noise, job.chi2_limit
+    )
     writers["mask"].write(start, flags)
     usable = (mask == 0) & np.isfinite(maps.chi2)
     chi2 = maps.chi2[usable]

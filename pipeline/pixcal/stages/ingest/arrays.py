@@ -4,7 +4,6 @@ An array whose files are all as they were is not read again: its chunks are link
 artefact, and what the headers said is taken from its tables. Its files are not even opened.
 """
 
-import errno
 import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -14,16 +13,14 @@ from typing import Any
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.errors import DamagedError
-from pixcal.storage.artefact import Manifest, read_json
+from pixcal.storage.artefact import Manifest, damaged_files, file_digest, read_json
 from pixcal.storage.cube import ArrayWriter, create_array, create_group
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.fits_in import Coding, FrameFile
+from pixcal.storage.folder import DISK_FULL
 from pixcal.storage.frames import tabulate
 from pixcal.storage.place import Place
 from pixcal.storage.sources import SourceFile
-
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errors of the system that are no fault of the file."""
 
 
 def create(cubes: Place, array: str, shape: Sequence[int], dtype: Any) -> ArrayWriter:
@@ -98,14 +95,21 @@ def find_kept(
     Returns
     -------
     list of Kept
-        Without those that its tables do not describe: they must be read again.
+        Without those that its tables do not describe, or that are damaged: they must be read
+        again.
     """
+    tables_file = folder / "frames.json"
     try:
-        tables = read_json(folder / "frames.json")
+        tables = read_json(tables_file)
     except DamagedError:
         return []
+    if earlier.files and file_digest(tables_file) != earlier.files.get(tables_file.name):
+        return []
+    damaged = damaged_files(folder)
     kept = []
     for array, name in same.items():
+        if any(file.startswith(f"raw.zarr/{name}/") for file in damaged):
+            continue
         try:
             facts = earlier.summary["arrays"][name]
             files = _described(sources[array], facts["shape"], tables[name])

@@ -22,7 +22,7 @@ from pixcal.engine.plan import Plan, make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.config import quantity, to_plain
-from pixcal.model.errors import InputError, RemoteError
+from pixcal.model.errors import DamagedError, InputError, RemoteError
 from pixcal.stages.ingest.arrays import create, find_kept, finish, take_over
 from pixcal.storage.artefact import (
     Build,
@@ -35,7 +35,7 @@ from pixcal.storage.artefact import (
     write_json,
 )
 from pixcal.storage.cube import CHUNK, ArrayWriter
-from pixcal.storage.cube_place import base_of, chosen_base
+from pixcal.storage.cube_place import base_of, chosen_base, cubes_of
 from pixcal.storage.fits_in import FrameFile, inspect
 from pixcal.storage.fits_rows import read_rows, unpack, unpack_bytes
 from pixcal.storage.folder import transit_bytes
@@ -109,7 +109,7 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
         done = up_to_date(out, STAGE, artefact_key(STAGE, FORMAT, plain, inputs))
         if done is not None and base_of(out / STAGE) == base:
             return done
-        earlier = read_manifest(out / STAGE)
+        earlier = _earlier(out)
         same = _same_files(earlier, inputs)
         if earlier is not None and not same and not config.overwrite:
             _refuse_other(out, earlier, plain, inputs)
@@ -123,6 +123,15 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
     manifest = read_manifest(out / STAGE)
     assert manifest is not None
     return manifest
+
+
+def _earlier(out: Path) -> Manifest | None:
+    """Manifest of an earlier ingest; what cannot be read is made again."""
+    try:
+        cubes_of(out / STAGE)
+        return read_manifest(out / STAGE)
+    except DamagedError:
+        return None
 
 
 def _same_files(earlier: Manifest | None, inputs: Mapping[str, str]) -> dict[str, str]:
@@ -295,7 +304,7 @@ def _pieces(
 def _fill(made: Build, tables: Mapping[str, Sequence[Frame]], runtime: Runtime) -> None:
     """Write all blocks that an earlier run has not written."""
     rows, plan = _plan(tables, made.cubes, runtime)
-    scratch = made.folder / "scratch"
+    scratch = made.scratch
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     journal = made.journal()

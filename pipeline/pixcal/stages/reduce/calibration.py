@@ -50,8 +50,8 @@ class Usual:
 
     Attributes
     ----------
-    response : float
-        Median response of the flats (ADU/s); NaN without flats.
+    response, response_error : float
+        Median response of the flats and its error in a pixel (ADU/s); NaN without flats.
     dark_rate, dark_rate_sigma : float
         Median and robust spread of the dark signal (ADU/s).
     dark_variance : float
@@ -61,6 +61,7 @@ class Usual:
     """
 
     response: float
+    response_error: float
     dark_rate: float
     dark_rate_sigma: float
     dark_variance: float
@@ -81,7 +82,10 @@ def usual(folder: Path, shape: tuple[int, int], gain: float) -> Usual:
     """
     reader = ArrayReader(folder / "maps")
     stride = int(np.ceil(np.sqrt(shape[0] * shape[1] / _SAMPLES)))
-    names = ("response", "dark_rate", "dark_variance", "dark_charge", "dark_dof", "bias")
+    names = (
+        "response", "response_error", "dark_rate", "dark_variance", "dark_charge", "dark_dof",
+        "bias",
+    )  # fmt: skip
     wanted = [STATISTICS.index(name) for name in names]
     parts = []
     for index in indices(shape):
@@ -89,9 +93,10 @@ def usual(folder: Path, shape: tuple[int, int], gain: float) -> Usual:
         block = reader.read((0, len(STATISTICS)), (y0, y1), (x0, x1))
         on_grid = block[wanted, -y0 % stride :: stride, -x0 % stride :: stride]
         parts.append(on_grid.reshape(len(wanted), -1))
-    response, rate, variance, charge, dof, bias = np.concatenate(parts, axis=1)
+    response, error, rate, variance, charge, dof, bias = np.concatenate(parts, axis=1)
     return Usual(
         median_and_sigma(response[response > 0])[0],
+        median_and_sigma(error[error > 0])[0],
         *median_and_sigma(rate),
         usual_variance((variance - charge / gain)[dof > 0], int(np.median(dof))),
         median_and_sigma(bias)[0],

@@ -26,6 +26,8 @@ _LINEAR_SHARE = 0.7
 _SATURATED_RUNG = 1e-2
 _GAIN_ERROR = 0.2
 _GUESS_ERROR = 0.1
+_LIT = 5.0
+"""Least response of the usual pixel over its error: below it the flat would be noise."""
 
 
 @dataclass(frozen=True)
@@ -115,8 +117,20 @@ def summarise(job: Measuring, folder: Path, declared: Detector) -> Summary:
         Where they are.
     declared : Detector
         What its owner says.
+
+    Raises
+    ------
+    InputError
+        If the flats hold no light.
     """
     medians = usual(folder, job.shape, job.gain)
+    if job.flat and not medians.response > _LIT * medians.response_error:
+        found = "no pixel has a response"
+        if math.isfinite(medians.response):
+            found = f"{medians.response:.2g} ± {medians.response_error:.2g} ADU/s in a pixel"
+        raise InputError(
+            f"frames.flat: the flats hold no light ({found}); take them again, or list none"
+        )
     tables = ArrayReader(folder / "pairs")
     sums = np.zeros(tables.shape[2:])
     # Added up in the order of the columns: the same sums whoever measured them.

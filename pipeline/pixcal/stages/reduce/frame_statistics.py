@@ -26,6 +26,7 @@ from pixcal.kernels.robust import BATCH, Combination, Combined
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.columns import Index, extent, grid
 from pixcal.stages.reduce.exposures import Group
+from pixcal.stages.reduce.ingested import MOST_ADU
 from pixcal.storage.cube import CHUNK, ArrayReader, ArrayWriter, create_array, create_group
 from pixcal.storage.place import Place
 
@@ -79,8 +80,8 @@ class Measuring:
         The one of ``dark`` whose noise is the read noise.
     flats_timed : bool
         Whether the exposure times of the flats are known.
-    saturation : float
-        Level (ADU) from which on samples of flats are saturated.
+    saturation, full : float
+        Level (ADU) from which on samples of flats are saturated; of any frames.
     quantum : float
         Step of the samples (ADU), 0 for real numbers.
     gain, read_noise : float
@@ -98,6 +99,7 @@ class Measuring:
     read_series: Group | None
     flats_timed: bool
     saturation: float
+    full: float
     quantum: float
     gain: float
     read_noise: float
@@ -169,6 +171,7 @@ def _measure_dark(
     maps["dark_dof"] = dof
     missing = ~np.isfinite(line.bias) | ~np.isfinite(line.rate)
     maps["flags"][missing] += int(PixelFlag.NO_DATA)
+    maps["flags"][line.bias >= job.full] += int(PixelFlag.HOT)
     usual = usual_variance(maps["dark_variance"], int(np.median(dof)))
     usual = job.read_noise**2 if np.isnan(usual) else usual
     return line, np.maximum(maps["dark_variance"], usual)
@@ -255,7 +258,7 @@ def _batches(job: Measuring, group: Group, index: Index) -> Iterator[F32]:
                 at = frame // CHUNK[0]
                 reader.read_chunk((at, *index), chunk)
             batch[n] = chunk[frame % CHUNK[0], : y1 - y0, : x1 - x0]
-        batch[~np.isfinite(batch)] = np.nan
+        batch[~(np.abs(batch) <= MOST_ADU)] = np.nan
         if group.array == "flat":
             # Only there: a pixel that is saturated without light shall be seen as hot.
             batch[batch >= job.saturation] = np.nan

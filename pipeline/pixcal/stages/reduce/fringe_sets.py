@@ -68,7 +68,7 @@ def write_set(
     Parameters
     ----------
     made : Build
-        With ``calibration.zarr``, and ``scratch.zarr`` for the counts.
+        With ``calibration.zarr``, and scratch for the counts.
     source : Ingested
         With the raw frames.
     name : str
@@ -105,11 +105,12 @@ def write_set(
         # Worth a look at the frames: they need not fill the range that the converter has.
         origin = "frames"
         ends = run_tasks(partial(signal_range, fringes), todo, runtime, label=f"{name} range")
-        low, high = min(e[0] for e in ends), max(e[1] for e in ends)
+        # Samples far below the bias are no samples: they have no weight.
+        low, high = max(low, min(e[0] for e in ends)), max(e[1] for e in ends)
         low, high = (low, high) if low <= high else (0.0, 1.0)
         scale = choose_scale(low, high, bounds.smallest_variance, share)
     folder = made.cubes / "reduced.zarr" / fringes.name
-    scratch = made.folder / "scratch.zarr" / "counts" / fringes.name
+    scratch = made.scratch / "counts" / fringes.name
     job = Converting(
         fringes, scale, set_writers(folder, scratch, fringes.frames, source.shape, scale)
     )

@@ -18,6 +18,9 @@ from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.place import Place
 
+MOST_ADU = 2.0**32
+"""No converter gives more: real numbers beyond are no samples."""
+
 
 @dataclass(frozen=True)
 class Ingested:
@@ -85,7 +88,7 @@ class Ingested:
 
     def saturation(self, name: str) -> float:
         """Level (ADU) from which on samples of an array are saturated: declared, or its type's."""
-        end = math.inf
+        end = MOST_ADU
         if self._is_integer(name):
             end = float(np.iinfo(self.arrays[name].dtype).max)
         return min(self.detector.saturation_adu or end, end)

@@ -4,7 +4,6 @@ Reads ``RUN/ingest`` only: when bias or flat frames change, no FITS file is read
 """
 
 import math
-import shutil
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -115,10 +114,12 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     InputError
         If the frames have not been ingested, or the gain is to be measured and cannot be.
     """
-    ingest = require(run_dir, "ingest", _INGEST_FORMAT)
-    inputs, plain = {"ingest": ingest.key}, to_plain(config)
+    require(run_dir, "ingest", _INGEST_FORMAT)
+    plain = to_plain(config)
     del plain["cubes"]
     with lock(run_dir):
+        # Again: another process may have replaced it until then.
+        inputs = {"ingest": require(run_dir, "ingest", _INGEST_FORMAT).key}
         base = chosen_base(config.cubes, run_dir, run_dir / "ingest")
         done = up_to_date(run_dir, STAGE, artefact_key(STAGE, FORMAT, plain, inputs))
         if done is not None and (config.cubes is None or base_of(run_dir / STAGE) == base):
@@ -141,13 +142,12 @@ def _reduce(made: Build, source: Ingested, config: Config, runtime: Runtime) -> 
     need = max(measure_bytes(exposures.dark, exposures.flat), CONVERT_BYTES)
     need += transit_bytes(source.raw, made.cubes)
     runtime = runtime.with_workers(make_plan("reduce", need, _SHARED_BYTES, runtime).workers)
-    scratch = made.folder / "scratch.zarr"
-    create_group(scratch)
-    job = _measuring(source, config, scratch / "statistics")
+    create_group(made.scratch)
+    job = _measuring(source, config, made.scratch / "statistics")
     run_noted(made, partial(measure, job), indices(source.shape), runtime, "statistics")
     for writer in job.writers.values():
         writer.finish()
-    summary = summarise(job, scratch / "statistics", source.detector)
+    summary = summarise(job, made.scratch / "statistics", source.detector)
     gain = summary.gain_to_use(config.gain)
     bounds = _calibrate(made, source, summary, gain, config, runtime)
     sets = {}
@@ -157,7 +157,6 @@ def _reduce(made: Build, source: Ingested, config: Config, runtime: Runtime) -> 
             gain=gain, bounds=bounds, share=config.rounding_share, runtime=runtime,
         )  # fmt: skip
     _report(made, source, config, job, summary, gain, bounds, sets)
-    shutil.rmtree(scratch)
 
 
 def _measuring(source: Ingested, config: Config, folder: Path) -> Measuring:
@@ -170,6 +169,7 @@ def _measuring(source: Ingested, config: Config, folder: Path) -> Measuring:
         read_series=exposures.read_series,
         flats_timed=exposures.known,
         saturation=source.saturation("flat") if exposures.flat else math.inf,
+        full=min(map(source.saturation, source.tables)),
         quantum=source.quantum,
         gain=detector.gain_e_per_adu,
         read_noise=max(detector.read_noise_e / detector.gain_e_per_adu, ROUNDING_ADU),
@@ -202,7 +202,7 @@ def _calibrate(
     read_noise = summary.read_noise_e(gain)
     frames = 0 if series is None else len(series.frames)
     job = Finishing(
-        statistics=made.folder / "scratch.zarr" / "statistics",
+        statistics=made.scratch / "statistics",
         shape=source.shape,
         usual=summary.usual,
         gain=gain,

@@ -1,0 +1,120 @@
+"""Write again what is generated in docs/: help texts, files, layers, the tutorial's pictures.
+
+A page names what follows: ``<!-- commands -->`` the help of all commands, to its end;
+``<!-- file: examples/glow.py -->`` a fenced block; ``<!-- keys: SimulatedOptics -->`` a table.
+"""
+
+import dataclasses
+import re
+import tempfile
+from pathlib import Path
+
+import click
+from click.testing import CliRunner
+
+import pixcal
+from documentation.layers import picture
+from pixcal.model import acquisition, bench
+from pixcal_cli.main import cli
+
+DOCS = Path(__file__).parents[1] / "docs"
+LAYERS = DOCS / "pictures" / "layers.svg"
+COMMANDS = re.compile(r"(<!-- commands -->\n).*\Z", re.DOTALL)
+FILES = re.compile(r"(<!-- file: (.+?) -->\n\n```[^\n]*\n).*?(```\n)", re.DOTALL)
+TABLES = re.compile(r"(<!-- keys: (\w+) -->\n\n)(?:\|.*\n)*")
+SEE = {
+    "pixcal run": "Step by step: [From FITS to the maps](tutorial.md).",
+    "pixcal ingest": "Frames: [Your own camera](own-camera.md). Keys of `acquisition.yaml`: "
+    "[Files](files.md).",
+    "pixcal fit": "What it computes: [Mathematics](mathematics.md).",
+    "pixcal astrometry": "How it is measured: [What the maps bring for stars](astrometry.md).",
+    "pixcal compare": "How to read it: [The same pixels twice](compare.md).",
+    "pixcal simulate": "Keys of the bench file: [Files](files.md#bench-files). Your own effects: "
+    "[in ten minutes](own-effect.md).",
+    "pixcal budget": "What is counted: [Frames before any are taken](budget.md).",
+    "pixcal blind": "What is asked and how it is marked: [The blind examination](blind.md).",
+}
+"""Pages that say more."""
+
+
+def help_text(words: str) -> str:
+    """What ``--help`` of a command prints, such as ``pixcal fit``, in a terminal of 80 columns."""
+    arguments = [*words.split()[1:], "--help"]
+    found = CliRunner().invoke(cli, arguments, prog_name="pixcal", env={"COLUMNS": "80"})
+    assert found.exit_code == 0, found.output
+    return found.output
+
+
+def commands_of(group: click.Group = cli, words: str = "pixcal") -> list[str]:
+    """All commands as they are typed, those of a group after it."""
+    found = []
+    for name, command in group.commands.items():
+        found.append(f"{words} {name}")
+        if isinstance(command, click.Group):
+            found += commands_of(command, found[-1])
+    return found
+
+
+def help_of_all() -> str:
+    """A section for each command."""
+    sections = []
+    for words in commands_of():
+        more = f"{SEE[words]}\n\n" if words in SEE else ""
+        sections.append(f"\n## {words}\n\n{more}```text\n{help_text(words).rstrip()}\n```\n")
+    return "".join(sections)
+
+
+def key_table(name: str) -> str:
+    """The keys of a section of a file, from the dataclass that reads it."""
+    kind = vars(bench).get(name) or vars(acquisition)[name]
+    lines = ["| key | unit | default | meaning |", "|---|---|---|---|"]
+    for key in dataclasses.fields(kind):
+        # Sections have tables of their own.
+        if doc := key.metadata.get("doc"):
+            unit = key.metadata.get("unit") or "–"
+            lines.append(f"| `{key.name}` | {unit} | {_default(key.default)} | {doc} |")
+    return "\n".join(lines) + "\n"
+
+
+def _default(value: object) -> str:
+    if value is dataclasses.MISSING:
+        return "needed"
+    if value in (None, (), ""):
+        return "–"
+    return f"`{list(value) if isinstance(value, tuple) else value}`"
+
+
+def filled(text: str) -> str:
+    """A page with its marked blocks and tables as they should be."""
+
+    text = COMMANDS.sub(lambda found: found[1] + help_of_all(), text)
+    text = FILES.sub(lambda found: found[1] + _content(found[2]) + found[3], text)
+    return TABLES.sub(lambda found: found[1] + key_table(found[2]), text)
+
+
+def _content(name: str) -> str:
+    return (DOCS / name).read_text(encoding="utf-8").rstrip() + "\n"
+
+
+def draw_tutorial(folder: Path) -> None:
+    """Pictures of the sample acquisition, as the report has them."""
+    with tempfile.TemporaryDirectory() as scratch:
+        run = pixcal.run(pixcal.sample_acquisition(), Path(scratch) / "demo")
+        run.delta_x.picture().save(folder / "demo-delta_x.png")
+        run.sets["vertical"].allan_picture().save(folder / "demo-allan.png")
+
+
+def main() -> None:
+    """Write everything."""
+    LAYERS.parent.mkdir(exist_ok=True)
+    LAYERS.write_text(picture(), encoding="utf-8")
+    for page in sorted(DOCS.rglob("*.md")):
+        before = page.read_text(encoding="utf-8")
+        if (after := filled(before)) != before:
+            page.write_text(after, encoding="utf-8")
+            print(page)
+    draw_tutorial(LAYERS.parent)
+
+
+if __name__ == "__main__":
+    main()

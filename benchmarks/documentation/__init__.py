@@ -1,0 +1,1 @@
+"""What is generated in the documentation: see ``make doc-pages``."""

@@ -1,0 +1,35 @@
+"""Faults done to pixcal on purpose, and what must be true afterwards.
+
+Each module holds one kind of fault: a function that does it so many times and returns an `Outcome`
+of what happened, or raises AssertionError when something was lost or came out otherwise. The tests
+do each a few times (tests/torture), ``make torture`` many times (benchmarks/torture.py).
+"""
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Outcome:
+    """What came of one kind of fault.
+
+    Attributes
+    ----------
+    fault : str
+        What was done.
+    ends : Counter
+        How often it ended how.
+    """
+
+    fault: str
+    ends: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def tried(self) -> int:
+        """How often it was done."""
+        return self.ends.total()
+
+    def row(self) -> str:
+        """A row of the table in the documentation."""
+        told = "; ".join(f"{end}: {count}" for end, count in self.ends.most_common())
+        return f"| {self.fault} | {self.tried} | {told} |"

@@ -1,0 +1,189 @@
+"""Bits flipped in what is stored, files that are gone, and half of a file."""
+
+import random
+import re
+import shlex
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from faults import Outcome
+from faults.bench import STAGES, Bench, differences
+from faults.forks import Command, pixcal
+from pixcal.model.errors import DamagedError
+from pixcal.storage.cube import ArrayReader
+
+OWNERS = {"ingest": "ingest", "reduce": "reduce", "sweep": "fit", "fit": "fit"}
+"""The command that makes each artefact."""
+READERS = {"ingest": "reduce", "reduce": "fit", "sweep": "fit", "fit": "allan"}
+"""The next command that reads it."""
+
+Damage = Callable[[Path, random.Random], None]
+Trial = Callable[[Bench, str, Damage, int | None, int], Outcome]
+
+
+def flip_a_bit(file: Path, rng: random.Random) -> None:
+    """Turn over one bit of a file, wherever."""
+    body = bytearray(file.read_bytes())
+    at = rng.randrange(8 * len(body))
+    body[at >> 3] ^= 1 << (at & 7)
+    _replace(file, bytes(body))
+
+
+def remove(file: Path, rng: random.Random) -> None:
+    """Remove a file."""
+    file.unlink()
+
+
+def cut(file: Path, rng: random.Random) -> None:
+    """Keep no more than the beginning of a file."""
+    body = file.read_bytes()
+    _replace(file, body[: rng.randrange(len(body))])
+
+
+def zero(file: Path, rng: random.Random) -> None:
+    """A file of the same size without content, as a disk leaves it that lost power."""
+    _replace(file, bytes(file.stat().st_size))
+
+
+def _replace(file: Path, body: bytes) -> None:
+    file.unlink()  # a hard link: the reference keeps its own
+    file.write_bytes(body)
+
+
+def stored(bench: Bench, artefact: str, *, chunks: bool) -> list[str]:
+    """Files of an artefact: chunks of arrays, or all others."""
+    folder = bench.reference / artefact
+    names = (f.relative_to(folder).as_posix() for f in sorted(folder.rglob("*")) if f.is_file())
+    return [name for name in names if ("/c/" in name) == chunks]
+
+
+def metadata(bench: Bench, artefact: str, damage: Damage, times: int | None, seed: int) -> Outcome:
+    """Damage files beside the chunks: the next command names them; their own makes them again.
+
+    Parameters
+    ----------
+    times : int, optional
+        How many of the files; None for each.
+    """
+    outcome = Outcome(f"`{artefact}`: {_name(damage)} of a file that is no chunk")
+    rng = random.Random(f"{artefact} {_name(damage)} {seed}")
+    for name in _some(stored(bench, artefact, chunks=False), times, rng):
+        run = _ready(bench, artefact)
+        damage(run / artefact / name, rng)
+        if name == "manifest.json" and damage is remove:
+            expected, words = 2, ("not there yet; run '",)
+        else:
+            expected, words = 2, (name.removesuffix("/chunks.npy").removesuffix("/zarr.json"),)
+        if artefact != "sweep":  # made and read by one command, which mends it at once
+            reader = bench.command(READERS[artefact], run)
+            pixcal(*reader).refused(expected, f"pixcal {OWNERS[artefact]}", *words)
+        _mended(bench, run, artefact)
+        outcome.ends["named, its command makes it again, bit-identical"] += 1
+    return outcome
+
+
+def chunks(bench: Bench, artefact: str, damage: Damage, times: int | None, seed: int) -> Outcome:
+    """Damage chunks: refused when they are read, never taken for anything else."""
+    outcome = Outcome(f"`{artefact}`: {_name(damage)} of a chunk")
+    rng = random.Random(f"{artefact} {_name(damage)} {seed}")
+    for name in _some(stored(bench, artefact, chunks=True), times, rng):
+        run = _ready(bench, artefact)
+        damage(run / artefact / name, rng)
+        _refused_by_its_reader(run, f"{artefact}/{name}")
+        ended = pixcal(*bench.command(READERS[artefact], run))
+        if ended.code == 0:
+            _unaffected(bench, run, artefact)
+            outcome.ends["not read by the next command"] += 1
+            continue
+        ended.refused(2, name, f"pixcal {OWNERS[artefact]}")
+        (advised,) = re.findall(r"make it again with '(.*)'", ended.err)
+        _type(bench, advised)
+        _mended(bench, run, artefact)
+        outcome.ends["named, the command advised makes it again, bit-identical"] += 1
+    return outcome
+
+
+def products(bench: Bench, damage: Damage, times: int, seed: int) -> Outcome:
+    """Damage the FITS maps: the fit, up to date as it is, writes them again."""
+    outcome = Outcome(f"`products`: {_name(damage)} of a map")
+    rng = random.Random(f"products {_name(damage)} {seed}")
+    for number in range(times):
+        run = bench.copy("damaged", "ingest", "reduce", "sweep", "fit", "products")
+        damage(run / "products" / ("delta_x.fits", "delta_y.fits")[number % 2], rng)
+        pixcal(*bench.command("fit", run)).succeeded()
+        bench.assert_same(run, *STAGES)
+        outcome.ends["written again, bit-identical"] += 1
+    return outcome
+
+
+def unfinished(bench: Bench, stage: str, damage: Damage, times: int, seed: int) -> Outcome:
+    """Kill a command, damage what it has left half-done, and go on."""
+    outcome = Outcome(f"`{stage}` killed, then {_name(damage)} of a file that it left half-done")
+    rng = random.Random(f"unfinished {stage} {_name(damage)} {seed}")
+    while outcome.tried < times:
+        run = bench.copy("unfinished", *STAGES[: STAGES.index(stage)])
+        command = Command(bench.command(stage, run))
+        time.sleep(rng.uniform(0.1, 1) * bench.seconds[stage])
+        command.send(signal.SIGKILL)
+        command.end()
+        left = [f for f in sorted(run.glob(".partial/**/*")) if f.is_file()]
+        left = [f for f in left if f.stat().st_size and not f.name.endswith(".aside")]
+        if not left:
+            continue
+        damage(rng.choice(left), rng)
+        refused = 0
+        for again in STAGES[STAGES.index(stage) :]:
+            while (ended := pixcal(*bench.command(again, run))).code:
+                refused += 1
+                assert refused < 4, ended.err
+                ended.refused(2)
+                if advised := re.findall(r"make it again with '(.*)'", ended.err):
+                    _type(bench, advised[0])
+        end = "named, then made again, bit-identical" if refused else "resumed, bit-identical"
+        for name in differences(bench.reference, run, *STAGES):
+            _refused_by_its_reader(run, name)
+            end = "a chunk that nothing has read yet is refused by its reader, the rest the same"
+        outcome.ends[end] += 1
+    return outcome
+
+
+def _type(bench: Bench, line: str) -> None:
+    """Do what a message advises."""
+    pixcal(*shlex.split(line.replace("ACQ", str(bench.acquisition)))[1:]).succeeded()
+
+
+def _refused_by_its_reader(run: Path, name: str) -> None:
+    """Assert that a chunk cannot be read."""
+    with pytest.raises(DamagedError, match=re.escape(name)):
+        ArrayReader(run / name.partition("/c/")[0]).verify()
+
+
+def _ready(bench: Bench, artefact: str) -> Path:
+    """A run up to an artefact, but for what the next command makes."""
+    order = ["ingest", "reduce", "sweep", "fit"]
+    return bench.copy("damaged", *order[: order.index(artefact) + 1])
+
+
+def _mended(bench: Bench, run: Path, artefact: str) -> None:
+    """Run the artefact's own command: all must be as without damage."""
+    pixcal(*bench.command(OWNERS[artefact], run)).succeeded()
+    bench.assert_same(run, OWNERS[artefact])
+    assert not list(run.rglob("damage.json"))
+
+
+def _unaffected(bench: Bench, run: Path, artefact: str) -> None:
+    """What was made beside the damage is what is made without it."""
+    if artefact != READERS[artefact]:
+        bench.assert_same(run, READERS[artefact])
+
+
+def _some(names: list[str], times: int | None, rng: random.Random) -> list[str]:
+    return names if times is None else rng.sample(names, min(times, len(names)))
+
+
+def _name(damage: Damage) -> str:
+    return damage.__name__.replace("_", " ")

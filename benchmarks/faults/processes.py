@@ -1,0 +1,38 @@
+"""Several processes at the same time on one run."""
+
+import random
+import time
+from collections import Counter
+
+from faults import Outcome
+from faults.bench import STAGES, Bench
+from faults.forks import Command, pixcal
+
+
+def together(bench: Bench, times: int, seed: int) -> Outcome:
+    """Begin three commands on one run at almost the same time; each does its work or is refused."""
+    outcome = Outcome("three processes on one RUN at the same time")
+    rng = random.Random(f"together {seed}")
+    for number in range(times):
+        stage = STAGES[number % len(STAGES)]
+        earlier = STAGES[: STAGES.index(stage)]
+        run = bench.copy("together", *earlier)
+        # Two of the same, and one that would change what they read or write.
+        others = [stage, stage, rng.choice(STAGES[: STAGES.index(stage) + 1])]
+        commands = []
+        for other in others:
+            commands.append(Command(bench.command(other, run)))
+            time.sleep(rng.uniform(0, 0.5) * bench.seconds[stage])
+        ends: Counter[str] = Counter()
+        for command in commands:
+            ended = command.end()
+            if ended.code == 0:
+                ends["done, or found up to date"] += 1
+                continue
+            ended.refused(2, f"{run}: another pixcal is working there; wait for it")
+            ends["refused with one line, exit 2"] += 1
+        assert ends["done, or found up to date"] > 0
+        pixcal(*bench.command(stage, run)).succeeded()
+        bench.assert_same(run, *earlier, stage)
+        outcome.ends += ends
+    return outcome

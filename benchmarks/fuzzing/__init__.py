@@ -1,0 +1,1 @@
+"""Bad input for pixcal, made at random and judged without its code: `python benchmarks/fuzz.py`."""

@@ -1,0 +1,16 @@
+"""All kinds of bad input."""
+
+from fuzzing import commands, files, frames, own_effects, places, settings
+from fuzzing.laws import Kind
+
+KINDS: dict[str, Kind] = {
+    kind.name: kind
+    for kind in [
+        *files.KINDS,
+        *frames.KINDS,
+        *settings.KINDS,
+        *places.KINDS,
+        *commands.KINDS,
+        *own_effects.KINDS,
+    ]
+}

@@ -1,0 +1,268 @@
+"""What must hold whatever the input is: exit 2 with one line that helps, or a truthful result."""
+
+import atexit
+import io
+import re
+import shutil
+import signal
+import sys
+import traceback
+import warnings
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory, mkdtemp
+from types import FrameType
+from typing import Literal
+
+import numpy as np
+
+from pixcal_cli.main import invoke
+
+Answer = Literal["refused", "truthful"]
+
+SECONDS = 60
+"""A case that takes longer hangs; the slowest takes some seconds."""
+MEMORY = 1 << 30
+"""What commands are allowed by ``--memory``."""
+INTERPRETER = 350 << 20
+"""Of that, what an interpreter with all libraries takes, which here is there before."""
+SCRATCH = "/dev/shm" if Path("/dev/shm").is_dir() else None
+"""Where cases lie: thousands of small files take long to remove from a disk."""
+LONGEST = 700
+"""Characters of a message, paths left out: more is no line that helps."""
+RUNTIME = ("--cluster", "sync", "--memory", "1GiB", "--quiet")
+
+MENDS = re.compile(
+    r"; |expected|must be|is (above|below)|not one of|the keys here are|missing|known are"
+    r"|are needed|not valid YAML|not allowed|twice|not found|number too large|in the range"
+    r"|too large|is not |cannot be (read|used|written)|MiB are allowed|Did you mean|Possible|choose"
+    r"|no room|do not fit|at least|more than half|is zero|no frames at all|not a |not in UTC"
+    r"|no permission|empty",
+)
+"""Words by which a message says what would mend the input, or what was expected instead."""
+
+
+class Broken(AssertionError):
+    """A law is broken; the message says which."""
+
+
+class Hang(BaseException):
+    """The time limit of a case is over (no Exception, so that nothing swallows it)."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One bad input.
+
+    Attributes
+    ----------
+    number : int
+        Of the case among its kind; kinds that count through a list take it from there.
+    rng : numpy.random.Generator
+        For everything that is drawn; from the kind and the number alone.
+    folder : Path
+        An empty directory of its own.
+    """
+
+    number: int
+    rng: np.random.Generator
+    folder: Path
+
+    def pick(self, *choices: object) -> object:
+        """One of some values."""
+        return choices[int(self.rng.integers(len(choices)))]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of bad input: its name, what the table calls it, and what makes and judges a case."""
+
+    name: str
+    title: str
+    judge: Callable[[Case], Answer]
+    cases: int = 1000
+    """In the long version."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How a case ended; ``why`` is the law that was broken, or the message of a refusal."""
+
+    outcome: Literal["refused", "truthful", "failed"]
+    why: str = ""
+
+
+LAST_MESSAGE = [""]
+"""The line of the last refusal, for `judged`."""
+
+
+def judged(kind: Kind, number: int) -> Verdict:
+    """Make a case and hold what pixcal does with it against the laws."""
+    LAST_MESSAGE[0] = ""
+    rng = np.random.default_rng([zlib.crc32(kind.name.encode()), number])
+    with TemporaryDirectory(dir=SCRATCH, prefix="pixcal-fuzz-") as folder:
+        try:
+            with time_limit(SECONDS), memory_limit(), warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # as the command line does
+                outcome = kind.judge(Case(number, rng, Path(folder)))
+        except Broken as error:
+            return Verdict("failed", str(error))
+        except Hang:
+            return Verdict("failed", f"still at work after {SECONDS} s")
+        except Exception as error:
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            told = " ".join(f"{type(error).__name__}: {error}".split())
+            return Verdict("failed", f"{told:.300} ({Path(where.filename).name}:{where.lineno})")
+    return Verdict(outcome, LAST_MESSAGE[0])
+
+
+@contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """Raise `Hang` in this thread when the time is over."""
+
+    def over(_signal: int, _frame: FrameType | None) -> None:
+        raise Hang
+
+    before = signal.signal(signal.SIGALRM, over)
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@contextmanager
+def memory_limit(most: int = MEMORY - INTERPRETER) -> Iterator[None]:
+    """Raise `Broken` where this process grew by more than a plan for `MEMORY` allows."""
+    status, clear = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+    try:
+        clear.write_text("5")  # the peak from now on
+    except OSError:
+        yield
+        return
+    before = _kib(status, "VmRSS")
+    yield
+    grown = (_kib(status, "VmHWM") - before) << 10
+    if grown > most:
+        raise Broken(f"took {grown >> 20} MiB where {most >> 20} MiB are planned")
+
+
+def _kib(status: Path, key: str) -> int:
+    found = re.search(rf"{key}:\s+(\d+) kB", status.read_text())
+    return int(found[1]) if found else 0
+
+
+def pixcal(*args: str | Path, names: Sequence[str] = ()) -> int:
+    """Run a command in this process and hold its end against the laws.
+
+    Parameters
+    ----------
+    args : str or Path
+        The command line.
+    names : sequence of str
+        A refusal must name one of these: the file, the key or the option that is bad.
+
+    Returns
+    -------
+    int
+        0 or 2.
+
+    Raises
+    ------
+    Broken
+        For any other exit code, a traceback, not one line, or a line that does not help.
+    """
+    # As the interpreter makes its own: what cannot be encoded is an error on stdout only.
+    out = io.TextIOWrapper(io.BytesIO(), "utf-8", "strict")
+    err = io.TextIOWrapper(io.BytesIO(), "utf-8", "backslashreplace")
+    words = [str(arg) for arg in args]
+    with redirect_stdout(out), redirect_stderr(err):
+        try:
+            code = invoke(words)
+        except SystemExit as error:
+            raise Broken(f"{_line(words)}: left by SystemExit({error.code})") from error
+        out.flush()
+    said = told(err)
+    if code == 0:
+        if said:
+            raise Broken(f"{_line(words)}: success, and on stderr {said[:200]!r}")
+        return 0
+    if code != 2:
+        raise Broken(f"{_line(words)}: exit code {code}: {said:.300}")
+    check_line(said, names, _line(words))
+    LAST_MESSAGE[0] = said.strip()
+    return 2
+
+
+def told(stream: io.TextIOWrapper) -> str:
+    """What was written to a stream."""
+    stream.flush()
+    raw = stream.buffer
+    assert isinstance(raw, io.BytesIO)
+    return raw.getvalue().decode("utf-8")
+
+
+def check_line(said: str, names: Sequence[str], where: str) -> None:
+    """Raise `Broken` unless a refusal is one line that names the thing and says what mends it."""
+    if not said.startswith("pixcal: ") or not said.endswith("\n") or len(said.splitlines()) != 1:
+        raise Broken(f"{where}: not one line: {said[:300]!r}")
+    if any(ord(c) < 32 or ord(c) == 127 for c in said[:-1]):
+        raise Broken(f"{where}: control characters in {said[:300]!r}")
+    if len(re.sub(r"/\S+", "", said)) > LONGEST:
+        raise Broken(f"{where}: {len(said)} characters: {said[:200]!r}…")
+    if "Traceback" in said or "internal error" in said:
+        raise Broken(f"{where}: {said:.300}")
+    if names and not any(name in said for name in names):
+        raise Broken(f"{where}: names none of {', '.join(names):.200}: {said:.300}")
+    if not MENDS.search(said):
+        raise Broken(f"{where}: does not say what mends it: {said:.300}")
+
+
+def _line(words: Sequence[str]) -> str:
+    return " ".join(f"{word:.60}" for word in words if word not in RUNTIME)
+
+
+def calibrate(acquisition: Path, run: Path, names: Sequence[str] = (), *more: str) -> Answer:
+    """Take an acquisition through ingest, reduce, fit and allan, as far as they go.
+
+    Parameters
+    ----------
+    acquisition, run : Path
+    names : sequence of str
+        What a refusal of ingest must name one of; those of later steps name the set or the run.
+    more : str
+        Further commands, e.g. ``report``.
+    """
+    if pixcal("ingest", acquisition, "--out", run, *RUNTIME, names=names) == 2:
+        return "refused"
+    for command in ("reduce", "fit", "allan", *more):
+        if (
+            pixcal(
+                command,
+                run,
+                *RUNTIME,
+                names=[str(run), "--memory", "frames.", "fringe set", *names],
+            )
+            == 2
+        ):
+            return "refused"
+    return "truthful"
+
+
+def lasting_folder() -> Path:
+    """A directory for what many cases read; removed when the process ends."""
+    folder = mkdtemp(dir=SCRATCH, prefix="pixcal-fuzz-")
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+def encodable(text: str) -> bool:
+    """Whether a text can be a file name here (NUL and lone surrogates of no byte cannot)."""
+    try:
+        return b"\0" not in text.encode(sys.getfilesystemencoding(), "surrogateescape")
+    except UnicodeEncodeError:
+        return False

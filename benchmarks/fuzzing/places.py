@@ -1,0 +1,145 @@
+"""Globs that lead out of an acquisition, and text with markup on its way into the report."""
+
+import json
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+from astropy.io import fits
+
+from fuzzing.laws import RUNTIME, Answer, Broken, Case, Kind, encodable, pixcal
+from fuzzing.night import Night
+
+GLOBS = (
+    "../*.fits", "x/../../*.fits", "..", "../", "a/../b/*.fits", "/etc/passwd", "/**", "//etc/*",
+    "~/*.fits", "$HOME/*", "**", "**/*.fits", "**/**/**/*", "*", ".", "./", "./b/*.fits", "**x",
+    "***", "[", "[a", "[!a]*", "b/[a-]*", "b/?.fits", "b/*.FITS", "b//x.fits", "b/x.fits/",
+    "b/x.fits", "b/./x.fits", "\\*", "b\\x.fits", "circle/**/*.fits", "circle/*/*/*.fits",
+    "out/*.fits", "out/**/*.fits", ".hidden/*.fits", ".*", "*/.*", "b/x.fits\n", "b/\x00", " ",
+    "é/*.fits", "\udcff*", "C:/x.fits", "file:///etc/passwd", "http://localhost/x", "`id`", "%s",
+    "{b,c}/*.fits", "b/" + "x" * 300, "b/" + "*" * 200 + ".fits", "/".join("b" * 3000), "dev/*",
+    "broken", "*/x.fits", "self.yaml", "acquisition.yaml", "empty", "<b>", "b/{{7*7}}",
+)  # fmt: skip
+MARKUP = (
+    "<script id=pwned>alert(1)</script>", '"><img pwned src=x onerror=alert(1)>',
+    "</style><b pwned>",
+    "' onload='pwned", "<!-- pwned", "]]><x pwned>", "{{ 7 * 7 }}pwned", "{% raw %}pwned",
+    "${pwned}",
+    "&lt;b pwned&gt;", "</svg><a pwned href=javascript:x>", "<iframe pwned>", "\\u003cb pwned",
+    "</script><script pwned>", "[bold red]pwned[/bold red]", "[/]pwned", "%(pwned)s", "pwned\\",
+    "\N{RIGHT-TO-LEFT OVERRIDE}pwned", "$pwned^{2$", "$\\frac{pwned}$", "`pwned`",
+)  # fmt: skip
+
+
+def _elsewhere(case: Case) -> Answer:
+    """Globs that leave the folder of the acquisition, and what lies in their way."""
+    acq = case.folder / "acq"
+    (acq / "b").mkdir(parents=True)
+    (acq / "dev").mkdir()
+    (acq / ".hidden").mkdir()
+    outside = case.folder / "outside"
+    outside.mkdir()
+    for file in (
+        acq / "b/x.fits",
+        acq / ".hidden/h.fits",
+        outside / "o.fits",
+        case.folder / "s.fits",
+    ):
+        fits.PrimaryHDU(np.full((5, 7), 100, np.int16)).writeto(file)
+    (acq / "circle").symlink_to(acq)
+    (acq / "circle2").symlink_to(acq)
+    (acq / "b/circle").symlink_to(acq)
+    (acq / "out").symlink_to(outside)
+    (acq / "broken").symlink_to(acq / "nothing")
+    (acq / "dev/null").symlink_to("/dev/null")
+    (acq / "dev/zero").symlink_to("/dev/zero")
+    (acq / "empty").touch()
+    globs = [str(case.pick(*GLOBS)) for _ in range(int(case.rng.integers(1, 3)))]
+    described = {
+        "schema": "pixcal/acquisition/1",
+        "detector": {"pitch_um": 4.4, "gain_e_per_adu": 1.0, "read_noise_e": 16.0},
+        "optics": {"wavelength_nm": 632.8, "distance_mm": 400.0},
+        "frames": {str(case.pick("bias", "dark", "flat")): globs},
+    }
+    (acq / "acquisition.yaml").write_text(json.dumps(described))
+    run = case.folder / "run"
+    if pixcal("ingest", acq, "--out", run, *RUNTIME, names=["frames", "acq/"]) == 2:
+        return "refused"
+    (table,) = json.loads((run / "ingest" / "frames.json").read_text()).values()
+    for name in table["file"]:
+        there = (acq / name).resolve()
+        # A link that is named in a glob is the user's own way out; '..' and '/' are none.
+        if not there.is_relative_to(acq.resolve()) and not name.startswith("out/"):
+            raise Broken(f"{globs}: took {there}")
+    return "truthful"
+
+
+class _Page(HTMLParser):
+    """Tags, attributes and comments of a page that hold the word of `MARKUP`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.text: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        names = [name for name, _ in attrs]
+        handlers = [name for name in names if name.startswith("on")]
+        if "pwned" in names or ("id", "pwned") in attrs or handlers or tag == "iframe":
+            self.found.append(f"<{tag} {attrs}>")
+
+    def handle_comment(self, data: str) -> None:
+        if "pwned" in data:
+            self.found.append(f"<!--{data}-->")
+
+    def handle_data(self, data: str) -> None:
+        self.text.append(data)
+
+
+def _markup(case: Case) -> Answer:
+    """Markup in the detector's name, in names of files, and in header strings."""
+    night = Night(case.rng, (16, 18), count=20)
+    text = str(case.pick(*MARKUP))
+    night.described["detector"]["name"] = text
+    acq = night.write(case.folder / "acq")
+    name = text.replace("/", "_")
+    if encodable(name):
+        for number in (2, 1):
+            target = acq / f"{name}{number}.fits"
+            data = night.frames["bias"][number::2].round().astype("uint16")
+            hdu = fits.PrimaryHDU(data)
+            if text.isascii():
+                hdu.header["OBJECT"] = text[:60]
+            # In the wrong order, so that a warning names the file.
+            hdu.header["MJD-OBS"] = 60000.0 + (2 - number)
+            hdu.writeto(target)
+        night.described["frames"]["bias"] = ["*[12].fits"]
+        (acq / "acquisition.yaml").write_text(json.dumps(night.described))
+    run = case.folder / "run"
+    names = ["detector", "acq/"]
+    if pixcal("ingest", acq, "--out", run, *RUNTIME, names=names) == 2:
+        return "refused"
+    for command in ("reduce", "report"):
+        if pixcal(command, run, *RUNTIME, names=[str(run)]) == 2:
+            return "refused"
+    _check_page(run / "products" / "report.html", text)
+    return "truthful"
+
+
+def _check_page(file: Path, text: str) -> None:
+    page = _Page()
+    content = file.read_text(encoding="utf-8")
+    page.feed(content)
+    page.close()
+    if page.found:
+        raise Broken(f"the report takes {text!r} for markup: {page.found[0]:.200}")
+    if text not in "".join(page.text):
+        raise Broken(f"the report does not show {text!r} as it is")
+
+
+KINDS = [
+    Kind(
+        "globs", "globs that leave the acquisition: .., absolute, links in circles", _elsewhere, 500
+    ),
+    Kind("markup", "markup in names, files and headers, on the way to the report", _markup, 30),
+]

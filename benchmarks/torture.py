@@ -1,0 +1,113 @@
+"""Faults survived: ``make torture`` does them all and writes the table of docs/torture.md.
+
+``--only kill`` takes those whose name the expression finds, ``--share 0.1`` a tenth of each; the
+table is written when nothing was left out. The last line is "all survived", or what was not.
+"""
+
+import argparse
+import re
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from faults import Outcome, clocks, damage, full_disk, inputs, kills, places, processes, workers
+from faults.bench import STAGES, Bench, make_bench
+
+PAGE = Path(__file__).parents[1] / "docs" / "torture.md"
+BEGIN, END = "<!-- torture: begin -->", "<!-- torture: end -->"
+HEAD = "| what was done | times | how it ended |\n|---|---|---|"
+SEED = 20261121
+
+ARTEFACTS = ("ingest", "reduce", "sweep", "fit")
+
+HOW_OFTEN = {damage.flip_a_bit: 40, damage.remove: 8, damage.cut: 4, damage.zero: 4}
+
+Trial = Callable[[], Outcome]
+
+
+def trials(bench: Bench, share: float) -> dict[str, Trial]:
+    """All that is tried, by name."""
+
+    def n(count: int) -> int:
+        return max(1, round(share * count))
+
+    found: dict[str, Trial] = {}
+    mount = full_disk.can_mount(bench.folder)
+    for stage in STAGES:
+        found[f"kill {stage}"] = partial(kills.kill, bench, stage, n(40), SEED)
+        found[f"ctrl-c {stage}"] = partial(kills.interrupt, bench, stage, n(10), SEED)
+        found[f"full disk {stage}"] = partial(full_disk.at_writes, bench, stage, n(30), SEED)
+        if mount:
+            small = partial(full_disk.on_small_disks, bench, stage, n(6), SEED)
+            found[f"small disk {stage}"] = small
+    for artefact in ARTEFACTS:
+        for what, do in (("metadata", damage.metadata), ("chunks", damage.chunks)):
+            for how, times in HOW_OFTEN.items():
+                name = f"{how.__name__} {what} {artefact}"
+                found[name] = partial(do, bench, artefact, how, n(times), SEED)
+    flip = damage.flip_a_bit
+    for stage in STAGES:
+        found[f"unfinished {stage}"] = partial(damage.unfinished, bench, stage, flip, n(8), SEED)
+    found["products"] = partial(damage.products, bench, flip, n(6), SEED)
+    found["processes"] = partial(processes.together, bench, n(12), SEED)
+    for change in inputs.CHANGES:
+        name = f"inputs {change.__name__}"
+        found[name] = partial(inputs.change, bench, change, n(6), SEED)
+    for jump in clocks.JUMPS:
+        found[f"clock {jump.__name__}"] = partial(clocks.jump, bench, jump)
+    found["read-only"] = partial(places.read_only, bench)
+    found["names"] = partial(places.hard_names, bench, places.NAMES)
+    for stage in STAGES:
+        for do_to in (workers.killed, workers.starved):
+            name = f"worker {do_to.__name__} {stage}"
+            found[name] = partial(_on_a_cluster, do_to, bench, stage, n(2))
+    return found
+
+
+def _on_a_cluster(
+    do: Callable[[Bench, str, str, int, int], Outcome], bench: Bench, stage: str, times: int
+) -> Outcome:
+    with workers.cluster() as address:
+        return do(bench, address, stage, times, SEED)
+
+
+def write_table(rows: list[str]) -> None:
+    """Put the rows between the marks of the page."""
+    text = PAGE.read_text(encoding="utf-8")
+    table = "\n".join([BEGIN, HEAD, *rows, END])
+    text = re.sub(f"{BEGIN}.*{END}", lambda _: table, text, flags=re.DOTALL)
+    PAGE.write_text(text, encoding="utf-8")
+
+
+def main() -> int:
+    """Do the trials."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", default="", help="those whose name this expression finds")
+    parser.add_argument("--share", type=float, default=1.0, help="of the usual numbers")
+    options = parser.parse_args()
+    rows: list[str] = []
+    failed: list[str] = []
+    with tempfile.TemporaryDirectory() as folder:
+        bench = make_bench(Path(folder))
+        for name, do in trials(bench, options.share).items():
+            if not re.search(options.only, name):
+                continue
+            begun = time.monotonic()
+            try:
+                rows.append(do().row())
+                print(f"{rows[-1]} <!-- {name}, {time.monotonic() - begun:.0f} s -->", flush=True)
+            except Exception:
+                failed.append(name)
+                print(f"FAILED {name}\n{traceback.format_exc()}", flush=True)
+    if not failed and not options.only and options.share == 1:
+        write_table(rows)
+    print(f"not survived: {', '.join(failed)}" if failed else "all survived")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,286 @@
+"""A run as arrays: maps of offsets, fringe sets, the detector, and what the stages measured."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.api.paths import StrPath
+from pixcal.api.picture import Picture
+from pixcal.model.acquisition import Acquisition
+from pixcal.model.config import parse
+from pixcal.model.errors import InputError
+from pixcal.storage.artefact import damage_noted, read_json, require
+from pixcal.storage.cube import ArrayReader
+from pixcal.storage.products import read_map
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+
+FORMATS = {"ingest": 1, "reduce": 1, "fit": 1, "allan": 1, "report": 1}
+"""Formats of the artefacts that are read here."""
+DETECTOR_MAPS = ("bias", "dark_rate", "flat", "read_noise", "mask")
+SERIES = ("time", "B", "A", "phi", "dkx", "dky")
+
+
+@dataclass(frozen=True)
+class OffsetMap:
+    """A map of offsets, as the product of the same name holds it.
+
+    Attributes
+    ----------
+    name : str
+        ``delta_x``, ``delta_y`` or ``delta_fringe``.
+    delta, sigma : (y, x) float32
+        Offset from the perfect grid and its 1-sigma error, px; NaN where masked. Positive: the
+        pixel responds at larger x (y).
+    mask : (y, x) uint8
+        Bits of `pixcal.PixelFlag`; 0 is a good pixel.
+    header : dict
+        Primary header of the FITS file: fringe vectors, frames, the modes that were removed.
+    """
+
+    name: str
+    delta: F32 = field(repr=False)
+    sigma: F32 = field(repr=False)
+    mask: U8 = field(repr=False)
+    header: dict[str, Any] = field(repr=False)
+
+    @property
+    def good(self) -> NDArray[np.bool_]:
+        """(y, x): pixels that have an offset."""
+        return np.equal(self.mask, 0)
+
+    def picture(self) -> Picture:
+        """The map with the means of its columns and rows, as the report shows it."""
+        # Here: matplotlib takes longer to import than all else.
+        from pixcal.report.drawing import png
+        from pixcal.report.map_figures import offsets
+        from pixcal.report.summary import ArraySource, summarise
+
+        delta, sigma = (summarise(ArraySource(values)) for values in (self.delta, self.sigma))
+        return Picture(png(offsets(self.name, delta, sigma)))
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run directory, opened. Arrays and tables are read with their first use, and kept.
+
+    It can stand wherever a path of a run is asked for.
+
+    Attributes
+    ----------
+    path : Path
+        The run directory.
+    """
+
+    path: Path
+    _kept: TemporaryDirectory[str] | None = field(default=None, repr=False, compare=False)
+    """The temporary directory it lies in, which goes when nothing refers to it any more."""
+
+    def __fspath__(self) -> str:
+        return str(self.path)
+
+    def _read(self, stage: str) -> Any:
+        require(self.path, stage, FORMATS[stage])
+        return read_json(self.path / stage / f"{stage}.json")
+
+    @cached_property
+    def acquisition(self) -> Acquisition:
+        """The contents of ``acquisition.yaml`` as they were understood."""
+        require(self.path, "ingest", FORMATS["ingest"])
+        file = self.path / "ingest" / "acquisition.json"
+        return parse(Acquisition, read_json(file), str(file))
+
+    @cached_property
+    def frames(self) -> dict[str, dict[str, list[Any]]]:
+        """File, plane, exposure time (s), time (s) and so on of every frame, by array.
+
+        The arrays are ``bias``, ``dark``, ``flat`` and ``fringes/<name of the set>``.
+        """
+        require(self.path, "ingest", FORMATS["ingest"])
+        found: dict[str, dict[str, list[Any]]] = read_json(self.path / "ingest" / "frames.json")
+        return found
+
+    @cached_property
+    def reduction(self) -> dict[str, Any]:
+        """Contents of ``reduce.json``: gain, read noise, linearity, counts of flags, warnings."""
+        found: dict[str, Any] = self._read("reduce")
+        return found
+
+    @cached_property
+    def fit(self) -> dict[str, Any]:
+        """Contents of ``fit.json``."""
+        found: dict[str, Any] = self._read("fit")
+        return found
+
+    @cached_property
+    def allan(self) -> dict[str, Any]:
+        """Contents of ``allan.json``."""
+        found: dict[str, Any] = self._read("allan")
+        return found
+
+    @cached_property
+    def detector(self) -> dict[str, NDArray[Any]]:
+        """Maps (y, x) of the detector.
+
+        ``bias`` (ADU), ``dark_rate`` (e-/s), ``flat`` (relative, median 1), ``read_noise`` (e-),
+        float32, and ``mask`` (uint8, bits of `pixcal.PixelFlag`).
+        """
+        require(self.path, "reduce", FORMATS["reduce"])
+        folder = self.path / "reduce" / "calibration.zarr"
+        with damage_noted(self.path):
+            return {name: ArrayReader(folder / name).read() for name in DETECTOR_MAPS}
+
+    @cached_property
+    def maps(self) -> dict[str, OffsetMap]:
+        """The maps of offsets: ``delta_x`` and ``delta_y``, or ``delta_fringe`` alone."""
+        folder = self.path / "products"
+        with damage_noted(self.path):
+            return {
+                name: OffsetMap(name, *read_map(folder / f"{name}.fits"))
+                for name in self.fit["outputs"]
+            }
+
+    def _map(self, name: str) -> OffsetMap:
+        if name not in self.maps:
+            raise InputError(
+                f"{self.path}: no {name} there, only {', '.join(self.maps)}; two fringe sets with "
+                "different axes give delta_x and delta_y, sets with one axis delta_fringe"
+            )
+        return self.maps[name]
+
+    @property
+    def delta_x(self) -> OffsetMap:
+        """Offsets along x."""
+        return self._map("delta_x")
+
+    @property
+    def delta_y(self) -> OffsetMap:
+        """Offsets along y."""
+        return self._map("delta_y")
+
+    @property
+    def delta_fringe(self) -> OffsetMap:
+        """Offsets along the only fringe axis."""
+        return self._map("delta_fringe")
+
+    @cached_property
+    def sets(self) -> dict[str, "FringeSet"]:
+        """The fringe sets as fitted, by name."""
+        return {name: FringeSet(name, self) for name in self.fit["sets"]}
+
+    @property
+    def report(self) -> Path:
+        """The HTML page."""
+        require(self.path, "report", FORMATS["report"])
+        return self.path / "products" / "report.html"
+
+
+@dataclass(frozen=True)
+class FringeSet:
+    """What the fit found of one fringe set. Arrays are read with their first use, and kept.
+
+    Attributes
+    ----------
+    name : str
+    run : Run
+    """
+
+    name: str
+    run: Run = field(repr=False)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Its entry in ``fit.json``: geometry, errors, bound, chi-square, removed modes."""
+        found: dict[str, Any] = self.run.fit["sets"][self.name]
+        return found
+
+    @property
+    def allan(self) -> dict[str, Any]:
+        """Its entry in ``allan.json``: the Allan deviation against averaging length."""
+        found: dict[str, Any] = self.run.allan["sets"][self.name]
+        return found
+
+    def _array(self, name: str) -> NDArray[Any]:
+        with damage_noted(self.run.path):
+            return ArrayReader(self.run.path / "fit" / "fit.zarr" / self.name / name).read()
+
+    @cached_property
+    def delta(self) -> F32:
+        """(y, x): offset along the set's fringe axis, px; NaN where masked."""
+        return self._array("delta")
+
+    @cached_property
+    def sigma(self) -> F32:
+        """(y, x): 1-sigma error of ``delta``, px."""
+        return self._array("sigma")
+
+    @cached_property
+    def iota(self) -> F32:
+        """(y, x): mean level, e-."""
+        return self._array("iota")
+
+    @cached_property
+    def alpha(self) -> F32:
+        """(y, x): amplitude of the fringes, e-."""
+        return self._array("alpha")
+
+    @cached_property
+    def chi2(self) -> F32:
+        """(y, x): reduced chi-square."""
+        return self._array("chi2")
+
+    @cached_property
+    def mask(self) -> U8:
+        """(y, x): bits of `pixcal.PixelFlag`."""
+        return self._array("mask")
+
+    @cached_property
+    def batch_delta(self) -> F32:
+        """(batch, y, x): offsets from each batch of frames alone, relative to the whole run's."""
+        return self._array("batch_delta")
+
+    @cached_property
+    def batch_sigma(self) -> F32:
+        """(batch, y, x): errors of ``batch_delta``, px."""
+        return self._array("batch_sigma")
+
+    @cached_property
+    def series(self) -> dict[str, F64]:
+        """Parameters (t,) of the frames.
+
+        ``time`` (s), ``B`` and ``A`` (relative intensity and amplitude), ``phi`` (rad), ``dkx`` and
+        ``dky`` (change of the fringe vector, rad/px).
+        """
+        return {name: self._array(name).astype(np.float64) for name in SERIES}
+
+    def allan_picture(self) -> Picture:
+        """The Allan deviation beside the square-root law, as the report shows it."""
+        from pixcal.report.drawing import png  # here, as in `OffsetMap.picture`
+        from pixcal.report.set_figures import allan
+
+        return Picture(png(allan(self.name, self.allan, self.facts)))
+
+
+def open_run(path: StrPath) -> Run:
+    """Open a run directory.
+
+    Parameters
+    ----------
+    path : str or path
+        The directory given to ``--out``.
+
+    Raises
+    ------
+    InputError
+        If it is not a run directory.
+    """
+    folder = Path(path)
+    require(folder, "ingest", FORMATS["ingest"])
+    return Run(folder)

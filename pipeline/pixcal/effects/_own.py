@@ -1,0 +1,92 @@
+"""An effect of the user's own: looked at before it is used, and its mistakes told by its file."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixcal.model.config import parse, to_plain
+from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect, Stage
+
+STEPS = ("states", "detector", "light", "photons", "charge", "signal", "readout")
+"""Steps of the exposure: each gives back what it is given first, changed."""
+OTHERS = ("__post_init__", "check", "predict", "undo")
+MOST_AROUND = 4096
+"""Rows around a piece, or frames before one, that an effect may ask for."""
+
+
+def checked(effect: type[Effect], file: Path) -> type[Effect]:
+    """The class, once it is what an effect is, with steps that name the file when they fail.
+
+    Raises
+    ------
+    InputError
+        Naming the file and what is wrong with its effect.
+    """
+    for name in (*STEPS, *OTHERS):
+        if name in vars(effect):
+            setattr(effect, name, _told(vars(effect)[name], file, name in STEPS))
+    try:
+        _check(effect)
+    except (Exception, SystemExit) as error:
+        raise InputError(f"{file}: {_reason(error)}; see docs/effects.md") from error
+    return effect
+
+
+def _check(effect: type[Effect]) -> None:
+    for name, kind in (("name", str), ("title", str), ("stage", Stage)):
+        if not isinstance(getattr(effect, name, None), kind):
+            raise InputError(f"{name} is missing or not a {kind.__name__}")
+    if not effect.name.isidentifier():
+        raise InputError(f"name {effect.name!r:.80} is not made of letters, digits and '_'")
+    if "__dataclass_params__" not in vars(effect):
+        raise InputError(f"{effect.__name__} is not a dataclass: put @dataclass(frozen=True) there")
+    default = effect()
+    parse(effect, to_plain(default), effect.__name__)
+    unknown = set(effect.strengths) - {field.name for field in dataclasses.fields(effect)}
+    if unknown:
+        raise InputError(f"strengths names {', '.join(sorted(unknown))}, which is no field")
+    for name in ("halo", "frames_back"):
+        if not 0 <= getattr(default, name) <= MOST_AROUND:
+            raise InputError(f"{name} is not from 0 to {MOST_AROUND}")
+
+
+def _told(step: Callable[..., Any], file: Path, gives_back: bool) -> Callable[..., Any]:
+    """A method that raises InputError where it fails, or gives back another thing."""
+
+    @functools.wraps(step)
+    def told(self: Effect, *args: Any) -> Any:
+        try:
+            result = step(self, *args)
+            if gives_back:
+                _compare(result, args[0])
+        except InputError as error:
+            raise InputError(f"{file}: {error}" if gives_back else str(error)) from error
+        except (Exception, SystemExit) as error:
+            raise InputError(f"{file}: {step.__name__}: {_reason(error)}; mend the file") from error
+        return result
+
+    return told
+
+
+def _compare(result: Any, given: Any) -> None:
+    """Raise TypeError unless a result is of the kind, the shape, and finite."""
+    if dataclasses.is_dataclass(given):
+        if type(result) is not type(given):
+            raise TypeError(f"gives {type(result).__name__}, not {type(given).__name__}")
+        for field in dataclasses.fields(given):
+            _compare(getattr(result, field.name), getattr(given, field.name))
+    elif isinstance(given, np.ndarray):
+        if not isinstance(result, np.ndarray) or result.shape != given.shape:
+            raise TypeError(f"gives no array of shape {given.shape}")
+        if result.dtype.kind not in "fiub" or not np.isfinite(result).all():
+            raise TypeError("gives values that are not finite real numbers")
+
+
+def _reason(error: BaseException) -> str:
+    told = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    return f"{' '.join(told.split()):.200}"

@@ -1,0 +1,98 @@
+"""Statistics in intensity: harmonics of the phase, residuals by level, photon transfer, codes."""
+
+import numpy as np
+
+from pixcal.estimators.battery import Curve, statistic
+from pixcal.estimators.battery.look import LEVELS, Look
+from pixcal.estimators.evidence import Evidence
+
+BITS = 6
+
+
+@statistic("intensity", "harmonics of the fringes", x="harmonic (cosine, sine)")
+def harmonics(look: Look) -> Curve:
+    """Two to four times the phase in the residuals, over the fringe amplitude."""
+    found, good = look.found, look.good
+    noise = np.sqrt(found.variance[:, good])
+    rest = look.residual[:, good] * noise
+    alpha = float(np.median(np.hypot(found.theta[1], found.theta[2])[good]))
+    phi, psi = found.phi, look.psi[good]
+    orders = (2, 3, 4)
+    turns = np.stack([f(n * phi) for n in orders for f in (np.cos, np.sin)]).astype(np.float32)
+    moments = turns @ rest
+    places, values = [], []
+    for at, n in enumerate(orders):
+        # The signal goes with cos(phi - psi).
+        moment = moments[2 * at] - 1j * moments[2 * at + 1]
+        size = 2 * np.mean(moment * np.exp(1j * n * psi)) / len(phi) / alpha
+        places += [n, n + 0.25]
+        values += [float(size.real), float(size.imag)]
+    return Curve(np.array(places), np.array(values))
+
+
+@statistic("intensity", "residual by level", unit="e-", x="bin of level")
+def residual_by_level(look: Look) -> Curve:
+    """Mean residual in bins of the level."""
+    bins, _ = look.level_bins
+    rest = look.residual[:, look.good] * np.sqrt(look.found.variance[:, look.good])
+    total = np.bincount(bins.ravel(), rest.ravel(), minlength=LEVELS)
+    count = np.bincount(bins.ravel(), minlength=LEVELS)
+    return Curve(np.arange(LEVELS, dtype=float), total / np.maximum(count, 1))
+
+
+@statistic("intensity", "variance of flats by level", x="flat", power=True, sets=False)
+def photon_transfer(evidence: Evidence) -> Curve | None:
+    """Variance of differences of flats over what shot and read noise give, for each level."""
+    values = []
+    for stack in evidence.of_kind("flat"):
+        if len(stack.adu) < 2:
+            continue
+        light = (stack.adu - evidence.bias.astype(np.float32))[:, evidence.good] * np.float32(
+            evidence.gain
+        )
+        light /= light.mean(axis=1, keepdims=True) / light.mean()
+        steps = np.diff(light, axis=0)
+        expected = np.maximum(light.mean(axis=0), 0) + evidence.read_noise**2
+        values.append(float(np.mean(np.minimum(steps**2 / 2 / expected, 50))))
+    return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None
+
+
+@statistic("intensity", "brightness of flats by exposure time", x="flat", sets=False)
+def flat_ladder(evidence: Evidence) -> Curve | None:
+    """Electrons a second of each level, over their mean."""
+    levels, times = [], []
+    for stack in evidence.of_kind("flat"):
+        if np.isfinite(stack.exptime_s) and stack.exptime_s > 0:
+            light = (stack.adu.mean(axis=0) - evidence.bias)[evidence.good] * evidence.gain
+            dark = evidence.dark_rate[evidence.good] * stack.exptime_s
+            levels.append(float(np.median(light - dark)))
+            times.append(stack.exptime_s)
+    if len(levels) < 2:
+        return None
+    rate = np.array(levels) / np.array(times)
+    return Curve(np.array(times), rate / rate.mean() - 1)
+
+
+@statistic("intensity", "bits of the samples", x="bit")
+def bits(look: Look) -> Curve | None:
+    """How much more often than every second time each of the lowest bits is set."""
+    codes = look.found.adu
+    if codes.dtype.kind not in "iu":
+        return None
+    own = codes[:: max(1, len(codes) // 100)][:, look.good].astype(np.int64)
+    value = [float(((own >> bit) & 1).mean()) - 0.5 for bit in range(BITS)]
+    return Curve(np.arange(BITS, dtype=float), np.array(value))
+
+
+@statistic("intensity", "evenness of codes", x="codes a class", power=True)
+def code_classes(look: Look) -> Curve | None:
+    """Scatter of how often codes come up, by their remainders on division by powers of two."""
+    codes = look.found.adu
+    if codes.dtype.kind not in "iu":
+        return None
+    own = codes[:: max(1, len(codes) // 100)][:, look.good].astype(np.int64).ravel()
+    value = []
+    for size in (4, 16, 64):
+        share = np.bincount(own % size, minlength=size) * size / len(own)
+        value.append(float(np.var(share)))
+    return Curve(np.array([4.0, 16.0, 64.0]), np.array(value))

@@ -1,0 +1,188 @@
+"""Statistics of noise: its size, what neighbours, rows and columns share, pixels that stand out."""
+
+import numpy as np
+
+from pixcal.estimators.battery import Curve, Statistic, statistic
+from pixcal.estimators.battery.look import F32, F64, LEVELS, Look, Mask
+from pixcal.estimators.evidence import Evidence
+
+STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4), (4, 0))
+"""Rows and columns to a neighbour."""
+OUTLIERS = (5.0, 7.0, 10.0)
+QUANTILES = (0.5, 0.9, 0.99, 0.999)
+MOST = 120
+"""Frames for statistics of pairs of pixels."""
+
+
+@statistic("noise", "variance of the residuals by level", x="bin of level", power=True)
+def variance_by_level(look: Look) -> Curve:
+    """Mean square of residuals over their noise, in bins of the level."""
+    bins, _ = look.level_bins
+    rest = look.residual[:, look.good]
+    total = np.bincount(bins.ravel(), (rest**2).ravel(), minlength=LEVELS)
+    count = np.bincount(bins.ravel(), minlength=LEVELS)
+    return Curve(np.arange(LEVELS, dtype=float), total / np.maximum(count, 1))
+
+
+@statistic("noise", "correlation of neighbours", x="neighbour")
+def neighbours(look: Look) -> Curve:
+    """Correlation of the residuals of pixels some rows and columns apart."""
+    rest = look.residual[:: max(1, len(look.residual) // MOST)]
+    value = [_correlation(rest, look.good, step) for step in STEPS]
+    return Curve(np.arange(len(STEPS), dtype=float), np.array(value))
+
+
+@statistic("noise", "correlation of neighbours by row", x="row of four, down then right")
+def neighbours_by_row(look: Look) -> Curve:
+    """Correlation with the pixel below and to the right, for each row of four."""
+    rest = look.residual[:: max(1, len(look.residual) // MOST)]
+    rows = np.arange(look.good.shape[0])[:, None] + look.found.origin[0]
+    value = [
+        _correlation(rest, look.good & (rows % 4 == row), step, look.good)
+        for step in ((1, 0), (0, 1))
+        for row in range(4)
+    ]
+    value = list(np.array(value) - np.repeat(np.reshape(value, (2, 4)).mean(axis=1), 4))
+    return Curve(np.arange(8.0), np.array(value))
+
+
+@statistic("noise", "correlation of neighbours, bright less dark", x="neighbour")
+def neighbours_by_level(look: Look) -> Curve:
+    """Covariance over shot noise in bright samples less that in dark ones."""
+    keep = slice(None, None, max(1, len(look.residual) // MOST))
+    rest, model = look.residual[keep], look.found.model[keep]
+    bright = (model > np.median(model[::4, look.good])).astype(np.float32)
+    parts = (rest * bright, rest * (1 - bright))
+    value = [
+        2 * (_correlation(parts[0], look.good, step) - _correlation(parts[1], look.good, step))
+        for step in STEPS[:4]
+    ]
+    return Curve(np.arange(4.0), np.array(value))
+
+
+def _correlation(rest: F32, good: Mask, step: tuple[int, int], other: Mask | None = None) -> float:
+    """Mean product (t, y, x) of pixels and their neighbours that are both good."""
+    dy, dx = step
+    ny, nx = good.shape
+    here = (slice(0, ny - dy), slice(max(0, -dx), nx - max(0, dx)))
+    there = (slice(dy, ny), slice(max(0, dx), nx + min(0, dx)))
+    pairs = good[here] & (good if other is None else other)[there]
+    one, two = rest[(slice(None), *here)], rest[(slice(None), *there)]
+    total = np.einsum("tyx,tyx,yx->t", one, two, pairs.astype(np.float32), optimize=False)
+    return float(total.sum(dtype=float)) / max(len(rest) * int(pairs.sum()), 1)
+
+
+def _line_power(rest: F32, good: Mask) -> F64:
+    """Mean square of the means of rows and of columns over that of white noise: (2,)."""
+    out = []
+    for axis in (2, 1):
+        count = np.maximum(good.sum(axis=axis - 1), 1)
+        means = rest.sum(axis=axis) / np.sqrt(count)
+        means -= means.mean(axis=1, keepdims=True)
+        out.append(float((means**2).mean()) / max(float((rest[:, good] ** 2).mean()), 1e-30))
+    return np.array(out)
+
+
+@statistic("noise", "noise of rows and columns", x="rows, columns", power=True)
+def lines(look: Look) -> Curve:
+    """Of the fringe frames' residuals."""
+    return Curve(np.arange(2.0), _line_power(look.residual, look.good))
+
+
+def _lines_of(kind: str) -> Statistic:
+    def measured(evidence: Evidence) -> Curve | None:
+        stacks = [s for s in evidence.of_kind(kind) if len(s.adu) >= 3]
+        if not stacks:
+            return None
+        values, weights = [], []
+        for stack in stacks:
+            rest = _calm(stack.adu, evidence.good)
+            values.append(_line_power(rest, evidence.good))
+            weights.append(len(rest))
+        return Curve(np.arange(2.0), np.average(values, axis=0, weights=weights))
+
+    measured.__name__ = f"lines_of_{kind}"
+    title = f"noise of rows and columns in {kind} frames"
+    return statistic("noise", title, x="rows, columns", power=True, sets=False)(measured)
+
+
+def _calm(frames: F32, good: Mask) -> F32:
+    """Frames less the mean of each pixel and of each frame, over the noise; outliers zero."""
+    rest = frames - frames.mean(axis=0)
+    rest -= rest[:, good].mean(axis=1)[:, None, None]
+    spread = 1.4826 * float(np.median(np.abs(rest[:, good]))) or 1.0
+    rest = rest / np.float32(spread)
+    rest[np.abs(rest) > 8] = 0
+    return np.asarray(rest * good, np.float32)
+
+
+@statistic("noise", "outliers", x="sigma, low then high", unit="2 √count", floor=1.0)
+def outliers(look: Look) -> Curve:
+    """Residuals of good pixels beyond 5, 7 and 10 sigma: twice the root of their number."""
+    rest = look.wild[:, look.good]
+    count = [float(np.count_nonzero(rest < -limit)) for limit in OUTLIERS]
+    count += [float(np.count_nonzero(rest > limit)) for limit in OUTLIERS]
+    return Curve(np.array([*(-x for x in OUTLIERS), *OUTLIERS]), 2 * np.sqrt(np.array(count)))
+
+
+@statistic("noise", "noise of the pixels", x="quantile", power=True)
+def pixel_noise(look: Look) -> Curve:
+    """Quantiles over the pixels of the mean square of their residuals."""
+    squares = np.mean(look.residual[:, look.good] ** 2, axis=0)
+    return Curve(np.array(QUANTILES), np.quantile(squares, QUANTILES))
+
+
+@statistic("noise", "fourth moments of the pixels", x="quantile")
+def pixel_peakedness(look: Look) -> Curve:
+    """Quantiles over the pixels of the kurtosis of their residuals."""
+    squares = look.residual[:, look.good] ** 2
+    fourth = np.mean(squares * squares, axis=0) / np.mean(squares, axis=0) ** 2
+    return Curve(np.array(QUANTILES), np.quantile(fourth, QUANTILES))
+
+
+@statistic("noise", "noise of the pixels in bias frames", x="quantile", power=True, sets=False)
+def read_noise(evidence: Evidence) -> Curve | None:
+    """Quantiles over all pixels of their variance over the read noise's."""
+    stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= 8]
+    if not stacks:
+        return None
+    frames = stacks[0].adu * np.float32(evidence.gain)
+    frames = frames - np.median(frames, axis=(1, 2), keepdims=True)
+    variance = np.var(frames, axis=0, ddof=1) / evidence.read_noise**2
+    return Curve(np.array(QUANTILES), np.quantile(variance, QUANTILES))
+
+
+@statistic("noise", "correlation of neighbours in flats", x="neighbour, by level", sets=False)
+def flat_neighbours(evidence: Evidence) -> Curve | None:
+    """Correlation of differences of flats."""
+    value: list[float] = []
+    for stack in evidence.of_kind("flat"):
+        if len(stack.adu) >= 4:
+            light = (stack.adu - evidence.bias.astype(np.float32)) * evidence.good
+            light = light / light.sum(axis=(1, 2), keepdims=True) * light[0].sum()
+            steps = _calm(np.asarray(light[1::2] - light[:-1:2], np.float32), evidence.good)
+            square = float((steps[:, evidence.good] ** 2).mean())
+            value += [_correlation(steps, evidence.good, s) / square for s in STEPS[:4]]
+    return Curve(np.arange(len(value), dtype=float), np.array(value)) if value else None
+
+
+@statistic("noise", "neighbours of hot pixels", x="left, right, above, below", sets=False)
+def hot_neighbours(evidence: Evidence) -> Curve | None:
+    """Dark current beside hot pixels over theirs."""
+    dark = evidence.dark_rate - np.median(evidence.dark_rate)
+    spread = 1.4826 * float(np.median(np.abs(dark)))
+    hot = dark > max(40 * spread, 1e-9)
+    hot[[0, -1]] = hot[:, [0, -1]] = False
+    y, x = np.nonzero(hot)
+    # A neighbour may be warm by itself, or the rows differ: medians over alike rows.
+    classes = [own for row in range(4) if (own := (y + evidence.origin[0]) % 4 == row).sum() >= 3]
+    if not classes:
+        return None
+    value = []
+    for dy, dx in ((0, -1), (0, 1), (-1, 0), (1, 0)):
+        share = dark[y + dy, x + dx] / dark[y, x]
+        value.append(float(np.mean([np.median(share[own]) for own in classes])))
+    return Curve(np.arange(4.0), np.array(value))
+
+
+LINES = tuple(_lines_of(kind) for kind in ("bias", "dark"))

@@ -1,0 +1,44 @@
+"""Statistics across configurations: do fringe sets agree on what the detector has of its own?"""
+
+from itertools import combinations
+
+import numpy as np
+
+from pixcal.estimators.battery import Curve, statistic
+from pixcal.estimators.battery.look import F64, Look
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.structure import flattened
+
+SAME = 0.98
+"""Cosine of the angle below which two sets measure along the same axis."""
+
+
+@statistic("space", "maps of two sets alike", x="offset, contrast, light, each pair", sets=False)
+def alike(evidence: Evidence) -> Curve | None:
+    """Correlation of the maps of each pair of sets; of offsets only along one axis."""
+    looks = [Look(f, evidence) for f in evidence.fringes.values()]
+    values = [
+        _correlation(flattened(one.maps[name]), flattened(other.maps[name]))
+        for one, other in combinations(looks, 2)
+        for name in ("contrast", "light")
+    ]
+    return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None
+
+
+def _correlation(one: F64, other: F64) -> float:
+    good = np.isfinite(one) & np.isfinite(other)
+    return float(np.corrcoef(one[good], other[good])[0, 1])
+
+
+@statistic("space", "offsets of two sets apart", unit="px", x="pair", power=True, sets=False)
+def apart(evidence: Evidence) -> Curve | None:
+    """Mean square of the difference of the offsets along one axis, by two baselines."""
+    looks = [Look(f, evidence) for f in evidence.fringes.values()]
+    values = []
+    for one, other in combinations(looks, 2):
+        a, b = np.array(one.found.k), np.array(other.found.k)
+        cosine = float(a @ b / np.linalg.norm(a) / np.linalg.norm(b))
+        if abs(cosine) > SAME:
+            other_map = np.sign(cosine) * other.maps["offset"]
+            values.append(float(np.nanmean(flattened(one.maps["offset"] - other_map) ** 2)))
+    return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None

@@ -1,0 +1,174 @@
+"""Statistics in time: what changes from frame to frame, slowly or with the frame before."""
+
+from itertools import pairwise
+
+import numpy as np
+from scipy.fft import dct
+
+from pixcal.estimators.battery import Curve, Statistic, statistic
+from pixcal.estimators.battery.look import F64, Look
+from pixcal.estimators.evidence import Evidence
+
+SERIES = {
+    "intensity": ("intensity", ""),
+    "contrast": ("contrast", ""),
+    "turn_along": ("fringe vector, along", "rad"),
+    "turn_across": ("fringe vector, across", "rad"),
+}
+LAGS = (1, 2, 3, -1, -2)
+BATCHES = 8
+
+
+def _spectrum(name: str) -> Statistic:
+    title, unit = SERIES[name]
+
+    def measured(look: Look) -> Curve:
+        return power_of(look.frames[name])
+
+    measured.__name__ = f"{name}_of_frames"
+    return statistic("time", f"{title} of the frames", unit=unit, x="cycles a frame", power=True)(
+        measured
+    )
+
+
+def power_of(series: F64) -> Curve:
+    """Mean squares of a series of frames in bins of frequency, of three modes and more."""
+    power = dct(series, norm="ortho")[1:] ** 2
+    edges = [0]
+    while edges[-1] < len(power):
+        edges.append(min(2 * edges[-1] + 3, len(power)))
+    if len(edges) > 2 and edges[-1] - edges[-2] < 3:
+        edges.pop(-2)
+    middle = [(a + b + 1) / 4 / len(series) for a, b in pairwise(edges)]
+    value = [float(power[a:b].mean()) for a, b in pairwise(edges)]
+    return Curve(np.array(middle), np.array(value))
+
+
+@statistic("time", "what other frames left in this one", x="frames before")
+def frames_before(look: Look) -> Curve:
+    """Share of another frame's fringes in the residuals.
+
+    By pixels: the coefficient of the other frame's model, after what the pixel's own fit absorbs.
+    """
+    g, theta = look.found.g, look.found.theta[:, look.good].astype(np.float32)
+    noise = np.sqrt(look.found.variance[:, look.good].mean(axis=1))[:, None]
+    rest = look.residual[:, look.good] * noise
+    basis = np.linalg.qr(g)[0]
+    along, square = (rest @ theta.T).astype(float), (theta @ theta.T).astype(float)
+    values = []
+    for lag in LAGS:
+        other = np.roll(g, lag, axis=0)
+        other -= basis @ (basis.T @ other)
+        size = np.einsum("ti,ij,tj->", other, square, other)
+        values.append(float(np.vdot(other, along) / size))
+    return Curve(np.array(LAGS, float), np.array(values))
+
+
+@statistic("time", "contrast by the step of the phase since frames before", x="frames before")
+def contrast_by_step(look: Look) -> Curve:
+    """Slope of the contrast against the cosine of the step."""
+    contrast, phi = look.frames["contrast"], look.found.phi
+    slow = np.stack([np.ones(len(phi)), np.linspace(-1, 1, len(phi))], axis=1)
+    values = []
+    for lag in LAGS[:3]:
+        step = np.cos(phi[lag:] - phi[:-lag])
+        terms = np.column_stack([slow[lag:], step])
+        values.append(float(np.linalg.lstsq(terms, contrast[lag:], rcond=1e-9)[0][-1]))
+    return Curve(np.array(LAGS[:3], float), np.array(values))
+
+
+@statistic("time", "contrast and intensity by the phase", x="term")
+def frames_by_phase(look: Look) -> Curve:
+    """Amplitudes of contrast and intensity at one, two and three times the frame's phase."""
+    phi = look.found.phi
+    turns = [f(n * phi) for n in (1, 2, 3) for f in (np.cos, np.sin)]
+    terms = np.stack([np.ones(len(phi)), *turns], axis=1)
+    values = [
+        np.linalg.lstsq(terms, look.frames[name], rcond=1e-9)[0][1:]
+        for name in ("contrast", "intensity")
+    ]
+    value = np.concatenate(values)
+    return Curve(np.arange(len(value), dtype=float), value)
+
+
+@statistic("time", "how evenly the phases lie", x="harmonic")
+def phases(look: Look) -> Curve:
+    """Size of the mean of exp(i n phi); of a ramp, of its departures at the turn's harmonics."""
+    phi = look.found.phi
+    step = np.exp(1j * np.diff(phi)).mean()
+    if abs(step) < RAMP:
+        return Curve(np.array([1.0, 2.0]), np.abs([np.exp(1j * n * phi).mean() for n in (1, 2)]))
+    command = float(np.angle(step)) * np.arange(len(phi))
+    rest = np.unwrap(np.angle(np.exp(1j * (phi - command))))
+    jumps = np.diff(rest) - np.diff(rest).mean()
+    middle = (command[1:] + command[:-1]) / 2
+    size = [abs(np.mean(jumps * np.exp(-1j * n * middle))) for n in (1, 2)]
+    return Curve(np.array([1.0, 2.0]), np.array(size))
+
+
+RAMP = 0.8
+"""Mean of exp(i step) from which phases are a ramp."""
+
+
+@statistic("time", "offsets from batch to batch", unit="px", x="batches averaged", power=True)
+def allan_of_batches(look: Look) -> Curve | None:
+    """Allan variance of the pixels' offsets, over lengths of one, two and four batches."""
+    found = look.found
+    size = len(found.g) // BATCHES
+    if size < 8:
+        return None
+    k = float(np.hypot(*found.k))
+    theta = found.theta[:, look.good]
+    alpha = np.hypot(theta[1], theta[2])
+    noise = np.sqrt(found.variance[:, look.good])
+    rest = (look.residual[:, look.good] * noise).astype(np.float32)
+    shifts = []
+    for n in range(BATCHES):
+        g = found.g[n * size : (n + 1) * size]
+        change = np.linalg.pinv(g) @ rest[n * size : (n + 1) * size]
+        # theta = (iota, alpha sin psi, alpha cos psi): a turn of psi moves along (cos, -sin).
+        shifts.append((change[1] * theta[2] - change[2] * theta[1]) / alpha**2 / k)
+    values = np.stack(shifts)
+    out = []
+    for length in (1, 2, 4):
+        means = values.reshape(BATCHES // length, length, -1).mean(axis=1)
+        out.append(float((np.diff(means, axis=0) ** 2).mean() / 2))
+    return Curve(np.array([1.0, 2.0, 4.0]), np.array(out))
+
+
+def _of_stacks(kind: str) -> Statistic:
+    def measured(evidence: Evidence) -> Curve | None:
+        stacks = [s for s in evidence.of_kind(kind) if len(s.adu) >= MIN_FRAMES]
+        if not stacks:
+            return None
+        values = []
+        for stack in stacks:
+            means = stack.adu[:, evidence.good].mean(axis=1, dtype=float) * evidence.gain
+            light = float(means.mean() - evidence.gain * evidence.bias[evidence.good].mean())
+            scale = light if kind == "flat" and light > 0 else 1.0
+            values.append(power_of(means / scale).value[:3])
+        shortest = min(map(len, values))
+        value = np.mean([v[:shortest] for v in values], axis=0)
+        return Curve(np.arange(shortest, dtype=float), value)
+
+    measured.__name__ = f"{kind}_of_frames"
+    return statistic(
+        "time", f"mean of {kind} frames", unit="" if kind == "flat" else "e-",
+        x="bin of frequency", power=True, sets=False,
+    )(measured)  # fmt: skip
+
+
+MIN_FRAMES = 8
+SPECTRA = tuple(_spectrum(name) for name in SERIES)
+STACKS = tuple(_of_stacks(kind) for kind in ("bias", "dark", "flat"))
+
+
+@statistic("time", "level of bias frames, first to last", unit="e-", x="", sets=False)
+def bias_trend(evidence: Evidence) -> Curve | None:
+    """Slope of the mean of bias and dark frames over their run, last less first."""
+    values = []
+    for stack in (*evidence.of_kind("bias"), *evidence.of_kind("dark")):
+        if len(stack.adu) >= MIN_FRAMES:
+            means = stack.adu[:, evidence.good].mean(axis=1, dtype=float) * evidence.gain
+            values.append(2 * float(np.polyfit(np.linspace(-1, 1, len(means)), means, 1)[0]))
+    return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None

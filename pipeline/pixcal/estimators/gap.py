@@ -1,0 +1,261 @@
+"""The gap between data and simulations: curve by curve, how far beyond what chance allows.
+
+Simulations of the same bench with other random numbers show how a statistic scatters. A value of
+the data is held against them by Student's distribution: with few simulations, a deviation counts
+for as much as it can. Mean squares are compared through a root below their usual size and a
+logarithm above it: the scatter of both is nearly normal, and the same for strong effects and weak.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri_exp
+from scipy.stats import t as student
+
+from pixcal.estimators.battery import Curve, Key, battery
+
+F64 = NDArray[np.float64]
+Curves = Mapping[Key, Curve]
+
+TOLERANCE = 0.05
+"""Share of what an effect does that its simulation may be wrong by."""
+ALLOWED = 2.0
+"""Standard deviations that a value may be off by before it counts as a gap."""
+CHANCE = 0.01
+"""Chance, of all statistics together, below which a difference is a gap."""
+
+
+def scaled(values: F64, usual: F64) -> F64:
+    """Mean squares over their usual size, on a scale where chance is nearly normal."""
+    ratio = values / np.maximum(usual, 1e-300)
+    low = 3 * (np.cbrt(np.minimum(ratio, 1.0)) - 1)
+    return np.asarray(np.where(ratio > 1, np.log(np.maximum(ratio, 1.0)), low))
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What the nominal bench lets expect: simulations with different seeds, on their scales.
+
+    Attributes
+    ----------
+    usual : mapping
+        Median (n,) of each curve that is a power; None for the others.
+    values : mapping
+        (simulation, n) of each curve, in the order of the seeds.
+    """
+
+    usual: Mapping[Key, F64 | None]
+    values: Mapping[Key, F64]
+
+    @classmethod
+    def of(cls, simulated: Sequence[Curves]) -> "Reference":
+        """From simulations; curves that not all of them have are left out."""
+        keys = [k for k in simulated[0] if all(k in s for s in simulated)]
+        keys = [k for k in keys if len({len(s[k].value) for s in simulated}) == 1]
+        usual: dict[Key, F64 | None] = {}
+        values = {}
+        for key in keys:
+            stack = np.stack([s[key].value for s in simulated])
+            power = battery()[key[0]].kind == "power"
+            usual[key] = np.median(stack, axis=0) if power else None
+            own = usual[key]
+            values[key] = stack if own is None else scaled(stack, own)
+        return cls(usual, values)
+
+    def on_scale(self, curves: Curves) -> dict[Key, F64]:
+        """Curves on the scales of the reference, where it has them."""
+        found = {}
+        for key, usual in self.usual.items():
+            curve = curves.get(key)
+            if curve is not None and len(curve.value) == self.values[key].shape[1]:
+                found[key] = curve.value if usual is None else scaled(curve.value, usual)
+        return found
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """What a bench, nominal or with effects, lets expect of every curve.
+
+    Attributes
+    ----------
+    mean, variance : mapping
+        (n,) on the reference's scales; the variance of a value of the data about the mean.
+    noise : mapping
+        Variance (n,) of the nominal bench alone.
+    dof : int
+    """
+
+    mean: Mapping[Key, F64]
+    variance: Mapping[Key, F64]
+    noise: Mapping[Key, F64]
+    dof: int
+
+
+def expect_nominal(reference: Reference) -> Expectation:
+    """What the nominal bench lets expect."""
+    mean, variance, noise, count = {}, {}, {}, 2
+    for key, values in reference.values.items():
+        count = len(values)
+        noise[key] = np.maximum(_variance(values), battery()[key[0]].floor ** 2)
+        mean[key] = values.mean(axis=0)
+        variance[key] = noise[key] * (1 + 1 / count)
+    return Expectation(mean, variance, noise, count - 1)
+
+
+def expect_with(
+    reference: Reference, simulated: Sequence[Curves], error: float = 0.0
+) -> Expectation:
+    """What a bench with effects lets expect.
+
+    Parameters
+    ----------
+    reference : Reference
+    simulated : sequence of Curves
+        With the first seeds of the reference, in the same order: what differs is due to effects.
+    error : float
+        Relative error of the effects' strength.
+    """
+    nominal = expect_nominal(reference)
+    scaled_ones = [reference.on_scale(s) for s in simulated]
+    mean, variance = dict(nominal.mean), dict(nominal.variance)
+    count = len(simulated)
+    for key, values in reference.values.items():
+        if any(key not in s for s in scaled_ones):
+            continue
+        own = np.stack([s[key] for s in scaled_ones])
+        change = own - values[:count]
+        shift = change.mean(axis=0)
+        mean[key] = nominal.mean[key] + shift
+        more = (TOLERANCE**2 + error**2) * shift**2
+        if count > 1:
+            paired = change.var(axis=0, ddof=1)
+            more += paired / count
+            more += np.maximum(own.var(axis=0, ddof=1) - nominal.noise[key], 0)
+        variance[key] = nominal.variance[key] + more
+    return Expectation(mean, variance, nominal.noise, nominal.dof)
+
+
+def _variance(values: F64) -> F64:
+    """Variance (n,), leaning on the other values of the curve so that none is tiny by chance."""
+    own = values.var(axis=0, ddof=1)
+    rounding = (1e-9 * np.abs(values).max(axis=0)) ** 2
+    return np.asarray(0.9 * own + 0.1 * np.median(own) + rounding + 1e-300)
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One curve of the data against an expectation.
+
+    Attributes
+    ----------
+    sigmas : (n,) float64
+        Signed; of a normal, as rare as the deviation is.
+    log_chance : float
+        Logarithm of the chance that any of the curve's values is as far off.
+    excess : float
+        Squares of the deviations, as far as they are beyond `ALLOWED` standard deviations, over
+        the nominal noise.
+    """
+
+    sigmas: F64
+    log_chance: float
+    excess: float
+
+    @property
+    def worst(self) -> int:
+        """Number of the value that is furthest off."""
+        return int(np.argmax(np.abs(self.sigmas)))
+
+
+def compare(data: Mapping[Key, F64], expected: Expectation) -> dict[Key, Difference]:
+    """Curves of the data (on the reference's scales) against an expectation."""
+    found = {}
+    for key, mean in expected.mean.items():
+        if key not in data:
+            continue
+        off, variance = data[key] - mean, expected.variance[key]
+        tails = student.logsf(np.abs(off) / np.sqrt(variance), expected.dof) + np.log(2)
+        sigmas = -ndtri_exp(np.minimum(tails - np.log(2), -1e-300)) * np.sign(off)
+        beyond = np.maximum(np.abs(off) - ALLOWED * np.sqrt(variance), 0) ** 2
+        any_of = float(np.min(tails)) + float(np.log(len(off)))
+        excess = float((beyond / expected.noise[key]).sum())
+        found[key] = Difference(sigmas, min(any_of, 0.0), excess)
+    return found
+
+
+def flagged(differences: Mapping[Key, Difference]) -> set[Key]:
+    """Curves that differ by more than chance, all statistics being looked at (Bonferroni)."""
+    limit = np.log(CHANCE / max(len(differences), 1))
+    return {key for key, d in differences.items() if d.log_chance < limit}
+
+
+def sigmas_of(log_chance: float) -> float:
+    """Standard deviations of a normal that are as rare, one-sided."""
+    return float(-ndtri_exp(min(log_chance, -1e-300)))
+
+
+def log_likelihood(data: Mapping[Key, F64], expected: Expectation) -> float:
+    """Logarithm of the chance density of the data; curves count by their least two values.
+
+    Values of a curve are not independent, so that long curves must not count for more.
+    """
+    total, nu = 0.0, expected.dof
+    for key, mean in expected.mean.items():
+        if key not in data:
+            continue
+        variance = expected.variance[key]
+        square = (data[key] - mean) ** 2 / variance
+        terms = -(nu + 1) / 2 * np.log1p(square / nu) - np.log(variance) / 2
+        total += float(terms.sum()) / max(1.0, len(mean) / 3)
+    return total
+
+
+@dataclass(frozen=True)
+class Gap:
+    """How much of the gap is left, against the nominal bench's.
+
+    Attributes
+    ----------
+    total : float
+        1: all of it; 0: none.
+    weights, left : mapping
+        Of each curve: its weight, and the share of its excess that is left.
+    """
+
+    total: float
+    weights: Mapping[Key, float]
+    left: Mapping[Key, float]
+
+    def of_domain(self, domain: str) -> tuple[float, float]:
+        """Weight of a domain, and of what is left of it, over all of the gap at the start."""
+        whole = sum(self.weights.values()) or 1.0
+        own = [k for k in self.left if battery()[k[0]].domain == domain]
+        return (
+            sum(self.weights.get(k, 0.0) for k in own) / whole,
+            sum(self.weights.get(k, 0.0) * self.left[k] for k in own) / whole,
+        )
+
+
+def remaining(
+    before: Mapping[Key, Difference], after: Mapping[Key, Difference], where: set[Key]
+) -> Gap:
+    """The gap that is left of what differed before.
+
+    Every curve that differed (``where``) counts by the square of its significance; of it, the share
+    of its excess that is left. What differs only after counts in full.
+    """
+    weights = {k: sigmas_of(before[k].log_chance) ** 2 for k in where}
+    whole = sum(weights.values())
+    left = {
+        k: float(np.clip(after[k].excess / max(before[k].excess, 1e-12), 0, 2))
+        for k in where
+        if k in after
+    }
+    total = sum(weights[k] * left[k] for k in left)
+    for key in flagged(after) - where:
+        own = sigmas_of(after[key].log_chance) ** 2
+        total += own
+        left[key] = own / max(whole, 1e-12)
+    return Gap(total / whole if whole else 0.0, weights, left)

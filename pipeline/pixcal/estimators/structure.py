@@ -1,0 +1,144 @@
+"""Structure of a map: smooth surfaces, rows and columns that repeat, fringes, scales."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+C128 = NDArray[np.complex128]
+Mask = NDArray[np.bool_]
+
+DEGREE = 3
+"""Of a smooth surface."""
+PERIODS = (2, 3, 4, 5, 6, 8)
+"""Of rows and columns: those of readout circuits."""
+_CLIP = 6.0
+
+
+def clipped(values: F64) -> F64:
+    """A map about its median, values beyond six robust standard deviations left out (NaN)."""
+    rest = values - np.nanmedian(values)
+    spread = 1.4826 * float(np.nanmedian(np.abs(rest)))
+    return np.where(np.abs(rest) <= _CLIP * max(spread, 1e-300), rest, np.nan)
+
+
+def legendre(shape: tuple[int, ...], degree: int) -> F64:
+    """Products of Legendre polynomials (term, y, x) up to a total degree, the constant first."""
+    ny, nx = shape
+    y = legvander(np.linspace(-1, 1, ny), degree)
+    x = legvander(np.linspace(-1, 1, nx), degree)
+    orders = [(i, n - i) for n in range(degree + 1) for i in range(n + 1)]
+    return np.stack([np.outer(y[:, i], x[:, j]) for i, j in orders])
+
+
+def fit_terms(values: F64, terms: F64) -> F64:
+    """Least-squares coefficients (term,) of maps (term, y, x) in a map with NaN."""
+    good = np.isfinite(values)
+    return np.asarray(np.linalg.lstsq(terms[:, good].T, values[good], rcond=1e-10)[0])
+
+
+def smooth_surface(values: F64, good: Mask, degree: int = DEGREE) -> F64:
+    """Polynomial surface (y, x) through the good pixels of a map, outliers left out."""
+    terms = legendre(values.shape, degree)
+    used = np.where(good, values, np.nan)
+    for _ in range(2):
+        surface = np.tensordot(fit_terms(used, terms), terms, 1)
+        used = np.where(np.isfinite(clipped(used - surface)), used, np.nan)
+    return np.asarray(np.tensordot(fit_terms(used, terms), terms, 1))
+
+
+def flattened(values: F64, degree: int = DEGREE) -> F64:
+    """A map less its smooth surface, NaN as before."""
+    terms = legendre(values.shape, degree)
+    return np.asarray(values - np.tensordot(fit_terms(values, terms), terms, 1))
+
+
+def profile(values: F64, axis: int) -> F64:
+    """Mean along rows (axis 0: one value a row) or columns of a map with NaN; zero where empty."""
+    good = np.isfinite(values)
+    count = good.sum(axis=1 - axis)
+    return np.asarray(np.where(good, values, 0).sum(axis=1 - axis) / np.maximum(count, 1))
+
+
+def repeats(values: F64, axis: int) -> C128:
+    """Amplitudes of the profile along an axis at the periods of `PERIODS`, and their phases."""
+    along = profile(values, axis)
+    place = np.arange(len(along))
+    return np.array(
+        [2 * np.mean(along * np.exp(-2j * np.pi * place / p)) for p in PERIODS], complex
+    )
+
+
+CELL = 8
+"""Pixels along the side of a cell, whose means show how red a map is."""
+
+
+def redness(values: F64) -> float:
+    """How much more the means of cells of a map (NaN: none) scatter than those of white noise."""
+    ny, nx = values.shape
+    good = np.isfinite(values)
+    cut = (slice(0, ny - ny % CELL), slice(0, nx - nx % CELL))
+    inside = np.where(good, values, 0)[cut].reshape(ny // CELL, CELL, nx // CELL, CELL)
+    white = float(np.nanvar(values)) / CELL**2
+    return max(1.0, float(inside.mean(axis=(1, 3)).var()) / max(white, 1e-300))
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Offsets as true ones can be: the part of a map that is kept, and how the rest scatters.
+
+    Attributes
+    ----------
+    kept : (y, x) float64
+        Without bending, repeating rows and columns, and fringes; px.
+    terms : (term, y, x) float64
+        What was taken out: all that an effect of the bench or the readout would bring about.
+    scatter : (term,) float64
+        Of the coefficients of the terms, by chance, in offsets such as those that were kept.
+    """
+
+    kept: F64
+    terms: F64
+    scatter: F64
+
+    def drawn(self, rng: np.random.Generator) -> F64:
+        """A map (y, x): kept as it was, and taken out as it may be by chance; px."""
+        size = self.scatter * rng.standard_normal(len(self.scatter))
+        return np.asarray(self.kept + np.tensordot(size, self.terms, 1))
+
+
+def true_offsets(delta: F64, sigma: F64, psi: F64) -> Offsets:
+    """Part a measured map of offsets.
+
+    Parameters
+    ----------
+    delta, sigma : (y, x) float64
+        Offset and its error, px; NaN where there is none.
+    psi : (y, x) float64
+        Phase of the fringes, rad.
+
+    Returns
+    -------
+    Offsets
+        ``kept`` is shrunk by the share of its scatter that is noise; zero where there is none.
+    """
+    bending = legendre(delta.shape, DEGREE)
+    lines = []
+    for axis in (0, 1):
+        place = np.expand_dims(np.arange(delta.shape[axis]), 1 - axis)
+        for period in PERIODS:
+            turn = np.broadcast_to(2 * np.pi * place / period, delta.shape)
+            lines += [np.cos(turn)] if period == 2 else [np.cos(turn), np.sin(turn)]
+    fringes = [np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)]
+    terms = np.concatenate([bending, np.stack([*lines, *fringes])])
+    rest = clipped(delta)
+    rest = rest - np.tensordot(fit_terms(rest, terms), terms, 1)
+    variance = float(np.nanvar(rest))
+    noise = float(np.nanmedian(sigma[np.isfinite(delta)] ** 2))
+    true = variance * max(0.0, 1 - noise / max(variance, 1e-300))
+    scatter = np.sqrt(true / (terms**2).sum(axis=(1, 2)))
+    scatter[: len(bending)] *= np.sqrt(redness(rest))
+    kept = np.nan_to_num(rest * np.sqrt(true / max(variance, 1e-300)))
+    return Offsets(kept, terms, scatter)

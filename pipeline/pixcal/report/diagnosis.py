@@ -1,0 +1,437 @@
+"""The chapter on the gap between data and simulation: what it is, what causes it, what remains."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from pixcal.report import diagnosis_figures as figures
+from pixcal.report.blocks import Block, Fold, Section, Words, folded, plate
+from pixcal.report.contents import Contents, Diagnosis, EffectWords
+from pixcal.report.diagnosis_words import (
+    DETECTOR,
+    answer,
+    chance,
+    deciding,
+    effect_title,
+    level,
+    listed,
+    percent,
+    place,
+    unit,
+    with_interval,
+    worst,
+)
+from pixcal.report.tables import Table, is_table
+from pixcal.report.text import exact, number, with_error
+
+Facts = Mapping[str, Any]
+
+SHOWN = 12
+"""Rows of a table that are not folded."""
+PLOTS = 3
+"""Statistics that are drawn for each cause, and of what remains."""
+NEW = "new with the causes"
+
+_READ = (
+    "Above: dots are the data, squares or lines the simulations with ±1σ of chance and of their "
+    "own error. Below: how far the data are from each simulation; the band is ±2σ. "
+)
+
+
+def diagnosis(contents: Contents) -> Section:
+    """All that ``pixcal diagnose`` found; one line where it was not run."""
+    found = contents.diagnosis
+    title = "Diagnosis: data against simulation"
+    if found is None:
+        lead = "Not measured: run 'pixcal diagnose RUN' and make the report again."
+        return Section("diagnosis", title, lead, [])
+    verdict = found.facts["verdict"]
+    blocks: list[Block] = [Words(answer(found), "answer", level(verdict))]
+    if verdict == "no gap":
+        blocks += _largest(found)
+    else:
+        blocks += _overview(found)
+        for rank, cause in enumerate(found.facts["causes"], 1):
+            blocks += _cause(rank, cause, found, contents)
+        blocks += _where(found)
+        blocks += _absolute(found)
+        blocks += _remainder(found, contents)
+    blocks += _candidates(found)
+    blocks += _looked_at(found)
+    return Section("diagnosis", title, _lead(contents), blocks)
+
+
+def _lead(contents: Contents) -> str:
+    """What was compared with what."""
+    fringes = contents.acquisition.get("frames", {}).get("fringes")
+    bench = "straight fringes, constant light, " if fringes else ""
+    given = [s.config.get("nominal") for s in contents.stages if s.name == "diagnose"]
+    more = f"; to it were added {listed(given[0])}" if given and given[0] else ""
+    return (
+        f"The same frames were simulated with the nominal bench: {bench}a linear detector without "
+        f"memory or crosstalk, and its noise{more}. The gap is all that differs from the data by "
+        "more than chance; effects were fitted on one part of the frames and judged on the other."
+    )
+
+
+def _heading(text: str) -> Words:
+    return Words(text, "heading")
+
+
+# What it is, in a minute
+
+
+def _overview(found: Diagnosis) -> Iterator[Block]:
+    gap, causes = found.facts["gap"], found.facts["causes"]
+    closed = [
+        figures.Closed(
+            effect_title(found, c["effect"]),
+            c["gap_closed"],
+            tuple(c["gap_closed_interval"]),
+            c["gain_over_rest"],
+        )
+        for c in causes
+    ]
+    caption = (
+        "Every statistic that differs counts by the square of its significance; the nominal "
+        "simulation's whole gap is 100\u00a0%. "
+    )
+    if causes:
+        caption += (
+            "Thin lines are intervals of 90\u00a0%. A cause that closes much alone and is missed "
+            "little does what another cause does too."
+        )
+    yield plate("The gap", caption, figures.gap_figure(_bars(gap, bool(causes)), closed))
+    if causes:
+        yield _causes_table(found)
+
+
+def _bars(gap: Facts, with_causes: bool) -> list[figures.Bar]:
+    """All of the gap, its domains, and what differs only with the causes."""
+    ends = gap["interval"]
+    whole = figures.Bar("all", gap["total"], gap["after"], (ends[0], ends[1]))
+    domains = gap.get("domains", {})
+    parts = [figures.Bar(d, before, after) for d, (before, after) in domains.items()]
+    rest = gap["after"] - sum(b.after for b in parts)
+    if with_causes and parts and rest > 0.001:
+        parts.append(figures.Bar(NEW, 0.0, rest))
+    return [whole, *sorted(parts, key=lambda b: -b.before)]
+
+
+def _causes_table(found: Diagnosis) -> Table:
+    rows = []
+    for rank, cause in enumerate(found.facts["causes"], 1):
+        alike = cause["not_told_apart_from"]
+        rows.append(
+            [
+                f"{rank}. {effect_title(found, cause['effect'])}",
+                with_interval(cause["gap_closed"], cause["gap_closed_interval"]),
+                percent(cause["gain_over_rest"]),
+                chance(cause["p_value"]),
+                listed(alike, "or") if alike else "–",
+            ]
+        )
+    header = [
+        "cause",
+        "gap closed by it alone",
+        "lost without it",
+        "p-value",
+        "not told apart from",
+    ]
+    return Table("Causes", header, rows)
+
+
+# A cause
+
+
+def _cause(rank: int, cause: Facts, found: Diagnosis, contents: Contents) -> Iterator[Block]:
+    name = cause["effect"]
+    words = found.effects.get(name, EffectWords(""))
+    yield _heading(f"Cause {rank}: {effect_title(found, name)}")
+    told = f"What gave it away: {cause['why'].rstrip('.')}." if cause.get("why") else ""
+    size = cause.get("sigmas")
+    sure = f"In the frames it was fitted to it is seen at {number(size, 2)}σ." if size else ""
+    yield Words(" ".join(filter(None, (words.about, told, sure))))
+    alike = cause["not_told_apart_from"]
+    if alike:
+        others = listed((effect_title(found, other) for other in alike), "or")
+        yield Words(
+            f"The data do not tell it apart from {others}. What would decide: "
+            f"{deciding(contents, [name, *alike])}.",
+            "advice",
+        )
+    shown = _named(found, cause.get("given_away_by", ()))
+    if shown:
+        yield plate(
+            f"What gave away {effect_title(found, name)}",
+            _READ + "The statistics are those that become likeliest by this cause.",
+            figures.curves_figure(shown),
+        )
+    yield from _parameters(cause, words)
+
+
+def _named(found: Diagnosis, names: Sequence[Facts]) -> list[Facts]:
+    curves = {(c["statistic"], c["set"]): c for c in found.curves}
+    keys = [(n["statistic"], n["set"]) for n in names[:PLOTS]]
+    return [curves[key] for key in keys if key in curves]
+
+
+def _parameters(cause: Facts, words: EffectWords) -> Iterator[Block]:
+    """Parameters with their errors; lists of like mappings have tables of their own."""
+    errors, parameters = cause["uncertainty"], cause["parameters"]
+    rows = []
+    for name, value in parameters.items():
+        if is_table(value):
+            continue
+        its_unit, meaning = words.parameters.get(name, ("", ""))
+        rows.append([name, _fitted(name, value, errors), unit(its_unit) or "–", meaning])
+    if rows:
+        header = ["parameter", "value", "unit", "meaning"]
+        yield Table(f"Parameters of {cause['effect']}", header, rows)
+    for name, value in parameters.items():
+        if is_table(value):
+            meaning = words.parameters.get(name, ("", ""))[1]
+            table, same = _list_of(name, value, errors)
+            about = f"{name}: {meaning}." if meaning else ""
+            yield Words(" ".join(filter(None, (about, f"In all: {same}." if same else ""))))
+            yield from folded(table, SHOWN, "rows")
+
+
+def _fitted(name: str, value: Any, errors: Facts) -> str:
+    if isinstance(value, list):
+        return ", ".join(_fitted(f"{name}[{n}]", v, errors) for n, v in enumerate(value)) or "–"
+    if name in errors and isinstance(value, (int, float)):
+        return with_error(float(value), errors[name])
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, str):
+        return value
+    return f"{exact(value)} (not fitted)"
+
+
+def _list_of(name: str, entries: Sequence[Facts], errors: Facts) -> tuple[Table, str]:
+    """A list of like mappings, and what is the same in all of them."""
+    keys = list(dict.fromkeys(key for entry in entries for key in entry))
+    fitted = {k for k in keys if any(f"{name}[{n}].{k}" in errors for n in range(len(entries)))}
+    constant = {k for k in keys if all(e.get(k) == entries[0].get(k) for e in entries)}
+    same = [k for k in keys if k in constant - fitted and len(entries) > 1]
+    columns = [k for k in keys if k not in same]
+    rows = [
+        [
+            with_error(entry.get(k), errors.get(f"{name}[{n}].{k}")) if k in fitted
+            else "–" if entry.get(k) is None else exact(entry[k])
+            for k in columns
+        ]
+        for n, entry in enumerate(entries)
+    ]  # fmt: skip
+    notes = [f"{k} {exact(entries[0][k])}" for k in same]
+    return Table(name, columns, rows), ", ".join(notes)
+
+
+# Where
+
+
+def _where(found: Diagnosis) -> Iterator[Block]:
+    curves = sorted((c for c in found.curves if c["in_gap"]), key=lambda c: -c["significance"])
+    if not curves:
+        return
+    yield _heading("Where data and simulation differ")
+    causes = bool(found.facts["causes"])
+    first, rest = _worst_of_each_domain(curves)
+    if len(rest) <= 2:
+        first, rest = _by_domain(curves), []
+    header = _header(causes)
+    title = "Statistics that differ, by domain, the worst first"
+    yield Table(title, header, [_row(c, causes) for c in first])
+    if rest:
+        rows = [_row(c, causes) for c in _by_domain(rest)]
+        yield Fold(
+            f"{len(rest)} more statistics that differ",
+            [Table("The others, likewise", header, rows)],
+        )
+    if not causes:
+        yield plate(
+            "The largest differences",
+            _READ,
+            figures.curves_figure(curves[:PLOTS], with_effects=False),
+        )
+
+
+def _by_domain(curves: Sequence[Facts]) -> list[Facts]:
+    """Curves that are sorted, by domain: first the domain of the first."""
+    order = list(dict.fromkeys(c["domain"] for c in curves))
+    return sorted(curves, key=lambda c: order.index(c["domain"]))
+
+
+def _worst_of_each_domain(curves: Sequence[Facts]) -> tuple[list[Facts], list[Facts]]:
+    """`SHOWN` of the curves, from each domain alike as far as it has them; and the others."""
+    rank = {id(c): _rank_in_domain(c, curves) for c in curves}
+    chosen = {id(c) for c in sorted(curves, key=lambda c: rank[id(c)])[:SHOWN]}
+    first = [c for c in curves if id(c) in chosen]
+    return _by_domain(first), _by_domain([c for c in curves if id(c) not in chosen])
+
+
+def _rank_in_domain(curve: Facts, curves: Sequence[Facts]) -> int:
+    same = [c for c in curves if c["domain"] == curve["domain"]]
+    return next(n for n, c in enumerate(same) if c is curve)
+
+
+def _header(causes: bool) -> list[str]:
+    after = ["with causes", "σ", "left"] if causes else []
+    return ["domain", "statistic", "where", "measured", "nominal", "σ", *after]
+
+
+def _row(curve: Facts, causes: bool) -> list[str]:
+    at = worst(curve)
+    measured, nominal = curve["measured"][at], curve["nominal"]["value"][at]
+    after = curve["with_effects"]["value"][at]
+    of = "" if curve["set"] == DETECTOR else f"set {curve['set']}: "
+    digits = _digits(measured, nominal)
+    row = [
+        curve["domain"],
+        curve["title"],
+        of + place(curve, at),
+        f"{number(measured, digits)} {unit(curve['unit'])}".strip(),
+        number(nominal, digits),
+        _sigma(curve["z"][at]),
+    ]
+    if causes:
+        left = percent(curve["left"]) if curve["in_gap"] else "new"
+        row += [number(after, digits), _sigma(curve["z_after"][at]), left]
+    return row
+
+
+def _digits(one: float, other: float) -> int:
+    """As many as show by how much two values differ."""
+    size, apart = max(abs(one), abs(other)), abs(one - other)
+    if not (math.isfinite(size) and apart > 0):
+        return 3
+    return min(max(3, 2 + math.ceil(math.log10(size / apart))), 6)
+
+
+def _sigma(value: float) -> str:
+    text = f"{value:+.1f}" if math.isfinite(value) else "–"
+    return "0.0" if text in ("+0.0", "-0.0") else text.replace("-", "−")
+
+
+def _absolute(found: Diagnosis) -> Iterator[Block]:
+    causes = bool(found.facts["causes"])
+    rows = []
+    for entry in found.facts["gap"]["absolute"]:
+        digits = _digits(entry["measured"], entry["simulated"])
+        values = ["measured", "simulated", *(["after"] if causes else [])]
+        rows.append(
+            [entry["quantity"], unit(entry["unit"]), *(number(entry[k], digits) for k in values)]
+        )
+    if rows:
+        header = ["quantity", "unit", "measured", "nominal", *(["with causes"] if causes else [])]
+        yield from folded(Table("In units of the bench", header, rows), SHOWN, "quantities")
+
+
+# What remains
+
+
+def _remainder(found: Diagnosis, contents: Contents) -> Iterator[Block]:
+    if not found.facts["causes"]:
+        yield Words(f"What could tell more: {deciding(contents)}.", "advice")
+        return
+    gap = found.facts["gap"]
+    left = sorted(
+        (c for c in found.curves if c["significance_after"] > found.noticed),
+        key=lambda c: -c["significance_after"],
+    )
+    yield _heading("What remains")
+    parts = [
+        f"{percent(after)} in {domain}"
+        for domain, (_, after) in sorted(gap.get("domains", {}).items(), key=lambda d: -d[1][1])
+        if after >= 5e-4
+    ]
+    shares = f": {listed(parts)}" if parts else ""
+    sentence = f"{with_interval(gap['after'], gap['interval'])} of the gap is left{shares}. "
+    if not left:
+        yield Words(sentence + "No statistic differs by more than chance any more.")
+        return
+    one = len(left) == 1
+    yield Words(
+        sentence + f"{len(left)} statistic{'' if one else 's'} still "
+        f"differ{'s' if one else ''} by more than chance."
+    )
+    new = [c for c in left if not c["in_gap"]]
+    if new:
+        yield Words(
+            f"Of them, {len(new)} did not differ before: there a cause does what the data do not "
+            "show, so it may not be the right one.",
+            "advice",
+        )
+    table = Table("Statistics that still differ", _header(True), [_row(c, True) for c in left])
+    yield from folded(table, SHOWN, "statistics that still differ")
+    yield plate("The largest of what remains", _READ, figures.curves_figure(left[:PLOTS]))
+
+
+def _largest(found: Diagnosis) -> Iterator[Block]:
+    """Where there is no gap: how far off the worst statistics are all the same."""
+    curves = sorted(found.curves, key=lambda c: -c["significance"])[:PLOTS]
+    if not curves:
+        return
+    yield Table(
+        "The largest deviations, all within chance",
+        _header(False),
+        [_row(c, False) for c in curves],
+    )
+    yield plate("The largest deviations", _READ, figures.curves_figure(curves, with_effects=False))
+    yield from _absolute(found)
+
+
+# What was tried
+
+
+def _candidates(found: Diagnosis) -> Iterator[Block]:
+    tried = sorted(
+        found.facts["candidates"], key=lambda c: (-c["gap_closed"], -(c.get("sigmas") or 0.0))
+    )
+    if not tried:
+        return
+    rows = [
+        [
+            effect_title(found, c["effect"]),
+            _sigma(c["sigmas"]) if "sigmas" in c else "–",
+            percent(c["gap_closed"]) if c.get("tried_on_unseen_frames") else "–",
+            c["rejected_because"],
+        ]
+        for c in tried
+    ]
+    header = ["effect", "seen at (σ)", "closed alone", "why not"]
+    other = " other" if found.facts["causes"] else ""
+    title = f"{len(tried)}{other} effects were considered and not taken"
+    yield Fold(title, [Table("Not taken", header, rows)])
+
+
+def _looked_at(found: Diagnosis) -> Iterator[Block]:
+    """Which frames and windows."""
+    facts = found.facts.get("looked_at")
+    if not facts:
+        return
+    one, other = facts["fitted_on"], facts["tried_on"]
+    rows = [["window", _window(one["window"]), "; ".join(map(_window, other["windows"]))]]
+    names = dict.fromkeys([*one["frames"], *other["frames"]])
+    rows += [[n, _frames(one["frames"].get(n)), _frames(other["frames"].get(n))] for n in names]
+    yield Fold(
+        "Which frames were looked at",
+        [Table("Frames and windows", ["", "effects fitted on", "effects judged on"], rows)],
+    )
+
+
+def _window(ends: Sequence[Sequence[int]]) -> str:
+    (y0, y1), (x0, x1) = ends
+    return f"rows {y0} to {y1 - 1}, columns {x0} to {x1 - 1}"
+
+
+def _frames(facts: Sequence[int] | None) -> str:
+    if facts is None:
+        return "–"
+    first, last, count = facts
+    if count == last - first + 1:
+        return f"frames {first} to {last}"
+    return f"{count} of the frames {first} to {last}"

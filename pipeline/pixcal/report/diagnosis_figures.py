@@ -1,0 +1,277 @@
+"""Figures of a diagnosis: the gap by domain, what each cause closes, statistics as three curves."""
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from numpy.typing import NDArray
+
+from pixcal.report.colours import BAND, BLUE, GREY, INK, RED
+from pixcal.report.diagnosis_words import DETECTOR, axis_label, percent, places, unit
+from pixcal.report.drawing import WIDE, Unit, finish, new_figure, unit_for
+
+F64 = NDArray[np.float64]
+
+ROOM = 50
+"""Letters that fit below a panel; where names of places have more, they are turned."""
+SPAN = 12.0
+"""Ratio of values from which an axis is logarithmic."""
+QUIET = 5.0
+"""Least half height of the axis of deviations, sigma."""
+ORDER = ("measured", "nominal simulation", "with the causes")
+BESIDE = 0.2
+"""How far simulations are drawn from the data's place, where places are not numbers."""
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A share of the gap, before and after, and the interval of what is left where it is known."""
+
+    name: str
+    before: float
+    after: float
+    interval: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Closed:
+    """What a cause closes by itself, with its interval, and beyond all the others."""
+
+    name: str
+    alone: float
+    interval: tuple[float, float]
+    over_rest: float
+
+
+def gap_figure(bars: Sequence[Bar], causes: Sequence[Closed]) -> Figure:
+    """The gap by domain, before and after, and beside it what each cause closes."""
+    height = 1.5 + 0.5 * max(len(bars), len(causes))
+    figure = new_figure(WIDE, height)
+    if not causes:
+        _bars(figure.subplots(), bars, with_after=False)
+        return figure
+    left, right = figure.subplots(1, 2, width_ratios=[1.25, 1])
+    _bars(left, bars, with_after=True)
+    _causes(right, causes)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=9.5, frameon=False)
+    return figure
+
+
+def _bars(axes: Axes, bars: Sequence[Bar], *, with_after: bool) -> None:
+    at = np.arange(len(bars), dtype=float)
+    thick = 0.34 if with_after else 0.5
+    shift = thick / 2 if with_after else 0.0
+    before = [100 * b.before for b in bars]
+    axes.barh(at - shift, before, thick, color=RED, alpha=0.45, label=ORDER[1])
+    for y, bar in zip(at, bars, strict=True):
+        _note(axes, 100 * bar.before, y - shift, percent(bar.before))
+    if with_after:
+        axes.barh(
+            at + shift, [100 * b.after for b in bars], thick, color=BLUE, label="with the causes"
+        )
+        for y, bar in zip(at, bars, strict=True):
+            end = bar.after
+            if bar.interval is not None:
+                low, high = bar.interval
+                end = max(end, high)
+                axes.plot([100 * low, 100 * high], [y + shift] * 2, color=INK, linewidth=1.6)
+            _note(axes, 100 * end, y + shift, percent(bar.after))
+    axes.set_yticks(at, [_plain(b.name, 24) for b in bars])
+    axes.set_ylim(len(bars) - 0.4, -0.6)
+    axes.set_xlim(0, 118 * max([1e-9, *(max(b.before, b.after) for b in bars)]))
+    axes.set_xlabel("share of the gap (%)")
+    axes.set_title("the gap by domain")
+    finish(axes)
+    axes.grid(visible=False, axis="y")
+
+
+def _note(axes: Axes, x: float, y: float, text: str) -> None:
+    axes.annotate(text, (x, y), (5, 0), textcoords="offset points", va="center", fontsize=9)
+
+
+def _causes(axes: Axes, causes: Sequence[Closed]) -> None:
+    for y, cause in enumerate(causes):
+        low, high = (100 * v for v in cause.interval)
+        first = y == 0
+        axes.plot([low, high], [y, y], color=BLUE, linewidth=3, solid_capstyle="butt")
+        axes.plot(
+            100 * cause.alone, y, "o", color=BLUE, markersize=8,
+            label="closed by it alone" if first else None,
+        )  # fmt: skip
+        axes.plot(
+            100 * cause.over_rest, y, "D", color=INK, markersize=7, fillstyle="none",
+            label="lost when it is left out" if first else None,
+        )  # fmt: skip
+    names = ["\n".join(textwrap.wrap(_plain(c.name, 60), 22)[:3]) for c in causes]
+    axes.set_yticks(range(len(causes)), names)
+    axes.set_ylim(len(causes) - 0.4, -0.6)
+    ends = [100 * v for c in causes for v in (*c.interval, c.over_rest, c.alone)]
+    axes.set_xlim(min(-3.0, *ends) - 2, max(103.0, *ends) + 2)
+    axes.set_xlabel("share of the gap (%)")
+    axes.set_title("what each cause closes")
+    finish(axes)
+    axes.grid(visible=False, axis="y")
+
+
+# Curves
+
+
+def curves_figure(curves: Sequence[Mapping[str, Any]], *, with_effects: bool = True) -> Figure:
+    """Statistics side by side: above the values, below their deviations from the simulations.
+
+    Parameters
+    ----------
+    curves : sequence of mapping
+        Up to three entries of ``curves.json``.
+    with_effects : bool
+        False where no effect was found: then that curve is the nominal one.
+    """
+    turned = any(_is_named(c) and _turned(places(c)) for c in curves)
+    figure = new_figure(WIDE * (1 + len(curves)) / 4, 5.0 + 0.5 * turned)
+    axes: Any = figure.subplots(
+        2, len(curves), squeeze=False, sharex="col", height_ratios=[2.1, 1]
+    )  # fmt: skip
+    for n, (top, below, curve) in enumerate(zip(axes[0], axes[1], curves, strict=True)):
+        _panel(top, below, curve, with_effects)
+        if n == 0:
+            below.set_ylabel("deviation (σ)")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    shown = dict(sorted(zip(labels, handles, strict=True), key=lambda pair: ORDER.index(pair[0])))
+    figure.legend(
+        shown.values(), shown, loc="outside upper center", ncols=3, fontsize=10, frameon=False
+    )  # fmt: skip
+    return figure
+
+
+def _panel(top: Axes, below: Axes, curve: Mapping[str, Any], with_effects: bool) -> None:
+    named = _is_named(curve)
+    x = np.arange(len(curve["x"]), dtype=float) if named else _numbers(curve["x"])
+    measured = _numbers(curve["measured"])
+    simulated = {"nominal": RED} | ({"with_effects": BLUE} if with_effects else {})
+    bands = {key: {k: _numbers(v) for k, v in curve[key].items()} for key in simulated}
+    every = np.concatenate([measured, *(b["value"] for b in bands.values())])
+    scale = unit_for(every, unit(str(curve["unit"])))
+    for side, (key, colour) in zip((-1, 1), simulated.items(), strict=False):
+        band = {k: v * scale.factor for k, v in bands[key].items()}
+        label = ORDER[1 if key == "nominal" else 2]
+        _simulated(top, x + side * BESIDE * named, band, colour, label, named)
+        sigmas = _numbers(curve["z" if key == "nominal" else "z_after"])
+        _deviations(below, x + side * BESIDE * named, sigmas, colour, named)
+    top.plot(
+        x, measured * scale.factor, "o" if named else "o-", color=INK, markersize=5, linewidth=1,
+        label=ORDER[0], zorder=5,
+    )  # fmt: skip
+    _value_axis(top, curve, every * scale.factor, scale)
+    _sigma_axis(below, [_numbers(curve[k]) for k in ("z", "z_after")])
+    _place_axis(below, curve, x, named)
+    of = "" if curve["set"] == DETECTOR else f"set {curve['set']}"
+    title = _plain(str(curve["title"]), 70)
+    width = 36 if len(title) <= 36 else len(title) // 2 + 6
+    lines = [*textwrap.wrap(title, width)[:2], _plain(of, 30)]
+    top.set_title("\n".join(lines).strip(), fontsize=11)
+    top.tick_params(labelbottom=False)
+
+
+def _simulated(
+    axes: Axes, x: F64, band: Mapping[str, F64], colour: str, label: str, named: bool
+) -> None:
+    """A simulation's curve with its limits of one sigma."""
+    low, high = np.fmin(band["low"], band["value"]), np.fmax(band["high"], band["value"])
+    if named:
+        errors = [band["value"] - low, high - band["value"]]
+        axes.errorbar(
+            x, band["value"], errors, fmt="s", color=colour, markersize=5, elinewidth=2.4,
+            alpha=0.8, label=label,
+        )  # fmt: skip
+        return
+    axes.fill_between(x, low, high, color=colour, alpha=0.25, linewidth=0)
+    # The nominal curve shows below one that lies on it.
+    width = 3.0 if colour == RED else 1.4
+    axes.plot(x, band["value"], color=colour, linewidth=width, label=label)
+
+
+def _deviations(axes: Axes, x: F64, sigmas: F64, colour: str, named: bool) -> None:
+    if named:
+        axes.bar(x, sigmas, 0.32, color=colour, alpha=0.75)
+    else:
+        size = 6 if colour == RED else 3.5
+        axes.plot(x, sigmas, "o-", color=colour, markersize=size, linewidth=size / 3)
+
+
+def _value_axis(axes: Axes, curve: Mapping[str, Any], values: F64, scale: Unit) -> None:
+    good = values[np.isfinite(values)]
+    if curve["kind"] == "power" and len(good) and good.min() > 0:
+        if good.max() > SPAN * good.min():
+            axes.set_yscale("log")
+            axes.set_ylim(good.min() / 2, good.max() * 2)
+            _plain_numbers(axes.yaxis, good.min() / 2, good.max() * 2)
+    else:
+        axes.axhline(0, color=GREY, linewidth=0.8)
+    axes.set_ylabel(_plain(scale.label, 24))
+    axes.margins(x=0.06)
+    finish(axes)
+
+
+def _sigma_axis(axes: Axes, sigmas: Sequence[F64]) -> None:
+    every = np.concatenate(sigmas)
+    top = 1.15 * max(QUIET, float(np.max(np.abs(every[np.isfinite(every)]), initial=0.0)))
+    axes.axhspan(-2, 2, color=BAND, linewidth=0, zorder=0)
+    axes.axhline(0, color=GREY, linewidth=0.8)
+    axes.set_ylim(-top, top)
+    finish(axes)
+
+
+def _place_axis(axes: Axes, curve: Mapping[str, Any], x: F64, named: bool) -> None:
+    axes.set_xlabel(_plain(axis_label(curve), 34))
+    if named:
+        names = places(curve)
+        step = -(-len(names) // 16)
+        turn = 90 if _turned(names[::step]) else 0
+        axes.set_xticks(x[::step], [_plain(n, 12) for n in names[::step]], rotation=turn)
+        axes.set_xlim(-0.6, len(x) - 0.4)
+        axes.tick_params(axis="x", labelsize=9)
+        return
+    axes.set_xscale("log")
+    low, high = float(x.min()) / 1.3, float(x.max()) * 1.3
+    axes.set_xlim(low, high)
+    _plain_numbers(axes.xaxis, low, high)
+
+
+def _turned(names: Sequence[str]) -> bool:
+    return sum(len(n) + 2 for n in names) > ROOM
+
+
+def _plain_numbers(axis: Axis, low: float, high: float) -> None:
+    """Numbers without powers of ten on a logarithmic axis, at most six."""
+    for steps in ((1, 2, 5), (1, 3), (1,)):
+        ticks = [m * 10.0**e for e in range(-12, 13) for m in steps]
+        shown = [t for t in ticks if low <= t <= high]
+        if len(shown) <= 6:
+            break
+    axis.set_major_locator(FixedLocator(shown))
+    axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    axis.set_minor_locator(NullLocator())
+
+
+def _is_named(curve: Mapping[str, Any]) -> bool:
+    """Whether places have names, or count things; else they are frequencies."""
+    x = _numbers(curve["x"])
+    return not (str(curve["x_label"]).startswith("cycles a ") and len(x) > 1 and x.min() > 0)
+
+
+def _numbers(values: Sequence[Any]) -> F64:
+    numbers = np.asarray(values, dtype=float)
+    return np.where(np.isfinite(numbers), numbers, np.nan)
+
+
+def _plain(text: str, most: int) -> str:
+    """Foreign text in a figure: one line, not too long, no formulas, letters that are there."""
+    line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    short = line if len(line) <= most else line[: most - 1] + "…"
+    return short.replace("$", r"\$")

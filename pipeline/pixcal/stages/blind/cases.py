@@ -1,0 +1,143 @@
+"""``pixcal blind make``: acquisitions whose effects are withheld, and the truth in a sealed file.
+
+Nothing but the samples depends on the truth. Folders, files, their sizes and headers, the frames
+and the bench are those that the case would have with any other effect; all times of files are the
+same; and all cases are copied into place at the end, one after the other, so that not even the
+hour of a file's birth tells how long its case took to make.
+"""
+
+import os
+import secrets
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import partial
+from pathlib import Path
+
+from pixcal.effects import parse_effects
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.model.bench import Bench
+from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect
+from pixcal.simulation.exposure import Camera
+from pixcal.stages.blind.benches import LAYOUTS
+from pixcal.stages.blind.draw import Examination, Truth, draw_examination
+from pixcal.stages.blind.elsewhere import Elsewhere
+from pixcal.stages.blind.paper import EXAMINATION, case_name, write_paper
+from pixcal.stages.blind.seal import write_seal
+from pixcal.stages.simulate import acquire
+from pixcal.storage.artefact import digest, lock
+
+MOMENT = datetime(2026, 1, 1, tzinfo=UTC).timestamp()
+"""Time of every file."""
+MOST_SEED = 10**17
+
+
+@dataclass(frozen=True)
+class MakeConfig:
+    """Options of the command.
+
+    Attributes
+    ----------
+    cases : int
+    seed : int, optional
+        Without one it is drawn, and nobody can guess it.
+    size : str
+        ``small`` or ``standard``.
+    """
+
+    cases: int
+    seed: int | None = None
+    size: str = "small"
+
+
+def make(out: Path, sealed: Path, config: MakeConfig, runtime: Runtime) -> Examination:
+    """Make an examination.
+
+    Parameters
+    ----------
+    out : Path
+        Directory of the cases; it appears when all are complete.
+    sealed : Path
+        File of the truth.
+    config : MakeConfig
+    runtime : Runtime
+
+    Raises
+    ------
+    InputError
+        If something stands in the way, or the truth would lie beside the cases.
+    """
+    _check(out, sealed, config)
+    seed = EXAMINATION + secrets.randbelow(MOST_SEED) if config.seed is None else config.seed
+    examination = draw_examination(config.cases, seed, config.size)
+    write_examination(out, sealed, examination, runtime)
+    return examination
+
+
+def write_examination(out: Path, sealed: Path, examination: Examination, runtime: Runtime) -> None:
+    """Write cases, paper and seal."""
+    benches = tuple(examination.bench(n) for n in range(len(examination.truths)))
+    partial_ones = f".{out.name}.partial-"
+    key = digest(repr(examination), repr(benches))[:16]
+    aside = out.with_name(partial_ones + key)
+    with lock(aside):
+        items = list(zip(range(len(benches)), benches, examination.truths, strict=True))
+        run_tasks(partial(_case, aside), items, runtime, label="cases")
+        commitment = write_seal(sealed, examination, benches)
+        _publish(aside, out, [case_name(n) for n in range(len(benches))])
+        write_paper(out, examination, commitment)
+        _same_times(out)
+    for stale in out.parent.glob(f"{partial_ones}*"):
+        shutil.rmtree(stale)
+
+
+def _check(out: Path, sealed: Path, config: MakeConfig) -> None:
+    if config.size not in LAYOUTS:
+        raise InputError(f"--size {config.size}: not one of {', '.join(LAYOUTS)}")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"--out {out}: not empty; choose another directory")
+    if sealed.exists():
+        raise InputError(f"--sealed {sealed}: is there already; choose another file")
+    if sealed.resolve().is_relative_to(out.resolve()):
+        raise InputError(f"--sealed {sealed}: inside {out}; keep the truth apart from the cases")
+
+
+def _case(folder: Path, item: tuple[int, Bench, Truth]) -> None:
+    number, bench, truth = item
+    final = folder / case_name(number)
+    if final.exists():
+        return
+    made = folder / f".{final.name}.aside"
+    shutil.rmtree(made, ignore_errors=True)
+    made.mkdir(parents=True)
+    here = Runtime(cluster="sync")
+    if truth.elsewhere:
+        foreign = [Elsewhere(d.effect, d.strength) for d in truth.drawn] or [Elsewhere()]
+        acquire(bench, (), made, here, foreign[0].camera)
+    else:
+        acquire(bench, effects_of(truth, bench), made, here, Camera)
+    made.rename(final)
+
+
+def effects_of(truth: Truth, bench: Bench) -> tuple[Effect, ...]:
+    """The library's effects of a case, which go together with its bench."""
+    plain = {d.effect: d.parameters for d in truth.drawn}
+    found = parse_effects(plain, "blind")
+    for effect in found:
+        effect.check(replace(bench, effects=plain))
+    return found
+
+
+def _publish(aside: Path, out: Path, names: Sequence[str]) -> None:
+    """Copy the cases, none of which takes longer than another."""
+    shutil.rmtree(out, ignore_errors=True)
+    out.mkdir(parents=True)
+    for name in names:
+        shutil.copytree(aside / name, out / name)
+
+
+def _same_times(folder: Path) -> None:
+    for path in sorted(folder.rglob("*"), reverse=True):
+        os.utime(path, (MOMENT, MOMENT))

@@ -1,0 +1,177 @@
+"""One case: what the diagnosis says, held against the truth."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pixcal.effects import effects
+from pixcal.stages.blind.draw import ELSEWHERE, LEFT_OUT, NOTHING, ONE, SEVERAL, Truth
+from pixcal.stages.blind.parameters import held
+
+BLAMED = 0.5
+"""Share of the gap from which an innocent effect is blamed for most of it."""
+WORST = 3
+"""Statistics among which the place of an effect is looked for."""
+
+Diagnosis = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Grade:
+    """How a case was answered.
+
+    Attributes
+    ----------
+    case : str
+    part : int
+    truth : tuple of str
+        Effects in the case.
+    way : str
+        How they come.
+    times : float or None
+        Threshold times of the weakest.
+    left_out : str
+    verdict : str
+        Of the diagnosis; ``failed`` without one.
+    named : tuple of str
+        Causes in their order.
+    marks : dict
+        Questions of the part, answered right or not.
+    why : str
+        What went wrong; empty where nothing did.
+    parameters : tuple of dict
+        Of true effects that were found: name, true, found, error, within.
+    closed, oracle : float or None
+        Share of the gap closed by the causes named, and by the true effects as they are.
+    offset_before_px, offset_after_px : float or None
+        Median error of the offsets, of the maps as fitted and as corrected.
+    """
+
+    case: str
+    part: int
+    truth: tuple[str, ...]
+    way: str
+    times: float | None
+    left_out: str
+    verdict: str
+    named: tuple[str, ...]
+    marks: dict[str, bool]
+    why: str
+    parameters: tuple[dict[str, Any], ...] = ()
+    closed: float | None = None
+    oracle: float | None = None
+    offset_before_px: float | None = None
+    offset_after_px: float | None = None
+
+    @property
+    def right(self) -> bool:
+        """Whether the answer to the part's first question is right."""
+        return next(iter(self.marks.values()))
+
+
+QUESTIONS = {
+    ONE: ("named first",),
+    NOTHING: ("no cause claimed", "no gap"),
+    SEVERAL: ("all found, none invented", "all found", "none invented"),
+    LEFT_OUT: ("honest", "right domain"),
+    ELSEWHERE: ("named first",),
+}
+"""Of each part; the first one decides."""
+
+
+def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "") -> Grade:
+    """Hold a diagnosis against the truth.
+
+    Parameters
+    ----------
+    case : str
+    truth : Truth
+    diagnosis : mapping, optional
+        ``diagnosis.json``; None where the case could not be diagnosed.
+    error : str
+        Why it could not.
+    """
+    way = ", ".join(f"{d.way} {d.strength:.3g}" for d in truth.drawn)
+    times = min((d.times for d in truth.drawn), default=None)
+    about = (case, truth.part, truth.names, way, times, truth.left_out)
+    if diagnosis is None:
+        marks = dict.fromkeys(QUESTIONS[truth.part], False)
+        return Grade(*about, "failed", (), marks, error or "not diagnosed")
+    named = tuple(cause["effect"] for cause in diagnosis["causes"])
+    answers = _answers(truth, diagnosis, named)
+    marks = dict(zip(QUESTIONS[truth.part], answers, strict=True))
+    why = "" if answers[0] else _why(truth, diagnosis, named)
+    closed = 1 - float(diagnosis["gap"]["after"]) if named else None
+    parameters = () if truth.elsewhere else tuple(_parameters(truth, diagnosis))
+    return Grade(
+        *about, diagnosis["verdict"], named, marks, why, parameters=parameters, closed=closed
+    )
+
+
+def _answers(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> tuple[bool, ...]:
+    if truth.part in (ONE, ELSEWHERE):
+        return (named[:1] == truth.names,)
+    if truth.part == NOTHING:
+        return not named, diagnosis["verdict"] == "no gap"
+    if truth.part == SEVERAL:
+        found, invented = set(truth.names) <= set(named), set(named) - set(truth.names)
+        return found and not invented, found, not invented
+    honest = diagnosis["verdict"] in ("unexplained", "partly explained")
+    blamed = any(cause["gap_closed"] > BLAMED for cause in diagnosis["causes"])
+    return honest and not blamed, _domain_seen(truth, diagnosis)
+
+
+def _domain_seen(truth: Truth, diagnosis: Diagnosis) -> bool:
+    """Whether the worst statistics are of a domain that the effect shows in."""
+    known = effects()
+    domains = {domain for name in truth.names for domain in known[name].domains}
+    worst = diagnosis["gap"]["where"][:WORST]
+    return any(one["domain"] in domains for one in worst)
+
+
+def _parameters(truth: Truth, diagnosis: Diagnosis) -> list[dict[str, Any]]:
+    causes = {cause["effect"]: cause for cause in diagnosis["causes"]}
+    found = []
+    for drawn in truth.drawn:
+        cause = causes.get(drawn.effect)
+        if cause is None:
+            continue
+        for one in held(drawn.effect, drawn.parameters, cause["parameters"], cause["uncertainty"]):
+            found.append(
+                {
+                    "effect": drawn.effect,
+                    "name": one.name,
+                    "true": one.true,
+                    "found": one.found,
+                    "error": one.error,
+                    "within": one.within,
+                }
+            )
+    return found
+
+
+def _why(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> str:
+    """What a wrong answer comes from, as far as the diagnosis tells."""
+    reasons = []
+    if truth.part == NOTHING:
+        return "; ".join(
+            f"{c['effect']} claimed (p = {c['p_value']:.1e}, closes {c['gap_closed']:.2f})"
+            for c in diagnosis["causes"]
+        )
+    if truth.part == LEFT_OUT:
+        blamed = [c for c in diagnosis["causes"] if c["gap_closed"] > BLAMED]
+        reasons = [f"{c['effect']} blamed for {c['gap_closed']:.2f} of the gap" for c in blamed]
+        return "; ".join(reasons) or f"verdict {diagnosis['verdict']!r}"
+    about = {c["effect"]: c for c in diagnosis["candidates"]}
+    for name in truth.names:
+        if name not in named:
+            reason = about.get(name, {}).get("rejected_because", "not a candidate")
+            reasons.append(f"{name}: {reason}")
+        elif len(truth.names) == 1 and named[0] != name:
+            reasons.append(f"{name}: named after {named[0]}")
+    invented = [name for name in named if name not in truth.names]
+    if invented:
+        reasons.append(f"invented: {', '.join(invented)}")
+    if not named:
+        reasons.append(f"verdict {diagnosis['verdict']!r}")
+    return "; ".join(reasons)

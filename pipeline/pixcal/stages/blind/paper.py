@@ -1,0 +1,73 @@
+"""What everybody may read of an examination: ``blind.json`` beside its cases."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from pixcal.model.config import parse, to_plain
+from pixcal.model.errors import InputError
+from pixcal.stages.blind.draw import Examination
+from pixcal.storage.artefact import read_json, write_json
+
+SCHEMA = "pixcal/blind/1"
+FILE = "blind.json"
+RUNS = "runs"
+EXAMINATION = 1000
+"""Seeds from here on are for examinations, those below for development."""
+
+
+@dataclass(frozen=True)
+class Paper:
+    """The question paper.
+
+    Attributes
+    ----------
+    schema, purpose, size : str
+        ``purpose``: examination or development.
+    commitment : str
+        To the truth.
+    without : tuple of str
+        Of each case, the effect that is no candidate.
+    """
+
+    schema: str
+    purpose: str
+    size: str
+    commitment: str
+    without: tuple[str, ...]
+
+    @property
+    def cases(self) -> tuple[str, ...]:
+        """Names of the cases, in order."""
+        return tuple(case_name(n) for n in range(len(self.without)))
+
+
+def case_name(number: int) -> str:
+    """Folder of a case."""
+    return f"case-{number + 1:04d}"
+
+
+def purpose_of(seed: int) -> str:
+    """What cases of a seed are for."""
+    return "examination" if seed >= EXAMINATION else "development"
+
+
+def write_paper(folder: Path, examination: Examination, commitment: str) -> None:
+    """Write it into the folder of the cases."""
+    without = tuple(truth.left_out for truth in examination.truths)
+    purpose = purpose_of(examination.seed)
+    paper = Paper(SCHEMA, purpose, examination.size, commitment, without)
+    write_json(folder / FILE, to_plain(paper))
+
+
+def read_paper(folder: Path) -> Paper:
+    """Read it.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    file = folder / FILE
+    if not file.is_file():
+        raise InputError(f"{file}: not found; give a directory that 'pixcal blind make' wrote")
+    return parse(Paper, read_json(file), str(file))

@@ -1,0 +1,92 @@
+"""Whether the parameters of a diagnosis are those of the truth, within their errors."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pixcal.effects import parse_effects
+from pixcal.model.config import to_plain
+
+WITHIN = 3.0
+"""Errors that a parameter may be off."""
+
+Plain = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Held:
+    """A parameter held against the truth.
+
+    Attributes
+    ----------
+    name : str
+    true, found, error : float
+    """
+
+    name: str
+    true: float
+    found: float
+    error: float
+
+    @property
+    def within(self) -> bool:
+        """Whether it is as near as its error says."""
+        return abs(self.found - self.true) <= WITHIN * self.error
+
+
+def held(effect: str, true: Plain, found: Plain, errors: Mapping[str, float]) -> list[Held]:
+    """Every parameter that the diagnosis gives an error of.
+
+    Parameters
+    ----------
+    effect : str
+    true : mapping
+        Parameters as in a bench file; those that are missing have their defaults.
+    found : mapping
+        All parameters.
+    errors : mapping
+        By name of the parameter, as in ``uncertainty`` of the diagnosis.
+    """
+    whole = to_plain(parse_effects({effect: dict(true)}, "truth")[0])
+    if "couplings" in whole:
+        return list(_couplings(whole["couplings"], found["couplings"], errors))
+    values, others = dict(_flat(whole)), dict(_flat(found))
+    pairs = []
+    for name, error in errors.items():
+        if name in values and name in others and math.isfinite(error):
+            value = others[name]
+            if name == "phase_rad":
+                value = values[name] + math.remainder(value - values[name], 2 * math.pi)
+            pairs.append(Held(name, values[name], value, error))
+    return pairs
+
+
+def _flat(plain: Plain, prefix: str = "") -> Iterator[tuple[str, float]]:
+    """Numbers by their dotted names: ``ramp[0]``."""
+    for name, value in plain.items():
+        if isinstance(value, (list, tuple)):
+            yield from _flat({f"{name}[{n}]": v for n, v in enumerate(value)}, prefix)
+        elif isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        elif isinstance(value, (int, float)) and not isinstance(value, bool):
+            yield f"{prefix}{name}", float(value)
+
+
+def _couplings(
+    true: Sequence[Plain], found: Sequence[Plain], errors: Mapping[str, float]
+) -> Iterator[Held]:
+    """Share of every true coupling: that of all found ones with its way whose rows meet its own."""
+    for one in true:
+        own = [n for n, other in enumerate(found) if _meet(one, other)]
+        share = sum(float(found[n]["share"]) for n in own)
+        error = math.hypot(*(errors.get(f"couplings[{n}].share", 0.0) for n in own))
+        name = f"share from rows {one['row']} of {one['every_rows']} by ({one['dy']}, {one['dx']})"
+        yield Held(name, float(one["share"]), share, error)
+
+
+def _meet(one: Plain, other: Plain) -> bool:
+    if (one["dy"], one["dx"]) != (other["dy"], other["dx"]):
+        return False
+    common = math.gcd(one["every_rows"], other["every_rows"])
+    return bool((one["row"] - other["row"]) % common == 0)

@@ -1,0 +1,74 @@
+"""The sealed file: the truth of an examination, and the commitment to it that is made in the open.
+
+The commitment is a SHA-256 of the truth with a random salt that only the sealed file holds: it
+tells nothing, and nobody can change the truth afterwards.
+"""
+
+import hashlib
+import json
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pixcal.model.bench import Bench
+from pixcal.model.config import parse, to_plain
+from pixcal.model.errors import InputError
+from pixcal.stages.blind.draw import Examination
+from pixcal.storage.artefact import read_json, write_json
+
+SCHEMA = "pixcal/blind-truth/1"
+
+
+@dataclass(frozen=True)
+class Sealed:
+    """Contents of a sealed file.
+
+    Attributes
+    ----------
+    schema, salt : str
+    examination : Examination
+    benches : tuple of Bench
+        Of the cases.
+    """
+
+    schema: str
+    salt: str
+    examination: Examination
+    benches: tuple[Bench, ...]
+
+
+def write_seal(path: Path, examination: Examination, benches: tuple[Bench, ...]) -> str:
+    """Write the truth where only its owner reads it; gives the commitment."""
+    plain = to_plain(Sealed(SCHEMA, secrets.token_hex(32), examination, benches))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_json(path, plain)
+    path.chmod(0o600)
+    return _commitment(plain)
+
+
+def read_seal(path: Path, commitment: str) -> Sealed:
+    """Open a sealed file.
+
+    Raises
+    ------
+    InputError
+        If it is not there, or not what the commitment was made to.
+    """
+    if not path.is_file():
+        raise InputError(
+            f"--sealed {path}: not found; give the file that 'pixcal blind make' wrote"
+        )
+    plain = read_json(path)
+    if not isinstance(plain, dict) or plain.get("schema") != SCHEMA:
+        raise InputError(f"--sealed {path}: not a sealed file of 'pixcal blind make'")
+    if _commitment(plain) != commitment:
+        raise InputError(
+            f"--sealed {path}: not the truth that these cases were made with, or changed since"
+        )
+    return parse(Sealed, plain, str(path))
+
+
+def _commitment(plain: Any) -> str:
+    text = json.dumps(plain, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()

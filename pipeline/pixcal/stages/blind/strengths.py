@@ -1,0 +1,165 @@
+"""How strong the effects of an examination are: from where they are just seen to ten times that."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+Plain = dict[str, Any]
+Make = Callable[[float, np.random.Generator], Plain]
+
+
+@dataclass(frozen=True)
+class Way:
+    """One of the ways in which an effect comes.
+
+    Attributes
+    ----------
+    effect : str
+    strength : str
+        What its strength is, for people.
+    small, standard : float
+        Threshold: strength that an estimate on half of the frames sees with about four sigmas, on
+        the middle bench of each size.
+    make : callable
+        Parameters of the effect, from a strength and random numbers for all that is left open.
+    """
+
+    effect: str
+    strength: str
+    small: float
+    standard: float
+    make: Make
+
+    def threshold(self, size: str) -> float:
+        """Of an examination's size."""
+        return self.small if size == "small" else self.standard
+
+
+def _around(size: float, rng: np.random.Generator) -> list[float]:
+    """A vector of some length in any direction."""
+    angle = rng.uniform(0, 2 * np.pi)
+    return [float(size * np.cos(angle)), float(size * np.sin(angle))]
+
+
+def _between(low: float, high: float, rng: np.random.Generator) -> float:
+    """Log-uniform."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _only(name: str, strengths: tuple[str, ...], **more: Any) -> Make:
+    """One strength of several, the others zero."""
+    return lambda s, rng: dict.fromkeys(strengths, 0.0) | more | {name: s}
+
+
+def _ramp(s: float, rng: np.random.Generator) -> Plain:
+    return {name: [0.0, 0.0] for name in _DRIFT} | {"ramp": _around(s, rng)}
+
+
+def _walk(s: float, rng: np.random.Generator) -> Plain:
+    share = rng.uniform(0.3, 1)
+    return {name: [0.0, 0.0] for name in _DRIFT} | {"walk": [s, float(s * share)]}
+
+
+def _vibration(s: float, rng: np.random.Generator) -> Plain:
+    along = [abs(part) for part in _around(s, rng)]
+    more = {"vibration": along, "vibration_hz": float(rng.uniform(0.3, 3.0))}
+    return {name: [0.0, 0.0] for name in _DRIFT} | more
+
+
+def _jitter(s: float, rng: np.random.Generator) -> Plain:
+    return {"rms": [s, float(s * rng.uniform(0.3, 1))]}
+
+
+def _ghost(s: float, rng: np.random.Generator) -> Plain:
+    beat = _around(rng.uniform(0.15, 1.0), rng)
+    return {"share": s, "beat_rad_px": beat, "phase_rad": float(rng.uniform(-np.pi, np.pi))}
+
+
+def _nearest(s: float, rng: np.random.Generator) -> Plain:
+    up, right = s, s * float(rng.uniform(0.3, 1))
+    places = ((1, 0, up), (-1, 0, up), (0, 1, right), (0, -1, right))
+    return {"couplings": [{"dy": dy, "dx": dx, "share": share} for dy, dx, share in places]}
+
+
+def _every_other_row(s: float, rng: np.random.Generator) -> Plain:
+    row = int(rng.integers(2))
+    return {"couplings": [{"dy": 1, "dx": 0, "share": s, "every_rows": 2, "row": row}]}
+
+
+def _bent(s: float, rng: np.random.Generator) -> Plain:
+    sign = 1 if rng.random() < 0.5 else -1
+    return {"quadratic": sign * s, "cubic": float(s * rng.uniform(-0.4, 0.4))}
+
+
+_BIAS = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e")
+_DRIFT = ("ramp", "settle", "walk", "vibration")
+_ROWS = ("row_rms", "flicker_rms", "interlace_rms", "column_rms")
+_CODES = ("coarse_adu", "dnl_rms", "ripple")
+_WAVE = ("ramp", "walk", "hop")
+
+# fmt: off
+WAYS = (
+    Way("bias_drift", "jitter, e-", 0.6, 0.4, _only("jitter_rms", _BIAS)),
+    Way("bias_drift", "random walk, e-/h^0.5", 32, 16, _only("walk_e_h", _BIAS)),
+    Way("brighter_fatter", "shift, px/e-", 1.1e-8, 4e-9,
+        lambda s, rng: {"shift_px_per_e": s, "falloff_px": float(rng.uniform(0.4, 1.0))}),
+    Way("contrast_noise", "vibration, rad", 0.012, 0.007,
+        _only("vibration_rad", ("polarisation",))),
+    Way("contrast_noise", "polarisation", 1.2e-4, 5e-5,
+        lambda s, rng: {"vibration_rad": 0.0, "polarisation": s,
+                        "polarisation_s": _between(0.5, 10, rng)}),
+    Way("cosmic_hits", "rate, /(cm² s)", 180, 60, lambda s, rng: {"rate_cm2_s": s}),
+    Way("flat_error", "from pixel to pixel", 5e-4, 2.5e-4, _only("pixel_rms", ("smooth_rms",))),
+    Way("flat_error", "smooth", 4.2e-4, 1.5e-4,
+        lambda s, rng: {"pixel_rms": 0.0, "smooth_rms": s, "scale_px": _between(3, 12, rng)}),
+    Way("fringe_drift", "random walk, rad/(px h^0.5)", 1.9e-4, 5e-5, _walk),
+    Way("fringe_drift", "ramp, rad/(px h)", 0.0018, 2.5e-4, _ramp),
+    Way("fringe_drift", "vibration, rad/px", 4.7e-6, 1e-6, _vibration),
+    Way("fringe_jitter", "vector, rad/px", 7.5e-6, 2e-6, _jitter),
+    Way("ghost_fringes", "share", 2.7e-4, 1e-4, _ghost),
+    Way("hyperbolic_fringes", "foot, mm", 12, 2, lambda s, rng: {"foot_mm": _around(s, rng)}),
+    Way("intensity_noise", "white, relative", 8e-5, 3.5e-5, _only("rms", ("line",))),
+    Way("intensity_noise", "slow, relative", 9e-5, 4e-5,
+        lambda s, rng: {"rms": s, "line": 0.0, "correlation_s": _between(0.3, 5, rng)}),
+    Way("intra_pixel_response", "scatter of the width, px", 0.006, 0.003,
+        lambda s, rng: {"width_px": 2 * [float(rng.uniform(0.8, 1.0))], "width_rms_px": s}),
+    Way("ipc", "share to the next pixel", 0.004, 0.002, _nearest),
+    Way("ipc", "share from every other row", 0.0023, 0.0008, _every_other_row),
+    Way("lag", "share", 3.3e-5, 1.2e-5,
+        lambda s, rng: {"share": s, "decay_frames": float(rng.choice([0.0, rng.uniform(1, 3)]))}),
+    Way("nonlinearity", "quadratic", 0.0011, 5e-4, _bent),
+    Way("phase_modulator_error", "one period a turn, rad", 1.8e-4, 7e-5,
+        lambda s, rng: {"first_rad": s, "second_rad": float(s * rng.uniform(0, 1))}),
+    Way("quantisation", "step beyond 1 ADU, ADU", 1.0, 1.0,
+        lambda s, rng: {"coarse_adu": float(np.ceil(s)), "dnl_rms": 0.0, "ripple": 0.0}),
+    Way("quantisation", "scatter of the codes", 0.012, 0.004, _only("dnl_rms", _CODES)),
+    Way("quantisation", "ripple of the codes", 0.007, 0.0025,
+        lambda s, rng: {"coarse_adu": 0.0, "dnl_rms": 0.0, "ripple": s,
+                        "ripple_phase_rad": float(rng.uniform(-np.pi, np.pi))}),
+    Way("rolling_shutter", "line time, us", 0.053, 0.01, lambda s, rng: {"line_time_us": s}),
+    Way("row_noise", "rows, e-", 0.75, 0.4, _only("row_rms", _ROWS)),
+    Way("row_noise", "columns, e-", 0.7, 0.4, _only("column_rms", _ROWS)),
+    Way("row_noise", "rows in turn, e-", 0.29, 0.1, _only("interlace_rms", _ROWS)),
+    Way("straylight", "slope, 1/px", 1.4e-6, 3e-7,
+        lambda s, rng: {"share": float(rng.uniform(0.01, 0.04)), "slope_per_px": _around(s, rng)}),
+    Way("telegraph_noise", "amplitude, e-", 20, 15,
+        lambda s, rng: {"amplitude_e": s, "share": float(rng.uniform(0.01, 0.05)),
+                        "switching_s": _between(0.3, 3, rng)}),
+    Way("wavelength_drift", "ramp, 1/h", 0.0026, 0.0004, _only("ramp", _WAVE)),
+    Way("wavelength_drift", "hop", 4e-5, 6e-6,
+        lambda s, rng: {"ramp": 0.0, "walk": 0.0, "hop": s, "hops_per_h": 300.0}),
+)
+# fmt: on
+"""Every way of every effect."""
+
+
+def ways_of() -> Mapping[str, tuple[Way, ...]]:
+    """Ways by the name of the effect."""
+    names = dict.fromkeys(way.effect for way in WAYS)
+    return {name: tuple(w for w in WAYS if w.effect == name) for name in names}
+
+
+STRONGEST = 10.0
+"""Times the threshold that an effect is at most."""

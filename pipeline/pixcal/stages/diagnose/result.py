@@ -1,0 +1,271 @@
+"""``diagnosis.json`` and the curves behind it, from what a search found."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal import __version__
+from pixcal.estimators.battery import DETECTOR, Curve, Key, battery
+from pixcal.estimators.gap import Expectation, Reference, flagged, sigmas_of
+from pixcal.model.config import to_plain
+from pixcal.stages.diagnose.search import Candidate, Found, Shrinkage, Trial, differing, shrinkage
+
+F64 = NDArray[np.float64]
+
+SCHEMA = "pixcal/diagnosis/1"
+EXPLAINED = 0.15
+"""Share of the gap that may be left where it is called explained,"""
+LEFT = 0.25
+"""and share of any one statistic's that is off by more than"""
+STILL = 6.0
+"""standard deviations: less can be the simulation of the effects themselves."""
+SHOWN = 3
+"""Statistics named that gave a cause away."""
+
+
+def describe(
+    found: Found,
+    data: Mapping[Key, F64],
+    measured: Mapping[Key, Curve],
+    reference: Reference,
+    facts: Mapping[str, Any],
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The product, and every curve as measured, nominal and with the effects found.
+
+    Parameters
+    ----------
+    found : Found
+    data : mapping
+        Curves of the unseen frames, on the reference's scales.
+    measured : mapping
+        The same in their own units.
+    reference : Reference
+    facts : mapping
+        What was looked at.
+    """
+    where = differing(found.nominal, found.final, data)
+    final = shrinkage(data, found.nominal, found.final, where)
+    verdict = _verdict(found, final)
+    curves = _curves(found, final, data, measured, reference)
+    by_key = {(c["statistic"], c["set"]): c for c in curves}
+    causes = [_cause(name, found, data, where, final) for name in found.taken]
+    diagnosis = {
+        "schema": SCHEMA,
+        "pixcal": __version__,
+        "verdict": verdict,
+        "causes": sorted(causes, key=lambda c: -float(c["gap_closed"])),
+        "gap": {
+            "total": 1.0 if where else 0.0,
+            "after": _rounded(final.gap.total),
+            "interval": [_rounded(v) for v in final.interval],
+            "domains": {
+                domain: [_rounded(v) for v in final.gap.of_domain(domain)]
+                for domain in ("space", "time", "intensity", "noise")
+            },
+            "where": _where(final, by_key),
+            "absolute": _absolute(final, by_key),
+        },
+        "candidates": [
+            _candidate(c, found, data, where)
+            for c in found.candidates.values()
+            if c.name not in found.taken
+        ],
+        "statistics": len(final.before),
+        "looked_at": dict(facts),
+    }
+    return diagnosis, curves
+
+
+def _verdict(found: Found, final: Shrinkage) -> str:
+    if not final.where:
+        return "no gap"
+    if not found.taken:
+        return "unexplained"
+    still = [
+        key
+        for key in flagged(final.after)
+        if final.gap.left.get(key, 1.0) > LEFT and sigmas_of(final.after[key].log_chance) > STILL
+    ]
+    return "explained" if final.gap.total <= EXPLAINED and not still else "partly explained"
+
+
+def _cause(
+    name: str, found: Found, data: Mapping[Key, F64], where: set[Key], final: Shrinkage
+) -> dict[str, Any]:
+    candidate = found.candidates[name]
+    estimate = candidate.estimate
+    assert estimate is not None
+    effect = next(e for e in found.final.effects if e.name == name)
+    only = candidate.alone if candidate.alone is not None and len(found.taken) > 1 else found.final
+    alone = shrinkage(data, found.nominal, only, where)
+    without = shrinkage(data, found.nominal, found.without[name], where)
+    gain = found.final.log_likelihood - found.without[name].log_likelihood
+    chance = len(found.candidates) * np.exp(-min(gain, 600.0))
+    return {
+        "effect": name,
+        "title": effect.title,
+        "parameters": to_plain(effect),
+        "uncertainty": {k: float(v) for k, v in estimate.errors.items()},
+        "gap_closed": _rounded(1 - alone.gap.total),
+        "gap_closed_interval": [_rounded(1 - v) for v in reversed(alone.interval)],
+        "gain_over_rest": _rounded(without.gap.total - final.gap.total),
+        "p_value": float(min(1.0, chance)),
+        "sigmas": _rounded(estimate.significance),
+        "why": estimate.why,
+        "given_away_by": _telling(found.without[name], found.final, data),
+        "not_told_apart_from": list(found.alike.get(name, ())),
+    }
+
+
+def _telling(before: Trial, after: Trial, data: Mapping[Key, F64]) -> list[dict[str, str]]:
+    """Statistics that an effect makes most likely, best first."""
+    gains = {
+        key: _likelihood(data[key], after.expected, key)
+        - _likelihood(data[key], before.expected, key)
+        for key in data
+    }
+    best = sorted(gains, key=lambda k: -gains[k])[:SHOWN]
+    return [{"statistic": k[0], "set": k[1]} for k in best if gains[k] > 1]
+
+
+def _likelihood(values: F64, expected: Expectation, key: Key) -> float:
+    variance = expected.variance[key]
+    square = (values - expected.mean[key]) ** 2 / variance
+    terms = -(expected.dof + 1) / 2 * np.log1p(square / expected.dof) - np.log(variance) / 2
+    return float(terms.sum()) / max(1.0, len(values) / 3)
+
+
+def _candidate(
+    candidate: Candidate, found: Found, data: Mapping[Key, F64], where: set[Key]
+) -> dict[str, Any]:
+    closed = 0.0
+    if candidate.alone is not None and where:
+        closed = 1 - shrinkage(data, found.nominal, candidate.alone, where).gap.total
+    about: dict[str, Any] = {
+        "effect": candidate.name,
+        "gap_closed": _rounded(closed),
+        "rejected_because": candidate.reason,
+        "tried_on_unseen_frames": candidate.alone is not None,
+    }
+    if candidate.estimate is not None:
+        about |= {
+            "sigmas": _rounded(candidate.estimate.significance),
+            "parameters": to_plain(candidate.estimate.effect),
+        }
+    return about
+
+
+def _curves(
+    found: Found,
+    final: Shrinkage,
+    data: Mapping[Key, F64],
+    measured: Mapping[Key, Curve],
+    reference: Reference,
+) -> list[dict[str, Any]]:
+    """Every statistic: measured, nominal and with effects, with limits of one sigma."""
+    curves = []
+    for key, before in final.before.items():
+        one = battery()[key[0]]
+        usual = reference.usual[key]
+        after = final.after[key]
+        curve = measured[key]
+        nominal = _band(found.nominal.expected, key, usual)
+        with_effects = _band(found.final.expected, key, usual)
+        curves.append(
+            {
+                "statistic": key[0],
+                "set": key[1],
+                "title": one.title,
+                "domain": one.domain,
+                "unit": one.unit,
+                "x_label": one.x_label,
+                "kind": one.kind,
+                "x": curve.x.tolist(),
+                "measured": _natural(data[key], usual).tolist(),
+                "nominal": nominal,
+                "with_effects": with_effects,
+                "z": before.sigmas.tolist(),
+                "z_after": after.sigmas.tolist(),
+                "in_gap": key in final.where,
+                "weight": final.gap.weights.get(key, 0.0),
+                "left": final.gap.left.get(key, 0.0),
+                "significance": sigmas_of(before.log_chance),
+                "significance_after": sigmas_of(after.log_chance),
+            }
+        )
+    return curves
+
+
+def _natural(values: F64, usual: F64 | None) -> F64:
+    """From the scale of comparison to the statistic's own unit."""
+    if usual is None:
+        return values
+    ratio = np.where(values > 0, np.exp(np.minimum(values, 600)), (1 + values / 3) ** 3)
+    return np.asarray(np.sqrt(np.maximum(ratio, 0) * usual))
+
+
+def _band(expected: Expectation, key: Key, usual: F64 | None) -> dict[str, list[float]]:
+    mean, error = expected.mean[key], np.sqrt(expected.variance[key])
+    return {
+        "value": _natural(mean, usual).tolist(),
+        "low": _natural(
+            np.maximum(mean - error, -3) if usual is not None else mean - error, usual
+        ).tolist(),
+        "high": _natural(mean + error, usual).tolist(),
+    }
+
+
+def _where(final: Shrinkage, curves: Mapping[Key, dict[str, Any]]) -> list[dict[str, Any]]:
+    """Statistics that differ, most significant first; then those that only differ with effects."""
+    keys = sorted(final.where, key=lambda k: final.before[k].log_chance)
+    keys += sorted(flagged(final.after) - final.where, key=lambda k: final.after[k].log_chance)
+    return [_entry(key, final, curves[key]) for key in keys]
+
+
+def _entry(key: Key, final: Shrinkage, curve: Mapping[str, Any]) -> dict[str, Any]:
+    at = final.before[key].worst if key in final.where else final.after[key].worst
+    set_name = "" if key[1] == DETECTOR else f"set {key[1]}, "
+    x = curve["x"][at] if at < len(curve["x"]) else at
+    return {
+        "domain": curve["domain"],
+        "statistic": key[0],
+        "set": key[1],
+        "title": curve["title"],
+        "unit": curve["unit"],
+        "measured": curve["measured"][at],
+        "simulated": curve["nominal"]["value"][at],
+        "after": curve["with_effects"]["value"][at],
+        "z": _rounded(float(final.before[key].sigmas[at])),
+        "z_after": _rounded(float(final.after[key].sigmas[at])),
+        "significance": _rounded(sigmas_of(final.before[key].log_chance)),
+        "left": _rounded(final.gap.left.get(key, 0.0)),
+        "place": f"{set_name}{curve['x_label'] or 'value'} {x:.4g}",
+    }
+
+
+def _absolute(final: Shrinkage, curves: Mapping[Key, dict[str, Any]]) -> list[dict[str, Any]]:
+    """What differs in units of the bench, and the stability of the offsets in any case."""
+    keys: Sequence[Key] = [k for k in curves if curves[k]["unit"] in ("px", "e-", "rad")]
+    rows = []
+    for key in keys:
+        curve = curves[key]
+        if key not in final.where and key[0] != "allan_of_batches":
+            continue
+        at = final.before[key].worst
+        quantity = curve["title"] + ("" if key[1] == DETECTOR else f" ({key[1]})")
+        rows.append(
+            {
+                "quantity": quantity,
+                "unit": curve["unit"],
+                "measured": curve["measured"][at],
+                "simulated": curve["nominal"]["value"][at],
+                "after": curve["with_effects"]["value"][at],
+            }
+        )
+    return rows
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")

@@ -1,0 +1,370 @@
+"""Which effects close the gap: added one by one on unseen data, then each left out again.
+
+A candidate comes with parameters that were fitted to other frames. It is taken when it makes the
+unseen data likelier by more than chance and complexity allow, and by more than any other; then the
+search goes on with it in the bench. What an effect already taken brings about in the estimate of a
+candidate is allowed for: the same estimate is made on a simulation with the effects taken.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.battery import Key
+from pixcal.estimators.gap import (
+    Difference,
+    Expectation,
+    Gap,
+    Reference,
+    compare,
+    expect_nominal,
+    expect_with,
+    flagged,
+    log_likelihood,
+    remaining,
+)
+from pixcal.simulation.effect import Effect, Estimate
+from pixcal.stages.diagnose.trial import Curves, Effects
+
+F64 = NDArray[np.float64]
+
+SURE = 4.0
+"""Standard deviations that the estimate on the first frames must have."""
+LEAST = 8.0
+"""By which an effect must raise the log-likelihood of unseen data."""
+SCREEN = 3
+"""Simulations of a candidate; of what was taken, `CONFIRM`."""
+CONFIRM = 8
+MOST = 5
+"""Effects that are taken."""
+OPEN = 0.5
+"""Share of the gap that is left where the cause is taken for unknown; then an effect that closes"""
+LITTLE = 0.1
+"""less than this share is not claimed."""
+EXPLAINED = 0.7
+"""Share of a candidate's significance that another effect may bring about."""
+
+Simulate = Callable[[Sequence[Effects], int, str], Sequence[list[Curves] | str]]
+Estimates = Callable[[Effects, Sequence[str]], Mapping[str, float]]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A bench held against the data.
+
+    Attributes
+    ----------
+    effects : tuple of Effect
+    expected : Expectation
+    log_likelihood : float
+    """
+
+    effects: Effects
+    expected: Expectation
+    log_likelihood: float
+
+
+@dataclass
+class Candidate:
+    """What became of an effect in the search.
+
+    Attributes
+    ----------
+    name : str
+    estimate : Estimate, optional
+    reason : str
+        Why it was not taken; empty when it was.
+    alone : Trial, optional
+        With it alone in the bench.
+    """
+
+    name: str
+    estimate: Estimate | None
+    reason: str = ""
+    alone: Trial | None = None
+
+
+@dataclass(frozen=True)
+class Found:
+    """Result of a search.
+
+    Attributes
+    ----------
+    nominal, final : Trial
+    taken : tuple of str
+        In the order in which they were taken.
+    without : mapping
+        With all taken but one, by its name.
+    candidates : mapping
+    alike : mapping
+        Effects that do about as well as one that was taken, by its name.
+    """
+
+    nominal: Trial
+    final: Trial
+    taken: tuple[str, ...]
+    without: Mapping[str, Trial]
+    candidates: Mapping[str, Candidate]
+    alike: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+class Search:
+    """Greedy search over candidates.
+
+    Parameters
+    ----------
+    reference : Reference
+    data : mapping
+        Curves of the unseen data on the reference's scales.
+    base : tuple of Effect
+        That the nominal bench has already.
+    simulate : callable
+        Curves of several benches: ``simulate(benches, seeds, label)``.
+    estimates : callable
+        Significance that some candidates have on a simulation of the first frames with some
+        effects: ``estimates(effects, names)``.
+    """
+
+    def __init__(
+        self,
+        reference: Reference,
+        data: Mapping[Key, F64],
+        base: Effects,
+        simulate: Simulate,
+        estimates: Estimates,
+    ) -> None:
+        self.reference, self.data, self.base = reference, data, base
+        self._simulate, self._estimates = simulate, estimates
+        self.nominal = self._trial((), expect_nominal(reference))
+
+    def run(self, candidates: Mapping[str, Candidate]) -> Found:
+        """Search; ``reason`` of the candidates is filled in."""
+        open_ones = {n: c for n, c in candidates.items() if c.estimate and not c.reason}
+        for name, candidate in list(open_ones.items()):
+            assert candidate.estimate is not None
+            if candidate.estimate.significance < SURE or candidate.estimate.effect.is_null:
+                size = candidate.estimate.significance
+                candidate.reason = f"not seen in the frames it was fitted on ({size:.1f} sigma)"
+                del open_ones[name]
+        taken: list[str] = []
+        effects: dict[str, Effect] = {}
+        alike: dict[str, tuple[str, ...]] = {}
+        current = self.nominal
+        shares = dict.fromkeys(open_ones, 1.0)
+        while open_ones and len(taken) < MOST:
+            trials = self._tried(effects, open_ones, shares)
+            if not taken:
+                for name, (trial, _) in trials.items():
+                    candidates[name].alone = trial
+            # Held against as many simulations as the candidates have: chance is the same in both.
+            start = self._screened(tuple(effects.values())) if effects else self.nominal
+            gains = {n: t.log_likelihood - start.log_likelihood for n, (t, _) in trials.items()}
+            if not gains:
+                break
+            best = max(gains, key=lambda n: gains[n])
+            if gains[best] < LEAST:
+                break
+            effects[best] = trials[best][1]
+            taken.append(best)
+            near = [n for n, g in gains.items() if n != best and g > gains[best] - LEAST]
+            del open_ones[best]
+            current = self._confirmed(tuple(effects.values()))
+            shares = self._unexplained(tuple(effects.values()), open_ones)
+            alike[best] = tuple(n for n in near if shares.get(n, 1.0) < 1 - EXPLAINED)
+            for name in [n for n, share in shares.items() if share < 1 - EXPLAINED]:
+                candidates[name].reason = f"what {best} does looks like it"
+                del open_ones[name], shares[name]
+        for candidate in open_ones.values():
+            candidate.reason = candidate.reason or "the unseen frames get no likelier with it"
+        return self._ablated(taken, effects, current, candidates, alike)
+
+    def _trial(self, effects: Effects, expected: Expectation) -> Trial:
+        return Trial(effects, expected, log_likelihood(self.data, expected))
+
+    def _tried(
+        self,
+        effects: Mapping[str, Effect],
+        open_ones: dict[str, Candidate],
+        shares: Mapping[str, float],
+    ) -> dict[str, tuple[Trial, Effect]]:
+        """Each candidate added to the effects taken, as strong as estimated and as what is left."""
+        options: list[tuple[str, Effect]] = []
+        for name, candidate in open_ones.items():
+            assert candidate.estimate is not None
+            whole = candidate.estimate.effect
+            options.append((name, whole))
+            if shares.get(name, 1.0) < 0.9:
+                options.append((name, whole.scaled(shares[name])))
+        benches = [(*effects.values(), effect) for _, effect in options]
+        simulated = self._simulate(benches, SCREEN, f"candidates, round {len(effects) + 1}")
+        found: dict[str, tuple[Trial, Effect]] = {}
+        for (name, effect), bench, curves in zip(options, benches, simulated, strict=True):
+            if isinstance(curves, str):
+                open_ones[name].reason = f"cannot be simulated: {curves}"
+                continue
+            trial = self._trial(bench, self._expected(curves, open_ones[name]))
+            if name not in found or trial.log_likelihood > found[name][0].log_likelihood:
+                found[name] = trial, effect
+        for name in [n for n, c in open_ones.items() if n not in found and c.reason]:
+            del open_ones[name]
+        return found
+
+    def _expected(self, curves: list[Curves], candidate: Candidate | None = None) -> Expectation:
+        error = 0.0
+        if candidate is not None and candidate.estimate is not None:
+            error = min(1.0, 1 / max(candidate.estimate.significance, 1.0))
+        return expect_with(self.reference, curves, error)
+
+    def _screened(self, effects: Effects) -> Trial:
+        return self._confirmed(effects, SCREEN)
+
+    def _confirmed(self, effects: Effects, simulations: int = CONFIRM) -> Trial:
+        (curves,) = self._simulate([effects], simulations, "confirm")
+        if isinstance(curves, str):
+            raise RuntimeError(curves)
+        return self._trial(effects, self._expected(curves))
+
+    def _unexplained(
+        self, effects: Effects, open_ones: Mapping[str, Candidate]
+    ) -> dict[str, float]:
+        """Share of each candidate's significance that the effects taken do not bring about."""
+        if not open_ones:
+            return {}
+        mimicked = self._estimates(effects, list(open_ones))
+        shares = {}
+        for name, candidate in open_ones.items():
+            assert candidate.estimate is not None
+            part = max(mimicked.get(name, 0.0), 0.0) / candidate.estimate.significance
+            shares[name] = float(np.clip(1 - part, 0, 1))
+        return shares
+
+    def _ablated(
+        self,
+        taken: list[str],
+        effects: dict[str, Effect],
+        current: Trial,
+        candidates: Mapping[str, Candidate],
+        alike: Mapping[str, tuple[str, ...]],
+    ) -> Found:
+        """Leave each effect out again; drop those that are worth nothing beside the others."""
+        while True:
+            without = self._each_left_out(taken, effects)
+            dropped = self._worthless(current, without) or self._doubtful(current, without)
+            if dropped is None:
+                break
+            least, candidates[dropped[0]].reason = dropped
+            taken.remove(least)
+            del effects[least]
+            current = self._confirmed(tuple(effects.values())) if effects else self.nominal
+        return Found(
+            self.nominal, current, tuple(taken), without, candidates,
+            {n: alike[n] for n in taken if alike.get(n)},
+        )  # fmt: skip
+
+    def _worthless(self, current: Trial, without: Mapping[str, Trial]) -> tuple[str, str] | None:
+        """An effect without which the data are about as likely, and what to say of it."""
+        worth = {n: current.log_likelihood - t.log_likelihood for n, t in without.items()}
+        least = min(worth, key=lambda n: worth[n], default=None)
+        if least is None or worth[least] >= LEAST:
+            return None
+        return least, "the other effects do without it"
+
+    def _doubtful(self, current: Trial, without: Mapping[str, Trial]) -> tuple[str, str] | None:
+        """An effect that closes little of a gap that stays open: it may stand in for another."""
+        where = differing(self.nominal, current, self.data)
+        before = compare(self.data, self.nominal.expected)
+
+        def left(trial: Trial) -> float:
+            return remaining(before, compare(self.data, trial.expected), where).total
+
+        open_still = left(current)
+        if open_still <= OPEN:
+            return None
+        gains = {name: left(trial) - open_still for name, trial in without.items()}
+        least = min(gains, key=lambda n: gains[n], default=None)
+        if least is None or gains[least] >= LITTLE:
+            return None
+        return least, (
+            f"closes {max(gains[least], 0):.1%} of a gap of which {open_still:.0%} stays "
+            "unexplained: too little to be told from the unknown cause"
+        )
+
+    def _each_left_out(
+        self, taken: Sequence[str], effects: Mapping[str, Effect]
+    ) -> dict[str, Trial]:
+        if len(taken) == 1:
+            return {taken[0]: self.nominal}
+        benches = [tuple(e for n, e in effects.items() if n != name) for name in taken]
+        simulated = self._simulate(benches, CONFIRM, "one left out") if benches else []
+        found = {}
+        for name, bench, curves in zip(taken, benches, simulated, strict=True):
+            if not isinstance(curves, str):
+                found[name] = self._trial(bench, self._expected(curves))
+        return found
+
+
+@dataclass(frozen=True)
+class Shrinkage:
+    """How far the gap shrinks, with its interval (5 to 95 %).
+
+    Attributes
+    ----------
+    before, after : mapping
+        Differences of the curves.
+    where : set
+        Curves that make up the gap.
+    gap : Gap
+    interval : (float, float)
+    """
+
+    before: Mapping[Key, Difference]
+    after: Mapping[Key, Difference]
+    where: set[Key]
+    gap: Gap
+    interval: tuple[float, float]
+
+
+DRAWS = 200
+
+
+def shrinkage(data: Mapping[Key, F64], nominal: Trial, other: Trial, where: set[Key]) -> Shrinkage:
+    """The gap with some effects, against the nominal bench's.
+
+    The interval comes from expectations shifted by their own scatter.
+    """
+    before = compare(data, nominal.expected)
+    after = compare(data, other.expected)
+    gap = remaining(before, after, where)
+    rng = np.random.default_rng(17)
+    draws = []
+    for _ in range(DRAWS):
+        expected = other.expected
+        mean = {
+            k: m + np.sqrt(expected.variance[k]) * rng.standard_normal(len(m))
+            for k, m in expected.mean.items()
+            if k in where
+        }
+        doubled = {k: 2 * expected.variance[k] for k in mean}
+        moved = replace(expected, mean=mean, variance=doubled)
+        draws.append(remaining(before, compare(data, moved), where).total if where else 0.0)
+    low, high = np.quantile(draws, (0.05, 0.95))
+    return Shrinkage(
+        before, after, where, gap, (min(float(low), gap.total), max(float(high), gap.total))
+    )
+
+
+def differing(nominal: Trial, final: Trial, data: Mapping[Key, F64]) -> set[Key]:
+    """Curves that make up the gap: those that differ, and those by which causes were told."""
+    where = flagged(compare(data, nominal.expected))
+    if not final.effects:
+        return where
+    for key, values in data.items():
+        if key not in nominal.expected.mean or key in where:
+            continue
+        one = {key: values}
+        gain = log_likelihood(one, final.expected) - log_likelihood(one, nominal.expected)
+        if gain > LEAST / 2:
+            where.add(key)
+    return where

@@ -1,0 +1,310 @@
+"""``pixcal diagnose``: where data and simulation differ, which effect causes it, what remains.
+
+The frames are parted: on the first half effects are fitted, on the second they are tried. Both the
+data and every simulation of them are reduced and fitted by the same stages.
+"""
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from pixcal.effects import effect_of_file, effects, parse_effects
+from pixcal.engine.plan import make_plan
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.battery import measure
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.gap import Reference
+from pixcal.model.acquisition import Acquisition
+from pixcal.model.bench import load_bench
+from pixcal.model.config import parse, quantity, to_plain
+from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect, Estimate
+from pixcal.stages import reduce
+from pixcal.stages.diagnose.nominal import nominal_bench
+from pixcal.stages.diagnose.parts import Half, evidence_of, take
+from pixcal.stages.diagnose.result import describe
+from pixcal.stages.diagnose.search import Candidate, Search
+from pixcal.stages.diagnose.trial import Curves, Effects, Trials, Window, averaged, estimate
+from pixcal.stages.diagnose.windows import chosen_windows, split
+from pixcal.stages.evidence import Part
+from pixcal.stages.reduce.ingested import Ingested
+from pixcal.storage.artefact import (
+    Manifest,
+    artefact_key,
+    build,
+    lock,
+    read_json,
+    require,
+    up_to_date,
+    write_json,
+)
+
+FORMAT = 1
+REFERENCES = 16
+"""Simulations of the nominal bench."""
+BYTES_A_SAMPLE = 60
+"""Peak of a task for each sample of a window's frames (measured)."""
+LEARN_SEED = 900_000
+FEWEST_FRAMES = 24
+"""Fringe frames in each half."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of the diagnosis.
+
+    Attributes
+    ----------
+    only, without : tuple of str
+        Candidates: these alone, or all but these.
+    own : tuple of Path
+        Files that each hold an effect of the user's own.
+    nominal : Path, optional
+        Bench file whose effects the nominal bench has from the start.
+    """
+
+    only: tuple[str, ...] = quantity((), doc="candidates")
+    without: tuple[str, ...] = quantity((), doc="not candidates")
+    own: tuple[Path, ...] = ()
+    nominal: Path | None = None
+
+
+def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
+    """Diagnose a reduced run: make ``RUN/diagnose`` and the product ``diagnosis.json``.
+
+    Raises
+    ------
+    InputError
+        If the run was not reduced, a name of an effect is unknown, or the frames cannot be fitted.
+    """
+    reduced = require(run_dir, "reduce", 1)
+    kinds = _kinds(config)
+    base = _base(config.nominal)
+    plain = {
+        "effects": sorted(kinds),
+        "own": [path.read_text(encoding="utf-8") for path in config.own],
+        "nominal": {e.name: to_plain(e) for e in base},
+    }
+    with lock(run_dir):
+        inputs = {"reduce": reduced.key}
+        key = artefact_key("diagnose", FORMAT, plain, inputs)
+        done = up_to_date(run_dir, "diagnose", key)
+        if done is None:
+            with build(run_dir, "diagnose", FORMAT, plain, inputs) as made:
+                scratch = made.folder / "scratch"
+                shutil.rmtree(scratch, ignore_errors=True)
+                scratch.mkdir()
+                try:
+                    diagnosis, curves = _diagnose(run_dir, kinds, base, scratch, runtime)
+                finally:
+                    shutil.rmtree(scratch, ignore_errors=True)
+                write_json(made.folder / "diagnosis.json", diagnosis)
+                write_json(made.folder / "curves.json", curves)
+                made.summary.update(
+                    verdict=diagnosis["verdict"],
+                    causes=[cause["effect"] for cause in diagnosis["causes"]],
+                )
+        product = run_dir / "products" / "diagnosis.json"
+        product.parent.mkdir(exist_ok=True)
+        write_json(product, read_json(run_dir / "diagnose" / "diagnosis.json"))
+        return require(run_dir, "diagnose", FORMAT)
+
+
+def _kinds(config: Config) -> dict[str, type[Effect]]:
+    """The candidates by name."""
+    known = dict(effects())
+    for path in config.own:
+        own = effect_of_file(path)
+        if own.name in known:
+            raise InputError(f"{path}: its effect is named {own.name!r} as another; rename it")
+        known[own.name] = own
+    for name in (*config.only, *config.without):
+        if name not in known:
+            raise InputError(
+                f"--effects {name!r:.80}: unknown effect; known are {', '.join(known)}"
+            )
+    return {
+        name: kind
+        for name, kind in known.items()
+        if (not config.only or name in config.only) and name not in config.without
+    }
+
+
+def _base(nominal: Path | None) -> Effects:
+    """Effects that the nominal bench has from the start."""
+    if nominal is None:
+        return ()
+    bench = load_bench(nominal)
+    found = list(parse_effects(bench.effects, str(nominal)))
+    if bench.optics.fringes == "exact":
+        found.append(parse_effects({"hyperbolic_fringes": {}}, str(nominal))[0])
+    return tuple(found)
+
+
+def _diagnose(
+    run_dir: Path,
+    kinds: Mapping[str, type[Effect]],
+    base: Effects,
+    scratch: Path,
+    runtime: Runtime,
+) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    look = _look(run_dir, scratch, runtime)
+    trials = Trials(look.windows, scratch, look.runtime)
+    (nominal,) = trials.curves([base], REFERENCES, "nominal bench")
+    if isinstance(nominal, str):
+        raise InputError(f"--nominal: {nominal}")
+    reference = Reference.of(nominal)
+    data = reference.on_scale(look.measured)
+    candidates = _candidates(look.learn, kinds, base, look.runtime)
+
+    def again(on: Effects, names: Sequence[str]) -> dict[str, float]:
+        """Significance of candidates on the first frames taken again with some effects."""
+        window = look.first
+        evidence = window.evidence(window.learn, (*base, *on), LEARN_SEED, scratch)
+        found = _estimates(evidence, {n: kinds[n] for n in names}, look.runtime, "estimate again")
+        return {n: e.significance for n, e in found.items() if isinstance(e, Estimate)}
+
+    search = Search(
+        reference,
+        data,
+        base,
+        lambda benches, seeds, label: trials.curves(
+            [(*base, *bench) for bench in benches], seeds, label
+        ),
+        again,
+    )
+    found = search.run(candidates)
+    return describe(found, data, look.measured, reference, look.facts)
+
+
+@dataclass(frozen=True)
+class Look:
+    """What is looked at.
+
+    Attributes
+    ----------
+    learn : Evidence
+        Of the first frames, on the first window.
+    first : Window
+        That effects are fitted on.
+    windows : tuple of Window
+        That they are tried on.
+    measured : mapping
+        Curves of the test frames, mean of the windows.
+    facts : dict
+        What is told of it.
+    runtime : Runtime
+        With as many workers as fit the memory.
+    """
+
+    learn: Evidence
+    first: Window
+    windows: tuple[Window, ...]
+    measured: Curves
+    facts: dict[str, Any]
+    runtime: Runtime
+
+
+def _look(run_dir: Path, scratch: Path, runtime: Runtime) -> Look:
+    ingested = Ingested(run_dir / "ingest")
+    file = run_dir / "ingest" / "acquisition.json"
+    acquisition = parse(Acquisition, read_json(file), str(file))
+    reduction = _reduction(run_dir)
+    shape = ingested.shape
+    first, parts = chosen_windows(shape)
+    pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
+    own = split(ingested.tables, pixels)
+    _enough(own.test)
+    longest = max(len(f) for f in own.test.frames.values())
+    need = BYTES_A_SAMPLE * pixels * longest + 2 * pixels * sum(
+        len(f) for f in own.test.frames.values()
+    )
+    plan = make_plan("diagnose", need, need, runtime)
+    runtime = runtime.with_workers(plan.workers)
+    dtypes = {name: array.dtype for name, array in ingested.arrays.items()}
+    windows: list[Window] = []
+    measured: list[Curves] = []
+    learn: Evidence | None = None
+    for part in dict.fromkeys((first, *parts)):
+        halves: list[Evidence] = []
+        for half in (own.learn, own.test):
+            folder = scratch / f"data-{len(windows)}-{len(halves)}"
+            raw = take(ingested, acquisition, half, part, reduction)
+            halves.append(evidence_of(raw, folder, part, shape))
+            shutil.rmtree(folder)
+        bench = nominal_bench(acquisition, ingested.tables, halves, reduction, dtypes)
+        windows.append(Window(part, bench, own.learn, own.test, shape))
+        if part in parts:
+            measured.append(measure(halves[1]))
+        if learn is None:
+            learn = halves[0]
+    assert learn is not None
+    return Look(
+        learn,
+        windows[0],
+        tuple(w for w in windows if w.part in parts),
+        averaged(measured),
+        {
+            "shape": list(shape),
+            "fitted_on": {"window": _plain_part(first), "frames": _plain_half(own.learn)},
+            "tried_on": {
+                "windows": [_plain_part(p) for p in parts],
+                "frames": _plain_half(own.test),
+            },
+            "kinds": [kind for kind in ("bias", "dark", "flat") if kind in ingested.tables],
+            "sets": {s.name: list(s.baseline_mm) for s in acquisition.frames.fringes},
+        },
+        runtime,
+    )
+
+
+def _enough(half: Half) -> None:
+    for name, frames in half.frames.items():
+        if "/" in name and len(frames) < FEWEST_FRAMES:
+            raise InputError(
+                f"{name}: half of its frames are {len(frames)}; diagnose needs {FEWEST_FRAMES} in "
+                "each half, for effects are fitted on one and tried on the other"
+            )
+
+
+def _plain_part(part: Part) -> list[list[int]]:
+    return [list(part[0]), list(part[1])]
+
+
+def _plain_half(half: Half) -> dict[str, list[int]]:
+    return {
+        name: [int(frames[0]), int(frames[-1]), len(frames)] for name, frames in half.frames.items()
+    }
+
+
+def _reduction(run_dir: Path) -> reduce.Config:
+    plain = dict(require(run_dir, "reduce", 1).config)
+    known = {k: v for k, v in plain.items() if k in reduce.Config.__dataclass_fields__}
+    return parse(reduce.Config, known, str(run_dir / "reduce" / "manifest.json"))
+
+
+def _candidates(
+    evidence: Evidence, kinds: Mapping[str, type[Effect]], base: Effects, runtime: Runtime
+) -> dict[str, Candidate]:
+    there = {effect.name for effect in base}
+    tried = {name: kind for name, kind in kinds.items() if name not in there}
+    found = _estimates(evidence, tried, runtime, "estimate effects")
+    candidates = {}
+    for name, one in found.items():
+        if isinstance(one, Estimate):
+            candidates[name] = Candidate(name, one)
+        else:
+            reason = one or "the acquisition holds no frames that could tell"
+            candidates[name] = Candidate(name, None, reason)
+    return candidates
+
+
+def _estimates(
+    evidence: Evidence, kinds: Mapping[str, type[Effect]], runtime: Runtime, label: str
+) -> dict[str, Estimate | str | None]:
+    here = runtime if runtime.cluster in ("threads", "sync") else Runtime(quiet=runtime.quiet)
+    results = run_tasks(partial(estimate, evidence), list(kinds.values()), here, label=label)
+    return dict(zip(kinds, results, strict=True))

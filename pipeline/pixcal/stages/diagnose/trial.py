@@ -1,0 +1,141 @@
+"""The bench taken again: simulations of the windows that are looked at, through the same stages."""
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.battery import Curve, Key, measure
+from pixcal.estimators.evidence import Evidence
+from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect, Estimate
+from pixcal.stages.diagnose.nominal import NominalBench
+from pixcal.stages.diagnose.parts import Half, evidence_of
+from pixcal.stages.evidence import Part
+
+Curves = dict[Key, Curve]
+Effects = tuple[Effect, ...]
+
+
+@dataclass(frozen=True)
+class Window:
+    """A part of the detector that is looked at.
+
+    Attributes
+    ----------
+    part : ((int, int), (int, int))
+        Rows and columns.
+    bench : NominalBench
+        As measured there.
+    learn, test : Half
+        Frames that effects are fitted on, and frames that they are tried on.
+    whole : (int, int)
+        Rows and columns of the detector's window.
+    """
+
+    part: Part
+    bench: NominalBench
+    learn: Half
+    test: Half
+    whole: tuple[int, int]
+
+    def evidence(self, half: Half, effects: Effects, seed: int, scratch: Path) -> Evidence:
+        """A half of the frames, taken again with some effects."""
+        raw = self.bench.simulate(half, effects, seed)
+        with tempfile.TemporaryDirectory(dir=scratch) as folder:
+            return evidence_of(raw, Path(folder) / "run", self.part, self.whole)
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Simulations of the test frames of some windows; none is made twice.
+
+    Attributes
+    ----------
+    windows : tuple of Window
+    scratch : Path
+        Folder for what is written in between.
+    runtime : Runtime
+    """
+
+    windows: tuple[Window, ...]
+    scratch: Path
+    runtime: Runtime
+    _made: dict[tuple[frozenset[Effect], int], Curves | str] = field(default_factory=dict)
+
+    def curves(
+        self, benches: Sequence[Effects], seeds: int, label: str
+    ) -> list[list[Curves] | str]:
+        """Statistics of several benches.
+
+        Parameters
+        ----------
+        benches : sequence of tuple of Effect
+            Effects of each.
+        seeds : int
+            Simulations of each, seeds 0, 1, ...
+
+        Returns
+        -------
+        list
+            For each bench its simulations, or why it cannot be simulated.
+        """
+        wanted = [(frozenset(bench), seed) for bench in benches for seed in range(seeds)]
+        missing = [one for one in dict.fromkeys(wanted) if one not in self._made]
+        places = range(len(self.windows))
+        items = [(tuple(bench), seed, n) for bench, seed in missing for n in places]
+        if items:
+            work = partial(_one, self.windows, self.scratch)
+            results = run_tasks(work, items, self.runtime, label=label)
+            for number, one in enumerate(missing):
+                own = results[number * len(places) : (number + 1) * len(places)]
+                wrong = [r for r in own if isinstance(r, str)]
+                kept = [r for r in own if not isinstance(r, str)]
+                self._made[one] = wrong[0] if wrong else averaged(kept)
+        found: list[list[Curves] | str] = []
+        for bench in benches:
+            own = [self._made[frozenset(bench), seed] for seed in range(seeds)]
+            wrong = [r for r in own if isinstance(r, str)]
+            found.append(wrong[0] if wrong else [r for r in own if not isinstance(r, str)])
+        return found
+
+
+def _one(
+    windows: tuple[Window, ...], scratch: Path, item: tuple[Effects, int, int]
+) -> Curves | str:
+    effects, seed, number = item
+    window = windows[number]
+    try:
+        return measure(window.evidence(window.test, effects, seed + 1000 * number, scratch))
+    except InputError as error:
+        return str(error)
+
+
+def averaged(curves: Sequence[Curves]) -> Curves:
+    """Mean over windows of the curves that all have."""
+    first, *others = curves
+    if not others:
+        return first
+    found = {}
+    for key, curve in first.items():
+        own = [curve, *(c[key] for c in others if key in c)]
+        if len(own) == len(curves) and len({len(c.value) for c in own}) == 1:
+            found[key] = Curve(curve.x, np.mean([c.value for c in own], axis=0))
+    return found
+
+
+def estimate(evidence: Evidence, kind: type[Effect]) -> Estimate | str | None:
+    """Parameters of an effect; None without evidence, a sentence where the estimate failed."""
+    try:
+        found = kind.estimate(evidence)
+    except NotImplementedError:
+        return "its file does not say how to estimate it"
+    except (InputError, np.linalg.LinAlgError, ValueError, ArithmeticError) as error:
+        return " ".join(f"cannot be estimated here: {error}".split())[:300]
+    if found is not None and not np.isfinite(found.significance):
+        return "cannot be estimated here: no finite significance"
+    return found

@@ -1,0 +1,84 @@
+"""Which pixels and frames are looked at: all of a small window, some windows of a large one."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.stages.diagnose.parts import Half, Table, groups
+from pixcal.stages.evidence import Part
+
+SIDE = 128
+"""Pixels along the side of a window on a large detector: those of a chunk of the cube."""
+LARGEST = 160
+"""Rows or columns of a detector that is taken whole."""
+SAMPLES = 1 << 23
+"""Samples of a fringe set that are looked at in each half of the frames and each window."""
+FEWEST = 4
+"""Calibration frames of an exposure time that can be halved; fewer serve both halves."""
+
+
+def chosen_windows(shape: tuple[int, int]) -> tuple[Part, tuple[Part, ...]]:
+    """The window that effects are fitted on, and those that they are tried on.
+
+    A small detector is one window, and only the frames are parted. On a large one, effects are
+    fitted in the middle and tried in four other places as well.
+    """
+    if max(shape) <= LARGEST:
+        whole = ((0, shape[0]), (0, shape[1]))
+        return whole, (whole,)
+
+    def place(share_y: float, share_x: float) -> Part:
+        spans = []
+        for size, share in zip(shape, (share_y, share_x), strict=True):
+            side = min(SIDE, size)
+            first = round((size - side) * share / SIDE) * SIDE
+            first = min(first, size - side)
+            spans.append((first, first + side))
+        return spans[0], spans[1]
+
+    middle = place(0.5, 0.5)
+    others = {place(y, x) for y, x in ((0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9))}
+    return middle, tuple(sorted(others))
+
+
+@dataclass(frozen=True)
+class Split:
+    """Frames that effects are fitted on (``learn``), and frames they are tried on (``test``)."""
+
+    learn: Half
+    test: Half
+
+
+def split(tables: Mapping[str, Table], pixels: int) -> Split:
+    """First and second half, in order of time, of every array and exposure time.
+
+    Of long fringe sets the first and the last frames only, `SAMPLES` in each half.
+
+    Parameters
+    ----------
+    tables : mapping
+        As in ``frames.json``.
+    pixels : int
+        Of a window.
+    """
+    learn, test = {}, {}
+    for name, table in tables.items():
+        exposures = np.array([np.nan if t is None else t for t in table["exptime_s"]], float)
+        fringes = "/" in name
+        early, late = [], []
+        for own in [np.arange(len(exposures))] if fringes else groups(exposures):
+            one, other = _halves(own, SAMPLES // pixels)
+            early.append(one)
+            late.append(other)
+        learn[name] = np.sort(np.concatenate(early))
+        test[name] = np.sort(np.concatenate(late))
+    return Split(Half(learn), Half(test))
+
+
+def _halves(frames: NDArray[np.intp], most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    if len(frames) < FEWEST:
+        return frames, frames
+    middle = len(frames) // 2
+    return frames[: min(middle, most)], frames[max(middle, len(frames) - most) :]

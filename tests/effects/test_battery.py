@@ -1,0 +1,97 @@
+"""The statistics: each sees what it is for, in its own unit, and nothing else."""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from pixcal.estimators.battery import DETECTOR, battery, measure
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.gap import Reference
+
+
+@pytest.fixture(scope="module")
+def plain(acquired: Callable[..., Evidence]) -> Evidence:
+    return acquired()
+
+
+def test_every_statistic_says_what_it_is() -> None:
+    assert len(battery()) > 50
+    for name, one in battery().items():
+        assert one.name == name
+        assert one.domain in {"space", "time", "intensity", "noise"}
+        assert one.kind in {"linear", "power"}
+        assert one.title
+
+
+def test_all_that_can_be_measured_is(plain: Evidence) -> None:
+    found = measure(plain)
+    missing = set(battery()) - {name for name, _ in found}
+    # Two baselines along one axis are not there.
+    assert missing == {"apart"}
+    for (name, of), curve in found.items():
+        assert len(curve.x) == len(curve.value) > 0
+        assert (of == DETECTOR) != battery()[name].of_set
+        assert battery()[name].kind == "linear" or (curve.value >= 0).all()
+
+
+def changed(plain: Evidence, **fields: object) -> Evidence:
+    one = dataclasses.replace(plain.fringes["vertical"], **fields)  # type: ignore[arg-type]
+    return dataclasses.replace(plain, fringes={**plain.fringes, "vertical": one})
+
+
+def test_rows_in_the_offsets_show_with_their_size(plain: Evidence) -> None:
+    rows = np.arange(plain.good.shape[0])[:, None]
+    delta = plain.fringes["vertical"].delta + 4e-3 * np.cos(np.pi * rows / 2)
+    found = measure(changed(plain, delta=delta))
+    curve = found["offset_rows_repeat", "vertical"]
+    assert curve.value[list(curve.x).index(4)] == pytest.approx(4e-3, rel=0.1)
+    same = measure(plain)
+    for key in (("contrast_rows_repeat", "vertical"), ("offset_rows_repeat", "horizontal")):
+        np.testing.assert_array_equal(found[key].value, same[key].value)
+
+
+def test_neighbours_that_share_noise_correlate(plain: Evidence) -> None:
+    one = plain.fringes["horizontal"]
+    shared = one.residual + 0.1 * np.roll(np.nan_to_num(one.residual), 1, axis=1)
+    rest = dataclasses.replace(one, electrons=(one.model + shared).astype(np.float32))
+    evidence = dataclasses.replace(plain, fringes={**plain.fringes, "horizontal": rest})
+    before, after = (
+        measure(plain)["neighbours", "horizontal"],
+        measure(evidence)["neighbours", "horizontal"],
+    )
+    change = after.value - before.value
+    assert change[1] == pytest.approx(0.1, abs=0.01)
+    assert np.abs(np.delete(change, 1)).max() < 0.02
+
+
+def test_a_third_harmonic_shows_with_its_size(plain: Evidence) -> None:
+    one = plain.fringes["vertical"]
+    alpha = np.hypot(one.theta[1], one.theta[2])
+    psi = np.arctan2(one.theta[1], one.theta[2])
+    turn = 3 * (one.phi[:, None, None] - psi)
+    more = (one.electrons + 1e-3 * alpha * np.cos(turn)).astype(np.float32)
+    curve = measure(changed(plain, electrons=more))["harmonics", "vertical"]
+    assert curve.value[list(curve.x).index(3.0)] == pytest.approx(1e-3, rel=0.1)
+    assert np.abs(np.delete(curve.value, 2)).max() < 2e-4
+
+
+def test_offsets_along_one_axis_are_compared(plain: Evidence) -> None:
+    twin = dataclasses.replace(
+        plain.fringes["vertical"],
+        name="longer",
+        delta=plain.fringes["vertical"].delta
+        + 1e-3 * np.random.default_rng(1).standard_normal(plain.good.shape),
+    )
+    evidence = dataclasses.replace(plain, fringes={**plain.fringes, "longer": twin})
+    value = measure(evidence)["apart", DETECTOR].value
+    assert value[0] == pytest.approx(1e-6, rel=0.1)
+
+
+def test_a_reference_needs_what_all_simulations_have(plain: Evidence) -> None:
+    whole = measure(plain)
+    part = {key: curve for key, curve in whole.items() if key[1] != "vertical"}
+    known = Reference.of([whole, part])
+    assert set(known.usual) == set(part)
+    assert set(known.on_scale(whole)) == set(part)

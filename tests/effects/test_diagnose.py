@@ -1,0 +1,236 @@
+"""The diagnosis on small acquisitions: what is there is found, what is not is not."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from click.testing import CliRunner
+
+from pixcal.engine.run import Runtime
+from pixcal.model.bench import Bench
+from pixcal.model.config import to_plain
+from pixcal.model.errors import InputError
+from pixcal.stages import diagnose, fit, ingest, reduce, simulate
+from pixcal.stages.diagnose.windows import chosen_windows, split
+from pixcal_cli.main import cli
+
+SYNC = Runtime(cluster="sync")
+SMALL = {
+    "detector.shape": [53, 59],
+    "frames.fringes.0.count": 120,
+    "frames.fringes.1.count": 110,
+}
+FEW = ("lag", "row_noise", "fringe_jitter", "quantisation")
+"""Candidates of most tests, for speed."""
+
+
+@pytest.fixture(scope="session")
+def reduced(
+    tmp_path_factory: pytest.TempPathFactory, make_effect_bench: Callable[..., Bench]
+) -> Callable[..., Path]:
+    """A reduced run of a small bench: ``reduced(effects, changes)``."""
+
+    def make(effects: dict[str, Any] | None = None, changes: dict[str, Any] | None = None) -> Path:
+        folder = tmp_path_factory.mktemp("diagnose")
+        bench = to_plain(make_effect_bench(SMALL | (changes or {}), effects))
+        (folder / "bench.yaml").write_text(yaml.safe_dump(bench))
+        simulate.run(folder / "bench.yaml", folder / "acq", simulate.Config(), SYNC)
+        ingest.run(folder / "acq", folder / "run", ingest.Config(), SYNC)
+        reduce.run(folder / "run", reduce.Config(), SYNC)
+        return folder / "run"
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def with_lag(reduced: Callable[..., Path]) -> Path:
+    return reduced({"lag": {"share": 0.004}})
+
+
+def diagnosed(run: Path, **options: Any) -> dict[str, Any]:
+    diagnose.run(run, diagnose.Config(**options), SYNC)
+    found: dict[str, Any] = json.loads((run / "products" / "diagnosis.json").read_text())
+    return found
+
+
+def test_an_effect_is_found_and_closes_the_gap(with_lag: Path) -> None:
+    found = diagnosed(with_lag, only=FEW)
+    assert found["schema"] == "pixcal/diagnosis/1"
+    assert found["verdict"] == "explained"
+    (cause,) = found["causes"]
+    assert cause["effect"] == "lag"
+    error = cause["uncertainty"]["share"]
+    assert cause["parameters"]["share"] == pytest.approx(0.004, abs=4 * error)
+    assert error < 4e-4
+    assert cause["gap_closed"] > 0.85
+    assert cause["gap_closed_interval"][0] <= cause["gap_closed"] <= cause["gap_closed_interval"][1]
+    assert cause["p_value"] < 1e-6
+    gap = found["gap"]
+    assert gap["total"] == 1
+    assert gap["interval"][0] <= gap["after"] <= gap["interval"][1] < 0.3
+    for entry in gap["where"]:
+        assert {"domain", "statistic", "measured", "simulated", "z", "after", "place"} <= set(entry)
+    assert {"time"} <= {entry["domain"] for entry in gap["where"]}
+    for row in gap["absolute"]:
+        assert {"quantity", "unit", "measured", "simulated", "after"} <= set(row)
+    assert {c["effect"] for c in found["candidates"]} == set(FEW) - {"lag"}
+    assert all(c["rejected_because"] for c in found["candidates"])
+
+
+def test_left_out_it_is_not_put_on_another(with_lag: Path) -> None:
+    found = diagnosed(with_lag, only=tuple(name for name in FEW if name != "lag"))
+    assert found["verdict"] == "unexplained"
+    assert not found["causes"]
+    assert found["gap"]["after"] == pytest.approx(1, abs=0.01)
+    worst = {entry["statistic"] for entry in found["gap"]["where"][:4]}
+    assert {"contrast_by_step", "frames_before"} & worst
+
+
+def test_in_the_nominal_bench_it_is_no_gap(
+    with_lag: Path, tmp_path: Path, make_effect_bench: Callable[..., Bench]
+) -> None:
+    """A richer bench as the starting point."""
+    bench = to_plain(make_effect_bench({}, {"lag": {"share": 0.004}}))
+    (tmp_path / "richer.yaml").write_text(yaml.safe_dump(bench))
+    found = diagnosed(with_lag, only=("row_noise",), nominal=tmp_path / "richer.yaml")
+    assert found["verdict"] == "no gap"
+    assert found["gap"]["total"] == 0
+
+
+def test_of_a_nominal_bench_nothing_is_claimed(reduced: Callable[..., Path]) -> None:
+    """Every effect is a candidate; the same on processes."""
+    run = reduced()
+    found = diagnosed(run)
+    assert found["verdict"] == "no gap"
+    assert not found["causes"]
+    written = (run / "diagnose" / "curves.json").read_bytes()
+    again = diagnose.run(run, diagnose.Config(), Runtime(cluster="processes", workers=2))
+    assert again.summary["verdict"] == "no gap"
+    assert (run / "diagnose" / "curves.json").read_bytes() == written
+
+
+def test_without_fringes_noise_and_intensity_are_looked_at(reduced: Callable[..., Path]) -> None:
+    run = reduced(
+        {"row_noise": {"row_rms": 6.0}},
+        {"frames.fringes": [], "frames.bias": 60, "detector.shape": [101, 97]},
+    )
+    found = diagnosed(run, only=("row_noise", "lag", "ipc"))
+    assert [cause["effect"] for cause in found["causes"]] == ["row_noise"]
+    assert found["verdict"] == "explained"
+    assert {entry["domain"] for entry in found["gap"]["where"]} <= {"noise", "intensity", "time"}
+
+
+OWN = '''
+from dataclasses import dataclass
+import numpy as np
+from pixcal.model.config import quantity
+from pixcal.simulation.effect import Effect, Estimate, Stage
+
+@dataclass(frozen=True)
+class Flicker(Effect):
+    """Every second frame is brighter."""
+    name, title, stage = "flicker", "every second frame brighter", Stage.LIGHT
+    domains, strengths, sources = ("time",), ("size",), ("nowhere in particular",)
+    size: float = quantity(0.01, low=-1, high=1, doc="relative")
+
+    def photons(self, mean, shot):
+        own = shot.recording.kind == "fringes" and shot.frame % 2
+        return mean * np.float32(1 + self.size) if own else mean
+
+    @classmethod
+    def estimate(cls, evidence):
+        found = [f.free[:, 0] / f.free[:, 0].mean() for f in evidence.fringes.values()]
+        # Frames of this half start with the run.
+        sizes = [b[1::2].mean() - b[::2].mean() for b in found]
+        error = np.std(np.concatenate([np.diff(b[::2]) for b in found])) / 5
+        size, error = float(np.mean(sizes)), max(float(error), 1e-6)
+        return Estimate(cls(size), {"size": error}, abs(size) / error, "odd frames")
+'''
+
+
+def test_an_effect_of_the_users_own_is_found(reduced: Callable[..., Path], tmp_path: Path) -> None:
+    file = tmp_path / "flicker.py"
+    file.write_text(OWN)
+    run = reduced()
+    raw = run.parent / "acq"
+    for path in sorted(raw.glob("vertical/*.fits")) + sorted(raw.glob("horizontal/*.fits")):
+        from astropy.io import fits
+
+        with fits.open(path, mode="update", memmap=False) as hdus:
+            frames = hdus[0].data.astype(float)
+            frames[1::2] = (frames[1::2] - 500) * 1.01 + 500
+            hdus[0].data = np.round(frames).astype(np.uint16)
+    ingest.run(raw, run, ingest.Config(), SYNC)
+    reduce.run(run, reduce.Config(), SYNC)
+    found = diagnosed(run, only=("flicker", "lag"), own=(file,))
+    assert [cause["effect"] for cause in found["causes"]] == ["flicker"]
+    assert found["causes"][0]["parameters"]["size"] == pytest.approx(0.01, rel=0.05)
+
+
+def test_it_is_made_once(with_lag: Path) -> None:
+    first = diagnose.run(with_lag, diagnose.Config(only=("row_noise",)), SYNC)
+    made = (with_lag / "diagnose" / "manifest.json").stat().st_mtime_ns
+    assert diagnose.run(with_lag, diagnose.Config(only=("row_noise",)), SYNC).key == first.key
+    assert (with_lag / "diagnose" / "manifest.json").stat().st_mtime_ns == made
+    fit.run(with_lag, fit.Config(), SYNC)
+    assert diagnose.run(with_lag, diagnose.Config(only=("row_noise",)), SYNC).key == first.key
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"only": ("colour",)}, "unknown effect; known are"),
+        ({"without": ("colour",)}, "unknown effect"),
+        ({"own": (Path("nowhere.py"),)}, "nowhere.py: not found"),
+        ({"nominal": Path("nowhere.yaml")}, "nowhere.yaml: not found"),
+    ],
+)
+def test_wrong_options_are_told(with_lag: Path, options: dict[str, Any], reason: str) -> None:
+    with pytest.raises(InputError, match=reason):
+        diagnose.run(with_lag, diagnose.Config(**options), SYNC)
+
+
+def test_too_few_frames_to_part_are_told(reduced: Callable[..., Path]) -> None:
+    run = reduced(None, {"frames.fringes.1.count": 20})
+    with pytest.raises(InputError, match=r"fringes/horizontal: half of its frames are 10; .* 24"):
+        diagnose.run(run, diagnose.Config(), SYNC)
+
+
+def test_a_run_that_was_not_reduced_is_told(tmp_path: Path) -> None:
+    result = CliRunner().invoke(cli, ["diagnose", str(tmp_path)])
+    assert result.exit_code != 0
+
+
+def test_halves_share_no_frame() -> None:
+    table: dict[str, list[Any]] = {
+        "exptime_s": [0.1] * 5 + [0.2] * 3 + [None] * 9,
+        "time_s": list(range(17)),
+    }
+    fringes: dict[str, list[Any]] = {"exptime_s": [0.1] * 101, "time_s": list(range(101))}
+    parts = split({"flat": table, "fringes/a": fringes}, 128 * 128)
+    learn, test = parts.learn.frames, parts.test.frames
+    assert not set(learn["fringes/a"]) & set(test["fringes/a"])
+    assert len(learn["fringes/a"]) + len(test["fringes/a"]) == 101
+    # Three frames of an exposure time cannot be parted.
+    assert set(learn["flat"]) & set(test["flat"]) == {5, 6, 7}
+    long = split({"fringes/a": {"exptime_s": [0.1] * 9000, "time_s": list(range(9000))}}, 128 * 128)
+    assert len(long.test.frames["fringes/a"]) == 512
+    assert long.test.frames["fringes/a"][-1] == 8999
+    assert long.learn.frames["fringes/a"][0] == 0
+
+
+def test_windows_of_a_large_detector_lie_apart_on_its_chunks() -> None:
+    learn, test = chosen_windows((5456, 8320))
+    everywhere = [learn, *test]
+    assert len(set(everywhere)) == 5
+    for (y0, y1), (x0, x1) in everywhere:
+        assert (y1 - y0, x1 - x0) == (128, 128)
+        assert y0 % 128 == x0 % 128 == 0
+        assert 0 <= y0 < y1 <= 5456
+        assert 0 <= x0 < x1 <= 8320
+    whole, (same,) = chosen_windows((61, 67))
+    assert whole == same == ((0, 61), (0, 67))

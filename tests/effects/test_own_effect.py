@@ -1,0 +1,105 @@
+"""An effect from outside pixcal: one file, through the commands, simulated and measured."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from click.testing import CliRunner
+
+import pixcal
+from pixcal.effects import effect_of_file, effects, known_effects
+from pixcal.engine.run import Runtime
+from pixcal.model.errors import InputError
+from pixcal.stages.evidence import load_evidence
+from pixcal_cli.main import cli
+
+ROOT = Path(__file__).parents[2]
+GLOW = ROOT / "docs" / "examples" / "glow.py"
+BENCH = """
+schema: pixcal/bench/1
+seed: 5
+detector: {shape: [61, 67], pitch_um: 4.4, gain_e_per_adu: 0.5, read_noise_e: 8.0, dark_e_s: 10.0}
+optics: {wavelength_nm: 632.8, distance_mm: 400.0, beam_radius_mm: 35.0}
+frames:
+  exptime_s: 0.02
+  period_s: 0.14
+  per_file: 100
+  bias: 30
+  darks: [{exptime_s: 2.0, count: 30}]
+effects:
+  glow: {rate: 120.0}
+"""
+SYNC = Runtime(cluster="sync")
+
+
+@pytest.fixture(scope="module")
+def acquisition(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Simulated by the command, as a user does."""
+    folder = tmp_path_factory.mktemp("own")
+    (folder / "bench.yaml").write_text(BENCH)
+    arguments = [str(folder / "bench.yaml"), "--out", str(folder / "acq"), "--own", str(GLOW)]
+    found = CliRunner().invoke(cli, ["simulate", *arguments, "--quiet", "--cluster", "sync"])
+    assert found.exit_code == 0, found.output
+    return folder / "acq"
+
+
+def test_the_frames_have_it(acquisition: Path) -> None:
+    (dark,) = acquisition.glob("dark/*.fits")
+    frames = fits.getdata(dark).astype(float)
+    y, x = np.mgrid[:61, :67]
+    light = (frames.mean(axis=0) - 500) * 0.5
+    expected = 2.0 * (10.0 + 120.0 * np.exp(-np.hypot(y, x) / 15.0))
+    # Shot and read noise of thirty frames.
+    error = np.sqrt((expected + 64) / 30)
+    assert np.std((light - expected) / error) == pytest.approx(1, abs=0.05)
+
+
+def test_it_is_measured_with_its_error(acquisition: Path, tmp_path: Path) -> None:
+    cls = effect_of_file(GLOW)
+    run = pixcal.ingest(acquisition, tmp_path / "run", runtime=SYNC)
+    pixcal.reduce(run, runtime=SYNC)
+    found = cls.estimate(load_evidence(run.path))
+    assert found is not None
+    assert found.effect.name == "glow"
+    (error,) = found.errors.values()
+    assert abs(found.effect.rate - 120.0) < 4 * error  # type: ignore[attr-defined]
+    assert found.significance > 10
+
+
+def test_other_workers_make_the_same_frames(acquisition: Path, tmp_path: Path) -> None:
+    """Processes of their own, which have never seen the file."""
+    (tmp_path / "bench.yaml").write_text(BENCH)
+    runtime = Runtime(cluster="processes", workers=2)
+    again = pixcal.simulate(tmp_path / "bench.yaml", tmp_path / "acq", own=[GLOW], runtime=runtime)
+    for file in sorted(acquisition.rglob("*.fits")):
+        assert (again / file.relative_to(acquisition)).read_bytes() == file.read_bytes()
+
+
+def test_another_file_is_another_acquisition(acquisition: Path, tmp_path: Path) -> None:
+    """The truth keeps the file; one that was changed is simulated anew."""
+    bench, truth = acquisition.parent / "bench.yaml", acquisition.with_name("acq-truth")
+    assert (truth / "glow.py").read_bytes() == GLOW.read_bytes()
+    before = (acquisition / "manifest.json").read_text()
+    pixcal.simulate(bench, acquisition, own=[GLOW], runtime=SYNC)
+    assert (acquisition / "manifest.json").read_text() == before
+    changed = tmp_path / "glow.py"
+    changed.write_text(GLOW.read_text().replace("15.0", "16.0"))
+    pixcal.simulate(bench, tmp_path / "acq", own=[changed], runtime=SYNC)
+    assert (tmp_path / "acq" / "manifest.json").read_text() != before
+
+
+def test_without_its_file_the_name_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "bench.yaml").write_text(BENCH)
+    with pytest.raises(InputError, match="effects: unknown effect 'glow'; known are"):
+        pixcal.simulate(tmp_path / "bench.yaml", tmp_path / "acq", runtime=SYNC)
+
+
+def test_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text(GLOW.read_text().replace('"glow"', '"ipc"'))
+    with pytest.raises(InputError, match=r"mine.py: there is an effect 'ipc' already; rename"):
+        known_effects([file])
+    with pytest.raises(InputError, match="'glow' already"):
+        known_effects([GLOW, GLOW])
+    assert known_effects() == effects()

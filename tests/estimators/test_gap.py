@@ -1,0 +1,135 @@
+"""The gap between data and simulations, on curves drawn with known distributions."""
+
+import numpy as np
+import pytest
+from scipy.stats import kstest, norm
+
+from pixcal.estimators.battery import Curve, Key, battery
+from pixcal.estimators.gap import (
+    CHANCE,
+    Reference,
+    compare,
+    expect_nominal,
+    expect_with,
+    flagged,
+    log_likelihood,
+    remaining,
+    scaled,
+)
+from pixcal.stages.diagnose.search import LEAST
+
+LINEAR: Key = ("harmonics", "a")
+POWER: Key = ("contrast_of_frames", "a")
+
+
+def drawn(seed: int, shift: float = 0.0, power: float = 1.0) -> dict[Key, Curve]:
+    rng = np.random.default_rng(seed)
+    x = np.arange(6.0)
+    return {
+        LINEAR: Curve(x, 3e-6 * (rng.standard_normal(6) + shift)),
+        POWER: Curve(x, 1e-9 * power * rng.chisquare(7, 6) / 7),
+    }
+
+
+def reference(seeds: range = range(100, 116)) -> Reference:
+    return Reference.of([drawn(seed) for seed in seeds])
+
+
+def test_the_kinds_are_what_the_test_takes_them_for() -> None:
+    assert battery()[LINEAR[0]].kind == "linear"
+    assert battery()[POWER[0]].kind == "power"
+
+
+def test_the_scale_of_powers_is_smooth_and_rises() -> None:
+    ratio = np.geomspace(1e-4, 1e6, 4001)
+    values = scaled(ratio, np.ones_like(ratio))
+    slopes = np.diff(values) / np.diff(ratio)
+    assert np.all(slopes > 0)
+    near = scaled(np.array([1 - 1e-6, 1.0, 1 + 1e-6]), np.ones(3))
+    np.testing.assert_allclose(near, [-1e-6, 0, 1e-6], rtol=1e-5, atol=1e-12)
+
+
+def test_deviations_by_chance_are_as_rare_as_they_are_called() -> None:
+    sigmas = []
+    for n in range(60):
+        known = reference(range(1000 * n, 1000 * n + 16))
+        data = known.on_scale(drawn(1000 * n + 500))
+        sigmas.append(compare(data, expect_nominal(known))[LINEAR].sigmas)
+    chance = norm.cdf(np.concatenate(sigmas))
+    assert kstest(chance, "uniform").pvalue > 1e-3
+
+
+def test_no_gap_is_found_where_there_is_none() -> None:
+    found = 0
+    for n in range(100):
+        known = reference(range(1000 * n, 1000 * n + 16))
+        found += bool(
+            flagged(compare(known.on_scale(drawn(1000 * n + 500)), expect_nominal(known)))
+        )
+    # Binomial of 100 at twice the chance: more than 7 once in a thousand.
+    assert found <= 7
+    assert CHANCE <= 0.05
+
+
+def test_a_shift_is_a_gap_that_its_cause_closes_and_another_does_not() -> None:
+    known = reference()
+    data = known.on_scale(drawn(7, shift=40, power=30))
+    nominal = expect_nominal(known)
+    before = compare(data, nominal)
+    assert flagged(before) == {LINEAR, POWER}
+    right = expect_with(known, [drawn(s, shift=40, power=30) for s in range(100, 108)])
+    after = compare(data, right)
+    assert not flagged(after)
+    assert remaining(before, before, flagged(before)).total == pytest.approx(1, abs=0.05)
+    assert remaining(before, after, flagged(before)).total < 0.02
+    wrong = expect_with(known, [drawn(s, shift=-40) for s in range(100, 108)])
+    assert log_likelihood(data, right) > log_likelihood(data, nominal) + 50
+    # A wrong effect widens what is expected, which is worth less than one that is taken.
+    assert log_likelihood(data, wrong) < log_likelihood(data, nominal) + LEAST
+
+
+def test_half_of_a_gap_is_half_closed() -> None:
+    """One of two curves that count about alike."""
+    known = reference()
+    data = known.on_scale(drawn(7, shift=40, power=30))
+    nominal = expect_nominal(known)
+    before = compare(data, nominal)
+    half = expect_with(known, [drawn(s, power=30) for s in range(100, 108)])
+    gap = remaining(before, compare(data, half), flagged(before))
+    share = gap.weights[LINEAR] / (gap.weights[LINEAR] + gap.weights[POWER])
+    assert gap.total == pytest.approx(share, abs=0.03)
+    intensity, time = gap.of_domain("intensity"), gap.of_domain("time")
+    assert intensity[0] + time[0] == pytest.approx(1)
+    assert intensity[1] + time[1] == pytest.approx(gap.total)
+
+
+def test_a_gap_that_an_effect_opens_counts() -> None:
+    known = reference()
+    data = known.on_scale(drawn(7, shift=40))
+    nominal = expect_nominal(known)
+    before = compare(data, nominal)
+    where = flagged(before)
+    assert where == {LINEAR}
+    opens = expect_with(known, [drawn(s, shift=40, power=100) for s in range(100, 108)])
+    assert remaining(before, compare(data, opens), where).total > 0.2
+
+
+def test_effects_that_scatter_by_themselves_are_not_asked_to_agree() -> None:
+    """A random effect of the same size, drawn again, closes the gap."""
+    known = reference()
+
+    def random(seed: int) -> dict[Key, Curve]:
+        rng = np.random.default_rng(10_000 + seed)
+        curve = drawn(seed)[LINEAR]
+        return {LINEAR: Curve(curve.x, curve.value + 1e-4 * rng.standard_normal(6))}
+
+    known = Reference.of([{LINEAR: drawn(s)[LINEAR]} for s in range(100, 116)])
+    nominal = expect_nominal(known)
+    left = []
+    for n in range(20):
+        data = known.on_scale(random(n))
+        before = compare(data, nominal)
+        after = compare(data, expect_with(known, [random(s) for s in range(100, 108)]))
+        assert not flagged(after)
+        left.append(remaining(before, after, flagged(before)).total)
+    assert np.median(left) < 0.35

@@ -1,0 +1,466 @@
+"""The diagnosis in the report: true to its numbers, whatever was found, whatever it is called."""
+
+import dataclasses
+import html
+import io
+import math
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pixcal.effects import effects
+from pixcal.estimators.battery import DETECTOR, battery
+from pixcal.estimators.battery.noise import OUTLIERS, STEPS
+from pixcal.report import blocks as blocks_module
+from pixcal.report import diagnosis_words
+from pixcal.report.blocks import Block, Fold, Plate, Section, Words
+from pixcal.report.contents import ArrayRecord, Contents, Diagnosis, EffectWords, StageRecord
+from pixcal.report.diagnosis import diagnosis
+from pixcal.report.diagnosis_figures import Bar, Closed, curves_figure, gap_figure
+from pixcal.report.diagnosis_words import deciding, place, places
+from pixcal.report.drawing import png
+from pixcal.report.page import render
+from pixcal.report.tables import Table
+from pixcal.report.verdict import cards
+
+NOTICED = 3.7
+NASTY = "<script>alert('$\\frac{1}{$')</script> & \"quotes\"\n\t\x07é漢"
+
+
+@pytest.fixture
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests of words: drawing takes most of the time."""
+    monkeypatch.setattr(blocks_module, "png", lambda _figure: b"")
+
+
+def a_curve(
+    statistic: str = "lines", of: str = "one", domain: str = "noise", sigma: float = 9.0,
+    after: float = 0.5, values: int = 2, **changes: Any,
+) -> dict[str, Any]:  # fmt: skip
+    """A curve whose last value differs by so many sigma, before and after."""
+    last = np.arange(values) == values - 1
+
+    def band(at: float) -> dict[str, list[float]]:
+        middle = 1 + 0.01 * at * last
+        return {"value": list(middle), "low": list(middle - 0.01), "high": list(middle + 0.01)}
+
+    return {
+        "statistic": statistic, "set": of, "title": f"title of {statistic}", "domain": domain,
+        "unit": "", "x_label": "bin", "kind": "power", "x": [float(n) for n in range(values)],
+        "measured": list(1 + 0.01 * sigma * last), "nominal": band(0.0),
+        "with_effects": band(sigma - after), "z": list(sigma * last),
+        "z_after": list(after * last), "in_gap": sigma > NOTICED, "weight": sigma**2,
+        "left": min(1.0, (after / sigma) ** 2) if after > 2 else 0.0, "significance": sigma,
+        "significance_after": after if after > 1 else -37.0,
+    } | changes  # fmt: skip
+
+
+def a_cause(effect: str = "lag", **changes: Any) -> dict[str, Any]:
+    return {
+        "effect": effect, "title": f"what {effect} is", "parameters": {"share": 0.002},
+        "uncertainty": {"share": 2e-5}, "gap_closed": 0.8, "gap_closed_interval": [0.75, 0.83],
+        "gain_over_rest": 0.61, "p_value": 2e-40, "sigmas": 80.0, "why": "frames follow others",
+        "given_away_by": [{"statistic": "lines", "set": "one"}], "not_told_apart_from": [],
+    } | changes  # fmt: skip
+
+
+def a_diagnosis(
+    verdict: str = "explained", causes: tuple[dict[str, Any], ...] | None = None,
+    curves: tuple[dict[str, Any], ...] | None = None, **gap: Any,
+) -> Diagnosis:  # fmt: skip
+    if causes is None:
+        causes = (a_cause(),) if "explained" in verdict.split() else ()
+    if curves is None:
+        curves = (a_curve(), a_curve("repeat", domain="space", sigma=5.0), a_curve("o", sigma=1.0))
+    facts = {
+        "verdict": verdict, "causes": list(causes), "statistics": 102,
+        "gap": {
+            "total": 1.0, "after": 0.03, "interval": [0.01, 0.06], "where": [],
+            "domains": {"space": [0.3, 0.02], "time": [0.0, 0.0], "intensity": [0.0, 0.0],
+                        "noise": [0.7, 0.01]},
+            "absolute": [{"quantity": "offset rows", "unit": "px", "measured": 2e-3,
+                          "simulated": 3e-5, "after": 1.9e-3}],
+        } | gap,
+        "candidates": [
+            {"effect": "ipc", "gap_closed": 0.0, "rejected_because": "not seen (0.4 sigma)",
+             "tried_on_unseen_frames": False, "sigmas": 0.4},
+            {"effect": "mine", "gap_closed": 0.11, "rejected_because": "no likelier with it",
+             "tried_on_unseen_frames": True, "sigmas": 5.0},
+        ],
+        "looked_at": {
+            "fitted_on": {"window": [[0, 64], [10, 74]],
+                          "frames": {"flat": [0, 18, 10], "fringes/one": [0, 99, 100]}},
+            "tried_on": {"windows": [[[0, 64], [10, 74]], [[70, 134], [0, 64]]],
+                         "frames": {"fringes/one": [100, 199, 100]}},
+        },
+    }  # fmt: skip
+    words = {
+        "lag": EffectWords("words", "Charge stays.", {"share": ("e-/um", "left behind")}),
+        "ipc": EffectWords("crosstalk"),
+    }
+    return Diagnosis(facts, list(curves), words, NOTICED)
+
+
+def contents(found: Diagnosis | None, **changes: Any) -> Contents:
+    frames = {
+        "bias": ["b"], "dark": ["d"], "flat": ["f"],
+        "fringes": [{"name": "one", "files": ["x"], "baseline_mm": [6.0, 0.0]}],
+    }  # fmt: skip
+    acquisition = {
+        "detector": {"pitch_um": 4.4, "gain_e_per_adu": 1.0, "read_noise_e": 16.0},
+        "optics": {"wavelength_nm": 632.8, "distance_mm": 400.0},
+        "frames": frames | changes.pop("frames", {}),
+    }
+    return Contents(acquisition=acquisition, stages=(), diagnosis=found, **changes)
+
+
+def every(blocks: Any) -> Iterator[Block]:
+    for block in blocks:
+        yield block
+        if isinstance(block, Fold):
+            yield from every(block.blocks)
+
+
+def text_of(section: Section) -> str:
+    parts = [section.lead]
+    for block in every(section.blocks):
+        if isinstance(block, Words):
+            parts.append(block.text)
+        elif isinstance(block, Table):
+            parts += [block.title, *block.header, *(cell for row in block.rows for cell in row)]
+        else:
+            parts.append(block.title)
+    return "\n".join(parts)
+
+
+def table(section: Section, title: str) -> Table:
+    (found,) = (
+        b for b in every(section.blocks) if isinstance(b, Table) and b.title.startswith(title)
+    )
+    return found
+
+
+def answer(section: Section) -> Words:
+    (found,) = (b for b in section.blocks if isinstance(b, Words) and b.role == "answer")
+    return found
+
+
+def test_a_run_that_was_not_diagnosed_says_what_to_run() -> None:
+    section = diagnosis(contents(None))
+    assert section.lead.startswith("Not measured: run 'pixcal diagnose RUN'")
+    assert not section.blocks
+    assert not any("simulation" in card.title for card in cards(contents(None)))
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_no_gap_is_said_at_once_and_what_came_nearest_is_shown() -> None:
+    curves = (a_curve("a", sigma=1.0, after=1.0), a_curve("b", sigma=3.1, after=3.1))
+    found = a_diagnosis("no gap", curves=curves, total=0.0, after=0.0, interval=[0.0, 0.0])
+    section = diagnosis(contents(found))
+    assert answer(section).level == "good"
+    assert answer(section).text.startswith("No gap")
+    assert "none of 102 statistics" in answer(section).text
+    nearest = table(section, "The largest deviations, all within chance")
+    assert [row[1] for row in nearest.rows] == ["title of b", "title of a"]
+    assert "with causes" not in text_of(section)
+    (card,) = (c for c in cards(contents(found)) if c.title == "data against simulation")
+    assert (card.value, card.level) == ("no gap", "good")
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_unexplained_says_where_and_what_could_tell_more() -> None:
+    found = a_diagnosis("unexplained", after=1.0, interval=[0.9, 1.1])
+    section = diagnosis(contents(found, frames={"dark": []}))
+    assert answer(section).level == "bad"
+    assert "in 2 of 102 statistics, mostly in noise, and none of the 2 effects" in (
+        answer(section).text
+    )
+    advice = [b.text for b in section.blocks if isinstance(b, Words) and b.role == "advice"]
+    assert len(advice) == 1
+    assert "dark frames" in advice[0]
+    assert "a second baseline along x" in advice[0]
+    titles = [b.title for b in section.blocks if isinstance(b, Plate)]
+    assert titles == ["The gap", "The largest differences"]
+    assert "with causes" not in text_of(section)
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_causes_come_with_their_numbers() -> None:
+    causes = (a_cause(), a_cause("mine", p_value=3e-4, gap_closed=0.2, gain_over_rest=0.05))
+    section = diagnosis(contents(a_diagnosis(causes=causes)))
+    assert answer(section).text.startswith(
+        "Explained: what lag is (lag) and what mine is (mine) account for"
+    )
+    assert "3.0\u00a0% [1.0, 6.0] of the gap is left" in answer(section).text
+    assert [row[:4] for row in table(section, "Causes").rows] == [
+        ["1. what lag is (lag)", "80\u00a0% [75, 83]", "61\u00a0%", "< 10⁻¹⁵"],
+        ["2. what mine is (mine)", "20\u00a0% [75, 83]", "5.0\u00a0%", "3.0 × 10⁻⁴"],
+    ]
+    assert "Charge stays. What gave it away: frames follow others." in text_of(section)
+    assert list(table(section, "Parameters of lag").rows) == [
+        ["share", "0.002000 ± 0.000020", "e⁻/µm", "left behind"]
+    ]
+    assert [b.title for b in section.blocks if isinstance(b, Plate)] == [
+        "The gap", "What gave away what lag is (lag)", "What gave away what mine is (mine)",
+    ]  # fmt: skip
+    assert "No statistic differs by more than chance any more." in text_of(section)
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_parameters_of_any_shape_are_listed() -> None:
+    couplings = [{"dy": n, "share": 0.01 * n, "every": 4} for n in range(1, 21)]
+    cause = a_cause(
+        parameters={"couplings": couplings, "pair": [1.0, 2.0], "on": True, "kind": "slow",
+                    "none": None},
+        uncertainty={"couplings[3].share": 0.001, "pair[1]": 0.1},
+    )  # fmt: skip
+    section = diagnosis(contents(a_diagnosis(causes=(cause,))))
+    assert [row[:2] for row in table(section, "Parameters").rows] == [
+        ["pair", "1 (not fitted), 2.00 ± 0.10"], ["on", "yes"], ["kind", "slow"], ["none", "–"],
+    ]  # fmt: skip
+    assert "In all: every 4." in text_of(section)
+    first, rest = (
+        b for b in every(section.blocks) if isinstance(b, Table) and b.title.startswith("coupl")
+    )
+    assert list(first.header) == ["dy", "share"]
+    assert first.rows[3] == ["4", "0.0400 ± 0.0010"]
+    assert len(first.rows) == 12
+    assert [row[0] for row in rest.rows] == [str(n) for n in range(13, 21)]
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_every_difference_is_listed_once_the_worst_of_each_domain_first() -> None:
+    domains = {"space": 20, "noise": 9, "time": 2, "intensity": 1}
+    curves = tuple(
+        a_curve(f"{domain}{n}", domain=domain, sigma=40.0 - n)
+        for domain, count in domains.items()
+        for n in range(count)
+    )
+    section = diagnosis(contents(a_diagnosis(curves=(*curves, a_curve("quiet", sigma=1.0)))))
+    first, rest = table(section, "Statistics that differ"), table(section, "The others")
+    assert len(first.rows) == 12
+    assert {row[0] for row in first.rows} == set(domains)
+    for rows in (first.rows, rest.rows):
+        order = [row[0] for row in rows]
+        assert order == sorted(order, key=list(dict.fromkeys(order)).index)
+        for domain in set(order):
+            sigmas = [float(row[5]) for row in rows if row[0] == domain]
+            assert sigmas == sorted(sigmas, reverse=True)
+    listed = [row[1] for row in (*first.rows, *rest.rows)]
+    assert sorted(listed) == sorted(c["title"] for c in curves)
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_values_that_hardly_differ_are_shown_with_the_digits_that_tell() -> None:
+    nominal = {key: [1.0, 1.0007] for key in ("value", "low", "high")}
+    curve = a_curve(unit="px", measured=[1.0, 1.0012], nominal=nominal)
+    section = diagnosis(contents(a_diagnosis(curves=(curve,))))
+    (row,) = table(section, "Statistics that differ").rows
+    assert row[3:5] == ["1.00120 px", "1.00070"]
+    assert row[5] == "+9.0"
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_what_remains_is_named_and_what_is_new_is_a_warning() -> None:
+    curves = (
+        a_curve("gone"), a_curve("stays", domain="time", sigma=9.0, after=8.0),
+        a_curve("new", domain="intensity", sigma=0.5, after=-6.0, significance_after=5.0),
+    )  # fmt: skip
+    found = a_diagnosis(
+        "partly explained", curves=curves, after=0.31, interval=[0.25, 0.36],
+        domains={"space": [0.5, 0.0], "time": [0.5, 0.2], "intensity": [0, 0], "noise": [0, 0]},
+    )  # fmt: skip
+    section = diagnosis(contents(found))
+    assert "69\u00a0% of the gap" in answer(section).text
+    assert "31\u00a0% [25, 36] is left, mostly in time." in answer(section).text
+    rest = table(section, "Statistics that still differ")
+    assert [row[1] for row in rest.rows] == ["title of stays", "title of new"]
+    assert rest.rows[0][-2:] == ["+8.0", "79\u00a0%"]
+    assert rest.rows[1][-2:] == ["−6.0", "new"]
+    assert "Of them, 1 did not differ before" in text_of(section)
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_what_was_considered_and_looked_at_is_folded() -> None:
+    section = diagnosis(contents(a_diagnosis()))
+    folds = {b.title: b for b in section.blocks if isinstance(b, Fold)}
+    tried = table(section, "Not taken")
+    assert tried in folds["2 other effects were considered and not taken"].blocks
+    assert list(tried.rows) == [
+        ["mine", "+5.0", "11\u00a0%", "no likelier with it"],
+        ["crosstalk (ipc)", "+0.4", "–", "not seen (0.4 sigma)"],
+    ]
+    frames = table(section, "Frames and windows")
+    assert frames.rows[0] == [
+        "window", "rows 0 to 63, columns 10 to 73",
+        "rows 0 to 63, columns 10 to 73; rows 70 to 133, columns 0 to 63",
+    ]  # fmt: skip
+    assert frames.rows[1] == ["flat", "10 of the frames 0 to 18", "–"]
+    assert frames.rows[2] == ["fringes/one", "frames 0 to 99", "frames 100 to 199"]
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_a_richer_nominal_bench_is_named() -> None:
+    stage = StageRecord("diagnose", "k", 1, "0", {"nominal": {"ipc": {}, "lag": {}}}, {})
+    assert "to it were added ipc and lag" in (
+        diagnosis(dataclasses.replace(contents(a_diagnosis()), stages=(stage,))).lead
+    )
+    assert "straight fringes" not in diagnosis(contents(a_diagnosis(), frames={"fringes": []})).lead
+
+
+# Which frames would decide
+
+
+def flats(*exposures: float) -> tuple[ArrayRecord, ...]:
+    return (ArrayRecord("flat", 9, 9, None, None, None, exposures, None, None),)
+
+
+def sets(*baselines: tuple[float, float]) -> dict[str, Any]:
+    return {"fringes": [{"name": str(n), "baseline_mm": b} for n, b in enumerate(baselines)]}
+
+
+FULL = sets((6.0, 0.0), (-9.0, 0.1), (0.0, 6.0), (0.0, 9.0))
+LADDER = flats(0.01, 0.02, 0.03)
+NOTHING_MORE = "more frames of the same kind, with the phases in random order"
+
+
+@pytest.mark.parametrize(
+    ("frames", "arrays", "names", "words"),
+    [
+        (FULL, LADDER, ("ipc", "mine"), NOTHING_MORE),
+        (FULL | {"dark": []}, LADDER, ("ipc",), "dark frames"),
+        (FULL | {"dark": []}, LADDER, ("lag", "contrast_noise"), "dark frames"),
+        (FULL | {"dark": []}, LADDER, ("contrast_noise",), NOTHING_MORE),
+        (sets((6, 0), (0, 6)), LADDER, ("ipc",), "a second baseline along x and y"),
+        (sets((6, 0), (9, 0), (0, 6)), LADDER, ("ipc",), "a second baseline along y"),
+        (sets((4, 4)), LADDER, ("intra_pixel_response",), "a second baseline along 45°"),
+        (sets((6, 0), (9, 0)), LADDER, ("ghost_fringes",), "a fringe set along another axis"),
+        (FULL, flats(0.01), ("nonlinearity",), "a ladder of flats (at least 3 exposure times)"),
+        (FULL, flats(0.01), ("lag",), NOTHING_MORE),
+        (FULL | {"flat": []}, (), ("own",),
+         "flat frames and a ladder of flats (at least 3 exposure times)"),
+    ],
+)  # fmt: skip
+def test_frames_that_would_decide_are_those_that_are_missing(
+    frames: dict[str, Any], arrays: tuple[ArrayRecord, ...], names: tuple[str, ...], words: str
+) -> None:
+    assert deciding(contents(None, frames=frames, arrays=arrays), names) == words
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_effects_that_are_not_told_apart_are_named_with_what_would_decide() -> None:
+    cause = a_cause(not_told_apart_from=["ipc", "mine"])
+    section = diagnosis(contents(a_diagnosis(causes=(cause,)), frames={"dark": []}))
+    assert table(section, "Causes").rows[0][-1] == "ipc or mine"
+    words = (
+        "The data do not tell it apart from crosstalk (ipc) or mine. What would decide: a second "
+    )
+    assert words in text_of(section)
+
+
+def test_all_effects_are_known_to_those_words() -> None:
+    assert set(diagnosis_words._DECIDING) == set(effects())
+
+
+# Places of curves
+
+
+def test_names_of_places_are_those_of_the_battery() -> None:
+    def name(dy: int, dx: int) -> str:
+        parts = [
+            f"{axis}{'+' if d > 0 else '−'}{abs(d)}" for axis, d in (("x", dx), ("y", dy)) if d
+        ]
+        return " ".join(parts)
+
+    curve = {"x_label": "neighbour", "x": list(range(len(STEPS)))}
+    assert places(curve) == [name(*step) for step in STEPS]
+    limits = [*(-x for x in OUTLIERS), *OUTLIERS]
+    outliers = places({"x_label": "sigma, low then high", "x": limits})
+    assert outliers == [f"{v:+.0f}".replace("-", "−") for v in limits]
+    assert set(diagnosis_words._AXES) <= {s.x_label for s in battery().values()}
+    assert diagnosis_words.DETECTOR == DETECTOR
+
+
+@pytest.mark.parametrize(
+    ("label", "x", "words"),
+    [
+        ("cycles a pixel", [0.25, 0.5], "periods of 2.0 px"),
+        ("cycles a frame", [0.1, 0.4], "periods of 2.5 frames"),
+        ("period, rows", [2.0, 4.0], "every 4 rows"),
+        ("frames before", [1.0, -2.0], "frame t+2"),
+        ("harmonic (cosine, sine)", [1.0, 2.25], "sin 2ψ"),
+        ("quantile", [0.5, 0.999], "99.9 % quantile"),
+        ("left, right, above, below", [0.0, 1.0], "neighbour x+1"),
+        ("", [0.0, 1.0], "1"),
+        ("own label", [0.0, 0.125], "own label 0.125"),
+    ],
+)
+def test_places_are_in_words(label: str, x: list[float], words: str) -> None:
+    assert place({"x_label": label, "x": x}, 1) == words
+
+
+# Figures
+
+
+def picture(figure: Any) -> Any:
+    return np.asarray(Image.open(io.BytesIO(png(figure))).convert("RGB"))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"values": 1, "x": [0.3], "x_label": "cycles a pixel"},
+        {"values": 5, "x": [0.01, 0.02, 0.1, 0.2, 0.5], "x_label": "cycles a frame"},
+        {"values": 40},
+        {"kind": "linear", "sigma": -9.0, "unit": "px"},
+        {"sigma": 1e6, "unit": NASTY},
+        {"title": NASTY * 3, "of": NASTY, "x_label": NASTY},
+        {"measured": [1.0, math.nan], "z": [0.0, math.inf]},
+        {"measured": [0.0, 0.0], "kind": "linear"},
+    ],
+)
+@pytest.mark.filterwarnings("ignore:Glyph:UserWarning")
+def test_any_curve_becomes_a_picture(changes: dict[str, Any]) -> None:
+    drawn = picture(curves_figure([a_curve(**changes)]))
+    assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 20
+
+
+@pytest.mark.filterwarnings("ignore:Glyph:UserWarning")
+def test_bars_are_as_long_as_their_shares() -> None:
+    def lengths(before: float, after: float) -> tuple[int, int]:
+        bars = [Bar("all", 1.0, 0.0), Bar(NASTY, before, after)]
+        drawn = picture(gap_figure(bars, [Closed(NASTY, 0.5, (0.4, 0.6), 0.2)])).astype(int)
+        left = drawn[:, : drawn.shape[1] // 2]
+        half = left[left.shape[0] // 3 :][: left.shape[0] // 3]  # the lower row of bars
+        red, blue = half[..., 0] - half[..., 2] > 40, half[..., 2] - half[..., 0] > 90
+        return int(red.sum(axis=1).max()), int(blue.sum(axis=1).max())
+
+    whole = lengths(1.0, 1.0)
+    red, blue = lengths(0.5, 0.25)
+    assert red / whole[0] == pytest.approx(0.5, abs=0.04)
+    assert blue / whole[1] == pytest.approx(0.25, abs=0.04)
+
+
+@pytest.mark.filterwarnings("ignore:Glyph:UserWarning")
+def test_hostile_text_is_shown_as_it_is_and_does_nothing() -> None:
+    cause = a_cause(
+        NASTY, title=NASTY, why=NASTY, not_told_apart_from=[NASTY],
+        parameters={NASTY: NASTY, "list": [{NASTY: NASTY}]},
+    )  # fmt: skip
+    curves = (a_curve("lines", title=NASTY), a_curve("b", of=NASTY, domain=NASTY, x_label=NASTY))
+    found = a_diagnosis(
+        causes=(cause,), curves=curves,
+        domains={NASTY: [0.6, 0.0], "noise": [0.4, 0.0]},
+        absolute=[{"quantity": NASTY, "unit": NASTY, "measured": 1.0, "simulated": 2.0,
+                   "after": 1.0}],
+    )  # fmt: skip
+    found.facts["candidates"][0] |= {"effect": NASTY, "rejected_because": NASTY}
+    page = render(contents(found))
+    assert "<script" not in page
+    shown = html.unescape(re.sub(r"<[^>]*>", " ", page))
+    assert shown.count("<script>alert('") > 8
+    assert 'alt="What gave away &lt;script&gt;' in page

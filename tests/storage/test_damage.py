@@ -1,0 +1,202 @@
+"""Damaged artefacts: seen before they are used, and made again by their own command."""
+
+import shutil
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pixcal.model.errors import DamagedError
+from pixcal.storage import artefact
+from pixcal.storage.artefact import (
+    MANIFEST,
+    build,
+    damage_noted,
+    lock,
+    read_json,
+    read_manifest,
+    require,
+    up_to_date,
+    write_json,
+)
+from pixcal.storage.cube import ArrayReader, create_group, write_array
+from pixcal.storage.products import is_whole, read_map, write_map
+
+
+def complete(run: Path, stage: str = "fit") -> str:
+    """An artefact with a file, an array in a group, and a list of numbers in its manifest."""
+    with lock(run), build(run, stage, 1, {"limits": (1.5, 1e-7)}, {"reduce": "key"}) as made:
+        write_json(made.folder / "facts.json", {"name": "Übung"})
+        create_group(made.folder / "maps.zarr")
+        write_array(made.folder / "maps.zarr" / "delta", np.arange(6.0).reshape(2, 3), dims="yx")
+        create_group(made.scratch)
+        made.note("a step")
+    return made.key
+
+
+def flip(file: Path, bit: int) -> None:
+    body = bytearray(file.read_bytes())
+    body[bit >> 3] ^= 1 << (bit & 7)
+    file.unlink()
+    file.write_bytes(body)
+
+
+def test_every_flipped_bit_of_a_manifest_is_seen(tmp_path: Path) -> None:
+    complete(tmp_path)
+    file = tmp_path / "fit" / MANIFEST
+    body = file.read_bytes()
+    for bit in range(8 * len(body)):
+        flip(file, bit)
+        with pytest.raises(DamagedError, match=MANIFEST):
+            read_manifest(tmp_path / "fit")
+        file.write_bytes(body)
+    assert read_manifest(tmp_path / "fit") is not None
+
+
+def test_a_manifest_of_an_earlier_version_has_no_seal(tmp_path: Path) -> None:
+    key = complete(tmp_path)
+    file = tmp_path / "fit" / MANIFEST
+    data = read_json(file)
+    del data["seal"], data["files"]
+    write_json(file, data)
+    assert require(tmp_path, "fit", 1).key == key
+    assert up_to_date(tmp_path, "fit", key) is not None
+
+
+FILES = (
+    MANIFEST,
+    "facts.json",
+    "maps.zarr/zarr.json",
+    "maps.zarr/delta/zarr.json",
+    "maps.zarr/delta/chunks.npy",
+)
+
+
+@pytest.mark.parametrize("damage", ["flipped", "missing", "cut", "empty"])
+@pytest.mark.parametrize("name", FILES)
+def test_what_is_no_chunk_is_named_with_the_command_that_mends_it(
+    tmp_path: Path, name: str, damage: str
+) -> None:
+    key = complete(tmp_path)
+    assert up_to_date(tmp_path, "fit", key) is not None
+    file = tmp_path / "fit" / name
+    if damage == "flipped":
+        flip(file, 8 * (file.stat().st_size // 2))
+    elif damage == "missing":
+        file.unlink()
+    else:
+        file.write_bytes(file.read_bytes()[: 9 * (damage == "cut")])
+    assert up_to_date(tmp_path, "fit", key) is None
+    if name != MANIFEST or damage != "missing":  # without a manifest there is no artefact
+        with pytest.raises(DamagedError, match=rf"{name}: .*; make it again with 'pixcal fit "):
+            require(tmp_path, "fit", 1)
+    assert complete(tmp_path) == key
+    assert up_to_date(tmp_path, "fit", key) is not None
+
+
+@pytest.mark.parametrize(
+    ("stage", "command"),
+    [
+        ("ingest", "pixcal ingest ACQ --out {}"),
+        ("reduce", "pixcal reduce {}"),
+        ("sweep", "pixcal fit {}"),
+    ],
+)
+@pytest.mark.parametrize("holds_the_lock", [True, False])
+def test_a_damaged_chunk_is_noted_and_its_command_told(
+    tmp_path: Path, stage: str, command: str, holds_the_lock: bool
+) -> None:
+    key = complete(tmp_path, stage)
+    chunk = tmp_path / stage / "maps.zarr/delta/c/0/0"
+    flip(chunk, 40)
+    assert up_to_date(tmp_path, stage, key) is not None, "nobody has read it"
+    with (
+        pytest.raises(DamagedError) as caught,
+        lock(tmp_path) if holds_the_lock else damage_noted(tmp_path),
+    ):
+        ArrayReader(chunk.parents[2]).read()
+    assert str(caught.value) == (
+        f"{chunk}: checksum does not match, the chunk was altered; "
+        f"make it again with '{command.format(tmp_path)}'"
+    )
+    assert up_to_date(tmp_path, stage, key) is None
+    with pytest.raises(DamagedError, match=r"c/0/0: damaged; make it again with"):
+        require(tmp_path, stage, 1)
+    complete(tmp_path, stage)
+    assert require(tmp_path, stage, 1).key == key
+    ArrayReader(chunk.parents[2]).verify()
+
+
+def test_a_note_that_is_damaged_itself_still_counts(tmp_path: Path) -> None:
+    key = complete(tmp_path)
+    (tmp_path / "fit" / artefact.DAMAGE).write_text("{")
+    assert up_to_date(tmp_path, "fit", key) is None
+    with pytest.raises(DamagedError, match=artefact.DAMAGE):
+        require(tmp_path, "fit", 1)
+
+
+def test_an_unfinished_build_that_is_damaged_is_begun_again(tmp_path: Path) -> None:
+    with suppress(KeyboardInterrupt), build(tmp_path, "fit", 1, {}, {}) as made:
+        write_array(made.folder / "delta", np.zeros(3), dims=("x",))
+        raise KeyboardInterrupt
+    flip(made.folder / "delta/c/0", 30)
+    with pytest.raises(DamagedError, match=r"c/0: .*; run the same command again"), lock(tmp_path):
+        ArrayReader(made.folder / "delta").read()
+    assert not made.folder.exists()
+
+
+def test_damage_elsewhere_is_not_noted(tmp_path: Path) -> None:
+    key = complete(tmp_path / "run")
+    complete(tmp_path / "run", "fitter")
+    with pytest.raises(DamagedError), lock(tmp_path / "run"):
+        raise DamagedError("x", tmp_path / "run" / "fitter" / "facts.json")
+    assert up_to_date(tmp_path / "run", "fit", key) is not None
+
+
+def test_a_kill_before_the_last_steps_leaves_nothing_behind(tmp_path: Path) -> None:
+    complete(tmp_path)
+    final, old = tmp_path / "fit", tmp_path / ".partial" / "fit-replaced"
+    assert sorted(f.name for f in final.iterdir()) == ["facts.json", MANIFEST, "maps.zarr"]
+    shutil.copytree(final, old)
+    (final / artefact.JOURNAL).touch()
+    (final / artefact.SCRATCH).mkdir()
+    with lock(tmp_path):
+        assert sorted(f.name for f in final.iterdir()) == ["facts.json", MANIFEST, "maps.zarr"]
+        assert not old.exists()
+
+
+# Products
+
+
+@pytest.fixture
+def product(tmp_path: Path) -> Path:
+    path = tmp_path / "delta_x.fits"
+    delta = np.arange(63, dtype=np.float32).reshape(7, 9)
+    mask = np.zeros((7, 9), np.uint8)
+    write_map(path, delta, delta / 9, mask, [("MODEL", "paraxial", "shape")], ["a line"])
+    return path
+
+
+def test_equal_maps_are_equal_files(product: Path) -> None:
+    data, sigma, mask, _ = read_map(product)
+    again = product.with_name("again.fits")
+    write_map(again, data, sigma, mask, [("MODEL", "paraxial", "shape")], ["a line"])
+    assert again.read_bytes() == product.read_bytes()
+
+
+def test_altered_and_cut_products_are_seen(product: Path) -> None:
+    body = product.read_bytes()
+    assert is_whole(product)
+    rng = np.random.default_rng(5)
+    for bit in rng.choice(8 * len(body), 300, replace=False):
+        flip(product, int(bit))
+        assert not is_whole(product)
+        with pytest.raises(DamagedError, match=r"delta_x\.fits"):
+            read_map(product)
+        product.write_bytes(body)
+    for size in range(0, len(body), 288):
+        product.write_bytes(body[:size])
+        assert not is_whole(product)
+    product.unlink()
+    assert not is_whole(product)
