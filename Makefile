@@ -11,7 +11,7 @@ SEED ?= 2001
 PIP := $(BIN)/python -m pip --quiet install --no-compile
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test lint smoke wheel-check docs doc-pages precision bench bench-full fuzz effect-pictures reproduce reproduce-full blind blind-full clean
+.PHONY: study-diagnose help install demo test lint smoke wheel-check docs doc-pages precision bench bench-full fuzz effect-pictures reproduce reproduce-full blind blind-full clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 17
@@ -73,6 +73,9 @@ fuzz: $(INSTALLED) ## bad input in thousands of cases, for docs/fuzz.md (half an
 
 torture: $(TOOLS) ## faults of all kinds done on purpose, for docs/torture.md (a quarter of an hour)
 	$(BIN)/python benchmarks/torture.py
+
+study-diagnose: $(INSTALLED) ## what the diagnosis claims by chance, and from which strength on it finds each effect (an hour)
+	$(BIN)/python benchmarks/study_diagnose.py
 
 effect-pictures: $(INSTALLED) ## what every effect does to the offsets, for docs/effects (two minutes)
 	$(BIN)/python benchmarks/effect_pictures.py

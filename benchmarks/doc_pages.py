@@ -99,7 +99,7 @@ def _content(name: str) -> str:
 def draw_tutorial(folder: Path) -> None:
     """Pictures of the sample acquisition, as the report has them."""
     with tempfile.TemporaryDirectory() as scratch:
-        run = pixcal.run(pixcal.sample_acquisition(), Path(scratch) / "demo")
+        run = pixcal.run(pixcal.sample_acquisition(), Path(scratch) / "demo", diagnosed=False)
         run.delta_x.picture().save(folder / "demo-delta_x.png")
         run.sets["vertical"].allan_picture().save(folder / "demo-allan.png")
 

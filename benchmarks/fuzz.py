@@ -5,11 +5,13 @@
 
 import argparse
 import faulthandler
+import os
 import re
 import resource
 import sys
 import time
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 
 from fuzzing.kinds import KINDS
@@ -28,8 +30,10 @@ def template(message: str) -> str:
 def try_kind(kind: Kind, numbers: range, messages: Counter[str]) -> Counter[str]:
     """Outcomes of some cases of a kind; failures are printed as they come."""
     found: Counter[str] = Counter()
+    stderr = os.fdopen(os.dup(2), "w")
     for number in numbers:
-        faulthandler.dump_traceback_later(3 * SECONDS, exit=True)  # for what no signal interrupts
+        # For what no signal interrupts.
+        faulthandler.dump_traceback_later(3 * SECONDS, exit=True, file=stderr)
         verdict = judged(kind, number)
         found[verdict.outcome] += 1
         if verdict.outcome == "failed":
@@ -37,6 +41,7 @@ def try_kind(kind: Kind, numbers: range, messages: Counter[str]) -> Counter[str]
         elif verdict.why:
             messages[template(verdict.why)] += 1
     faulthandler.cancel_dump_traceback_later()
+    stderr.close()
     return found
 
 
@@ -46,16 +51,23 @@ def row(title: str, found: Counter[str]) -> str:
     return f"| {title} | " + " | ".join(map(str, numbers)) + " |"
 
 
-def write_table(rows: list[str]) -> None:
-    """Replace the rows of the table in the documentation."""
+def write_table(tried: Mapping[str, Counter[str]]) -> None:
+    """Put the outcomes of some kinds, by title, into the table of the documentation."""
     text = PAGE.read_text(encoding="utf-8")
-    head = re.search(r"^\| kind of input .*\n\|[-|]+\|\n", text, re.MULTILINE)
-    assert head is not None, PAGE
-    rest = text[head.end() :].lstrip("\n")
-    while rest.startswith("|"):
-        rest = rest.partition("\n")[2]
-    table = "\n".join(rows)
-    PAGE.write_text(f"{text[: head.end()]}{table}\n\n{rest.lstrip()}", encoding="utf-8")
+    head, table, rest = re.split(
+        r"(?<=\|---\|---\|---\|---\|---\|\n)((?:\|.*\n)*)", text, maxsplit=1
+    )
+    outcomes: dict[str, Counter[str]] = {}
+    for line in table.splitlines():
+        title, _, refused, truthful, failed = line.strip("| ").split(" | ")
+        numbers = {"refused": refused, "truthful": truthful, "failed": failed}
+        outcomes[title] = Counter({name: int(number) for name, number in numbers.items()})
+    outcomes |= tried
+    known = [kind.title for kind in KINDS.values() if kind.title in outcomes]
+    rows = [row(title, outcomes[title]) for title in known]
+    total = sum((outcomes[title] for title in known), Counter())
+    table = "\n".join([*rows, row("all", total)])
+    PAGE.write_text(f"{head}{table}\n{rest}", encoding="utf-8")
 
 
 def main() -> int:
@@ -68,22 +80,22 @@ def main() -> int:
     parser.add_argument("--write", action="store_true", help="write the table of docs/fuzz.md")
     asked = parser.parse_args()
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
-    rows, messages, total = [], Counter[str](), Counter[str]()
+    messages, tried = Counter[str](), {}
     for name in asked.kind or KINDS:
         begin = time.monotonic()
         numbers = range(asked.cases or KINDS[name].cases)
         if asked.case is not None:
             numbers = range(asked.case, asked.case + 1)
         found = try_kind(KINDS[name], numbers, messages)
-        total += found
-        rows.append(row(KINDS[name].title, found))
-        print(f"{rows[-1]} {time.monotonic() - begin:.1f} s", flush=True)
-    rows.append(row("all", total))
-    print(rows[-1])
+        tried[KINDS[name].title] = found
+        took = time.monotonic() - begin
+        print(f"{row(KINDS[name].title, found)} {took:.1f} s", flush=True)
+    total = sum(tried.values(), Counter())
+    print(row("all", total))
     if asked.messages:
         print(*(f"{count:6d} {text}" for text, count in sorted(messages.items())), sep="\n")
     if asked.write:
-        write_table(rows)
+        write_table(tried)
     return int(total["failed"] > 0)
 
 

@@ -49,6 +49,9 @@ def zero(file: Path, rng: random.Random) -> None:
     _replace(file, bytes(file.stat().st_size))
 
 
+_DONE = {remove: "removed", cut: "cut short", zero: "turned to zeros"}
+
+
 def _replace(file: Path, body: bytes) -> None:
     file.unlink()  # a hard link: the reference keeps its own
     file.write_bytes(body)
@@ -69,7 +72,7 @@ def metadata(bench: Bench, artefact: str, damage: Damage, times: int | None, see
     times : int, optional
         How many of the files; None for each.
     """
-    outcome = Outcome(f"`{artefact}`: {_name(damage)} of a file that is no chunk")
+    outcome = Outcome(_fault(damage, f"a file of `{artefact}` that is no chunk"))
     rng = random.Random(f"{artefact} {_name(damage)} {seed}")
     for name in _some(stored(bench, artefact, chunks=False), times, rng):
         run = _ready(bench, artefact)
@@ -88,7 +91,7 @@ def metadata(bench: Bench, artefact: str, damage: Damage, times: int | None, see
 
 def chunks(bench: Bench, artefact: str, damage: Damage, times: int | None, seed: int) -> Outcome:
     """Damage chunks: refused when they are read, never taken for anything else."""
-    outcome = Outcome(f"`{artefact}`: {_name(damage)} of a chunk")
+    outcome = Outcome(_fault(damage, f"a chunk of `{artefact}`"))
     rng = random.Random(f"{artefact} {_name(damage)} {seed}")
     for name in _some(stored(bench, artefact, chunks=True), times, rng):
         run = _ready(bench, artefact)
@@ -109,7 +112,7 @@ def chunks(bench: Bench, artefact: str, damage: Damage, times: int | None, seed:
 
 def products(bench: Bench, damage: Damage, times: int, seed: int) -> Outcome:
     """Damage the FITS maps: the fit, up to date as it is, writes them again."""
-    outcome = Outcome(f"`products`: {_name(damage)} of a map")
+    outcome = Outcome(_fault(damage, "a FITS map of the products"))
     rng = random.Random(f"products {_name(damage)} {seed}")
     for number in range(times):
         run = bench.copy("damaged", "ingest", "reduce", "sweep", "fit", "products")
@@ -122,7 +125,7 @@ def products(bench: Bench, damage: Damage, times: int, seed: int) -> Outcome:
 
 def unfinished(bench: Bench, stage: str, damage: Damage, times: int, seed: int) -> Outcome:
     """Kill a command, damage what it has left half-done, and go on."""
-    outcome = Outcome(f"`{stage}` killed, then {_name(damage)} of a file that it left half-done")
+    outcome = Outcome(_fault(damage, f"a file that a killed `{stage}` left half-done"))
     rng = random.Random(f"unfinished {stage} {_name(damage)} {seed}")
     while outcome.tried < times:
         run = bench.copy("unfinished", *STAGES[: STAGES.index(stage)])
@@ -183,6 +186,12 @@ def _unaffected(bench: Bench, run: Path, artefact: str) -> None:
 
 def _some(names: list[str], times: int | None, rng: random.Random) -> list[str]:
     return names if times is None else rng.sample(names, min(times, len(names)))
+
+
+def _fault(damage: Damage, what: str) -> str:
+    if damage is flip_a_bit:
+        return f"a bit flipped in {what}"
+    return f"{what} {_DONE[damage]}"
 
 
 def _name(damage: Damage) -> str:

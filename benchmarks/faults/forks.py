@@ -115,6 +115,8 @@ def _main(args: Sequence[str], out: Path, err: Path, before: Callable[[], None] 
         os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT), number)
     sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
     sys.stderr = open(2, "w", closefd=False, buffering=1)  # noqa: SIM115
+    # A shell that starts us in the background may have it ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     from pixcal_cli.main import main
 
     if before is not None:

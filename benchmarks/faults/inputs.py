@@ -38,12 +38,17 @@ def replace(file: Path, rng: random.Random) -> None:
     other.replace(file)
 
 
-CHANGES = (vanish, cut, write_into, replace)
+CHANGES = {
+    vanish: "vanishes",
+    cut: "is cut short",
+    write_into: "is overwritten in part",
+    replace: "is replaced",
+}
 
 
 def change(bench: Bench, how: Change, times: int, seed: int) -> Outcome:
     """Change a file of the acquisition at a random moment of ingest, then put it back."""
-    outcome = Outcome(f"ingest: {how.__name__.replace('_', ' ')} an input file while it runs")
+    outcome = Outcome(f"an input file {CHANGES[how]} while `ingest` runs")
     rng = random.Random(f"{how.__name__} {seed}")
     acquisition = bench.folder / "changing"
     files = [f.relative_to(bench.acquisition) for f in sorted(bench.acquisition.rglob("*.fits"))]

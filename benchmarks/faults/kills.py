@@ -40,8 +40,10 @@ def _disturbed(
 ) -> Iterator[Ended]:
     rng = random.Random(f"{stage} {seed}")
     earlier = STAGES[: STAGES.index(stage)]
-    disturbed, longest = 0, bench.seconds[stage]
+    begun, disturbed, longest = 0, 0, bench.seconds[stage]
     while disturbed < times:
+        begun += 1
+        assert begun < 10 * times, "the signal has no effect"
         run = bench.copy(f"{stage}-{number.name}", *earlier)
         for _ in range(6):
             command = Command(bench.command(stage, run))

@@ -7,7 +7,7 @@ import numpy as np
 from fuzzing.laws import Answer, Broken, Case, Kind, calibrate
 from fuzzing.night import Night
 
-CASES = 60
+CASES = 150
 """Of each kind: every one is calibrated."""
 
 INTEGERS = ("uint16", "int32", "uint8", "int16")
@@ -49,18 +49,24 @@ def _holes(case: Case) -> Answer:
 
 
 def _saturated(case: Case) -> Answer:
-    """Light beyond the converter or a declared level, in some pixels, frames, or all."""
-    level = 10 ** case.rng.uniform(4.3, 5.5)
+    """Light beyond the converter or a declared level: in some pixels, frames, samples, or all."""
+    level = 10 ** case.rng.uniform(4.3, 5.5) if case.rng.random() < 0.3 else 2e4
     night = Night(case.rng, _window(case), level=level, gain=float(case.pick(1.0, 0.5, 4.0)))
-    if case.rng.random() < 0.5:
-        top = 10 ** case.rng.uniform(2, 5)
-        night.described["detector"]["saturation_adu"] = float(top)
+    top = 65535.0
+    if case.rng.random() < 0.3:
+        top = float(10 ** case.rng.uniform(2, 5))
+        night.described["detector"]["saturation_adu"] = top
         night.frames = {name: np.minimum(f, top) for name, f in night.frames.items()}
     for name in night.vectors:
         frames = night.frames[name]
-        some = case.rng.random(len(frames)) < float(case.pick(0.0, 0.1, 0.9))
-        frames[some] = 65535
-        night.spoilt |= (frames >= 65535).all(axis=0)
+        shape = {
+            "frames": (len(frames), 1, 1),
+            "pixels": (1, *night.shape),
+            "samples": frames.shape,
+        }[str(case.pick("frames", "pixels", "samples"))]
+        some = case.rng.random(shape) < float(case.pick(0.0, 1e-3, 0.05, 0.5, 1.0))
+        frames[np.broadcast_to(some, frames.shape)] = max(top, 65535.0)
+        night.spoilt |= (frames >= min(top, 65535.0)).all(axis=0)
     return _answer(case, night)
 
 

@@ -2,6 +2,7 @@
 
 import atexit
 import io
+import os
 import re
 import shutil
 import signal
@@ -13,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory, mkdtemp
+from tempfile import TemporaryDirectory, TemporaryFile, mkdtemp
 from types import FrameType
 from typing import Literal
 
@@ -180,13 +181,13 @@ def pixcal(*args: str | Path, names: Sequence[str] = ()) -> int:
     out = io.TextIOWrapper(io.BytesIO(), "utf-8", "strict")
     err = io.TextIOWrapper(io.BytesIO(), "utf-8", "backslashreplace")
     words = [str(arg) for arg in args]
-    with redirect_stdout(out), redirect_stderr(err):
+    with below_python() as below, redirect_stdout(out), redirect_stderr(err):
         try:
             code = invoke(words)
         except SystemExit as error:
             raise Broken(f"{_line(words)}: left by SystemExit({error.code})") from error
         out.flush()
-    said = told(err)
+    said = told(err) + below[0]
     if code == 0:
         if said:
             raise Broken(f"{_line(words)}: success, and on stderr {said[:200]!r}")
@@ -196,6 +197,22 @@ def pixcal(*args: str | Path, names: Sequence[str] = ()) -> int:
     check_line(said, names, _line(words))
     LAST_MESSAGE[0] = said.strip()
     return 2
+
+
+@contextmanager
+def below_python() -> Iterator[list[str]]:
+    """What libraries write to the process's own stderr, past Python; a list, filled at the end."""
+    found: list[str] = []
+    kept = os.dup(2)
+    with TemporaryFile() as file:
+        os.dup2(file.fileno(), 2)
+        try:
+            yield found
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            file.seek(0)
+            found.append(file.read().decode("utf-8", "replace"))
 
 
 def told(stream: io.TextIOWrapper) -> str:

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import signal
 import sys
 import traceback
 import warnings
@@ -143,6 +144,8 @@ def main() -> None:
         # Libraries warn of what pixcal checks itself; what a user must know is in the results.
         warnings.simplefilter("ignore")
     code = invoke(sys.argv[1:])
+    # Nothing is left to be interrupted, and the interpreter would complain as it goes.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         sys.stdout.flush()
     except OSError:

@@ -96,6 +96,49 @@ def show_fit(run: Path) -> None:
     show_table(header, rows)
 
 
+def show_correction(run: Path) -> None:
+    """Print what was done about each effect of a diagnosis, and what the maps gained."""
+    found = read_json(run / "corrected" / "correction.json")
+    if not found["effects"]:
+        click.echo(
+            f"  {found['verdict']}: the diagnosis found no effect; the maps of the fit stand"
+        )
+        return
+    rows = [(e["effect"], e["treatment"], e["why"]) for e in found["effects"]]
+    show_table(("effect", "treatment", "why"), rows)
+    if not found["outputs"]:
+        click.echo("  nothing to undo: the maps of the fit stand")
+        return
+    header = ("set", "moved px", "at most", "left px", "sigma px", "chi2", "every 4 rows px")
+    show_table(header, [_gain_row(name, own) for name, own in found["sets"].items()])
+    show_notes(["'left': what the errors of the effects' parameters leave in the offsets"])
+    for pair in found["pairs"]:
+        expected = _number(pair["after_expected_px"], 3)
+        apart = _before_after(pair["before_px"], pair["after_px"])
+        click.echo(f"  {' and '.join(pair['sets'])} apart: {apart} px (noise {expected} px)")
+    if not found["pairs"]:
+        show_notes(["one set along each axis: a second baseline would measure the gain"])
+
+
+def _gain_row(name: str, own: Mapping[str, Any]) -> tuple[str, ...]:
+    """What moved in a set, and what was before and after."""
+    left = [error for error in own["parameter_error_px"].values() if error is not None]
+    rows = own["rows"]
+    return (
+        name,
+        _number(own["change"]["rms_px"], 3),
+        _number(own["change"]["max_px"], 3),
+        _number(math.hypot(*left) if left else None, 3),
+        _before_after(own["sigma_median_px"]["before"], own["sigma_median_px"]["after"]),
+        _before_after(own["chi2_reduced"]["before"], own["chi2_reduced"]["after"], 4),
+        "-" if rows is None else _before_after(rows["before_px"], rows["after_px"]),
+    )
+
+
+def _before_after(before: float | None, after: float | None, digits: int = 3) -> str:
+    return f"{_number(before, digits)} → {_number(after, digits)}"
+
+
 def show_allan(run: Path) -> None:
     """Print one row for each fringe set and region: how the error falls with more frames."""
     rows, notes = [], []

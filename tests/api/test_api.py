@@ -50,7 +50,7 @@ def acquired(make_bench: Callable[..., Any], tmp_path_factory: pytest.TempPathFa
     bench = make_bench(shape=(61, 67), frames=70, response=0.01)
     folder = tmp_path_factory.mktemp("api")
     bench.write(folder / "acquisition")
-    return bench, pixcal.run(folder / "acquisition", folder / "run", runtime=SYNC)
+    return bench, pixcal.run(folder / "acquisition", folder / "run", diagnosed=False, runtime=SYNC)
 
 
 def arrays_of(run: pixcal.Run) -> dict[str, NDArray[Any]]:

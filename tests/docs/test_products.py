@@ -7,7 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import xarray
 from astropy.io import fits
 
 import pixcal
@@ -25,7 +27,9 @@ def run(make_bench: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory
     """A run with a saturated pixel."""
     folder = tmp_path_factory.mktemp("products")
     make_bench(shape=(37, 41), frames=70).write(folder / "acquisition")
-    return pixcal.run(folder / "acquisition", folder / "run", runtime=pixcal.Runtime("sync"))
+    return pixcal.run(
+        folder / "acquisition", folder / "run", diagnosed=False, runtime=pixcal.Runtime("sync")
+    )
 
 
 def section(title: str) -> str:
@@ -59,6 +63,16 @@ def test_every_keyword_and_image_is_told(run: pixcal.Run) -> None:
 def test_every_flag_is_told() -> None:
     for flag in PixelFlag:
         assert f"| {flag.value} | {str(flag.name).lower()} |" in PAGE
+
+
+def test_xarray_opens_the_fit(run: pixcal.Run) -> None:
+    maps = xarray.open_zarr(run.path / "fit" / "fit.zarr", consolidated=False)
+    for name in ("delta_x", "delta_y"):
+        np.testing.assert_array_equal(maps[name], run.maps[name].delta)
+    for name, fringes in run.sets.items():
+        found = xarray.open_zarr(run.path / "fit" / "fit.zarr" / name, consolidated=False)
+        np.testing.assert_array_equal(found.iota, fringes.iota)
+        assert found.batch_delta.dims == ("batch", "y", "x")
 
 
 def test_verifiers_find_nothing(run: pixcal.Run) -> None:

@@ -1,5 +1,6 @@
 """Some cases of every kind of bad input, and the laws that judge them (docs/fuzz.md)."""
 
+import os
 import time
 from collections import Counter
 from pathlib import Path
@@ -73,13 +74,14 @@ def fails(error: BaseException) -> Any:
     ("body", "told"),
     [
         (fails(RuntimeError("x")), "exit code 1"),
-        (fails(SystemExit(2)), "exit"),
+        (fails(SystemExit(2)), "left by"),
         (fails(InputError("a.yaml: gain; mend it\N{BELL}")), None),
         (fails(InputError("b.yaml: gain; mend it")), "names none of a.yaml"),
         (fails(InputError("a.yaml: gain")), "what mends it"),
         (fails(InputError("a.yaml: Traceback; mend it")), "Traceback"),
         (fails(InputError("a.yaml: " + "gain; mend it " * 60)), "characters"),
         (lambda: click.echo("odd", err=True), "on stderr"),
+        (lambda: os.write(2, b"from below") and None, "on stderr"),
         (fails(InputError("a.yaml: gain; mend it")), None),
     ],
 )

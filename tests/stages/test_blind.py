@@ -377,7 +377,7 @@ def test_a_score_counts_and_is_shown(tmp_path: Path) -> None:
     assert first["interval"] == pytest.approx([0.0126, 0.9874], abs=1e-4)
     assert found["confusion"] == {
         "lag": {"ipc": 1, "lag": 1},
-        "nothing": {"failed": 1, "no gap": 1},
+        "nothing": {"failed": 1, "nothing": 1},
     }
     about = {"purpose": "development", "size": "small", "seed": 3, "notes": []}
     text = as_markdown(found | about)

@@ -3,6 +3,7 @@
 Each imports its stage when it is called, as the shell commands do: to open a run is quick.
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ from pixcal.api.opened import Run, open_run
 from pixcal.api.paths import StrPath
 from pixcal.engine.run import Runtime
 from pixcal.model.config import parse
+from pixcal.model.errors import InputError
 from pixcal.storage.artefact import read_json
 
 C = TypeVar("C")
@@ -36,6 +38,7 @@ def run(
     gain: Literal["declared", "measured"] = "declared",
     model: str = "auto",
     cubes: StrPath | None = None,
+    diagnosed: bool = True,
     runtime: Runtime | None = None,
 ) -> Run:
     """Do all steps, from an acquisition to the report, as ``pixcal run``.
@@ -54,6 +57,8 @@ def run(
         Shape of the fringes: ``paraxial``, ``hyperbolic``, or ``auto``, by evidence.
     cubes : str or path, optional
         Folder or URL for the cubes.
+    diagnosed : bool
+        Tell where the frames differ from a simulation of the bench, and why: takes the longest.
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -72,6 +77,12 @@ def run(
     if reduced.acquisition.frames.fringes:
         fit(out, model=model, runtime=runtime)
         allan(out, runtime=runtime)
+    if diagnosed:
+        try:
+            diagnose(out, runtime=runtime)
+        except InputError as error:
+            # The maps are good without it.
+            warnings.warn(f"not diagnosed: {error}", stacklevel=2)
     return write_report(out, runtime=runtime)
 
 
@@ -168,6 +179,8 @@ def fit(
     model: str = "auto",
     batch_frames: int | None = None,
     chi2_limit: float = 1.5,
+    with_diagnosis: bool = False,
+    own: Sequence[StrPath] = (),
     runtime: Runtime | None = None,
 ) -> Run:
     """Fit the fringes and write the maps of the offsets.
@@ -181,19 +194,29 @@ def fit(
         Frames of a batch of the Allan deviation; 500, or fewer in a short run.
     chi2_limit : float
         Pixels with a reduced chi-square above are flagged ``BAD_FIT``.
+    with_diagnosis : bool
+        Write maps without the effects that `diagnose` found as well, and what they gained.
+    own : sequence of str or path
+        Files of effects of one's own that the diagnosis found.
     runtime : Runtime, optional
 
     Raises
     ------
     InputError
-        If the run was not reduced, or holds no fringes that can be fitted.
+        If the run was not reduced, or holds no fringes that can be fitted; with a diagnosis, if
+        there is none.
     """
+    from pixcal.stages import correct
     from pixcal.stages import fit as stage
 
     config = _config(
         stage.Config, "fit", model=model, batch_frames=batch_frames, chi2_limit=chi2_limit
     )
-    stage.run(Path(run), config, runtime or Runtime())
+    if with_diagnosis:
+        files = tuple(Path(file) for file in own)
+        correct.run(Path(run), correct.Config(files, config), runtime or Runtime())
+    else:
+        stage.run(Path(run), config, runtime or Runtime())
     return open_run(run)
 
 

@@ -22,7 +22,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 
-FORMATS = {"ingest": 1, "reduce": 1, "fit": 1, "allan": 1, "report": 1}
+FORMATS = {"ingest": 1, "reduce": 1, "fit": 1, "allan": 1, "diagnose": 1, "report": 1}
 """Formats of the artefacts that are read here."""
 DETECTOR_MAPS = ("bias", "dark_rate", "flat", "read_noise", "mask")
 SERIES = ("time", "B", "A", "phi", "dkx", "dky")
@@ -123,6 +123,13 @@ class Run:
     def allan(self) -> dict[str, Any]:
         """Contents of ``allan.json``."""
         found: dict[str, Any] = self._read("allan")
+        return found
+
+    @cached_property
+    def diagnosis(self) -> dict[str, Any]:
+        """Contents of ``diagnosis.json``: verdict, causes, what is left of the gap."""
+        require(self.path, "diagnose", FORMATS["diagnose"])
+        found: dict[str, Any] = read_json(self.path / "diagnose" / "diagnosis.json")
         return found
 
     @cached_property

@@ -14,7 +14,7 @@ from pixcal.simulation.effect import Effect, Stage
 
 STEPS = ("states", "detector", "light", "photons", "charge", "signal", "readout")
 """Steps of the exposure: each gives back what it is given first, changed."""
-OTHERS = ("__post_init__", "check", "predict", "undo")
+OTHERS = ("__post_init__", "check", "predict", "undo", "undo_samples", "noise_factor")
 MOST_AROUND = 4096
 """Rows around a piece, or frames before one, that an effect may ask for."""
 

@@ -20,6 +20,8 @@ LEVEL = 5e4
 """Electrons at which powers of the level are one."""
 
 _DISAGREE = 4.0
+_TURNS = 4
+"""Of the inverse: each gains the size of the effect, a few per cent."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +83,18 @@ class BrighterFatter(Effect):
             e-; the same sum.
         """
         found = charge
-        for _ in range(4):  # each turn gains the size of the effect, a few per cent
+        for _ in range(_TURNS):
             found = charge - moved_charge(found, self._shifts)
         return found
+
+    def undo_samples(self, charge: F32) -> F32:
+        """As in `Effect.undo_samples`."""
+        return np.stack([self.restored(frame) for frame in charge])
+
+    @property
+    def undo_halo(self) -> int:
+        """As in `Effect.undo_halo`."""
+        return _TURNS * (REACH + 1)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:

@@ -102,6 +102,10 @@ class Nonlinearity(Effect):
                 break
         return np.asarray(u * self.level_e, np.float32)
 
+    def undo_samples(self, charge: F32) -> F32:
+        """As in `Effect.undo_samples`."""
+        return self.linearised(charge)
+
     def signal(self, signal: F32, shot: Shot) -> F32:
         """As in `Effect.signal`."""
         return self.response(signal)

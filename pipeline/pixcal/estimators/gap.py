@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri_exp
 from scipy.stats import t as student
 
-from pixcal.estimators.battery import Curve, Key, battery
+from pixcal.estimators.battery import Curve, Key, statistic_named
 
 F64 = NDArray[np.float64]
 Curves = Mapping[Key, Curve]
@@ -58,7 +58,7 @@ class Reference:
         values = {}
         for key in keys:
             stack = np.stack([s[key].value for s in simulated])
-            power = battery()[key[0]].kind == "power"
+            power = statistic_named(key[0]).kind == "power"
             usual[key] = np.median(stack, axis=0) if power else None
             own = usual[key]
             values[key] = stack if own is None else scaled(stack, own)
@@ -98,7 +98,7 @@ def expect_nominal(reference: Reference) -> Expectation:
     mean, variance, noise, count = {}, {}, {}, 2
     for key, values in reference.values.items():
         count = len(values)
-        noise[key] = np.maximum(_variance(values), battery()[key[0]].floor ** 2)
+        noise[key] = np.maximum(_variance(values), statistic_named(key[0]).floor ** 2)
         mean[key] = values.mean(axis=0)
         variance[key] = noise[key] * (1 + 1 / count)
     return Expectation(mean, variance, noise, count - 1)
@@ -231,7 +231,7 @@ class Gap:
     def of_domain(self, domain: str) -> tuple[float, float]:
         """Weight of a domain, and of what is left of it, over all of the gap at the start."""
         whole = sum(self.weights.values()) or 1.0
-        own = [k for k in self.left if battery()[k[0]].domain == domain]
+        own = [k for k in self.left if statistic_named(k[0]).domain == domain]
         return (
             sum(self.weights.get(k, 0.0) for k in own) / whole,
             sum(self.weights.get(k, 0.0) * self.left[k] for k in own) / whole,

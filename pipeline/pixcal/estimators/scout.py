@@ -275,13 +275,13 @@ class Scout:
         phasor = np.where(tile.good, theta[2] + 1j * theta[1], 0.0) / level
         smooth = smooth_phasor(np.asarray(phasor, complex), tile.good, self.k)
         away = np.abs(np.angle(phasor * smooth.map.conj()))[tile.good]
-        if not np.median(away) < FOLLOWS_RAD:
+        (kx, ky), (ny, nx) = smooth.k, tile.shape
+        turned = np.hypot((kx - self.k[0]) * nx, (ky - self.k[1]) * ny)
+        if not np.median(away) < FOLLOWS_RAD or turned > np.pi:
             raise InputError(
                 "no fringes found that the pixels follow; look at the frames, at the bias frames, "
                 "and at which files the set lists"
             )
-        kx, ky = smooth.k
-        ny, nx = tile.shape
         across = float(np.hypot(kx * nx, ky * ny)) / (2 * np.pi)
         if across < HONEST_FRINGES:
             raise InputError(

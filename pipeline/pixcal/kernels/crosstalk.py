@@ -26,7 +26,9 @@ STEPS = 60
 """Most steps of the inverse; each gains a factor of one over the shares that leave a pixel."""
 CONVERGED = 1e-13
 FILL_PX = 2.0
-"""Radius of the neighbourhood that stands in for a pixel without data, px."""
+"""Radius of the neighbourhood that stands in for a pixel without data, px,"""
+FILL_REACH = 16
+"""and how far it goes."""
 
 
 @dataclass(frozen=True)
@@ -230,7 +232,7 @@ def filled(theta: F64, k: tuple[float, float]) -> F64:
     carrier = np.exp(1j * (k[1] * np.arange(ny)[:, None] + k[0] * np.arange(nx)))
     iota = np.where(good, theta[0], 0.0)
     fringe = np.where(good, theta[2] + 1j * theta[1], 0.0) * carrier.conj()
-    around = {"sigma": FILL_PX, "mode": "constant", "truncate": 8.0}
+    around = {"sigma": FILL_PX, "mode": "constant", "truncate": FILL_REACH / FILL_PX}
     weight = np.maximum(gaussian_filter(good.astype(float), **around), 1e-300)
     smooth = gaussian_filter(fringe.real, **around) + 1j * gaussian_filter(fringe.imag, **around)
     smooth = smooth / weight * carrier

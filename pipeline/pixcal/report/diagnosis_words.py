@@ -167,7 +167,12 @@ _AXES = {
     ),
     "left, right, above, below": _Axis("neighbour", "neighbour {}", ("x−1", "x+1", "y−1", "y+1")),
     "rows, columns": _Axis("", "{}", ("rows", "columns")),
-    "offset, contrast, light, each pair": _Axis("maps", "{}", ("contrast", "light") * 20),
+    "cell of 4 × 4": _Axis(
+        "cell of the window",
+        "cell {}",
+        tuple(f"{row},{column}" for row in range(1, 5) for column in range(1, 5)),
+    ),
+    "contrast, light of each pair": _Axis("maps", "{}", ("contrast", "light") * 20),
     "term": _Axis(
         "contrast V, then intensity B",
         "{}",

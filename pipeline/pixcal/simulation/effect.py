@@ -193,6 +193,33 @@ class Effect:
         """Maps without the effect, from those with it; None where that is not possible."""
         return None
 
+    def undo_samples(self, charge: F32) -> F32 | None:
+        """Frames without the effect, where it is one of samples and not of maps.
+
+        Parameters
+        ----------
+        charge : (t, y, x) float32
+            e-, as collected: dark signal included, not divided by the flat. All finite.
+        """
+        return None
+
+    @property
+    def undo_halo(self) -> int:
+        """Pixels around a piece of the window that undoing the effect on it depends on."""
+        return 0
+
+    def noise_factor(self, charge: float, read_noise: float, maps: FringeMaps) -> F64:
+        """Error (y, x) of a pixel's phase after `undo` over that before.
+
+        Parameters
+        ----------
+        charge, read_noise : float
+            Mean signal and read noise, e-.
+        maps : FringeMaps
+            That are undone.
+        """
+        return np.ones(maps.theta.shape[1:])
+
 
 def _times(value: Any, factor: float) -> Any:
     return tuple(_times(v, factor) for v in value) if isinstance(value, tuple) else value * factor

@@ -105,7 +105,7 @@ def _fringes(
     centre = ((y[0] + y[1] - 1) / 2, (x[0] + x[1] - 1) / 2)
     g, dk = found.at(*centre)[frames], found.dk[frames]
     facts = read_json(run_dir / "fit" / "fit.json")["sets"][name]
-    theta = _theta(swept, part, found.reference)
+    theta = fitted_theta(swept, part, found.reference)
     mask = ArrayReader(fitted / "mask").read(y, x)
     good = (mask == 0) & np.isfinite(theta).all(axis=0)
     read = ArrayReader(source.folder / "read_variance").read(y, x).astype(float)
@@ -137,7 +137,7 @@ def _fringes(
     )
 
 
-def _theta(swept: Path, part: Part, reference: tuple[float, float]) -> F64:
+def fitted_theta(swept: Path, part: Part, reference: tuple[float, float]) -> F64:
     """Maps (iota, alpha sin psi, alpha cos psi) of a part, from those of the sweep."""
     y, x = part
     iota, alpha, phase = (

@@ -26,6 +26,11 @@ class ReducedSet:
 
     folder: Path
 
+    @property
+    def more_bytes(self) -> int:
+        """For each pixel, beyond its codes, while `codes` and `blocks` read a block of frames."""
+        return 0
+
     @cached_property
     def place(self) -> Place:
         """Where the set's arrays are: ``folder``, unless reduce was told to put cubes elsewhere."""

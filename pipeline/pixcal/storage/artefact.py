@@ -11,177 +11,68 @@ to date from then on, and its stage makes it again.
 """
 
 import fcntl
-import hashlib
 import json
 import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pixcal import __version__
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.storage.cube_place import POINTER, cubes_of, remove_cubes, settle, settled
-from pixcal.storage.folder import DISK_FULL, INDEX
+from pixcal.storage.folder import DISK_FULL
+from pixcal.storage.manifest import (
+    DAMAGE,
+    JOURNAL,
+    MANIFEST,
+    SCRATCH,
+    Manifest,
+    check_intact,
+    damaged_files,
+    digest,
+    file_digest,
+    list_files,
+    read_json,
+    read_manifest,
+    write_json,
+    write_manifest,
+)
 from pixcal.storage.place import Place
 
-MANIFEST = "manifest.json"
-JOURNAL = "journal.jsonl"
-SCRATCH = "scratch"
-DAMAGE = "damage.json"
-"""Names of the files of an artefact that turned out to be damaged, found when they were read."""
-_NOT_LISTED = (MANIFEST, JOURNAL, DAMAGE)
+__all__ = [
+    "DAMAGE",
+    "JOURNAL",
+    "MANIFEST",
+    "SCRATCH",
+    "Build",
+    "Manifest",
+    "artefact_key",
+    "build",
+    "damage_noted",
+    "damaged_files",
+    "digest",
+    "file_digest",
+    "lock",
+    "read_json",
+    "read_manifest",
+    "require",
+    "up_to_date",
+    "write_json",
+    "write_manifest",
+]
+
 _KEY_IN_NAME = 16
-
-
-@dataclass(frozen=True)
-class Manifest:
-    """What an artefact is and what it was made from."""
-
-    stage: str
-    format: int
-    key: str
-    config: dict[str, Any]
-    inputs: dict[str, str]
-    """Key of each artefact (or file set) that this one was made from."""
-    pixcal: str = __version__
-    summary: dict[str, Any] = field(default_factory=dict)
-    files: dict[str, str] = field(default_factory=dict)
-    """Digest of each file of the artefact, but for chunks of arrays."""
-
-
-def digest(*parts: Any) -> str:
-    """SHA-256 (hex, 32 characters) of plain data."""
-    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=str)
-    return hashlib.sha256(text.encode()).hexdigest()[:32]
-
-
-def file_digest(path: Path) -> str:
-    """SHA-256 (hex, 32 characters) of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()[:32]
-
-
-def _json(data: Any) -> str:
-    return json.dumps(data, indent=2, allow_nan=False) + "\n"
-
-
-def write_json(path: Path, data: Any) -> None:
-    """Write JSON aside, flush it to the disk, and rename it into place."""
-    aside = path.with_name(f".{path.name}.aside")
-    text = _json(data)
-    with aside.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
-
-
-def read_json(path: Path) -> Any:
-    """Read JSON that pixcal wrote.
-
-    Raises
-    ------
-    DamagedError
-        If the file is missing or does not parse.
-    """
-    return _parse(path, _text(path))
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise DamagedError(f"{path}: cannot be read ({error.strerror})", path) from error
-    except ValueError as error:
-        raise DamagedError(f"{path}: damaged ({error})", path) from error
-
-
-def _parse(path: Path, text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError as error:
-        raise DamagedError(f"{path}: damaged ({error})", path) from error
-
-
-def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Write the manifest of an artefact, sealed with its own digest."""
-    # As it will be read: JSON has lists for tuples, and strings for all keys.
-    data = json.loads(_json(asdict(manifest)))
-    write_json(folder / MANIFEST, data | {"seal": digest(data)})
-
-
-def read_manifest(folder: Path) -> Manifest | None:
-    """Manifest of an artefact, or None when there is no artefact.
-
-    Raises
-    ------
-    DamagedError
-        If it does not parse, or was altered (those of earlier versions have no seal).
-    """
-    path = folder / MANIFEST
-    if not path.exists():
-        return None
-    text = _text(path)
-    data = _parse(path, text)
-    try:
-        sealed = data.pop("seal", None) is not None
-        if sealed and text != _json(data | {"seal": digest(data)}):
-            raise DamagedError(f"{path}: altered since it was written", path)
-        return Manifest(**data)
-    except (AttributeError, TypeError) as error:
-        raise DamagedError(f"{path}: not a manifest that this pixcal reads", path) from error
-
-
-def _listed(folder: Path) -> Iterator[str]:
-    """Names of the files of an artefact whose digests its manifest holds."""
-    for at, folders, names in os.walk(folder):
-        here = Path(at).relative_to(folder)
-        if INDEX in names:
-            folders.clear()  # of an array: its chunks
-        if here == Path():
-            folders[:] = [name for name in folders if name != SCRATCH]
-            names = [name for name in names if name not in _NOT_LISTED]
-        yield from ((here / name).as_posix() for name in names if not name.startswith("."))
-
-
-def check_intact(folder: Path, manifest: Manifest) -> None:
-    """Hold the files of an artefact against its manifest; chunks are checked when they are read.
-
-    Raises
-    ------
-    DamagedError
-        Naming the first file that is missing or altered, or was found to be so earlier.
-    """
-    for name in damaged_files(folder):
-        raise DamagedError(f"{folder / name}: damaged", folder / name)
-    for name, expected in manifest.files.items():
-        try:
-            same = file_digest(folder / name) == expected
-        except OSError as error:
-            reason = f"cannot be read ({error.strerror})"
-            raise DamagedError(f"{folder / name}: {reason}", folder / name) from error
-        if not same:
-            raise DamagedError(f"{folder / name}: altered since it was written", folder / name)
-
-
-def damaged_files(folder: Path) -> list[str]:
-    """Names of the files of an artefact that were found to be damaged as they were read."""
-    if not (folder / DAMAGE).exists():
-        return []
-    try:
-        return [str(name) for name in read_json(folder / DAMAGE)["files"]]
-    except (DamagedError, LookupError, TypeError):
-        return [DAMAGE]
 
 
 def _command(run: Path, stage: str) -> str:
     """What to type to have an artefact made."""
     if stage == "ingest":
         return f"pixcal ingest ACQ --out {run}"
+    if stage == "corrected":
+        return f"pixcal fit {run} --with-diagnosis"
     # The sweep is a part of the command that reads it.
     return f"pixcal {'fit' if stage == 'sweep' else stage} {run}"
 
@@ -345,8 +236,9 @@ def build(
     yield made
     # What is called complete must be on the disk, not on its way to it.
     os.sync()
-    files = {name: file_digest(folder / name) for name in sorted(_listed(folder))}
-    manifest = Manifest(stage, format, key, config, inputs, summary=made.summary, files=files)
+    manifest = Manifest(
+        stage, format, key, config, inputs, summary=made.summary, files=list_files(folder)
+    )
     write_manifest(folder, manifest)
     final = run / stage
     old = run / ".partial" / f"{stage}-replaced"
@@ -445,6 +337,8 @@ def lock(run: Path) -> Iterator[None]:
         handle = (run / ".lock").open("w")
     except (FileExistsError, NotADirectoryError) as error:
         raise InputError(f"{run}: not a directory; choose another RUN") from error
+    except RecursionError as error:  # folder in folder is made
+        raise InputError(f"{run}: nested too deeply; choose another RUN") from error
     except OSError as error:
         if error.errno in DISK_FULL:
             raise

@@ -140,6 +140,8 @@ def _write_json(folder: Place, name: str, data: Any) -> None:
         open_folder(folder).write([(name, [content])], durable=True)
     except RemoteError as error:
         raise RemoteError(f"--cubes {error}") from error
+    except RecursionError as error:  # folder in folder is made
+        raise InputError(f"--cubes {folder}: nested too deeply; choose another place") from error
     except OSError as error:
         raise InputError(
             f"--cubes {folder}: cannot be written ({error.strerror}); choose another place"

@@ -1,6 +1,7 @@
 """Statistics of noise: its size, what neighbours, rows and columns share, pixels that stand out."""
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 from pixcal.estimators.battery import Curve, Statistic, statistic
 from pixcal.estimators.battery.look import F32, F64, LEVELS, Look, Mask
@@ -10,6 +11,8 @@ STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4)
 """Rows and columns to a neighbour."""
 OUTLIERS = (5.0, 7.0, 10.0)
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
+CELLS = 4
+"""Cells of the window along each side."""
 MOST = 120
 """Frames for statistics of pairs of pixels."""
 
@@ -22,6 +25,33 @@ def variance_by_level(look: Look) -> Curve:
     total = np.bincount(bins.ravel(), (rest**2).ravel(), minlength=LEVELS)
     count = np.bincount(bins.ravel(), minlength=LEVELS)
     return Curve(np.arange(LEVELS, dtype=float), total / np.maximum(count, 1))
+
+
+@statistic("noise", "variance of the residuals by place", x="cell of 4 × 4", power=True)
+def variance_by_place(look: Look) -> Curve | None:
+    """Mean square of residuals over their noise, in cells of the window, row by row."""
+    squares = np.einsum("tyx,tyx->yx", look.residual, look.residual) / len(look.residual)
+    cells = _cells(squares, look.good)
+    return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
+
+
+def _cells(values: F64, good: Mask) -> F64 | None:
+    """Means (cell,) of the good pixels of each cell; None where a cell has hardly any."""
+    ny, nx = good.shape
+    row = np.arange(ny)[:, None] * CELLS // ny
+    cell = row * CELLS + np.arange(nx)[None, :] * CELLS // nx
+    count = np.bincount(cell[good], minlength=CELLS**2)
+    if count.min() < 8:
+        return None
+    return np.asarray(np.bincount(cell[good], values[good], minlength=CELLS**2) / count)
+
+
+@statistic("noise", "variance of the residuals by time", x="eighth of the frames", power=True)
+def variance_by_time(look: Look) -> Curve:
+    """Mean square of residuals over their noise, in eighths of the frames."""
+    squares = np.einsum("tyx,tyx->t", look.residual, look.residual) / look.good.sum()
+    value = [float(part.mean()) for part in np.array_split(squares, 8)]
+    return Curve(np.arange(1.0, 9.0), np.array(value))
 
 
 @statistic("noise", "correlation of neighbours", x="neighbour")
@@ -171,7 +201,8 @@ def hot_neighbours(evidence: Evidence) -> Curve | None:
     """Dark current beside hot pixels over theirs."""
     dark = evidence.dark_rate - np.median(evidence.dark_rate)
     spread = 1.4826 * float(np.median(np.abs(dark)))
-    hot = dark > max(40 * spread, 1e-9)
+    # Only the brightest about: what it gave to its neighbours does not make them hot.
+    hot = (dark > max(40 * spread, 1e-9)) & (dark >= maximum_filter(dark, size=5))
     hot[[0, -1]] = hot[:, [0, -1]] = False
     y, x = np.nonzero(hot)
     # A neighbour may be warm by itself, or the rows differ: medians over alike rows.

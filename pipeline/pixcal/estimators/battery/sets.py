@@ -13,9 +13,9 @@ SAME = 0.98
 """Cosine of the angle below which two sets measure along the same axis."""
 
 
-@statistic("space", "maps of two sets alike", x="offset, contrast, light, each pair", sets=False)
+@statistic("space", "maps of two sets alike", x="contrast, light of each pair", sets=False)
 def alike(evidence: Evidence) -> Curve | None:
-    """Correlation of the maps of each pair of sets; of offsets only along one axis."""
+    """Correlation of the maps of each pair of sets."""
     looks = [Look(f, evidence) for f in evidence.fringes.values()]
     values = [
         _correlation(flattened(one.maps[name]), flattened(other.maps[name]))

@@ -85,10 +85,11 @@ def write_examination(out: Path, sealed: Path, examination: Examination, runtime
     with lock(aside):
         items = list(zip(range(len(benches)), benches, examination.truths, strict=True))
         run_tasks(partial(_case, aside), items, runtime, label="cases")
-        commitment = write_seal(sealed, examination, benches)
-        _publish(aside, out, [case_name(n) for n in range(len(benches))])
-        write_paper(out, examination, commitment)
-        _same_times(out)
+        made = _copied(aside, [case_name(n) for n in range(len(benches))])
+        write_paper(made, examination, write_seal(sealed, examination, benches))
+        _same_times(made)
+        out.parent.mkdir(parents=True, exist_ok=True)
+        made.rename(out)
     for stale in out.parent.glob(f"{partial_ones}*"):
         shutil.rmtree(stale)
 
@@ -130,12 +131,13 @@ def effects_of(truth: Truth, bench: Bench) -> tuple[Effect, ...]:
     return found
 
 
-def _publish(aside: Path, out: Path, names: Sequence[str]) -> None:
-    """Copy the cases, none of which takes longer than another."""
-    shutil.rmtree(out, ignore_errors=True)
-    out.mkdir(parents=True)
+def _copied(aside: Path, names: Sequence[str]) -> Path:
+    """The cases together; none of them takes longer to copy than another."""
+    made = aside / "made"
+    shutil.rmtree(made, ignore_errors=True)
     for name in names:
-        shutil.copytree(aside / name, out / name)
+        shutil.copytree(aside / name, made / name)
+    return made
 
 
 def _same_times(folder: Path) -> None:

@@ -23,6 +23,7 @@ from pixcal.storage.artefact import read_json, write_json
 SCHEMA = "pixcal/blind-score/1"
 PRODUCT = "score.json"
 TABLE = "score.md"
+NOBODY = "nothing"
 TWICE = 2.0
 NEAR = 0.05
 """By which the share closed may differ from the oracle's."""
@@ -178,8 +179,9 @@ def confusion(grades: Sequence[Grade]) -> dict[str, dict[str, int]]:
     for g in grades:
         if len(g.truth) > 1 or g.left_out in g.truth:
             continue
-        true = g.truth[0] if g.truth else "nothing"
-        first = g.named[0] if g.named else g.verdict
+        true = g.truth[0] if g.truth else NOBODY
+        silent = true if true == NOBODY and g.right else g.verdict
+        first = g.named[0] if g.named else silent
         row = table.setdefault(true, {})
         row[first] = row.get(first, 0) + 1
     return {name: dict(sorted(row.items())) for name, row in sorted(table.items())}

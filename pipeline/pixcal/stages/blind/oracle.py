@@ -16,7 +16,7 @@ from pixcal.stages import ingest, reduce
 from pixcal.stages.blind.cases import effects_of
 from pixcal.stages.blind.draw import Truth
 from pixcal.stages.diagnose.search import CONFIRM, Trial, differing, shrinkage
-from pixcal.stages.diagnose.stage import REFERENCES, _look
+from pixcal.stages.diagnose.stage import REFERENCES, look_at
 from pixcal.stages.diagnose.trial import Trials
 
 
@@ -42,7 +42,7 @@ def share_closed(acquisition: Path, truth: Truth, bench: Bench, runtime: Runtime
     try:
         ingest.run(acquisition, scratch / "run", ingest.Config(), runtime)
         reduce.run(scratch / "run", reduce.Config(), runtime)
-        look = _look(scratch / "run", scratch, runtime)
+        look = look_at(scratch / "run", scratch, runtime)
         trials = Trials(look.windows, scratch, look.runtime)
         effects = effects_of(truth, bench)
         (nominal,) = trials.curves([()], REFERENCES, "nominal bench")

@@ -94,7 +94,10 @@ def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Ma
         the directory is not one that a comparison may write to.
     """
     if not 0 <= config.sigma_accuracy <= 0.5:
-        raise InputError(f"--sigma-accuracy {config.sigma_accuracy}: not between 0 and 0.5")
+        raise InputError(
+            f"--sigma-accuracy {config.sigma_accuracy}: not between 0 and 0.5; "
+            "choose for example 0.02"
+        )
     _check_out(out)
     with damage_noted(*runs):
         sides = _sides(runs, config)

@@ -5,9 +5,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import log_ndtr
 
 from pixcal import __version__
-from pixcal.estimators.battery import DETECTOR, Curve, Key, battery
+from pixcal.estimators.battery import DETECTOR, Curve, Key, statistic_named
 from pixcal.estimators.gap import Expectation, Reference, flagged, sigmas_of
 from pixcal.model.config import to_plain
 from pixcal.stages.diagnose.search import Candidate, Found, Shrinkage, Trial, differing, shrinkage
@@ -102,7 +103,9 @@ def _cause(
     alone = shrinkage(data, found.nominal, only, where)
     without = shrinkage(data, found.nominal, found.without[name], where)
     gain = found.final.log_likelihood - found.without[name].log_likelihood
-    chance = len(found.candidates) * np.exp(-min(gain, 600.0))
+    # Two independent parts of the frames, joined by Fisher's rule.
+    log_both = float(log_ndtr(-estimate.significance)) - max(gain, 0.0)
+    chance = len(found.candidates) * np.exp(max(log_both, -600.0)) * (1 - max(log_both, -600.0))
     return {
         "effect": name,
         "title": effect.title,
@@ -167,7 +170,7 @@ def _curves(
     """Every statistic: measured, nominal and with effects, with limits of one sigma."""
     curves = []
     for key, before in final.before.items():
-        one = battery()[key[0]]
+        one = statistic_named(key[0])
         usual = reference.usual[key]
         after = final.after[key]
         curve = measured[key]

@@ -32,7 +32,7 @@ F64 = NDArray[np.float64]
 
 SURE = 4.0
 """Standard deviations that the estimate on the first frames must have."""
-LEAST = 8.0
+LEAST = 5.0
 """By which an effect must raise the log-likelihood of unseen data."""
 SCREEN = 3
 """Simulations of a candidate; of what was taken, `CONFIRM`."""
@@ -118,8 +118,6 @@ class Search:
     reference : Reference
     data : mapping
         Curves of the unseen data on the reference's scales.
-    base : tuple of Effect
-        That the nominal bench has already.
     simulate : callable
         Curves of several benches: ``simulate(benches, seeds, label)``.
     estimates : callable
@@ -131,11 +129,10 @@ class Search:
         self,
         reference: Reference,
         data: Mapping[Key, F64],
-        base: Effects,
         simulate: Simulate,
         estimates: Estimates,
     ) -> None:
-        self.reference, self.data, self.base = reference, data, base
+        self.reference, self.data = reference, data
         self._simulate, self._estimates = simulate, estimates
         self.nominal = self._trial((), expect_nominal(reference))
 
@@ -179,6 +176,10 @@ class Search:
         for candidate in open_ones.values():
             candidate.reason = candidate.reason or "the unseen frames get no likelier with it"
         return self._ablated(taken, effects, current, candidates, alike)
+
+    def held_against(self, effects: Effects, curves: list[Curves]) -> Trial:
+        """A bench with some effects against the data, from its simulations."""
+        return self._trial(effects, self._expected(curves))
 
     def _trial(self, effects: Effects, expected: Expectation) -> Trial:
         return Trial(effects, expected, log_likelihood(self.data, expected))

@@ -5,7 +5,7 @@ data and every simulation of them are reduced and fitted by the same stages.
 """
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -14,7 +14,6 @@ from typing import Any
 from pixcal.effects import effect_of_file, effects, parse_effects
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.battery import measure
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.gap import Reference
 from pixcal.model.acquisition import Acquisition
@@ -26,8 +25,16 @@ from pixcal.stages import reduce
 from pixcal.stages.diagnose.nominal import nominal_bench
 from pixcal.stages.diagnose.parts import Half, evidence_of, take
 from pixcal.stages.diagnose.result import describe
-from pixcal.stages.diagnose.search import Candidate, Search
-from pixcal.stages.diagnose.trial import Curves, Effects, Trials, Window, averaged, estimate
+from pixcal.stages.diagnose.search import SURE, Candidate, Search
+from pixcal.stages.diagnose.trial import (
+    Curves,
+    Effects,
+    Trials,
+    Window,
+    averaged,
+    estimate,
+    looked_at,
+)
 from pixcal.stages.diagnose.windows import chosen_windows, split
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.ingested import Ingested
@@ -48,6 +55,8 @@ REFERENCES = 16
 BYTES_A_SAMPLE = 60
 """Peak of a task for each sample of a window's frames (measured)."""
 LEARN_SEED = 900_000
+CLEAR = 100.0
+"""Standard deviations from which the battery sees an effect without its estimator."""
 FEWEST_FRAMES = 24
 """Fringe frames in each half."""
 
@@ -151,14 +160,22 @@ def _diagnose(
     scratch: Path,
     runtime: Runtime,
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    look = _look(run_dir, scratch, runtime)
-    trials = Trials(look.windows, scratch, look.runtime)
+    candidates: dict[str, Candidate] = {}
+    signatures: tuple[type[Effect], ...] = ()
+
+    def learnt(evidence: Evidence) -> tuple[type[Effect], ...]:
+        nonlocal signatures
+        candidates.update(_candidates(evidence, kinds, base, runtime))
+        signatures = weakly_seen(candidates, kinds)
+        return signatures
+
+    look = look_at(run_dir, scratch, runtime, learnt)
+    trials = Trials(look.windows, scratch, look.runtime, signatures)
     (nominal,) = trials.curves([base], REFERENCES, "nominal bench")
     if isinstance(nominal, str):
         raise InputError(f"--nominal: {nominal}")
     reference = Reference.of(nominal)
     data = reference.on_scale(look.measured)
-    candidates = _candidates(look.learn, kinds, base, look.runtime)
 
     def again(on: Effects, names: Sequence[str]) -> dict[str, float]:
         """Significance of candidates on the first frames taken again with some effects."""
@@ -170,7 +187,6 @@ def _diagnose(
     search = Search(
         reference,
         data,
-        base,
         lambda benches, seeds, label: trials.curves(
             [(*base, *bench) for bench in benches], seeds, label
         ),
@@ -186,8 +202,6 @@ class Look:
 
     Attributes
     ----------
-    learn : Evidence
-        Of the first frames, on the first window.
     first : Window
         That effects are fitted on.
     windows : tuple of Window
@@ -200,7 +214,6 @@ class Look:
         With as many workers as fit the memory.
     """
 
-    learn: Evidence
     first: Window
     windows: tuple[Window, ...]
     measured: Curves
@@ -208,7 +221,26 @@ class Look:
     runtime: Runtime
 
 
-def _look(run_dir: Path, scratch: Path, runtime: Runtime) -> Look:
+def look_at(
+    run_dir: Path,
+    scratch: Path,
+    runtime: Runtime,
+    learnt: Callable[[Evidence], Sequence[type[Effect]]] = lambda _: (),
+) -> Look:
+    """Take the parts of a reduced run that are looked at, and measure their nominal bench.
+
+    Parameters
+    ----------
+    run_dir, scratch : Path
+    runtime : Runtime
+    learnt : callable
+        Is given the evidence that effects are fitted on; tells whose estimates are statistics too.
+
+    Raises
+    ------
+    InputError
+        If there are too few frames, or a part cannot be fitted.
+    """
     ingested = Ingested(run_dir / "ingest")
     file = run_dir / "ingest" / "acquisition.json"
     acquisition = parse(Acquisition, read_json(file), str(file))
@@ -227,7 +259,7 @@ def _look(run_dir: Path, scratch: Path, runtime: Runtime) -> Look:
     dtypes = {name: array.dtype for name, array in ingested.arrays.items()}
     windows: list[Window] = []
     measured: list[Curves] = []
-    learn: Evidence | None = None
+    signatures: tuple[type[Effect], ...] = ()
     for part in dict.fromkeys((first, *parts)):
         halves: list[Evidence] = []
         for half in (own.learn, own.test):
@@ -235,15 +267,13 @@ def _look(run_dir: Path, scratch: Path, runtime: Runtime) -> Look:
             raw = take(ingested, acquisition, half, part, reduction)
             halves.append(evidence_of(raw, folder, part, shape))
             shutil.rmtree(folder)
+        if not windows:
+            signatures = tuple(learnt(halves[0]))
         bench = nominal_bench(acquisition, ingested.tables, halves, reduction, dtypes)
         windows.append(Window(part, bench, own.learn, own.test, shape))
         if part in parts:
-            measured.append(measure(halves[1]))
-        if learn is None:
-            learn = halves[0]
-    assert learn is not None
+            measured.append(looked_at(halves[1], signatures))
     return Look(
-        learn,
         windows[0],
         tuple(w for w in windows if w.part in parts),
         averaged(measured),
@@ -300,6 +330,17 @@ def _candidates(
             reason = one or "the acquisition holds no frames that could tell"
             candidates[name] = Candidate(name, None, reason)
     return candidates
+
+
+def weakly_seen(
+    candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]]
+) -> tuple[type[Effect], ...]:
+    """Candidates that the frames they were fitted on show, but not so clearly that all would."""
+    return tuple(
+        kinds[name]
+        for name, candidate in candidates.items()
+        if candidate.estimate is not None and SURE <= candidate.estimate.significance < CLEAR
+    )
 
 
 def _estimates(

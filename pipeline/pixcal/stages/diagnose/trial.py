@@ -10,6 +10,7 @@ import numpy as np
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.battery import Curve, Key, measure
+from pixcal.estimators.battery.signature import signature_curve, signature_key
 from pixcal.estimators.evidence import Evidence
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate
@@ -60,11 +61,14 @@ class Trials:
     scratch : Path
         Folder for what is written in between.
     runtime : Runtime
+    signatures : tuple of type
+        Effects whose estimates are statistics too.
     """
 
     windows: tuple[Window, ...]
     scratch: Path
     runtime: Runtime
+    signatures: tuple[type[Effect], ...] = ()
     _made: dict[tuple[frozenset[Effect], int], Curves | str] = field(default_factory=dict)
 
     def curves(
@@ -89,7 +93,7 @@ class Trials:
         places = range(len(self.windows))
         items = [(tuple(bench), seed, n) for bench, seed in missing for n in places]
         if items:
-            work = partial(_one, self.windows, self.scratch)
+            work = partial(_one, self.windows, self.scratch, self.signatures)
             results = run_tasks(work, items, self.runtime, label=label)
             for number, one in enumerate(missing):
                 own = results[number * len(places) : (number + 1) * len(places)]
@@ -105,14 +109,29 @@ class Trials:
 
 
 def _one(
-    windows: tuple[Window, ...], scratch: Path, item: tuple[Effects, int, int]
+    windows: tuple[Window, ...],
+    scratch: Path,
+    signatures: tuple[type[Effect], ...],
+    item: tuple[Effects, int, int],
 ) -> Curves | str:
     effects, seed, number = item
     window = windows[number]
     try:
-        return measure(window.evidence(window.test, effects, seed + 1000 * number, scratch))
+        evidence = window.evidence(window.test, effects, seed + 1000 * number, scratch)
+        return looked_at(evidence, signatures)
     except InputError as error:
         return str(error)
+
+
+def looked_at(evidence: Evidence, signatures: Sequence[type[Effect]]) -> Curves:
+    """The battery, and what the estimates of some effects see."""
+    curves = measure(evidence)
+    for kind in signatures:
+        found = estimate(evidence, kind)
+        if isinstance(found, Estimate):
+            key = signature_key(kind.name, kind.domains[0])
+            curves[key] = signature_curve(found.significance)
+    return curves
 
 
 def averaged(curves: Sequence[Curves]) -> Curves:

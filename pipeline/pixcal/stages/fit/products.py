@@ -1,7 +1,9 @@
 """The fit's products: what other programs read."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,10 +49,25 @@ def published(run_dir: Path) -> bool:
 
 def publish(run_dir: Path) -> None:
     """Write the products of a complete fit."""
-    folder = run_dir / "fit"
-    result = read_json(folder / "fit.json")
+    result = read_json(run_dir / "fit" / "fit.json")
+    key = read_json(run_dir / "fit" / "manifest.json")["key"]
+    cards, history = header_of(result, key)
+    publish_maps(run_dir, run_dir / "fit" / "fit.zarr", result["outputs"], cards, history)
+    write_json(run_dir / "products" / "fit.json", result)
+
+
+def header_of(result: dict[str, Any], key: str) -> tuple[list[Card], list[str]]:
+    """Cards and HISTORY lines of the maps of a fit.
+
+    Parameters
+    ----------
+    result : dict
+        As in ``fit.json``.
+    key : str
+        Of the artefact that holds the maps.
+    """
     cards: list[Card] = [
-        ("PIXCALID", read_json(folder / "manifest.json")["key"], "key of the fit"),
+        ("PIXCALID", key, "key of the fit"),
         ("INDIGEST", result["input"], "digest of the acquisition"),
         ("MODEL", result["model"], "shape of the fringes"),
         ("NSETS", len(result["sets"]), "fringe sets used"),
@@ -70,21 +87,52 @@ def publish(run_dir: Path) -> None:
             (f"M{n}_{m}", mode, "removed mode") for m, mode in enumerate(facts["removed_modes"], 1)
         ]
         history.append(f"set {name}: modes removed: {', '.join(facts['removed_modes'])}")
-    mask = ArrayReader(folder / "fit.zarr" / "mask").read()
-    for name in result["outputs"]:
-        _publish_map(run_dir, name, mask, cards, history)
-    for other in {"delta_x", "delta_y", "delta_fringe"} - set(result["outputs"]):
-        (run_dir / "products" / f"{other}.fits").unlink(missing_ok=True)
-    write_json(run_dir / "products" / "fit.json", result)
+    return cards, history
+
+
+def publish_maps(
+    run_dir: Path,
+    group: Path,
+    outputs: Sequence[str],
+    cards: list[Card],
+    history: list[str],
+    suffix: str = "",
+) -> None:
+    """Write the maps that the sets give together, and remove those of another fit.
+
+    Parameters
+    ----------
+    run_dir : Path
+    group : Path
+        ``fit.zarr``, or another that `pixcal.stages.fit.maps.write_maps` wrote.
+    outputs : sequence of str
+        Their names.
+    cards, history : list
+        Of their headers.
+    suffix : str
+        Of the names of the products.
+    """
+    mask = ArrayReader(group / "mask").read() if outputs else np.empty((0, 0), np.uint8)
+    for name in outputs:
+        _publish_map(
+            group, name, run_dir / "products" / f"{name}{suffix}.fits", mask, cards, history
+        )
+    for other in {"delta_x", "delta_y", "delta_fringe"} - set(outputs):
+        (run_dir / "products" / f"{other}{suffix}.fits").unlink(missing_ok=True)
 
 
 def _publish_map(
-    run_dir: Path, name: str, mask: NDArray[np.uint8], cards: list[Card], history: list[str]
+    group: Path,
+    name: str,
+    product: Path,
+    mask: NDArray[np.uint8],
+    cards: list[Card],
+    history: list[str],
 ) -> None:
     """Write one map; a function, so that its arrays are gone before the next."""
     data, sigma = (
         # In the byte order of FITS at once: whole maps are large.
-        ArrayReader(run_dir / "fit" / "fit.zarr" / array).read(out=np.empty(mask.shape, ">f4"))
+        ArrayReader(group / array).read(out=np.empty(mask.shape, ">f4"))
         for array in (name, f"{name}_sigma")
     )
-    write_map(run_dir / "products" / f"{name}.fits", data, sigma, mask, cards, history)
+    write_map(product, data, sigma, mask, cards, history)

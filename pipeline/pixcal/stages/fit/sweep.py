@@ -97,7 +97,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             nominal = nominal_vector(acquisition, fringe_set.name)
             source = ReducedSet(run_dir / "reduce" / "reduced.zarr" / fringe_set.name)
             try:
-                sets[fringe_set.name] = _sweep_set(
+                sets[fringe_set.name] = sweep_set(
                     made, source, fringe_set.name, nominal, config, runtime
                 )
             except DamagedError:
@@ -123,7 +123,7 @@ class _Job:
     chi2_limit: float
 
 
-def _sweep_set(
+def sweep_set(
     made: Build,
     source: ReducedSet,
     name: str,
@@ -131,6 +131,13 @@ def _sweep_set(
     config: Config,
     runtime: Runtime,
 ) -> dict[str, Any]:
+    """Sweep one set into ``sweep.zarr/<set name>`` of a build; returns its summary.
+
+    Raises
+    ------
+    InputError
+        If the set has no fringes that can be fitted.
+    """
     folder = made.folder / "sweep.zarr" / name
     create_group(folder)
     done, scouted = made.journal(), folder / "scout.json"
@@ -150,7 +157,7 @@ def _sweep_set(
     # Codes held until the start model stands and those of the chunk at hand; sums, maps and modes;
     # what is kept of each batch.
     held = 2 * min(prime, source.n_frames) + 4 * source.block
-    per_task = cy * cx * (held + 900 + 24 * n_batches)
+    per_task = cy * cx * (held + 900 + 24 * n_batches + source.more_bytes)
     plan = make_plan(f"the fit of {name}", per_task, CACHE_BYTES, runtime)
     tiles = [t for t in source.tiles() if f"{name}:{t[0]},{t[1]}" not in done]
     carrier = Carrier((float(facts["k"][0]), float(facts["k"][1])), frames.reference)

@@ -1,0 +1,323 @@
+"""What the diagnosis claims by chance, and from which strength on it finds each effect.
+
+One small bench is recorded and reduced as a user's would be; its nominal bench then plays the
+reality again and again, with other random numbers, with nothing in it or with one effect of some
+strength. Every step of the search is that of ``pixcal diagnose``. Writes ``study.json``, tables and
+a picture into ``docs/diagnose``.
+"""
+
+import argparse
+import json
+import shutil
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache, lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+import yaml
+from scipy.stats import binomtest, kstest
+
+from pixcal.effects import effects
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.battery import Curve, Key
+from pixcal.estimators.battery.signature import signature_curve, signature_key
+from pixcal.estimators.gap import Reference, compare, flagged
+from pixcal.model.bench import SCHEMA
+from pixcal.simulation.effect import Effect, Estimate
+from pixcal.stages import ingest, reduce, simulate
+from pixcal.stages.diagnose.search import Candidate, Search, Trial, differing, shrinkage
+from pixcal.stages.diagnose.stage import Look, look_at, weakly_seen
+from pixcal.stages.diagnose.trial import Curves, Trials, estimate, looked_at
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+
+OUT = Path(__file__).parents[1] / "docs" / "diagnose"
+HERE = Runtime(cluster="sync")
+STRENGTHS = (0.03, 0.1, 0.3, 1.0, 3.0)
+"""Times the default strength, which is that of the literature."""
+REFERENCES = 16
+FIRST_SEED = 5000
+RAMPS = ("phase_modulator_error",)
+"""Effects that are looked for in a set whose phase is a ramp."""
+
+
+def bench(ramp: bool) -> dict[str, Any]:
+    """Two sets of 300 frames on 61 x 67 pixels, with bias, darks and a ladder of flats."""
+    law = {"phase_law": "ramp", "phase_step_rad": 0.35} if ramp else {}
+    return {
+        "schema": SCHEMA,
+        "seed": 9000,
+        "detector": {
+            "seed": 9001, "shape": [61, 67], "pitch_um": 4.4, "gain_e_per_adu": 1.0,
+            "read_noise_e": 16.0, "bias_adu": 500, "bias_pixel_rms_adu": 4.0, "dark_e_s": 24.0,
+            "prnu_rms": 0.01, "delta_rms_px": 2.0e-3, "hot_fraction": 0.004,
+            "hot_rate_e_s": 3.0e4,
+        },
+        "optics": {
+            "wavelength_nm": 632.8, "distance_mm": 400.0, "beam_radius_mm": 35.0,
+            "visibility": 0.95, "fringes": "straight",
+        },
+        "frames": {
+            "exptime_s": 0.02, "period_s": 0.14, "per_file": 500, "bias": 60,
+            "darks": [{"exptime_s": 0.5, "count": 20}],
+            "flat_rate_e_s": 1.25e6,
+            "flats": [{"exptime_s": 0.01 * n, "count": 20} for n in (1, 2, 3)],
+            "fringes": [
+                {"name": name, "baseline_mm": baseline, "count": 300, "peak_e": 45000, **law}
+                for name, baseline in (("vertical", [11.5, 0.0]), ("horizontal", [0.0, 6.4]))
+            ],
+        },
+    }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Stage:
+    """The bench, and what its simulations look like."""
+
+    look: Look
+    nominal: tuple[Curves, ...]
+    scratch: Path
+
+
+@lru_cache(maxsize=2)
+def set_up(folder: Path, ramp: bool) -> Stage:
+    """Record, reduce and simulate the bench (once in a process)."""
+    own = folder / ("ramp" if ramp else "random")
+    look, nominal = own / "look.pickle", own / "run"
+    if not look.exists():
+        own.mkdir(parents=True, exist_ok=True)
+        (own / "bench.yaml").write_text(yaml.safe_dump(bench(ramp)))
+        simulate.run(own / "bench.yaml", own / "acq", simulate.Config(), HERE)
+        ingest.run(own / "acq", nominal, ingest.Config(), HERE)
+        reduce.run(nominal, reduce.Config(), HERE)
+        shutil.rmtree(own / "acq")
+        look.touch()
+    scratch = Path(tempfile.mkdtemp(dir=own))
+    found = look_at(nominal, scratch, HERE)
+    trials = Trials(found.windows, scratch, HERE)
+    (curves,) = trials.curves([()], REFERENCES, "nominal bench")
+    assert not isinstance(curves, str)
+    return Stage(found, tuple(curves), scratch)
+
+
+@cache
+def signature(folder: Path, ramp: bool, name: str) -> tuple[Key, list[Curve]]:
+    """What an effect's estimate sees in the simulations of the nominal bench."""
+    stage, kind = set_up(folder, ramp), effects()[name]
+    curves = []
+    for seed in range(REFERENCES):
+        window = stage.look.first
+        found = estimate(window.evidence(window.test, (), seed, stage.scratch), kind)
+        size = found.significance if isinstance(found, Estimate) else 0.0
+        curves.append(signature_curve(size))
+    return signature_key(name, kind.domains[0]), curves
+
+
+def play(folder: Path, case: tuple[str, float, int]) -> dict[str, Any]:
+    """Let the bench play the reality once: name of an effect (or none), strength, seed."""
+    name, strength, seed = case
+    stage = set_up(folder, name in RAMPS)
+    window = stage.look.first
+    truth = (effects()[name]().scaled(strength),) if name else ()
+    learn = window.evidence(window.learn, truth, seed, stage.scratch)
+    candidates = {}
+    for other, kind in effects().items():
+        one = estimate(learn, kind)
+        candidates[other] = (
+            Candidate(other, one)
+            if isinstance(one, Estimate)
+            else Candidate(other, None, str(one or "no evidence"))
+        )
+    signatures = weakly_seen(candidates, effects())
+    known = [signature(folder, name in RAMPS, kind.name) for kind in signatures]
+    reference = Reference.of(
+        [
+            curves | {key: own[number] for key, own in known}
+            for number, curves in enumerate(stage.nominal)
+        ]
+    )
+    data = reference.on_scale(
+        looked_at(window.evidence(window.test, truth, seed + 1, stage.scratch), signatures)
+    )
+    trials = Trials((window,), stage.scratch, HERE, signatures)
+
+    def again(on: tuple[Effect, ...], names: Sequence[str]) -> dict[str, float]:
+        evidence = window.evidence(window.learn, on, seed + 2, stage.scratch)
+        found = {n: estimate(evidence, effects()[n]) for n in names}
+        return {n: e.significance for n, e in found.items() if isinstance(e, Estimate)}
+
+    search = Search(reference, data, trials.curves, again)
+    found = search.run(candidates)
+    before = compare(data, search.nominal.expected)
+    own = candidates[name].estimate if name else None
+    result: dict[str, Any] = {
+        "effect": name,
+        "strength": strength,
+        "seed": seed,
+        "taken": list(found.taken),
+        "gap": bool(flagged(before)),
+        "chances": [float(np.exp(d.log_chance)) for d in before.values()],
+        "sigmas": own.significance if own else None,
+    }
+    if name and name in found.taken:
+        where = differing(search.nominal, found.final, data)
+        closed = 1 - shrinkage(data, search.nominal, found.final, where).gap.total
+        (oracle,) = trials.curves([truth], 8, "oracle")
+        if not isinstance(oracle, str):
+            best = search.held_against(truth, oracle)
+            result["closed"] = closed
+            result["closed_by_truth"] = 1 - shrinkage(data, search.nominal, best, where).gap.total
+    elif name:
+        result["wrong_closed"] = _closed_by_wrong(search, found.taken, candidates, data)
+    return result
+
+
+def _closed_by_wrong(
+    search: Search, taken: Sequence[str], candidates: dict[str, Candidate], data: Any
+) -> list[float]:
+    found: list[float] = []
+    for other in taken:
+        trial: Trial | None = candidates[other].alone
+        if trial is not None:
+            where = differing(search.nominal, trial, data)
+            found.append(1 - shrinkage(data, search.nominal, trial, where).gap.total)
+    return found
+
+
+def nominal_table(played: Sequence[dict[str, Any]]) -> str:
+    """False claims and how the chances of the statistics lie."""
+    count = len(played)
+    claims = sum(bool(p["taken"]) for p in played)
+    gaps = sum(p["gap"] for p in played)
+    chances = np.concatenate([p["chances"] for p in played])
+    # The least of several values, taken as independent: 1 for some, uniform below.
+    inside = chances[chances < 0.5]
+    share = [float(np.mean(chances < limit)) for limit in (0.1, 0.01, 0.001)]
+    rows = [
+        ("nominal acquisitions", count),
+        ("in which a cause was claimed", _share(claims, count)),
+        ("in which a gap was seen", _share(gaps, count)),
+        ("statistics with a chance below 0.1", f"{share[0]:.3f}"),
+        ("below 0.01", f"{share[1]:.4f}"),
+        ("below 0.001", f"{share[2]:.5f}"),
+        ("Kolmogorov-Smirnov of chances below 0.5 against uniform", f"{_ks(inside):.2g}"),
+    ]
+    return _table(("", ""), rows)
+
+
+def _ks(inside: np.ndarray) -> float:
+    rng = np.random.default_rng(1)
+    few = rng.choice(inside, min(400, len(inside)), replace=False)
+    return float(kstest(few / 0.5, "uniform").pvalue)
+
+
+def _share(found: int, count: int) -> str:
+    low, high = binomtest(found, count).proportion_ci(0.95)
+    return f"{found} of {count} (95 %: {low:.1%} to {high:.1%})"
+
+
+def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    lines = ["| " + " | ".join(map(str, row)) + " |" for row in (header, *rows)]
+    return "\n".join([lines[0], "|" + "---|" * len(header), *lines[1:]])
+
+
+def power_table(played: Sequence[dict[str, Any]]) -> str:
+    """Share of acquisitions in which each effect was found, by its strength."""
+    rows = []
+    for name in sorted({p["effect"] for p in played}):
+        own = [p for p in played if p["effect"] == name]
+        cells = []
+        for strength in STRENGTHS:
+            here = [p for p in own if p["strength"] == strength]
+            found = sum(name in p["taken"] for p in here)
+            others = sum(any(t != name for t in p["taken"]) for p in here)
+            sigmas = np.median([p["sigmas"] or 0.0 for p in here]) if here else np.nan
+            cells.append(
+                f"{found}/{len(here)} ({sigmas:.1f} σ)" + (f", others {others}" if others else "")
+            )
+        pairs = [(p["closed"], p["closed_by_truth"]) for p in own if "closed" in p]
+        off = f"{np.median([abs(a - b) for a, b in pairs]):.3f}" if pairs else "-"
+        rows.append((name, *cells, off))
+    header = ("effect", *(f"{s:g} × default" for s in STRENGTHS), "share closed, off truth's")
+    return _table(header, rows)
+
+
+def draw(played: Sequence[dict[str, Any]], file: Path) -> None:
+    """Power curves, a small panel each."""
+    names = sorted({p["effect"] for p in played})
+    columns = 5
+    figure, axes = plt.subplots(
+        -(-len(names) // columns), columns, figsize=(11, 9), sharex=True, sharey=True,
+        layout="constrained",
+    )  # fmt: skip
+    for axis in axes.flat[len(names) :]:
+        axis.set_visible(False)
+    for name, axis in zip(names, axes.flat, strict=False):
+        own = [p for p in played if p["effect"] == name]
+        share = [
+            np.mean([name in p["taken"] for p in own if p["strength"] == s]) for s in STRENGTHS
+        ]
+        wrong = [
+            np.mean([any(t != name for t in p["taken"]) for p in own if p["strength"] == s])
+            for s in STRENGTHS
+        ]
+        axis.semilogx(STRENGTHS, share, "o-", color="#2b6ca3", label="found")
+        axis.semilogx(STRENGTHS, wrong, "x:", color="#b5482f", label="another claimed")
+        axis.set_title(name, fontsize=9)
+        axis.set_ylim(-0.05, 1.05)
+        axis.grid(alpha=0.3)
+    axes.flat[0].legend(fontsize=7, loc="center left")
+    figure.supxlabel("strength, times that of the literature")
+    figure.supylabel("share of acquisitions")
+    figure.savefig(file, dpi=110)
+
+
+def main() -> None:
+    """Play all cases, two at a time."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--nominal", type=int, default=40, help="acquisitions without an effect")
+    parser.add_argument("--seeds", type=int, default=2, help="for each effect and strength")
+    parser.add_argument("--effects", nargs="*", default=list(effects()), help="default: all")
+    parser.add_argument("--out", type=Path, default=OUT)
+    options = parser.parse_args()
+    names = options.effects
+    cases = [("", 0.0, FIRST_SEED + 10 * n) for n in range(options.nominal)]
+    cases += [
+        (name, strength, FIRST_SEED + 100_000 + 10 * n)
+        for n in range(options.seeds)
+        for strength in STRENGTHS
+        for name in names
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        for ramp in (False, True):
+            set_up(Path(folder), ramp)
+        played = run_tasks(
+            partial(play, Path(folder)), cases, Runtime(cluster="processes", quiet=False),
+            label="acquisitions",
+        )  # fmt: skip
+    nothing = [p for p in played if not p["effect"]]
+    something = [p for p in played if p["effect"]]
+    options.out.mkdir(parents=True, exist_ok=True)
+    plain = [{k: v for k, v in p.items() if k != "chances"} for p in played]
+    (options.out / "study.json").write_text(json.dumps(plain, indent=0))
+    tables = {"nominal": nominal_table(nothing), "power": power_table(something)}
+    draw(something, options.out / "power.png")
+    page = OUT.parent / "diagnose.md"
+    text = page.read_text(encoding="utf-8")
+    for name, table in tables.items():
+        start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+        print(table, "\n")
+        if start in text:
+            before, _, rest = text.partition(start)
+            text = before + start + "\n" + table + "\n\n" + end + rest.partition(end)[2]
+    if options.out == OUT:
+        page.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""What the estimate of an effect sees, as one more statistic.
+
+The battery looks at everything and so at nothing as sharply as an effect's own estimator does. For
+candidates that are seen weakly on the frames they are fitted on, the estimate's significance on the
+other frames is a statistic too.
+"""
+
+import numpy as np
+
+from pixcal.estimators.battery import DETECTOR, Curve, Key, Statistic
+
+STRAIGHT = 10.0
+"""Standard deviations beyond which they count by their logarithm."""
+_PREFIX, _INFIX = "estimate_of_", "_in_"
+
+
+def signature_key(effect: str, domain: str) -> Key:
+    """Key of the signature of an effect that shows in a domain."""
+    return f"{_PREFIX}{effect}{_INFIX}{domain}", DETECTOR
+
+
+def signature_curve(significance: float) -> Curve:
+    """The curve, of one value."""
+    size = abs(significance)
+    if size > STRAIGHT:
+        size = STRAIGHT * (1 + float(np.log(size / STRAIGHT)))
+    return Curve(np.zeros(1), np.array([float(np.copysign(size, significance))]))
+
+
+def statistic_of_signature(name: str) -> Statistic:
+    """What such a key stands for."""
+    effect, _, domain = name.removeprefix(_PREFIX).rpartition(_INFIX)
+    title = f"what the estimate of {effect} sees"
+
+    def nothing(_: object) -> None:
+        return None
+
+    return Statistic(name, title, domain, "σ", "", "linear", False, FLOOR, nothing)
+
+
+FLOOR = 0.7
+"""Of a significance, by chance, at least."""

@@ -1,0 +1,5 @@
+"""``pixcal fit --with-diagnosis``: offset maps without the effects that a diagnosis found."""
+
+from pixcal.stages.correct.stage import Config, run
+
+__all__ = ["Config", "run"]

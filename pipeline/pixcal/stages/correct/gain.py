@@ -1,0 +1,309 @@
+"""What the maps gained: how far they moved, what repeats, how sets and halves of frames agree.
+
+Everything is measured on pixels that are good before and after.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.engine.plan import make_plan
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.stages.correct.undoing import HALVES, mean_of
+from pixcal.stages.reduced_set import ReducedSet
+from pixcal.storage.cube import ArrayReader
+
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+PERIOD = 4
+"""Rows or columns after which patterns repeat (paper, section 5.1: period of four rows)."""
+ALIGNED = 0.985
+"""Cosine between the axes of sets that see the same offsets (10 degrees)."""
+
+
+@dataclass(frozen=True)
+class Maps:
+    """Maps of the sets before and after.
+
+    Attributes
+    ----------
+    before, after : Path
+        ``fit.zarr`` and ``corrected.zarr``.
+    source : ReducedSet
+        For the tiles.
+    names : tuple of str
+        Of the sets.
+    axes : mapping
+        Unit vector (x, y) that each measures along.
+    has_halves : mapping
+        Which sets have maps of both halves of the frames.
+    effects : int
+        Undone on maps: the variants that follow the halves.
+    """
+
+    before: Path
+    after: Path
+    source: ReducedSet
+    names: tuple[str, ...]
+    axes: Mapping[str, tuple[float, float]]
+    has_halves: Mapping[str, bool]
+    effects: int
+
+    @property
+    def pairs(self) -> list[tuple[str, str, float]]:
+        """Sets along one axis, and the sign of the second one's offsets to those of the first."""
+        found = []
+        for a, b in combinations(self.names, 2):
+            along = float(np.dot(self.axes[a], self.axes[b]))
+            if abs(along) > ALIGNED:
+                found.append((a, b, float(np.sign(along))))
+        return found
+
+    def read(self, group: Path, name: str, array: str, *ranges: tuple[int, int]) -> F64:
+        """A part of a map."""
+        return np.asarray(ArrayReader(group / name / array).read(*ranges), float)
+
+
+@dataclass
+class Sums:
+    """Sums over pixels of one set.
+
+    Attributes
+    ----------
+    count : int
+    moved : (1 + effect, 2) float64
+        Sum of squares and largest of the change of offsets: of all, then of each effect on maps;
+        last of those on samples.
+    rows, columns : (3, n) float64
+        Sums over each row and column of the offsets before and after, and the count.
+    halves : (2, 3) float64
+        Before and after: squares of half the difference, what errors let expect of them, count.
+    square : float
+        Sum of the squared offsets after.
+    """
+
+    count: int
+    moved: F64
+    rows: F64
+    columns: F64
+    halves: F64
+    square: float
+
+
+@dataclass(frozen=True)
+class Told:
+    """Sums of one tile: of its sets, and of pairs of them (as `Sums.halves`)."""
+
+    sets: list[Sums]
+    pairs: list[F64]
+
+
+def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
+    """What ``correction.json`` says of the sets and of pairs of them.
+
+    Parameters
+    ----------
+    maps : Maps
+    runtime : Runtime
+
+    Returns
+    -------
+    dict
+        ``sets``: by name; ``pairs``: of sets along one axis.
+    """
+    ny, nx = maps.source.shape
+    cy, cx = maps.source.signal.chunks[1:]
+    variants = HALVES + maps.effects
+    batches = max(_batches(maps.before / name) for name in maps.names)
+    need = cy * cx * (16 * (variants + 2 * batches) + 60 * len(maps.names) + 100)
+    plan = make_plan("measuring the gain", need, 0, runtime)
+    tiles = maps.source.tiles()
+    told = run_tasks(partial(_tile, maps), tiles, runtime.with_workers(plan.workers), label="gain")
+    sets = {}
+    for n, name in enumerate(maps.names):
+        total = _empty(ny, nx, maps.effects)
+        for at, one in zip(tiles, told, strict=True):
+            _add(total, one.sets[n], *maps.source.ranges(at))
+        sets[name] = total
+    pairs = [
+        {"sets": [a, b]} | _agreement(np.sum([t.pairs[n] for t in told], axis=0))
+        for n, (a, b, _) in enumerate(maps.pairs)
+    ]
+    return {"sets": {name: _described(total) for name, total in sets.items()}, "pairs": pairs}
+
+
+def _batches(folder: Path) -> int:
+    return int(ArrayReader(folder / "batch_count").shape[0])
+
+
+def _tile(maps: Maps, at: tuple[int, int]) -> Told:
+    y, x = maps.source.ranges(at)
+    delta: dict[str, tuple[F64, F64]] = {}
+    error: dict[str, tuple[F64, F64]] = {}
+    for name in maps.names:
+        delta[name], error[name] = (
+            (maps.read(maps.before, name, array, y, x), maps.read(maps.after, name, array, y, x))
+            for array in ("delta", "sigma")
+        )
+    sets = [_of_set(maps, name, delta[name], (y, x)) for name in maps.names]
+    pairs = []
+    for a, b, sign in maps.pairs:
+        apart = [delta[a][n] - sign * delta[b][n] for n in (0, 1)]
+        expected = [error[a][n] ** 2 + error[b][n] ** 2 for n in (0, 1)]
+        pairs.append(_squares(apart, expected))
+    return Told(sets, pairs)
+
+
+def _of_set(
+    maps: Maps,
+    name: str,
+    delta: tuple[F64, F64],
+    part: tuple[tuple[int, int], tuple[int, int]],
+) -> Sums:
+    before, after = delta
+    good = np.isfinite(before) & np.isfinite(after)
+    first = HALVES * maps.has_halves[name]
+    steps = [
+        after - maps.read(maps.after, name, "batch_delta", (n, n + 1), *part)[0]
+        for n in range(first, first + maps.effects)
+    ]
+    total = after - before
+    moved = [total, *steps, total - np.sum(steps, axis=0)]
+    halves = np.zeros((2, 3))
+    if maps.has_halves[name]:
+        halves = _of_halves(maps, name, good, part)
+    profiles = np.stack([np.where(good, values, 0.0) for values in (before, after, good)])
+    return Sums(
+        int(good.sum()),
+        np.array([_square_and_most(m[good]) for m in moved]),
+        profiles.sum(axis=2),
+        profiles.sum(axis=1),
+        halves,
+        float((after[good] ** 2).sum()),
+    )
+
+
+def _square_and_most(values: F64) -> tuple[float, float]:
+    return float((values**2).sum()), float(np.abs(values).max(initial=0.0))
+
+
+def _of_halves(
+    maps: Maps, name: str, good: Mask, part: tuple[tuple[int, int], tuple[int, int]]
+) -> F64:
+    """Of half the difference between the halves of the frames, which is the noise of the map."""
+    every = (0, _batches(maps.before / name))
+    own = [
+        ArrayReader(maps.before / name / array).read(every, *part)
+        for array in ("batch_delta", "batch_sigma")
+    ]
+    middle = every[1] // 2
+    parts = (slice(middle), slice(middle, None))
+    before = [mean_of(own[0][cut], own[1][cut]) for cut in parts]
+    after = [
+        maps.read(maps.after, name, array, (0, HALVES), *part)
+        for array in ("batch_delta", "batch_sigma")
+    ]
+    apart = [before[0][0].astype(float) - before[1][0], after[0][0] - after[0][1]]
+    variance = [before[0][1].astype(float) ** 2 + before[1][1] ** 2, (after[1] ** 2).sum(axis=0)]
+    return _squares(
+        [np.where(good, a / 2, np.nan) for a in apart], [v / 4 for v in variance]
+    )  # fmt: skip
+
+
+def _squares(apart: Sequence[F64], expected: Sequence[F64]) -> F64:
+    """Sums (before or after; square, expected square, count) over pixels that have all."""
+    good = np.isfinite(np.stack([*apart, *expected])).all(axis=0)
+    return np.array(
+        [
+            [(a[good] ** 2).sum(), v[good].sum(), good.sum()]
+            for a, v in zip(apart, expected, strict=True)
+        ]
+    )
+
+
+def _empty(ny: int, nx: int, effects: int) -> Sums:
+    return Sums(
+        0, np.zeros((2 + effects, 2)), np.zeros((3, ny)), np.zeros((3, nx)), np.zeros((2, 3)), 0.0
+    )
+
+
+def _add(total: Sums, own: Sums, y: tuple[int, int], x: tuple[int, int]) -> None:
+    total.count += own.count
+    total.moved[:, 0] += own.moved[:, 0]
+    total.moved[:, 1] = np.maximum(total.moved[:, 1], own.moved[:, 1])
+    total.rows[:, slice(*y)] += own.rows
+    total.columns[:, slice(*x)] += own.columns
+    total.halves += own.halves
+    total.square += own.square
+
+
+def _described(total: Sums) -> dict[str, Any]:
+    pixels = max(total.count, 1)
+    change = [
+        {"rms_px": float(np.sqrt(square / pixels)), "max_px": float(most)}
+        for square, most in total.moved
+    ]
+    return {
+        "pixels": total.count,
+        "change": change[0],
+        "change_by_effect": change[1:-1],
+        "change_on_samples": change[-1],
+        "rows": _patterns(total.rows, total),
+        "columns": _patterns(total.columns, total),
+        "halves": _agreement(total.halves) if total.halves[:, 2].all() else None,
+    }
+
+
+def _patterns(profile: F64, total: Sums) -> dict[str, Any] | None:
+    """Rms of what repeats every `PERIOD` rows (px), before and after, and of offsets that do not.
+
+    None where the window is too small.
+    """
+    if profile.shape[1] < 3 * PERIOD:
+        return None
+    count = profile[2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        means = np.where(count > 0, profile[:2] / count, np.nan)
+    chance = np.sqrt(total.square * (PERIOD - 1)) / max(total.count, 1)
+    before, after = (repeating(own) for own in means)
+    return {
+        "period_px": PERIOD,
+        "before_px": before,
+        "after_px": after,
+        "chance_px": float(chance),
+    }
+
+
+def repeating(profile: F64) -> float | None:
+    """Rms of what repeats every `PERIOD` places of a profile; NaN are left out.
+
+    What changes slowly is taken off first: the mean over a period about each place, which is that
+    of any pattern that repeats.
+    """
+    half = PERIOD // 2
+    kernel = np.ones(PERIOD + 1)
+    kernel[[0, -1]] = 0.5
+    rest = profile[half:-half] - np.convolve(profile, kernel / PERIOD, "valid")
+    good = np.isfinite(rest)
+    classes = np.arange(len(rest)) % PERIOD
+    count = np.bincount(classes[good], minlength=PERIOD)
+    if not count.all():
+        return None
+    means = np.bincount(classes[good], rest[good], PERIOD) / count
+    return float(np.sqrt(((means - means.mean()) ** 2).mean()))
+
+
+def _agreement(sums: F64) -> dict[str, Any]:
+    """Rms (px) before and after, and what the errors let expect."""
+    found: dict[str, Any] = {}
+    for (square, expected, count), when in zip(sums, ("before", "after"), strict=True):
+        found[f"{when}_px"] = float(np.sqrt(square / max(count, 1)))
+        found[f"{when}_expected_px"] = float(np.sqrt(expected / max(count, 1)))
+    return found

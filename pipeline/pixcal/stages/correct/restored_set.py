@@ -1,0 +1,113 @@
+"""A reduced fringe set whose samples are read without some effects."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.scout import Coding
+from pixcal.simulation.effect import Effect
+from pixcal.stages.reduced_set import ReducedSet
+from pixcal.storage.cube import ArrayReader
+
+F32 = NDArray[np.float32]
+Ranges = tuple[tuple[int, int], tuple[int, int]]
+
+STRETCH = 1.25
+"""Range of the codes over that of the set: undoing may take samples beyond it."""
+FRAME_BYTES = 40
+"""Arrays of a frame while effects are undone on it."""
+
+
+@dataclass
+class RestoredSet(ReducedSet):
+    """A set as `ReducedSet`, its samples freed of effects as they are read.
+
+    Parameters
+    ----------
+    folder : Path
+        ``RUN/reduce/reduced.zarr/<set name>``.
+    effects : tuple of Effect
+        In the order in which they are undone.
+    calibration : Path
+        ``calibration.zarr``: samples were divided by its flat, after its dark signal was taken off.
+    exptime_s : (t,) float32
+        Exposure time of each frame.
+    """
+
+    effects: tuple[Effect, ...]
+    calibration: Path
+    exptime_s: F32
+
+    @property
+    def halo(self) -> int:
+        """Pixels around a tile that are read with it."""
+        return sum(effect.undo_halo for effect in self.effects)
+
+    @property
+    def more_bytes(self) -> int:
+        """As in `ReducedSet.more_bytes`: a block with its surroundings, and a frame at work."""
+        cy, cx = self.signal.chunks[1:]
+        around = (cy + 2 * self.halo) * (cx + 2 * self.halo) / (cy * cx)
+        return int(around * (2 * 2 * self.block + FRAME_BYTES * (1 + len(self.effects))))
+
+    @property
+    def coding(self) -> Coding:
+        """Electrons of the codes that are read."""
+        stored = super().coding
+        below = (STRETCH - 1) / 2 * stored.fill * stored.scale
+        return Coding(stored.scale * STRETCH, stored.offset - below, stored.fill)
+
+    @cached_property
+    def _maps_of_charge(self) -> dict[str, ArrayReader]:
+        return {name: ArrayReader(self.calibration / name) for name in ("flat", "dark_rate")}
+
+    def codes(self, tile: tuple[int, int], block: int, *, keep: bool = False) -> NDArray[np.uint16]:
+        """Codes (t, y, x) of one block of frames of a tile, of `coding`."""
+        if keep:
+            self.signal.keep((block, *tile))
+        y, x = self.ranges(tile)
+        ny, nx = self.shape
+        around = (
+            (max(0, y[0] - self.halo), min(ny, y[1] + self.halo)),
+            (max(0, x[0] - self.halo), min(nx, x[1] + self.halo)),
+        )
+        first = block * self.block
+        frames = (first, min(first + self.block, self.n_frames))
+        codes = self.signal.read(frames, *around)
+        inside = (
+            slice(y[0] - around[0][0], y[1] - around[0][0]),
+            slice(x[0] - around[1][0], x[1] - around[1][0]),
+        )
+        flat, rate = (self._maps_of_charge[n].read(*around) for n in ("flat", "dark_rate"))
+        out = np.empty((len(codes), y[1] - y[0], x[1] - x[0]), np.uint16)
+        for n, frame in enumerate(codes):
+            dark = rate * self.exptime_s[first + n]
+            out[n] = self._restored(frame, flat, dark)[inside]
+        return out
+
+    def blocks(self, tile: tuple[int, int]) -> Iterator[NDArray[np.uint16]]:
+        """Codes of a tile, block after block."""
+        for block in range(self.n_blocks):
+            yield self.codes(tile, block)
+
+    def _restored(self, codes: NDArray[Any], flat: F32, dark: F32) -> NDArray[np.uint16]:
+        """Codes (y, x) of `coding` of a frame, from the stored ones."""
+        stored, new = super().coding, self.coding
+        missing = codes == stored.fill
+        charge = (codes * np.float32(stored.scale) + np.float32(stored.offset)) * flat + dark
+        # What lies there is not known; to its neighbours it is like the frame.
+        charge[missing] = charge[~missing].mean() if not missing.all() else 0.0
+        frames = np.asarray(charge[None], np.float32)
+        for effect in self.effects:
+            undone = effect.undo_samples(frames)
+            assert undone is not None
+            frames = undone
+        signal = (frames[0] - dark) / flat
+        wanted = np.rint((signal - np.float32(new.offset)) / np.float32(new.scale))
+        missing |= ~((wanted >= 0) & (wanted < new.fill))
+        return np.where(missing, new.fill, wanted).astype(np.uint16)

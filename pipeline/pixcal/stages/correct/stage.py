@@ -1,0 +1,266 @@
+"""The fit with a diagnosis: effects found are undone where that is possible, maps made again.
+
+The ordinary fit and its products stay as they are. What acts on samples is undone as the cube is
+swept again; what acts on maps, on the maps that the sweep left. Shapes of the fringes are fitted to
+what remains, and sets combined, by the code of the fit.
+"""
+
+import json
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from pixcal import __version__
+from pixcal.engine.run import Runtime
+from pixcal.model.acquisition import Acquisition
+from pixcal.model.errors import DamagedError, InputError
+from pixcal.stages import fit
+from pixcal.stages.correct.gain import Maps, measure_gain
+from pixcal.stages.correct.restored_set import RestoredSet
+from pixcal.stages.correct.treatment import Treatments, treatments
+from pixcal.stages.correct.uncertainty import parameter_errors
+from pixcal.stages.correct.undoing import Swept, undo_on_maps
+from pixcal.stages.fit import Config as FitConfig
+from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
+from pixcal.stages.fit.maps import Totals, write_maps
+from pixcal.stages.fit.products import header_of, plan_products, publish_maps
+from pixcal.stages.fit.sweep import Config as SweepConfig
+from pixcal.stages.fit.sweep import load_run, nominal_vector, sweep_set
+from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduced_set import ReducedSet
+from pixcal.storage.artefact import (
+    Build,
+    Manifest,
+    artefact_key,
+    build,
+    lock,
+    read_json,
+    require,
+    up_to_date,
+    write_json,
+)
+from pixcal.storage.cube import create_group
+from pixcal.storage.products import Card, is_whole
+
+FORMAT = 1
+SUFFIX = "_corrected"
+"""Of the names of the products."""
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of the fit with a diagnosis.
+
+    Attributes
+    ----------
+    own : tuple of Path
+        Files of effects of the user's own that the diagnosis found.
+    fit : fit.Config
+        Of the ordinary fit.
+    """
+
+    own: tuple[Path, ...] = ()
+    fit: FitConfig = field(default_factory=FitConfig)
+
+
+def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
+    """Fit a run, and fit it again without the effects that its diagnosis found.
+
+    Makes ``RUN/fit`` where it is not up to date, ``RUN/corrected``, and the products
+    ``delta_x_corrected.fits``, ``delta_y_corrected.fits`` (or ``delta_fringe_corrected.fits``) and
+    ``correction.json``.
+
+    Raises
+    ------
+    InputError
+        If the run was not diagnosed, or not as it is reduced now; if an effect that was found is of
+        the user's own and its file was not given, or undoes what it should not.
+    """
+    diagnosed = require(run_dir, "diagnose", 1)
+    if diagnosed.inputs["reduce"] != require(run_dir, "reduce", 1).key:
+        raise InputError(
+            f"{run_dir / 'diagnose'}: of frames that were reduced otherwise; run "
+            f"'pixcal diagnose {run_dir}' again"
+        )
+    fitted = fit.run(run_dir, config.fit, runtime)
+    plan = treatments(
+        read_json(run_dir / "diagnose" / "diagnosis.json")["causes"],
+        diagnosed.config["nominal"],
+        {name: facts["model"] for name, facts in fitted.summary["sets"].items()},
+        config.own,
+        run_dir / "diagnose",
+    )
+    plain: Json = {
+        "own": [path.read_text(encoding="utf-8") for path in config.own],
+        "effects": [t.plain for t in plan.every],
+    }
+    inputs = {"fit": fitted.key, "diagnose": diagnosed.key}
+    acquisition, _ = load_run(run_dir)
+    if plan.undone:
+        plan_products(run_dir, [s.name for s in acquisition.frames.fringes], runtime)
+    with lock(run_dir):
+        key = artefact_key("corrected", FORMAT, plain, inputs)
+        if up_to_date(run_dir, "corrected", key) is None:
+            with build(run_dir, "corrected", FORMAT, plain, inputs) as made:
+                made.summary = _correct(run_dir, made, plan, acquisition, runtime)
+        if not _published(run_dir):
+            _publish(run_dir, plan)
+        return require(run_dir, "corrected", FORMAT)
+
+
+def _correct(
+    run_dir: Path, made: Build, plan: Treatments, acquisition: Acquisition, runtime: Runtime
+) -> Json:
+    before = read_json(run_dir / "fit" / "fit.json")
+    result: Json = {
+        "schema": "pixcal/correction/1",
+        "pixcal": __version__,
+        "input": before["input"],
+        "verdict": read_json(run_dir / "diagnose" / "diagnosis.json")["verdict"],
+        "effects": [t.plain for t in plan.every],
+        "outputs": [],
+        "sets": {},
+        "pairs": [],
+        "sets_chi2_reduced": None,
+    }
+    if plan.undone:
+        result |= _corrected_maps(run_dir, made, plan, acquisition, runtime)
+    write_json(made.folder / "correction.json", result)
+    return {"outputs": result["outputs"], "undone": [e.name for e in plan.undone]}
+
+
+def _corrected_maps(
+    run_dir: Path, made: Build, plan: Treatments, acquisition: Acquisition, runtime: Runtime
+) -> Json:
+    before = read_json(run_dir / "fit" / "fit.json")
+    names = tuple(before["sets"])
+    for old in (made.scratch / "undone", made.folder / "corrected.zarr"):
+        shutil.rmtree(old, ignore_errors=True)
+    create_group(made.scratch / "undone")
+    swept, facts = _sweep(run_dir, made, plan, acquisition, runtime)
+    fitted, halves, left = [], {}, {}
+    for name in names:
+        own = _swept_set(run_dir, swept / name, before["sets"][name], plan, acquisition, name)
+        target = made.scratch / "undone" / name
+        undo_on_maps(own, target, runtime, name)
+        halves[name] = own.has_halves
+        left[name] = parameter_errors(own, plan.errors, runtime)
+        model = before["sets"][name]["model"]
+        fitted.append(fit_set(target, own.source, facts[name], acquisition, name, model))
+    group = made.folder / "corrected.zarr"
+    totals = write_maps(group, fitted, runtime)
+    gain = measure_gain(
+        Maps(
+            run_dir / "fit" / "fit.zarr", group, fitted[0].source, names,
+            {name: tuple(before["sets"][name]["axis"]) for name in names}, halves,
+            len(plan.on_maps),
+        ),
+        runtime,
+    )  # fmt: skip
+    return {
+        "outputs": list(totals.outputs),
+        "model": before["model"],
+        "sets": {
+            f.name: _of_set(f, totals, gain["sets"][f.name], before["sets"][f.name], plan)
+            | {"parameter_error_px": left[f.name]}
+            for f in fitted
+        },
+        "pairs": gain["pairs"],
+        "sets_chi2_reduced": {
+            "before": before["sets_chi2_reduced"], "after": totals.consistency
+        },
+    }  # fmt: skip
+
+
+def _sweep(
+    run_dir: Path, made: Build, plan: Treatments, acquisition: Acquisition, runtime: Runtime
+) -> tuple[Path, Mapping[str, Json]]:
+    """Where the swept sets are, and their summaries: those of the fit, unless samples change."""
+    of_fit = require(run_dir, "sweep", 2)
+    if not plan.on_samples:
+        return run_dir / "sweep" / "sweep.zarr", of_fit.summary["sets"]
+    again = replace(made, folder=made.scratch)
+    create_group(made.scratch / "sweep.zarr")
+    ingested = Ingested(run_dir / "ingest")
+    facts = {}
+    for listed in acquisition.frames.fringes:
+        source = RestoredSet(
+            run_dir / "reduce" / "reduced.zarr" / listed.name,
+            plan.on_samples,
+            run_dir / "reduce" / "calibration.zarr",
+            ingested.exposures.fringes[f"fringes/{listed.name}"],
+        )
+        facts[listed.name] = sweep_set(
+            again, source, listed.name, nominal_vector(acquisition, listed.name),
+            SweepConfig(**of_fit.config), runtime,
+        )  # fmt: skip
+    return made.scratch / "sweep.zarr", facts
+
+
+def _swept_set(
+    run_dir: Path, folder: Path, facts: Json, plan: Treatments, acquisition: Acquisition, name: str
+) -> Swept:
+    used = read_json(run_dir / "reduce" / "reduce.json")
+    flat = run_dir / "reduce" / "calibration.zarr" / "flat"
+    return Swept(
+        folder,
+        ReducedSet(run_dir / "reduce" / "reduced.zarr" / name),
+        plan.on_maps,
+        (float(facts["kx"]), float(facts["ky"])),
+        flat if acquisition.frames.flat else None,
+        float(used["read_noise_e"]["used"]),
+    )
+
+
+def _of_set(fitted: FittedSet, totals: Totals, gain: Json, before: Json, plan: Treatments) -> Json:
+    """What ``correction.json`` says of a set."""
+    own = totals.sets[fitted.name]
+    by_effect = dict(zip((e.name for e in plan.on_maps), gain.pop("change_by_effect"), strict=True))
+    on_samples = gain.pop("change_on_samples")
+    if plan.on_samples:
+        # They are undone at once: the sweep does not tell one from the other.
+        by_effect[" and ".join(e.name for e in plan.on_samples)] = on_samples
+    after = describe(fitted, own.masked, own.sigma_px)
+    return gain | {
+        "change_by_effect": by_effect,
+        "sigma_median_px": {"before": before["sigma_median_px"], "after": own.sigma_px},
+        "chi2_reduced": {"before": before["chi2_reduced"], "after": after["chi2_reduced"]},
+        "fit": after,
+    }
+
+
+def _published(run_dir: Path) -> bool:
+    """Whether the products are there, unaltered, and are those of the present artefact."""
+    try:
+        product = read_json(run_dir / "products" / "correction.json")
+        same = product == read_json(run_dir / "corrected" / "correction.json")
+    except DamagedError:
+        return False
+    return same and all(
+        is_whole(run_dir / "products" / f"{name}{SUFFIX}.fits") for name in product["outputs"]
+    )
+
+
+def _publish(run_dir: Path, plan: Treatments) -> None:
+    """Write the products; without effects to undo, ``correction.json`` alone."""
+    folder = run_dir / "corrected"
+    result = read_json(folder / "correction.json")
+    cards: list[Card] = []
+    history: list[str] = []
+    if result["outputs"]:
+        fits = {name: facts["fit"] for name, facts in result["sets"].items()}
+        key = read_json(folder / "manifest.json")["key"]
+        cards, history = header_of(result | {"sets": fits}, key)
+        cards.append(("NEFFECT", len(plan.undone), "effects undone"))
+        for n, effect in enumerate(plan.undone, start=1):
+            cards.append((f"EFFECT{n}", effect.name, "effect undone"))
+        for t in plan.every:
+            if t.how.startswith("undone"):
+                told = json.dumps(t.plain["parameters"])
+                history.append(f"{t.effect.name}: {t.how}: {told}")
+    publish_maps(run_dir, folder / "corrected.zarr", result["outputs"], cards, history, SUFFIX)
+    write_json(run_dir / "products" / "correction.json", result)

@@ -1,0 +1,175 @@
+"""What is done about each effect of a diagnosis: undone on samples, on maps, or left, and why."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pixcal.effects import known_effects, parse_effects
+from pixcal.model.config import to_plain
+from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect
+
+ABSORBED = {
+    "bias_drift": "a level that all pixels share moves the free intensity of a frame",
+    "contrast_noise": "every frame of the fit has an amplitude of its own",
+    "flat_error": "it scales a pixel's mean light and fringe alike: the phase stays",
+    "fringe_drift": "every frame of the fit has a fringe vector of its own where it moves",
+    "fringe_jitter": "every frame of the fit has a fringe vector of its own where it moves",
+    "intensity_noise": "every frame of the fit has an intensity of its own",
+    "lag": "the frame before is a sum of the same maps: the fit takes it up; only the scatter of "
+    "the share moves phases, by hundredths of the bound",
+    "phase_modulator_error": "the fit finds the phase of every frame",
+    "wavelength_drift": "every frame of the fit has a phase and, where it moves, a fringe vector",
+}
+"""Effects that the free parameters of the fit take up, and how (measured: docs/correct.md)."""
+
+LEFT = {
+    "cosmic_hits": "few samples are hit; most of those the reduction has left out",
+    "quantisation": "rounding is noise of the samples, and costs offsets hundredths of the bound",
+    "rolling_shutter": "rows hold light of two frames; what the fit does not take up is a tenth of "
+    "the bound of 300 frames",
+    "row_noise": "noise of every frame of its own: nothing of it stays in the maps",
+    "telegraph_noise": "pixels that jump have larger errors, which the fit finds",
+}
+"""Effects that are noise, or too small to be worth undoing (measured: docs/correct.md)."""
+
+
+@dataclass(frozen=True)
+class Treatment:
+    """An effect and what is done about it.
+
+    Attributes
+    ----------
+    effect : Effect
+    origin : str
+        ``diagnosis``, or ``nominal``: known to be there before the diagnosis.
+    errors : mapping
+        Of its parameters, 1-sigma, by name.
+    how : str
+        ``undone on samples``, ``undone on maps``, ``in the fit``, ``absorbed by the fit`` or
+        ``not undone``.
+    why : str
+    """
+
+    effect: Effect
+    origin: str
+    errors: Mapping[str, float]
+    how: str
+    why: str
+
+    @property
+    def plain(self) -> dict[str, Any]:
+        """For ``correction.json``."""
+        return {
+            "effect": self.effect.name,
+            "title": self.effect.title,
+            "parameters": to_plain(self.effect),
+            "uncertainty": dict(self.errors),
+            "origin": self.origin,
+            "treatment": self.how,
+            "why": self.why,
+        }
+
+
+@dataclass(frozen=True)
+class Treatments:
+    """All effects of a diagnosis.
+
+    Attributes
+    ----------
+    every : tuple of Treatment
+        In the order of the diagnosis.
+    """
+
+    every: tuple[Treatment, ...]
+
+    def _those(self, how: str) -> tuple[Effect, ...]:
+        """Effects of a treatment, the last that acted first."""
+        own = [t.effect for t in self.every if t.how == how]
+        return tuple(sorted(own, key=lambda e: (e.stage, e.name), reverse=True))
+
+    @property
+    def on_samples(self) -> tuple[Effect, ...]:
+        """To undo on samples, in that order."""
+        return self._those("undone on samples")
+
+    @property
+    def on_maps(self) -> tuple[Effect, ...]:
+        """To undo on maps, in that order."""
+        return self._those("undone on maps")
+
+    @property
+    def errors(self) -> dict[str, Mapping[str, float]]:
+        """Of the parameters of each effect."""
+        return {t.effect.name: t.errors for t in self.every}
+
+    @property
+    def undone(self) -> tuple[Effect, ...]:
+        """All that are undone."""
+        return (*self.on_samples, *self.on_maps)
+
+
+def treatments(
+    causes: Sequence[Mapping[str, Any]],
+    nominal: Mapping[str, Any],
+    models: Mapping[str, str],
+    own: Sequence[Path],
+    where: Path,
+) -> Treatments:
+    """What to do about the effects of a diagnosis.
+
+    Parameters
+    ----------
+    causes : sequence of mapping
+        Of ``diagnosis.json``.
+    nominal : mapping
+        Parameters of the effects that the nominal bench had, by name.
+    models : mapping
+        Shape of the fringes that was fitted, by fringe set.
+    own : sequence of Path
+        Files with effects of the user's own.
+    where : Path
+        The diagnosis, for messages.
+
+    Raises
+    ------
+    InputError
+        If an effect is not known: it is of the user's own, and its file has not been given.
+    """
+    known = known_effects(own)
+    found: list[tuple[str, str, Any, Mapping[str, float]]]
+    found = [("nominal", name, parameters, {}) for name, parameters in nominal.items()]
+    found += [
+        ("diagnosis", str(c["effect"]), c["parameters"], c.get("uncertainty", {})) for c in causes
+    ]
+    for _, name, _, _ in found:
+        if name not in known:
+            raise InputError(
+                f"{where}: {name!r:.80} is an effect of your own; give its file again with "
+                "--own FILE"
+            )
+    every = []
+    for origin, name, parameters, errors in found:
+        (effect,) = parse_effects({name: parameters}, str(where), known)
+        every.append(Treatment(effect, origin, errors, *_treated(effect, models)))
+    return Treatments(tuple(every))
+
+
+def _treated(effect: Effect, models: Mapping[str, str]) -> tuple[str, str]:
+    kind = type(effect)
+    if kind.undo is not Effect.undo:
+        return "undone on maps", "it acts on the three maps of a fit alike"
+    if kind.undo_samples is not Effect.undo_samples:
+        return "undone on samples", "it depends on the light of each frame: swept again without it"
+    if effect.name == "hyperbolic_fringes":
+        straight = [name for name, model in models.items() if model != "hyperbolic"]
+        if not straight:
+            return "in the fit", "the shape that was fitted to the fringes is hyperbolic"
+        return (
+            "not undone",
+            f"straight fringes were fitted ({', '.join(straight)}): give --model hyperbolic",
+        )
+    if effect.name in ABSORBED:
+        return "absorbed by the fit", ABSORBED[effect.name]
+    return "not undone", LEFT.get(effect.name, "its file does not say how to undo it")

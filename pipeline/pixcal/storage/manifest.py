@@ -1,0 +1,169 @@
+"""The manifest of an artefact: what it was made from, and whether it is as it was written.
+
+It is sealed with its own digest, and holds a digest of every other file but the chunks of arrays,
+which have checksums of their own. What turns out to be damaged as it is read is noted beside it.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pixcal import __version__
+from pixcal.model.errors import DamagedError
+from pixcal.storage.folder import INDEX
+
+MANIFEST = "manifest.json"
+JOURNAL = "journal.jsonl"
+SCRATCH = "scratch"
+DAMAGE = "damage.json"
+"""Names of the files of an artefact that turned out to be damaged, found when they were read."""
+_NOT_LISTED = (MANIFEST, JOURNAL, DAMAGE)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What an artefact is and what it was made from."""
+
+    stage: str
+    format: int
+    key: str
+    config: dict[str, Any]
+    inputs: dict[str, str]
+    """Key of each artefact (or file set) that this one was made from."""
+    pixcal: str = __version__
+    summary: dict[str, Any] = field(default_factory=dict)
+    files: dict[str, str] = field(default_factory=dict)
+    """Digest of each file of the artefact, but for chunks of arrays."""
+
+
+def digest(*parts: Any) -> str:
+    """SHA-256 (hex, 32 characters) of plain data."""
+    text = json.dumps(parts, sort_keys=True, separators=(",", ":"), default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 (hex, 32 characters) of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:32]
+
+
+def _json(data: Any) -> str:
+    return json.dumps(data, indent=2, allow_nan=False) + "\n"
+
+
+def write_json(path: Path, data: Any) -> None:
+    """Write JSON aside, flush it to the disk, and rename it into place."""
+    aside = path.with_name(f".{path.name}.aside")
+    text = _json(data)
+    with aside.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    aside.replace(path)
+
+
+def read_json(path: Path) -> Any:
+    """Read JSON that pixcal wrote.
+
+    Raises
+    ------
+    DamagedError
+        If the file is missing or does not parse.
+    """
+    return _parse(path, _text(path))
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise DamagedError(f"{path}: cannot be read ({error.strerror})", path) from error
+    except ValueError as error:
+        raise DamagedError(f"{path}: damaged ({error})", path) from error
+
+
+def _parse(path: Path, text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise DamagedError(f"{path}: damaged ({error})", path) from error
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Write the manifest of an artefact, sealed with its own digest."""
+    # As it will be read: JSON has lists for tuples, and strings for all keys.
+    data = json.loads(_json(asdict(manifest)))
+    write_json(folder / MANIFEST, data | {"seal": digest(data)})
+
+
+def read_manifest(folder: Path) -> Manifest | None:
+    """Manifest of an artefact, or None when there is no artefact.
+
+    Raises
+    ------
+    DamagedError
+        If it does not parse, or was altered (those of earlier versions have no seal).
+    """
+    path = folder / MANIFEST
+    if not path.exists():
+        return None
+    text = _text(path)
+    data = _parse(path, text)
+    try:
+        sealed = data.pop("seal", None) is not None
+        if sealed and text != _json(data | {"seal": digest(data)}):
+            raise DamagedError(f"{path}: altered since it was written", path)
+        return Manifest(**data)
+    except (AttributeError, TypeError) as error:
+        raise DamagedError(f"{path}: not a manifest that this pixcal reads", path) from error
+
+
+def list_files(folder: Path) -> dict[str, str]:
+    """Digests of the files of an artefact, as its manifest holds them."""
+    return {name: file_digest(folder / name) for name in sorted(_listed(folder))}
+
+
+def _listed(folder: Path) -> Iterator[str]:
+    for at, folders, names in os.walk(folder):
+        here = Path(at).relative_to(folder)
+        if INDEX in names:
+            folders.clear()  # of an array: its chunks
+        if here == Path():
+            folders[:] = [name for name in folders if name != SCRATCH]
+            names = [name for name in names if name not in _NOT_LISTED]
+        yield from ((here / name).as_posix() for name in names if not name.startswith("."))
+
+
+def check_intact(folder: Path, manifest: Manifest) -> None:
+    """Hold the files of an artefact against its manifest; chunks are checked when they are read.
+
+    Raises
+    ------
+    DamagedError
+        Naming the first file that is missing or altered, or was found to be so earlier.
+    """
+    for name in damaged_files(folder):
+        raise DamagedError(f"{folder / name}: damaged", folder / name)
+    for name, expected in manifest.files.items():
+        try:
+            same = file_digest(folder / name) == expected
+        except OSError as error:
+            reason = f"cannot be read ({error.strerror})"
+            raise DamagedError(f"{folder / name}: {reason}", folder / name) from error
+        if not same:
+            raise DamagedError(f"{folder / name}: altered since it was written", folder / name)
+
+
+def damaged_files(folder: Path) -> list[str]:
+    """Names of the files of an artefact that were found to be damaged as they were read."""
+    if not (folder / DAMAGE).exists():
+        return []
+    try:
+        return [str(name) for name in read_json(folder / DAMAGE)["files"]]
+    except (DamagedError, LookupError, TypeError):
+        return [DAMAGE]

@@ -1,0 +1,172 @@
+"""The search for causes, in a world of a few curves where effects do what the test says."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from pixcal.estimators.battery import Curve, Key
+from pixcal.estimators.gap import Reference
+from pixcal.model.config import quantity
+from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.stages.diagnose.search import Candidate, Found, Search, differing, shrinkage
+
+KEYS: tuple[Key, ...] = (
+    ("harmonics", "a"),
+    ("neighbours", "a"),
+    ("frames_before", "a"),
+    ("residual_by_level", "a"),
+    ("bits", "a"),
+    ("contrast_fringes", "a"),
+)
+SIZE = 5
+NOISE = 1e-3
+
+
+@dataclass(frozen=True)
+class Toy(Effect):
+    """Moves some curves by ``size`` times a pattern."""
+
+    name = "toy"
+    title = "a toy"
+    stage = Stage.LIGHT
+    domains = ("noise",)
+    strengths = ("size",)
+    sources = ("the test",)
+
+    label: str = quantity("toy", doc="its name here")
+    size: float = quantity(1.0, doc="of the pattern")
+
+
+PATTERNS: Mapping[str, Mapping[int, float]] = {
+    "left": {0: 1.0, 1: 0.5},
+    "right": {2: 1.0, 3: -0.5},
+    "mimic": {0: 1.0, 1: 0.5, 4: 1.0},
+    "unknown": {2: 1.0, 3: 1.0, 4: 1.0, 5: 1.0, 1: 1.0},
+    "little": {5: 1.0},
+}
+
+
+def curves(
+    effects: Sequence[Effect], seed: int, sizes: Mapping[str, float] = {}
+) -> dict[Key, Curve]:
+    rng = np.random.default_rng(seed)
+    values = NOISE * rng.standard_normal((len(KEYS), SIZE))
+    on = {e.label: e.size for e in effects if isinstance(e, Toy)} | dict(sizes)
+    for label, size in on.items():
+        for row, weight in PATTERNS[label].items():
+            values[row] += size * weight * np.linspace(0.5, 1.5, SIZE)
+    return {
+        key: Curve(np.arange(SIZE, dtype=float), v) for key, v in zip(KEYS, values, strict=True)
+    }
+
+
+REFERENCE = Reference.of([curves((), seed) for seed in range(16)])
+
+
+def simulate(
+    benches: Sequence[Sequence[Effect]], seeds: int, _: str
+) -> list[list[dict[Key, Curve]] | str]:
+    return [
+        "not on this bench"
+        if any(isinstance(e, Toy) and e.size < 0 for e in bench)
+        else [curves(bench, seed) for seed in range(seeds)]
+        for bench in benches
+    ]
+
+
+def candidate(label: str, size: float, sigmas: float = 50.0) -> Candidate:
+    effect = Toy(label, size)
+    object.__setattr__(effect, "name", label)
+    return Candidate(label, Estimate(effect, {"size": 0.01 * size}, sigmas, "told"))
+
+
+def search(
+    truth: Mapping[str, float],
+    candidates: Sequence[Candidate],
+    mimicked: Mapping[str, float] | None = None,
+    seed: int = 500,
+) -> tuple[Found, float]:
+    data = REFERENCE.on_scale(curves((), seed, truth))
+    found = Search(REFERENCE, data, simulate, lambda *_: mimicked or {}).run(
+        {c.name: c for c in candidates}
+    )
+    where = differing(found.nominal, found.final, data)
+    return found, shrinkage(data, found.nominal, found.final, where).gap.total
+
+
+def test_what_is_there_is_taken_and_what_is_not_is_left() -> None:
+    found, left = search({"left": 0.03}, [candidate("left", 0.0301), candidate("right", 0.03)])
+    assert found.taken == ("left",)
+    assert left < 0.05
+    assert found.candidates["right"].reason == "the unseen frames get no likelier with it"
+
+
+def test_two_effects_are_both_found_in_any_order() -> None:
+    both = [candidate("left", 0.03), candidate("right", 0.01), candidate("little", 0.02)]
+    results = [search({"left": 0.03, "right": 0.01}, order) for order in (both, both[::-1])]
+    for found, left in results:
+        assert set(found.taken) == {"left", "right"}
+        assert left < 0.05
+        assert set(found.without) == {"left", "right"}
+    assert results[0][1] == pytest.approx(results[1][1])
+
+
+def test_of_two_that_are_alike_the_one_that_opens_no_gap_is_taken() -> None:
+    found, _ = search(
+        {"left": 0.03}, [candidate("mimic", 0.03), candidate("left", 0.03)], {"mimic": 49.0}
+    )
+    assert found.taken == ("left",)
+    assert found.candidates["mimic"].reason == "what left does looks like it"
+
+
+def test_effects_that_no_unseen_frame_tells_apart_are_named_together() -> None:
+    twin = candidate("left", 0.03)
+    object.__setattr__(twin, "name", "twin")
+    assert twin.estimate is not None
+    object.__setattr__(twin.estimate.effect, "name", "twin")
+    found, _ = search({"left": 0.03}, [candidate("left", 0.03), twin], {"left": 50.0, "twin": 50.0})
+    (first,) = found.taken
+    other = {"left": "twin", "twin": "left"}[first]
+    assert found.alike == {first: (other,)}
+
+
+def test_an_effect_below_its_threshold_is_not_tried() -> None:
+    found, _ = search({"left": 0.03}, [candidate("left", 0.03, sigmas=3.9)])
+    assert not found.taken
+    assert "3.9 sigma" in found.candidates["left"].reason
+    assert found.candidates["left"].alone is None
+
+
+def test_a_stand_in_for_an_unknown_cause_is_not_claimed() -> None:
+    """It makes the data likelier, but next to nothing of the gap is closed."""
+    found, left = search({"unknown": 0.05, "little": 0.004}, [candidate("little", 0.006)])
+    assert not found.taken
+    assert left == pytest.approx(1, abs=0.02)
+    assert "stays unexplained" in found.candidates["little"].reason
+
+
+def test_nothing_is_claimed_of_nothing() -> None:
+    for seed in range(600, 640):
+        found, left = search({}, [candidate(label, 2 * NOISE) for label in PATTERNS], None, seed)
+        assert not found.taken
+        assert left == 0
+
+
+def test_what_cannot_be_simulated_is_said() -> None:
+    found, _ = search({"left": 0.03}, [candidate("left", -0.03), candidate("right", 0.03)])
+    assert found.candidates["left"].reason == "cannot be simulated: not on this bench"
+
+
+def test_an_estimate_inflated_by_another_effect_is_scaled_down() -> None:
+    """Half of the right effect's estimate is owed to the left one."""
+    found, left = search(
+        {"left": 0.03, "right": 0.01},
+        [candidate("left", 0.03), candidate("right", 0.02)],
+        {"right": 25.0},
+    )
+    assert set(found.taken) == {"left", "right"}
+    sizes = {e.label: e.size for e in found.final.effects if isinstance(e, Toy)}
+    assert sizes["right"] == pytest.approx(0.01)
+    assert left < 0.05

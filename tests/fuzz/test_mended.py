@@ -1,0 +1,108 @@
+"""What bad input once broke, each by itself."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fuzzing.laws import LAST_MESSAGE, calibrate
+from fuzzing.night import Night
+from pixcal.effects import effect_of_file
+from pixcal.model.acquisition import Frames
+from pixcal.model.errors import InputError
+from pixcal.storage.sources import find_sources
+
+ONE = {"vertical": (1.18, 0.02)}
+
+
+def night(seed: int = 1, **options: Any) -> Night:
+    return Night(np.random.default_rng(seed), **({"vectors": ONE} | options))
+
+
+def refused(made: Night, folder: Path, dtype: str = "uint16") -> str:
+    assert calibrate(made.write(folder / "acq", dtype), folder / "run") == "refused"
+    return LAST_MESSAGE[0]
+
+
+def calibrated(made: Night, folder: Path, dtype: str = "uint16") -> None:
+    assert calibrate(made.write(folder / "acq", dtype), folder / "run") == "truthful"
+    made.check(folder / "run")
+
+
+@pytest.mark.parametrize("count", [6, 9, 15, 16])
+def test_few_frames_have_no_batches_but_a_map(count: int, tmp_path: Path) -> None:
+    calibrated(night(count=count), tmp_path)
+
+
+def test_fringes_under_two_pixels_are_refused(tmp_path: Path) -> None:
+    message = refused(night(vectors={"vertical": (4.0, 0.3)}), tmp_path)
+    assert "fringes of 1.6 px" in message
+
+
+def test_fringes_along_another_axis_are_refused(tmp_path: Path) -> None:
+    made = night()
+    scan = made.described["frames"]["fringes"][0]
+    scan["baseline_mm"] = scan["baseline_mm"][::-1]
+    assert "degrees from where baseline_mm says" in refused(made, tmp_path)
+
+
+@pytest.mark.parametrize("factor", [0.45, 2.0])
+def test_nominal_fringes_of_another_width_lead_nowhere_else(factor: float, tmp_path: Path) -> None:
+    made = night(shape=(33, 39))
+    made.described["optics"]["wavelength_nm"] /= factor
+    calibrated(made, tmp_path)
+
+
+@pytest.mark.parametrize("phases", ["two", "one other"])
+def test_two_phases_are_too_few(phases: str, tmp_path: Path) -> None:
+    t = np.arange(40)
+    turn = np.pi / 2 * (t % 2) if phases == "two" else np.where(t == 3, 2.0, 0.0)
+    assert "scanned too little" in refused(night(phases=turn), tmp_path)
+
+
+def test_three_phases_are_enough(tmp_path: Path) -> None:
+    calibrated(night(phases=2 * np.pi / 3 * (np.arange(40) % 3)), tmp_path)
+
+
+def test_flats_without_light_are_refused(tmp_path: Path) -> None:
+    made = night()
+    rng = np.random.default_rng(4)
+    made.frames["flat"] = made.bias + rng.normal(0, 16, (10, *made.shape))
+    made.described["frames"]["flat"] = ["flat.fits"]
+    assert "the flats hold no light" in refused(made, tmp_path)
+
+
+@pytest.mark.parametrize("level", [300.0, 7000.0])
+def test_pixels_of_a_wrong_bias_do_no_harm_to_others(level: float, tmp_path: Path) -> None:
+    made = night(shape=(31, 37), level=level)
+    wrong = np.random.default_rng(2).random(made.shape) < 0.05
+    made.frames["bias"][:, wrong] += 3000.0
+    made.spoilt = wrong
+    calibrated(made, tmp_path, "int32")
+
+
+@pytest.mark.parametrize("value", [1e38, -1e38])
+def test_an_absurd_sample_costs_no_more_than_its_pixel(value: float, tmp_path: Path) -> None:
+    made = night()
+    made.frames["vertical"][7, 3, 5] = value
+    made.frames["bias"][:, 9, 9] = value
+    made.spoilt[9, 9] = True
+    del made.described["detector"]["saturation_adu"]
+    calibrated(made, tmp_path, "float32")
+
+
+def test_links_in_circles_are_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b/x.fits").write_text("x")
+    for name in ("c1", "c2", "b/c3"):
+        (tmp_path / name).symlink_to(tmp_path)
+    found = find_sources(Frames(bias=("**/*.fits",)), tmp_path / "acquisition.yaml")
+    assert [source.name for source in found["bias"]] == ["b/x.fits"]
+
+
+def test_an_effect_that_leaves_the_interpreter_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "own.py"
+    file.write_text("raise SystemExit(0)")
+    with pytest.raises(InputError, match=r"own\.py: cannot be imported \(SystemExit: 0\)"):
+        effect_of_file(file)
