@@ -130,7 +130,9 @@ def unfinished(bench: Bench, stage: str, damage: Damage, times: int, seed: int) 
     while outcome.tried < times:
         run = bench.copy("unfinished", *STAGES[: STAGES.index(stage)])
         command = Command(bench.command(stage, run))
-        time.sleep(rng.uniform(0.1, 1) * bench.seconds[stage])
+        while command.process.is_alive() and not any(run.glob(".partial/*/*")):
+            time.sleep(0.001)
+        time.sleep(rng.uniform(0, 0.7) * bench.seconds[stage])
         command.send(signal.SIGKILL)
         command.end()
         left = [f for f in sorted(run.glob(".partial/**/*")) if f.is_file()]

@@ -195,6 +195,15 @@ def test_the_type_of_the_samples_does_not_matter(acquired: Any) -> None:
         )
 
 
+def test_which_fibre_is_called_a_does_not_matter(acquired: Any) -> None:
+    bench, run = acquired
+    turned = {name: (-x, -y) for name, (x, y) in bench.sets.items()}
+    other = pixcal.calibrate(**in_memory(bench, run, baselines_mm=turned))
+    for name in ("delta_x", "delta_y"):
+        found, sigma = other.maps[name], run.maps[name].sigma
+        np.testing.assert_allclose(found.delta, run.maps[name].delta, atol=0.02 * sigma.max())
+
+
 def test_a_temporary_run_goes_with_the_last_reference(acquired: Any) -> None:
     bench, run = acquired
     only = {"frames": {"vertical": arrays_of(run)["vertical"]}}
@@ -257,6 +266,10 @@ def test_what_is_wrong_is_named(changes: dict[str, Any], message: str, tmp_path:
         (lambda run: pixcal.fit(run, chi2_limit=0.5), "pixcal.fit: chi2_limit: 0.5 must be"),
         (lambda run: pixcal.reduce(run, hot_sigma=1), "pixcal.reduce: hot_sigma: 1 is below 5"),
         (lambda run: pixcal.allan(run, region=(0, 9)), "pixcal.allan: region: expected 4 values"),
+        (lambda run: pixcal.fit(run, own=["mine.py"]), "own: of use with with_diagnosis only"),
+        (lambda run: pixcal.fit(run, with_diagnosis=True), "diagnose: not there yet; run 'pixcal"),
+        (lambda run: run.diagnosis, "diagnose: not there yet; run 'pixcal diagnose"),
+        (lambda run: run.corrected, "corrected: not there yet; run 'pixcal"),
         (lambda run: pixcal.open_run(run.path / "nowhere"), "nowhere: no such run directory"),
         (lambda run: pixcal.budget("none.yaml", frames=0), "pixcal.budget: frames: 0 is below 1"),
         (lambda run: pixcal.astrometry(run, stars=1), "pixcal.astrometry: stars: 1 is below 2"),

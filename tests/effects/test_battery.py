@@ -70,7 +70,10 @@ def test_a_third_harmonic_shows_with_its_size(plain: Evidence) -> None:
     one = plain.fringes["vertical"]
     alpha = np.hypot(one.theta[1], one.theta[2])
     psi = np.arctan2(one.theta[1], one.theta[2])
-    turn = 3 * (one.phi[:, None, None] - psi)
+    turn = 3 * (one.phi[:, None, None] + psi)
+    # As the model has it: the fringes themselves are sin(phi + psi).
+    fringes = one.model - one.g[:, :1, None] * one.theta[0]
+    assert np.corrcoef(fringes.ravel(), np.sin(turn / 3).ravel())[0, 1] > 0.99
     more = (one.electrons + 1e-3 * alpha * np.cos(turn)).astype(np.float32)
     curve = measure(changed(plain, electrons=more))["harmonics", "vertical"]
     assert curve.value[list(curve.x).index(3.0)] == pytest.approx(1e-3, rel=0.1)

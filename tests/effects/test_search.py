@@ -10,7 +10,14 @@ from pixcal.estimators.battery import Curve, Key
 from pixcal.estimators.gap import Reference
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
-from pixcal.stages.diagnose.search import Candidate, Found, Search, differing, shrinkage
+from pixcal.stages.diagnose.search import (
+    LEAST_OF_HINTED,
+    Candidate,
+    Found,
+    Search,
+    differing,
+    shrinkage,
+)
 
 KEYS: tuple[Key, ...] = (
     ("harmonics", "a"),
@@ -133,10 +140,25 @@ def test_effects_that_no_unseen_frame_tells_apart_are_named_together() -> None:
 
 
 def test_an_effect_below_its_threshold_is_not_tried() -> None:
-    found, _ = search({"left": 0.03}, [candidate("left", 0.03, sigmas=3.9)])
-    assert not found.taken
+    """Where nothing differs 4 standard deviations are asked for, where there is a gap 1.5."""
+    found, _ = search({}, [candidate("left", 2 * NOISE, sigmas=3.9)])
     assert "3.9 sigma" in found.candidates["left"].reason
     assert found.candidates["left"].alone is None
+    found, _ = search({"left": 0.03}, [candidate("left", 0.03, sigmas=1.4)])
+    assert not found.taken
+    assert "1.4 sigma" in found.candidates["left"].reason
+
+
+def test_an_effect_that_is_only_hinted_at_passes_a_higher_mark() -> None:
+    found, left = search({"left": 0.03}, [candidate("left", 0.03, sigmas=2.0)])
+    assert found.taken == ("left",)
+    assert left < 0.05
+    weak = {"left": 0.004}
+    found, _ = search(weak, [candidate("left", 0.004, sigmas=2.0)])
+    sure, _ = search(weak, [candidate("left", 0.004, sigmas=20.0)])
+    gain = sure.final.log_likelihood - sure.nominal.log_likelihood
+    assert sure.taken == ("left",)
+    assert (found.taken == ("left",)) == (gain >= LEAST_OF_HINTED)
 
 
 def test_a_stand_in_for_an_unknown_cause_is_not_claimed() -> None:

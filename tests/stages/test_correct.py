@@ -240,31 +240,56 @@ def test_what_the_fit_takes_up_is_said(coupled, tmp_path):
     _, run, *_ = coupled
     again = tmp_path / "run"
     shutil.copytree(run, again)
-    names = ("intensity_noise", "hyperbolic_fringes", "row_noise")
+    names = ("intensity_noise", "telegraph_noise", "row_noise")
     diagnosed(again, *parse_effects(dict.fromkeys(names), "test"))
     correct.run(again, correct.Config(), SYNC)
     found = json.loads((again / "products" / "correction.json").read_text())
     assert [e["treatment"] for e in found["effects"]] == [
         "absorbed by the fit", "not undone", "not undone"
     ]  # fmt: skip
-    assert "--model hyperbolic" in found["effects"][1]["why"]
     assert found["outputs"] == []
 
 
 def test_effects_known_before_the_diagnosis_are_undone_too(tmp_path):
-    found = treatments([], {"ipc": to_plain(Ipc())}, {"only": "hyperbolic"}, (), tmp_path)
+    found = treatments([], {"ipc": to_plain(Ipc())}, "auto", {"only": "paraxial"}, (), tmp_path)
     assert found.on_maps == (Ipc(),)
     assert found.every[0].origin == "nominal"
+
+
+@pytest.mark.parametrize(
+    ("asked", "taken", "how"),
+    [
+        ("auto", "hyperbolic", "in the fit"),
+        ("auto", "paraxial", "in the corrected fit"),
+        ("paraxial", "paraxial", "not undone"),
+    ],
+)
+def test_bent_fringes_are_for_the_shape_that_is_fitted(tmp_path, asked, taken, how):
     causes = [{"effect": "hyperbolic_fringes", "parameters": {}}]
-    (one,) = treatments(causes, {}, {"only": "hyperbolic"}, (), tmp_path).every
-    assert one.how == "in the fit"
+    found = treatments(causes, {}, asked, {"one": "hyperbolic", "two": taken}, (), tmp_path)
+    assert found.every[0].how == how
+    assert found.changes == (how == "in the corrected fit")
+    assert ("--model hyperbolic" in found.every[0].why) == (how == "not undone")
+
+
+def test_bent_fringes_that_the_fit_did_not_see_are_fitted(coupled, tmp_path):
+    _, run, *_ = coupled
+    again = tmp_path / "run"
+    shutil.copytree(run, again)
+    diagnosed(again, *parse_effects({"hyperbolic_fringes": None}, "test"))
+    correct.run(again, correct.Config(), SYNC)
+    found = json.loads((again / "products" / "correction.json").read_text())
+    assert found["outputs"] == ["delta_x", "delta_y"]
+    assert {s["fit"]["model"] for s in found["sets"].values()} == {"hyperbolic"}
+    header = read_map(again / "products" / "delta_x_corrected.fits")[3]
+    assert (header["MODEL"], header["NEFFECT"]) == ("hyperbolic", 0)
 
 
 def test_every_effect_of_pixcal_has_a_treatment_with_a_reason(tmp_path):
     from pixcal.effects import effects
 
     causes = [{"effect": name, "parameters": {}} for name in effects()]
-    for one in treatments(causes, {}, {"only": "paraxial"}, (), tmp_path).every:
+    for one in treatments(causes, {}, "auto", {"only": "paraxial"}, (), tmp_path).every:
         assert "its file" not in one.why, one.effect.name
     assert set(ABSORBED) | set(LEFT) <= set(effects())
 
@@ -287,7 +312,7 @@ def test_an_effect_of_the_users_own_is_asked_for(coupled, tmp_path):
     file = tmp_path / "glow.py"
     file.write_text(GLOW)
     (glow,) = treatments(
-        [{"effect": "glow", "parameters": {}}], {}, {}, (file,), run / "diagnose"
+        [{"effect": "glow", "parameters": {}}], {}, "auto", {}, (file,), run / "diagnose"
     ).every
     assert glow.why == "its file does not say how to undo it"
     diagnosed(again, glow.effect)

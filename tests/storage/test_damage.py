@@ -20,7 +20,7 @@ from pixcal.storage.artefact import (
     up_to_date,
     write_json,
 )
-from pixcal.storage.cube import ArrayReader, create_group, write_array
+from pixcal.storage.cube import ArrayReader, create_array, create_group, write_array
 from pixcal.storage.products import is_whole, read_map, write_map
 
 
@@ -200,3 +200,32 @@ def test_altered_and_cut_products_are_seen(product: Path) -> None:
         assert not is_whole(product)
     product.unlink()
     assert not is_whole(product)
+
+
+# Arrays in the making
+
+
+def test_metadata_of_an_unfinished_array_are_not_trusted(tmp_path: Path) -> None:
+    attrs = {"scale_factor": 1.25}
+    for name in ("whole", "altered"):
+        made = create_array(tmp_path / name, (4,), "u2", dims=["t"], chunks=(2,), attrs=attrs)
+        made.write((0,), np.array([1, 2], "u2"))
+    file = tmp_path / "altered" / "zarr.json"
+    file.write_text(file.read_text().replace("1.25", "1.35"))
+    for name in ("whole", "altered"):
+        made = create_array(tmp_path / name, (4,), "u2", dims=["t"], chunks=(2,), attrs=attrs)
+        made.write((2,), np.array([3, 4], "u2"))
+        made.finish()
+        reader = ArrayReader(tmp_path / name)
+        assert reader.attrs == attrs
+        np.testing.assert_array_equal(reader.read(), [1, 2, 3, 4])
+
+
+def test_metadata_altered_while_chunks_are_written_are_not_sealed(tmp_path: Path) -> None:
+    made = create_array(tmp_path / "a", (2,), "u2", dims=["t"], chunks=(2,), attrs={"gain": 1.5})
+    made.write((0,), np.array([1, 2], "u2"))
+    file = tmp_path / "a" / "zarr.json"
+    file.write_text(file.read_text().replace("1.5", "1.7"))
+    made.finish()
+    with pytest.raises(DamagedError, match="altered"):
+        ArrayReader(tmp_path / "a")

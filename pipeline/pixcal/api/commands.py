@@ -195,7 +195,8 @@ def fit(
     chi2_limit : float
         Pixels with a reduced chi-square above are flagged ``BAD_FIT``.
     with_diagnosis : bool
-        Write maps without the effects that `diagnose` found as well, and what they gained.
+        Also write maps without the effects that `diagnose` found (`Run.corrected`), and what
+        they gained.
     own : sequence of str or path
         Files of effects of one's own that the diagnosis found.
     runtime : Runtime, optional
@@ -213,8 +214,10 @@ def fit(
         stage.Config, "fit", model=model, batch_frames=batch_frames, chi2_limit=chi2_limit
     )
     if with_diagnosis:
-        files = tuple(Path(file) for file in own)
-        correct.run(Path(run), correct.Config(files, config), runtime or Runtime())
+        corrected = correct.Config(tuple(map(Path, own)), config)
+        correct.run(Path(run), corrected, runtime or Runtime())
+    elif own:
+        raise InputError("pixcal.fit: own: of use with with_diagnosis only; give that as well")
     else:
         stage.run(Path(run), config, runtime or Runtime())
     return open_run(run)

@@ -22,7 +22,15 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 
-FORMATS = {"ingest": 1, "reduce": 1, "fit": 1, "allan": 1, "diagnose": 1, "report": 1}
+FORMATS = {
+    "ingest": 1,
+    "reduce": 1,
+    "fit": 1,
+    "allan": 1,
+    "diagnose": 1,
+    "corrected": 1,
+    "report": 1,
+}
 """Formats of the artefacts that are read here."""
 DETECTOR_MAPS = ("bias", "dark_rate", "flat", "read_noise", "mask")
 SERIES = ("time", "B", "A", "phi", "dkx", "dky")
@@ -152,6 +160,23 @@ class Run:
             return {
                 name: OffsetMap(name, *read_map(folder / f"{name}.fits"))
                 for name in self.fit["outputs"]
+            }
+
+    @cached_property
+    def correction(self) -> dict[str, Any]:
+        """Contents of ``correction.json``: what was done about each effect that was found."""
+        require(self.path, "corrected", FORMATS["corrected"])
+        found: dict[str, Any] = read_json(self.path / "corrected" / "correction.json")
+        return found
+
+    @cached_property
+    def corrected(self) -> dict[str, OffsetMap]:
+        """The maps without the effects that were found; none where nothing was to be undone."""
+        folder = self.path / "products"
+        with damage_noted(self.path):
+            return {
+                name: OffsetMap(name, *read_map(folder / f"{name}_corrected.fits"))
+                for name in self.correction["outputs"]
             }
 
     def _map(self, name: str) -> OffsetMap:

@@ -33,7 +33,7 @@ def checked(effect: type[Effect], file: Path) -> type[Effect]:
     try:
         _check(effect)
     except (Exception, SystemExit) as error:
-        raise InputError(f"{file}: {_reason(error)}; see docs/effects.md") from error
+        raise InputError(f"{file}: {_reason(error)}; see docs/own-effect.md") from error
     return effect
 
 

@@ -35,7 +35,7 @@ MIN_FRAMES = 6
 ODD_VISIBILITY = 12.0
 """Departure from the visibility of a tile's pixels, over the usual one, of a pixel not to learn
 from; some 8 standard deviations."""
-MANY = 20.0
+MANY = 3.0
 """Mean light over that of most pixels, or the reverse, of pixels not to learn from."""
 FOLLOWS_RAD = 0.8
 """Most of the usual distance of the pixels' phases from smooth ones; random ones have 1.57."""

@@ -71,18 +71,28 @@ def repeats(values: F64, axis: int) -> C128:
     )
 
 
-CELL = 8
-"""Pixels along the side of a cell, whose means show how red a map is."""
+CELLS = (8, 16)
+"""Pixels along the sides of cells, whose means show how red a map is; and a quarter of the map."""
 
 
 def redness(values: F64) -> float:
-    """How much more the means of cells of a map (NaN: none) scatter than those of white noise."""
+    """How much more the means of cells of a map (NaN: none) scatter than those of white noise.
+
+    The most that cells of several sizes show: what is alike over blocks of the foundry's stitching
+    does not average down as single pixels do.
+    """
     ny, nx = values.shape
     good = np.isfinite(values)
-    cut = (slice(0, ny - ny % CELL), slice(0, nx - nx % CELL))
-    inside = np.where(good, values, 0)[cut].reshape(ny // CELL, CELL, nx // CELL, CELL)
-    white = float(np.nanvar(values)) / CELL**2
-    return max(1.0, float(inside.mean(axis=(1, 3)).var()) / max(white, 1e-300))
+    filled = np.where(good, values, 0)
+    variance = max(float(np.nanvar(values)), 1e-300)
+    found = 1.0
+    for side in {*CELLS, max(1, min(ny, nx) // 4)}:
+        if min(ny, nx) < 2 * side:
+            continue
+        rows, columns = ny // side, nx // side
+        inside = filled[: rows * side, : columns * side].reshape(rows, side, columns, side)
+        found = max(found, float(inside.mean(axis=(1, 3)).var()) * side**2 / variance)
+    return found
 
 
 @dataclass(frozen=True)
@@ -139,6 +149,8 @@ def true_offsets(delta: F64, sigma: F64, psi: F64) -> Offsets:
     noise = float(np.nanmedian(sigma[np.isfinite(delta)] ** 2))
     true = variance * max(0.0, 1 - noise / max(variance, 1e-300))
     scatter = np.sqrt(true / (terms**2).sum(axis=(1, 2)))
-    scatter[: len(bending)] *= np.sqrt(redness(rest))
+    # The polynomials took most of what is alike over large blocks: they scatter by more than the
+    # rest is red by. Of white maps the factor is one.
+    scatter[: len(bending)] *= redness(rest)
     kept = np.nan_to_num(rest * np.sqrt(true / max(variance, 1e-300)))
     return Offsets(kept, terms, scatter)

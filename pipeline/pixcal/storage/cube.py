@@ -74,38 +74,44 @@ def create_array(
     """
     shape, chunks = tuple(map(int, shape)), tuple(map(int, chunks))
     dtype = np.dtype(dtype).newbyteorder("<")
-    if not (path / "zarr.json").exists():
-        made: dict[str, Any] = {}
-        zarr.create_array(
-            store=made,
-            shape=shape,
-            chunks=chunks,
-            dtype=dtype,
-            fill_value=fill_value,
-            serializer=BytesCodec(endian="little"),
-            compressors=[
-                BloscCodec(typesize=dtype.itemsize, cname="lz4", clevel=1, shuffle="bitshuffle"),
-                Crc32cCodec(),
-            ],
-            filters=None,
-            dimension_names=tuple(dims),
-            attributes=attrs or {},
-        )
-        _write_metadata(path, made)
-    return ArrayWriter(path, shape, chunks, dtype, fill_value, durable)
+    made: dict[str, Any] = {}
+    zarr.create_array(
+        store=made,
+        shape=shape,
+        chunks=chunks,
+        dtype=dtype,
+        fill_value=fill_value,
+        serializer=BytesCodec(endian="little"),
+        compressors=[
+            BloscCodec(typesize=dtype.itemsize, cname="lz4", clevel=1, shuffle="bitshuffle"),
+            Crc32cCodec(),
+        ],
+        filters=None,
+        dimension_names=tuple(dims),
+        attributes=attrs or {},
+    )
+    metadata = _write_metadata(path, made)
+    return ArrayWriter(path, shape, chunks, dtype, fill_value, metadata, durable)
 
 
 def create_group(path: Place, attrs: dict[str, Any] | None = None) -> None:
     """Create a Zarr group (a folder that xarray opens as a dataset) if it is not there."""
-    if not (path / "zarr.json").exists():
-        made: dict[str, Any] = {}
-        zarr.create_group(store=made, attributes=attrs or {})
-        _write_metadata(path, made)
+    made: dict[str, Any] = {}
+    zarr.create_group(store=made, attributes=attrs or {})
+    _write_metadata(path, made)
 
 
-def _write_metadata(path: Place, made: dict[str, Any]) -> None:
-    """Put down what zarr-python has made in memory."""
-    open_folder(path).write((name, [content.to_bytes()]) for name, content in made.items())
+def _write_metadata(path: Place, made: dict[str, Any]) -> bytes:
+    """Put down what zarr-python has made in memory, unless just that is there already."""
+    content: bytes = made["zarr.json"].to_bytes()
+    try:
+        there = (path / "zarr.json").read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
+        there = b""
+    # What an unfinished build has left is not trusted: it has no checksum yet.
+    if there != content:
+        open_folder(path).write([("zarr.json", [content])])
+    return content
 
 
 def write_array(path: Place, data: NDArray[Any], **options: Any) -> None:
@@ -120,9 +126,9 @@ def _grid(shape: tuple[int, ...], chunks: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(-(-n // c) for n, c in zip(shape, chunks, strict=True))
 
 
-def _seal(path: Place, index: bytes) -> bytes:
+def _seal(metadata: bytes, index: bytes) -> bytes:
     """Checksum of an array's metadata and index, kept at the end of the index."""
-    seal: int = google_crc32c.value((path / "zarr.json").read_bytes() + index)
+    seal: int = google_crc32c.value(metadata + index)
     return seal.to_bytes(4, "little")
 
 
@@ -145,6 +151,7 @@ class ArrayWriter:
     chunks: tuple[int, ...]
     dtype: np.dtype[Any]
     fill_value: Any
+    metadata: bytes
     durable: bool = False
 
     def write(self, start: Sequence[int], data: NDArray[Any]) -> None:
@@ -226,7 +233,7 @@ class ArrayWriter:
         body = BytesIO()
         np.save(body, index)
         content = body.getvalue()
-        folder.write([(INDEX, (content, _seal(self.path, content)))], durable=self.durable)
+        folder.write([(INDEX, (content, _seal(self.metadata, content)))], durable=self.durable)
         return index
 
 
@@ -269,11 +276,12 @@ class ArrayReader:
         self.path = path
         try:
             body = (path / INDEX).read_bytes()
-            if _seal(path, body[:-4]) != body[-4:]:
+            metadata = (path / "zarr.json").read_bytes()
+            if _seal(metadata, body[:-4]) != body[-4:]:
                 raise ValueError(f"zarr.json or {INDEX} was altered")
             # Sealed, so it is what zarr wrote: no need of zarr's event loop, which takes its time
             # when many threads open many arrays.
-            meta = json.loads((path / "zarr.json").read_bytes())
+            meta = json.loads(metadata)
             grid = _grid(meta["shape"], meta["chunk_grid"]["configuration"]["chunk_shape"])
             count = math.prod(grid)
             # Not np.load: parsing its header as Python is not safe in the threads of a Dask worker,

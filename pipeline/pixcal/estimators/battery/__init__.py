@@ -106,15 +106,6 @@ def battery() -> Mapping[str, Statistic]:
     return found
 
 
-def statistic_named(name: str) -> Statistic:
-    """A statistic of the battery, or the signature of an effect."""
-    if name in battery():
-        return battery()[name]
-    from pixcal.estimators.battery.signature import statistic_of_signature
-
-    return statistic_of_signature(name)
-
-
 def measure(evidence: Evidence) -> dict[Key, Curve]:
     """Every statistic of an acquisition that it has the frames for."""
     found: dict[Key, Curve] = {}

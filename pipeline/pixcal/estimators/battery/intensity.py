@@ -22,9 +22,9 @@ def harmonics(look: Look) -> Curve:
     moments = turns @ rest
     places, values = [], []
     for at, n in enumerate(orders):
-        # The signal goes with cos(phi - psi).
+        # The signal goes with sin(phi + psi).
         moment = moments[2 * at] - 1j * moments[2 * at + 1]
-        size = 2 * np.mean(moment * np.exp(1j * n * psi)) / len(phi) / alpha
+        size = 2 * np.mean(moment * np.exp(-1j * n * psi)) / len(phi) / alpha
         places += [n, n + 0.25]
         values += [float(size.real), float(size.imag)]
     return Curve(np.array(places), np.array(values))

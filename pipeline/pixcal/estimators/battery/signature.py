@@ -7,7 +7,7 @@ other frames is a statistic too.
 
 import numpy as np
 
-from pixcal.estimators.battery import DETECTOR, Curve, Key, Statistic
+from pixcal.estimators.battery import DETECTOR, Curve, Key, Statistic, battery
 
 STRAIGHT = 10.0
 """Standard deviations beyond which they count by their logarithm."""
@@ -27,8 +27,10 @@ def signature_curve(significance: float) -> Curve:
     return Curve(np.zeros(1), np.array([float(np.copysign(size, significance))]))
 
 
-def statistic_of_signature(name: str) -> Statistic:
-    """What such a key stands for."""
+def statistic_named(name: str) -> Statistic:
+    """A statistic of the battery, or the signature of an effect."""
+    if name in battery():
+        return battery()[name]
     effect, _, domain = name.removeprefix(_PREFIX).rpartition(_INFIX)
     title = f"what the estimate of {effect} sees"
 

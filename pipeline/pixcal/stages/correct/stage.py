@@ -19,7 +19,7 @@ from pixcal.model.errors import DamagedError, InputError
 from pixcal.stages import fit
 from pixcal.stages.correct.gain import Maps, measure_gain
 from pixcal.stages.correct.restored_set import RestoredSet
-from pixcal.stages.correct.treatment import Treatments, treatments
+from pixcal.stages.correct.treatment import HYPERBOLIC, Treatments, treatments
 from pixcal.stages.correct.uncertainty import parameter_errors
 from pixcal.stages.correct.undoing import Swept, undo_on_maps
 from pixcal.stages.fit import Config as FitConfig
@@ -90,6 +90,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     plan = treatments(
         read_json(run_dir / "diagnose" / "diagnosis.json")["causes"],
         diagnosed.config["nominal"],
+        config.fit.model,
         {name: facts["model"] for name, facts in fitted.summary["sets"].items()},
         config.own,
         run_dir / "diagnose",
@@ -100,7 +101,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     }
     inputs = {"fit": fitted.key, "diagnose": diagnosed.key}
     acquisition, _ = load_run(run_dir)
-    if plan.undone:
+    if plan.changes:
         plan_products(run_dir, [s.name for s in acquisition.frames.fringes], runtime)
     with lock(run_dir):
         key = artefact_key("corrected", FORMAT, plain, inputs)
@@ -127,7 +128,7 @@ def _correct(
         "pairs": [],
         "sets_chi2_reduced": None,
     }
-    if plan.undone:
+    if plan.changes:
         result |= _corrected_maps(run_dir, made, plan, acquisition, runtime)
     write_json(made.folder / "correction.json", result)
     return {"outputs": result["outputs"], "undone": [e.name for e in plan.undone]}
@@ -142,6 +143,7 @@ def _corrected_maps(
         shutil.rmtree(old, ignore_errors=True)
     create_group(made.scratch / "undone")
     swept, facts = _sweep(run_dir, made, plan, acquisition, runtime)
+    model = HYPERBOLIC if plan.bent else before["model"]
     fitted, halves, left = [], {}, {}
     for name in names:
         own = _swept_set(run_dir, swept / name, before["sets"][name], plan, acquisition, name)
@@ -149,7 +151,6 @@ def _corrected_maps(
         undo_on_maps(own, target, runtime, name)
         halves[name] = own.has_halves
         left[name] = parameter_errors(own, plan.errors, runtime)
-        model = before["sets"][name]["model"]
         fitted.append(fit_set(target, own.source, facts[name], acquisition, name, model))
     group = made.folder / "corrected.zarr"
     totals = write_maps(group, fitted, runtime)
@@ -163,7 +164,7 @@ def _corrected_maps(
     )  # fmt: skip
     return {
         "outputs": list(totals.outputs),
-        "model": before["model"],
+        "model": model,
         "sets": {
             f.name: _of_set(f, totals, gain["sets"][f.name], before["sets"][f.name], plan)
             | {"parameter_error_px": left[f.name]}

@@ -6,10 +6,14 @@ from pathlib import Path
 from typing import Any
 
 from pixcal.effects import known_effects, parse_effects
+from pixcal.effects.hyperbolic_fringes import HyperbolicFringes
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 
+HYPERBOLIC = "hyperbolic"
+"""The shape of fringes (`pixcal.estimators.models`) that takes up `HyperbolicFringes`."""
+IN_CORRECTED = "in the corrected fit"
 ABSORBED = {
     "bias_drift": "a level that all pixels share moves the free intensity of a frame",
     "contrast_noise": "every frame of the fit has an amplitude of its own",
@@ -47,8 +51,8 @@ class Treatment:
     errors : mapping
         Of its parameters, 1-sigma, by name.
     how : str
-        ``undone on samples``, ``undone on maps``, ``in the fit``, ``absorbed by the fit`` or
-        ``not undone``.
+        ``undone on samples``, ``undone on maps``, ``in the fit``, ``in the corrected fit``,
+        ``absorbed by the fit`` or ``not undone``.
     why : str
     """
 
@@ -100,6 +104,16 @@ class Treatments:
         return self._those("undone on maps")
 
     @property
+    def changes(self) -> bool:
+        """Whether there are other maps to be made."""
+        return bool(self.undone) or self.bent
+
+    @property
+    def bent(self) -> bool:
+        """Whether hyperbolic fringes are to be fitted where the fit took straight ones."""
+        return any(t.how == IN_CORRECTED for t in self.every)
+
+    @property
     def errors(self) -> dict[str, Mapping[str, float]]:
         """Of the parameters of each effect."""
         return {t.effect.name: t.errors for t in self.every}
@@ -113,6 +127,7 @@ class Treatments:
 def treatments(
     causes: Sequence[Mapping[str, Any]],
     nominal: Mapping[str, Any],
+    asked: str,
     models: Mapping[str, str],
     own: Sequence[Path],
     where: Path,
@@ -125,8 +140,10 @@ def treatments(
         Of ``diagnosis.json``.
     nominal : mapping
         Parameters of the effects that the nominal bench had, by name.
+    asked : str
+        Shape of the fringes that the fit was asked for.
     models : mapping
-        Shape of the fringes that was fitted, by fringe set.
+        The one that was fitted, by fringe set.
     own : sequence of Path
         Files with effects of the user's own.
     where : Path
@@ -152,24 +169,30 @@ def treatments(
     every = []
     for origin, name, parameters, errors in found:
         (effect,) = parse_effects({name: parameters}, str(where), known)
-        every.append(Treatment(effect, origin, errors, *_treated(effect, models)))
+        every.append(Treatment(effect, origin, errors, *_treated(effect, asked, models)))
     return Treatments(tuple(every))
 
 
-def _treated(effect: Effect, models: Mapping[str, str]) -> tuple[str, str]:
+def _treated(effect: Effect, asked: str, models: Mapping[str, str]) -> tuple[str, str]:
     kind = type(effect)
     if kind.undo is not Effect.undo:
         return "undone on maps", "it acts on the three maps of a fit alike"
     if kind.undo_samples is not Effect.undo_samples:
         return "undone on samples", "it depends on the light of each frame: swept again without it"
-    if effect.name == "hyperbolic_fringes":
-        straight = [name for name, model in models.items() if model != "hyperbolic"]
-        if not straight:
-            return "in the fit", "the shape that was fitted to the fringes is hyperbolic"
-        return (
-            "not undone",
-            f"straight fringes were fitted ({', '.join(straight)}): give --model hyperbolic",
-        )
+    if isinstance(effect, HyperbolicFringes):
+        return _of_bent_fringes(asked, models)
     if effect.name in ABSORBED:
         return "absorbed by the fit", ABSORBED[effect.name]
     return "not undone", LEFT.get(effect.name, "its file does not say how to undo it")
+
+
+def _of_bent_fringes(asked: str, models: Mapping[str, str]) -> tuple[str, str]:
+    straight = [name for name, model in models.items() if model != HYPERBOLIC]
+    if not straight:
+        return "in the fit", "the shape that was fitted to the fringes is hyperbolic"
+    if asked == "auto":
+        return (
+            IN_CORRECTED,
+            f"the fit took straight fringes ({', '.join(straight)}); the corrected maps do not",
+        )
+    return "not undone", "straight fringes were asked for: give --model hyperbolic"

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from pixcal import __version__
-from pixcal.estimators.battery import DETECTOR, Curve, Key, statistic_named
+from pixcal.estimators.battery import DETECTOR, Curve, Key
+from pixcal.estimators.battery.signature import statistic_named
 from pixcal.estimators.gap import Expectation, Reference, flagged, sigmas_of
 from pixcal.model.config import to_plain
 from pixcal.stages.diagnose.search import Candidate, Found, Shrinkage, Trial, differing, shrinkage

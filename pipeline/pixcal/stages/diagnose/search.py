@@ -31,9 +31,13 @@ from pixcal.stages.diagnose.trial import Curves, Effects
 F64 = NDArray[np.float64]
 
 SURE = 4.0
-"""Standard deviations that the estimate on the first frames must have."""
+"""Standard deviations that the estimate on the first frames must have; or, where there is a gap,"""
+HINTED = 1.5
+"""as an effect that another looks like may have no more by itself."""
 LEAST = 5.0
 """By which an effect must raise the log-likelihood of unseen data."""
+LEAST_OF_HINTED = 12.0
+"""The same for an effect that the first frames only hint at."""
 SCREEN = 3
 """Simulations of a candidate; of what was taken, `CONFIRM`."""
 CONFIRM = 8
@@ -139,9 +143,12 @@ class Search:
     def run(self, candidates: Mapping[str, Candidate]) -> Found:
         """Search; ``reason`` of the candidates is filled in."""
         open_ones = {n: c for n, c in candidates.items() if c.estimate and not c.reason}
+        # Where something differs, also those are tried that could not be told from another effect.
+        differs = bool(flagged(compare(self.data, self.nominal.expected)))
         for name, candidate in list(open_ones.items()):
             assert candidate.estimate is not None
-            if candidate.estimate.significance < SURE or candidate.estimate.effect.is_null:
+            least = HINTED if differs else SURE
+            if candidate.estimate.significance < least or candidate.estimate.effect.is_null:
                 size = candidate.estimate.significance
                 candidate.reason = f"not seen in the frames it was fitted on ({size:.1f} sigma)"
                 del open_ones[name]
@@ -160,9 +167,10 @@ class Search:
             gains = {n: t.log_likelihood - start.log_likelihood for n, (t, _) in trials.items()}
             if not gains:
                 break
-            best = max(gains, key=lambda n: gains[n])
-            if gains[best] < LEAST:
+            own = {n: g for n, g in gains.items() if g >= self._least(candidates[n])}
+            if not own:
                 break
+            best = max(own, key=lambda n: own[n])
             effects[best] = trials[best][1]
             taken.append(best)
             near = [n for n, g in gains.items() if n != best and g > gains[best] - LEAST]
@@ -176,6 +184,12 @@ class Search:
         for candidate in open_ones.values():
             candidate.reason = candidate.reason or "the unseen frames get no likelier with it"
         return self._ablated(taken, effects, current, candidates, alike)
+
+    @staticmethod
+    def _least(candidate: Candidate) -> float:
+        """By how much the unseen frames must become likelier with a candidate."""
+        assert candidate.estimate is not None
+        return LEAST if candidate.estimate.significance >= SURE else LEAST_OF_HINTED
 
     def held_against(self, effects: Effects, curves: list[Curves]) -> Trial:
         """A bench with some effects against the data, from its simulations."""
