@@ -2,8 +2,8 @@
 
 One small bench is recorded and reduced as a user's would be; its nominal bench then plays the
 reality again and again, with other random numbers, with nothing in it or with one effect of some
-strength. Every step of the search is that of ``pixcal diagnose``. Writes ``study.json``, tables and
-a picture into ``docs/diagnose``.
+strength. Every step of the search is that of ``pixcal diagnose``. What is played goes to
+``docs/diagnose/study.jsonl``, where an interrupted study goes on; tables and picture into the page.
 """
 
 import argparse
@@ -38,7 +38,7 @@ import matplotlib.pyplot as plt
 
 OUT = Path(__file__).parents[1] / "docs" / "diagnose"
 HERE = Runtime(cluster="sync")
-STRENGTHS = (0.03, 0.1, 0.3, 1.0, 3.0)
+STRENGTHS = (0.03, 0.1, 0.3, 1.0)
 """Times the default strength, which is that of the literature."""
 REFERENCES = 16
 FIRST_SEED = 5000
@@ -281,7 +281,7 @@ def main() -> None:
     """Play all cases, two at a time."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--nominal", type=int, default=40, help="acquisitions without an effect")
-    parser.add_argument("--seeds", type=int, default=2, help="for each effect and strength")
+    parser.add_argument("--seeds", type=int, default=3, help="for each effect and strength")
     parser.add_argument("--effects", nargs="*", default=list(effects()), help="default: all")
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args()
@@ -293,20 +293,38 @@ def main() -> None:
         for strength in STRENGTHS
         for name in names
     ]
-    with tempfile.TemporaryDirectory() as folder:
-        for ramp in (False, True):
+    # So that an interrupted study has some of all.
+    np.random.default_rng(1).shuffle(cases)
+    cases = [(str(name), float(strength), int(seed)) for name, strength, seed in cases]
+    options.out.mkdir(parents=True, exist_ok=True)
+    record = options.out / "study.jsonl"
+    played: list[dict[str, Any]] = []
+    if record.exists():
+        # What an interrupted study has played is not played again.
+        played = [json.loads(line) for line in record.read_text().splitlines()]
+    known = {(p["effect"], p["strength"], p["seed"]) for p in played}
+    pending = [case for case in cases if case not in known]
+    with tempfile.TemporaryDirectory() as folder, record.open("a") as lines:
+
+        def noted(_: int, result: dict[str, Any]) -> None:
+            played.append(result)
+            print(json.dumps(result), file=lines, flush=True)
+
+        for ramp in {case[0] in RAMPS for case in pending}:
             set_up(Path(folder), ramp)
-        played = run_tasks(
-            partial(play, Path(folder)), cases, Runtime(cluster="processes", quiet=False),
-            label="acquisitions",
+        run_tasks(
+            partial(play, Path(folder)), pending, Runtime(cluster="processes", quiet=False),
+            label="acquisitions", done=noted,
         )  # fmt: skip
+    publish(played, options.out)
+
+
+def publish(played: Sequence[dict[str, Any]], out: Path) -> None:
+    """Print the tables, draw the picture, and put both into the documentation."""
     nothing = [p for p in played if not p["effect"]]
     something = [p for p in played if p["effect"]]
-    options.out.mkdir(parents=True, exist_ok=True)
-    plain = [{k: v for k, v in p.items() if k != "chances"} for p in played]
-    (options.out / "study.json").write_text(json.dumps(plain, indent=0))
     tables = {"nominal": nominal_table(nothing), "power": power_table(something)}
-    draw(something, options.out / "power.png")
+    draw(something, out / "power.png")
     page = OUT.parent / "diagnose.md"
     text = page.read_text(encoding="utf-8")
     for name, table in tables.items():
@@ -315,7 +333,7 @@ def main() -> None:
         if start in text:
             before, _, rest = text.partition(start)
             text = before + start + "\n" + table + "\n\n" + end + rest.partition(end)[2]
-    if options.out == OUT:
+    if out == OUT:
         page.write_text(text, encoding="utf-8")
 
 

@@ -121,7 +121,7 @@ def _option(case: Case) -> Answer:
     (here / "locked").mkdir()
     (here / "locked").chmod(0o500)
     label = (parameter.metavar or str(parameter.name)).strip("[].").split("]")[0]
-    shown = value.encode("utf-8", "backslashreplace").decode()
+    shown = one_line(value.encode("utf-8", "backslashreplace").decode())
     names = [
         *parameter.opts,
         label,
@@ -130,7 +130,7 @@ def _option(case: Case) -> Answer:
         "ACQ",
         "run",
         "option",
-        " ".join(shown.split())[:40],
+        shown[:40],
     ]
     line = _line(words, command, parameter, value)
     if words[0] in SLOW:

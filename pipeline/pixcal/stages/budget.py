@@ -100,7 +100,7 @@ def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, 
             )
     precision = config.precision_px
     if precision is not None and not 1e-9 <= precision <= 1:
-        raise InputError(f"--precision {precision}: not between 1e-9 and 1 px")
+        raise InputError(f"--precision {precision}: not between 1e-9 and 1 px; choose another")
     if precision is None and config.frames is None:
         precision = PRECISION_PX
     result = _budget(bench, bound, precision, config.frames)
