@@ -7,6 +7,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -108,17 +109,23 @@ def shell(programs: Path) -> Shell:
     folders = [str(programs), str(Path(sys.executable).parent), os.environ["PATH"]]
 
     def run(script: str, folder: Path) -> str:
-        found = subprocess.run(
+        with subprocess.Popen(
             ["bash", "-euo", "pipefail", "-c", script],
             cwd=folder,
             env=os.environ | {"PATH": os.pathsep.join(folders)},
-            capture_output=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             text=True,
-            timeout=300,
-            check=False,
-        )
-        assert found.returncode == 0, found.stderr
-        return found.stdout
+            start_new_session=True,
+        ) as process:
+            try:
+                printed, complaints = process.communicate(timeout=300)
+            except subprocess.TimeoutExpired:
+                # With all that it has started, in the background too.
+                os.killpg(process.pid, signal.SIGTERM)
+                raise
+        assert process.returncode == 0, complaints
+        return printed
 
     return run
 

@@ -93,6 +93,8 @@ def products(
             _right_sums(*noise, dy, dx, right[n])
             _right_sums(*modes, dy, dx, right[n])
             _normal_sums(*terms, dy, dx, normal[n])
+        # Not beside the next one: each is large.
+        del part, noise, terms, modes
     if brightest < MIN_CHARGE:
         return None
     covariance = np.linalg.pinv(line, rcond=1e-12, hermitian=True)

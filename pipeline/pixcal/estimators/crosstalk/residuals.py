@@ -7,8 +7,9 @@ left, with the negative of the modes' products; the modes are kept, so that this
 The second makes it smaller, which is made good here.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,7 +108,9 @@ def _of_stack(stack: Stack, evidence: Evidence, known: Sequence[Coupling], kept:
     rest = np.where(used, (signal - light) / UNIT**0.5, np.nan).astype(np.float32)
     collected = np.maximum(uncouple(light, known, evidence.origin), 0)
     charge = np.broadcast_to((collected / UNIT).astype(np.float32), rest.shape)
-    common = [np.ones_like(charge)] + ([charge] if stack.kind == "flat" else [])
+    common = [partial(np.ones_like, charge)]
+    if stack.kind == "flat":
+        common.append(partial(np.asarray, charge))
     read = np.full(used.shape, evidence.read_noise**2 / UNIT, np.float32)
     return _noise(rest, charge, read, kept, common, np.ones((len(at), 1)))
 
@@ -126,7 +129,8 @@ def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> 
     y, x = (a.astype(np.float32) for a in grid((flat.shape[0], flat.shape[1])))
     whole = (light - fringe, fringe, slope)
     # Also what changes along the window: a fringe vector that moves, rows that are exposed later.
-    common = [*whole, *(x * part for part in whole), *(y * part for part in whole)]
+    ones = np.ones((1, 1), np.float32)
+    common = [partial(np.multiply, place, part) for place in (ones, x, y) for part in whole]
     rest = np.where(found.good, found.residual[at] * flat / UNIT**0.5, np.nan).astype(np.float32)
     read = (found.read_variance * flat**2 / UNIT).astype(np.float32)
     turn = np.exp(1j * found.phi[at])
@@ -148,7 +152,9 @@ def _model(theta: F64, g: F64, dk: F64) -> tuple[F32, F32, F32]:
     return b * theta[0] + fringe, fringe, slope
 
 
-def _noise(rest: F32, charge: F32, read: F32, kept: F32, common: list[F32], own: F64) -> Residuals:
+def _noise(
+    rest: F32, charge: F32, read: F32, kept: F32, common: Sequence[Callable[[], F32]], own: F64
+) -> Residuals:
     """Residuals in units of their noise, without what is common to pixels and to frames.
 
     Parameters
@@ -156,8 +162,8 @@ def _noise(rest: F32, charge: F32, read: F32, kept: F32, common: list[F32], own:
     rest, charge : (t, y, x) float32
     read, kept : (y, x) float32
         Variance without light; variance of the shot noise over the charge.
-    common : list of (t, y, x) float32
-        What is free in each frame.
+    common : sequence of callable
+        Each gives a (t, y, x) float32 of what is free in each frame: one at a time, they are large.
     own : (t, m) float64
         What is free in each pixel.
     """
@@ -166,9 +172,10 @@ def _noise(rest: F32, charge: F32, read: F32, kept: F32, common: list[F32], own:
     good = rest**2 < CLIP**2 * variance
     one = np.where(good, 1 / np.sqrt(variance), np.float32(0)).astype(np.float32)
     e = np.where(good, rest, np.float32(0)) * one
-    modes = _orthonormal(
-        np.stack([c * one for c in common], axis=1).reshape(len(e), len(common), -1)
-    )
+    modes = np.empty((len(e), len(common), one[0].size), np.float32)
+    for m, make in enumerate(common):
+        modes[:, m] = (make() * one).reshape(len(e), -1)
+    _make_orthonormal(modes)
     pixels = _PixelModes.of(own, one.reshape(len(e), -1))
     flat = e.reshape(len(e), -1)
     for _ in range(STEPS):
@@ -184,12 +191,12 @@ def _noise(rest: F32, charge: F32, read: F32, kept: F32, common: list[F32], own:
     return Residuals(e * less, charge * one, shot * one, one, some)
 
 
-def _orthonormal(modes: F32) -> F32:
-    """Modes (t, m, pixel) of each frame, orthonormal over its pixels."""
-    size = np.sqrt(np.maximum(np.einsum("tmp,tmp->tm", modes, modes), np.float32(1e-20)))
-    modes /= size[:, :, None]
-    gram = (modes @ modes.swapaxes(1, 2)).astype(float) + 1e-6 * np.eye(modes.shape[1])
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(gram)).astype(np.float32) @ modes)
+def _make_orthonormal(modes: F32) -> None:
+    """Make the modes (t, m, pixel) of each frame orthonormal over its pixels, in place."""
+    for own in modes:
+        own /= np.sqrt(np.maximum(np.einsum("mp,mp->m", own, own), np.float32(1e-20)))[:, None]
+        gram = (own @ own.T).astype(float) + 1e-6 * np.eye(len(own))
+        own[:] = np.linalg.inv(np.linalg.cholesky(gram)).astype(np.float32) @ own
 
 
 @dataclass(frozen=True)

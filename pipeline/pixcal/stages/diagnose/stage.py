@@ -6,7 +6,7 @@ data and every simulation of them are reduced and fitted by the same stages.
 
 import shutil
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -52,8 +52,12 @@ from pixcal.storage.artefact import (
 FORMAT = 1
 REFERENCES = 16
 """Simulations of the nominal bench."""
-BYTES_A_SAMPLE = 60
-"""Peak of a task for each sample of a window's frames (measured)."""
+EVIDENCE_BYTES = 30
+"""Evidence in memory, for each sample of all fringe sets (measured, as the next two)."""
+LOOK_BYTES = 65
+"""What the statistics of one set need beside it, for each sample of the largest set."""
+ESTIMATE_BYTES = 190
+"""What the hungriest estimate, that of crosstalk, needs beside it."""
 LEARN_SEED = 900_000
 CLEAR = 100.0
 """Standard deviations from which the battery sees an effect without its estimator."""
@@ -163,9 +167,9 @@ def _diagnose(
     candidates: dict[str, Candidate] = {}
     signatures: tuple[type[Effect], ...] = ()
 
-    def learnt(evidence: Evidence) -> tuple[type[Effect], ...]:
+    def learnt(evidence: Evidence, few: Runtime) -> tuple[type[Effect], ...]:
         nonlocal signatures
-        candidates.update(_candidates(evidence, kinds, base, runtime))
+        candidates.update(_candidates(evidence, kinds, base, few))
         signatures = weakly_seen(candidates, kinds)
         return signatures
 
@@ -181,7 +185,7 @@ def _diagnose(
         """Significance of candidates on the first frames taken again with some effects."""
         window = look.first
         evidence = window.evidence(window.learn, (*base, *on), LEARN_SEED, scratch)
-        found = _estimates(evidence, {n: kinds[n] for n in names}, look.runtime, "estimate again")
+        found = _estimates(evidence, {n: kinds[n] for n in names}, look.few, "estimate again")
         return {n: e.significance for n, e in found.items() if isinstance(e, Estimate)}
 
     search = Search(
@@ -210,8 +214,8 @@ class Look:
         Curves of the test frames, mean of the windows.
     facts : dict
         What is told of it.
-    runtime : Runtime
-        With as many workers as fit the memory.
+    runtime, few : Runtime
+        With as many workers as fit the memory: of simulations, and of estimates.
     """
 
     first: Window
@@ -219,13 +223,14 @@ class Look:
     measured: Curves
     facts: dict[str, Any]
     runtime: Runtime
+    few: Runtime
 
 
 def look_at(
     run_dir: Path,
     scratch: Path,
     runtime: Runtime,
-    learnt: Callable[[Evidence], Sequence[type[Effect]]] = lambda _: (),
+    learnt: Callable[[Evidence, Runtime], Sequence[type[Effect]]] = lambda *_: (),
 ) -> Look:
     """Take the parts of a reduced run that are looked at, and measure their nominal bench.
 
@@ -234,7 +239,8 @@ def look_at(
     run_dir, scratch : Path
     runtime : Runtime
     learnt : callable
-        Is given the evidence that effects are fitted on; tells whose estimates are statistics too.
+        Is given the evidence that effects are fitted on, and how to run estimates in the memory
+        that there is; tells whose estimates are statistics too.
 
     Raises
     ------
@@ -250,11 +256,12 @@ def look_at(
     pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
     own = split(ingested.tables, pixels)
     _enough(own.test)
-    longest = max(len(f) for f in own.test.frames.values())
-    need = BYTES_A_SAMPLE * pixels * longest + 2 * pixels * sum(
-        len(f) for f in own.test.frames.values()
-    )
-    plan = make_plan("diagnose", need, need, runtime)
+    largest, evidence = _samples(own.test, pixels)
+    need = EVIDENCE_BYTES * evidence + LOOK_BYTES * largest
+    estimates = ESTIMATE_BYTES * largest
+    for_estimates = make_plan("diagnose", estimates, EVIDENCE_BYTES * evidence, runtime)
+    plan = make_plan("diagnose", need, 0, runtime)
+    few = runtime.with_workers(for_estimates.workers)
     runtime = runtime.with_workers(plan.workers)
     dtypes = {name: array.dtype for name, array in ingested.arrays.items()}
     windows: list[Window] = []
@@ -268,7 +275,7 @@ def look_at(
             halves.append(evidence_of(raw, folder, part, shape))
             shutil.rmtree(folder)
         if not windows:
-            signatures = tuple(learnt(halves[0]))
+            signatures = tuple(learnt(halves[0], few))
         bench = nominal_bench(acquisition, ingested.tables, halves, reduction, dtypes)
         windows.append(Window(part, bench, own.learn, own.test, shape))
         if part in parts:
@@ -288,7 +295,15 @@ def look_at(
             "sets": {s.name: list(s.baseline_mm) for s in acquisition.frames.fringes},
         },
         runtime,
+        few,
     )
+
+
+def _samples(half: Half, pixels: int) -> tuple[int, int]:
+    """Samples of a window: of the largest fringe set, and of all; without fringes of all frames."""
+    counts = [len(frames) for name, frames in half.frames.items() if "/" in name]
+    counts = counts or [sum(map(len, half.frames.values()))]
+    return pixels * max(counts), pixels * sum(counts)
 
 
 def _enough(half: Half) -> None:
@@ -346,6 +361,7 @@ def weakly_seen(
 def _estimates(
     evidence: Evidence, kinds: Mapping[str, type[Effect]], runtime: Runtime, label: str
 ) -> dict[str, Estimate | str | None]:
-    here = runtime if runtime.cluster in ("threads", "sync") else Runtime(quiet=runtime.quiet)
+    # Here, for the evidence is too large to be sent about.
+    here = runtime if runtime.cluster == "sync" else replace(runtime, cluster="threads")
     results = run_tasks(partial(estimate, evidence), list(kinds.values()), here, label=label)
     return dict(zip(kinds, results, strict=True))

@@ -13,7 +13,7 @@ SIDE = 128
 """Pixels along the side of a window on a large detector: those of a chunk of the cube."""
 LARGEST = 160
 """Rows or columns of a detector that is taken whole."""
-SAMPLES = 1 << 23
+SAMPLES = 6_000_000
 """Samples of a fringe set that are looked at in each half of the frames and each window."""
 FEWEST = 4
 """Calibration frames of an exposure time that can be halved; fewer serve both halves."""
