@@ -38,8 +38,8 @@ $(DOCS): $(INSTALLED)
 demo: $(INSTALLED) ## calibrate the sample acquisition into demo/
 	$(BIN)/pixcal run data_samples/demo --out demo
 
-test: $(TOOLS) ## run the tests
-	$(BIN)/pytest
+test: $(TOOLS) ## run the tests, two files at a time
+	$(BIN)/pytest -n 2 --dist loadfile
 
 lint: $(TOOLS) ## check style and types
 	$(BIN)/ruff check .

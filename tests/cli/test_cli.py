@@ -30,9 +30,11 @@ from pixcal_cli.main import cli, explain, invoke
 from pixcal_cli.options import memory_size, region
 
 PIXCAL = Path(sys.executable).with_name("pixcal")
-STAGES = ["ingest", "reduce", "fit", "allan", "report"]
+STAGES = ["ingest", "reduce", "fit", "allan", "diagnose", "report"]
+SHOWN = {"diagnose": "diagnosis"}
+"""Stages whose results have another name."""
 COMMANDS = [
-    "run", *STAGES[:-1], "crests", "diagnose", "astrometry", STAGES[-1], "compare", "simulate",
+    "run", *STAGES[:4], "crests", "diagnose", "astrometry", "report", "compare", "simulate",
     "budget", "blind",
 ]  # fmt: skip
 
@@ -53,8 +55,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, tuple[Any, ...]]]:
             made.append((name, args))
 
         monkeypatch.setattr(f"pixcal.stages.{name}.run", note)
-        monkeypatch.setattr(results, f"show_{name}", lambda run: None)
-    monkeypatch.setattr(results, "show_run", lambda run, fitted: None)
+        monkeypatch.setattr(results, f"show_{SHOWN.get(name, name)}", lambda run: None)
+    monkeypatch.setattr(results, "show_run", lambda run, fitted, diagnosed: None)
     return made
 
 
@@ -312,7 +314,13 @@ def test_run_does_all_steps_that_the_acquisition_allows(
     frames = ACQUISITION["frames"] | {"fringes": [vertical] if fringes else []}
     (tmp_path / "acquisition.yaml").write_text(json.dumps(ACQUISITION | {"frames": frames}))
     assert invoke(["run", str(tmp_path), "--out", "RUN", "--model", "paraxial"]) == 0
-    assert [name for name, _ in calls] == (STAGES if fringes else ["ingest", "reduce", "report"])
+    steps = STAGES if fringes else ["ingest", "reduce", "diagnose", "report"]
+    assert [name for name, _ in calls] == steps
+    calls.clear()
+    assert invoke(["run", str(tmp_path), "--out", "RUN", "--no-diagnose"]) == 0
+    assert [name for name, _ in calls] == [name for name in steps if name != "diagnose"]
+    calls.clear()
+    assert invoke(["run", str(tmp_path), "--out", "RUN", "--model", "paraxial"]) == 0
     if fringes:
         assert calls[2][1][1].model == "paraxial"
 

@@ -102,8 +102,10 @@ def _run(program: str, arguments: list[str]) -> int:
             sys.path[0] = ""
             exec(arguments[1], {"__name__": "__main__"})  # noqa: S102 (a block of the pages)
         else:
-            sys.argv, sys.path[0] = arguments, str(Path(arguments[0]).resolve().parent)
-            runpy.run_path(arguments[0], run_name="__main__")
+            # Absolute: multiprocessing looks for it from where the server began.
+            file = Path(arguments[0]).resolve()
+            sys.argv, sys.path[0] = arguments, str(file.parent)
+            runpy.run_path(str(file), run_name="__main__")
         code: Any = 0
     except SystemExit as ended:
         code = ended.code

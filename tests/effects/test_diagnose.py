@@ -1,6 +1,7 @@
 """The diagnosis on small acquisitions: what is there is found, what is not is not."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.stages import diagnose, fit, ingest, reduce, simulate
+from pixcal.stages.diagnose import trial
 from pixcal.stages.diagnose.windows import chosen_windows, split
 from pixcal_cli.main import cli
 
@@ -84,6 +86,34 @@ def test_an_effect_is_found_and_closes_the_gap(with_lag: Path) -> None:
     fit.run(with_lag, fit.Config(), SYNC)
     assert diagnosed(with_lag, only=FEW) == found
     assert (with_lag / "diagnose" / "manifest.json").stat().st_mtime_ns == made
+
+
+def test_a_run_that_was_stopped_goes_on(
+    with_lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Simulations that were made are not made again, and the result is the same."""
+    run, only = tmp_path / "run", ("row_noise",)
+    shutil.copytree(with_lag, run)
+    whole = diagnosed(with_lag, only=only)
+    made: list[int] = []
+    make = trial._made
+
+    def stops(*args: Any) -> Any:
+        made.append(1)
+        if len(made) == 10:
+            raise KeyboardInterrupt
+        return make(*args)
+
+    monkeypatch.setattr(trial, "_made", stops)
+    with pytest.raises(KeyboardInterrupt):
+        diagnosed(run, only=only)
+    assert not (run / "diagnose").exists() or whole != json.loads(
+        (run / "products" / "diagnosis.json").read_text()
+    )
+    assert diagnosed(run, only=only) == whole
+    # Ten begun, nine of them kept, of sixteen and what the search asked for.
+    assert len(made) == 17
+    assert not list((run / ".partial").glob("diagnose-*"))
 
 
 def test_left_out_it_is_not_put_on_another(with_lag: Path) -> None:

@@ -407,7 +407,7 @@ def test_the_commands_hand_the_place_on(night: Path, monkeypatch: pytest.MonkeyP
     for stage in ("ingest", "reduce", "fit", "allan", "report"):
         monkeypatch.setattr(f"pixcal.stages.{stage}.run", lambda *args: given.append(args[-2]))
         monkeypatch.setattr(f"pixcal_cli.results.show_{stage}", lambda run: None)
-    monkeypatch.setattr("pixcal_cli.results.show_run", lambda run, fitted: None)
+    monkeypatch.setattr("pixcal_cli.results.show_run", lambda run, fitted, diagnosed: None)
     for command in (["run", str(night), "--out"], ["ingest", str(night), "--out"], ["reduce"]):
         assert invoke([*command, "run", "--cubes", "s3://b/x"]) == 0
     told = [config.cubes for config in given if hasattr(config, "cubes")]

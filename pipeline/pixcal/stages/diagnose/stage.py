@@ -108,12 +108,11 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         if done is None:
             with build(run_dir, "diagnose", FORMAT, plain, inputs) as made:
                 scratch = made.folder / "scratch"
+                scratch.mkdir(exist_ok=True)
+                for unfinished in (p for p in scratch.iterdir() if p.is_dir()):
+                    shutil.rmtree(unfinished, ignore_errors=True)
+                diagnosis, curves = _diagnose(run_dir, kinds, base, scratch, runtime)
                 shutil.rmtree(scratch, ignore_errors=True)
-                scratch.mkdir()
-                try:
-                    diagnosis, curves = _diagnose(run_dir, kinds, base, scratch, runtime)
-                finally:
-                    shutil.rmtree(scratch, ignore_errors=True)
                 write_json(made.folder / "diagnosis.json", diagnosis)
                 write_json(made.folder / "curves.json", curves)
                 made.summary.update(

@@ -12,11 +12,14 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.battery import Curve, Key, measure
 from pixcal.estimators.battery.signature import signature_curve, signature_key
 from pixcal.estimators.evidence import Evidence
+from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.nominal import NominalBench
 from pixcal.stages.diagnose.parts import Half, evidence_of
 from pixcal.stages.evidence import Part
+from pixcal.storage.artefact import read_json, write_json
+from pixcal.storage.manifest import digest
 
 Curves = dict[Key, Curve]
 Effects = tuple[Effect, ...]
@@ -59,7 +62,7 @@ class Trials:
     ----------
     windows : tuple of Window
     scratch : Path
-        Folder for what is written in between.
+        Folder for what is written in between; a run that goes on finds its simulations there.
     runtime : Runtime
     signatures : tuple of type
         Effects whose estimates are statistics too.
@@ -93,7 +96,7 @@ class Trials:
         places = range(len(self.windows))
         items = [(tuple(bench), seed, n) for bench, seed in missing for n in places]
         if items:
-            work = partial(_one, self.windows, self.scratch, self.signatures)
+            work = partial(_kept_or_made, self.windows, self.scratch, self.signatures)
             results = run_tasks(work, items, self.runtime, label=label)
             for number, one in enumerate(missing):
                 own = results[number * len(places) : (number + 1) * len(places)]
@@ -108,7 +111,35 @@ class Trials:
         return found
 
 
-def _one(
+def _kept_or_made(
+    windows: tuple[Window, ...],
+    scratch: Path,
+    signatures: tuple[type[Effect], ...],
+    item: tuple[Effects, int, int],
+) -> Curves | str:
+    """A simulation that an interrupted run has left, or a new one, which is left in turn."""
+    effects, seed, number = item
+    on = sorted((e.name, to_plain(e)) for e in effects)
+    name = digest(on, seed, number, windows[number].part, sorted(k.name for k in signatures))
+    file = scratch / f"{name}.json"
+    if file.exists():
+        plain = read_json(file)
+        if "curves" not in plain:
+            return str(plain["refused"])
+        return {
+            (key, of): Curve(np.array(x, float), np.array(value, float))
+            for key, of, x, value in plain["curves"]
+        }
+    made = _made(windows, scratch, signatures, item)
+    if isinstance(made, str):
+        write_json(file, {"refused": made})
+    else:
+        rows = [(*key, c.x.tolist(), c.value.tolist()) for key, c in made.items()]
+        write_json(file, {"curves": rows})
+    return made
+
+
+def _made(
     windows: tuple[Window, ...],
     scratch: Path,
     signatures: tuple[type[Effect], ...],
