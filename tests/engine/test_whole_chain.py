@@ -21,6 +21,8 @@ from pixcal.stages import allan, crests, fit, ingest, reduce, simulate
 
 HOW_IT_RAN = {"chunks_read", "passes"}
 """What differs with the runtime: other processes do not share what the scout keeps in memory."""
+OF_A_MANIFEST = {"files", "seal"}
+"""Digests of files that hold such counts."""
 
 
 Chain = Callable[[Runtime], Path]
@@ -67,7 +69,8 @@ def contents(folder: Path) -> Iterator[tuple[str, Any]]:
         if "/tiles/" in name:
             continue
         if file.suffix == ".json" and "zarr.json" not in name:
-            yield name, without(json.loads(file.read_text()), HOW_IT_RAN)
+            own = OF_A_MANIFEST if file.name == "manifest.json" else set()
+            yield name, without(json.loads(file.read_text()), HOW_IT_RAN | own)
         elif file.suffix == ".fits":
             with fits.open(file) as hdus:
                 yield name, [None if hdu.data is None else hdu.data.tobytes() for hdu in hdus]
