@@ -66,6 +66,7 @@ class Ipc(Effect):
     stage = Stage.SIGNAL
     domains = ("space", "noise")
     strengths = ("couplings",)
+    quick = False
     sources = (
         "Rousset et al., section 5.1: period of four rows, 2-3 % vertical, 0.6 % horizontal, "
         "sparse (design/paper.txt)",

@@ -111,6 +111,9 @@ class Effect:
         Fields that `scaled` multiplies: with all of them zero the effect does nothing.
     sources : tuple of str
         Where the default sizes come from.
+    quick : bool
+        Whether an estimate takes about a second or less of 10⁷ samples, so that it can be made of
+        many simulations.
     """
 
     name: ClassVar[str]
@@ -119,6 +122,7 @@ class Effect:
     domains: ClassVar[tuple[str, ...]]
     strengths: ClassVar[tuple[str, ...]]
     sources: ClassVar[tuple[str, ...]]
+    quick: ClassVar[bool] = True
 
     def scaled(self, factor: float) -> Self:
         """The same effect, ``factor`` times as strong."""

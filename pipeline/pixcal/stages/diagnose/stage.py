@@ -60,7 +60,7 @@ ESTIMATE_BYTES = 190
 """What the hungriest estimate, that of crosstalk, needs beside it."""
 LEARN_SEED = 900_000
 CLEAR = 100.0
-"""Standard deviations from which the battery sees an effect without its estimator."""
+"""Standard deviations from which an effect whose estimate is slow is left to the battery."""
 FEWEST_FRAMES = 24
 """Fringe frames in each half."""
 
@@ -349,11 +349,13 @@ def _candidates(
 def weakly_seen(
     candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]]
 ) -> tuple[type[Effect], ...]:
-    """Candidates that the frames they were fitted on show, but not so clearly that all would."""
+    """Candidates that the frames they were fitted on show; slow ones if the battery may not."""
     return tuple(
         kinds[name]
         for name, candidate in candidates.items()
-        if candidate.estimate is not None and SURE <= candidate.estimate.significance < CLEAR
+        if candidate.estimate is not None
+        and candidate.estimate.significance >= SURE
+        and (kinds[name].quick or candidate.estimate.significance < CLEAR)
     )
 
 
