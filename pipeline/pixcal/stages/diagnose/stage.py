@@ -59,7 +59,7 @@ LOOK_BYTES = 65
 ESTIMATE_BYTES = 190
 """What the hungriest estimate, that of crosstalk, needs beside it."""
 LEARN_SEED = 900_000
-CLEAR = 100.0
+CLEAR = 20.0
 """Standard deviations from which an effect whose estimate is slow is left to the battery."""
 FEWEST_FRAMES = 24
 """Fringe frames in each half."""
