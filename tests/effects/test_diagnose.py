@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from click.testing import CliRunner
 
 from pixcal.engine.run import Runtime
 from pixcal.model.bench import Bench
@@ -18,7 +17,6 @@ from pixcal.model.errors import InputError
 from pixcal.stages import diagnose, fit, ingest, reduce, simulate
 from pixcal.stages.diagnose import trial
 from pixcal.stages.diagnose.windows import chosen_windows, split
-from pixcal_cli.main import cli
 
 SYNC = Runtime(cluster="sync")
 SMALL = {
@@ -227,8 +225,8 @@ def test_too_few_frames_to_part_are_told(reduced: Callable[..., Path]) -> None:
 
 
 def test_a_run_that_was_not_reduced_is_told(tmp_path: Path) -> None:
-    result = CliRunner().invoke(cli, ["diagnose", str(tmp_path)])
-    assert result.exit_code != 0
+    with pytest.raises(InputError, match="reduce"):
+        diagnose.run(tmp_path, diagnose.Config(), SYNC)
 
 
 def test_halves_share_no_frame() -> None:

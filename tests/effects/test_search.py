@@ -192,3 +192,32 @@ def test_an_estimate_inflated_by_another_effect_is_scaled_down() -> None:
     sizes = {e.label: e.size for e in found.final.effects if isinstance(e, Toy)}
     assert sizes["right"] == pytest.approx(0.01)
     assert left < 0.05
+
+
+def test_a_bench_that_fails_only_when_confirmed_costs_its_candidate(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The first seeds may pass where a later one is refused; the search goes on with the others."""
+    plain = simulate
+
+    def fails(
+        benches: Sequence[Sequence[Effect]], seeds: int, label: str
+    ) -> list[list[dict[Key, Curve]] | str]:
+        return [
+            "no light left" if seeds > 3 and any(e.name == "left" for e in bench) else made
+            for bench, made in zip(benches, plain(benches, seeds, label), strict=True)
+        ]
+
+    monkeypatch.setitem(globals(), "simulate", fails)
+    both = {"left": 0.03, "right": 0.01}
+    found, _ = search(both, [candidate(label, size) for label, size in both.items()])
+    assert found.taken == ("right",)
+    assert found.candidates["left"].reason == "cannot be simulated: no light left"
+
+
+def test_a_cause_always_has_a_gap_that_it_closes() -> None:
+    for seed in range(700, 730):
+        found, left = search({"left": 0.0025}, [candidate("left", 0.0025)], None, seed)
+        data = REFERENCE.on_scale(curves((), seed, {"left": 0.0025}))
+        assert bool(differing(found.nominal, found.final, data)) >= bool(found.taken)
+        assert left <= 1

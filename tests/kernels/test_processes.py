@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.kernels.processes import damped_walk, swing
+from pixcal.kernels.processes import damped_walk, ramp_step, swing
 
 
 def test_a_damped_walk_is_the_recursion_that_defines_it() -> None:
@@ -23,3 +23,13 @@ def test_a_swing_is_the_mean_of_the_sine_over_the_exposure() -> None:
     means = np.sin(2 * np.pi * hz * (time[:, None] + inside) + phase).mean(axis=1)
     np.testing.assert_allclose(swing(time, hz, phase, exptime), means, atol=1e-8)
     assert swing(time, 5.0, phase, 0.2) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("step", [0.35, -1.1, 3.0])
+def test_the_step_of_a_ramp_is_found_and_random_phases_are_none(step: float) -> None:
+    rng = np.random.default_rng(3)
+    noise = 0.05 * rng.standard_normal(101)
+    wrapped = np.angle(np.exp(1j * (0.7 + step * np.arange(101) + noise)))
+    assert ramp_step(wrapped) == pytest.approx(step, abs=0.01)
+    assert ramp_step(2 * np.pi * rng.random(101)) == 0
+    assert ramp_step(np.zeros(1)) == 0

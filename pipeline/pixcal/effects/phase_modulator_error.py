@@ -15,6 +15,7 @@ from pixcal.estimators.variance_components import (
     sigmas,
     walk_power,
 )
+from pixcal.kernels.processes import ramp_step
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
@@ -24,8 +25,6 @@ from pixcal.simulation.recording import Recording
 F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
 
-RAMP = 0.8
-"""Mean of exp(i step) from which the phases are a ramp; of random phases it is near zero."""
 FEWEST = 24
 MOST = 0.9
 """Of first + 2 second: at 1 the phase would stand still somewhere in the turn."""
@@ -92,8 +91,10 @@ class PhaseModulatorError(Effect):
         in the same way: its error is in the result.
         """
         sets = {name: f for name, f in evidence.fringes.items() if len(_phase(f)) >= FEWEST}
-        ramps = [_of_ramp(_phase(f), _gauge_error(f)) for f in sets.values() if _is_ramp(_phase(f))]
-        random = [_of_random(_phase(f)) for f in sets.values() if not _is_ramp(_phase(f))]
+        ramps = [
+            _of_ramp(_phase(f), _gauge_error(f)) for f in sets.values() if ramp_step(_phase(f))
+        ]
+        random = [_of_random(_phase(f)) for f in sets.values() if not ramp_step(_phase(f))]
         found = ramps or random
         if not found:
             return None
@@ -135,10 +136,6 @@ def _phase(found: FringeEvidence) -> F64:
     return np.asarray(np.arctan2(found.free[seen, 2], found.free[seen, 1]))
 
 
-def _is_ramp(phase: F64) -> bool:
-    return bool(np.abs(np.exp(1j * np.diff(phase)).mean()) > RAMP)
-
-
 def _gauge_error(found: FringeEvidence) -> F64:
     """Error of the maps' gauge, rad, once and twice a fringe.
 
@@ -172,7 +169,7 @@ def _beside(values: F64, good: NDArray[np.bool_], k: F64) -> float:
 def _of_ramp(phase: F64, gauge: F64) -> Harmonics:
     """Beside an even ramp, and a phase that walks as that of two fibres does."""
     n = len(phase)
-    step = float(np.angle(np.exp(1j * np.diff(phase)).mean()))
+    step = ramp_step(phase)
     for _ in range(3):
         command = step * np.arange(n)
         rest = np.unwrap(np.angle(np.exp(1j * (phase - command))))

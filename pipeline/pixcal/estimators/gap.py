@@ -198,19 +198,25 @@ def sigmas_of(log_chance: float) -> float:
 
 
 def log_likelihood(data: Mapping[Key, F64], expected: Expectation) -> float:
-    """Logarithm of the chance density of the data; curves count by their least two values.
+    """Logarithm of the chance density (Student's) of the data, of all curves together."""
+    return sum(_log_density(data[key], expected, key) for key in expected.mean if key in data)
 
-    Values of a curve are not independent, so that long curves must not count for more.
-    """
-    total, nu = 0.0, expected.dof
-    for key, mean in expected.mean.items():
-        if key not in data:
-            continue
-        variance = expected.variance[key]
-        square = (data[key] - mean) ** 2 / variance
-        terms = -(nu + 1) / 2 * np.log1p(square / nu) - np.log(variance) / 2
-        total += float(terms.sum()) / max(1.0, len(mean) / 3)
-    return total
+
+def likelier(data: Mapping[Key, F64], before: Expectation, after: Expectation) -> dict[Key, float]:
+    """By how much the logarithm of the chance density of each curve rises."""
+    return {
+        key: _log_density(data[key], after, key) - _log_density(data[key], before, key)
+        for key in before.mean
+        if key in data
+    }
+
+
+def _log_density(values: F64, expected: Expectation, key: Key) -> float:
+    """Of one curve; of more than three values it counts as three, for they are not independent."""
+    variance, nu = expected.variance[key], expected.dof
+    square = (values - expected.mean[key]) ** 2 / variance
+    terms = -(nu + 1) / 2 * np.log1p(square / nu) - np.log(variance) / 2
+    return float(terms.sum()) / max(1.0, len(values) / 3)
 
 
 @dataclass(frozen=True)

@@ -63,3 +63,19 @@ def brownian(time: float, normal: Callable[[int, int], float]) -> float:
         if height:
             value += 2 ** (-level / 2) * height * normal(level + 1, int(place))
     return float(np.sqrt(HORIZON) * value)
+
+
+RAMP = 0.8
+"""Mean of exp(i step) from which phases are a ramp; of random phases it is near zero."""
+
+
+def ramp_step(phase: F64) -> float:
+    """Step (rad) of phases that rise by equal steps; zero where they do not.
+
+    Parameters
+    ----------
+    phase : (t,) float64
+        rad.
+    """
+    mean = np.exp(1j * np.diff(phase)).mean() if len(phase) > 1 else 0.0
+    return float(np.angle(mean)) if abs(mean) > RAMP else 0.0

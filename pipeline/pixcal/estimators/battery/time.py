@@ -8,6 +8,7 @@ from scipy.fft import dct
 from pixcal.estimators.battery import Curve, Statistic, statistic
 from pixcal.estimators.battery.look import F64, Look
 from pixcal.estimators.evidence import Evidence
+from pixcal.kernels.processes import ramp_step
 
 SERIES = {
     "intensity": ("intensity", ""),
@@ -95,19 +96,15 @@ def frames_by_phase(look: Look) -> Curve:
 def phases(look: Look) -> Curve:
     """Size of the mean of exp(i n phi); of a ramp, of its departures at the turn's harmonics."""
     phi = look.found.phi
-    step = np.exp(1j * np.diff(phi)).mean()
-    if abs(step) < RAMP:
+    step = ramp_step(phi)
+    if not step:
         return Curve(np.array([1.0, 2.0]), np.abs([np.exp(1j * n * phi).mean() for n in (1, 2)]))
-    command = float(np.angle(step)) * np.arange(len(phi))
+    command = step * np.arange(len(phi))
     rest = np.unwrap(np.angle(np.exp(1j * (phi - command))))
     jumps = np.diff(rest) - np.diff(rest).mean()
     middle = (command[1:] + command[:-1]) / 2
     size = [abs(np.mean(jumps * np.exp(-1j * n * middle))) for n in (1, 2)]
     return Curve(np.array([1.0, 2.0]), np.array(size))
-
-
-RAMP = 0.8
-"""Mean of exp(i step) from which phases are a ramp."""
 
 
 @statistic("time", "offsets from batch to batch", unit="px", x="batches averaged", power=True)

@@ -20,6 +20,7 @@ from pixcal.estimators.corrected import corrected_offsets, phase_change, straigh
 from pixcal.estimators.evidence import Evidence, FringeEvidence
 from pixcal.estimators.structure import Offsets, smooth_surface, true_offsets
 from pixcal.kernels.crosstalk import filled
+from pixcal.kernels.processes import ramp_step
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.bench import (
@@ -46,8 +47,6 @@ HOT = 40.0
 HOT_REACH = 2
 """Pixels around a hot one that may have got some of its charge: at most a share of `SHARED`."""
 SHARED = 0.1
-RAMP = 0.8
-"""Mean of exp(i step) from which the phases of a set are a ramp; of random ones it is near zero."""
 
 
 @dataclass(frozen=True)
@@ -314,8 +313,8 @@ def nominal_bench(
         dark_rate=np.maximum(_mean([_uncoupled(e.dark_rate) for e in evidence]), 0),
         mask=np.where(good, 0, 1).astype(np.uint8),
     )
-    recordings, places = _recordings(acquisition, tables, one)
     bench = _bench(acquisition, tables, one, sets, _top(acquisition, one, sets, dtypes))
+    recordings, places = _recordings(bench, acquisition, tables, one)
     return NominalBench(
         acquisition,
         tables,
@@ -324,7 +323,7 @@ def nominal_bench(
         bench,
         Measured(maps, sets),
         fits,
-        tuple(replace(r, bench=bench) for r in recordings),
+        tuple(recordings),
         tuple(places),
     )
 
@@ -381,25 +380,23 @@ def _set_truth(found: Sequence[FringeEvidence]) -> SetTruth:
     plane = one.k[0] * x + one.k[1] * y
     phasor = np.where(good, (one.theta[2] + 1j * one.theta[1]) * np.exp(-1j * plane), 0)
     psi = plane + np.angle(phasor.sum())
-    step = np.exp(1j * np.diff(one.phi)).mean()
     return SetTruth(
         light=np.maximum(surface, 0).astype(np.float32),
         contrast=float(np.mean(contrast)),
         psi=psi,
         k=one.k,
-        step=float(np.angle(step)) if abs(step) > RAMP else 0.0,
+        step=ramp_step(one.phi),
         first=float(one.phi[0]),
     )
 
 
 def _recordings(
-    acquisition: Acquisition, tables: Mapping[str, Table], evidence: Evidence
+    bench: Bench, acquisition: Acquisition, tables: Mapping[str, Table], evidence: Evidence
 ) -> tuple[list[Recording], list[tuple[str, NDArray[np.intp]]]]:
-    """Recordings without their bench, and where their frames are."""
+    """Recordings, and where their frames are."""
     start = _start(tables)
     listed = {f"fringes/{s.name}": n for n, s in enumerate(acquisition.frames.fringes)}
     recordings, places = [], []
-    bench: Bench = None  # type: ignore[assignment]
     for name, table in tables.items():
         exposures = np.array([np.nan if t is None else t for t in table["exptime_s"]], float)
         times = np.array(table["time_s"], float)

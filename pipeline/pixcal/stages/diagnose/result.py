@@ -10,7 +10,7 @@ from scipy.special import log_ndtr
 from pixcal import __version__
 from pixcal.estimators.battery import DETECTOR, Curve, Key
 from pixcal.estimators.battery.signature import statistic_named
-from pixcal.estimators.gap import Expectation, Reference, flagged, sigmas_of
+from pixcal.estimators.gap import Expectation, Reference, flagged, likelier, sigmas_of
 from pixcal.model.config import to_plain
 from pixcal.stages.diagnose.search import Candidate, Found, Shrinkage, Trial, differing, shrinkage
 
@@ -125,20 +125,9 @@ def _cause(
 
 def _telling(before: Trial, after: Trial, data: Mapping[Key, F64]) -> list[dict[str, str]]:
     """Statistics that an effect makes most likely, best first."""
-    gains = {
-        key: _likelihood(data[key], after.expected, key)
-        - _likelihood(data[key], before.expected, key)
-        for key in data
-    }
+    gains = likelier(data, before.expected, after.expected)
     best = sorted(gains, key=lambda k: -gains[k])[:SHOWN]
     return [{"statistic": k[0], "set": k[1]} for k in best if gains[k] > 1]
-
-
-def _likelihood(values: F64, expected: Expectation, key: Key) -> float:
-    variance = expected.variance[key]
-    square = (values - expected.mean[key]) ** 2 / variance
-    terms = -(expected.dof + 1) / 2 * np.log1p(square / expected.dof) - np.log(variance) / 2
-    return float(terms.sum()) / max(1.0, len(values) / 3)
 
 
 def _candidate(

@@ -22,6 +22,7 @@ from pixcal.estimators.gap import (
     expect_nominal,
     expect_with,
     flagged,
+    likelier,
     log_likelihood,
     remaining,
 )
@@ -163,7 +164,7 @@ class Search:
                 for name, (trial, _) in trials.items():
                     candidates[name].alone = trial
             # Held against as many simulations as the candidates have: chance is the same in both.
-            start = self._screened(tuple(effects.values())) if effects else self.nominal
+            start = self._start(tuple(effects.values()), SCREEN)
             gains = {n: t.log_likelihood - start.log_likelihood for n, (t, _) in trials.items()}
             if not gains:
                 break
@@ -171,11 +172,15 @@ class Search:
             if not own:
                 break
             best = max(own, key=lambda n: own[n])
+            del open_ones[best]
+            confirmed = self._confirmed((*effects.values(), trials[best][1]))
+            if isinstance(confirmed, str):
+                candidates[best].reason = f"cannot be simulated: {confirmed}"
+                continue
+            current = confirmed
             effects[best] = trials[best][1]
             taken.append(best)
             near = [n for n, g in gains.items() if n != best and g > gains[best] - LEAST]
-            del open_ones[best]
-            current = self._confirmed(tuple(effects.values()))
             shares = self._unexplained(tuple(effects.values()), open_ones)
             alike[best] = tuple(n for n in near if shares.get(n, 1.0) < 1 - EXPLAINED)
             for name in [n for n, share in shares.items() if share < 1 - EXPLAINED]:
@@ -215,15 +220,16 @@ class Search:
         benches = [(*effects.values(), effect) for _, effect in options]
         simulated = self._simulate(benches, SCREEN, f"candidates, round {len(effects) + 1}")
         found: dict[str, tuple[Trial, Effect]] = {}
+        refused: dict[str, str] = {}
         for (name, effect), bench, curves in zip(options, benches, simulated, strict=True):
             if isinstance(curves, str):
-                open_ones[name].reason = f"cannot be simulated: {curves}"
+                refused[name] = f"cannot be simulated: {curves}"
                 continue
             trial = self._trial(bench, self._expected(curves, open_ones[name]))
             if name not in found or trial.log_likelihood > found[name][0].log_likelihood:
                 found[name] = trial, effect
-        for name in [n for n, c in open_ones.items() if n not in found and c.reason]:
-            del open_ones[name]
+        for name in refused.keys() - found.keys():
+            open_ones.pop(name).reason = refused[name]
         return found
 
     def _expected(self, curves: list[Curves], candidate: Candidate | None = None) -> Expectation:
@@ -232,14 +238,18 @@ class Search:
             error = min(1.0, 1 / max(candidate.estimate.significance, 1.0))
         return expect_with(self.reference, curves, error)
 
-    def _screened(self, effects: Effects) -> Trial:
-        return self._confirmed(effects, SCREEN)
-
-    def _confirmed(self, effects: Effects, simulations: int = CONFIRM) -> Trial:
+    def _confirmed(self, effects: Effects, simulations: int = CONFIRM) -> Trial | str:
+        """A bench with some effects, or why it cannot be simulated."""
         (curves,) = self._simulate([effects], simulations, "confirm")
-        if isinstance(curves, str):
-            raise RuntimeError(curves)
-        return self._trial(effects, self._expected(curves))
+        return curves if isinstance(curves, str) else self.held_against(effects, curves)
+
+    def _start(self, effects: Effects, simulations: int = CONFIRM) -> Trial:
+        """A bench with some effects; the nominal one where there are none, or it is refused.
+
+        What has been simulated with more effects is hardly ever refused with fewer.
+        """
+        found = self._confirmed(effects, simulations) if effects else self.nominal
+        return self.nominal if isinstance(found, str) else found
 
     def _unexplained(
         self, effects: Effects, open_ones: Mapping[str, Candidate]
@@ -272,7 +282,7 @@ class Search:
             least, candidates[dropped[0]].reason = dropped
             taken.remove(least)
             del effects[least]
-            current = self._confirmed(tuple(effects.values())) if effects else self.nominal
+            current = self._start(tuple(effects.values()))
         return Found(
             self.nominal, current, tuple(taken), without, candidates,
             {n: alike[n] for n in taken if alike.get(n)},
@@ -309,15 +319,13 @@ class Search:
     def _each_left_out(
         self, taken: Sequence[str], effects: Mapping[str, Effect]
     ) -> dict[str, Trial]:
-        if len(taken) == 1:
-            return {taken[0]: self.nominal}
-        benches = [tuple(e for n, e in effects.items() if n != name) for name in taken]
-        simulated = self._simulate(benches, CONFIRM, "one left out") if benches else []
-        found = {}
-        for name, bench, curves in zip(taken, benches, simulated, strict=True):
-            if not isinstance(curves, str):
-                found[name] = self._trial(bench, self._expected(curves))
-        return found
+        benches = {
+            name: tuple(e for n, e in effects.items() if n != name)
+            for name in (taken if len(taken) > 1 else ())
+        }
+        # All at once, side by side; below they are at hand.
+        self._simulate(list(benches.values()), CONFIRM, "one left out")
+        return {name: self._start(benches.get(name, ())) for name in taken}
 
 
 @dataclass(frozen=True)
@@ -375,11 +383,7 @@ def differing(nominal: Trial, final: Trial, data: Mapping[Key, F64]) -> set[Key]
     where = flagged(compare(data, nominal.expected))
     if not final.effects:
         return where
-    for key, values in data.items():
-        if key not in nominal.expected.mean or key in where:
-            continue
-        one = {key: values}
-        gain = log_likelihood(one, final.expected) - log_likelihood(one, nominal.expected)
-        if gain > LEAST / 2:
-            where.add(key)
-    return where
+    gains = likelier(data, nominal.expected, final.expected)
+    where |= {key for key, gain in gains.items() if gain > LEAST / 2}
+    # A cause that many curves tell a little each is still told by the one that does it best.
+    return where or {max(gains, key=lambda key: gains[key])}
