@@ -11,7 +11,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from pixcal.estimators.gap import Reference, compare, flagged
 from pixcal.model.bench import SCHEMA
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages import ingest, reduce, simulate
+from pixcal.stages.diagnose.nominal import nominal_bench
 from pixcal.stages.diagnose.search import Candidate, Search, Trial, differing, shrinkage
 from pixcal.stages.diagnose.stage import Look, look_at, weakly_seen
 from pixcal.stages.diagnose.trial import Curves, Trials, estimate, looked_at
@@ -43,8 +44,8 @@ STRENGTHS = (0.03, 0.1, 0.3, 1.0)
 REFERENCES = 16
 FIRST_SEED = 5000
 REFITTED = tuple(n for n, kind in effects().items() if kind.undo is not Effect.undo)
-"""Effects that the diagnosis undoes on the measured offsets before simulating them. Here the bench
-is measured once, without them: they are left to the blind examination, where all is fitted anew."""
+"""Effects that are undone on the measured maps before they are simulated: the bench is measured
+anew with each of them, where the others share one."""
 RAMPS = ("phase_modulator_error",)
 """Effects that are looked for in a set whose phase is a ramp."""
 
@@ -127,7 +128,10 @@ def play(folder: Path, case: tuple[str, float, int]) -> dict[str, Any]:
     stage = set_up(folder, name in RAMPS)
     window = stage.look.first
     truth = (effects()[name]().scaled(strength),) if name else ()
-    learn = window.evidence(window.learn, truth, seed, stage.scratch)
+    learn, test = (
+        window.evidence(half, truth, seed + n, stage.scratch, fitted=False)
+        for n, half in enumerate((window.learn, window.test))
+    )
     candidates = {}
     for other, kind in effects().items():
         one = estimate(learn, kind)
@@ -137,20 +141,27 @@ def play(folder: Path, case: tuple[str, float, int]) -> dict[str, Any]:
             else Candidate(other, None, str(one or "no evidence"))
         )
     signatures = weakly_seen(candidates, effects())
-    known = [signature(folder, name in RAMPS, kind.name) for kind in signatures]
-    reference = Reference.of(
-        [
-            curves | {key: own[number] for key, own in known}
-            for number, curves in enumerate(stage.nominal)
-        ]
-    )
-    data = reference.on_scale(
-        looked_at(window.evidence(window.test, truth, seed + 1, stage.scratch), signatures)
-    )
-    trials = Trials((window,), stage.scratch, HERE, signatures)
+    if name in REFITTED:
+        b = window.bench
+        own_bench = nominal_bench(b.acquisition, b.tables, [learn, test], b.reduction, b.dtypes)
+        window = replace(window, bench=own_bench)
+        trials = Trials((window,), Path(tempfile.mkdtemp(dir=folder)), HERE, signatures)
+        (nominal,) = trials.curves([()], REFERENCES, "nominal bench")
+        assert not isinstance(nominal, str)
+        reference = Reference.of(nominal)
+    else:
+        trials = Trials((window,), stage.scratch, HERE, signatures)
+        known = [signature(folder, name in RAMPS, kind.name) for kind in signatures]
+        reference = Reference.of(
+            [
+                curves | {key: own[number] for key, own in known}
+                for number, curves in enumerate(stage.nominal)
+            ]
+        )
+    data = reference.on_scale(looked_at(test, signatures))
 
     def again(on: tuple[Effect, ...], names: Sequence[str]) -> dict[str, float]:
-        evidence = window.evidence(window.learn, on, seed + 2, stage.scratch)
+        evidence = window.evidence(window.learn, on, seed + 2, trials.scratch)
         found = {n: estimate(evidence, effects()[n]) for n in names}
         return {n: e.significance for n, e in found.items() if isinstance(e, Estimate)}
 
@@ -289,7 +300,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--publish", action="store_true", help="what was played, and no more")
     options = parser.parse_args()
-    names = [name for name in options.effects if name not in REFITTED]
+    names = options.effects
     cases = [("", 0.0, FIRST_SEED + 10 * n) for n in range(options.nominal)]
     cases += [
         (name, strength, FIRST_SEED + 100_000 + 10 * n)
@@ -326,7 +337,7 @@ def main() -> None:
 def publish(played: Sequence[dict[str, Any]], out: Path) -> None:
     """Print the tables, draw the picture, and put both into the documentation."""
     nothing = [p for p in played if not p["effect"]]
-    something = [p for p in played if p["effect"] and p["effect"] not in REFITTED]
+    something = [p for p in played if p["effect"]]
     tables = {"nominal": nominal_table(nothing), "power": power_table(something)}
     draw(something, out / "power.png")
     page = OUT.parent / "diagnose.md"

@@ -215,7 +215,9 @@ class NominalBench:
     recordings: tuple[Recording, ...]
     places: tuple[tuple[str, NDArray[np.intp]], ...]
 
-    def simulate(self, half: Half, effects: Sequence[Effect], seed: int) -> Raw:
+    def simulate(
+        self, half: Half, effects: Sequence[Effect], seed: int, *, fitted: bool = True
+    ) -> Raw:
         """Frames of a half of the acquisition, from this bench with some effects.
 
         Parameters
@@ -224,6 +226,8 @@ class NominalBench:
         effects : sequence of Effect
         seed : int
             Of everything random; the same seed gives the same noise with other effects.
+        fitted : bool
+            The measured maps have the effects in them, which are undone before they act anew.
 
         Raises
         ------
@@ -234,7 +238,11 @@ class NominalBench:
         bench = replace(self.bench, seed=seed, detector=detector)
         for effect in effects:
             effect.check(bench)
-        camera = Camera(bench, (0, bench.detector.shape[0]), [self._drawn(effects, seed), *effects])
+        camera = Camera(
+            bench,
+            (0, bench.detector.shape[0]),
+            [self._drawn(effects if fitted else (), seed), *effects],
+        )
         arrays = {
             name: np.empty((len(frames), *bench.detector.shape), self.dtypes[name])
             for name, frames in half.frames.items()

@@ -47,9 +47,11 @@ class Window:
     test: Half
     whole: tuple[int, int]
 
-    def evidence(self, half: Half, effects: Effects, seed: int, scratch: Path) -> Evidence:
-        """A half of the frames, taken again with some effects."""
-        raw = self.bench.simulate(half, effects, seed)
+    def evidence(
+        self, half: Half, effects: Effects, seed: int, scratch: Path, *, fitted: bool = True
+    ) -> Evidence:
+        """A half of the frames, taken again with some effects (`NominalBench.simulate`)."""
+        raw = self.bench.simulate(half, effects, seed, fitted=fitted)
         with tempfile.TemporaryDirectory(dir=scratch) as folder:
             return evidence_of(raw, Path(folder) / "run", self.part, self.whole)
 
