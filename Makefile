@@ -68,7 +68,7 @@ bench: $(INSTALLED) ## speed against a bare scan, and beside other methods (6 mi
 bench-full: $(INSTALLED) ## the same for 46 Mpix: time and memory (20 minutes, 60 GB of disk)
 	$(BIN)/python benchmarks/throughput.py --full
 
-fuzz: $(INSTALLED) ## bad input in thousands of cases, for docs/fuzz.md (half an hour)
+fuzz: $(INSTALLED) ## bad input in thousands of cases, for docs/fuzz.md (under ten minutes on two cores)
 	$(BIN)/python benchmarks/fuzz.py --write
 
 torture: $(TOOLS) ## faults of all kinds done on purpose, for docs/torture.md (a quarter of an hour)
@@ -96,8 +96,9 @@ blind-full: $(TOOLS) ## 200 cases of 128 x 128 pixels (hours, 15 GB of disk); an
 	[ -e work/blind-full ] || \
 	  $(BIN)/pixcal blind make --cases 200 --seed $(SEED) --size standard \
 	  --out work/blind-full --sealed work/blind-full-truth.json
-	$(BIN)/pixcal blind run work/blind-full
-	$(BIN)/pixcal blind score work/blind-full --sealed work/blind-full-truth.json --oracle
+	$(BIN)/pixcal blind run work/blind-full --cluster processes --memory 4GiB
+	$(BIN)/pixcal blind score work/blind-full --sealed work/blind-full-truth.json --oracle 20 \
+	  --cluster processes --memory 4GiB
 
 clean: ## remove the environment, the demo and all caches
 	rm -rf .venv demo site work/reproduction build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -30,7 +30,7 @@ SEE = {
     "pixcal astrometry": "How it is measured: [What the maps bring for stars](astrometry.md).",
     "pixcal compare": "How to read it: [The same pixels twice](compare.md).",
     "pixcal simulate": "Keys of the bench file: [Files](files.md#bench-files). Your own effects: "
-    "[in ten minutes](own-effect.md).",
+    "[one Python file](own-effect.md).",
     "pixcal budget": "What is counted: [Frames before any are taken](budget.md).",
     "pixcal blind": "What is asked and how it is marked: [The blind examination](blind.md).",
 }

@@ -63,15 +63,15 @@ def draw(title: str, change: F64, sigma: F64, file: Path) -> None:
     """Maps of the change and their profiles, in 1e-3 px."""
     milli = 1e3 * change
     limit = max(float(np.nanpercentile(np.abs(milli), 99)), 1e-3)
-    figure, axes = plt.subplots(2, 2, figsize=(7.2, 6.0), height_ratios=(3, 1.3), dpi=110)
+    figure, axes = plt.subplots(2, 2, figsize=(7.6, 6.4), height_ratios=(3, 1.3), dpi=110)
     for n, name in enumerate(AXES):
         picture = axes[0, n].imshow(
             milli[n], cmap="RdBu_r", vmin=-limit, vmax=limit, origin="lower"
         )
         rms = float(np.nanstd(milli[n]))
         error = 1e3 * float(np.nanmedian(sigma[n]))
-        axes[0, n].set_title(f"change of {name}: {rms:.2g}e-3 px rms", fontsize=10)
-        axes[0, n].set_xlabel(f"x, px   (noise of the map: {error:.2g}e-3 px)", fontsize=9)
+        axes[0, n].set_title(f"change of {name}\n{rms:.2g}e-3 px rms", fontsize=10)
+        axes[0, n].set_xlabel(f"x, px\nnoise of the map: {error:.2g}e-3 px", fontsize=9)
         # In the unit of the profiles below.
         figure.colorbar(picture, ax=axes[0, n], shrink=0.85)
         for axis, label in ((0, "mean of columns, along x"), (1, "mean of rows, along y")):

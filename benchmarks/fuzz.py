@@ -11,13 +11,17 @@ import resource
 import sys
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 
 from fuzzing.kinds import KINDS
 from fuzzing.laws import SECONDS, Kind, judged
 
 PAGE = Path(__file__).parents[1] / "docs" / "fuzz.md"
+PART = 20
+"""Cases that a process tries at a time."""
 ADDRESS_SPACE = 16 << 30
 """A case that asks for more gets a MemoryError, not the machine."""
 
@@ -27,9 +31,9 @@ def template(message: str) -> str:
     return re.sub(r"'[^']*'|/\S+|[-+]?\d[\d.e+-]*", "#", message)
 
 
-def try_kind(kind: Kind, numbers: range, messages: Counter[str]) -> Counter[str]:
-    """Outcomes of some cases of a kind; failures are printed as they come."""
-    found: Counter[str] = Counter()
+def try_kind(kind: Kind, numbers: range) -> tuple[Counter[str], Counter[str], float]:
+    """Outcomes of some cases of a kind, messages, and seconds; failures are printed at once."""
+    found, messages, begin = Counter[str](), Counter[str](), time.monotonic()
     stderr = os.fdopen(os.dup(2), "w")
     for number in numbers:
         # For what no signal interrupts.
@@ -42,7 +46,42 @@ def try_kind(kind: Kind, numbers: range, messages: Counter[str]) -> Counter[str]
             messages[template(verdict.why)] += 1
     faulthandler.cancel_dump_traceback_later()
     stderr.close()
-    return found
+    return found, messages, time.monotonic() - begin
+
+
+def limit_memory() -> None:
+    """Of the process that tries cases."""
+    resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
+
+
+def try_part(part: tuple[str, range]) -> tuple[Counter[str], Counter[str], float]:
+    """As `try_kind`, in another process."""
+    return try_kind(KINDS[part[0]], part[1])
+
+
+def try_all(
+    numbers: Mapping[str, range], jobs: int
+) -> tuple[dict[str, Counter[str]], Counter[str]]:
+    """Outcomes by the title of their kind, printed as each is done, and all messages."""
+    parts = [(name, part) for name, cases in numbers.items() for part in split(cases)]
+    messages, tried, seconds = Counter[str](), dict[str, Counter[str]](), Counter[str]()
+    context = get_context("spawn")
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=limit_memory) as pool:
+        left = Counter(name for name, _ in parts)
+        for (name, _), (found, said, took) in zip(parts, pool.map(try_part, parts), strict=True):
+            title = KINDS[name].title
+            tried[title] = tried.get(title, Counter()) + found
+            messages += said
+            seconds[name] += took
+            left[name] -= 1
+            if not left[name]:
+                print(f"{row(title, tried[title])} {seconds[name]:.1f} s", flush=True)
+    return tried, messages
+
+
+def split(cases: range) -> Sequence[range]:
+    """Parts of the cases of a kind, so that all cores have something to do to the end."""
+    return [cases[at : at + PART] for at in range(0, len(cases), PART)]
 
 
 def row(title: str, found: Counter[str]) -> str:
@@ -76,22 +115,18 @@ def main() -> int:
     parser.add_argument("--kind", choices=list(KINDS), action="append")
     parser.add_argument("--case", type=int, help="this one only")
     parser.add_argument("--cases", type=int, help="of each kind")
+    jobs = len(os.sched_getaffinity(0))
+    parser.add_argument("--jobs", type=int, default=jobs, help="processes [default: all cores]")
     parser.add_argument("--messages", action="store_true", help="print the refusals")
     parser.add_argument("--write", action="store_true", help="write the table of docs/fuzz.md")
     asked = parser.parse_args()
-    resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE, ADDRESS_SPACE))
-    messages, tried = Counter[str](), {}
-    for name in asked.kind or KINDS:
-        begin = time.monotonic()
-        numbers = range(asked.cases or KINDS[name].cases)
-        if asked.case is not None:
-            numbers = range(asked.case, asked.case + 1)
-        found = try_kind(KINDS[name], numbers, messages)
-        tried[KINDS[name].title] = found
-        took = time.monotonic() - begin
-        print(f"{row(KINDS[name].title, found)} {took:.1f} s", flush=True)
+    numbers = {name: range(asked.cases or KINDS[name].cases) for name in asked.kind or KINDS}
+    if asked.case is not None:
+        numbers = {name: range(asked.case, asked.case + 1) for name in numbers}
+    begin = time.monotonic()
+    tried, messages = try_all(numbers, asked.jobs)
     total = sum(tried.values(), Counter())
-    print(row("all", total))
+    print(f"{row('all', total)} {time.monotonic() - begin:.0f} s")
     if asked.messages:
         print(*(f"{count:6d} {text}" for text, count in sorted(messages.items())), sep="\n")
     if asked.write:

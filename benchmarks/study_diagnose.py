@@ -21,16 +21,18 @@ import numpy as np
 import yaml
 from scipy.stats import binomtest, kstest
 
-from pixcal.effects import effects
+from pixcal.effects import effects, parse_effects
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.battery import Curve, Key
+from pixcal.estimators.battery import Curve, Key, battery
 from pixcal.estimators.battery.signature import signature_curve, signature_key
-from pixcal.estimators.gap import Reference, compare, flagged
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.gap import Reference, compare, expect_nominal, flagged
 from pixcal.model.bench import SCHEMA
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages import ingest, reduce, simulate
+from pixcal.stages.blind.strengths import ways_of
 from pixcal.stages.diagnose.nominal import nominal_bench
-from pixcal.stages.diagnose.search import Candidate, Search, Trial, differing, shrinkage
+from pixcal.stages.diagnose.search import SCREEN, Candidate, Search, differing, shrinkage
 from pixcal.stages.diagnose.stage import Look, look_at, weakly_seen
 from pixcal.stages.diagnose.trial import Curves, Trials, estimate, looked_at
 
@@ -39,13 +41,17 @@ import matplotlib.pyplot as plt
 
 OUT = Path(__file__).parents[1] / "docs" / "diagnose"
 HERE = Runtime(cluster="sync")
-STRENGTHS = (0.03, 0.1, 0.3, 1.0)
-"""Times the default strength, which is that of the literature."""
-REFERENCES = 16
-FIRST_SEED = 5000
+STRENGTHS = (0.3, 1.0, 3.0, 10.0)
+"""Times the threshold (`pixcal.stages.blind.strengths`), of each way in turn."""
+REFERENCES, POOL = 16, 64
+"""Simulations of the nominal bench that an acquisition is held against, and those they are drawn
+from where only chances count: with the same ones for all, chances would go together."""
+FIRST_SEED, SEEDS_APART = 5000, 10
 REFITTED = tuple(n for n, kind in effects().items() if kind.undo is not Effect.undo)
 """Effects that are undone on the measured maps before they are simulated: the bench is measured
 anew with each of them, where the others share one."""
+MOST_WRONG = 3
+"""Innocent effects that are named in the table of what they close."""
 RAMPS = ("phase_modulator_error",)
 """Effects that are looked for in a set whose phase is a ramp."""
 
@@ -104,7 +110,7 @@ def set_up(folder: Path, ramp: bool) -> Stage:
     scratch = Path(tempfile.mkdtemp(dir=own))
     found = look_at(nominal, scratch, HERE)
     trials = Trials(found.windows, scratch, HERE)
-    (curves,) = trials.curves([()], REFERENCES, "nominal bench")
+    (curves,) = trials.curves([()], POOL, "nominal bench")
     assert not isinstance(curves, str)
     return Stage(found, tuple(curves), scratch)
 
@@ -122,12 +128,22 @@ def signature(folder: Path, ramp: bool, name: str) -> tuple[Key, list[Curve]]:
     return signature_key(name, kind.domains[0]), curves
 
 
+def truth_of(name: str, strength: float, seed: int) -> tuple[Effect, ...]:
+    """An effect in one of its ways, so many times as strong as its threshold; none without name."""
+    if not name:
+        return ()
+    ways = ways_of()[name]
+    way = ways[seed // SEEDS_APART % len(ways)]
+    drawn = way.make(strength * way.threshold("small"), np.random.default_rng(seed))
+    return tuple(parse_effects({name: drawn}, name))
+
+
 def play(folder: Path, case: tuple[str, float, int]) -> dict[str, Any]:
     """Let the bench play the reality once: name of an effect (or none), strength, seed."""
     name, strength, seed = case
     stage = set_up(folder, name in RAMPS)
     window = stage.look.first
-    truth = (effects()[name]().scaled(strength),) if name else ()
+    truth = truth_of(name, strength, seed)
     learn, test = (
         window.evidence(half, truth, seed + n, stage.scratch, fitted=False)
         for n, half in enumerate((window.learn, window.test))
@@ -141,21 +157,28 @@ def play(folder: Path, case: tuple[str, float, int]) -> dict[str, Any]:
             else Candidate(other, None, str(one or "no evidence"))
         )
     signatures = weakly_seen(candidates, effects())
+    estimates = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
     if name in REFITTED:
         b = window.bench
-        own_bench = nominal_bench(b.acquisition, b.tables, [learn, test], b.reduction, b.dtypes)
+        own_bench = nominal_bench(
+            b.acquisition, b.tables, [learn, test], (window.learn, window.test), b.reduction,
+            b.dtypes,
+        )  # fmt: skip
         window = replace(window, bench=own_bench)
-        trials = Trials((window,), Path(tempfile.mkdtemp(dir=folder)), HERE, signatures)
+        trials = Trials(
+            (window,), Path(tempfile.mkdtemp(dir=folder)), HERE, signatures, estimates, SCREEN
+        )
         (nominal,) = trials.curves([()], REFERENCES, "nominal bench")
         assert not isinstance(nominal, str)
         reference = Reference.of(nominal)
     else:
-        trials = Trials((window,), stage.scratch, HERE, signatures)
+        scratch = Path(tempfile.mkdtemp(dir=folder))
+        trials = Trials((window,), scratch, HERE, signatures, estimates, SCREEN)
         known = [signature(folder, name in RAMPS, kind.name) for kind in signatures]
         reference = Reference.of(
             [
                 curves | {key: own[number] for key, own in known}
-                for number, curves in enumerate(stage.nominal)
+                for number, curves in enumerate(stage.nominal[:REFERENCES])
             ]
         )
     data = reference.on_scale(looked_at(test, signatures))
@@ -175,32 +198,36 @@ def play(folder: Path, case: tuple[str, float, int]) -> dict[str, Any]:
         "seed": seed,
         "taken": list(found.taken),
         "gap": bool(flagged(before)),
-        "chances": [float(np.exp(d.log_chance)) for d in before.values()],
+        "chances": _chances(stage, test, seed) if not name else [],
         "sigmas": own.significance if own else None,
     }
     if name and name in found.taken:
         where = differing(search.nominal, found.final, data)
         closed = 1 - shrinkage(data, search.nominal, found.final, where).gap.total
-        (oracle,) = trials.curves([truth], 8, "oracle")
+        (oracle,) = replace(trials, estimates={}).curves([truth], 8, "oracle")
         if not isinstance(oracle, str):
             best = search.held_against(truth, oracle)
             result["closed"] = closed
             result["closed_by_truth"] = 1 - shrinkage(data, search.nominal, best, where).gap.total
-    elif name:
-        result["wrong_closed"] = _closed_by_wrong(search, found.taken, candidates, data)
+    if where := flagged(before):
+        result["closed_by_wrong"] = {
+            other: 1 - shrinkage(data, search.nominal, one.alone, where).gap.total
+            for other, one in candidates.items()
+            if one.alone is not None and other != name
+        }
     return result
 
 
-def _closed_by_wrong(
-    search: Search, taken: Sequence[str], candidates: dict[str, Candidate], data: Any
-) -> list[float]:
-    found: list[float] = []
-    for other in taken:
-        trial: Trial | None = candidates[other].alone
-        if trial is not None:
-            where = differing(search.nominal, trial, data)
-            found.append(1 - shrinkage(data, search.nominal, trial, where).gap.total)
-    return found
+def _chances(stage: Stage, test: Evidence, seed: int) -> list[float]:
+    """Of all statistics but counts, whose chances come in steps; against references of its own."""
+    drawn = np.random.default_rng(seed).choice(POOL, REFERENCES, replace=False)
+    reference = Reference.of([stage.nominal[n] for n in drawn])
+    differences = compare(reference.on_scale(looked_at(test, ())), expect_nominal(reference))
+    return [
+        float(np.exp(one.log_chance))
+        for key, one in differences.items()
+        if not battery()[key[0]].floor
+    ]
 
 
 def nominal_table(played: Sequence[dict[str, Any]]) -> str:
@@ -209,8 +236,6 @@ def nominal_table(played: Sequence[dict[str, Any]]) -> str:
     claims = sum(bool(p["taken"]) for p in played)
     gaps = sum(p["gap"] for p in played)
     chances = np.concatenate([p["chances"] for p in played])
-    # The least of several values, taken as independent: 1 for some, uniform below.
-    inside = chances[chances < 0.5]
     share = [float(np.mean(chances < limit)) for limit in (0.1, 0.01, 0.001)]
     rows = [
         ("nominal acquisitions", count),
@@ -219,15 +244,40 @@ def nominal_table(played: Sequence[dict[str, Any]]) -> str:
         ("statistics with a chance below 0.1", f"{share[0]:.3f}"),
         ("below 0.01", f"{share[1]:.4f}"),
         ("below 0.001", f"{share[2]:.5f}"),
-        ("Kolmogorov-Smirnov of chances below 0.5 against uniform", f"{_ks(inside):.2g}"),
+        ("furthest off a uniform distribution (Kolmogorov-Smirnov)", _ks(chances)),
+        ("statistics whose own chances differ from that with p < 0.05", _unlike(played)),
     ]
     return _table(("", ""), rows)
 
 
-def _ks(inside: np.ndarray) -> float:
-    rng = np.random.default_rng(1)
-    few = rng.choice(inside, min(400, len(inside)), replace=False)
-    return float(kstest(few / 0.5, "uniform").pvalue)
+def wrong_table(played: Sequence[dict[str, Any]]) -> str:
+    """What innocent effects close by themselves of the gap that another makes."""
+    closed = [
+        (share, other, p["effect"])
+        for p in played
+        for other, share in p.get("closed_by_wrong", {}).items()
+    ]
+    shares = np.array([share for share, *_ in closed])
+    rows: list[tuple[Any, ...]] = [
+        ("innocent effects tried", len(closed)),
+        ("share closed: median", f"{np.median(shares):.3f}"),
+        ("95 % close at most", f"{np.quantile(shares, 0.95):.3f}"),
+    ]
+    most = sorted(closed, reverse=True)[:MOST_WRONG]
+    told = ", ".join(f"{other} of {name}'s {share:.2f}" for share, other, name in most)
+    return _table(("", ""), [*rows, ("the most", told)])
+
+
+def _ks(chances: np.ndarray) -> str:
+    """Of one acquisition many statistics hang together, so only the distance is told."""
+    return f"{kstest(chances, 'uniform').statistic:.3f}"
+
+
+def _unlike(played: Sequence[dict[str, Any]]) -> str:
+    """A twentieth is what chance lets expect."""
+    by_statistic = np.array([p["chances"] for p in played]).T
+    off = sum(kstest(own, "uniform").pvalue < 0.05 for own in by_statistic)
+    return f"{off} of {len(by_statistic)}"
 
 
 def _share(found: int, count: int) -> str:
@@ -257,7 +307,7 @@ def power_table(played: Sequence[dict[str, Any]]) -> str:
         pairs = [(p["closed"], p["closed_by_truth"]) for p in own if "closed" in p]
         off = f"{np.median([abs(a - b) for a, b in pairs]):.3f}" if pairs else "-"
         rows.append((name, *cells, off))
-    header = ("effect", *(f"{s:g} × default" for s in STRENGTHS), "share closed, off truth's")
+    header = ("effect", *(f"{s:g} × threshold" for s in STRENGTHS), "share closed, off truth's")
     return _table(header, rows)
 
 
@@ -285,8 +335,12 @@ def draw(played: Sequence[dict[str, Any]], file: Path) -> None:
         axis.set_title(name, fontsize=9)
         axis.set_ylim(-0.05, 1.05)
         axis.grid(alpha=0.3)
-    axes.flat[0].legend(fontsize=7, loc="center left")
-    figure.supxlabel("strength, times that of the literature")
+    for axis in axes[-1]:
+        axis.set_xticks(STRENGTHS, [f"{s:g}" for s in STRENGTHS])
+        axis.minorticks_off()
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower right", ncols=2, frameon=False)
+    figure.supxlabel("strength, times the threshold")
     figure.supylabel("share of acquisitions")
     figure.savefig(file, dpi=110)
 
@@ -301,9 +355,9 @@ def main() -> None:
     parser.add_argument("--publish", action="store_true", help="what was played, and no more")
     options = parser.parse_args()
     names = options.effects
-    cases = [("", 0.0, FIRST_SEED + 10 * n) for n in range(options.nominal)]
+    cases = [("", 0.0, FIRST_SEED + SEEDS_APART * n) for n in range(options.nominal)]
     cases += [
-        (name, strength, FIRST_SEED + 100_000 + 10 * n)
+        (name, strength, FIRST_SEED + 100_000 + SEEDS_APART * n)
         for n in range(options.seeds)
         for strength in STRENGTHS
         for name in names
@@ -338,7 +392,11 @@ def publish(played: Sequence[dict[str, Any]], out: Path) -> None:
     """Print the tables, draw the picture, and put both into the documentation."""
     nothing = [p for p in played if not p["effect"]]
     something = [p for p in played if p["effect"]]
-    tables = {"nominal": nominal_table(nothing), "power": power_table(something)}
+    tables = {
+        "nominal": nominal_table(nothing),
+        "power": power_table(something),
+        "wrong": wrong_table(something),
+    }
     draw(something, out / "power.png")
     page = OUT.parent / "diagnose.md"
     text = page.read_text(encoding="utf-8")

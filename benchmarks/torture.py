@@ -5,13 +5,16 @@ table is written when nothing was left out. The last line is "all survived", or 
 """
 
 import argparse
+import os
 import re
 import sys
 import tempfile
 import time
 import traceback
 from collections.abc import Callable
-from functools import partial
+from concurrent.futures import ProcessPoolExecutor
+from functools import lru_cache, partial
+from multiprocessing import get_context
 from pathlib import Path
 
 from faults import Outcome, clocks, damage, full_disk, inputs, kills, places, processes, workers
@@ -40,6 +43,7 @@ def trials(bench: Bench, share: float) -> dict[str, Trial]:
     for stage in STAGES:
         found[f"kill {stage}"] = partial(kills.kill, bench, stage, n(40), SEED)
         found[f"ctrl-c {stage}"] = partial(kills.interrupt, bench, stage, n(10), SEED)
+        found[f"loading {stage}"] = partial(kills.loading, bench, stage, n(20), SEED)
         found[f"full disk {stage}"] = partial(full_disk.at_writes, bench, stage, n(30), SEED)
         if mount:
             small = partial(full_disk.on_small_disks, bench, stage, n(6), SEED)
@@ -51,7 +55,7 @@ def trials(bench: Bench, share: float) -> dict[str, Trial]:
                 found[name] = partial(do, bench, artefact, how, n(times), SEED)
     flip = damage.flip_a_bit
     for stage in STAGES:
-        found[f"unfinished {stage}"] = partial(damage.unfinished, bench, stage, flip, n(8), SEED)
+        found[f"unfinished {stage}"] = partial(damage.unfinished, bench, stage, flip, n(12), SEED)
     found["products"] = partial(damage.products, bench, flip, n(6), SEED)
     found["processes"] = partial(processes.together, bench, n(12), SEED)
     for change in inputs.CHANGES:
@@ -83,26 +87,45 @@ def write_table(rows: list[str]) -> None:
     PAGE.write_text(text, encoding="utf-8")
 
 
+@lru_cache
+def _trials(folder: Path, share: float) -> dict[str, Trial]:
+    """All trials, on a bench of this process."""
+    return trials(make_bench(Path(tempfile.mkdtemp(dir=folder))), share)
+
+
+def _tried(folder: Path, share: float, name: str) -> tuple[str, float, str]:
+    """Row of a trial, its seconds, and what went wrong."""
+    begun = time.monotonic()
+    try:
+        row, wrong = _trials(folder, share)[name]().row(), ""
+    except Exception as error:
+        row, wrong = "", f"{traceback.format_exc()}{error!r:.2000}"
+    return row, time.monotonic() - begun, wrong
+
+
 def main() -> int:
     """Do the trials."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="those whose name this expression finds")
     parser.add_argument("--share", type=float, default=1.0, help="of the usual numbers")
+    jobs = max(1, len(os.sched_getaffinity(0)))
+    parser.add_argument("--jobs", type=int, default=jobs, help="at a time [default: all cores]")
     options = parser.parse_args()
     rows: list[str] = []
     failed: list[str] = []
-    with tempfile.TemporaryDirectory() as folder:
-        bench = make_bench(Path(folder))
-        for name, do in trials(bench, options.share).items():
-            if not re.search(options.only, name):
-                continue
-            begun = time.monotonic()
-            try:
-                rows.append(do().row())
-                print(f"{rows[-1]} <!-- {name}, {time.monotonic() - begun:.0f} s -->", flush=True)
-            except Exception:
-                failed.append(name)
-                print(f"FAILED {name}\n{traceback.format_exc()}", flush=True)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        every = trials(Bench(folder, folder, folder, {}), options.share)
+        names = [name for name in every if re.search(options.only, name)]
+        try_one = partial(_tried, folder, options.share)
+        with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
+            for name, (row, took, wrong) in zip(names, pool.map(try_one, names), strict=True):
+                if wrong:
+                    failed.append(name)
+                    print(f"FAILED {name}\n{wrong}", flush=True)
+                else:
+                    rows.append(row)
+                    print(f"{row} <!-- {name}, {took:.0f} s -->", flush=True)
     if not failed and not options.only and options.share == 1:
         write_table(rows)
     print(f"not survived: {', '.join(failed)}" if failed else "all survived")

@@ -51,7 +51,7 @@ def test_the_wheel_installs_the_command(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         (file,) = [name for name in archive.namelist() if name.endswith("entry_points.txt")]
         text = archive.read(file).decode()
-    assert text.split() == ["[console_scripts]", "pixcal", "=", "pixcal_cli.main:main"]
+    assert text.split() == ["[console_scripts]", "pixcal", "=", "pixcal_cli.__main__:main"]
 
 
 def test_a_wheel_can_be_built_from_the_sources(wheel: Path, sources: Path, tmp_path: Path) -> None:

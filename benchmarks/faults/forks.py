@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from multiprocessing.context import ForkServerContext, ForkServerProcess
+from multiprocessing.synchronize import Event
 from pathlib import Path
 
 PATIENCE_S = 120.0
@@ -49,7 +50,7 @@ class Ended:
     def refused(self, code: int, *words: str) -> "Ended":
         """Itself, when it ended with this exit code and one line that holds some words."""
         assert self.code == code, (self.code, self.err, self.out)
-        assert self.err.startswith("pixcal: "), self.err
+        assert self.err.startswith("pixcal: "), (self.err, self.seconds)
         assert self.err.count("\n") == 1, self.err
         for word in words:
             assert word in self.err, (word, self.err)
@@ -81,13 +82,16 @@ class Command:
         self._files = tempfile.TemporaryDirectory()
         self._out, self._err = (Path(self._files.name) / name for name in ("out", "err"))
         self._begun = time.monotonic()
+        self._listens = _server().Event()
         self.process: ForkServerProcess = _server().Process(
-            target=_main, args=([*args, "--quiet"], self._out, self._err, before)
+            target=_main, args=([*args, "--quiet"], self._out, self._err, before, self._listens)
         )
         self.process.start()
 
     def send(self, number: signal.Signals) -> None:
-        """Send it a signal, if it still runs."""
+        """Send it a signal, if it still runs; Ctrl-C once it listens, and kill at any time."""
+        while number == signal.SIGINT and self.process.is_alive() and not self._listens.wait(0.01):
+            pass
         if self.process.is_alive() and self.process.pid is not None:
             with suppress(ProcessLookupError):
                 os.kill(self.process.pid, number)
@@ -110,16 +114,27 @@ def pixcal(*args: str | Path, before: Callable[[], None] | None = None) -> Ended
     return Command([str(arg) for arg in args], before).end()
 
 
-def _main(args: Sequence[str], out: Path, err: Path, before: Callable[[], None] | None) -> None:
+def _main(
+    args: Sequence[str],
+    out: Path,
+    err: Path,
+    before: Callable[[], None] | None,
+    listens: Event,
+) -> None:
     for number, file in ((1, out), (2, err)):
         os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT), number)
     sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
     sys.stderr = open(2, "w", closefd=False, buffering=1)  # noqa: SIM115
-    # A shell that starts us in the background may have it ignored.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+    from pixcal_cli.__main__ import _leave
     from pixcal_cli.main import main
 
     if before is not None:
         before()
     sys.argv = ["pixcal", *args]
-    main()
+    try:
+        # A shell that starts us in the background may have it ignored.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        listens.set()
+        main()
+    except KeyboardInterrupt:  # as `pixcal_cli.__main__` does
+        _leave()

@@ -2,13 +2,18 @@
 
 import random
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 
 from faults import Outcome
 from faults.bench import STAGES, Bench
-from faults.forks import Command, Ended, pixcal
+from faults.forks import PATIENCE_S, Command, Ended, pixcal
 
+MAIN = "from pixcal_cli.__main__ import main; main()"
+"""What the shell command does."""
+LOADING_S = 1.5
 LONGER = 1.1
 """Moments are drawn from as long as the undisturbed command takes, and a little more."""
 
@@ -32,6 +37,39 @@ def interrupt(bench: Bench, stage: str, times: int, seed: int) -> Outcome:
     for again in _disturbed(bench, stage, times, seed, signal.SIGINT):
         again.refused(1, "interrupted; run the same command again to resume")
         outcome.ends["one line, exit 1, resumed, bit-identical"] += 1
+    return outcome
+
+
+def loading(bench: Bench, stage: str, times: int, seed: int) -> Outcome:
+    """Ctrl-C in the first second and a half of a new interpreter, while it loads its libraries.
+
+    Before it has come to pixcal, which takes some hundredths of a second, Python answers itself.
+    """
+    outcome = Outcome(f"Ctrl-C in the first {LOADING_S} s of `pixcal {stage}`, libraries loading")
+    rng = random.Random(f"loading {stage} {seed}")
+    while outcome.tried < times:
+        run = bench.copy("loading", *STAGES[: STAGES.index(stage)])
+        line = [sys.executable, "-c", MAIN, *bench.command(stage, run), "--quiet"]
+        # A shell that starts us in the background may have it ignored.
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        streams = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
+        with subprocess.Popen(line, **streams, text=True) as process:
+            signal.signal(signal.SIGINT, before)
+            time.sleep(rng.uniform(0, LOADING_S))
+            process.send_signal(signal.SIGINT)
+            _, said = process.communicate(timeout=PATIENCE_S)
+        if process.returncode == 0:
+            continue  # over before: not counted
+        if said.startswith("pixcal: "):
+            Ended(process.returncode, "", said, 0.0).refused(1, "interrupted; run the same")
+            end = "one line, exit 1, resumed, bit-identical"
+        else:
+            assert "pixcal_cli" not in said, said
+            assert {f.name for f in run.iterdir()} == set(STAGES[: STAGES.index(stage)])
+            end = "Python itself not up yet, nothing begun"
+        pixcal(*bench.command(stage, run)).succeeded()
+        bench.assert_same(run, stage)
+        outcome.ends[end] += 1
     return outcome
 
 

@@ -5,10 +5,11 @@ from pathlib import Path
 
 import pixcal_cli.main  # noqa: F401
 from pixcal.engine.run import Runtime
-from pixcal.stages import allan, fit, ingest, reduce, simulate
+from pixcal.stages import allan, correct, diagnose, fit, ingest, reduce, report, simulate
 
 BENCH = Path(__file__).parents[2] / "tests" / "bench.yaml"
 SYNC = Runtime("sync")
+LATE = (correct, diagnose, report)  # commands import these late, some as who cannot compile
 
 with tempfile.TemporaryDirectory() as folder:
     acquisition, run = Path(folder, "acquisition"), Path(folder, "run")

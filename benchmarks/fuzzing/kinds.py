@@ -1,6 +1,6 @@
 """All kinds of bad input."""
 
-from fuzzing import commands, files, frames, own_effects, places, settings
+from fuzzing import commands, diagnoses, examinations, files, frames, own_effects, places, settings
 from fuzzing.laws import Kind
 
 KINDS: dict[str, Kind] = {
@@ -12,5 +12,7 @@ KINDS: dict[str, Kind] = {
         *places.KINDS,
         *commands.KINDS,
         *own_effects.KINDS,
+        *diagnoses.KINDS,
+        *examinations.KINDS,
     ]
 }

@@ -75,16 +75,22 @@ def make(
     results.show_notes(found.notes)
 
 
-@blind.command(epilog=examples("pixcal blind run exam", "pixcal blind run exam --again"))
+@blind.command(epilog=examples("pixcal blind run exam", "pixcal blind run exam --limit 20"))
 @cases_argument
 @click.option("--again", is_flag=True, help="Diagnose anew what was diagnosed.")
 @click.option("--keep", is_flag=True, help="Keep the runs whole, not their products alone.")
+@click.option(
+    "--limit",
+    metavar="N",
+    type=click.IntRange(1),
+    help="Diagnose at most N cases now, in order; their order is random.",
+)
 @runtime_options
-def run(folder: Path, again: bool, keep: bool, runtime: "Runtime") -> None:
+def run(folder: Path, again: bool, keep: bool, limit: int | None, runtime: "Runtime") -> None:
     """Diagnose every case of DIR; those that are done are skipped."""
     from pixcal.stages import blind as stage  # here: for a fast `pixcal --help`
 
-    done, failed = stage.run(folder, stage.RunConfig(again, keep), runtime)
+    done, failed = stage.run(folder, stage.RunConfig(again, keep, limit), runtime)
     failures = f", {failed} of which failed" if failed else ""
     click.echo(f"cases diagnosed: {done}{failures}; results in {folder / 'runs'}")
 
@@ -92,13 +98,19 @@ def run(folder: Path, again: bool, keep: bool, runtime: "Runtime") -> None:
 @blind.command(
     epilog=examples(
         "pixcal blind score exam --sealed truth.json",
-        "pixcal blind score exam --sealed truth.json --oracle --write docs/blind.md",
+        "pixcal blind score exam --sealed truth.json --oracle 20 --write docs/blind.md",
     )
 )
 @cases_argument
 @sealed_option
 @click.option(
-    "--oracle", is_flag=True, help="Simulate the true effects as well: what could be closed."
+    "--oracle",
+    metavar="N",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Simulate the true effects of the first N cases of parts 1 and 4 as well: "
+    "what could be closed.",
 )
 @click.option(
     "--write",
@@ -107,7 +119,7 @@ def run(folder: Path, again: bool, keep: bool, runtime: "Runtime") -> None:
     help="Markdown page that the table goes to, between its marks.",
 )
 @runtime_options
-def score(folder: Path, sealed: Path, oracle: bool, write: Path | None, runtime: "Runtime") -> None:
+def score(folder: Path, sealed: Path, oracle: int, write: Path | None, runtime: "Runtime") -> None:
     """Open the seal and hold every diagnosis against its truth."""
     from pixcal.stages import blind as stage  # here: for a fast `pixcal --help`
 
@@ -128,4 +140,5 @@ def _show(found: Mapping[str, Any]) -> None:
             )
     results.show_table(("part", "", "question", "right", "95 % interval"), rows)
     wrong = [f"{c['case']}: {c['why']}" for c in found["cases"] if not c["right"]]
-    results.show_notes([*wrong, *found["notes"]])
+    missing = [f"not diagnosed yet: {len(found['missing'])} of {found['made']} cases"]
+    results.show_notes([*wrong, *(missing if found["missing"] else []), *found["notes"]])

@@ -7,7 +7,6 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
-from typing import Any
 
 import click
 
@@ -38,13 +37,6 @@ class InOrder(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Names of the commands."""
         return list(self.commands)
-
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run the command; click itself would print an empty line at Ctrl-C."""
-        try:
-            return super().invoke(ctx)
-        except KeyboardInterrupt as error:
-            raise click.Abort from error
 
 
 @click.group(
@@ -127,7 +119,9 @@ def invoke(args: Sequence[str]) -> int:
         0 on success, 2 for a usage or input error, 1 for anything else.
     """
     try:
-        code = cli.main(args, prog_name="pixcal", standalone_mode=False)
+        if os.environ.get("_PIXCAL_COMPLETE"):  # a shell asks what may follow
+            cli.main(args, prog_name="pixcal", standalone_mode=False)
+        code = _run(args)
         sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
         if os.environ.get("PIXCAL_DEBUG"):
@@ -135,7 +129,17 @@ def invoke(args: Sequence[str]) -> int:
         code, message = explain(error)
         if message:
             click.echo(f"pixcal: {one_line(message)}", err=True)
-    return code or 0
+    return code
+
+
+def _run(args: Sequence[str]) -> int:
+    # Not click's own `main`, which answers Ctrl-C with an empty line.
+    try:
+        with cli.make_context("pixcal", list(args)) as context:
+            cli.invoke(context)
+    except click.exceptions.Exit as ended:  # of --help and --version
+        return ended.exit_code
+    return 0
 
 
 def main() -> None:

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,9 +18,12 @@ def test_an_examination_from_beginning_to_end(
     assert capsys.readouterr().out == f"cases in {exam}: 1; their truth in {sealed}\n"
     products = exam / "runs" / "case-0001" / "products"
     products.mkdir(parents=True)
-    diagnosis = {"verdict": "no gap", "causes": [], "candidates": [], "gap": {"after": 1.0}}
+    diagnosis: dict[str, Any] = {"verdict": "no gap", "causes": [], "candidates": []}
+    diagnosis["gap"] = {"after": 1.0, "where": []}
     (products / "diagnosis.json").write_text(json.dumps(diagnosis))
-    assert invoke(["blind", "run", str(exam), "--quiet"]) == 0
+    sat = {"code": "a", "seconds": {"diagnosis": 1.0, "maps": 0.0}, "no_maps": "not diagnosed"}
+    (products.parent / "sat.json").write_text(json.dumps(sat))
+    assert invoke(["blind", "run", str(exam), "--limit", "3", "--quiet"]) == 0
     assert capsys.readouterr().out.startswith("cases diagnosed: 0;")
     page = tmp_path / "page.md"
     page.write_text("<!-- blind:tiny -->\n<!-- end -->\n")

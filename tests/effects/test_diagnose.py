@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from astropy.io import fits
 
 from pixcal.engine.run import Runtime
 from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.stages import diagnose, fit, ingest, reduce, simulate
-from pixcal.stages.diagnose import trial
+from pixcal.stages.diagnose import trial, windows
 from pixcal.stages.diagnose.windows import chosen_windows, split
 
 SYNC = Runtime(cluster="sync")
@@ -256,5 +257,59 @@ def test_windows_of_a_large_detector_lie_apart_on_its_chunks() -> None:
         assert y0 % 128 == x0 % 128 == 0
         assert 0 <= y0 < y1 <= 5456
         assert 0 <= x0 < x1 <= 8320
+    assert len({*chosen_windows((180, 200))[1]}) == 4
     whole, (same,) = chosen_windows((61, 67))
     assert whole == same == ((0, 61), (0, 67))
+
+
+def test_other_random_numbers_of_the_simulations_change_no_more_than_the_interval(
+    with_lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = diagnosed(with_lag, only=FEW)
+    run = tmp_path / "run"
+    shutil.copytree(with_lag, run, ignore=shutil.ignore_patterns("diagnose", "products"))
+    taken = trial.Window.evidence
+
+    def with_other_seeds(self: trial.Window, half: Any, effects: Any, seed: int, *more: Any) -> Any:
+        return taken(self, half, effects, seed + 50_000, *more)
+
+    monkeypatch.setattr(trial.Window, "evidence", with_other_seeds)
+    again = diagnosed(run, only=FEW)
+    assert again["verdict"] == found["verdict"]
+    assert again["gap"]["where"] != found["gap"]["where"]
+    (one,), (other,) = found["causes"], again["causes"]
+    assert one["effect"] == other["effect"]
+    assert one["parameters"] == other["parameters"]
+    low, high = one["gap_closed_interval"]
+    assert low - 0.05 <= other["gap_closed"] <= high + 0.05
+
+
+def test_the_window_that_is_off_is_named(
+    reduced: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Noise that no effect makes, in one corner of a detector that is looked at by windows."""
+    monkeypatch.setattr(windows, "LARGEST", 60)
+    monkeypatch.setattr(windows, "SIDE", 40)
+    run = reduced(None, {"detector.shape": [131, 127], "detector.hot_fraction": 0.0})
+    acquisition = run.parent / "acq"
+    rng = np.random.default_rng(5)
+    for file in (*acquisition.glob("vertical/*.fits"), *acquisition.glob("horizontal/*.fits")):
+        with fits.open(file, mode="update") as opened:
+            cube = np.asarray(opened[0].data)
+            corner = cube[:, 80:, 80:]
+            noisy = corner + np.rint(60 * rng.standard_normal(corner.shape))
+            cube[:, 80:, 80:] = np.clip(noisy, 0, 65535).astype(cube.dtype)
+            opened[0].data = cube
+    other = run.parent / "other"
+    ingest.run(acquisition, other, ingest.Config(), SYNC)
+    reduce.run(other, reduce.Config(), SYNC)
+    found = diagnosed(other, only=("fringe_jitter", "row_noise"))
+    assert found["verdict"] == "unexplained"
+    assert found["more_would_tell"]
+    places = found["gap"]["places"]
+    assert [p["window"] for p in places] == [
+        [[9, 49], [9, 49]], [[9, 49], [78, 118]], [[82, 122], [9, 49]], [[82, 122], [78, 118]],
+    ]  # fmt: skip
+    *calm, off = (p["domains"]["noise"] for p in places)
+    assert off[0] > 6
+    assert all(c[0] < 4 for c in calm)

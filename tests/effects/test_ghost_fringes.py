@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from pixcal.effects import ghost_fringes
 from pixcal.effects.ghost_fringes import GhostFringes
 from pixcal.estimators.evidence import Evidence
 from pixcal.model.bench import Bench
@@ -99,3 +100,17 @@ def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: s
     found = GhostFringes.estimate(acquired(None, {other: {}}))
     assert found is not None
     assert found.significance < 4
+
+
+def test_crosstalk_of_every_other_row_is_not_taken_for_it(
+    acquired: Callable[..., Evidence], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is a wave in phase and visibility too, of rows that repeat."""
+    coupling = {"dy": 1, "dx": 0, "share": 0.0023, "every_rows": 2}
+    found = GhostFringes.estimate(acquired(None, {"ipc": {"couplings": [coupling]}}))
+    assert found is not None
+    assert found.significance < 4
+    monkeypatch.setattr(ghost_fringes, "PERIODS", ())
+    there = GhostFringes.estimate(acquired(None, {"ipc": {"couplings": [coupling]}}))
+    assert there is not None
+    assert there.significance > 6

@@ -149,6 +149,31 @@ def test_an_effect_below_its_threshold_is_not_tried() -> None:
     assert "1.4 sigma" in found.candidates["left"].reason
 
 
+def test_once_nothing_differs_only_what_is_sure_is_tried() -> None:
+    tried: list[frozenset[str]] = []
+
+    def noted(
+        benches: Sequence[Sequence[Effect]], seeds: int, label: str
+    ) -> list[list[dict[Key, Curve]] | str]:
+        tried.extend(frozenset(e.label for e in b if isinstance(e, Toy)) for b in benches)
+        return simulate(benches, seeds, label)
+
+    def sought(sigmas: float, mimicked: float) -> Found:
+        tried.clear()
+        one, other = candidate("left", 0.03), candidate("right", 2 * NOISE, sigmas)
+        data = REFERENCE.on_scale(curves((), 500, {"left": 0.03}))
+        found = Search(REFERENCE, data, noted, lambda *_: {"right": mimicked})
+        return found.run({"left": one, "right": other})
+
+    assert sought(9.0, 0.0).taken == ("left",)
+    assert frozenset({"left", "right"}) in tried
+    for sigmas, mimicked in ((3.0, 0.0), (9.0, 6.0)):
+        found = sought(sigmas, mimicked)
+        assert found.taken == ("left",)
+        assert frozenset({"left", "right"}) not in tried
+        assert "3.0 sigma beside left" in found.candidates["right"].reason
+
+
 def test_an_effect_that_is_only_hinted_at_passes_a_higher_mark() -> None:
     found, left = search({"left": 0.03}, [candidate("left", 0.03, sigmas=2.0)])
     assert found.taken == ("left",)

@@ -251,6 +251,7 @@ def test_a_worker_with_a_run_of_its_own_is_refused(
     for folder in (tmp_path, Path(there)):
         (folder / "run" / "reduce").mkdir(parents=True)
         (folder / "run" / ".lock").touch()
+        (folder / "run" / ".partial").mkdir()
     monkeypatch.chdir(tmp_path)
     source = Path("/proc/self/cwd/run/reduce")
     with pytest.raises(InputError, match=r"run/\.cluster-\w+: the worker on .* does not see it"):
@@ -259,6 +260,16 @@ def test_a_worker_with_a_run_of_its_own_is_refused(
     monkeypatch.chdir(there)
     run_tasks(partial(spot, source), range(3), cluster.runtime, label="spots")
     shutil.rmtree(Path(there) / "run")
+
+
+def test_locks_of_other_programs_make_no_run_directory(cluster: Any, tmp_path: Path) -> None:
+    """pytest keeps one above all its folders, and several processes work below."""
+    (tmp_path / ".lock").touch()
+    other = tmp_path / ".cluster-other"
+    other.touch()
+    (tmp_path / "frames").mkdir()
+    run_tasks(partial(spot, tmp_path / "frames"), range(3), cluster.runtime, label="spots")
+    assert sorted(tmp_path.glob(".cluster*")) == [other]
 
 
 @pytest.mark.parametrize(

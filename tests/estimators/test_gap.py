@@ -59,6 +59,25 @@ def test_deviations_by_chance_are_as_rare_as_they_are_called() -> None:
     assert kstest(chance, "uniform").pvalue > 1e-3
 
 
+@pytest.mark.parametrize("alike", [0.0, 0.6, 0.95, 1.0])
+def test_the_chance_of_a_curve_is_uniform_however_alike_its_values_are(alike: float) -> None:
+    def curves(rng: np.random.Generator) -> dict[Key, Curve]:
+        common, own = rng.standard_normal(), rng.standard_normal(9)
+        return {LINEAR: Curve(np.arange(9.0), np.sqrt(alike) * common + np.sqrt(1 - alike) * own)}
+
+    rng, chances, counts = np.random.default_rng(5), [], []
+    for _ in range(300):
+        known = Reference.of([curves(rng) for _ in range(16)])
+        (found,) = compare(known.on_scale(curves(rng)), expect_nominal(known)).values()
+        chances.append(np.exp(found.log_chance))
+        counts.append(known.independent[LINEAR])
+    assert kstest(chances, "uniform").pvalue > 1e-3
+    # All alike count as one; independent ones as several, a little less than they are.
+    assert (np.median(counts) < 1.3) if alike == 1 else (np.median(counts) > 1.3)
+    if not alike:
+        assert 6 < np.median(counts) <= 9
+
+
 def test_no_gap_is_found_where_there_is_none() -> None:
     found = 0
     for n in range(100):

@@ -5,6 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
+from pixcal.estimators import scout as scouting
 from pixcal.estimators.fringes import FrameParameters, find_fringe_vector, smooth_phasor
 from pixcal.estimators.pixel_sums import phase_sigma
 from pixcal.estimators.scout import Coding, Scout, Tile, accumulate, start_model
@@ -59,6 +60,29 @@ def test_error_is_at_the_bound_with_everything_free(bench):
     assert error.std() / made.bound("vertical") < 1.03
     assert 0.97 < (error / sigma).std() < 1.03
     assert np.median(chi2) / (made.frames - 3) == pytest.approx(1.0, abs=0.02)
+
+
+@pytest.mark.parametrize("motion", [0.0, 2e-4, 1e-2])
+def test_turns_left_out_would_change_nothing_that_noise_does_not_hide(bench, monkeypatch, motion):
+    found, turns = {}, {}
+    refine = Scout._refine
+    for settled in (scouting.SETTLED, 0.0):
+        monkeypatch.setattr(scouting, "SETTLED", settled)
+        taken = []
+        monkeypatch.setattr(Scout, "_refine", lambda *a, n=taken: n.append(1) or refine(*a))
+        scout, codes = scout_of(bench(shape=(67, 83), frames=250, vector_noise=motion))
+        frames = scout.prime([codes])
+        found[settled], turns[settled] = np.hstack([frames.g, frames.dk]), len(taken)
+        _, _, normal = scout._frame_step([codes], frames, scout.moving)
+    few, all_of_them = found.values()
+    size = 5 if scout.moving else 3
+    change = (few - all_of_them)[:, :size]
+    square = np.einsum("ti,tij,tj->", change, normal[:, :size, :size], change)
+    assert square < (2 * max(found)) ** 2 * change.size
+    fewer, most = turns.values()
+    assert fewer <= most == (11 if scout.moving else 3)
+    # At 0 three turns are needed, and at 1e-2 all eleven may be: between them some are not.
+    assert fewer < most or motion != 2e-4
 
 
 def test_motion_is_not_claimed_without_motion(bench):

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pixcal.effects import effects
 from pixcal.estimators.battery import DETECTOR, battery
 from pixcal.estimators.battery.noise import OUTLIERS, STEPS
 from pixcal.report import blocks as blocks_module
+from pixcal.report import diagnosis_maps as maps
 from pixcal.report import diagnosis_words
 from pixcal.report.blocks import Block, Fold, Plate, Section, Words
-from pixcal.report.contents import ArrayRecord, Contents, Diagnosis, EffectWords, StageRecord
+from pixcal.report.contents import Contents, Diagnosis, EffectWords, StageRecord
 from pixcal.report.diagnosis import diagnosis
 from pixcal.report.diagnosis_figures import Bar, Closed, curves_figure, gap_figure
-from pixcal.report.diagnosis_words import deciding, place, places
+from pixcal.report.diagnosis_words import place, places
 from pixcal.report.drawing import png
 from pixcal.report.page import render
 from pixcal.report.tables import Table
@@ -65,6 +65,7 @@ def a_cause(effect: str = "lag", **changes: Any) -> dict[str, Any]:
         "uncertainty": {"share": 2e-5}, "gap_closed": 0.8, "gap_closed_interval": [0.75, 0.83],
         "gain_over_rest": 0.61, "p_value": 2e-40, "sigmas": 80.0, "why": "frames follow others",
         "given_away_by": [{"statistic": "lines", "set": "one"}], "not_told_apart_from": [],
+        "would_decide": [],
     } | changes  # fmt: skip
 
 
@@ -78,6 +79,7 @@ def a_diagnosis(
         curves = (a_curve(), a_curve("repeat", domain="space", sigma=5.0), a_curve("o", sigma=1.0))
     facts = {
         "verdict": verdict, "causes": list(causes), "statistics": 102,
+        "more_would_tell": ["dark frames"],
         "gap": {
             "total": 1.0, "after": 0.03, "interval": [0.01, 0.06], "where": [],
             "domains": {"space": [0.3, 0.02], "time": [0.0, 0.0], "intensity": [0.0, 0.0],
@@ -174,7 +176,7 @@ def test_no_gap_is_said_at_once_and_what_came_nearest_is_shown() -> None:
 @pytest.mark.usefixtures("without_figures")
 def test_unexplained_says_where_and_what_could_tell_more() -> None:
     found = a_diagnosis("unexplained", after=1.0, interval=[0.9, 1.1])
-    section = diagnosis(contents(found, frames={"dark": []}))
+    section = diagnosis(contents(found))
     assert answer(section).level == "bad"
     assert "in 2 of 102 statistics, mostly in noise, and none of the 2 effects" in (
         answer(section).text
@@ -182,7 +184,6 @@ def test_unexplained_says_where_and_what_could_tell_more() -> None:
     advice = [b.text for b in section.blocks if isinstance(b, Words) and b.role == "advice"]
     assert len(advice) == 1
     assert "dark frames" in advice[0]
-    assert "a second baseline along x" in advice[0]
     titles = [b.title for b in section.blocks if isinstance(b, Plate)]
     assert titles == ["The gap", "The largest differences"]
     assert "with causes" not in text_of(section)
@@ -305,65 +306,74 @@ def test_what_was_considered_and_looked_at_is_folded() -> None:
 
 @pytest.mark.usefixtures("without_figures")
 def test_a_richer_nominal_bench_is_named() -> None:
-    stage = StageRecord("diagnose", "k", 1, "0", {"nominal": {"ipc": {}, "lag": {}}}, {})
+    stage = StageRecord("diagnose", "k", 2, "0", {"nominal": {"ipc": {}, "lag": {}}}, {})
     assert "to it were added ipc and lag" in (
         diagnosis(dataclasses.replace(contents(a_diagnosis()), stages=(stage,))).lead
     )
     assert "straight fringes" not in diagnosis(contents(a_diagnosis(), frames={"fringes": []})).lead
 
 
-# Which frames would decide
-
-
-def flats(*exposures: float) -> tuple[ArrayRecord, ...]:
-    return (ArrayRecord("flat", 9, 9, None, None, None, exposures, None, None),)
-
-
-def sets(*baselines: tuple[float, float]) -> dict[str, Any]:
-    return {"fringes": [{"name": str(n), "baseline_mm": b} for n, b in enumerate(baselines)]}
-
-
-FULL = sets((6.0, 0.0), (-9.0, 0.1), (0.0, 6.0), (0.0, 9.0))
-LADDER = flats(0.01, 0.02, 0.03)
-NOTHING_MORE = "more frames of the same kind, with the phases in random order"
-
-
-@pytest.mark.parametrize(
-    ("frames", "arrays", "names", "words"),
-    [
-        (FULL, LADDER, ("ipc", "mine"), NOTHING_MORE),
-        (FULL | {"dark": []}, LADDER, ("ipc",), "dark frames"),
-        (FULL | {"dark": []}, LADDER, ("lag", "contrast_noise"), "dark frames"),
-        (FULL | {"dark": []}, LADDER, ("contrast_noise",), NOTHING_MORE),
-        (sets((6, 0), (0, 6)), LADDER, ("ipc",), "a second baseline along x and y"),
-        (sets((6, 0), (9, 0), (0, 6)), LADDER, ("ipc",), "a second baseline along y"),
-        (sets((4, 4)), LADDER, ("intra_pixel_response",), "a second baseline along 45°"),
-        (sets((6, 0), (9, 0)), LADDER, ("ghost_fringes",), "a fringe set along another axis"),
-        (FULL, flats(0.01), ("nonlinearity",), "a ladder of flats (at least 3 exposure times)"),
-        (FULL, flats(0.01), ("lag",), NOTHING_MORE),
-        (FULL | {"flat": []}, (), ("own",),
-         "flat frames and a ladder of flats (at least 3 exposure times)"),
-    ],
-)  # fmt: skip
-def test_frames_that_would_decide_are_those_that_are_missing(
-    frames: dict[str, Any], arrays: tuple[ArrayRecord, ...], names: tuple[str, ...], words: str
-) -> None:
-    assert deciding(contents(None, frames=frames, arrays=arrays), names) == words
-
-
 @pytest.mark.usefixtures("without_figures")
 def test_effects_that_are_not_told_apart_are_named_with_what_would_decide() -> None:
-    cause = a_cause(not_told_apart_from=["ipc", "mine"])
-    section = diagnosis(contents(a_diagnosis(causes=(cause,)), frames={"dark": []}))
+    cause = a_cause(not_told_apart_from=["ipc", "mine"], would_decide=["dark frames", "flats"])
+    section = diagnosis(contents(a_diagnosis(causes=(cause,))))
     assert table(section, "Causes").rows[0][-1] == "ipc or mine"
     words = (
-        "The data do not tell it apart from crosstalk (ipc) or mine. What would decide: a second "
+        "The data do not tell it apart from crosstalk (ipc) or mine. "
+        "What would decide: dark frames and flats."
     )
     assert words in text_of(section)
 
 
-def test_all_effects_are_known_to_those_words() -> None:
-    assert set(diagnosis_words._DECIDING) == set(effects())
+# The map of where
+
+
+def a_map(sigma: float, after: float) -> dict[str, Any]:
+    """Sixteen cells of which the third of the second row is off."""
+    curve = a_curve(domain="space", sigma=sigma, after=after, values=16, x_label="cell of 4 × 4")
+    return curve | {k: list(np.roll(curve[k], 7)) for k in ("z", "z_after")}
+
+
+def test_the_map_shows_the_cell_that_is_off_where_it_lies() -> None:
+    (panel,) = maps.panels((70, 90), (), [a_map(8.0, 1.0), a_map(1.0, 0.5), a_curve()])
+    assert len(panel.spots) == 16
+    (off,) = [s for s in panel.spots if s.sigmas[0] > 1]
+    assert off.rows == (17.5, 35.0)
+    assert off.columns == (45.0, 67.5)
+    assert off.sigmas == (8.0, 1.0)
+    drawn = [
+        picture(maps.where_figure((70, 90), [panel], with_after=after)) for after in (False, True)
+    ]
+    assert drawn[1].shape[0] > 1.5 * drawn[0].shape[0]
+    reddish = (drawn[0][..., 0].astype(int) - drawn[0][..., 2]) > 90
+    rows, columns = np.nonzero(reddish)
+    assert 0.2 < np.median(rows) / drawn[0].shape[0] < 0.5
+    assert 0.5 < np.median(columns) / drawn[0].shape[1] < 0.85
+
+
+def test_windows_of_a_large_detector_are_drawn_where_they_are_and_large_enough() -> None:
+    places = [
+        {"window": [[0, 128], [5248, 5376]], "domains": {"space": [9.0, 0.4], "noise": [0.5, 0.3]}},
+        {"window": [[8192, 8320], [0, 128]], "domains": {"space": [2.0, 0.1], "noise": [1.0, 0.2]}},
+    ]
+    (panel,) = maps.panels((8320, 5456), places, [a_map(50.0, 50.0)])
+    assert panel.title == "space"
+    for spot in panel.spots:
+        (top, left), (high, wide) = maps._shown(spot, (8320, 5456))
+        assert high > 1000
+        assert wide > 600
+        assert top <= spot.rows[0] <= spot.rows[1] <= top + high <= 8320
+        assert left <= spot.columns[0] <= spot.columns[1] <= left + wide <= 5456
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_a_gap_that_is_of_no_place_has_no_map() -> None:
+    found = a_diagnosis(curves=(a_curve(), a_map(2.0, 1.0)))
+    found.facts["looked_at"]["shape"] = [70, 90]
+    assert "Where on the detector" not in text_of(diagnosis(contents(found)))
+    found = a_diagnosis(curves=(a_curve(), a_map(9.0, 1.0)))
+    found.facts["looked_at"]["shape"] = [70, 90]
+    assert "Where on the detector" in text_of(diagnosis(contents(found)))
 
 
 # Places of curves
@@ -449,6 +459,7 @@ def test_bars_are_as_long_as_their_shares() -> None:
 def test_hostile_text_is_shown_as_it_is_and_does_nothing() -> None:
     cause = a_cause(
         NASTY, title=NASTY, why=NASTY, not_told_apart_from=[NASTY],
+        would_decide=[NASTY],
         parameters={NASTY: NASTY, "list": [{NASTY: NASTY}]},
     )  # fmt: skip
     curves = (a_curve("lines", title=NASTY), a_curve("b", of=NASTY, domain=NASTY, x_label=NASTY))

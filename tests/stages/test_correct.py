@@ -63,7 +63,7 @@ def seen_through(bench: Any, act: Callable[[F64], F64]) -> Any:
 def diagnosed(run: Path, *causes: Effect | dict[str, Any], verdict: str = "explained") -> None:
     """Write the diagnosis that a run would have."""
     inputs = {"reduce": require(run, "reduce", 1).key}
-    with build(run, "diagnose", 1, {"own": [], "nominal": {}}, inputs) as made:
+    with build(run, "diagnose", 2, {"own": [], "nominal": {}}, inputs) as made:
         found = [
             {"effect": c.name, "parameters": to_plain(c)} if isinstance(c, Effect) else c
             for c in causes
@@ -299,7 +299,7 @@ def test_without_a_diagnosis_it_says_what_to_run(make_bench, write_reduced, tmp_
     with pytest.raises(InputError, match=r"diagnose: not there yet; run 'pixcal diagnose"):
         correct.run(run, correct.Config(), SYNC)
     assert not (run / "fit").exists()
-    with build(run, "diagnose", 1, {"own": [], "nominal": {}}, {"reduce": "earlier"}) as made:
+    with build(run, "diagnose", 2, {"own": [], "nominal": {}}, {"reduce": "earlier"}) as made:
         write_json(made.folder / "diagnosis.json", {"verdict": "no gap", "causes": []})
     with pytest.raises(InputError, match="reduced otherwise; run 'pixcal diagnose"):
         correct.run(run, correct.Config(), SYNC)

@@ -202,16 +202,17 @@ def write_diagnose(run: Path, verdict: str = "explained", effects: tuple[str, ..
         "uncertainty": {"share": 1e-5}, "gap_closed": 0.97, "gap_closed_interval": [0.95, 0.98],
         "gain_over_rest": 0.97, "p_value": 1e-30, "sigmas": 30.0, "why": NASTY,
         "given_away_by": [{"statistic": "contrast_by_step", "set": "one"}],
-        "not_told_apart_from": [],
+        "not_told_apart_from": [], "would_decide": [],
     }  # fmt: skip
     facts = {
         "schema": "pixcal/diagnosis/1", "verdict": verdict, "statistics": 1, "candidates": [],
+        "more_would_tell": ["dark frames"],
         "causes": [cause | {"effect": name} for name in effects or ("lag",)],
         "gap": {"total": 1.0, "after": 0.03, "interval": [0.02, 0.05], "where": [], "absolute": [],
                 "domains": {"time": [1.0, 0.03]}},
     }  # fmt: skip
     inputs = {"reduce": read_manifest(run / "reduce").key}
-    with build(run, "diagnose", 1, {"effects": list(effects), "nominal": {}}, inputs) as made:
+    with build(run, "diagnose", 2, {"effects": list(effects), "nominal": {}}, inputs) as made:
         write_json(made.folder / "diagnosis.json", facts)
         write_json(made.folder / "curves.json", [curve])
 

@@ -4,9 +4,11 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from pixcal.storage.artefact import build, lock, read_manifest
+from pixcal.storage.cube import create_array, create_group
 
 
 def complete(run: Path, stage: str, number: int) -> None:
@@ -37,6 +39,26 @@ def test_an_unfinished_build_removes_nothing(tmp_path: Path) -> None:
     with build(tmp_path, "fit", 1, {"number": 1}, {}) as made:
         assert made.resumed
         assert made.journal() == {"one step"}
+
+
+@pytest.mark.parametrize("array", ["signal", "c"])
+@pytest.mark.parametrize("damage", ["none", "bit", "empty"])
+def test_what_is_resumed_is_as_it_was_written(tmp_path: Path, array: str, damage: str) -> None:
+    """A group may be named as the folder of the chunks is."""
+    with suppress(KeyboardInterrupt), build(tmp_path, "fit", 1, {}, {}) as made:
+        create_group(made.folder / "c")
+        writer = create_array(made.folder / "c" / array, (70, 130, 5), "u2")
+        writer.write((0, 0, 0), np.arange(64 * 128 * 5, dtype="u2").reshape(64, 128, 5))
+        made.note("the first block")
+        raise KeyboardInterrupt
+    chunk = made.folder / "c" / array / "c/0/0/0"
+    body = bytearray(chunk.read_bytes())
+    body[len(body) // 3] ^= damage == "bit"
+    chunk.write_bytes(b"" if damage == "empty" else bytes(body))
+    with suppress(KeyboardInterrupt), build(tmp_path, "fit", 1, {}, {}) as again:
+        assert again.resumed == (damage == "none")
+        assert again.journal() == ({"the first block"} if damage == "none" else set())
+        raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize("move", [1, 2])

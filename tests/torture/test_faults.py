@@ -23,6 +23,10 @@ def test_interrupted_at_a_random_moment(bench: Bench, stage: str) -> None:
     assert kills.interrupt(bench, stage, 1, SEED).tried == 1
 
 
+def test_interrupted_while_the_libraries_load(bench: Bench) -> None:
+    assert kills.loading(bench, "fit", 3, SEED).tried == 3
+
+
 @pytest.mark.parametrize("stage", STAGES)
 def test_no_room_for_a_write(bench: Bench, stage: str) -> None:
     assert full_disk.at_writes(bench, stage, 1, SEED).tried == 1
@@ -45,8 +49,9 @@ def test_a_chunk_that_is_gone(bench: Bench, artefact: str) -> None:
     assert damage.chunks(bench, artefact, damage.remove, 1, SEED).tried == 1
 
 
-def test_a_flipped_bit_in_what_a_kill_has_left(bench: Bench) -> None:
-    assert damage.unfinished(bench, "reduce", damage.flip_a_bit, 1, SEED).tried == 1
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_flipped_bit_in_what_a_kill_has_left(bench: Bench, stage: str) -> None:
+    assert damage.unfinished(bench, stage, damage.flip_a_bit, 1, SEED).tried == 1
 
 
 def test_products_that_are_damaged_are_written_again(bench: Bench) -> None:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from pixcal.model.config import parse, to_plain
-from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Effect, Stage
+from pixcal.model.errors import InputError, PixcalError
+from pixcal.simulation.effect import Effect, Estimate, Stage
 
 STEPS = ("states", "detector", "light", "photons", "charge", "signal", "readout")
 """Steps of the exposure: each gives back what it is given first, changed."""
@@ -32,6 +32,9 @@ def checked(effect: type[Effect], file: Path) -> type[Effect]:
             setattr(effect, name, _told(vars(effect)[name], file, name in STEPS))
     try:
         _check(effect)
+        if "estimate" in vars(effect):
+            # mypy: a class may be given another method
+            effect.estimate = _estimate(vars(effect)["estimate"], file)  # type: ignore[method-assign]
     except (Exception, SystemExit) as error:
         raise InputError(f"{file}: {_reason(error)}; see docs/own-effect.md") from error
     return effect
@@ -71,6 +74,46 @@ def _told(step: Callable[..., Any], file: Path, gives_back: bool) -> Callable[..
         return result
 
     return told
+
+
+def _estimate(method: Any, file: Path) -> Any:
+    """The class method `estimate`, which names the file where it fails or gives another thing.
+
+    That ends a diagnosis (no InputError): of frames that cannot tell, it gives None instead.
+    """
+    if not isinstance(method, classmethod):
+        raise InputError("estimate is no class method: put @classmethod above it")
+
+    def told(cls: type[Effect], evidence: Any) -> Estimate | None:
+        try:
+            found: Estimate | None = method.__func__(cls, evidence)
+            if found is not None:
+                _check_estimate(found, cls)
+        except (InputError, NotImplementedError):
+            raise
+        except (Exception, SystemExit) as error:
+            raise PixcalError(f"{file}: estimate: {_reason(error)}; mend the file") from error
+        return found
+
+    return classmethod(told)
+
+
+def _check_estimate(found: Any, effect: type[Effect]) -> None:
+    """Raise TypeError or ValueError unless all that an estimate says can be used."""
+    if not isinstance(found, Estimate) or not isinstance(found.effect, effect):
+        raise TypeError(f"gives no Estimate of a {effect.__name__}")
+    try:
+        parse(effect, to_plain(found.effect), effect.__name__)
+    except InputError as error:
+        raise ValueError(str(error)) from error
+    names = {field.name for field in dataclasses.fields(effect)}
+    for name, sigma in dict(found.errors).items():
+        if name.partition("[")[0] not in names or not (np.isfinite(sigma) and sigma >= 0):
+            raise ValueError(f"errors: {name!r} is no parameter, or {sigma!r} no error of one")
+    if not np.isfinite(found.significance):
+        raise ValueError(f"significance is {found.significance!r}")
+    if not isinstance(found.why, str):
+        raise TypeError("why is not a sentence")
 
 
 def _compare(result: Any, given: Any) -> None:

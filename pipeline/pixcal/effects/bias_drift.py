@@ -58,6 +58,7 @@ class BiasDrift(Effect):
     stage = Stage.READOUT
     domains = ("time", "noise")
     strengths = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e")
+    told_by = ("dark",)
     sources = (
         "Rauscher 2015, PASP 127, 1144: pedestal drift of 4 e- rms at 5 e- of read noise",
         "M. Richmond, WIYN HDI technical note 6 (2014): level of the overscan changes by 5 to 20 "

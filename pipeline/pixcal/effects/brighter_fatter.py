@@ -37,6 +37,7 @@ class BrighterFatter(Effect):
     stage = Stage.CHARGE
     domains = ("intensity", "noise", "space")
     strengths = ("shift_px_per_e",)
+    told_by = ("ladder", "baseline")
     sources = (
         "Antilogus et al. 2014, JINST 9, C03048: spots grow by up to 2 % over the full range; "
         "thinned sensors have it too",

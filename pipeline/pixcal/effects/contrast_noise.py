@@ -43,6 +43,7 @@ class ContrastNoise(Effect):
     stage = Stage.LIGHT
     domains = ("time",)
     strengths = ("vibration_rad", "polarisation")
+    told_by = ()
     sources = (
         "Rousset et al., section 4.2: micro-vibrations within a frame are still to be looked at",
         "Colavita 1999, PASP 111, 111: the visibility falls by exp(-s²/2) for a phase of rms s "

@@ -55,6 +55,7 @@ class CosmicHits(Effect):
     stage = Stage.CHARGE
     domains = ("noise",)
     strengths = ("rate_cm2_s",)
+    told_by = ("dark",)
     sources = (
         "Particle Data Group, Review of Particle Physics, Cosmic Rays: about one muon per cm^2 and "
         "minute through a horizontal detector at sea level",

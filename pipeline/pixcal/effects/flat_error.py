@@ -46,6 +46,7 @@ class FlatError(Effect):
     stage = Stage.PIXEL
     domains = ("space",)
     strengths = ("pixel_rms", "smooth_rms")
+    told_by = ("flat", "axis")
     sources = (
         "EMVA Standard 1288, release 4.0 (2021): nonuniformity is told with the wavelength and the "
         "f-number of the light that it was measured with",

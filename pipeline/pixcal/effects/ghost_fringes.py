@@ -18,6 +18,7 @@ from pixcal.estimators.map_fit import (
     polynomial,
     without,
 )
+from pixcal.estimators.structure import PERIODS
 from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.config import quantity
@@ -58,6 +59,7 @@ class GhostFringes(Effect):
     stage = Stage.LIGHT
     domains = ("space",)
     strengths = ("share",)
+    told_by = ("baseline", "axis")
     sources = (
         "a ghost of 0.5 % shifts by up to 0.005 / |K|: 4e-3 px at 5 px interfringe",
         "Born & Wolf, Principles of Optics, sections 1.5 and 7.6: a surface of n = 1.5 reflects "
@@ -267,7 +269,7 @@ def _best_wave(maps: Sequence[_Map], sets: Sequence[FringeEvidence]) -> tuple[F6
         seen += data / variance * np.conj(m.part)
     power = np.abs(np.fft.fft2(seen, size)) ** 2
     fy, fx = np.meshgrid(*(np.fft.fftfreq(n) for n in size), indexing="ij")
-    allowed = np.ones(size, bool)
+    allowed = ~_of_lines(fx, fy, shape)
     for f in sets:
         for n in range(HARMONICS + 1):
             for sign in (1, -1):
@@ -280,6 +282,17 @@ def _best_wave(maps: Sequence[_Map], sets: Sequence[FringeEvidence]) -> tuple[F6
     q = 2 * np.pi * np.array([fx.flat[at], fy.flat[at]])
     # Between the waves of the window there are some that are alike but not the same.
     return q, 3 * np.count_nonzero(allowed) / 4
+
+
+def _of_lines(fx: F64, fy: F64, shape: tuple[int, ...]) -> Mask:
+    """Frequencies (cycles/px) of rows or columns that repeat: those are circuits, and not glass."""
+    found = np.zeros(fx.shape, bool)
+    for across, along, n, m in ((fx, fy, shape[1], shape[0]), (fy, fx, shape[0], shape[1])):
+        level = np.abs(across) * n < NEAR
+        for period in PERIODS:
+            harmonic = np.abs(along * period - np.rint(along * period)) / period * m < NEAR
+            found |= level & harmonic & (np.abs(along) * m >= NEAR)
+    return found
 
 
 def _fitted(maps: Sequence[_Map], q: F64) -> tuple[complex, F64, MapFit]:

@@ -42,6 +42,7 @@ class IntensityNoise(Effect):
     stage = Stage.LIGHT
     domains = ("time",)
     strengths = ("rms", "line")
+    told_by = ()
     sources = (
         "Rousset et al., section on simulations: 2 % fluctuations of the laser (design/paper.txt)",
         "Thorlabs manual 12112-S01 (HRP350 He-Ne laser): modes that sweep through the gain curve "

@@ -41,6 +41,7 @@ class IntraPixelResponse(Effect):
     stage = Stage.PIXEL
     domains = ("space",)
     strengths = ("width_px", "width_rms_px")
+    told_by = ("baseline",)
     sources = (
         "Janesick, Scientific Charge-Coupled Devices (SPIE 2001), chapter 4: the aperture of a "
         "pixel has the transfer function sin(u) / u",

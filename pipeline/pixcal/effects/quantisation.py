@@ -46,6 +46,7 @@ class Quantisation(Effect):
     stage = Stage.CONVERTER
     domains = ("noise", "intensity")
     strengths = ("coarse_adu", "dnl_rms", "ripple")
+    told_by = ("ladder",)
     sources = (
         "IEEE Std 1241-2010: code widths from histograms; round-off of step/sqrt(12) rms",
         "Widrow and Kollar 2008, Quantization Noise, Cambridge University Press: when round-off is "

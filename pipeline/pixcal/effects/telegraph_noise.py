@@ -45,6 +45,7 @@ class TelegraphNoise(Effect):
     stage = Stage.READOUT
     domains = ("noise",)
     strengths = ("amplitude_e",)
+    told_by = ("dark",)
     sources = (
         "Ozdogru et al. 2025, Proc. SPIE 13527, 135270V (arXiv:2505.24540): telegraph noise in 1 "
         "to 5 % of the pixels of two scientific CMOS cameras",

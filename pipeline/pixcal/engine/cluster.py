@@ -32,8 +32,8 @@ LEAST_AHEAD = 32
 """Tasks handed over however few threads there are: a cluster that grows does so by demand."""
 LOOK_S = 5.0
 """Time between two looks at how many threads there are."""
-LOCK = ".lock"
-"""File by which a run directory is known (`pixcal.storage.artefact`)."""
+HELD = (".lock", ".partial")
+"""By these a run directory that is worked on is known (`pixcal.storage.artefact`)."""
 
 Ended = Callable[[int, Any], None]
 
@@ -164,7 +164,8 @@ def _witness(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
 
     A directory of the same name on the worker's own disk would do for all other checks.
     """
-    runs = (up for path in paths for up in path.parents if (up / LOCK).is_file())
+    ups = (up for path in paths for up in path.parents)
+    runs = (up for up in ups if all((up / name).exists() for name in HELD))
     run = next(runs, None)
     if run is None:
         yield ()

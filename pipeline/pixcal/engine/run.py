@@ -1,11 +1,14 @@
 """Run independent tasks with Dask: local threads or processes, or any distributed cluster."""
 
 import os
+import sys
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, TypeVar
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController
 
 from pixcal.engine.local import run_here, run_in_processes, run_in_threads
 from pixcal.engine.progress import Progress
@@ -60,13 +63,28 @@ class Runtime:
         return replace(self, workers=workers)
 
 
-def one_blas_thread() -> threadpool_limits:
+def one_blas_thread() -> AbstractContextManager[Any]:
     """Context in which BLAS does not start threads of its own.
 
     Tasks already fill the cores; and the last bits of a product must not depend on how many
     threads shared it.
     """
-    return threadpool_limits(limits=1, user_api="blas")
+    limits: AbstractContextManager[Any] = _libraries(len(sys.modules)).limit(
+        limits=1, user_api="blas"
+    )
+    return limits
+
+
+@lru_cache(maxsize=1)
+def _libraries(modules: int) -> ThreadpoolController:
+    """Libraries with threads that are loaded; to look for them takes milliseconds.
+
+    Parameters
+    ----------
+    modules : int
+        Modules imported by now: more may have brought more libraries.
+    """
+    return ThreadpoolController()
 
 
 def run_tasks(

@@ -7,7 +7,7 @@ them blind to every error of the fit, a moving fringe vector included, and the s
 least-squares fit of one to the other (Gauss-Newton, since the fitted signal is itself distorted).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -20,7 +20,7 @@ from pixcal.kernels.two_way import turn
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-Distortion = Callable[[FringeEvidence, F32, F64], tuple[F32, Sequence[F32]]]
+Distortion = Callable[[FringeEvidence, F32, F64], tuple[F32, Iterable[F32]]]
 
 _TURNS = 4
 """Of the alternating projections: with the weights of fringes of full contrast 0.5 % of the rest

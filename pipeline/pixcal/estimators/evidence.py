@@ -87,16 +87,17 @@ class FringeEvidence:
     @cached_property
     def model(self) -> F32:
         """Fitted model (t, y, x), e-; the change of the fringe vector to first order."""
-        model = np.einsum("ti,iyx->tyx", self.g, self.theta)
+        frames, maps = self.g, self.theta
         if np.any(self.dk):
-            ny, nx = self.good.shape
-            y, x = np.arange(ny) - (ny - 1) / 2, np.arange(nx) - (nx - 1) / 2
-            turn = self.dk[:, 0, None, None] * x + self.dk[:, 1, None, None] * y[:, None]
-            slope = (
-                self.g[:, 1, None, None] * self.theta[2] - self.g[:, 2, None, None] * self.theta[1]
-            )
-            model += turn * slope
-        return np.asarray(model, np.float32)
+            y, x = grid((self.good.shape[0], self.good.shape[1]))
+            _, c, s = self.g.T
+            kx, ky = self.dk.T
+            _, of_sine, of_cosine = self.theta
+            frames = np.column_stack([self.g, kx * c, ky * c, kx * s, ky * s])
+            turned = [x * of_cosine, y * of_cosine, -x * of_sine, -y * of_sine]
+            maps = np.concatenate([self.theta, turned])
+        flat = maps.reshape(len(maps), -1).astype(np.float32)
+        return np.asarray((frames.astype(np.float32) @ flat).reshape(-1, *self.good.shape))
 
     @cached_property
     def residual(self) -> F32:
@@ -106,8 +107,10 @@ class FringeEvidence:
     @cached_property
     def variance(self) -> F32:
         """Variance (t, y, x) that the noise model predicts, e-²."""
-        model = np.maximum(self.model, 0)
-        return (self.shot_factor * model + self.read_variance).astype(np.float32)
+        variance = np.maximum(self.model, np.float32(0))
+        variance *= self.shot_factor.astype(np.float32)
+        variance += self.read_variance.astype(np.float32)
+        return np.asarray(variance)
 
     @property
     def phi(self) -> F64:

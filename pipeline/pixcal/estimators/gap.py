@@ -7,7 +7,7 @@ logarithm above it: the scatter of both is nearly normal, and the same for stron
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,10 +45,13 @@ class Reference:
         Median (n,) of each curve that is a power; None for the others.
     values : mapping
         (simulation, n) of each curve, in the order of the seeds.
+    independent : mapping
+        As how many independent values each curve's are, `independent_values`.
     """
 
     usual: Mapping[Key, F64 | None]
     values: Mapping[Key, F64]
+    independent: Mapping[Key, float]
 
     @classmethod
     def of(cls, simulated: Sequence[Curves]) -> "Reference":
@@ -63,7 +66,9 @@ class Reference:
             usual[key] = np.median(stack, axis=0) if power else None
             own = usual[key]
             values[key] = stack if own is None else scaled(stack, own)
-        return cls(usual, values)
+        floors = {key: statistic_named(key[0]).floor for key in values}
+        independent = {key: independent_values(v, floors[key]) for key, v in values.items()}
+        return cls(usual, values, independent)
 
     def on_scale(self, curves: Curves) -> dict[Key, F64]:
         """Curves on the scales of the reference, where it has them."""
@@ -85,12 +90,15 @@ class Expectation:
         (n,) on the reference's scales; the variance of a value of the data about the mean.
     noise : mapping
         Variance (n,) of the nominal bench alone.
+    independent : mapping
+        As of the reference.
     dof : int
     """
 
     mean: Mapping[Key, F64]
     variance: Mapping[Key, F64]
     noise: Mapping[Key, F64]
+    independent: Mapping[Key, float]
     dof: int
 
 
@@ -99,10 +107,10 @@ def expect_nominal(reference: Reference) -> Expectation:
     mean, variance, noise, count = {}, {}, {}, 2
     for key, values in reference.values.items():
         count = len(values)
-        noise[key] = np.maximum(_variance(values), statistic_named(key[0]).floor ** 2)
+        noise[key] = _variance(values, statistic_named(key[0]).floor)
         mean[key] = values.mean(axis=0)
         variance[key] = noise[key] * (1 + 1 / count)
-    return Expectation(mean, variance, noise, count - 1)
+    return Expectation(mean, variance, noise, reference.independent, count - 1)
 
 
 def expect_with(
@@ -135,14 +143,39 @@ def expect_with(
             more += paired / count
             more += np.maximum(own.var(axis=0, ddof=1) - nominal.noise[key], 0)
         variance[key] = nominal.variance[key] + more
-    return Expectation(mean, variance, nominal.noise, nominal.dof)
+    return replace(nominal, mean=mean, variance=variance)
 
 
-def _variance(values: F64) -> F64:
+def _variance(values: F64, floor: float) -> F64:
     """Variance (n,), leaning on the other values of the curve so that none is tiny by chance."""
     own = values.var(axis=0, ddof=1)
     rounding = (1e-9 * np.abs(values).max(axis=0)) ** 2
-    return np.asarray(0.9 * own + 0.1 * np.median(own) + rounding + 1e-300)
+    leaning = 0.9 * own + 0.1 * np.median(own) + rounding + 1e-300
+    return np.asarray(np.maximum(leaning, floor**2))
+
+
+def independent_values(values: F64, floor: float = 0.0) -> float:
+    """As how many independent values those of a curve are, when the least likely one is looked at.
+
+    Each simulation is held against the others. Of n independent values the least chance u has
+    -log(1 - u) distributed as an exponential with the mean 1 / n, whose likelihood gives n.
+
+    Parameters
+    ----------
+    values : (simulation, n) float64
+    floor : float
+        Least standard deviation.
+    """
+    count, n = values.shape
+    if n == 1 or count < 3:
+        return float(n)
+    total = 0.0
+    for number in range(count):
+        others = np.delete(values, number, axis=0)
+        error = np.sqrt(_variance(others, floor) * (1 + 1 / len(others)))
+        chance = 2 * student.sf(np.abs(values[number] - others.mean(axis=0)) / error, count - 2)
+        total -= float(np.log1p(-min(float(chance.min()), 1 - 1e-9)))
+    return float(np.clip(count / total, 1, n))
 
 
 @dataclass(frozen=True)
@@ -154,7 +187,8 @@ class Difference:
     sigmas : (n,) float64
         Signed; of a normal, as rare as the deviation is.
     log_chance : float
-        Logarithm of the chance that any of the curve's values is as far off.
+        Logarithm of the chance that any of the curve's values is as far off; uniform (its
+        exponential) where there is no gap.
     excess : float
         Squares of the deviations, as far as they are beyond `ALLOWED` standard deviations, over
         the nominal noise.
@@ -180,10 +214,18 @@ def compare(data: Mapping[Key, F64], expected: Expectation) -> dict[Key, Differe
         tails = student.logsf(np.abs(off) / np.sqrt(variance), expected.dof) + np.log(2)
         sigmas = -ndtri_exp(np.minimum(tails - np.log(2), -1e-300)) * np.sign(off)
         beyond = np.maximum(np.abs(off) - ALLOWED * np.sqrt(variance), 0) ** 2
-        any_of = float(np.min(tails)) + float(np.log(len(off)))
+        any_of = _any_of(float(np.min(tails)), expected.independent[key])
         excess = float((beyond / expected.noise[key]).sum())
-        found[key] = Difference(sigmas, min(any_of, 0.0), excess)
+        found[key] = Difference(sigmas, any_of, excess)
     return found
+
+
+def _any_of(log_chance: float, count: float) -> float:
+    """Logarithm of the chance that the least of some independent chances is as small."""
+    if log_chance < -30:
+        return log_chance + float(np.log(count))
+    none = count * np.log1p(-min(np.exp(log_chance), 1 - 1e-15))
+    return float(np.log(-np.expm1(none)))
 
 
 def flagged(differences: Mapping[Key, Difference]) -> set[Key]:

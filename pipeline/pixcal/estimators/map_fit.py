@@ -21,6 +21,8 @@ BLOCK = 8
 """Pixels along the side of a block."""
 
 _CLIP = 5.0
+_LEAST = 1e-30
+"""Variance of a map that its signals fit exactly."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ def fit_maps(parts: Sequence[MapPart]) -> MapFit:
     """Weighted least squares of the same parameters in several maps."""
     n = parts[0].signals.shape[1]
     values = np.zeros(n)
-    variances = np.array([p.data @ p.data / max(p.dof, 1) for p in parts])
+    variances = np.array([max(p.data @ p.data / max(p.dof, 1), _LEAST) for p in parts])
     for _ in range(3):
         normal, right = np.zeros((n, n)), np.zeros(n)
         for part, variance in zip(parts, variances, strict=True):
@@ -92,7 +94,7 @@ def fit_maps(parts: Sequence[MapPart]) -> MapFit:
         values = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) @ right
         left = [p.data - p.signals @ values for p in parts]
         variances = np.array(
-            [max(r @ r / max(p.dof - n, 1), 1e-30) for p, r in zip(parts, left, strict=True)]
+            [max(r @ r / max(p.dof - n, 1), _LEAST) for p, r in zip(parts, left, strict=True)]
         )
     covariance = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     meat = np.zeros((n, n))

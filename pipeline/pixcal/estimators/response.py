@@ -5,7 +5,7 @@ the phase: a response the same for all fringes, moving boundaries (brighter-fatt
 on the fringes' spacing.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,21 +50,30 @@ def fit_response(
     covariance : (powers + 1, powers + 1) float64
     """
 
-    def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> tuple[F32, Sequence[F32]]:
+    def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> tuple[F32, Iterable[F32]]:
         level = evidence.level(fringes, signal)
         gained = np.stack([moved_charge(frame, UNIT * shifts) for frame in level])
         charge = level + np.float32(sizes[-1]) * gained
-        u = charge / np.float32(level_e)
         flat = evidence.flat.astype(np.float32)
-        bent, steepness, power = charge, np.ones_like(charge), charge
-        slopes: list[F32] = []
-        for n, size in enumerate(sizes[:-1].astype(np.float32), start=1):
-            power = power * u
-            bent = bent + size * power
-            steepness += size * np.float32(n + 1) * u**n
-            slopes.append(np.asarray(power / flat, np.float32))
-        slopes.append(steepness * gained / flat)
-        return (bent - level) / flat, slopes
+        response = [np.float32(size) for size in sizes[:-1]]
+
+        def slopes() -> Iterator[F32]:
+            u = charge / np.float32(level_e)
+            power, steepness = charge / flat, np.float32(1) / flat
+            to_the_n = np.ones_like(u)
+            for n, size in enumerate(response, start=1):
+                power = power * u
+                yield np.asarray(power, np.float32)
+                to_the_n *= u
+                steepness = steepness + (size * np.float32(n + 1) / flat) * to_the_n
+            yield np.asarray(steepness * gained, np.float32)
+
+        # Horner's scheme of c_1 u + c_2 u² + ...
+        bend = np.zeros_like(charge)
+        for size in reversed(response):
+            bend += size
+            bend *= charge / np.float32(level_e)
+        return (charge * (1 + bend) - level) / flat, slopes()
 
     prior = None
     if known_shift is not None:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.evidence import FringeEvidence
 from pixcal.estimators.map_fit import centred
+from pixcal.kernels.row_sums import MODES, row_sums
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -114,41 +115,55 @@ def _rows(found: FringeEvidence, way: int, share: F64) -> tuple[F64, F64, F64]:
     shares given (row), the frames' parameters hold the mean already, and the fringe's amplitude in
     the maps has lost the rest.
     """
-    good, ny = found.good, found.good.shape[0]
-    frames = np.arange(1, len(found.g) - 1)
-    theta, g = found.theta[:, good], found.g[frames]
-    rest = found.residual[frames][:, good]
-    weight = np.where(np.isfinite(rest), 1 / found.variance[frames][:, good], 0).astype(np.float32)
-    rest = np.nan_to_num(rest)
+    inside = slice(1, len(found.g) - 1)
+    theta = np.where(found.good, found.theta, 0)
+    rest, variance = found.residual[inside], found.variance[inside]
+    used = np.isfinite(rest) & found.good
+    weight = np.divide(np.float32(1), variance, out=np.zeros_like(rest), where=used)
     own, mean = _apart_in_time(found.g, float(share.mean()), way), theta.copy()
-    mean[1:] /= 1 - (share - share.mean())[np.nonzero(good)[0]]
-    light = _apart((own[frames + way] - own[frames]) @ mean, g, weight)
-    moving = bool(np.any(found.dk))
-    row = np.nonzero(good)[0]
-    y, x = (np.broadcast_to(c, good.shape)[good] for c in centred(good.shape))
-    normal, vector = np.zeros((ny, ny)), np.zeros(ny)
-    for t in range(len(frames)):
-        modes = theta
-        if moving:
-            slope = g[t, 1] * theta[2] - g[t, 2] * theta[1]
-            modes = np.concatenate([theta, [slope * x, slope * y]])
-        weighted = modes * weight[t]
-        across = np.stack([np.bincount(row, m * light[t], minlength=ny) for m in weighted], axis=1)
-        inner = weighted @ modes.T
-        size = np.sqrt(np.maximum(np.diag(inner), 1e-300))
-        unit = inner / np.outer(size, size)
-        inverse = np.linalg.pinv(unit, rcond=1e-10, hermitian=True) / np.outer(size, size)
-        pull = weight[t] * light[t]
-        normal += np.diag(np.bincount(row, pull * light[t], minlength=ny))
-        normal -= across @ inverse @ across.T
-        vector += np.bincount(row, pull * rest[t], minlength=ny)
-        vector -= across @ (inverse @ (weighted @ rest[t]))
-    return found.origin[0] + np.arange(ny, dtype=float), normal, vector
+    mean[1:] /= 1 - (share - share.mean())[:, None]
+    other = own[1 + way : len(own) - 1 + way] - own[inside]
+    light = _apart(other, mean, found.g[inside], weight)
+    y, x = (place.ravel().astype(np.float32) for place in centred(found.good.shape))
+    inner, of_rest, across, sums = row_sums(
+        np.where(used, rest, np.float32(0)), weight, light,
+        found.g[inside].astype(np.float32), theta.astype(np.float32), y, x,
+    )  # fmt: skip
+    free = MODES if np.any(found.dk) else 3
+    covariance = _inverse(inner[:, :free, :free])
+    # What the modes of each frame absorb, (y, t modes).
+    across = across[:, :, :free]
+    taken = across @ covariance
+    beside, taken = (a.swapaxes(0, 1).reshape(len(y), -1) for a in (across, taken))
+    normal = np.diag(sums[:, 0]) - taken @ beside.T
+    vector = sums[:, 1] - taken @ of_rest[:, :free].ravel()
+    return found.origin[0] + np.arange(len(y), dtype=float), normal, vector
 
 
-def _apart(light: F64, g: F64, weight: F32) -> F64:
-    """Light (t, pixel) less what the maps of each pixel absorb: it is linear in the frames' g."""
-    inner = np.einsum("ti,tj,tp->pij", g, g, weight, optimize=True)
-    right = (weight * light).T @ g
+def _inverse(inner: F64) -> F64:
+    """Of normal matrices (t, m, m) of modes of any size."""
+    size = np.sqrt(np.maximum(np.diagonal(inner, axis1=1, axis2=2), 1e-300))
+    scale = size[:, :, None] * size[:, None, :]
+    return np.asarray(np.linalg.pinv(inner / scale, rcond=1e-10, hermitian=True) / scale)
+
+
+def _apart(other: F64, maps: F64, g: F64, weight: F32) -> F32:
+    """Light of other frames' parameters (t, 3) and maps (3, y, x) less what those of g absorb.
+
+    In each pixel alike light of all frames, linear in the frames' g (t, 3), goes into the maps.
+    """
+    products = np.column_stack([_products(g, g), _products(g, other)]).astype(np.float32)
+    sums = (weight.reshape(len(g), -1).T @ products).astype(float).reshape(-1, 2, 3, 3)
+    flat = maps.reshape(3, -1)
+    right = np.einsum("pij,jp->pi", sums[:, 1], flat)
+    # Pixels without samples have no light to look for.
+    inner = sums[:, 0] + np.where(sums[:, 0].any(axis=(1, 2)), 0.0, 1.0)[:, None, None] * np.eye(3)
     absorbed = np.linalg.solve(inner, right[:, :, None])[:, :, 0]
-    return np.asarray(light - g @ absorbed.T)
+    frames = np.column_stack([other, -g]).astype(np.float32)
+    light = frames @ np.concatenate([flat, absorbed.T]).astype(np.float32)
+    return np.asarray(light.reshape(weight.shape))
+
+
+def _products(one: F64, other: F64) -> F64:
+    """Products (t, 9) of each pair of parameters."""
+    return (one[:, :, None] * other[:, None, :]).reshape(len(one), -1)

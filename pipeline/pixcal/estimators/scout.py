@@ -6,8 +6,9 @@ the help of the fringe vector and the gauge (physics note, sections 2 and 3). Wi
 these tiles known, every frame is then solved by itself, block after block.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,8 @@ from pixcal.model.errors import InputError
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+Pixels = NDArray[np.intp] | slice
+Each = Callable[[Callable[[int], Any], Sequence[int]], list[Any]]
 
 MAX_PIXELS = 20_000
 """Pixels that frames are solved with: their noise then adds some 2e-4 to a map's variance."""
@@ -39,6 +42,11 @@ MANY = 3.0
 """Mean light over that of most pixels, or the reverse, of pixels not to learn from."""
 FOLLOWS_RAD = 0.8
 """Most of the usual distance of the pixels' phases from smooth ones; random ones have 1.57."""
+TURNS, TURNS_MOVING = 3, 8
+"""Most turns of pixels from frames and frames from pixels."""
+SETTLED = 0.02
+"""Change of the frames by a turn, over their errors, after which no other is needed. Each turn
+halves it: what is left is less than this share of the frames' noise, which is little itself."""
 ABOVE_NOISE = 1.5
 """Least power of the weakest of three components over the next, which is noise: frames of two
 phases only have no third component, and noise in its place would pass for the fringes' shape."""
@@ -84,6 +92,11 @@ class Tile:
         return (self.y[0] + self.y[1] - 1) / 2, (self.x[0] + self.x[1] - 1) / 2
 
 
+def in_turn(function: Callable[[int], Any], numbers: Sequence[int]) -> list[Any]:
+    """Call a function with each of some numbers, one after the other."""
+    return [function(n) for n in numbers]
+
+
 @dataclass
 class Scout:
     """Frame parameters from a few tiles.
@@ -98,6 +111,8 @@ class Scout:
         Nominal fringe vector (kx, ky), rad/px.
     reference : (float, float)
         Point (y, x) at which the frame parameters hold.
+    each : callable
+        Does what is to be done for every tile: as `in_turn`, or several at a time.
 
     Attributes
     ----------
@@ -115,6 +130,7 @@ class Scout:
     coding: Coding
     nominal: tuple[float, float]
     reference: tuple[float, float]
+    each: Each = field(default=in_turn, repr=False)
     k: tuple[float, float] = (0.0, 0.0)
     moving: bool = False
     moving_significance: float = 0.0
@@ -146,17 +162,17 @@ class Scout:
         self._require_pixels()
         g = self._subspace(codes)
         frames = FrameParameters(g, np.zeros((n_frames, 2)), self.reference)
-        for _ in range(3):
-            frames = self._refine(codes, frames)
+        frames = self._settled(codes, frames, TURNS)
         self._count_fringes()
-        significance = self._motion_significance(codes, frames)
+        noise = self._noise(codes, frames)
+        significance = self._motion_significance(codes, frames) / noise
         self.moving_significance = significance
         # Six standard deviations of what frames without motion would show.
         self.moving = significance > 1 + 6 / np.sqrt(n_frames)
         if self.moving:
-            for _ in range(8):
-                frames = self._refine(codes, frames)
-        self.noise = self._noise(codes, frames) / (1 - 2 / (9 * (n_frames - 3))) ** 3
+            frames = self._settled(codes, frames, TURNS_MOVING)
+            noise = self._noise(codes, frames)
+        self.noise = noise / (1 - 2 / (9 * (n_frames - 3))) ** 3
         return frames
 
     def solve(
@@ -205,13 +221,13 @@ class Scout:
         wanted = max(1, MAX_PIXELS // len(self.tiles))
         return good[:: max(1, -(-len(good) // wanted))]
 
-    def _electrons(self, codes: NDArray[np.uint16], picked: NDArray[np.intp]) -> F32:
+    def _electrons(self, codes: NDArray[np.uint16], picked: Pixels) -> F32:
         """Samples (t, p) in electrons, for first values that know no weights.
 
         Most samples without weight are saturated: the brightest of the pixel stands for them. A
         frame that has no other samples is zero.
         """
-        flat = np.take(codes.reshape(len(codes), -1), picked, axis=1)
+        flat = _taken(codes, picked)
         electrons = flat * np.float32(self.coding.scale) + np.float32(self.coding.offset)
         lost = flat == self.coding.fill
         if lost.any():
@@ -222,21 +238,31 @@ class Scout:
 
     def _drop_odd_levels(self, codes: Sequence[NDArray[np.uint16]]) -> None:
         """Leave out pixels whose mean light is far from that of most: few would outweigh all."""
-        for tile, block in zip(self.tiles, codes, strict=True):
-            parts = _parts(np.flatnonzero(tile.good))
-            if not parts:
-                continue
-            level = np.concatenate([self._electrons(block, p).mean(axis=0) for p in parts])
-            usual = np.median(level)
-            tile.good.flat[np.concatenate(parts)] = (level > usual / MANY) & (level < MANY * usual)
+
+        def drop(n: int) -> None:
+            tile = self.tiles[n]
+            if not tile.good.any():
+                return
+            parts = _parts(tile.good.size)
+            level = np.concatenate([self._electrons(codes[n], p).mean(axis=0) for p in parts])
+            level = level.reshape(tile.shape)
+            usual = np.median(level[tile.good])
+            tile.good &= (level > usual / MANY) & (level < MANY * usual)
+
+        self.each(drop, range(len(self.tiles)))
 
     def _subspace(self, codes: Sequence[NDArray[np.uint16]]) -> F64:
         """First frame parameters: rank three, then turned by means of the fringe vector."""
-        gram: F64 = np.zeros((len(codes[0]), len(codes[0])))
-        for tile, block in zip(self.tiles, codes, strict=True):
-            for part in _parts(self._picked(tile)):
-                electrons = self._electrons(block, part)
-                gram += electrons @ electrons.T
+
+        def gram_of(n: int) -> F64:
+            own: F64 = np.zeros((len(codes[n]), len(codes[n])))
+            picked = self._picked(self.tiles[n])
+            for part in _parts(len(picked)):
+                electrons = self._electrons(codes[n], picked[part])
+                own += electrons @ electrons.T
+            return own
+
+        gram = np.sum(self.each(gram_of, range(len(self.tiles))), axis=0)
         last = len(gram) - 1
         values, vectors = eigh(gram, subset_by_index=(last - 3, last), overwrite_a=True)
         if values[1] <= 1e-12 * values[3] or values[1] < ABOVE_NOISE * values[0]:
@@ -246,7 +272,7 @@ class Scout:
             )
         g = vectors[:, :0:-1]
         first, block = self.tiles[0], codes[0]
-        every = _parts(np.arange(first.good.size))
+        every = _parts(first.good.size)
         maps = np.hstack([g.T @ self._electrons(block, part) for part in every])
         maps = maps.reshape(3, *first.shape)
         mean = np.where(first.good & (np.abs(maps[0]) > 0), maps[0], 1.0)
@@ -295,15 +321,30 @@ class Scout:
         amplitude = np.hypot(g[:, 1], g[:, 2]).mean()
         return np.array([g[:, 0].mean(), amplitude, amplitude])
 
+    def _settled(
+        self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters, most: int
+    ) -> FrameParameters:
+        """Turns until they change the frames no more than their noise allows."""
+        for _ in range(most):
+            before = frames
+            frames, normal = self._refine(codes, before)
+            size = 5 if self.moving else 3
+            change = np.hstack([frames.g - before.g, frames.dk - before.dk])[:, :size]
+            square = np.einsum("ti,tij,tj->", change, normal[:, :size, :size], change)
+            if square < SETTLED**2 * size * len(change):
+                break
+        return frames
+
     def _refine(
         self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters
-    ) -> FrameParameters:
-        """One turn: pixels from frames, gauge, frames from pixels."""
-        thetas, smooths = [], []
-        for tile, block in zip(self.tiles, codes, strict=True):
-            theta, smooth = fit_tile(tile, [block], self.coding, frames, self.k)
-            thetas.append(theta)
-            smooths.append(smooth)
+    ) -> tuple[FrameParameters, F64]:
+        """One turn: pixels from frames, gauge, frames from pixels; with their normal matrices."""
+        before: Sequence[F64 | None] = self.theta or [None] * len(self.tiles)
+
+        def fit(n: int) -> tuple[F64, NDArray[np.complex128]]:
+            return fit_tile(self.tiles[n], [codes[n]], self.coding, frames, self.k, before[n])
+
+        thetas, smooths = zip(*self.each(fit, range(len(self.tiles))), strict=True)
         goods = [
             _like_most(theta, t.good & np.isfinite(theta).all(axis=0) & (theta[0] > 0))
             for t, theta in zip(self.tiles, thetas, strict=True)
@@ -312,28 +353,33 @@ class Scout:
         g = frames.g @ np.linalg.inv(q)
         norm = self._norm(g)
         self.theta = [
-            np.where(good, np.einsum("i,ij,jyx->iyx", norm, q, theta), 0.0)
+            np.where(good, ((norm[:, None] * q) @ theta.reshape(3, -1)).reshape(theta.shape), 0.0)
             for theta, good in zip(thetas, goods, strict=True)
         ]
         for tile, good in zip(self.tiles, goods, strict=True):
             tile.good &= good
         self._require_pixels()
         frames = FrameParameters(g / norm, frames.dk, self.reference)
-        frames, _, _ = self._frame_step(codes, frames, self.moving)
-        return frames
+        frames, _, normal = self._frame_step(codes, frames, self.moving)
+        return frames, normal
 
     def _frame_step(
         self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters, moving: bool
     ) -> tuple[FrameParameters, F64, F64]:
         """One Gauss-Newton step of every frame; its size and normal matrices (t, 5, 5) too."""
         n = len(frames.g)
-        packed, right = np.zeros((n, 15)), np.zeros((n, 5))
         g, dk = frames.g.astype(np.float32), frames.dk.astype(np.float32)
-        for tile, theta, block in zip(self.tiles, self.theta, codes, strict=True):
+
+        def sums_of(number: int) -> tuple[F64, F64]:
+            tile, theta, block = self.tiles[number], self.theta[number], codes[number]
+            packed, right = np.zeros((n, 15)), np.zeros((n, 5))
             picked = self._picked(tile)
+            if 4 * len(picked) > 3 * tile.good.size:
+                # Those of no use are zero in theta, and take less time than leaving them out.
+                picked = np.arange(tile.good.size)
             yy, xx = np.divmod(picked, tile.shape[1])
             frame_sums(
-                np.take(block.reshape(n, -1), picked, axis=1),
+                _taken(block, picked),
                 self.coding.scale,
                 self.coding.offset,
                 self.coding.fill,
@@ -347,6 +393,10 @@ class Scout:
                 packed,
                 right,
             )
+            return packed, right
+
+        every = self.each(sums_of, range(len(self.tiles)))
+        packed, right = (np.sum(sums, axis=0) for sums in zip(*every, strict=True))
         normal = np.zeros((n, 5, 5))
         upper = np.triu_indices(5)
         normal[:, upper[0], upper[1]] = packed
@@ -365,26 +415,22 @@ class Scout:
     def _motion_significance(
         self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters
     ) -> float:
-        """Mean of dk' C^-1 dk / 2 over frames, in units of the noise: 1 without motion."""
+        """Mean of dk' C^-1 dk / 2 over frames: that of the samples' noise without motion."""
         _, step, normal = self._frame_step(codes, frames, moving=True)
         seen = normal[:, 0, 0] > 0
         covariance = _inverses(normal[seen])[:, 3:, 3:]
         dk = step[seen, 3:]
         dk = dk - dk.mean(axis=0)
-        size = np.einsum("ti,tij,tj->t", dk, _inverses(covariance), dk).mean() / 2
-        return float(size / self._noise(codes, frames))
+        return float(np.einsum("ti,tij,tj->t", dk, _inverses(covariance), dk).mean() / 2)
 
     def _noise(self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters) -> float:
         """Usual reduced chi-square of the pixels."""
-        return float(
-            np.median(
-                [
-                    residual_chi2(tile, block, self.coding, frames, theta)
-                    for tile, block, theta in zip(self.tiles, codes, self.theta, strict=True)
-                    if tile.good.any()
-                ]
-            )
-        )
+
+        def chi2(n: int) -> float:
+            return residual_chi2(self.tiles[n], codes[n], self.coding, frames, self.theta[n])
+
+        seen = [n for n, tile in enumerate(self.tiles) if tile.good.any()]
+        return float(np.median(self.each(chi2, seen)))
 
 
 def _like_most(theta: F64, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -398,9 +444,17 @@ def _like_most(theta: F64, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(good & (away < ODD_VISIBILITY * usual + 1e-9))
 
 
-def _parts(pixels: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Pixels a thousand at a time: their samples are many bytes as floating point."""
-    return [pixels[first : first + 1024] for first in range(0, len(pixels), 1024)]
+def _parts(n: int) -> list[slice]:
+    """Of so many pixels a thousand at a time: their samples are many bytes as floating point."""
+    return [slice(first, min(first + 1024, n)) for first in range(0, n, 1024)]
+
+
+def _taken(codes: NDArray[np.uint16], picked: Pixels) -> NDArray[np.uint16]:
+    """Samples (t, p) of some pixels; of all of them no copy."""
+    flat = codes.reshape(len(codes), -1)
+    if isinstance(picked, slice):
+        return flat[:, picked]
+    return flat if len(picked) == flat.shape[1] else np.take(flat, picked, axis=1)
 
 
 def _inverses(matrices: F64) -> F64:
@@ -486,6 +540,7 @@ def start_model(
     coding: Coding,
     frames: FrameParameters,
     k: tuple[float, float],
+    start: F64 | None = None,
 ) -> tuple[F32, SmoothPhasor]:
     """Smooth model of a tile, for weights that do not know the pixel's own noise.
 
@@ -498,6 +553,8 @@ def start_model(
         As in `accumulate`.
     k : (float, float)
         Fringe vector near the tile, rad/px.
+    start : (3, y, x) float64, optional
+        The pixels as they are known; else from an unweighted fit.
 
     Returns
     -------
@@ -506,7 +563,7 @@ def start_model(
     smooth : SmoothPhasor
         Of alpha exp(i psi) / iota.
     """
-    theta = _unweighted_pixels(tile, blocks, coding, frames)
+    theta = _unweighted_pixels(tile, blocks, coding, frames) if start is None else start
     iota = theta[0]
     usable = np.isfinite(iota) & (iota > 0)
     good = tile.good & usable
@@ -547,9 +604,10 @@ def fit_tile(
     coding: Coding,
     frames: FrameParameters,
     k: tuple[float, float],
+    start: F64 | None = None,
 ) -> tuple[F64, NDArray[np.complex128]]:
     """Weighted fit of every pixel of a tile: theta (3, y, x) and the smooth phasor (y, x)."""
-    model, smooth = start_model(tile, blocks, coding, frames, k)
+    model, smooth = start_model(tile, blocks, coding, frames, k, start)
     sums = accumulate(tile, blocks, coding, frames, model)
     step, _, _ = solve_pixels(sums)
     return model + step, smooth.map

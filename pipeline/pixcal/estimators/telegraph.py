@@ -34,6 +34,7 @@ CLEAR = 1.0
 _FEW = 5
 _OUTLIER = 5.0
 _LEAST = 8
+_UNDERFLOW = 1e-200
 
 
 @dataclass(frozen=True)
@@ -251,11 +252,13 @@ def _population(
         ratio = m.dof / 2 * (m.variance[:, None] * (1 - 1 / variance) - np.log(variance))
         np.add.at(log_ratio, np.searchsorted(pixels, m.pixel), ratio)
 
+    mixture = _Mixture.of(log_ratio)
+
     def cost(p: F64) -> float:
         share, mean = expit(p[0]), np.exp(p[1])
         weight = AMPLITUDES / mean * np.exp(-AMPLITUDES / mean) * np.gradient(np.log(AMPLITUDES))
         # Amplitudes below those looked at do nothing.
-        telegraph = logsumexp(log_ratio, b=share * weight, axis=1)
+        telegraph = mixture.log_likelihood(share * weight)
         return -float(np.logaddexp(np.log(max(1 - share * weight.sum(), 1e-12)), telegraph).sum())
 
     start = np.array([-4.0, 1.0])
@@ -273,6 +276,29 @@ def _population(
             float(unit * mean * errors[1]),
         ),
     )
+
+
+@dataclass(frozen=True)
+class _Mixture:
+    """Likelihoods (pixel, class) over the largest of each pixel, and the logarithm of that."""
+
+    ratio: F64
+    largest: F64
+    logarithms: F64
+
+    @classmethod
+    def of(cls, logarithms: F64) -> "_Mixture":
+        largest = logarithms.max(axis=1)
+        return cls(np.exp(logarithms - largest[:, None]), largest, logarithms)
+
+    def log_likelihood(self, weight: F64) -> F64:
+        """Of each pixel, with weights (class,) of the classes."""
+        total = self.ratio @ weight
+        found = self.largest + np.log(np.maximum(total, _UNDERFLOW))
+        # Where the largest has hardly any weight the others have been rounded to nothing.
+        lost = total <= _UNDERFLOW
+        found[lost] = logsumexp(self.logarithms[lost], b=weight, axis=1)
+        return found
 
 
 def _curvature(cost: Callable[[F64], float], at: F64, step: float = 0.05) -> F64 | None:

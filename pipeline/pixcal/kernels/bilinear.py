@@ -131,7 +131,11 @@ def sweep_block(
                 sums[k, row, i] += p[k][i]
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+GROUP = 1024
+"""Pixels summed at a time: what is kept of them stays in the first cache."""
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def frame_sums(
     codes: Any,
     scale: float,
@@ -164,83 +168,105 @@ def frame_sums(
     right : (t, 5) float64
         Added to: right-hand sides.
     """
-    s, o = np.float32(scale), np.float32(offset)
-    one, zero, two, half = np.float32(1), np.float32(0), np.float32(2), np.float32(0.5)
+    s, o, f = np.float32(scale), np.float32(offset), np.float32(fill)
+    n = codes.shape[1]
+    kept = [np.empty(min(GROUP, n), np.float32) for _ in range(5)]
+    theta = np.ascontiguousarray(theta)
+    for first in range(0, n, GROUP):
+        stop = min(first + GROUP, n)
+        h1, h2, turn, w, wr = [k[: stop - first] for k in kept]
+        h0, t1, t2 = theta[0, first:stop], theta[1, first:stop], theta[2, first:stop]
+        xs, ys, shots, reads = x[first:stop], y[first:stop], shot[first:stop], read[first:stop]
+        for t in range(codes.shape[0]):
+            kx, ky = dk[t, 0], dk[t, 1]
+            if kx == 0 and ky == 0:
+                h1[:], h2[:] = t1, t2
+            else:
+                _turn_pixels(t1, t2, kx, ky, ys, xs, h1, h2)
+            _weigh_pixels(
+                codes[t, first:stop], s, o, f, g[t, 0], g[t, 1], g[t, 2],
+                h0, h1, h2, reads, shots, turn, w, wr,
+            )  # fmt: skip
+            _add_pixels(h0, h1, h2, turn, w, wr, ys, xs, normal[t], right[t])
+
+
+# Loops of their own: one with all of this needs more registers than there are, and takes thrice as
+# long.
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _turn_pixels(t1: Any, t2: Any, kx: float, ky: float, y: Any, x: Any, h1: Any, h2: Any) -> None:
+    one, two, half = np.float32(1), np.float32(2), np.float32(0.5)
     sixth, fourth = np.float32(1 / 6), np.float32(1 / 24)
     fifth, tenth = np.float32(1 / 120), np.float32(1 / 720)
     eighth, turn_length = np.float32(0.125), np.float32(2 * np.pi)
-    f = np.float32(fill)
-    n = codes.shape[1]
-    for t in range(codes.shape[0]):
-        g0, c1, c2 = g[t, 0], g[t, 1], g[t, 2]
-        kx, ky = dk[t, 0], dk[t, 1]
-        for start in range(0, n, 4096):
-            q00 = q01 = q02 = q0x = q0y = zero
-            q11 = q12 = q1x = q1y = q22 = q2x = q2y = qxx = qxy = qyy = zero
-            r0 = r1 = r2 = rx = ry = zero
-            for i in range(start, min(start + 4096, n)):
-                # cos and sin of any u by halving it three times: calls would not vectorise.
-                u = kx * x[i] + ky * y[i]
-                u = (u - turn_length * np.rint(u / turn_length)) * eighth
-                v = u * u
-                si = u * (one - v * (sixth - v * fifth))
-                co = one - v * (half - v * (fourth - v * tenth))
-                si, co = two * si * co, one - two * si * si
-                si, co = two * si * co, one - two * si * si
-                si, co = two * si * co, one - two * si * si
-                h0 = theta[0, i]
-                h1 = theta[1, i] * co + theta[2, i] * si
-                h2 = theta[2, i] * co - theta[1, i] * si
-                model = h0 * g0 + h1 * c1 + h2 * c2
-                turn = h2 * c1 - h1 * c2
-                hx, hy = turn * x[i], turn * y[i]
-                code = np.float32(codes[t, i])
-                w = (one if code != f else zero) / (shot[i] * max(model, zero) + read[i])
-                wr = w * (s * code + o - model)
-                q00 += w * h0 * h0
-                q01 += w * h0 * h1
-                q02 += w * h0 * h2
-                q0x += w * h0 * hx
-                q0y += w * h0 * hy
-                q11 += w * h1 * h1
-                q12 += w * h1 * h2
-                q1x += w * h1 * hx
-                q1y += w * h1 * hy
-                q22 += w * h2 * h2
-                q2x += w * h2 * hx
-                q2y += w * h2 * hy
-                qxx += w * hx * hx
-                qxy += w * hx * hy
-                qyy += w * hy * hy
-                r0 += wr * h0
-                r1 += wr * h1
-                r2 += wr * h2
-                rx += wr * hx
-                ry += wr * hy
-            normal[t, 0] += q00
-            normal[t, 1] += q01
-            normal[t, 2] += q02
-            normal[t, 3] += q0x
-            normal[t, 4] += q0y
-            normal[t, 5] += q11
-            normal[t, 6] += q12
-            normal[t, 7] += q1x
-            normal[t, 8] += q1y
-            normal[t, 9] += q22
-            normal[t, 10] += q2x
-            normal[t, 11] += q2y
-            normal[t, 12] += qxx
-            normal[t, 13] += qxy
-            normal[t, 14] += qyy
-            right[t, 0] += r0
-            right[t, 1] += r1
-            right[t, 2] += r2
-            right[t, 3] += rx
-            right[t, 4] += ry
+    for i in range(x.size):
+        # cos and sin of any u by halving it three times: calls would not vectorise.
+        u = kx * x[i] + ky * y[i]
+        u = (u - turn_length * np.rint(u / turn_length)) * eighth
+        v = u * u
+        si = u * (one - v * (sixth - v * fifth))
+        co = one - v * (half - v * (fourth - v * tenth))
+        si, co = two * si * co, one - two * si * si
+        si, co = two * si * co, one - two * si * si
+        si, co = two * si * co, one - two * si * si
+        h1[i] = t1[i] * co + t2[i] * si
+        h2[i] = t2[i] * co - t1[i] * si
 
 
-GROUP = 1024
-"""Pixels summed at a time by `fringe_block`: their sums stay in the first cache."""
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _weigh_pixels(
+    codes: Any, s: float, o: float, f: float, g0: float, c1: float, c2: float,
+    h0: Any, h1: Any, h2: Any, read: Any, shot: Any, turn: Any, w: Any, wr: Any,
+) -> None:  # fmt: skip
+    one, zero = np.float32(1), np.float32(0)
+    for i in range(codes.size):
+        model = h0[i] * g0 + h1[i] * c1 + h2[i] * c2
+        turn[i] = h2[i] * c1 - h1[i] * c2
+        code = np.float32(codes[i])
+        weight = (one if code != f else zero) / (shot[i] * max(model, zero) + read[i])
+        w[i] = weight
+        wr[i] = weight * (s * code + o - model)
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _add_pixels(
+    h0: Any, h1: Any, h2: Any, turn: Any, w: Any, wr: Any, y: Any, x: Any, normal: Any, right: Any
+) -> None:
+    zero = np.float32(0)
+    q00 = q01 = q02 = q0x = q0y = zero
+    q11 = q12 = q1x = q1y = q22 = q2x = q2y = qxx = qxy = qyy = zero
+    r0 = r1 = r2 = rx = ry = zero
+    for i in range(w.size):
+        a0, a1, a2 = h0[i], h1[i], h2[i]
+        ax, ay = turn[i] * x[i], turn[i] * y[i]
+        w0, w1, w2, wx = w[i] * a0, w[i] * a1, w[i] * a2, w[i] * ax
+        q00 += w0 * a0
+        q01 += w0 * a1
+        q02 += w0 * a2
+        q0x += w0 * ax
+        q0y += w0 * ay
+        q11 += w1 * a1
+        q12 += w1 * a2
+        q1x += w1 * ax
+        q1y += w1 * ay
+        q22 += w2 * a2
+        q2x += w2 * ax
+        q2y += w2 * ay
+        qxx += wx * ax
+        qxy += wx * ay
+        qyy += w[i] * ay * ay
+        r0 += wr[i] * a0
+        r1 += wr[i] * a1
+        r2 += wr[i] * a2
+        rx += wr[i] * ax
+        ry += wr[i] * ay
+    for k, q in enumerate(
+        (q00, q01, q02, q0x, q0y, q11, q12, q1x, q1y, q22, q2x, q2y, qxx, qxy, qyy)
+    ):
+        normal[k] += q
+    for k, r in enumerate((r0, r1, r2, rx, ry)):
+        right[k] += r
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]

@@ -65,6 +65,16 @@ def area_changes(falloff_px: float) -> F64:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _surround(charge: Any, out: Any) -> None:
+    """A frame with a margin of `REACH`, in which it goes on as it is at its edges."""
+    ny, nx = charge.shape
+    for y in range(out.shape[0]):
+        row = min(max(y - REACH, 0), ny - 1)
+        for x in range(out.shape[1]):
+            out[y, x] = charge[row, min(max(x - REACH, 0), nx - 1)]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _push(charge: Any, shifts: Any, along_x: bool, out: Any) -> None:
     """Mean shift of the boundaries after each pixel, of a frame with a margin of `REACH`."""
     ny, nx = out.shape
@@ -99,7 +109,8 @@ def _move(charge: Any, push_x: Any, push_y: Any, out: Any) -> None:
 
 def _pushes(charge: F32, shifts: F64) -> tuple[F32, F32]:
     """Mean shift of the boundaries to the right of and below each pixel (y, x)."""
-    around = np.pad(charge, REACH, mode="edge")
+    around = np.empty((charge.shape[0] + 2 * REACH, charge.shape[1] + 2 * REACH), np.float32)
+    _surround(charge, around)
     push_x, push_y = np.empty_like(charge), np.empty_like(charge)
     _push(around, shifts, True, push_x)
     _push(around, shifts, False, push_y)

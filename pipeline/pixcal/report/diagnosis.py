@@ -5,13 +5,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from pixcal.report import diagnosis_figures as figures
+from pixcal.report import diagnosis_maps as maps
 from pixcal.report.blocks import Block, Fold, Section, Words, folded, plate
 from pixcal.report.contents import Contents, Diagnosis, EffectWords
 from pixcal.report.diagnosis_words import (
     DETECTOR,
     answer,
     chance,
-    deciding,
     effect_title,
     level,
     listed,
@@ -52,10 +52,10 @@ def diagnosis(contents: Contents) -> Section:
     else:
         blocks += _overview(found)
         for rank, cause in enumerate(found.facts["causes"], 1):
-            blocks += _cause(rank, cause, found, contents)
+            blocks += _cause(rank, cause, found)
         blocks += _where(found)
         blocks += _absolute(found)
-        blocks += _remainder(found, contents)
+        blocks += _remainder(found)
     blocks += _candidates(found)
     blocks += _looked_at(found)
     return Section("diagnosis", title, _lead(contents), blocks)
@@ -144,7 +144,7 @@ def _causes_table(found: Diagnosis) -> Table:
 # A cause
 
 
-def _cause(rank: int, cause: Facts, found: Diagnosis, contents: Contents) -> Iterator[Block]:
+def _cause(rank: int, cause: Facts, found: Diagnosis) -> Iterator[Block]:
     name = cause["effect"]
     words = found.effects.get(name, EffectWords(""))
     yield _heading(f"Cause {rank}: {effect_title(found, name)}")
@@ -156,8 +156,8 @@ def _cause(rank: int, cause: Facts, found: Diagnosis, contents: Contents) -> Ite
     if alike:
         others = listed((effect_title(found, other) for other in alike), "or")
         yield Words(
-            f"The data do not tell it apart from {others}. What would decide: "
-            f"{deciding(contents, [name, *alike])}.",
+            f"The data do not tell it apart from {others}."
+            + _advice("What would decide", cause.get("would_decide")),
             "advice",
         )
     shown = _named(found, cause.get("given_away_by", ()))
@@ -168,6 +168,11 @@ def _cause(rank: int, cause: Facts, found: Diagnosis, contents: Contents) -> Ite
             figures.curves_figure(shown),
         )
     yield from _parameters(cause, words)
+
+
+def _advice(words: str, frames: Sequence[str] | None) -> str:
+    """A sentence on frames to take; nothing of a diagnosis that does not tell them."""
+    return f" {words}: {listed(frames)}." if frames else ""
 
 
 def _named(found: Diagnosis, names: Sequence[Facts]) -> list[Facts]:
@@ -251,12 +256,29 @@ def _where(found: Diagnosis) -> Iterator[Block]:
             f"{len(rest)} more statistics that differ",
             [Table("The others, likewise", header, rows)],
         )
+    yield from _maps(found)
     if not causes:
         yield plate(
             "The largest differences",
             _READ,
             figures.curves_figure(curves[:PLOTS], with_effects=False),
         )
+
+
+def _maps(found: Diagnosis) -> Iterator[Block]:
+    """The map of where, if the differences are of some places more than of others."""
+    shape = found.facts.get("looked_at", {}).get("shape")
+    places = found.facts["gap"].get("places", ())
+    panels = maps.panels(shape, places, found.curves) if shape else []
+    if panels:
+        what = (
+            "Windows that were looked at (drawn larger than they are), and the statistic that is "
+            "furthest off in each, by domain"
+            if places
+            else "Cells of the window, by statistic"
+        )
+        figure = maps.where_figure(shape, panels, with_after=bool(found.facts["causes"]))
+        yield plate("Where on the detector", f"{what}; numbers are deviations in σ.", figure)
 
 
 def _by_domain(curves: Sequence[Facts]) -> list[Facts]:
@@ -333,9 +355,10 @@ def _absolute(found: Diagnosis) -> Iterator[Block]:
 # What remains
 
 
-def _remainder(found: Diagnosis, contents: Contents) -> Iterator[Block]:
+def _remainder(found: Diagnosis) -> Iterator[Block]:
     if not found.facts["causes"]:
-        yield Words(f"What could tell more: {deciding(contents)}.", "advice")
+        if more := _advice("What could tell more", found.facts.get("more_would_tell")):
+            yield Words(more.strip(), "advice")
         return
     gap = found.facts["gap"]
     left = sorted(

@@ -1,49 +1,16 @@
-"""A diagnosis in words: the verdict, the places of a curve, and the frames that would decide."""
+"""A diagnosis in words: the verdict, and the places of a curve."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pixcal.report.contents import Contents, Diagnosis
+from pixcal.report.contents import Diagnosis
 from pixcal.report.text import number
 
 DETECTOR = "detector"
 """What ``curves.json`` has for the name of a set where a curve is of no single set."""
 
 _UNITS = {"sigma": "σ", "2 √count": "2 √number", "": "", "h^-0.5": "1/√h"}
-
-SAME_AXIS = 0.98
-"""Cosine of the angle below which two sets measure along one axis."""
-LADDER = 3
-"""Exposure times of flats that make a ladder."""
-
-_DECIDING = {
-    "ipc": ("dark", "baseline"),
-    "intra_pixel_response": ("baseline",),
-    "hyperbolic_fringes": ("baseline", "other axis"),
-    "ghost_fringes": ("baseline", "other axis"),
-    "wavelength_drift": ("baseline", "other axis"),
-    "fringe_drift": ("baseline", "other axis"),
-    "fringe_jitter": ("baseline", "other axis"),
-    "flat_error": ("flat", "other axis"),
-    "straylight": ("flat", "other axis"),
-    "nonlinearity": ("ladder",),
-    "brighter_fatter": ("ladder", "baseline"),
-    "quantisation": ("ladder",),
-    "cosmic_hits": ("dark",),
-    "telegraph_noise": ("dark",),
-    "bias_drift": ("dark",),
-    "row_noise": ("dark",),
-    "lag": ("dark",),
-    "contrast_noise": (),
-    "intensity_noise": (),
-    "phase_modulator_error": (),
-    "rolling_shutter": (),
-}
-"""Kinds of frames that tell on each effect besides its fringes (``docs/effects``)."""
-
-_MORE = "more frames of the same kind, with the phases in random order"
 
 
 def unit(name: str) -> str:
@@ -228,61 +195,3 @@ def place(curve: Mapping[str, Any], at: int) -> str:
         period = number(1 / curve["x"][at], 2)
         return f"periods of {period} {'px' if label.endswith('pixel') else 'frames'}"
     return f"{label} {name}".strip()
-
-
-# What would decide
-
-
-def deciding(contents: Contents, names: Iterable[str] | None = None) -> str:
-    """Frames that the acquisition lacks and that tell on some effects (default: any), as a list."""
-    lacking = _lacking(contents)
-    wanted = set(lacking)
-    if names is not None:
-        wanted = {k for n in names for k in _DECIDING.get(n, tuple(lacking))}
-    found = [text for kind, text in lacking.items() if kind in wanted]
-    return listed(found) if found else _MORE
-
-
-def _lacking(contents: Contents) -> dict[str, str]:
-    """Kinds of frames that are usual and that this acquisition does not have."""
-    frames = contents.acquisition.get("frames", {})
-    axes = _axes([s["baseline_mm"] for s in frames.get("fringes", ())])
-    lacking = {}
-    single = [name for name, lengths in axes if len(lengths) == 1]
-    if single:
-        lacking["baseline"] = f"a second baseline along {listed(single)}"
-    if len(axes) == 1:
-        lacking["other axis"] = "a fringe set along another axis"
-    if not frames.get("dark"):
-        lacking["dark"] = "dark frames"
-    if not frames.get("flat"):
-        lacking["flat"] = "flat frames"
-    exposures = {t for a in contents.arrays if a.name == "flat" for t in a.exptimes_s}
-    if len(exposures) < LADDER:
-        lacking["ladder"] = f"a ladder of flats (at least {LADDER} exposure times)"
-    return lacking
-
-
-def _axes(baselines: Iterable[Sequence[float]]) -> list[tuple[str, set[float]]]:
-    """Axes of the fringe sets, and the different lengths (mm) of their baselines."""
-    found: list[tuple[tuple[float, float], set[float]]] = []
-    for bx, by in baselines:
-        size = math.hypot(bx, by)
-        if size == 0:
-            continue
-        one = bx / size, by / size
-        for axis, lengths in found:
-            if abs(axis[0] * one[0] + axis[1] * one[1]) > SAME_AXIS:
-                lengths.add(round(size, 1))
-                break
-        else:
-            found.append((one, {round(size, 1)}))
-    return [(_axis_name(axis), lengths) for axis, lengths in found]
-
-
-def _axis_name(axis: tuple[float, float]) -> str:
-    if abs(axis[0]) > SAME_AXIS:
-        return "x"
-    if abs(axis[1]) > SAME_AXIS:
-        return "y"
-    return f"{math.degrees(math.atan2(axis[1], axis[0])) % 180:.0f}°"

@@ -11,7 +11,9 @@ act in the order of `Effect.stage` and then of their names.
 """
 
 import dataclasses
-from collections.abc import Mapping
+import re
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, ClassVar, Self
@@ -22,11 +24,17 @@ from numpy.typing import NDArray
 from pixcal.estimators.evidence import Evidence
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
 from pixcal.model.bench import Bench
+from pixcal.model.config import parse, to_plain
+from pixcal.model.errors import InputError
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.shot import Shot
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+
+
+SURE = 3.0
+"""Errors that a strength must have to stand beside others of the same effect."""
 
 
 class Stage(IntEnum):
@@ -93,6 +101,39 @@ class Estimate:
     why: str
     details: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def sure(self) -> "Effect":
+        """The effect without those of several strengths that may as well be zero.
+
+        What is known badly may be tiny in some frames and wild in others.
+        """
+        nothing = self.effect.scaled(0.0)
+        unsure = {n: getattr(nothing, n) for n in self.effect.strengths if not self._is_sure(n)}
+        pruned = dataclasses.replace(self.effect, **unsure)
+        return self.effect if pruned.is_null else pruned
+
+    def scattered(self, effect: "Effect", seed: int) -> "Effect":
+        """This effect, as it is or in part, with its parameters moved by their errors.
+
+        What is zero in it stays so; beyond the range of a parameter nothing is moved.
+        """
+        rng = np.random.default_rng([seed, zlib.crc32(effect.name.encode())])
+        plain = to_plain(effect)
+        for key in sorted(self.errors):
+            _move(plain, re.findall(r"[^.\[\]]+", key), self.errors[key] * rng.standard_normal())
+        try:
+            return parse(type(effect), plain, effect.name)
+        except InputError:
+            return effect
+
+    def _is_sure(self, name: str) -> bool:
+        value = getattr(self.effect, name)
+        parts = {f"{name}[{n}]": v for n, v in enumerate(value if isinstance(value, tuple) else ())}
+        return not all(
+            isinstance(part, (int, float)) and abs(part) <= SURE * self.errors.get(key, 0.0)
+            for key, part in (parts or {name: value}).items()
+        )
+
 
 @dataclass(frozen=True)
 class Effect:
@@ -109,6 +150,9 @@ class Effect:
         Where it shows: ``space``, ``time``, ``intensity``, ``noise``.
     strengths : tuple of str
         Fields that `scaled` multiplies: with all of them zero the effect does nothing.
+    told_by : tuple of str
+        Frames that tell on it besides fringes of one set: ``dark``, ``flat``, ``ladder`` (of
+        flats), ``baseline`` (a second one along an axis), ``axis`` (another one); if not said, any.
     sources : tuple of str
         Where the default sizes come from.
     quick : bool
@@ -121,6 +165,7 @@ class Effect:
     stage: ClassVar[Stage]
     domains: ClassVar[tuple[str, ...]]
     strengths: ClassVar[tuple[str, ...]]
+    told_by: ClassVar[tuple[str, ...]] = ("dark", "flat", "ladder", "baseline", "axis")
     sources: ClassVar[tuple[str, ...]]
     quick: ClassVar[bool] = True
 
@@ -223,6 +268,18 @@ class Effect:
             That are undone.
         """
         return np.ones(maps.theta.shape[1:])
+
+
+def _move(plain: Any, path: Sequence[str], step: float) -> None:
+    """Add to the number at a path of keys and places, if there is one that is not zero."""
+    for key in path[:-1]:
+        plain = plain[int(key)] if isinstance(plain, list) else plain.get(key)
+        if not plain:
+            return
+    last: Any = int(path[-1]) if isinstance(plain, list) else path[-1]
+    value = plain[last] if isinstance(plain, list) else plain.get(last)
+    if isinstance(value, float) and value:
+        plain[last] = value + step
 
 
 def _times(value: Any, factor: float) -> Any:

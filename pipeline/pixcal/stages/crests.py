@@ -154,7 +154,8 @@ def _measure(
 ) -> dict[str, Any]:
     """One fringe set: its part of ``crests.json``; writes its arrays and figure."""
     source = ReducedSet(run_dir / "reduce" / "reduced.zarr" / name)
-    frames = np.unique(np.linspace(0, source.n_frames - 1, config.frames).astype(int)).tolist()
+    count = min(config.frames, source.n_frames)
+    frames = np.unique(np.linspace(0, source.n_frames - 1, count).astype(int)).tolist()
     nominal = _nominal(acquisition, name, source)
     try:
         paths = _extract(source, frames, nominal_vector(acquisition, name), name, config, runtime)

@@ -208,8 +208,9 @@ def build(
     """Build an artefact aside and put it in place when the block ends without an exception.
 
     When the block raises (or the process is killed) the unfinished folder stays, and the next
-    build with the same key resumes in it. An artefact of the same stage with another key is
-    replaced only once the new one is complete; unfinished builds of the stage are then removed.
+    build with the same key resumes in it, or begins anew if a chunk of it is not as it was written.
+    An artefact of the same stage with another key is replaced only once the new one is complete;
+    unfinished builds of the stage are then removed.
 
     Parameters
     ----------
@@ -227,7 +228,7 @@ def build(
     """
     key = artefact_key(stage, format, config, inputs)
     folder = run / ".partial" / f"{stage}-{key[:_KEY_IN_NAME]}"
-    if folder.is_dir() and not settled(folder, run, cubes):
+    if folder.is_dir() and not (settled(folder, run, cubes) and _whole(folder)):
         _discard(folder, run)
     resumed = folder.is_dir()
     folder.mkdir(parents=True, exist_ok=True)
@@ -251,6 +252,17 @@ def build(
     _tidy(final)
     for left in [old, *folder.parent.glob(f"{stage}-{'[0-9a-f]' * _KEY_IN_NAME}")]:
         _discard(left, run)
+
+
+def _whole(folder: Path) -> bool:
+    """Whether the chunks that an interrupted build has left are as it wrote them.
+
+    Those at a URL are not fetched for that: whoever reads them will tell.
+    """
+    from pixcal.storage.cube import chunks_whole  # here: the command line does without zarr
+
+    places = {folder, cubes_of(folder)}
+    return all(chunks_whole(place) for place in places if isinstance(place, Path))
 
 
 def _discard(folder: Path, run: Path) -> None:

@@ -72,16 +72,22 @@ class LocalFolder:
         written = []
         for name, content in files:
             file = self.path / name
-            file.parent.mkdir(parents=True, exist_ok=True)
-            with _aside(file).open("wb") as out:
+            aside = _aside(file)
+            # Most folders are there: to make sure of it first would take as long as the rest.
+            try:
+                out = aside.open("wb")
+            except FileNotFoundError:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                out = aside.open("wb")
+            with out:
                 out.writelines(content)
-            written.append(file)
+            written.append((aside, file))
         # Flushed once all are written: the disk works meanwhile (twice as fast as one by one).
-        for file in written:
+        for aside, file in written:
             if durable:
-                with _aside(file).open("rb") as handle:
+                with aside.open("rb") as handle:
                     os.fdatasync(handle.fileno())
-            _aside(file).replace(file)
+            aside.replace(file)
 
     def ends(self, names: Sequence[str]) -> Iterator[tuple[int, bytes]]:
         for name in names:

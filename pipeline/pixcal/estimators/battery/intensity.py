@@ -3,23 +3,21 @@
 import numpy as np
 
 from pixcal.estimators.battery import Curve, statistic
-from pixcal.estimators.battery.look import LEVELS, Look
+from pixcal.estimators.battery.look import CODES, LEVELS, Look
 from pixcal.estimators.evidence import Evidence
 
-BITS = 6
+CLASSES = (4, 16, 64)
 
 
 @statistic("intensity", "harmonics of the fringes", x="harmonic (cosine, sine)")
 def harmonics(look: Look) -> Curve:
     """Two to four times the phase in the residuals, over the fringe amplitude."""
     found, good = look.found, look.good
-    noise = np.sqrt(found.variance[:, good])
-    rest = look.residual[:, good] * noise
     alpha = float(np.median(np.hypot(found.theta[1], found.theta[2])[good]))
     phi, psi = found.phi, look.psi[good]
     orders = (2, 3, 4)
     turns = np.stack([f(n * phi) for n in orders for f in (np.cos, np.sin)]).astype(np.float32)
-    moments = turns @ rest
+    moments = (turns @ look.electrons)[:, good.ravel()]
     places, values = [], []
     for at, n in enumerate(orders):
         # The signal goes with sin(phi + psi).
@@ -33,11 +31,7 @@ def harmonics(look: Look) -> Curve:
 @statistic("intensity", "residual by level", unit="e-", x="bin of level")
 def residual_by_level(look: Look) -> Curve:
     """Mean residual in bins of the level."""
-    bins, _ = look.level_bins
-    rest = look.residual[:, look.good] * np.sqrt(look.found.variance[:, look.good])
-    total = np.bincount(bins.ravel(), rest.ravel(), minlength=LEVELS)
-    count = np.bincount(bins.ravel(), minlength=LEVELS)
-    return Curve(np.arange(LEVELS, dtype=float), total / np.maximum(count, 1))
+    return Curve(np.arange(LEVELS, dtype=float), look.by_level[0])
 
 
 @statistic("intensity", "variance of flats by level", x="flat", power=True, sets=False)
@@ -76,23 +70,19 @@ def flat_ladder(evidence: Evidence) -> Curve | None:
 @statistic("intensity", "bits of the samples", x="bit")
 def bits(look: Look) -> Curve | None:
     """How much more often than every second time each of the lowest bits is set."""
-    codes = look.found.adu
-    if codes.dtype.kind not in "iu":
+    count = look.remainders
+    if count is None:
         return None
-    own = codes[:: max(1, len(codes) // 100)][:, look.good].astype(np.int64)
-    value = [float(((own >> bit) & 1).mean()) - 0.5 for bit in range(BITS)]
-    return Curve(np.arange(BITS, dtype=float), np.array(value))
+    bit = np.arange(CODES.bit_length() - 1)
+    is_set = (np.arange(CODES) >> bit[:, None]) & 1
+    return Curve(bit.astype(float), is_set @ count / count.sum() - 0.5)
 
 
 @statistic("intensity", "evenness of codes", x="codes a class", power=True)
 def code_classes(look: Look) -> Curve | None:
     """Scatter of how often codes come up, by their remainders on division by powers of two."""
-    codes = look.found.adu
-    if codes.dtype.kind not in "iu":
+    count = look.remainders
+    if count is None:
         return None
-    own = codes[:: max(1, len(codes) // 100)][:, look.good].astype(np.int64).ravel()
-    value = []
-    for size in (4, 16, 64):
-        share = np.bincount(own % size, minlength=size) * size / len(own)
-        value.append(float(np.var(share)))
-    return Curve(np.array([4.0, 16.0, 64.0]), np.array(value))
+    value = [float(np.var(count.reshape(-1, n).sum(axis=0) * n / count.sum())) for n in CLASSES]
+    return Curve(np.array(CLASSES, float), np.array(value))

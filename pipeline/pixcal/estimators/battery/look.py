@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.evidence import Evidence, FringeEvidence
-from pixcal.estimators.structure import clipped, smooth_surface
+from pixcal.estimators.structure import clipped, flattened, smooth_surface
+from pixcal.kernels.sample_sums import calm_residuals, level_sums, pixel_moments
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -36,30 +38,55 @@ class Look:
         return self.found.good
 
     @cached_property
-    def wild(self) -> F32:
-        """Residuals (t, y, x) over their noise, outliers included; NaN without weight."""
-        return np.asarray(self.found.residual / np.sqrt(self.found.variance), np.float32)
+    def _calm(self) -> tuple[F32, F32]:
+        calm, kept = calm_residuals(self.found.residual, self.found.variance, self.good, WILD)
+        return calm, kept
 
-    @cached_property
+    @property
     def residual(self) -> F32:
         """Residuals (t, y, x) over their noise; zero for outliers and where there is no weight."""
-        calm = np.nan_to_num(self.wild, nan=0.0)
-        calm[np.abs(calm) > WILD] = 0
-        return np.asarray(calm * self.good, np.float32)
+        return self._calm[0]
+
+    @property
+    def electrons(self) -> F32:
+        """The same residuals, e-, as (t, pixel) of all pixels."""
+        return self._calm[1].reshape(len(self.residual), -1)
 
     @cached_property
-    def level(self) -> F32:
-        """Model (t, pixel) of the good pixels, e-."""
-        return np.asarray(self.found.model[:, self.good])
+    def theta(self) -> F32:
+        """Maps (3, pixel) of all pixels as the fit has them; zero in those that are not good."""
+        theta = np.where(self.good, self.found.theta, 0).astype(np.float32)
+        return np.asarray(theta.reshape(3, -1))
 
     @cached_property
-    def level_bins(self) -> tuple[NDArray[np.intp], F64]:
-        """Bin (t, pixel) of every sample by its level, and the middle of each bin, e-."""
-        low, high = np.quantile(self.level[:: max(1, len(self.level) // 40)], (0.005, 0.995))
-        edges = np.linspace(low, high, LEVELS + 1)
-        scale = np.float32(LEVELS / max(high - low, 1e-9))
-        bins = ((self.level - np.float32(low)) * scale).astype(np.intp)
-        return np.clip(bins, 0, LEVELS - 1, out=bins), (edges[1:] + edges[:-1]) / 2
+    def by_level(self) -> tuple[F64, F64]:
+        """Mean residual (e-) and mean square over the noise, in bins of the level (bin,)."""
+        model = self.found.model
+        some = model[:: max(1, len(model) // 40)][:, self.good]
+        low, high = (float(level) for level in np.quantile(some, (0.005, 0.995)))
+        sums = np.zeros((LEVELS, 3))
+        step = max(high - low, 1e-9) / LEVELS
+        level_sums(model, self.good, low, step, self._calm[1], self.residual, sums)
+        count, total, squares = sums.T
+        return total / np.maximum(count, 1), squares / np.maximum(count, 1)
+
+    @cached_property
+    def moments(self) -> tuple[F64, F64]:
+        """Mean square and mean fourth power (y, x) of the residuals over their noise."""
+        second, fourth = pixel_moments(self.residual)
+        return second, fourth
+
+    @cached_property
+    def remainders(self) -> NDArray[np.intp] | None:
+        """How often codes of good pixels have each remainder on division by `CODES`.
+
+        None where what the camera wrote is not whole numbers.
+        """
+        codes: NDArray[Any] = self.found.adu
+        if codes.dtype.kind not in "iu":
+            return None
+        some = codes[:: max(1, len(codes) // 100)][:, self.good]
+        return np.bincount((some & (CODES - 1)).ravel(), minlength=CODES)
 
     @cached_property
     def psi(self) -> F64:
@@ -78,6 +105,11 @@ class Look:
             "contrast": clipped(contrast / np.nanmedian(contrast) - 1),
             "light": clipped(light - 1),
         }
+
+    @cached_property
+    def flat_maps(self) -> dict[str, F64]:
+        """The maps less their smooth surfaces."""
+        return {name: flattened(values) for name, values in self.maps.items()}
 
     @cached_property
     def frames(self) -> dict[str, F64]:
@@ -99,3 +131,18 @@ class Look:
 
 LEVELS = 8
 """Bins of level."""
+CODES = 64
+"""Codes whose remainders are told apart, a power of two."""
+CELLS = 4
+"""Cells of the window along each side."""
+
+
+def by_cell(values: F64, good: Mask) -> F64 | None:
+    """Means (cell,) of the good pixels of each cell; None where a cell has hardly any."""
+    ny, nx = good.shape
+    row = np.arange(ny)[:, None] * CELLS // ny
+    cell = row * CELLS + np.arange(nx)[None, :] * CELLS // nx
+    count = np.bincount(cell[good], minlength=CELLS**2)
+    if count.min() < 8:
+        return None
+    return np.asarray(np.bincount(cell[good], values[good], minlength=CELLS**2) / count)

@@ -4,15 +4,14 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from pixcal.estimators.battery import Curve, Statistic, statistic
-from pixcal.estimators.battery.look import F32, F64, LEVELS, Look, Mask
+from pixcal.estimators.battery.look import CELLS, F32, F64, LEVELS, Look, Mask, by_cell
 from pixcal.estimators.evidence import Evidence
+from pixcal.kernels.sample_sums import count_beyond, neighbour_products
 
 STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4), (4, 0))
 """Rows and columns to a neighbour."""
 OUTLIERS = (5.0, 7.0, 10.0)
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
-CELLS = 4
-"""Cells of the window along each side."""
 MOST = 120
 """Frames for statistics of pairs of pixels."""
 
@@ -20,30 +19,14 @@ MOST = 120
 @statistic("noise", "variance of the residuals by level", x="bin of level", power=True)
 def variance_by_level(look: Look) -> Curve:
     """Mean square of residuals over their noise, in bins of the level."""
-    bins, _ = look.level_bins
-    rest = look.residual[:, look.good]
-    total = np.bincount(bins.ravel(), (rest**2).ravel(), minlength=LEVELS)
-    count = np.bincount(bins.ravel(), minlength=LEVELS)
-    return Curve(np.arange(LEVELS, dtype=float), total / np.maximum(count, 1))
+    return Curve(np.arange(LEVELS, dtype=float), look.by_level[1])
 
 
 @statistic("noise", "variance of the residuals by place", x="cell of 4 × 4", power=True)
 def variance_by_place(look: Look) -> Curve | None:
     """Mean square of residuals over their noise, in cells of the window, row by row."""
-    squares = np.einsum("tyx,tyx->yx", look.residual, look.residual) / len(look.residual)
-    cells = _cells(squares, look.good)
+    cells = by_cell(look.moments[0], look.good)
     return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
-
-
-def _cells(values: F64, good: Mask) -> F64 | None:
-    """Means (cell,) of the good pixels of each cell; None where a cell has hardly any."""
-    ny, nx = good.shape
-    row = np.arange(ny)[:, None] * CELLS // ny
-    cell = row * CELLS + np.arange(nx)[None, :] * CELLS // nx
-    count = np.bincount(cell[good], minlength=CELLS**2)
-    if count.min() < 8:
-        return None
-    return np.asarray(np.bincount(cell[good], values[good], minlength=CELLS**2) / count)
 
 
 @statistic("noise", "variance of the residuals by time", x="eighth of the frames", power=True)
@@ -97,19 +80,22 @@ def _correlation(rest: F32, good: Mask, step: tuple[int, int], other: Mask | Non
     here = (slice(0, ny - dy), slice(max(0, -dx), nx - max(0, dx)))
     there = (slice(dy, ny), slice(max(0, dx), nx + min(0, dx)))
     pairs = good[here] & (good if other is None else other)[there]
-    one, two = rest[(slice(None), *here)], rest[(slice(None), *there)]
-    total = np.einsum("tyx,tyx,yx->t", one, two, pairs.astype(np.float32), optimize=False)
-    return float(total.sum(dtype=float)) / max(len(rest) * int(pairs.sum()), 1)
+    total = neighbour_products(rest, pairs.astype(np.float32), dy, dx)
+    return float(total) / max(len(rest) * int(pairs.sum()), 1)
 
 
 def _line_power(rest: F32, good: Mask) -> F64:
-    """Mean square of the means of rows and of columns over that of white noise: (2,)."""
+    """Mean square of the means of rows and of columns over that of white noise: (2,).
+
+    Of residuals (t, y, x) that are zero in pixels that are not good.
+    """
+    squares = float(np.einsum("tyx,tyx->t", rest, rest).mean(dtype=float)) / good.sum()
     out = []
     for axis in (2, 1):
         count = np.maximum(good.sum(axis=axis - 1), 1)
         means = rest.sum(axis=axis) / np.sqrt(count)
         means -= means.mean(axis=1, keepdims=True)
-        out.append(float((means**2).mean()) / max(float((rest[:, good] ** 2).mean()), 1e-30))
+        out.append(float((means**2).mean()) / max(squares, 1e-30))
     return np.array(out)
 
 
@@ -149,25 +135,22 @@ def _calm(frames: F32, good: Mask) -> F32:
 @statistic("noise", "outliers", x="sigma, low then high", unit="2 √count", floor=1.0)
 def outliers(look: Look) -> Curve:
     """Residuals of good pixels beyond 5, 7 and 10 sigma: twice the root of their number."""
-    rest = look.wild[:, look.good]
-    count = [float(np.count_nonzero(rest < -limit)) for limit in OUTLIERS]
-    count += [float(np.count_nonzero(rest > limit)) for limit in OUTLIERS]
-    return Curve(np.array([*(-x for x in OUTLIERS), *OUTLIERS]), 2 * np.sqrt(np.array(count)))
+    limits = np.array(OUTLIERS)
+    count = count_beyond(look.found.residual, look.found.variance, look.good, limits)
+    return Curve(np.concatenate([-limits, limits]), 2 * np.sqrt(np.concatenate(count)))
 
 
 @statistic("noise", "noise of the pixels", x="quantile", power=True)
 def pixel_noise(look: Look) -> Curve:
     """Quantiles over the pixels of the mean square of their residuals."""
-    squares = np.mean(look.residual[:, look.good] ** 2, axis=0)
-    return Curve(np.array(QUANTILES), np.quantile(squares, QUANTILES))
+    return Curve(np.array(QUANTILES), np.quantile(look.moments[0][look.good], QUANTILES))
 
 
 @statistic("noise", "fourth moments of the pixels", x="quantile")
 def pixel_peakedness(look: Look) -> Curve:
     """Quantiles over the pixels of the kurtosis of their residuals."""
-    squares = look.residual[:, look.good] ** 2
-    fourth = np.mean(squares * squares, axis=0) / np.mean(squares, axis=0) ** 2
-    return Curve(np.array(QUANTILES), np.quantile(fourth, QUANTILES))
+    second, fourth = (moment[look.good] for moment in look.moments)
+    return Curve(np.array(QUANTILES), np.quantile(fourth / second**2, QUANTILES))
 
 
 @statistic("noise", "noise of the pixels in bias frames", x="quantile", power=True, sets=False)

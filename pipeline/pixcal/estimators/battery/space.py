@@ -5,11 +5,10 @@ from collections.abc import Callable
 import numpy as np
 
 from pixcal.estimators.battery import Curve, Statistic, statistic
-from pixcal.estimators.battery.look import F64, Look
+from pixcal.estimators.battery.look import CELLS, F64, Look, by_cell
 from pixcal.estimators.structure import (
     PERIODS,
     fit_terms,
-    flattened,
     legendre,
     profile,
     redness,
@@ -23,7 +22,7 @@ BINS = 6
 
 def _repeats(name: str, axis: int) -> Statistic:
     def measured(look: Look) -> Curve:
-        size = np.abs(repeats(flattened(look.maps[name]), axis))
+        size = np.abs(repeats(look.flat_maps[name], axis))
         return Curve(np.array(PERIODS, float), size)
 
     measured.__name__ = f"{name}_{LINES[axis]}_repeat"
@@ -33,7 +32,7 @@ def _repeats(name: str, axis: int) -> Statistic:
 
 def _profile(name: str, axis: int) -> Statistic:
     def measured(look: Look) -> Curve:
-        along = profile(flattened(look.maps[name]), axis)
+        along = profile(look.flat_maps[name], axis)
         power = np.abs(np.fft.rfft(along)[1:]) ** 2 * 2 / len(along) ** 2
         return _binned(np.arange(1, len(power) + 1) / len(along), power)
 
@@ -44,7 +43,7 @@ def _profile(name: str, axis: int) -> Statistic:
 
 def _fringes(name: str) -> Statistic:
     def measured(look: Look) -> Curve:
-        values, psi = flattened(look.maps[name]), look.psi
+        values, psi = look.flat_maps[name], look.psi
         terms = np.stack([np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)])
         return Curve(np.array([1.0, 1.25, 2.0, 2.25]), fit_terms(values, terms))
 
@@ -84,7 +83,7 @@ def _without_beams(values: F64, k: tuple[float, float]) -> F64:
 
 def _scales(name: str) -> Statistic:
     def measured(look: Look) -> Curve:
-        values = np.nan_to_num(flattened(look.maps[name]))
+        values = np.nan_to_num(look.flat_maps[name])
         power = np.abs(np.fft.rfft2(values)) ** 2 / values.size**2
         fy = np.fft.fftfreq(values.shape[0])[:, None]
         fx = np.fft.rfftfreq(values.shape[1])[None, :]
@@ -100,7 +99,7 @@ def _scales(name: str) -> Statistic:
 
 def _peak(name: str) -> Statistic:
     def measured(look: Look) -> Curve:
-        values = np.nan_to_num(flattened(look.maps[name]))
+        values = np.nan_to_num(look.flat_maps[name])
         power = np.abs(np.fft.rfft2(values)) ** 2
         fy = np.fft.fftfreq(values.shape[0])[:, None]
         fx = np.fft.rfftfreq(values.shape[1])[None, :]
@@ -112,6 +111,17 @@ def _peak(name: str) -> Statistic:
     measured.__name__ = f"{name}_peak"
     title = f"{name}: strongest period of its own"
     return statistic("space", title, unit=UNITS[name], x="cycles a pixel", power=True)(measured)
+
+
+def _by_place(name: str) -> Statistic:
+    def measured(look: Look) -> Curve | None:
+        squares = look.flat_maps[name] ** 2
+        cells = by_cell(squares, np.isfinite(squares))
+        return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
+
+    measured.__name__ = f"{name}_by_place"
+    title = f"{name}: power by place"
+    return statistic("space", title, unit=UNITS[name], x="cell of 4 × 4", power=True)(measured)
 
 
 def _binned(frequency: F64, power: F64, highest: float = 0.5) -> Curve:
@@ -128,7 +138,13 @@ def _binned(frequency: F64, power: F64, highest: float = 0.5) -> Curve:
 
 
 _OF_AXIS: tuple[Callable[[str, int], Statistic], ...] = (_repeats, _profile)
-_OF_MAP: tuple[Callable[[str], Statistic], ...] = (_fringes, _low_orders, _scales, _peak)
+_OF_MAP: tuple[Callable[[str], Statistic], ...] = (
+    _fringes,
+    _low_orders,
+    _scales,
+    _peak,
+    _by_place,
+)
 
 STATISTICS = tuple(
     [make(name, axis) for make in _OF_AXIS for name in UNITS for axis in LINES]

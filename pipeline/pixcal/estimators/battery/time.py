@@ -9,6 +9,7 @@ from pixcal.estimators.battery import Curve, Statistic, statistic
 from pixcal.estimators.battery.look import F64, Look
 from pixcal.estimators.evidence import Evidence
 from pixcal.kernels.processes import ramp_step
+from pixcal.kernels.sample_sums import frame_means
 
 SERIES = {
     "intensity": ("intensity", ""),
@@ -51,11 +52,11 @@ def frames_before(look: Look) -> Curve:
 
     By pixels: the coefficient of the other frame's model, after what the pixel's own fit absorbs.
     """
-    g, theta = look.found.g, look.found.theta[:, look.good].astype(np.float32)
-    noise = np.sqrt(look.found.variance[:, look.good].mean(axis=1))[:, None]
-    rest = look.residual[:, look.good] * noise
+    g, theta = look.found.g, look.theta
+    noise = np.sqrt(frame_means(look.found.variance, look.good))[:, None]
     basis = np.linalg.qr(g)[0]
-    along, square = (rest @ theta.T).astype(float), (theta @ theta.T).astype(float)
+    along = noise * (look.residual.reshape(len(g), -1) @ theta.T)
+    square = (theta @ theta.T).astype(float)
     values = []
     for lag in LAGS:
         other = np.roll(g, lag, axis=0)
@@ -115,16 +116,15 @@ def allan_of_batches(look: Look) -> Curve | None:
     if size < 8:
         return None
     k = float(np.hypot(*found.k))
-    theta = found.theta[:, look.good]
-    alpha = np.hypot(theta[1], theta[2])
-    noise = np.sqrt(found.variance[:, look.good])
-    rest = (look.residual[:, look.good] * noise).astype(np.float32)
+    good = look.good.ravel()
+    _, of_sine, of_cosine = look.theta[:, good].astype(float)
     shifts = []
     for n in range(BATCHES):
-        g = found.g[n * size : (n + 1) * size]
-        change = np.linalg.pinv(g) @ rest[n * size : (n + 1) * size]
+        own = slice(n * size, (n + 1) * size)
+        inverse = np.linalg.pinv(found.g[own])[1:].astype(np.float32)
+        c, s = (inverse @ look.electrons[own])[:, good]
         # theta = (iota, alpha sin psi, alpha cos psi): a turn of psi moves along (cos, -sin).
-        shifts.append((change[1] * theta[2] - change[2] * theta[1]) / alpha**2 / k)
+        shifts.append((c * of_cosine - s * of_sine) / (of_sine**2 + of_cosine**2) / k)
     values = np.stack(shifts)
     out = []
     for length in (1, 2, 4):
@@ -140,7 +140,7 @@ def _of_stacks(kind: str) -> Statistic:
             return None
         values = []
         for stack in stacks:
-            means = stack.adu[:, evidence.good].mean(axis=1, dtype=float) * evidence.gain
+            means = frame_means(stack.adu, evidence.good) * evidence.gain
             light = float(means.mean() - evidence.gain * evidence.bias[evidence.good].mean())
             scale = light if kind == "flat" and light > 0 else 1.0
             values.append(power_of(means / scale).value[:3])
@@ -166,6 +166,6 @@ def bias_trend(evidence: Evidence) -> Curve | None:
     values = []
     for stack in (*evidence.of_kind("bias"), *evidence.of_kind("dark")):
         if len(stack.adu) >= MIN_FRAMES:
-            means = stack.adu[:, evidence.good].mean(axis=1, dtype=float) * evidence.gain
+            means = frame_means(stack.adu, evidence.good) * evidence.gain
             values.append(2 * float(np.polyfit(np.linspace(-1, 1, len(means)), means, 1)[0]))
     return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None

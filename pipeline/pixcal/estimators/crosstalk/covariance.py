@@ -14,7 +14,7 @@ The products of residuals are summed pixel by pixel, so that they can be joined 
 period later.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -79,22 +79,22 @@ def products(
         What is known of the couplings, by which the charge collected follows from what is read.
     """
     ny, nx = evidence.good.shape
+    steps = np.array(links, int).reshape(-1, 2)
     right = np.zeros((len(links), TERMS, ny, nx))
     normal = np.zeros((len(links), NORMALS, ny, nx))
     line, line_right = np.zeros((3, 3)), np.zeros(3)
     brightest = 0.0
-    for part in all_residuals(evidence, known):
-        brightest = max(brightest, part.brightness)
-        own, own_right = _variance(part)
-        line, line_right = line + own, line_right + own_right
-        noise, terms = _factors(part.e, part.charge, part.one)
-        modes, _ = _factors(*part.taken)
-        for n, (dy, dx) in enumerate(links):
-            _right_sums(*noise, dy, dx, right[n])
-            _right_sums(*modes, dy, dx, right[n])
-            _normal_sums(*terms, dy, dx, normal[n])
-        # Not beside the next one: each is large.
-        del part, noise, terms, modes
+    for parts in _gathered(all_residuals(evidence, known)):
+        for part in parts:
+            brightest = max(brightest, part.brightness)
+            own, own_right = _variance(part)
+            line, line_right = line + own, line_right + own_right
+        noise = [frames for p in parts for frames in ((p.e, p.charge, p.one), p.taken)]
+        _add_right_sums(*_powers(noise, 2), steps, right)
+        terms = [(p.one, p.charge, p.one) for p in parts]
+        _add_normal_sums(*_powers(terms, 4), steps, normal)
+        # Not beside the next ones: they are large.
+        del parts, part, noise, terms
     if brightest < MIN_CHARGE:
         return None
     covariance = np.linalg.pinv(line, rcond=1e-12, hermitian=True)
@@ -102,77 +102,121 @@ def products(
     return Products(right, normal, shot, error, evidence.read_noise**2 / UNIT)
 
 
-def _factors(e: F32, charge: F32, one: F32) -> tuple[tuple[F32, ...], tuple[F32, ...]]:
-    """What products of residuals are sums of, and what products of terms are; all (y, x, t)."""
-    e, p, g = (np.ascontiguousarray(a.transpose(1, 2, 0)) for a in (e, charge, one))
-    h = (p * p / np.maximum(g, TINY)).astype(np.float32)
-    return (e * p, e * g, e * h), (p * p, p * g, g * g, p * h, g * h, h * h)
-
-
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
+_LONG = 128
+"""Frames of sequences that are gathered."""
+_COLUMNS = 16
+"""Columns that are gone through at once: with their partners they stay in the cache."""
+
+
+def _gathered(parts: Iterable[Residuals]) -> Iterator[list[Residuals]]:
+    """Short sequences together, for sums over few frames cost as much; long ones one by one."""
+    some: list[Residuals] = []
+    for part in parts:
+        if sum(len(p.e) for p in (*some, part)) > _LONG and some:
+            yield some
+            some = []
+        some.append(part)
+        if len(part.e) >= _LONG:
+            # Before the next one is made, which is as large.
+            del part
+            yield some
+            some = []
+    if some:
+        yield some
+
+
+def _powers(parts: Sequence[tuple[F32, F32, F32]], highest: int) -> tuple[F32, ...]:
+    """Factors over sigma, times the charge to the powers 0, 1, ...; one sequence after the other.
+
+    From (factor, charge over sigma, one over sigma), all (t, y, x), to (y, x, t).
+    """
+    count = sum(len(factor) for factor, _, _ in parts)
+    factor, charge, one = np.empty((3, *parts[0][0].shape[1:], count), np.float32)
+    for out, arrays in zip((factor, charge, one), zip(*parts, strict=True), strict=True):
+        np.concatenate([a.transpose(1, 2, 0) for a in arrays], axis=2, out=out)
+    found = [factor * one]
+    charge /= np.maximum(one, TINY)
+    for _ in range(highest):
+        found.append(found[-1] * charge)
+    return tuple(found)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _add_pixels(sums: F32, y: int, first: int, out: F64) -> None:
+    """Add sums (pixel, link, n) of pixels of a row, from a column on, to all (link, n, y, x)."""
+    count = min(len(sums), out.shape[3] - first)
+    for n in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            for x in range(count):
+                out[n, i, y, first + x] += sums[x, n, i]
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
-def _right_sums(ep: Any, eg: Any, eh: Any, dy: int, dx: int, right: Any) -> None:
-    ny, nx, nt = ep.shape
-    for y in range(ny - dy):
-        for x in range(max(0, -dx), min(nx, nx - dx)):
-            v, j = y + dy, x + dx
-            r0 = r1 = r2 = r3 = r4 = np.float32(0)
-            for t in range(nt):
-                r0 += ep[y, x, t] * eg[v, j, t]
-                r1 += eg[y, x, t] * ep[v, j, t]
-                r2 += eg[y, x, t] * eg[v, j, t]
-                r3 += ep[y, x, t] * ep[v, j, t]
-                r4 += eh[y, x, t] * eg[v, j, t] + eg[y, x, t] * eh[v, j, t]
-            right[0, y, x] += r0
-            right[1, y, x] += r1
-            right[2, y, x] += r2
-            right[3, y, x] += r3
-            right[4, y, x] += r4
+def _add_right_sums(e0: F32, e1: F32, e2: F32, links: Any, right: F64) -> None:
+    """Add to the sums (link, 5, y, x), of powers of the charge times residuals (y, x, t)."""
+    ny, nx, nt = e0.shape
+    sums = np.empty((_COLUMNS, len(links), 5), np.float32)
+    for first in range(0, nx, _COLUMNS):
+        for y in range(ny):
+            sums[:] = 0
+            for x in range(first, min(first + _COLUMNS, nx)):
+                a0, a1, a2 = e0[y, x], e1[y, x], e2[y, x]
+                for n in range(len(links)):
+                    v, u = y + links[n, 0], x + links[n, 1]
+                    if v >= ny or u < 0 or u >= nx:
+                        continue
+                    b0, b1, b2 = e0[v, u], e1[v, u], e2[v, u]
+                    s10 = s01 = s00 = s11 = both20 = np.float32(0)
+                    for t in range(nt):
+                        s10 += a1[t] * b0[t]
+                        s01 += a0[t] * b1[t]
+                        s00 += a0[t] * b0[t]
+                        s11 += a1[t] * b1[t]
+                        both20 += a2[t] * b0[t] + a0[t] * b2[t]
+                    for i, value in enumerate((s10, s01, s00, s11, both20)):
+                        sums[x - first, n, i] = value
+            _add_pixels(sums, y, first, right)
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
-def _normal_sums(
-    pp: Any, pg: Any, gg: Any, ph: Any, gh: Any, hh: Any, dy: int, dx: int, normal: Any
-) -> None:
-    ny, nx, nt = pp.shape
-    for y in range(ny - dy):
-        for x in range(max(0, -dx), min(nx, nx - dx)):
-            v, j = y + dy, x + dx
-            n0 = n1 = n2 = n3 = n4 = n5 = n6 = n7 = n8 = np.float32(0)
-            m0 = m1 = m2 = m3 = m4 = np.float32(0)
-            for t in range(nt):
-                n0 += pp[y, x, t] * gg[v, j, t]
-                n1 += pg[y, x, t] * pg[v, j, t]
-                n2 += gg[y, x, t] * pp[v, j, t]
-                n3 += pg[y, x, t] * gg[v, j, t]
-                n4 += gg[y, x, t] * pg[v, j, t]
-                n5 += gg[y, x, t] * gg[v, j, t]
-                n6 += pp[y, x, t] * pg[v, j, t]
-                n7 += pg[y, x, t] * pp[v, j, t]
-                n8 += pp[y, x, t] * pp[v, j, t]
-            for t in range(nt):
-                m0 += ph[y, x, t] * gg[v, j, t] + pg[y, x, t] * gh[v, j, t]
-                m1 += gh[y, x, t] * pg[v, j, t] + gg[y, x, t] * ph[v, j, t]
-                m2 += gh[y, x, t] * gg[v, j, t] + gg[y, x, t] * gh[v, j, t]
-                m3 += ph[y, x, t] * pg[v, j, t] + pg[y, x, t] * ph[v, j, t]
-                m4 += hh[y, x, t] * gg[v, j, t] + gg[y, x, t] * hh[v, j, t]
-                m4 += np.float32(2) * gh[y, x, t] * gh[v, j, t]
-            normal[0, y, x] += n0
-            normal[1, y, x] += n1
-            normal[2, y, x] += n2
-            normal[3, y, x] += n3
-            normal[4, y, x] += n4
-            normal[5, y, x] += n5
-            normal[6, y, x] += n6
-            normal[7, y, x] += n7
-            normal[8, y, x] += n8
-            normal[9, y, x] += m0
-            normal[10, y, x] += m1
-            normal[11, y, x] += m2
-            normal[12, y, x] += m3
-            normal[13, y, x] += m4
+def _add_normal_sums(w0: F32, w1: F32, w2: F32, w3: F32, w4: F32, links: Any, normal: F64) -> None:
+    """Add to the sums (link, 14, y, x), of powers of the charge over the variance (y, x, t)."""
+    ny, nx, nt = w0.shape
+    sums = np.empty((_COLUMNS, len(links), NORMALS), np.float32)
+    for first in range(0, nx, _COLUMNS):
+        for y in range(ny):
+            sums[:] = 0
+            for x in range(first, min(first + _COLUMNS, nx)):
+                a0, a1, a2, a3, a4 = w0[y, x], w1[y, x], w2[y, x], w3[y, x], w4[y, x]
+                for n in range(len(links)):
+                    v, u = y + links[n, 0], x + links[n, 1]
+                    if v >= ny or u < 0 or u >= nx:
+                        continue
+                    b0, b1, b2, b3, b4 = w0[v, u], w1[v, u], w2[v, u], w3[v, u], w4[v, u]
+                    s00 = s10 = s01 = s20 = s11 = s02 = np.float32(0)
+                    s21 = s12 = s22 = s30 = s03 = both31 = both40 = np.float32(0)
+                    for t in range(nt):
+                        s00 += a0[t] * b0[t]
+                        s10 += a1[t] * b0[t]
+                        s01 += a0[t] * b1[t]
+                        s20 += a2[t] * b0[t]
+                        s11 += a1[t] * b1[t]
+                        s02 += a0[t] * b2[t]
+                        s21 += a2[t] * b1[t]
+                        s12 += a1[t] * b2[t]
+                        s22 += a2[t] * b2[t]
+                        s30 += a3[t] * b0[t]
+                        s03 += a0[t] * b3[t]
+                        both31 += a3[t] * b1[t] + a1[t] * b3[t]
+                        both40 += a4[t] * b0[t] + a0[t] * b4[t]
+                    found = (
+                        s20, s11, s02, s10, s01, s00, s21, s12, s22, s30 + s12, s21 + s03,
+                        s20 + s02, both31, both40 + np.float32(2) * s22,
+                    )  # fmt: skip
+                    for i, value in enumerate(found):
+                        sums[x - first, n, i] = value
+            _add_pixels(sums, y, first, normal)
 
 
 def _variance(part: Residuals) -> tuple[F64, F64]:

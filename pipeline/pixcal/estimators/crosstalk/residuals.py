@@ -7,9 +7,8 @@ left, with the negative of the modes' products; the modes are kept, so that this
 The second makes it smaller, which is made good here.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,11 +107,11 @@ def _of_stack(stack: Stack, evidence: Evidence, known: Sequence[Coupling], kept:
     rest = np.where(used, (signal - light) / UNIT**0.5, np.nan).astype(np.float32)
     collected = np.maximum(uncouple(light, known, evidence.origin), 0)
     charge = np.broadcast_to((collected / UNIT).astype(np.float32), rest.shape)
-    common = [partial(np.ones_like, charge)]
+    common = [np.ones((1, 1), np.float32)]
     if stack.kind == "flat":
-        common.append(partial(np.asarray, charge))
+        common.append(charge)
     read = np.full(used.shape, evidence.read_noise**2 / UNIT, np.float32)
-    return _noise(rest, charge, read, kept, common, np.ones((len(at), 1)))
+    return _noise(rest, charge, read, kept, common, common[:1], np.ones((len(at), 1)))
 
 
 def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> Residuals:
@@ -127,16 +126,17 @@ def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> 
     charge, _, _ = _model(collected, found.g[at], found.dk[at])
     light, fringe, slope = _model(theta, found.g[at], found.dk[at])
     y, x = (a.astype(np.float32) for a in grid((flat.shape[0], flat.shape[1])))
-    whole = (light - fringe, fringe, slope)
+    light -= fringe
     # Also what changes along the window: a fringe vector that moves, rows that are exposed later.
-    ones = np.ones((1, 1), np.float32)
-    common = [partial(np.multiply, place, part) for place in (ones, x, y) for part in whole]
-    rest = np.where(found.good, found.residual[at] * flat / UNIT**0.5, np.nan).astype(np.float32)
+    places = (np.ones((1, 1), np.float32), x, y)
+    scale = np.where(found.good, flat / UNIT**0.5, np.nan).astype(np.float32)
+    rest = found.residual[at] * scale
     read = (found.read_variance * flat**2 / UNIT).astype(np.float32)
     turn = np.exp(1j * found.phi[at])
     powers = np.column_stack([turn**n for n in (1, 2, 3)])
     own = np.column_stack([np.ones(len(at)), powers.real, powers.imag])
-    return _noise(rest, np.maximum(charge / np.float32(UNIT), 0), read, kept, common, own)
+    charge = np.maximum(charge / np.float32(UNIT), 0)
+    return _noise(rest, charge, read, kept, (light, fringe, slope), places, own)
 
 
 def _model(theta: F64, g: F64, dk: F64) -> tuple[F32, F32, F32]:
@@ -153,7 +153,13 @@ def _model(theta: F64, g: F64, dk: F64) -> tuple[F32, F32, F32]:
 
 
 def _noise(
-    rest: F32, charge: F32, read: F32, kept: F32, common: Sequence[Callable[[], F32]], own: F64
+    rest: F32,
+    charge: F32,
+    read: F32,
+    kept: F32,
+    common: Sequence[F32],
+    places: Sequence[F32],
+    own: F64,
 ) -> Residuals:
     """Residuals in units of their noise, without what is common to pixels and to frames.
 
@@ -162,8 +168,8 @@ def _noise(
     rest, charge : (t, y, x) float32
     read, kept : (y, x) float32
         Variance without light; variance of the shot noise over the charge.
-    common : sequence of callable
-        Each gives a (t, y, x) float32 of what is free in each frame: one at a time, they are large.
+    common, places : sequence of float32 array
+        What is free in each frame, (t, y, x): each of the first times each of the second.
     own : (t, m) float64
         What is free in each pixel.
     """
@@ -172,31 +178,72 @@ def _noise(
     good = rest**2 < CLIP**2 * variance
     one = np.where(good, 1 / np.sqrt(variance), np.float32(0)).astype(np.float32)
     e = np.where(good, rest, np.float32(0)) * one
-    modes = np.empty((len(e), len(common), one[0].size), np.float32)
-    for m, make in enumerate(common):
-        modes[:, m] = (make() * one).reshape(len(e), -1)
-    _make_orthonormal(modes)
+    modes = _FrameModes.of(common, places, one)
     pixels = _PixelModes.of(own, one.reshape(len(e), -1))
     flat = e.reshape(len(e), -1)
     for _ in range(STEPS):
-        flat -= np.einsum("tmp,tm->tp", modes, np.einsum("tmp,tp->tm", modes, flat))
+        modes.take_off(flat)
         flat -= pixels.part_of(flat)
     e /= np.sqrt(np.maximum(1 - pixels.taken(), LEAST)).astype(np.float32).reshape(e.shape)
     # Noise beyond what is known makes every product count for less.
-    excess = max(1.0, float(np.sum(e * e, dtype=float)) / max(int(np.count_nonzero(one)), 1))
+    squares = float(np.einsum("tyx,tyx->t", e, e).sum(dtype=float))
+    excess = max(1.0, squares / max(int(np.count_nonzero(one)), 1))
     less = np.float32(excess**-0.5)
-    some = modes[::STRIDE] * (less * np.float32(np.sqrt(len(e) / len(modes[::STRIDE]))))
-    some = some.swapaxes(0, 1).reshape(len(common), -1, *e.shape[1:])
+    some = np.stack([modes.orthonormal(t) for t in range(0, len(e), STRIDE)], axis=1)
+    some *= less * np.float32(np.sqrt(len(e) / some.shape[1]))
+    some = some.reshape(*some.shape[:2], *e.shape[1:])
     one *= less
     return Residuals(e * less, charge * one, shot * one, one, some)
 
 
-def _make_orthonormal(modes: F32) -> None:
-    """Make the modes (t, m, pixel) of each frame orthonormal over its pixels, in place."""
-    for own in modes:
-        own /= np.sqrt(np.maximum(np.einsum("mp,mp->m", own, own), np.float32(1e-20)))[:, None]
-        gram = (own @ own.T).astype(float) + 1e-6 * np.eye(len(own))
-        own[:] = np.linalg.inv(np.linalg.cholesky(gram)).astype(np.float32) @ own
+@dataclass(frozen=True)
+class _FrameModes:
+    """What is free in each frame: some frames times some functions of place.
+
+    They are made anew whenever they are needed: all at once they would be many times the samples.
+
+    Attributes
+    ----------
+    common : sequence of (t, y, x) float32
+    places : (place, y, x) float32
+        As in `_noise`.
+    one : (t, y, x) float32
+    to_orthonormal : (t, m, m) float32
+    """
+
+    common: Sequence[F32]
+    places: F32
+    one: F32
+    to_orthonormal: F32
+
+    @classmethod
+    def of(cls, common: Sequence[F32], places: Sequence[F32], one: F32) -> "_FrameModes":
+        frames = [np.broadcast_to(part, one.shape) for part in common]
+        every = np.stack([np.broadcast_to(place, one.shape[1:]) for place in places])
+        count = len(frames) * len(every)
+        found = cls(frames, every, one, np.empty((len(one), count, count), np.float32))
+        for t, to_orthonormal in enumerate(found.to_orthonormal):
+            own = found.frame(t)
+            size = np.sqrt(np.maximum(np.einsum("mp,mp->m", own, own), np.float32(1e-20)))
+            own /= size[:, None]
+            gram = (own @ own.T).astype(float) + 1e-6 * np.eye(count)
+            to_orthonormal[:] = np.linalg.inv(np.linalg.cholesky(gram)) / size
+        return found
+
+    def frame(self, t: int) -> F32:
+        """Modes (m, pixel) of a frame, over sigma."""
+        weighted = np.stack([part[t] for part in self.common]) * self.one[t]
+        return np.asarray((self.places[:, None] * weighted).reshape(-1, weighted[0].size))
+
+    def orthonormal(self, t: int) -> F32:
+        """Modes (m, pixel) of a frame that are orthonormal over its pixels."""
+        return np.asarray(self.to_orthonormal[t] @ self.frame(t))
+
+    def take_off(self, e: F32) -> None:
+        """Take what they explain off residuals (t, pixel) in units of their noise, in place."""
+        for t, (rest, to_orthonormal) in enumerate(zip(e, self.to_orthonormal, strict=True)):
+            own = self.frame(t)
+            rest -= (to_orthonormal @ (own @ rest)) @ to_orthonormal @ own
 
 
 @dataclass(frozen=True)

@@ -163,9 +163,10 @@ def _measure(
     seen = star(psf, half, config.electrons, config.background_e, acquisition.detector)
     shape = components[0].delta.shape
     if seen.side > min(shape):
+        by_itself = "" if config.window else ", which a star of --wavelength and --diameter takes,"
         raise InputError(
-            f"--window: {seen.side} px do not fit maps of {shape[1]} × {shape[0]} px (x × y); "
-            f"give an odd number up to {min(shape)}"
+            f"--window: {seen.side} px{by_itself} do not fit maps of {shape[1]} × {shape[0]} px "
+            f"(x × y); give an odd number up to {min(shape)}"
         )
     sets = [SetModes.of_fit(shape, facts, acquisition) for facts in fit["sets"].values()]
     modes = Modes(shape, tuple(sets)).number if config.truth is not None else 0

@@ -51,6 +51,8 @@ LAYOUTS = {
 }
 """By the name of the size; ``tiny`` is for tests of the procedure, too small to find much."""
 
+MOST_SETS = 3
+"""Fringe sets of a case at most."""
 FLATS_S = (0.006, 0.014, 0.022, 0.03)
 
 

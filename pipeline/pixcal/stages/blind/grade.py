@@ -6,10 +6,13 @@ from typing import Any
 
 from pixcal.effects import effects
 from pixcal.stages.blind.draw import ELSEWHERE, LEFT_OUT, NOTHING, ONE, SEVERAL, Truth
+from pixcal.stages.blind.offsets import AxisError
 from pixcal.stages.blind.parameters import held
 
 BLAMED = 0.5
 """Share of the gap from which an innocent effect is blamed for most of it."""
+WITHIN = (1, 2, 3)
+"""Errors that a parameter may be off."""
 WORST = 3
 """Statistics among which the place of an effect is looked for."""
 
@@ -39,12 +42,18 @@ class Grade:
         Questions of the part, answered right or not.
     why : str
         What went wrong; empty where nothing did.
+    claims : tuple of dict
+        What was claimed of each cause: significance of its estimate, share of the gap closed,
+        chance.
+    worst : tuple of dict
+        Where data and simulation differ most: domain, statistic, set, place.
     parameters : tuple of dict
-        Of true effects that were found: name, true, found, error, within.
+        Of true effects that were found: name, true, found, error, and whether it is within one,
+        two and three errors.
     closed, oracle : float or None
         Share of the gap closed by the causes named, and by the true effects as they are.
-    offset_before_px, offset_after_px : float or None
-        Median error of the offsets, of the maps as fitted and as corrected.
+    offsets : tuple of AxisError
+        Errors of the offsets along x and y.
     """
 
     case: str
@@ -57,11 +66,12 @@ class Grade:
     named: tuple[str, ...]
     marks: dict[str, bool]
     why: str
+    claims: tuple[dict[str, Any], ...] = ()
+    worst: tuple[dict[str, str], ...] = ()
     parameters: tuple[dict[str, Any], ...] = ()
     closed: float | None = None
     oracle: float | None = None
-    offset_before_px: float | None = None
-    offset_after_px: float | None = None
+    offsets: tuple[AxisError, ...] = ()
 
     @property
     def right(self) -> bool:
@@ -73,7 +83,7 @@ QUESTIONS = {
     ONE: ("named first",),
     NOTHING: ("no cause claimed", "no gap"),
     SEVERAL: ("all found, none invented", "all found", "none invented"),
-    LEFT_OUT: ("honest", "right domain"),
+    LEFT_OUT: ("honest", "not called explained", "nobody blamed for most", "right domain"),
     ELSEWHERE: ("named first",),
 }
 """Of each part; the first one decides."""
@@ -91,7 +101,7 @@ def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "")
     error : str
         Why it could not.
     """
-    way = ", ".join(f"{d.way} {d.strength:.3g}" for d in truth.drawn)
+    way = ", ".join(f"{d.effect}: {d.way} {d.strength:.3g}" for d in truth.drawn)
     times = min((d.times for d in truth.drawn), default=None)
     about = (case, truth.part, truth.names, way, times, truth.left_out)
     if diagnosis is None:
@@ -104,8 +114,19 @@ def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "")
     closed = 1 - float(diagnosis["gap"]["after"]) if named else None
     parameters = () if truth.elsewhere else tuple(_parameters(truth, diagnosis))
     return Grade(
-        *about, diagnosis["verdict"], named, marks, why, parameters=parameters, closed=closed
-    )
+        *about, diagnosis["verdict"], named, marks, why,
+        claims=tuple(_claim(cause) for cause in diagnosis["causes"]),
+        worst=tuple(_place(one) for one in diagnosis["gap"]["where"][:WORST]),
+        parameters=parameters, closed=closed,
+    )  # fmt: skip
+
+
+def _claim(cause: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: cause.get(key) for key in ("effect", "sigmas", "gap_closed", "p_value")}
+
+
+def _place(one: Mapping[str, Any]) -> dict[str, str]:
+    return {key: str(one.get(key, "")) for key in ("domain", "statistic", "set", "place")}
 
 
 def _answers(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> tuple[bool, ...]:
@@ -118,7 +139,7 @@ def _answers(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> tuple[
         return found and not invented, found, not invented
     honest = diagnosis["verdict"] in ("unexplained", "partly explained")
     blamed = any(cause["gap_closed"] > BLAMED for cause in diagnosis["causes"])
-    return honest and not blamed, _domain_seen(truth, diagnosis)
+    return honest and not blamed, honest, not blamed, _domain_seen(truth, diagnosis)
 
 
 def _domain_seen(truth: Truth, diagnosis: Diagnosis) -> bool:
@@ -144,7 +165,7 @@ def _parameters(truth: Truth, diagnosis: Diagnosis) -> list[dict[str, Any]]:
                     "true": one.true,
                     "found": one.found,
                     "error": one.error,
-                    "within": one.within,
+                    "within": [one.within(errors) for errors in WITHIN],
                 }
             )
     return found
@@ -165,8 +186,9 @@ def _why(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> str:
     about = {c["effect"]: c for c in diagnosis["candidates"]}
     for name in truth.names:
         if name not in named:
-            reason = about.get(name, {}).get("rejected_because", "not a candidate")
-            reasons.append(f"{name}: {reason}")
+            tried = about.get(name, {})
+            seen = f" ({tried['sigmas']:.1f} sigmas)" if "sigmas" in tried else ""
+            reasons.append(f"{name}{seen}: {tried.get('rejected_because', 'not a candidate')}")
         elif len(truth.names) == 1 and named[0] != name:
             reasons.append(f"{name}: named after {named[0]}")
     invented = [name for name in named if name not in truth.names]

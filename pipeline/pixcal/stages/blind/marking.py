@@ -1,6 +1,7 @@
 """``pixcal blind score``: the seal is opened, and every case held against its truth."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -10,23 +11,38 @@ import numpy as np
 from scipy.stats import binomtest
 
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.model.errors import PixcalError
-from pixcal.stages.blind.draw import ONE, PARTS, SEVERAL
-from pixcal.stages.blind.grade import QUESTIONS, Grade, grade
-from pixcal.stages.blind.oracle import share_closed
-from pixcal.stages.blind.paper import RUNS, Paper, purpose_of, read_paper
+from pixcal.model.errors import DamagedError, InputError, PixcalError, PlanError
+from pixcal.stages.blind.draw import ELSEWHERE, LEFT_OUT, NOTHING, ONE, PARTS, SEVERAL
+from pixcal.stages.blind.grade import QUESTIONS, WITHIN, Grade, grade
+from pixcal.stages.blind.offsets import AXES, AxisError, offset_errors
+from pixcal.stages.blind.oracle import Oracle, ask_oracle
+from pixcal.stages.blind.paper import FILE, RUNS, Paper, purpose_of, read_paper
 from pixcal.stages.blind.seal import Sealed, read_seal
-from pixcal.stages.blind.sitting import DIAGNOSIS, FAILED
+from pixcal.stages.blind.sitting import DIAGNOSIS, FAILED, PRODUCTS, SAT, share
 from pixcal.stages.blind.table import as_markdown, write_between
 from pixcal.storage.artefact import read_json, write_json
 
-SCHEMA = "pixcal/blind-score/1"
+SCHEMA = "pixcal/blind-score/2"
 PRODUCT = "score.json"
 TABLE = "score.md"
 NOBODY = "nothing"
 TWICE = 2.0
+FROM_TWICE = "named first, from twice the threshold"
+PLACE = "right place, by the true effect"
 NEAR = 0.05
 """By which the share closed may differ from the oracle's."""
+TARGETS = {
+    (ONE, FROM_TWICE): 0.95,
+    (NOTHING, "no cause claimed"): 0.95,
+    (SEVERAL, "pairs: both found"): 0.85,
+    (LEFT_OUT, "honest"): 0.9,
+    (ELSEWHERE, "named first"): 0.9,
+}
+"""Shares that the diagnosis is to reach."""
+BOUNDS = 1.3
+"""Cramér-Rao bounds that the median error of corrected maps is to be at most, where an effect
+biases them."""
+_TIMED = ("diagnosis", "maps")
 
 
 @dataclass(frozen=True)
@@ -35,18 +51,20 @@ class ScoreConfig:
 
     Attributes
     ----------
-    oracle : bool
-        Simulate the true effects as well, to tell what they close.
+    oracle : int
+        Cases of parts 1 and 4, the first of them, whose true effects are simulated as well.
     write : Path, optional
         Page that the table goes to, between the marks of the examination's size.
     """
 
-    oracle: bool = False
+    oracle: int = 0
     write: Path | None = None
 
 
 def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> dict[str, Any]:
     """Score an examination: ``score.json`` and ``score.md`` in its folder.
+
+    Cases that were not sat yet are counted as missing, and not scored.
 
     Parameters
     ----------
@@ -65,18 +83,32 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
     Raises
     ------
     InputError
-        If the truth is not the one that the cases were made with.
+        If the truth is not the one that the cases were made with, or no case was sat.
     """
     paper = read_paper(folder)
     opened = read_seal(sealed, paper.commitment)
-    grades = _grades(folder, paper, opened)
+    if len(paper.cases) != len(opened.examination.truths):
+        raise InputError(
+            f"{folder / FILE}: tells of {len(paper.cases)} cases, --sealed {sealed} of "
+            f"{len(opened.examination.truths)}; one of them is damaged"
+        )
+    sat = [n for n, name in enumerate(paper.cases) if _was_sat(folder / RUNS / name)]
+    if not sat:
+        raise InputError(f"{folder}: no case was diagnosed; run 'pixcal blind run {folder}'")
+    mark = partial(_graded, folder, paper, opened)
+    grades = run_tasks(mark, sat, runtime, label="score")
     if config.oracle:
-        grades = _with_oracle(folder, opened, grades, runtime)
+        grades = _with_oracle(folder, opened, dict(zip(sat, grades, strict=True)), config, runtime)
+    missing = [name for n, name in enumerate(paper.cases) if n not in sat]
     found = summary(grades) | {
         "schema": SCHEMA,
         "purpose": purpose_of(opened.examination.seed),
-        "seed": opened.examination.seed,
+        # Who has it can draw the cases that are still to be sat.
+        "seed": None if missing else opened.examination.seed,
         "size": paper.size,
+        "made": len(paper.cases),
+        "missing": missing,
+        "sittings": _sittings(folder, [g.case for g in grades]),
         "notes": list(opened.examination.notes),
     }
     write_json(folder / PRODUCT, found)
@@ -87,75 +119,159 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
     return found
 
 
-def _grades(folder: Path, paper: Paper, opened: Sealed) -> list[Grade]:
-    grades = []
-    for name, truth in zip(paper.cases, opened.examination.truths, strict=True):
-        run_dir = folder / RUNS / name
-        if (run_dir / DIAGNOSIS).is_file():
-            grades.append(grade(name, truth, read_json(run_dir / DIAGNOSIS)))
-        else:
-            failed = run_dir / FAILED
-            error = read_json(failed)["error"] if failed.is_file() else ""
-            grades.append(grade(name, truth, None, error))
-    return grades
+def _was_sat(run_dir: Path) -> bool:
+    """Whether a case was diagnosed, or could not be."""
+    return (run_dir / DIAGNOSIS).is_file() or (run_dir / FAILED).is_file()
+
+
+@contextmanager
+def _understood(file: Path) -> Iterator[None]:
+    """What is amiss as the content of a case's file is looked at is the file's fault."""
+    try:
+        yield
+    except (AttributeError, LookupError, TypeError, ValueError) as error:
+        told = " ".join(f"{type(error).__name__}: {error}".split())
+        damaged = DamagedError(f"{file}: damaged ({told:.200})", file)
+        case = next(up for up in file.parents if up.parent.name == RUNS)
+        damaged.advice = f"remove {case} and say 'pixcal blind run {case.parents[1]}'"
+        raise damaged from error
+
+
+def _graded(folder: Path, paper: Paper, opened: Sealed, number: int) -> Grade:
+    name, truth = paper.cases[number], opened.examination.truths[number]
+    run_dir = folder / RUNS / name
+    if not (run_dir / DIAGNOSIS).is_file():
+        with _understood(run_dir / FAILED):
+            return grade(name, truth, None, str(read_json(run_dir / FAILED)["error"]))
+    with _understood(run_dir / DIAGNOSIS):
+        found = grade(name, truth, read_json(run_dir / DIAGNOSIS))
+    if not (run_dir / PRODUCTS / "correction.json").is_file():
+        return found
+    with _understood(run_dir / PRODUCTS / "correction.json"):
+        errors = offset_errors(
+            run_dir / PRODUCTS, folder / name, truth, opened.benches[number]
+        )  # fmt: skip
+    return replace(found, offsets=errors)
+
+
+def _sittings(folder: Path, cases: Sequence[str]) -> dict[str, Any]:
+    """By how many versions of the code the cases were diagnosed, how long that took, what failed.
+
+    One is right: what was changed after a part of the seal was opened is no blind examination.
+    """
+    files = [folder / RUNS / case / SAT for case in cases]
+    told = [_sitting(file) for file in files if file.is_file()]
+    return {
+        "codes": sorted({one["code"] for one in told}),
+        "median_seconds": {what: _median(one[what] for one in told) for what in _TIMED},
+        "without_maps": sum(one["no_maps"] for one in told),
+    }
+
+
+def _sitting(file: Path) -> dict[str, Any]:
+    with _understood(file):
+        one = read_json(file)
+        seconds = {what: float(one["seconds"][what]) for what in _TIMED}
+        return {"code": str(one["code"]), "no_maps": bool(one["no_maps"]), **seconds}
 
 
 def _with_oracle(
-    folder: Path, opened: Sealed, grades: Sequence[Grade], runtime: Runtime
+    folder: Path,
+    opened: Sealed,
+    grades: Mapping[int, Grade],
+    config: ScoreConfig,
+    runtime: Runtime,
 ) -> list[Grade]:
-    """Grades of parts 1 and 3 with what the true effects close."""
-    numbers = [n for n, g in enumerate(grades) if g.part in (ONE, SEVERAL) and g.closed is not None]
-    at_once = min(runtime.n_workers, max(len(numbers), 1))
-    each = Runtime("sync", memory=runtime.memory // at_once)
-    shares = run_tasks(
-        partial(_oracle, folder, opened, tuple(g.case for g in grades), each),
-        numbers, runtime, label="true effects",
-    )  # fmt: skip
-    found = list(grades)
-    for number, share in zip(numbers, shares, strict=True):
-        found[number] = replace(found[number], oracle=share)
-    return found
+    """Grades with what the true effects close, and where; of some cases of parts 1 and 4."""
+    numbers = [n for n, g in grades.items() if g.part in (ONE, LEFT_OUT) and g.verdict != "failed"][
+        : config.oracle
+    ]
+    size = opened.examination.size
+    over, each = share("simulating the true effects", size, len(numbers), runtime)
+    ask = partial(_oracle, folder, opened, {n: grades[n].case for n in numbers}, each)
+    answers = run_tasks(ask, numbers, over, label="true effects")
+    found = dict(grades)
+    for number, answer in zip(numbers, answers, strict=True):
+        if answer is not None:
+            found[number] = _beside(found[number], answer)
+    return list(found.values())
+
+
+def _beside(own: Grade, answer: Oracle) -> Grade:
+    if own.part == ONE:
+        return replace(own, oracle=answer.closed)
+    first = own.worst[0] if own.worst else {"statistic": "", "set": ""}
+    right = (first["statistic"], first["set"]) in answer.causes
+    return replace(own, oracle=answer.closed, marks=own.marks | {PLACE: right})
 
 
 def _oracle(
-    folder: Path, opened: Sealed, cases: Sequence[str], runtime: Runtime, number: int
-) -> float | None:
+    folder: Path, opened: Sealed, cases: Mapping[int, str], runtime: Runtime, number: int
+) -> Oracle | None:
     truth, bench = opened.examination.truths[number], opened.benches[number]
+    case = cases[number]
     try:
-        return share_closed(folder / cases[number], truth, bench, runtime)
+        return ask_oracle(folder / case, folder / RUNS / case / "diagnose", truth, bench, runtime)
+    except PlanError:
+        raise
     except PixcalError:
         return None
 
 
 def summary(grades: Sequence[Grade]) -> dict[str, Any]:
-    """Counts of every part, with intervals, and the confusion of causes."""
+    """Counts of every part, with intervals and targets, and the confusion of causes."""
     parts = {}
     for part, title in PARTS.items():
         own = [g for g in grades if g.part == part]
-        if not own:
-            continue
-        questions = {q: _count(g.marks[q] for g in own) for q in QUESTIONS[part]}
-        if part == ONE:
-            clear = [g for g in own if g.times is not None and g.times >= TWICE]
-            questions["named first, from twice the threshold"] = _count(g.right for g in clear)
-            questions["parameters within three errors"] = _count(
-                p["within"] for g in own for p in g.parameters
-            )
-            questions["share closed as by the truth"] = _count(
-                abs(g.closed - g.oracle) <= NEAR
-                for g in own
-                if g.closed is not None and g.oracle is not None
-            )
-        if part == SEVERAL:
-            pairs = [g for g in own if len(g.truth) == 2]
-            questions["pairs: both found"] = _count(g.marks["all found"] for g in pairs)
-        parts[str(part)] = {"title": title, "cases": len(own), "questions": questions}
+        if own:
+            questions = {q: _count(g.marks[q] for g in own) for q in QUESTIONS[part]}
+            questions |= _more_questions(part, own)
+            for question, count in questions.items():
+                target = TARGETS.get((part, question))
+                if target is not None:
+                    count |= {"target": target}
+            parts[str(part)] = {"title": title, "cases": len(own), "questions": questions}
+    one = [g for g in grades if g.part == ONE]
     return {
         "cases": [asdict(g) | {"right": g.right} for g in grades],
         "parts": parts,
         "confusion": confusion(grades),
-        "medians": _medians(grades),
+        "effects": _by_effect(one),
+        "medians": {
+            "closed": _median(g.closed for g in one),
+            "oracle": _median(g.oracle for g in one),
+        },
+        "maps": _of_maps(one),
     }
+
+
+def _more_questions(part: int, own: Sequence[Grade]) -> dict[str, dict[str, Any]]:
+    if part == ONE:
+        return {
+            FROM_TWICE: _count(g.right for g in own if _clear(g)),
+            **{
+                f"parameters within {errors} sigma": _count(
+                    p["within"][n] for g in own for p in g.parameters
+                )
+                for n, errors in enumerate(WITHIN)
+            },
+            "share closed as by the truth": _count(
+                abs(g.closed - g.oracle) <= NEAR
+                for g in own
+                if g.closed is not None and g.oracle is not None
+            ),
+        }
+    if part == SEVERAL:
+        pairs = [g for g in own if len(g.truth) == 2]
+        return {"pairs: both found": _count(g.marks["all found"] for g in pairs)}
+    if part == LEFT_OUT:
+        return {PLACE: _count(g.marks[PLACE] for g in own if PLACE in g.marks)}
+    return {}
+
+
+def _clear(own: Grade) -> bool:
+    """Whether the weakest effect has twice its threshold."""
+    return own.times is not None and own.times >= TWICE
 
 
 def _count(answers: Iterable[bool]) -> dict[str, Any]:
@@ -173,6 +289,11 @@ def _count(answers: Iterable[bool]) -> dict[str, Any]:
     }
 
 
+def _median(values: Iterable[float | None]) -> float | None:
+    known = [v for v in values if v is not None]
+    return float(np.median(known)) if known else None
+
+
 def confusion(grades: Sequence[Grade]) -> dict[str, dict[str, int]]:
     """Of every effect that is alone in a case and a candidate, the causes named first."""
     table: dict[str, dict[str, int]] = {}
@@ -187,17 +308,39 @@ def confusion(grades: Sequence[Grade]) -> dict[str, dict[str, int]]:
     return {name: dict(sorted(row.items())) for name, row in sorted(table.items())}
 
 
-def _medians(grades: Sequence[Grade]) -> Mapping[str, float | None]:
-    """Of part 1: share closed, beside the oracle's, and errors of the offsets."""
-    own = [g for g in grades if g.part == ONE]
+def _by_effect(own: Sequence[Grade]) -> dict[str, dict[str, Any]]:
+    """Of every effect of part 1: named first below and above twice the threshold, and the maps."""
+    found = {}
+    for name in sorted({g.truth[0] for g in own}):
+        those = [g for g in own if g.truth[0] == name]
+        found[name] = {
+            "below_twice": _count(g.right for g in those if not _clear(g)),
+            "from_twice": _count(g.right for g in those if _clear(g)),
+            "closed": _median(g.closed for g in those),
+            "offsets": {
+                axis: {
+                    "before": _median(one.before for one in _along(those, axis)),
+                    "after": _median(one.after for one in _along(those, axis)),
+                }
+                for axis in AXES
+            },
+        }
+    return found
 
-    def median(values: Iterable[float | None]) -> float | None:
-        known = [v for v in values if v is not None]
-        return float(np.median(known)) if known else None
 
-    return {
-        "closed": median(g.closed for g in own),
-        "oracle": median(g.oracle for g in own),
-        "offset_before_px": median(g.offset_before_px for g in own),
-        "offset_after_px": median(g.offset_after_px for g in own),
-    }
+def _along(grades: Iterable[Grade], axis: str) -> list[AxisError]:
+    return [one for g in grades for one in g.offsets if one.axis == axis]
+
+
+def _of_maps(own: Sequence[Grade]) -> dict[str, Any]:
+    """Errors of the offsets over the bound, medians: of all maps, and of those that are biased."""
+    every = [one for axis in AXES for one in _along(own, axis)]
+    found: dict[str, Any] = {"target": BOUNDS}
+    for name, chosen in (("all", every), ("biased", [one for one in every if one.biased])):
+        found[name] = {
+            "maps": len(chosen),
+            "before": _median(one.before for one in chosen),
+            "after": _median(one.after for one in chosen),
+            "within_target": _count(one.after <= BOUNDS for one in chosen),
+        }
+    return found

@@ -1,32 +1,61 @@
 """What the true effects, with their true parameters, close of the gap.
 
-They are simulated as a candidate of the diagnosis is, on the same frames and against the same
-reference; what then is left is the share that nobody could do better than.
+They are simulated as a candidate of the diagnosis is, on the same frames, against the same
+reference and by the same statistics; what then is left is the share that nobody could do better
+than. That costs about what the diagnosis costs, so it is done for some cases.
 """
 
 import shutil
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
+from pixcal.effects import effects
 from pixcal.engine.run import Runtime
+from pixcal.estimators.battery.signature import signature_key
 from pixcal.estimators.gap import Reference, expect_nominal, expect_with, log_likelihood
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect
 from pixcal.stages import ingest, reduce
 from pixcal.stages.blind.cases import effects_of
 from pixcal.stages.blind.draw import Truth
 from pixcal.stages.diagnose.search import CONFIRM, Trial, differing, shrinkage
 from pixcal.stages.diagnose.stage import REFERENCES, look_at
 from pixcal.stages.diagnose.trial import Trials
+from pixcal.storage.artefact import read_json
+
+EXPLAINS = 0.5
+"""Share of a statistic's gap that the true effects leave at most where they cause it."""
 
 
-def share_closed(acquisition: Path, truth: Truth, bench: Bench, runtime: Runtime) -> float:
-    """Share of the gap that the true effects close.
+@dataclass(frozen=True)
+class Oracle:
+    """What the true effects do to the gap.
+
+    Attributes
+    ----------
+    closed : float
+        Share of the gap that they close.
+    causes : frozenset of (str, str)
+        Statistics, of sets, that differ because of them.
+    """
+
+    closed: float
+    causes: frozenset[tuple[str, str]]
+
+
+def ask_oracle(
+    acquisition: Path, diagnosed: Path, truth: Truth, bench: Bench, runtime: Runtime
+) -> Oracle:
+    """Simulate the true effects.
 
     Parameters
     ----------
     acquisition : Path
         Of the case.
+    diagnosed : Path
+        The artefact of its diagnosis, whose statistics are used.
     truth : Truth
         Of the library's own effects.
     bench : Bench
@@ -42,11 +71,12 @@ def share_closed(acquisition: Path, truth: Truth, bench: Bench, runtime: Runtime
     try:
         ingest.run(acquisition, scratch / "run", ingest.Config(), runtime)
         reduce.run(scratch / "run", reduce.Config(), runtime)
-        look = look_at(scratch / "run", scratch, runtime)
-        trials = Trials(look.windows, scratch, look.runtime)
-        effects = effects_of(truth, bench)
+        seen = _signatures(diagnosed)
+        look = look_at(scratch / "run", scratch, runtime, lambda *_: seen)
+        trials = Trials(look.windows, scratch, look.runtime, seen)
+        true = effects_of(truth, bench)
         (nominal,) = trials.curves([()], REFERENCES, "nominal bench")
-        (with_effects,) = trials.curves([effects], CONFIRM, "true effects")
+        (with_effects,) = trials.curves([true], CONFIRM, "true effects")
         if isinstance(nominal, str) or isinstance(with_effects, str):
             raise InputError(
                 f"{acquisition}: {nominal if isinstance(nominal, str) else with_effects}"
@@ -55,8 +85,19 @@ def share_closed(acquisition: Path, truth: Truth, bench: Bench, runtime: Runtime
         data = reference.on_scale(look.measured)
         before, after = expect_nominal(reference), expect_with(reference, with_effects)
         start = Trial((), before, log_likelihood(data, before))
-        end = Trial(effects, after, log_likelihood(data, after))
-        where = differing(start, end, data)
-        return 1 - shrinkage(data, start, end, where).gap.total
+        end = Trial(true, after, log_likelihood(data, after))
+        left = shrinkage(data, start, end, differing(start, end, data)).gap
+        causes = frozenset(key for key in left.weights if left.left.get(key, 1.0) <= EXPLAINS)
+        return Oracle(1 - left.total, causes)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _signatures(diagnosed: Path) -> tuple[type[Effect], ...]:
+    """Effects whose estimates were statistics of the diagnosis."""
+    names = {curve["statistic"] for curve in read_json(diagnosed / "curves.json")}
+    return tuple(
+        kind
+        for name, kind in effects().items()
+        if any(signature_key(name, domain)[0] in names for domain in kind.domains)
+    )

@@ -8,9 +8,6 @@ from typing import Any
 from pixcal.effects import parse_effects
 from pixcal.model.config import to_plain
 
-WITHIN = 3.0
-"""Errors that a parameter may be off."""
-
 Plain = Mapping[str, Any]
 
 
@@ -29,10 +26,9 @@ class Held:
     found: float
     error: float
 
-    @property
-    def within(self) -> bool:
-        """Whether it is as near as its error says."""
-        return abs(self.found - self.true) <= WITHIN * self.error
+    def within(self, errors: float) -> bool:
+        """Whether it is off by at most some times its error."""
+        return abs(self.found - self.true) <= errors * self.error
 
 
 def held(effect: str, true: Plain, found: Plain, errors: Mapping[str, float]) -> list[Held]:

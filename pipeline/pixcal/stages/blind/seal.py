@@ -61,10 +61,11 @@ def read_seal(path: Path, commitment: str) -> Sealed:
         )
     plain = read_json(path)
     if not isinstance(plain, dict) or plain.get("schema") != SCHEMA:
-        raise InputError(f"--sealed {path}: not a sealed file of 'pixcal blind make'")
+        raise InputError(f"--sealed {path}: not a sealed file of 'pixcal blind make'; give another")
     if _commitment(plain) != commitment:
         raise InputError(
-            f"--sealed {path}: not the truth that these cases were made with, or changed since"
+            f"--sealed {path}: not the truth that these cases were made with, or changed "
+            "since; give the file that was written with them"
         )
     return parse(Sealed, plain, str(path))
 

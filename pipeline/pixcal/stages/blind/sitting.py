@@ -1,21 +1,39 @@
-"""``pixcal blind run``: every case is ingested, reduced and diagnosed; the truth is not needed."""
+"""``pixcal blind run``: every case is ingested, reduced and diagnosed; the truth is not needed.
 
+Its offset maps are fitted, and corrected by what was diagnosed: the products stay, whatever is
+large goes.
+"""
+
+import hashlib
+import math
 import shutil
+import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import pixcal
+from pixcal.engine.plan import BASE_BYTES, make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.model.errors import ClusterError
-from pixcal.stages import diagnose, ingest, reduce
+from pixcal.model.errors import ClusterError, DamagedError, PlanError
+from pixcal.stages import correct, diagnose, ingest, reduce
+from pixcal.stages.blind.benches import LAYOUTS, MOST_SETS
 from pixcal.stages.blind.paper import RUNS, read_paper
-from pixcal.storage.artefact import write_json
+from pixcal.stages.diagnose.stage import ESTIMATE_BYTES, EVIDENCE_BYTES
+from pixcal.storage.artefact import read_json, write_json
 
-DIAGNOSIS = Path("products/diagnosis.json")
+PRODUCTS = "products"
+DIAGNOSIS = Path(PRODUCTS) / "diagnosis.json"
 FAILED = "failed.json"
-LARGE = ("ingest", "reduce", "sweep", "fit")
+SAT = "sat.json"
+"""Of a case that is done: by which code, in how many seconds, and why there are no maps."""
+BEGUN = "begun.json"
+"""Of a case: by which code."""
+LEAST_BYTES = 1 << 30
+"""Of a case on a cluster, whose workers have limits of their own."""
+LARGE = ("ingest", "reduce", "sweep", "fit", "corrected")
 """Artefacts that are removed once a case is diagnosed."""
 
 
@@ -29,10 +47,13 @@ class RunConfig:
         Diagnose anew what was diagnosed.
     keep : bool
         Keep the runs whole, not the products alone.
+    limit : int, optional
+        Cases that are diagnosed at most, in order; their order is random.
     """
 
     again: bool = False
     keep: bool = False
+    limit: int | None = None
 
 
 def run(folder: Path, config: RunConfig, runtime: Runtime) -> tuple[int, int]:
@@ -47,49 +68,124 @@ def run(folder: Path, config: RunConfig, runtime: Runtime) -> tuple[int, int]:
     ------
     InputError
         If the folder holds no examination.
+    PlanError
+        If a case does not fit the memory.
     """
     paper = read_paper(folder)
     pending = [
         (name, left_out)
         for name, left_out in zip(paper.cases, paper.without, strict=True)
-        if config.again or not (folder / RUNS / name / DIAGNOSIS).is_file()
-    ]
-    each = _share(runtime, len(pending))
-    failed = run_tasks(partial(_case, folder, config, each), pending, runtime, label="diagnose")
+        if config.again or not (folder / RUNS / name / SAT).is_file()
+    ][: config.limit]
+    over, each = share("diagnosing a case", paper.size, len(pending), runtime)
+    sit = partial(_case, folder, config, code_digest(), each)
+    failed = run_tasks(sit, pending, over, label="diagnose")
     return len(pending), sum(failed)
 
 
-def _share(runtime: Runtime, cases: int) -> Runtime:
-    """What a case gets: all for a single one, else one core, and memory in equal parts."""
-    if cases <= 1:
-        return replace(runtime, quiet=True)
-    return Runtime("sync", memory=runtime.memory // min(runtime.n_workers, cases))
+def code_digest() -> str:
+    """Of the program's own files: whether two cases were diagnosed by the same code."""
+    package = Path(pixcal.__file__).parent
+    told = hashlib.sha256()
+    for file in sorted(package.rglob("*.py")):
+        told.update(file.relative_to(package).as_posix().encode() + b"\0" + file.read_bytes())
+    return told.hexdigest()[:16]
 
 
-def _case(folder: Path, config: RunConfig, runtime: Runtime, item: tuple[str, str]) -> bool:
+def share(what: str, size: str, cases: int, runtime: Runtime) -> tuple[Runtime, Runtime]:
+    """How many cases are looked at at once, and what each gets: one core, and memory.
+
+    Parameters
+    ----------
+    what : str
+        Is done, for messages.
+    size : str
+        Of the examination.
+    cases : int
+    runtime : Runtime
+
+    Returns
+    -------
+    (Runtime, Runtime)
+        Over the cases, and of each.
+
+    Raises
+    ------
+    PlanError
+        If not even one case fits the memory.
+    """
+    layout = LAYOUTS[size]
+    half = math.prod(layout.shape) * -(-layout.frames // 2)
+    need = half * (ESTIMATE_BYTES + MOST_SETS * EVIDENCE_BYTES)
+    plan = make_plan(what, need, 0, runtime)
+    over = runtime.with_workers(plan.workers)
+    if runtime.remote:
+        return over, Runtime("sync", memory=BASE_BYTES + max(need, LEAST_BYTES))
+    if min(cases, plan.workers) <= 1:
+        return over, replace(runtime, quiet=True)
+    own = (runtime.memory - BASE_BYTES) // min(cases, plan.workers)
+    # Processes have an interpreter each; threads share theirs.
+    return over, Runtime("sync", memory=own + BASE_BYTES * (runtime.cluster == "threads"))
+
+
+def _case(
+    folder: Path, config: RunConfig, code: str, runtime: Runtime, item: tuple[str, str]
+) -> bool:
     """Diagnose a case; gives whether that failed.
 
     Whatever breaks the diagnosis is a case answered wrong, and no end of the examination.
     """
     name, left_out = item
     run_dir = folder / RUNS / name
-    if config.again:
+    # What other code has left is not gone on with: a case is one version's.
+    if config.again or _begun_by(run_dir) != code:
         shutil.rmtree(run_dir, ignore_errors=True)
     run_dir.mkdir(parents=True, exist_ok=True)
+    write_json(run_dir / BEGUN, {"code": code})
+    start = time.perf_counter()
     try:
         ingest.run(folder / name, run_dir, ingest.Config(), runtime)
         reduce.run(run_dir, reduce.Config(), runtime)
         diagnose.run(run_dir, diagnose.Config(without=(left_out,)), runtime)
-    except (ClusterError, OSError, MemoryError):
+    except (ClusterError, PlanError, OSError, MemoryError):
         raise
     except Exception as error:
         facts = {"error": f"{type(error).__name__}: {error}", "where": traceback.format_exc()}
         write_json(run_dir / FAILED, facts)
+        seconds = {"diagnosis": time.perf_counter() - start, "maps": 0.0}
+        _say_sat(run_dir, code, seconds, "not diagnosed")
         return True
-    (run_dir / FAILED).unlink(missing_ok=True)
+    diagnosed = time.perf_counter()
+    without_maps = _fit_maps(run_dir, runtime)
     if not config.keep:
         _clear(run_dir, LARGE)
+    seconds = {"diagnosis": diagnosed - start, "maps": time.perf_counter() - diagnosed}
+    _say_sat(run_dir, code, seconds, without_maps)
     return False
+
+
+def _begun_by(run_dir: Path) -> str | None:
+    """The code that a case was begun with, if that is told."""
+    try:
+        return str(read_json(run_dir / BEGUN)["code"])
+    except (DamagedError, FileNotFoundError, LookupError, TypeError):
+        return None
+
+
+def _say_sat(run_dir: Path, code: str, seconds: Mapping[str, float], no_maps: str) -> None:
+    rounded = {what: round(value, 1) for what, value in seconds.items()}
+    write_json(run_dir / SAT, {"code": code, "seconds": rounded, "no_maps": no_maps})
+
+
+def _fit_maps(run_dir: Path, runtime: Runtime) -> str:
+    """Make the offset maps, as fitted and as corrected; gives why there are none."""
+    try:
+        correct.run(run_dir, correct.Config(), runtime)
+    except (ClusterError, PlanError, OSError, MemoryError):
+        raise
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return ""
 
 
 def _clear(run_dir: Path, names: Sequence[str]) -> None:

@@ -48,6 +48,11 @@ def _between(low: float, high: float, rng: np.random.Generator) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
+def _either(size: float, rng: np.random.Generator) -> float:
+    """Of either sign."""
+    return size if rng.random() < 0.5 else -size
+
+
 def _only(name: str, strengths: tuple[str, ...], **more: Any) -> Make:
     """One strength of several, the others zero."""
     return lambda s, rng: dict.fromkeys(strengths, 0.0) | more | {name: s}
@@ -89,8 +94,7 @@ def _every_other_row(s: float, rng: np.random.Generator) -> Plain:
 
 
 def _bent(s: float, rng: np.random.Generator) -> Plain:
-    sign = 1 if rng.random() < 0.5 else -1
-    return {"quadratic": sign * s, "cubic": float(s * rng.uniform(-0.4, 0.4))}
+    return {"quadratic": _either(s, rng), "cubic": float(s * rng.uniform(-0.4, 0.4))}
 
 
 _BIAS = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e")
@@ -118,6 +122,7 @@ WAYS = (
     Way("fringe_drift", "ramp, rad/(px h)", 0.0018, 1.4e-4, _ramp),
     Way("fringe_drift", "vibration, rad/px", 4.7e-6, 1.1e-6, _vibration),
     Way("fringe_jitter", "vector, rad/px", 7.5e-6, 1.3e-6, _jitter),
+    Way("gain_error", "relative", 0.024, 0.0085, lambda s, rng: {"relative": _either(s, rng)}),
     Way("ghost_fringes", "share", 2.7e-4, 1.3e-4, _ghost),
     Way("hyperbolic_fringes", "foot, mm", 12, 1.1, lambda s, rng: {"foot_mm": _around(s, rng)}),
     Way("intensity_noise", "white, relative", 8e-5, 4.7e-5, _only("rms", ("line",))),

@@ -10,20 +10,39 @@ Plain = Mapping[str, Any]
 
 
 def as_markdown(score: Plain) -> str:
-    """Tables of a score: parts, confusion, failures."""
-    about = f"{len(score['cases'])} cases, size {score['size']}, seed {score['seed']}"
-    if score["purpose"] == "development":
-        about += " — **development seed: not an examination**"
+    """Tables of a score: parts, part 1 by effect, confusion, failures."""
+    wrong = [case for case in score["cases"] if not case["right"]]
     blocks = [
-        about + ".",
+        _about(score),
         _parts(score["parts"]),
         _medians(score["medians"]),
+        _maps(score["maps"]),
+        _effects(score["effects"]),
         "Named first, by what was in the data (alone in it, and a candidate):",
         _confusion(score["confusion"]),
-        _failures(score["cases"]),
+        _failures(wrong) if wrong else "No case was answered wrong.",
         *(f"{note}." for note in score["notes"]),
     ]
     return "\n\n".join(block for block in blocks if block) + "\n"
+
+
+def _about(score: Plain) -> str:
+    told = f"{len(score['cases'])} cases, size {score['size']}"
+    if score["seed"] is not None:
+        told += f", seed {score['seed']}"
+    if score["missing"]:
+        told += f"; **{len(score['missing'])} of {score['made']} are not diagnosed yet**"
+    if score["purpose"] == "development":
+        told += " — **development seed: not an examination**"
+    sittings = score["sittings"]
+    if len(sittings["codes"]) > 1:
+        told += f" — **diagnosed by {len(sittings['codes'])} versions of the program**"
+    seconds = sittings["median_seconds"]
+    if seconds["diagnosis"] is not None:
+        told += f". A case took {seconds['diagnosis']:.0f} s, its maps {seconds['maps']:.1f} s more"
+    if sittings["without_maps"]:
+        told += f"; {sittings['without_maps']} have no maps, for they could not be fitted"
+    return told + "."
 
 
 def _parts(parts: Mapping[str, Plain]) -> str:
@@ -31,8 +50,9 @@ def _parts(parts: Mapping[str, Plain]) -> str:
     for part, facts in parts.items():
         for question, count in facts["questions"].items():
             name, right = f"{part}: {facts['title']}", f"{count['right']} of {count['of']}"
-            rows.append((name, question, right, *_percent(count)))
-    return _table(("part", "question", "right", "share", "95 % interval"), rows)
+            rows.append((name, question, right, *_percent(count), *_target(count)))
+    header = ("part", "question", "right", "share", "95 % interval", "target", "reached")
+    return _table(header, rows)
 
 
 def _percent(count: Plain) -> tuple[str, str]:
@@ -42,15 +62,68 @@ def _percent(count: Plain) -> tuple[str, str]:
     return f"{100 * count['share']:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %"
 
 
+def _target(count: Plain) -> tuple[str, str]:
+    if "target" not in count:
+        return "", ""
+    told = f"≥ {100 * count['target']:.0f} %"
+    if count["share"] is None:
+        return told, ""
+    return told, "yes" if count["share"] >= count["target"] else "**no**"
+
+
 def _medians(medians: Mapping[str, float | None]) -> str:
-    names = {
-        "closed": "share of the gap closed",
-        "oracle": "by the true effects",
-        "offset_before_px": "error of the offsets before, px",
-        "offset_after_px": "after, px",
-    }
+    names = {"closed": "share of the gap closed", "oracle": "by the true effects"}
     known = [f"{names[n]} {v:.3g}" for n, v in medians.items() if v is not None]
     return f"Medians of part 1: {', '.join(known)}." if known else ""
+
+
+def _maps(maps: Plain) -> str:
+    """Errors of the offsets, in Cramér-Rao bounds."""
+    if not maps["all"]["maps"]:
+        return ""
+    titles = {"all": "all of part 1", "biased": "those that the effect biases"}
+    rows = []
+    for which, title in titles.items():
+        own = maps[which]
+        if not own["maps"]:
+            rows.append((title, 0, "", "", "", "", ""))
+            continue
+        of_target = ("", "")
+        if which == "biased":
+            reached = "yes" if own["after"] <= maps["target"] else "**no**"
+            of_target = (f"≤ {maps['target']}", reached)
+        within = own["within_target"]
+        rows.append(
+            (
+                title, own["maps"], f"{own['before']:.2f}", f"{own['after']:.2f}",
+                f"{within['right']} ({_percent(within)[1]})", *of_target,
+            )
+        )  # fmt: skip
+    header = (
+        "maps along x or y", "number", "median error as fitted, bounds", "as corrected",
+        f"at most {maps['target']} bounds", "target of the median", "reached",
+    )  # fmt: skip
+    return _table(header, rows)
+
+
+def _effects(effects: Mapping[str, Plain]) -> str:
+    if not effects:
+        return ""
+    rows = []
+    for name, own in effects.items():
+        counts = [f"{own[k]['right']} of {own[k]['of']}" for k in ("below_twice", "from_twice")]
+        closed = "" if own["closed"] is None else f"{own['closed']:.2f}"
+        rows.append((name, *counts, closed, *(_before_after(o) for o in own["offsets"].values())))
+    header = (
+        "part 1", "named first below twice the threshold", "from there", "gap closed, median",
+        "error along x, bounds", "along y",
+    )  # fmt: skip
+    return _table(header, rows)
+
+
+def _before_after(own: Mapping[str, float | None]) -> str:
+    before, after = own["before"], own["after"]
+    return "" if before is None or after is None else f"{before:.2f} → {after:.2f}"
 
 
 def _confusion(confusion: Mapping[str, Mapping[str, int]]) -> str:
@@ -61,24 +134,28 @@ def _confusion(confusion: Mapping[str, Mapping[str, int]]) -> str:
     return _table(("in the data", "cases", "named first", "instead"), rows)
 
 
-def _failures(cases: Sequence[Plain]) -> str:
+def _failures(wrong: Sequence[Plain]) -> str:
     rows = [
         (
             case["case"],
             case["part"],
-            ", ".join(case["truth"]) or "nothing",
-            case["way"],
+            case["way"] or "nothing",
             "" if case["times"] is None else f"{case['times']:.1f}",
-            ", ".join(case["named"]) or case["verdict"],
+            ", ".join(_claimed(one) for one in case["claims"]) or case["verdict"],
+            "; ".join(f"{one['statistic']} ({one['place']})" for one in case["worst"][:1]),
             case["why"],
         )
-        for case in cases
-        if not case["right"]
+        for case in wrong
     ]
-    if not rows:
-        return "No case was answered wrong."
-    header = ("case", "part", "in the data", "how", "× threshold", "answer", "why")
+    header = ("case", "part", "in the data", "× threshold", "answer", "worst", "why")
     return "Answered wrong:\n\n" + _table(header, rows)
+
+
+def _claimed(one: Plain) -> str:
+    told = [] if one["sigmas"] is None else [f"{one['sigmas']:.1f} sigmas"]
+    if one["gap_closed"] is not None:
+        told.append(f"closes {one['gap_closed']:.2f}")
+    return f"{one['effect']} ({', '.join(told)})" if told else str(one["effect"])
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

@@ -4,7 +4,7 @@ A side gives the offset along any direction that its fringe sets measure, its va
 modes that this side's fit took off, as they come out in that direction.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -217,7 +217,7 @@ def whole_run(run: Path, label: str | None = None) -> Side:
     first = ArrayReader(group / next(iter(result["sets"])) / "delta")
     window = (first.shape[0], first.shape[1])
     sets = tuple(
-        FittedSet(name, group / name, _shape(run, facts, acquisition, window))
+        FittedSet(name, group / name, fitted_shape(run, facts, acquisition, window))
         for name, facts in result["sets"].items()
     )
     told = {
@@ -231,10 +231,26 @@ def whole_run(run: Path, label: str | None = None) -> Side:
     )  # fmt: skip
 
 
-def _shape(
-    run: Path, facts: dict[str, Any], acquisition: Acquisition, window: tuple[int, int]
+def fitted_shape(
+    run: Path, facts: Mapping[str, Any], acquisition: Acquisition, window: tuple[int, int]
 ) -> FringeShape:
-    """The fringes as fitted, from pixel (0, 0)."""
+    """The fringes of a set as fitted, from pixel (0, 0).
+
+    Parameters
+    ----------
+    run : Path
+        For messages.
+    facts : mapping
+        What ``fit.json`` says of the set.
+    acquisition : Acquisition
+    window : (int, int)
+        (y, x), px.
+
+    Raises
+    ------
+    InputError
+        If they were fitted by a model that is not known here.
+    """
     phase, origin = facts["phase_at_origin_rad"], (0.0, 0.0)
     if facts["model"] == "paraxial":
         return Paraxial(phase, facts["kx"], facts["ky"], origin, max(window) / 2)

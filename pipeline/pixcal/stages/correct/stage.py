@@ -22,6 +22,7 @@ from pixcal.stages.correct.restored_set import RestoredSet
 from pixcal.stages.correct.treatment import HYPERBOLIC, Treatments, treatments
 from pixcal.stages.correct.uncertainty import parameter_errors
 from pixcal.stages.correct.undoing import Swept, undo_on_maps
+from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
 from pixcal.stages.fit import Config as FitConfig
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
 from pixcal.stages.fit.maps import Totals, write_maps
@@ -80,7 +81,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         If the run was not diagnosed, or not as it is reduced now; if an effect that was found is of
         the user's own and its file was not given, or undoes what it should not.
     """
-    diagnosed = require(run_dir, "diagnose", 1)
+    diagnosed = require(run_dir, "diagnose", DIAGNOSIS_FORMAT)
     if diagnosed.inputs["reduce"] != require(run_dir, "reduce", 1).key:
         raise InputError(
             f"{run_dir / 'diagnose'}: of frames that were reduced otherwise; run "

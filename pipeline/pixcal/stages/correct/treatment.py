@@ -30,6 +30,8 @@ ABSORBED = {
 
 LEFT = {
     "cosmic_hits": "few samples are hit; most of those the reduction has left out",
+    "gain_error": "offsets stay and SIGMA is wrong: mend gain_e_per_adu in acquisition.yaml, or "
+    "'pixcal reduce --gain measured', and fit again",
     "quantisation": "rounding is noise of the samples, and costs offsets hundredths of the bound",
     "rolling_shutter": "rows hold light of two frames; what the fit does not take up is a tenth of "
     "the bound of 300 frames",

@@ -19,6 +19,7 @@ from scipy.ndimage import maximum_filter
 from pixcal.estimators.corrected import corrected_offsets, phase_change, straight_modes
 from pixcal.estimators.evidence import Evidence, FringeEvidence
 from pixcal.estimators.structure import Offsets, smooth_surface, true_offsets
+from pixcal.estimators.wander import Wander, wander_of
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.processes import ramp_step
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
@@ -65,8 +66,8 @@ class SetTruth:
         Fringe vector, rad/px.
     step : float
         Of a ramp of the phase, rad; zero: random phases.
-    first : float
-        Phase of the first frame of a ramp.
+    wander : Wander
+        What a ramp's phases are besides.
     """
 
     light: F32
@@ -74,7 +75,7 @@ class SetTruth:
     psi: F64
     k: tuple[float, float]
     step: float
-    first: float
+    wander: Wander
 
     def phase(self, delta_x: F32, delta_y: F32) -> F64:
         """Phase (y, x) of the pixels at their offsets (px), rad."""
@@ -128,7 +129,8 @@ class Measured(Effect):
         """As in `Effect.states`."""
         own, count = self.sets[recording.number], recording.count
         if own.step:
-            phi = own.first + own.step * np.arange(count, dtype=np.float64)
+            command = own.step * np.arange(count, dtype=np.float64)
+            phi = command + own.wander.drawn(command, recording.rng(self.name))
         else:
             phi = 2 * np.pi * recording.rng(self.name).random(count)
         still = np.zeros(count)
@@ -286,6 +288,7 @@ def nominal_bench(
     acquisition: Acquisition,
     tables: Mapping[str, Table],
     evidence: Sequence[Evidence],
+    halves: Sequence[Half],
     reduction: reduce.Config,
     dtypes: Mapping[str, np.dtype[Any]],
 ) -> NominalBench:
@@ -298,6 +301,8 @@ def nominal_bench(
         Of all frames.
     evidence : sequence of Evidence
         Of the same pixels, e.g. two halves of the frames.
+    halves : sequence of Half
+        The frames of each.
     reduction : reduce.Config
     dtypes : mapping
         Of the samples of each array.
@@ -310,9 +315,18 @@ def nominal_bench(
     one = evidence[0]
     good = np.all([e.good for e in evidence], axis=0)
     names = list(one.fringes)
-    flat = _mean([e.flat for e in evidence])
-    sets = tuple(_set_truth([e.fringes[name] for e in evidence]) for name in names)
-    fits = tuple(_fitted([e.fringes[name] for e in evidence], one.origin, flat) for name in names)
+    with_flats = "flat" in tables
+    flat = _mean([e.flat for e in evidence]) if with_flats else _response_of_fringes(evidence)
+    sets = tuple(
+        _set_truth(
+            [e.fringes[name] for e in evidence],
+            [half.frames[f"fringes/{name}"] for half in halves],
+            len(tables[f"fringes/{name}"]["time_s"]),
+        )
+        for name in names
+    )
+    known = flat.astype(float) if with_flats else None
+    fits = tuple(_fitted([e.fringes[name] for e in evidence], one.origin, known) for name in names)
     maps = DetectorMaps(
         delta_x=np.zeros(good.shape, np.float32),
         delta_y=np.zeros(good.shape, np.float32),
@@ -341,7 +355,27 @@ def _mean(maps: Sequence[F64]) -> F32:
     return np.asarray(values, np.float32)
 
 
-def _fitted(found: Sequence[FringeEvidence], origin: tuple[int, int], flat: F32) -> FittedSet:
+def _response_of_fringes(evidence: Sequence[Evidence]) -> F32:
+    """Response as the light of the fringes shows it, where there are no flats.
+
+    Its scatter is lessened by what is noise, for the simulation adds its own.
+    """
+    parts = []
+    for one in evidence:
+        for found in one.fringes.values():
+            light = np.where(found.good, found.theta[0], np.nan)
+            parts.append(light / smooth_surface(light, found.good))
+    if len(parts) < 2:
+        return np.ones(evidence[0].good.shape, np.float32)
+    mean, seen = np.mean(parts, axis=0) - 1, float(np.nanvar(np.mean(parts, axis=0)))
+    noise = float(np.nanmean(np.var(parts, axis=0, ddof=1))) / len(parts)
+    true = np.sqrt(max(seen - noise, 0.0) / seen) if seen > 0 else 0.0
+    return np.asarray(1 + true * np.nan_to_num(mean), np.float32)
+
+
+def _fitted(
+    found: Sequence[FringeEvidence], origin: tuple[int, int], flat: F64 | None
+) -> FittedSet:
     one = found[0]
     good = np.all([f.good for f in found], axis=0)
     k = float(np.hypot(*one.k))
@@ -359,7 +393,7 @@ def _fitted(found: Sequence[FringeEvidence], origin: tuple[int, int], flat: F32)
         np.where(bad, np.nan, sigma),
         one.k,
         origin,
-        flat.astype(float),
+        flat,
     )
 
 
@@ -372,7 +406,9 @@ def _uncoupled(dark: F64) -> F64:
     return np.where(beside, np.median(dark), dark)
 
 
-def _set_truth(found: Sequence[FringeEvidence]) -> SetTruth:
+def _set_truth(
+    found: Sequence[FringeEvidence], frames: Sequence[NDArray[np.intp]], count: int
+) -> SetTruth:
     """Straight, steady fringes with the offsets that can be true ones."""
     one = found[0]
     good = np.all([f.good for f in found], axis=0)
@@ -394,7 +430,7 @@ def _set_truth(found: Sequence[FringeEvidence]) -> SetTruth:
         psi=psi,
         k=one.k,
         step=ramp_step(one.phi),
-        first=float(one.phi[0]),
+        wander=wander_of(found, frames, count, ramp_step(one.phi)),
     )
 
 

@@ -120,7 +120,7 @@ def evidence_of(raw: Raw, folder: Path, part: Part, window: tuple[int, int]) -> 
         made.summary.update(arrays=facts, warnings=[])
     reduce.run(folder, raw.reduction, runtime)
     if raw.acquisition.frames.fringes:
-        fit.run(folder, fit.Config(model="paraxial"), runtime)
+        fit.run(folder, fit.Config(model="paraxial"), runtime, products=False)
     found = load_evidence(folder)
     origin = (part[0][0], part[1][0])
     return replace(

@@ -10,8 +10,16 @@ from scipy.special import log_ndtr
 from pixcal import __version__
 from pixcal.estimators.battery import DETECTOR, Curve, Key
 from pixcal.estimators.battery.signature import statistic_named
-from pixcal.estimators.gap import Expectation, Reference, flagged, likelier, sigmas_of
+from pixcal.estimators.gap import (
+    Difference,
+    Expectation,
+    Reference,
+    flagged,
+    likelier,
+    sigmas_of,
+)
 from pixcal.model.config import to_plain
+from pixcal.stages.diagnose.deciding import deciding
 from pixcal.stages.diagnose.search import Candidate, Found, Shrinkage, Trial, differing, shrinkage
 
 F64 = NDArray[np.float64]
@@ -23,6 +31,7 @@ LEFT = 0.25
 """and share of any one statistic's that is off by more than"""
 STILL = 6.0
 """standard deviations: less can be the simulation of the effects themselves."""
+DOMAINS = ("space", "time", "intensity", "noise")
 SHOWN = 3
 """Statistics named that gave a cause away."""
 
@@ -33,6 +42,7 @@ def describe(
     measured: Mapping[Key, Curve],
     reference: Reference,
     facts: Mapping[str, Any],
+    places: Sequence[Mapping[str, Any]] = (),
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The product, and every curve as measured, nominal and with the effects found.
 
@@ -46,13 +56,15 @@ def describe(
     reference : Reference
     facts : mapping
         What was looked at.
+    places : sequence of mapping
+        How far windows are off by themselves, `by_domain`.
     """
     where = differing(found.nominal, found.final, data)
     final = shrinkage(data, found.nominal, found.final, where)
     verdict = _verdict(found, final)
     curves = _curves(found, final, data, measured, reference)
     by_key = {(c["statistic"], c["set"]): c for c in curves}
-    causes = [_cause(name, found, data, where, final) for name in found.taken]
+    causes = [_cause(name, found, data, where, final, facts) for name in found.taken]
     diagnosis = {
         "schema": SCHEMA,
         "pixcal": __version__,
@@ -63,21 +75,45 @@ def describe(
             "after": _rounded(final.gap.total),
             "interval": [_rounded(v) for v in final.interval],
             "domains": {
-                domain: [_rounded(v) for v in final.gap.of_domain(domain)]
-                for domain in ("space", "time", "intensity", "noise")
+                domain: [_rounded(v) for v in final.gap.of_domain(domain)] for domain in DOMAINS
             },
             "where": _where(final, by_key),
             "absolute": _absolute(final, by_key),
+            "places": list(places),
         },
         "candidates": [
             _candidate(c, found, data, where)
             for c in found.candidates.values()
             if c.name not in found.taken
         ],
+        "more_would_tell": (
+            deciding(facts["missing_frames"])
+            if verdict in ("unexplained", "partly explained")
+            else []
+        ),
         "statistics": len(final.before),
         "looked_at": dict(facts),
     }
     return diagnosis, curves
+
+
+def by_domain(
+    before: Mapping[Key, Difference], after: Mapping[Key, Difference]
+) -> dict[str, list[float]]:
+    """Standard deviations of the statistic that is furthest off in each domain, before and after.
+
+    Of chance, all statistics of the domain being looked at; at least zero.
+    """
+    found = {}
+    for domain in DOMAINS:
+        keys = [k for k in before if statistic_named(k[0]).domain == domain]
+        found[domain] = [
+            _rounded(max(sigmas_of(min(one[k].log_chance for k in keys) + np.log(len(keys))), 0.0))
+            if keys
+            else 0.0
+            for one in (before, after)
+        ]
+    return found
 
 
 def _verdict(found: Found, final: Shrinkage) -> str:
@@ -94,7 +130,12 @@ def _verdict(found: Found, final: Shrinkage) -> str:
 
 
 def _cause(
-    name: str, found: Found, data: Mapping[Key, F64], where: set[Key], final: Shrinkage
+    name: str,
+    found: Found,
+    data: Mapping[Key, F64],
+    where: set[Key],
+    final: Shrinkage,
+    facts: Mapping[str, Any],
 ) -> dict[str, Any]:
     candidate = found.candidates[name]
     estimate = candidate.estimate
@@ -104,9 +145,12 @@ def _cause(
     alone = shrinkage(data, found.nominal, only, where)
     without = shrinkage(data, found.nominal, found.without[name], where)
     gain = found.final.log_likelihood - found.without[name].log_likelihood
+    alike = found.alike.get(name, ())
+    kinds = [type(e.effect) for n in (name, *alike) if (e := found.candidates[n].estimate)]
     # Two independent parts of the frames, joined by Fisher's rule.
     log_both = float(log_ndtr(-estimate.significance)) - max(gain, 0.0)
-    chance = len(found.candidates) * np.exp(max(log_both, -600.0)) * (1 - max(log_both, -600.0))
+    trials = len(found.candidates) * candidate.ways
+    chance = trials * np.exp(max(log_both, -600.0)) * (1 - max(log_both, -600.0))
     return {
         "effect": name,
         "title": effect.title,
@@ -119,7 +163,8 @@ def _cause(
         "sigmas": _rounded(estimate.significance),
         "why": estimate.why,
         "given_away_by": _telling(found.without[name], found.final, data),
-        "not_told_apart_from": list(found.alike.get(name, ())),
+        "not_told_apart_from": list(alike),
+        "would_decide": deciding(facts["missing_frames"], kinds) if alike else [],
     }
 
 

@@ -83,12 +83,15 @@ class Candidate:
         Why it was not taken; empty when it was.
     alone : Trial, optional
         With it alone in the bench.
+    ways : int
+        In how many ways it was tried, of which the likeliest was taken.
     """
 
     name: str
     estimate: Estimate | None
     reason: str = ""
     alone: Trial | None = None
+    ways: int = 1
 
 
 @dataclass(frozen=True)
@@ -144,21 +147,15 @@ class Search:
     def run(self, candidates: Mapping[str, Candidate]) -> Found:
         """Search; ``reason`` of the candidates is filled in."""
         open_ones = {n: c for n, c in candidates.items() if c.estimate and not c.reason}
-        # Where something differs, also those are tried that could not be told from another effect.
-        differs = bool(flagged(compare(self.data, self.nominal.expected)))
-        for name, candidate in list(open_ones.items()):
-            assert candidate.estimate is not None
-            least = HINTED if differs else SURE
-            if candidate.estimate.significance < least or candidate.estimate.effect.is_null:
-                size = candidate.estimate.significance
-                candidate.reason = f"not seen in the frames it was fitted on ({size:.1f} sigma)"
-                del open_ones[name]
         taken: list[str] = []
         effects: dict[str, Effect] = {}
         alike: dict[str, tuple[str, ...]] = {}
         current = self.nominal
         shares = dict.fromkeys(open_ones, 1.0)
-        while open_ones and len(taken) < MOST:
+        while len(taken) < MOST:
+            self._drop_unseen(open_ones, shares, current)
+            if not open_ones:
+                break
             trials = self._tried(effects, open_ones, shares)
             if not taken:
                 for name, (trial, _) in trials.items():
@@ -190,6 +187,25 @@ class Search:
             candidate.reason = candidate.reason or "the unseen frames get no likelier with it"
         return self._ablated(taken, effects, current, candidates, alike)
 
+    def _drop_unseen(
+        self, open_ones: dict[str, Candidate], shares: Mapping[str, float], current: Trial
+    ) -> None:
+        """Leave those out that the first frames do not show, beyond what the effects taken do.
+
+        Where something differs, also those are tried that could not be told from another effect.
+        """
+        least = HINTED if flagged(compare(self.data, current.expected)) else SURE
+        for name, candidate in list(open_ones.items()):
+            assert candidate.estimate is not None
+            size = candidate.estimate.significance * shares.get(name, 1.0)
+            if size < least or candidate.estimate.effect.is_null:
+                beside = f" beside {' and '.join(e.name for e in current.effects)}"
+                candidate.reason = (
+                    f"not seen in the frames it was fitted on ({size:.1f} sigma"
+                    f"{beside if current.effects else ''})"
+                )
+                del open_ones[name]
+
     @staticmethod
     def _least(candidate: Candidate) -> float:
         """By how much the unseen frames must become likelier with a candidate."""
@@ -209,14 +225,20 @@ class Search:
         open_ones: dict[str, Candidate],
         shares: Mapping[str, float],
     ) -> dict[str, tuple[Trial, Effect]]:
-        """Each candidate added to the effects taken, as strong as estimated and as what is left."""
+        """Each candidate added to the effects taken, in its likeliest way.
+
+        As estimated, and without strengths that may be zero; as strong as that, and as what is left
+        beside the effects taken.
+        """
         options: list[tuple[str, Effect]] = []
         for name, candidate in open_ones.items():
             assert candidate.estimate is not None
-            whole = candidate.estimate.effect
-            options.append((name, whole))
+            whole, sure = candidate.estimate.effect, candidate.estimate.sure
+            ways = [whole, *([sure] if sure != whole else [])]
             if shares.get(name, 1.0) < 0.9:
-                options.append((name, whole.scaled(shares[name])))
+                ways += [way.scaled(shares[name]) for way in ways]
+            candidate.ways = max(candidate.ways, len(ways))
+            options += [(name, way) for way in ways]
         benches = [(*effects.values(), effect) for _, effect in options]
         simulated = self._simulate(benches, SCREEN, f"candidates, round {len(effects) + 1}")
         found: dict[str, tuple[Trial, Effect]] = {}

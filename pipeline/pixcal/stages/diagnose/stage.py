@@ -15,17 +15,18 @@ from pixcal.effects import effect_of_file, effects, parse_effects
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.gap import Reference
+from pixcal.estimators.gap import Reference, compare, expect_nominal, expect_with
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.bench import load_bench
 from pixcal.model.config import parse, quantity, to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages import reduce
+from pixcal.stages.diagnose.deciding import missing_frames
 from pixcal.stages.diagnose.nominal import nominal_bench
 from pixcal.stages.diagnose.parts import Half, evidence_of, take
-from pixcal.stages.diagnose.result import describe
-from pixcal.stages.diagnose.search import SURE, Candidate, Search
+from pixcal.stages.diagnose.result import by_domain, describe
+from pixcal.stages.diagnose.search import CONFIRM, SCREEN, SURE, Candidate, Found, Search
 from pixcal.stages.diagnose.trial import (
     Curves,
     Effects,
@@ -35,7 +36,7 @@ from pixcal.stages.diagnose.trial import (
     estimate,
     looked_at,
 )
-from pixcal.stages.diagnose.windows import chosen_windows, split
+from pixcal.stages.diagnose.windows import chosen_windows, split, whole_of
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.artefact import (
@@ -49,14 +50,15 @@ from pixcal.storage.artefact import (
     write_json,
 )
 
-FORMAT = 1
+FORMAT = 2
 REFERENCES = 16
 """Simulations of the nominal bench."""
-EVIDENCE_BYTES = 30
-"""Evidence in memory, for each sample of all fringe sets (measured, as the next two)."""
-LOOK_BYTES = 65
+EVIDENCE_BYTES = 34
+"""Evidence in memory and the run that it is made of, for each sample of all fringe sets (measured,
+as the next two)."""
+LOOK_BYTES = 50
 """What the statistics of one set need beside it, for each sample of the largest set."""
-ESTIMATE_BYTES = 190
+ESTIMATE_BYTES = 130
 """What the hungriest estimate, that of crosstalk, needs beside it."""
 LEARN_SEED = 900_000
 CLEAR = 20.0
@@ -173,7 +175,8 @@ def _diagnose(
         return signatures
 
     look = look_at(run_dir, scratch, runtime, learnt)
-    trials = Trials(look.windows, scratch, look.runtime, signatures)
+    estimates = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
+    trials = Trials(look.windows, scratch, look.runtime, signatures, estimates, SCREEN)
     (nominal,) = trials.curves([base], REFERENCES, "nominal bench")
     if isinstance(nominal, str):
         raise InputError(f"--nominal: {nominal}")
@@ -196,7 +199,26 @@ def _diagnose(
         again,
     )
     found = search.run(candidates)
-    return describe(found, data, look.measured, reference, look.facts)
+    return describe(
+        found, data, look.measured, reference, look.facts, _places(look, trials, base, found)
+    )
+
+
+def _places(look: "Look", trials: Trials, base: Effects, found: Found) -> list[dict[str, Any]]:
+    """How far each window is off by itself, unless one is all there is."""
+    if len(look.windows) == 1 and look.windows[0].part == whole_of(look.windows[0].whole):
+        return []
+    places = []
+    for number, window in enumerate(look.windows):
+        own = Reference.of(trials.of_window(number, base, REFERENCES))
+        data = own.on_scale(look.each[number])
+        nominal = compare(data, expect_nominal(own))
+        final = nominal
+        if found.taken:
+            bench = (*base, *found.final.effects)
+            final = compare(data, expect_with(own, trials.of_window(number, bench, CONFIRM)))
+        places.append({"window": _plain_part(window.part), "domains": by_domain(nominal, final)})
+    return places
 
 
 @dataclass(frozen=True)
@@ -209,8 +231,10 @@ class Look:
         That effects are fitted on.
     windows : tuple of Window
         That they are tried on.
+    each : tuple of mapping
+        Curves of the test frames of each window.
     measured : mapping
-        Curves of the test frames, mean of the windows.
+        Their mean.
     facts : dict
         What is told of it.
     runtime, few : Runtime
@@ -219,6 +243,7 @@ class Look:
 
     first: Window
     windows: tuple[Window, ...]
+    each: tuple[Curves, ...]
     measured: Curves
     facts: dict[str, Any]
     runtime: Runtime
@@ -271,17 +296,25 @@ def look_at(
         for half in (own.learn, own.test):
             folder = scratch / f"data-{len(windows)}-{len(halves)}"
             raw = take(ingested, acquisition, half, part, reduction)
-            halves.append(evidence_of(raw, folder, part, shape))
+            try:
+                halves.append(evidence_of(raw, folder, part, shape))
+            except InputError as error:
+                which = ("first", "second")[len(halves)]
+                reason = str(error).replace(f"{folder}: ", "")
+                raise InputError(f"{run_dir}: the {which} half of its frames: {reason}") from error
             shutil.rmtree(folder)
         if not windows:
             signatures = tuple(learnt(halves[0], few))
-        bench = nominal_bench(acquisition, ingested.tables, halves, reduction, dtypes)
+        bench = nominal_bench(
+            acquisition, ingested.tables, halves, (own.learn, own.test), reduction, dtypes
+        )
         windows.append(Window(part, bench, own.learn, own.test, shape))
         if part in parts:
             measured.append(looked_at(halves[1], signatures))
     return Look(
         windows[0],
         tuple(w for w in windows if w.part in parts),
+        tuple(measured),
         averaged(measured),
         {
             "shape": list(shape),
@@ -292,6 +325,7 @@ def look_at(
             },
             "kinds": [kind for kind in ("bias", "dark", "flat") if kind in ingested.tables],
             "sets": {s.name: list(s.baseline_mm) for s in acquisition.frames.fringes},
+            "missing_frames": missing_frames(acquisition, ingested.tables),
         },
         runtime,
         few,

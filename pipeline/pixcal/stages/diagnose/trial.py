@@ -1,25 +1,29 @@
 """The bench taken again: simulations of the windows that are looked at, through the same stages."""
 
-import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.engine.scratch import scratch
 from pixcal.estimators.battery import Curve, Key, measure
 from pixcal.estimators.battery.signature import signature_curve, signature_key
 from pixcal.estimators.evidence import Evidence
 from pixcal.model.config import to_plain
-from pixcal.model.errors import InputError
+from pixcal.model.errors import DamagedError, InputError
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.nominal import NominalBench
 from pixcal.stages.diagnose.parts import Half, evidence_of
 from pixcal.stages.evidence import Part
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.manifest import digest
+
+RUN_SHARE = 3
+"""Times the raw frames that a run made of them may take."""
 
 Curves = dict[Key, Curve]
 Effects = tuple[Effect, ...]
@@ -48,12 +52,13 @@ class Window:
     whole: tuple[int, int]
 
     def evidence(
-        self, half: Half, effects: Effects, seed: int, scratch: Path, *, fitted: bool = True
+        self, half: Half, effects: Effects, seed: int, otherwise: Path, *, fitted: bool = True
     ) -> Evidence:
         """A half of the frames, taken again with some effects (`NominalBench.simulate`)."""
         raw = self.bench.simulate(half, effects, seed, fitted=fitted)
-        with tempfile.TemporaryDirectory(dir=scratch) as folder:
-            return evidence_of(raw, Path(folder) / "run", self.part, self.whole)
+        need = RUN_SHARE * sum(frames.nbytes for frames in raw.arrays.values())
+        with scratch(need, otherwise) as folder:
+            return evidence_of(raw, folder / "run", self.part, self.whole)
 
 
 @dataclass(frozen=True)
@@ -68,13 +73,19 @@ class Trials:
     runtime : Runtime
     signatures : tuple of type
         Effects whose estimates are statistics too.
+    estimates : mapping
+        By name, of effects whose parameters are known within errors: from the seed ``exact`` on
+        they are moved by these, so that the scatter of the simulations holds what they leave open.
+    exact : int
     """
 
     windows: tuple[Window, ...]
     scratch: Path
     runtime: Runtime
     signatures: tuple[type[Effect], ...] = ()
-    _made: dict[tuple[frozenset[Effect], int], Curves | str] = field(default_factory=dict)
+    estimates: Mapping[str, Estimate] = field(default_factory=dict)
+    exact: int = 0
+    _made: dict[tuple[frozenset[Effect], int], list[Curves] | str] = field(default_factory=dict)
 
     def curves(
         self, benches: Sequence[Effects], seeds: int, label: str
@@ -91,26 +102,51 @@ class Trials:
         Returns
         -------
         list
-            For each bench its simulations, or why it cannot be simulated.
+            For each bench its simulations (means over the windows), or why it cannot be simulated.
         """
         wanted = [(frozenset(bench), seed) for bench in benches for seed in range(seeds)]
         missing = [one for one in dict.fromkeys(wanted) if one not in self._made]
         places = range(len(self.windows))
         items = [(tuple(bench), seed, n) for bench, seed in missing for n in places]
         if items:
-            work = partial(_kept_or_made, self.windows, self.scratch, self.signatures)
-            results = run_tasks(work, items, self.runtime, label=label)
+            results = self._simulated(items, label)
             for number, one in enumerate(missing):
                 own = results[number * len(places) : (number + 1) * len(places)]
                 wrong = [r for r in own if isinstance(r, str)]
                 kept = [r for r in own if not isinstance(r, str)]
-                self._made[one] = wrong[0] if wrong else averaged(kept)
+                self._made[one] = wrong[0] if wrong else kept
         found: list[list[Curves] | str] = []
         for bench in benches:
-            own = [self._made[frozenset(bench), seed] for seed in range(seeds)]
-            wrong = [r for r in own if isinstance(r, str)]
-            found.append(wrong[0] if wrong else [r for r in own if not isinstance(r, str)])
+            made = [self._made[frozenset(bench), seed] for seed in range(seeds)]
+            wrong = [r for r in made if isinstance(r, str)]
+            right = [averaged(r) for r in made if not isinstance(r, str)]
+            found.append(wrong[0] if wrong else right)
         return found
+
+    def _simulated(self, items: Sequence[tuple[Effects, int, int]], label: str) -> list[Any]:
+        work = partial(_kept_or_made, self.windows, self.scratch, self.signatures)
+        moved = [(self._moved(effects, seed), seed, n) for effects, seed, n in items]
+        results = run_tasks(work, moved, self.runtime, label=label)
+        # What is refused as moved may do as it was.
+        again = [
+            n
+            for n, (one, other) in enumerate(zip(moved, items, strict=True))
+            if isinstance(results[n], str) and one != other
+        ]
+        if again:
+            exact = run_tasks(work, [items[n] for n in again], self.runtime, label=label)
+            for n, result in zip(again, exact, strict=True):
+                results[n] = result
+        return results
+
+    def _moved(self, effects: Effects, seed: int) -> Effects:
+        known = self.estimates if seed >= self.exact else {}
+        return tuple(known[e.name].scattered(e, seed) if e.name in known else e for e in effects)
+
+    def of_window(self, number: int, bench: Effects, seeds: int) -> list[Curves]:
+        """Statistics of a window by itself, of a bench that `curves` has simulated."""
+        made = [self._made[frozenset(bench), seed] for seed in range(seeds)]
+        return [r[number] for r in made if not isinstance(r, str)]
 
 
 def _kept_or_made(
@@ -124,8 +160,8 @@ def _kept_or_made(
     on = sorted((e.name, to_plain(e)) for e in effects)
     name = digest(on, seed, number, windows[number].part, sorted(k.name for k in signatures))
     file = scratch / f"{name}.json"
-    if file.exists():
-        plain = read_json(file)
+    plain = _kept(file)
+    if plain is not None:
         if "curves" not in plain:
             return str(plain["refused"])
         return {
@@ -134,11 +170,20 @@ def _kept_or_made(
         }
     made = _made(windows, scratch, signatures, item)
     if isinstance(made, str):
-        write_json(file, {"refused": made})
+        plain = {"refused": made}
     else:
-        rows = [(*key, c.x.tolist(), c.value.tolist()) for key, c in made.items()]
-        write_json(file, {"curves": rows})
+        plain = {"curves": [[*key, c.x.tolist(), c.value.tolist()] for key, c in made.items()]}
+    write_json(file, plain | {"seal": digest(plain)})
     return made
+
+
+def _kept(file: Path) -> dict[str, Any] | None:
+    """What an interrupted run has left, if it is as it was written."""
+    try:
+        plain: dict[str, Any] = read_json(file)
+        return plain if plain.pop("seal") == digest(plain) else None
+    except (DamagedError, AttributeError, KeyError):
+        return None
 
 
 def _made(

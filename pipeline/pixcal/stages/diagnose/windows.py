@@ -13,6 +13,8 @@ SIDE = 128
 """Pixels along the side of a window on a large detector: those of a chunk of the cube."""
 LARGEST = 160
 """Rows or columns of a detector that is taken whole."""
+APART = 4
+"""Sides of a window that a detector has at least where windows lie on chunks."""
 SAMPLES = 6_000_000
 """Samples of a fringe set that are looked at in each half of the frames and each window."""
 FEWEST = 4
@@ -26,21 +28,26 @@ def chosen_windows(shape: tuple[int, int]) -> tuple[Part, tuple[Part, ...]]:
     fitted in the middle and tried in four other places as well.
     """
     if max(shape) <= LARGEST:
-        whole = ((0, shape[0]), (0, shape[1]))
-        return whole, (whole,)
+        return whole_of(shape), (whole_of(shape),)
 
     def place(share_y: float, share_x: float) -> Part:
         spans = []
         for size, share in zip(shape, (share_y, share_x), strict=True):
             side = min(SIDE, size)
-            first = round((size - side) * share / SIDE) * SIDE
-            first = min(first, size - side)
+            # On chunks of the cube, where there are enough to lie apart on.
+            grid = SIDE if size >= APART * SIDE else 1
+            first = min(round((size - side) * share / grid) * grid, size - side)
             spans.append((first, first + side))
         return spans[0], spans[1]
 
     middle = place(0.5, 0.5)
     others = {place(y, x) for y, x in ((0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9))}
     return middle, tuple(sorted(others))
+
+
+def whole_of(shape: tuple[int, int]) -> Part:
+    """All rows and columns."""
+    return (0, shape[0]), (0, shape[1])
 
 
 @dataclass(frozen=True)

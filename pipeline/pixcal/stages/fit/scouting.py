@@ -1,6 +1,6 @@
 """The scout's part of the sweep: frame parameters of a set, from a few tiles."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, one_blas_thread, run_tasks
 from pixcal.estimators.fringes import FrameParameters
-from pixcal.estimators.scout import Scout
+from pixcal.estimators.scout import Scout, in_turn
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader, write_array
@@ -86,25 +86,36 @@ def scout_set(
     order = sorted(range(len(tiles)), key=lambda n: -int(tiles[n].good.sum() > 100))
     places, tiles = [places[n] for n in order], [tiles[n] for n in order]
     ny, nx = source.shape
-    scout = Scout(tiles, source.coding, nominal, ((ny - 1) / 2, (nx - 1) / 2))
+    # Here, whatever does the rest: in other processes nothing would be kept for the sweep.
+    here = replace(runtime, cluster="sync" if runtime.cluster == "sync" else "threads", quiet=True)
+    if runtime.remote:
+        here = here.with_workers(0)
+    # The chunks kept; the first look's codes, copies of a tile's share, and its Gram matrix; for
+    # each task the sums of a tile, or chunks that are not kept.
+    kept = len(places) * tile_bytes if keep else 0
+    what = f"the scout of {name}"
+    per_task = (4 if keep else max(4, len(places))) * chunk_bytes
+    plan = make_plan(what, per_task, 3 * PRIME_BYTES + kept, here)
+    here = here.with_workers(plan.workers)
+    each = partial(run_tasks, runtime=here, label=f"first look at {name}")
+    scout = Scout(tiles, source.coding, nominal, ((ny - 1) / 2, (nx - 1) / 2), each)
     lookout = Lookout(source, places, keep)
 
-    # The chunks kept; the first look's codes, copies of a tile's share, and its Gram matrix.
-    kept = len(places) * tile_bytes if keep else 0
-    make_plan(f"the scout of {name}", 0, 3 * PRIME_BYTES + kept, runtime.with_workers(1))
     first = _first_look(source, PRIME_BYTES // (len(places) * chunk_bytes))
-    looks = [[codes[some] for codes in lookout.codes(n)] for n, some in first]
+    looks = run_tasks(partial(_look, lookout), first, here, label=f"first look at {name}")
     with one_blas_thread():
-        scout.prime([np.concatenate(tile) for tile in zip(*looks, strict=True)])
+        parts = [scout.prime([np.concatenate(tile) for tile in zip(*looks, strict=True)])]
     del looks
-    # A chunk of each place and what its solution takes.
-    plan = make_plan(f"the scout of {name}", 3 * len(places) * chunk_bytes, kept, runtime)
-    parts = run_tasks(
-        partial(_solve_block, lookout, scout),
-        range(source.n_blocks),
-        runtime.with_workers(plan.workers),
-        label=f"scout {name}",
-    )
+    scout.each = in_turn
+    if len(parts[0].g) < source.n_frames:
+        # A chunk of each place and what its solution takes.
+        plan = make_plan(what, 3 * len(places) * chunk_bytes, kept, runtime)
+        parts = run_tasks(
+            partial(_solve_block, lookout, scout),
+            range(source.n_blocks),
+            runtime.with_workers(plan.workers),
+            label=f"scout {name}",
+        )
     g = np.concatenate([p.g for p in parts])
     dk = np.concatenate([p.dk for p in parts])
     for array, data in (("g", g), ("dk", dk), ("time", source.time_s())):
@@ -122,6 +133,11 @@ def scout_set(
         "chunks_read": len(places) * source.n_blocks if keep else again,
     }
     write_json(folder / "scout.json", facts)
+
+
+def _look(lookout: Lookout, wanted: tuple[int, NDArray[np.intp]]) -> list[NDArray[np.uint16]]:
+    block, frames = wanted
+    return [codes[frames] for codes in lookout.codes(block)]
 
 
 def _solve_block(lookout: Lookout, scout: Scout, block: int) -> FrameParameters:

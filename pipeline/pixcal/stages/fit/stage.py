@@ -43,12 +43,12 @@ class Config:
     )
 
 
-def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
+def run(run_dir: Path, config: Config, runtime: Runtime, *, products: bool = True) -> Manifest:
     """Fit every fringe set of a run and write the offset maps.
 
     Reads ``RUN/reduce``; makes ``RUN/sweep`` (when it is not up to date) and ``RUN/fit``, and
     writes the products ``delta_x.fits``, ``delta_y.fits`` (with one fringe axis:
-    ``delta_fringe.fits``) and ``fit.json``.
+    ``delta_fringe.fits``) and ``fit.json``, unless ``products`` is false.
 
     Raises
     ------
@@ -57,19 +57,21 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """
     require(run_dir, "reduce", 1)
     acquisition, _ = load_run(run_dir)
-    if sets := [listed.name for listed in acquisition.frames.fringes]:
+    sets = [listed.name for listed in acquisition.frames.fringes]
+    if products and sets:
         plan_products(run_dir, sets, runtime)
     with lock(run_dir):
         swept = sweep.run(run_dir, sweep.Config(config.batch_frames, config.chi2_limit), runtime)
         inputs = {"sweep": swept.key}
         key = artefact_key("fit", FORMAT, asdict(config), inputs)
         if (ready := up_to_date(run_dir, "fit", key)) is not None:
-            if not published(run_dir):
+            if products and not published(run_dir):
                 publish(run_dir)
             return ready
         with build(run_dir, "fit", FORMAT, asdict(config), inputs) as made:
             made.summary = _fit_all(run_dir, made, swept, config, runtime)
-        publish(run_dir)
+        if products:
+            publish(run_dir)
         return require(run_dir, "fit", FORMAT)
 
 

@@ -1,0 +1,289 @@
+"""What `pixcal diagnose` can be given: odd acquisitions, damaged runs, own effects, benches."""
+
+import json
+import os
+import shutil
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from fuzzing.laws import RUNTIME, Answer, Broken, Case, Kind, lasting_folder, pixcal
+from fuzzing.night import Night
+
+SHAPE, COUNT = (16, 19), 50
+"""As small as can be diagnosed: 24 frames in each half."""
+VECTORS = {"vertical": (2 * np.pi / 5.3, 0.02)}
+ONLY = ("--effects", "intensity_noise")
+"""One candidate, so that a case takes a second and not ten."""
+VERDICTS = ("explained", "partly explained", "unexplained", "no gap")
+
+
+def diagnosed(run: Path, *more: str | Path, names: tuple[str, ...] = ()) -> Answer:
+    """Diagnose, and look whether what is told is a diagnosis."""
+    if pixcal("diagnose", run, *ONLY, *more, *RUNTIME, names=names) == 2:
+        return "refused"
+    told = verdict(run)
+    if told["verdict"] not in VERDICTS:
+        raise Broken(f"verdict {told['verdict']}")
+    if bool(told["causes"]) != (told["verdict"] in VERDICTS[:2]):
+        raise Broken(f"{told['verdict']} with {len(told['causes'])} causes")
+    return "truthful"
+
+
+def verdict(run: Path) -> dict[str, Any]:
+    """The product."""
+    told: dict[str, Any] = json.loads((run / "products" / "diagnosis.json").read_text())
+    return told
+
+
+def reduced(night: Night, folder: Path, dtype: str = "uint16") -> Path | None:
+    """A run up to `reduce`, or None where that is refused."""
+    acquisition, run = night.write(folder / "acquisition", dtype), folder / "run"
+    for line in (("ingest", acquisition, "--out", run), ("reduce", run)):
+        if pixcal(*line, *RUNTIME) == 2:
+            return None
+    return run
+
+
+# Acquisitions
+
+
+def _odd(case: Case) -> Answer:
+    """Frames with which a diagnosis has little or nothing to begin."""
+    what = str(case.pick("few", "tiny", "saturated", "constant", "no fringes", "masked", "alone",
+                         "still", "short", "loud"))  # fmt: skip
+    shape = (7, 5) if what == "tiny" and case.number % 2 else SHAPE
+    if what == "tiny" and case.number % 2 == 0:
+        shape = tuple(int(n) for n in case.rng.integers(1, 12, 2))
+    count = int(case.rng.integers(1, 60)) if what == "few" else COUNT
+    phases = np.zeros(COUNT) if what == "still" else None
+    level = 5.0 if what == "short" else 2e4
+    vectors = VECTORS | ({"horizontal": (0.01, 1.2)} if case.number % 5 == 0 else {})
+    night = Night(case.rng, shape, count=count, vectors=vectors, phases=phases, level=level)
+    fringes = night.frames["vertical"]
+    if what == "saturated":
+        night.described["detector"]["saturation_adu"] = float(np.quantile(fringes, 0.3))
+    elif what == "constant":
+        night.frames["vertical"] = np.full_like(fringes, 5000.0)
+    elif what == "no fringes":
+        night.frames["vertical"] = case.rng.poisson(2e4, fringes.shape) + 300.0
+    elif what == "masked":
+        night.frames["bias"][:, case.rng.random(shape) < case.pick(0.9, 1.0)] = np.nan
+    elif what == "alone":  # no bias, dark or flat
+        night.described["frames"]["bias"] = []
+        del night.frames["bias"]
+    elif what == "loud":
+        night.frames["vertical"] = fringes * (1 + 0.3 * case.rng.standard_normal((count, 1, 1)))
+    run = reduced(night, case.folder, "float32" if what == "masked" else "uint16")
+    if run is None:
+        return "refused"
+    answer = diagnosed(run, names=(str(run), "--memory", "fringes/"))
+    if answer == "truthful" and what in ("few", "tiny", "alone") and verdict(run)["causes"]:
+        raise Broken(f"{what}: a cause was claimed of a nominal bench")
+    return answer
+
+
+# Artefacts
+
+
+@cache
+def _runs() -> tuple[Path, Path, dict[str, Any]]:
+    """A run, another one, and the diagnosis of the first."""
+    folder = lasting_folder()
+    runs = []
+    for number in (1, 2):
+        night = Night(np.random.default_rng(number), SHAPE, count=COUNT, vectors=VECTORS)
+        run = reduced(night, folder / str(number))
+        assert run is not None
+        runs.append(run)
+    whole = folder / "whole"
+    shutil.copytree(runs[0], whole)
+    assert diagnosed(whole) == "truthful"
+    return whole, runs[1], verdict(whole)
+
+
+def _spoil(case: Case, file: Path) -> None:
+    body = bytearray(file.read_bytes())
+    how = str(case.pick("flip", "flip", "cut", "zero", "remove", "text", "folder", "empty"))
+    if how == "flip" and body:
+        at = int(case.rng.integers(8 * len(body)))
+        body[at >> 3] ^= 1 << (at & 7)
+    file.unlink()
+    if how == "cut":
+        del body[int(case.rng.integers(len(body) + 1)) :]
+    spoilt = {"zero": bytes(len(body)), "text": b"[]\n", "empty": b""}
+    if how == "folder":
+        file.mkdir()
+    elif how != "remove":
+        file.write_bytes(spoilt.get(how, bytes(body)))
+
+
+def _artefacts(case: Case) -> Answer:
+    """Files of RUN damaged or gone; stages missing, or those of another run."""
+    whole, other, told = _runs()
+    run = case.folder / "run"
+    shutil.copytree(whole, run, copy_function=os.link)
+    what = str(case.pick("file", "file", "file", "file", "file", "other", "gone", "run"))
+    stage = str(case.pick("ingest", "reduce"))
+    if what == "file":
+        files = sorted(f for f in run.rglob("*") if f.is_file() and f.name != ".lock")
+        chunks = [f for f in files if "/c/" in f.as_posix()]
+        few = [f for f in files if f not in chunks and "/diagnose/" not in f.as_posix()]
+        pool = [files, chunks, few][case.number % 3]
+        if case.pick(True, True, False):
+            shutil.rmtree(run / "diagnose")
+            pool = [f for f in pool if f.exists()]
+        _spoil(case, pool[int(case.rng.integers(len(pool)))])
+    elif what == "run":
+        shutil.rmtree(run)
+        case.pick(lambda: None, run.mkdir, run.touch)()  # type: ignore[operator]
+    else:
+        shutil.rmtree(run / stage)
+        if what == "other":
+            shutil.copytree(other / stage, run / stage)
+    answer = diagnosed(run, names=(str(run),))
+    if answer == "truthful" and verdict(run) != told:
+        raise Broken(f"another diagnosis than that of the whole run: {verdict(run)['verdict']}")
+    return answer
+
+
+# Effects of the user's own
+
+OWN = '''
+from dataclasses import dataclass
+import numpy as np
+from pixcal.model.config import quantity
+from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect, Estimate, Stage
+
+@dataclass(frozen=True)
+class Glow(Effect):
+    """Light of the amplifier."""
+
+    name, title, stage = "glow", "amplifier glow", Stage.LIGHT
+    domains, strengths, sources = ("intensity",), ("electrons",), ("a guess, to be measured",)
+    electrons: float = quantity(100.0, unit="e-", low=0, doc="in every pixel")
+
+    def photons(self, mean, shot):
+        return mean + self.electrons
+
+    @classmethod
+    def estimate(cls, evidence):
+        return Estimate(cls(electrons=50.0), {"electrons": 1.0}, 50.0, "made up")
+'''
+ANSWER = 'return Estimate(cls(electrons=50.0), {"electrons": 1.0}, 50.0, "made up")'
+LIGHT = "return mean + self.electrons"
+BROKEN = (
+    ("", ""), (ANSWER, "return None"), (ANSWER, "raise ValueError('two\\nlines')"),
+    (ANSWER, "raise InputError('glow: no darks; take some')"), (ANSWER, "return 3"),
+    (ANSWER, "return float('nan')"), (ANSWER, "return cls()"), (ANSWER, "1 / 0"),
+    (ANSWER, "raise SystemExit(3)"), (ANSWER, "exit('bye')"), (ANSWER, "return []"),
+    (ANSWER, "return evidence.nothing"), (ANSWER, "return cls.estimate(evidence)"),
+    (ANSWER, "return Estimate(None, {}, 50.0, '')"), (ANSWER, "return Estimate()"),
+    (ANSWER, "return np.array(1.0)"), (ANSWER, "raise MemoryError"),
+    (ANSWER, "evidence.good[:] = False; return None"),
+    ("electrons=50.0", "electrons=float('nan')"), ("electrons=50.0", "electrons=-1.0"),
+    ("electrons=50.0", "electrons='many'"), ("electrons=50.0", "electrons=1e30"),
+    ("electrons=50.0", "protons=1.0"), ('"electrons": 1.0}', '"electrons": float("nan")}'),
+    ('"electrons": 1.0}', '"electrons": 0.0}'), ('"electrons": 1.0}', '"electrons": -1.0}'),
+    ('{"electrons": 1.0}', "{}"), ('{"electrons": 1.0}', "None"),
+    ('{"electrons": 1.0}', '{"protons": 1.0}'), ("50.0, \"made", "float('nan'), \"made"),
+    ("50.0, \"made", "float('inf'), \"made"), ("50.0, \"made", "'much', \"made"),
+    ("50.0, \"made", "-50.0, \"made"), ("50.0, \"made", "np.float32(50), \"made"),
+    ('"made up"', "None"), ('"made up"', "'two\\nlines <b>&'"),
+    ("@classmethod\n", "\n"), ("(cls, evidence)", "(cls)"), ("class Glow", "clas Glow"),
+    ("(Effect)", "(Exception)"), ("(Effect)", ""), ("(frozen=True)", ""),
+    (LIGHT, "return mean * float('nan')"), (LIGHT, "raise ValueError('x')"), (LIGHT, "return None"),
+    (LIGHT, "return mean[:1]"), (LIGHT, "raise SystemExit(3)"), (LIGHT, "return mean - 1e9"),
+    (LIGHT, "return mean * 1e300"), (LIGHT, "return 'light'"),
+)  # fmt: skip
+
+
+def _own(case: Case) -> Answer:
+    """A broken file of an effect as a candidate; what cannot be estimated is no cause."""
+    whole, _, _ = _runs()
+    old, new = BROKEN[case.number % len(BROKEN)]
+    text = OWN.replace(old, new) if old else OWN
+    if case.number >= len(BROKEN):
+        old, new = BROKEN[int(case.rng.integers(len(BROKEN)))]
+        text = text.replace(old, new) if old else text
+    own, run = case.folder / "own.py", case.folder / "run"
+    own.write_text(text, encoding="utf-8")
+    shutil.copytree(whole, run, copy_function=os.link, ignore=shutil.ignore_patterns("diagnose"))
+    effects = ("--own", own, "--effects", "intensity_noise,glow")
+    answer = diagnosed(run, *effects, names=("own.py", "glow", "Glow"))
+    if answer == "truthful" and any(c["effect"] == "glow" for c in verdict(run)["causes"]):
+        raise Broken("an effect that is not there was claimed")
+    return answer
+
+
+# The nominal bench
+
+BENCH: dict[str, Any] = {
+    "schema": "pixcal/bench/1",
+    "seed": 3,
+    "detector": {"shape": list(SHAPE), "pitch_um": 4.4, "gain_e_per_adu": 1.0, "read_noise_e": 16,
+                 "delta_rms_px": 2.0e-3},
+    "optics": {"wavelength_nm": 632.8, "distance_mm": 400.0, "beam_radius_mm": 30.0,
+               "visibility": 0.9},
+    "frames": {
+        "exptime_s": 0.02,
+        "period_s": 0.14,
+        "bias": 12,
+        "fringes": [
+            {"name": "vertical", "baseline_mm": [10.9, 0.0], "count": 50, "peak_e": 38000}
+        ],
+    },
+    "effects": {"lag": {}},
+}  # fmt: skip
+EFFECTS: tuple[Any, ...] = (
+    {"lag": {}}, {}, None, [], 3, "lag", {"lag": None}, {"lag": 3}, {"lag": {"x": 1}},
+    {"nowhere": {}}, {"ipc": {}, "lag": {}}, {"intensity_noise": {}}, {3: {}}, {"glow": {}},
+    {"quantisation": {}}, {"cosmic_hits": {}}, {"hyperbolic_fringes": {}}, {"straylight": {}},
+    {"nonlinearity": {}}, {"telegraph_noise": {}}, {"rolling_shutter": {}}, {"flat_error": {}},
+    {"lag": {"fraction": -1}}, {"lag": {"fraction": "a"}}, {"ipc": {"nearest": 3}},
+)  # fmt: skip
+
+
+def _nominal(case: Case) -> Answer:
+    """A bench file for `--nominal` that is none, that does not fit the run, or that does."""
+    whole, _, _ = _runs()
+    run, file = case.folder / "run", case.folder / "bench.yaml"
+    shutil.copytree(whole, run, copy_function=os.link, ignore=shutil.ignore_patterns("diagnose"))
+    bench = json.loads(json.dumps(BENCH))
+    bench["effects"] = EFFECTS[case.number % len(EFFECTS)]
+    text = yaml.safe_dump(bench)
+    if case.number >= len(EFFECTS):
+        how = str(case.pick("cut", "bytes", "key", "value", "acquisition", "empty", "folder"))
+        if how == "cut":
+            text = text[: int(case.rng.integers(len(text)))]
+        elif how == "bytes":
+            text = "".join(chr(int(c)) for c in case.rng.integers(1, 300, 200))
+        elif how == "acquisition":
+            text = (run.parent / "none").as_posix()
+        elif how == "empty":
+            text = ""
+        elif how == "folder":
+            file.mkdir()
+        else:
+            section = str(case.pick(*bench))
+            if how == "key":
+                del bench[section]
+            else:
+                bench[section] = case.pick(None, [], {}, "x", 1e300, -1)
+            text = yaml.safe_dump(bench)
+    if not file.is_dir():
+        file.write_text(text, encoding="utf-8")
+    names = ("bench.yaml", "effects", "--nominal")
+    return diagnosed(run, "--nominal", file, names=names)
+
+
+KINDS = [
+    Kind("diagnose-odd", "odd acquisitions, diagnosed", _odd, 60),
+    Kind("diagnose-run", "damaged, missing, exchanged artefacts, diagnosed", _artefacts, 60),
+    Kind("diagnose-own", "broken effects of the user's own, as candidates", _own, 60),
+    Kind("diagnose-nominal", "bench files for --nominal, bad and good", _nominal, 50),
+]

@@ -1,0 +1,163 @@
+"""The map of where: how far data are from simulations in the cells of a window, or in windows."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from numpy.typing import NDArray
+
+from pixcal.report.colours import GREY, INK
+from pixcal.report.drawing import WIDE, new_figure
+
+F64 = NDArray[np.float64]
+
+CELLS = "cell of 4 × 4"
+"""``x_label`` of curves whose values are cells of the window."""
+ASIDE = 3.0
+"""Standard deviations below which a map is not worth looking at."""
+MOST = 3
+"""Maps side by side."""
+COLOURS = "RdBu_r"
+LARGEST = 12.0
+"""Standard deviations at which colours end."""
+SMALLEST = 0.17
+"""Least side of a window in the picture, share of the detector's: real ones would be dots."""
+
+
+@dataclass(frozen=True)
+class Spot:
+    """A part of the detector and how far it is off.
+
+    Attributes
+    ----------
+    rows, columns : (float, float)
+        Ends.
+    sigmas : (float, float)
+        Before and after.
+    """
+
+    rows: tuple[float, float]
+    columns: tuple[float, float]
+    sigmas: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A map of one statistic or domain."""
+
+    title: str
+    spots: tuple[Spot, ...]
+
+    @property
+    def largest(self) -> float:
+        """Standard deviations of the spot that is furthest off, before or after."""
+        return max(abs(s) for spot in self.spots for s in spot.sigmas)
+
+
+def panels(
+    shape: tuple[int, int], places: Sequence[Mapping[str, Any]], curves: Sequence[Mapping[str, Any]]
+) -> list[Panel]:
+    """Maps that are worth looking at, the furthest off first.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Rows and columns of the detector's window.
+    places : sequence of mapping
+        Windows with ``domains``, of ``diagnosis.json``; of a small detector none.
+    curves : sequence of mapping
+        Of ``curves.json``; those by cells are maps.
+    """
+    found = _of_windows(places) if places else _of_cells(shape, curves)
+    found = [panel for panel in found if panel.largest > ASIDE]
+    return sorted(found, key=lambda panel: -panel.largest)[:MOST]
+
+
+def _of_windows(places: Sequence[Mapping[str, Any]]) -> list[Panel]:
+    domains = list(places[0]["domains"])
+    return [
+        Panel(
+            domain,
+            tuple(
+                Spot(tuple(p["window"][0]), tuple(p["window"][1]), tuple(p["domains"][domain]))
+                for p in places
+            ),
+        )
+        for domain in domains
+    ]
+
+
+def _of_cells(shape: tuple[int, int], curves: Sequence[Mapping[str, Any]]) -> list[Panel]:
+    found = []
+    for curve in curves:
+        if curve["x_label"] != CELLS:
+            continue
+        count = round(len(curve["z"]) ** 0.5)
+        edges = [np.linspace(0, size, count + 1) for size in shape]
+        spots = []
+        for n, sigmas in enumerate(zip(curve["z"], curve["z_after"], strict=True)):
+            row, column = divmod(n, count)
+            rows, columns = edges[0][row : row + 2], edges[1][column : column + 2]
+            spots.append(Spot((rows[0], rows[1]), (columns[0], columns[1]), sigmas))
+        found.append(Panel(f"{curve['title']}\nset {curve['set']}", tuple(spots)))
+    return found
+
+
+def where_figure(shape: tuple[int, int], maps: Sequence[Panel], *, with_after: bool) -> Figure:
+    """Maps side by side, in the nominal simulation and, below, with the causes."""
+    rows = 1 + with_after
+    figure = new_figure(WIDE * (1 + len(maps)) / 4, 0.9 + 3.0 * rows)
+    axes: Any = figure.subplots(rows, len(maps), squeeze=False, sharex=True, sharey=True)
+    largest = min(max(panel.largest for panel in maps), LARGEST)
+    scale = Normalize(-largest, largest)
+    for row, words in zip(axes, ("nominal simulation", "with the causes"), strict=False):
+        for number, (ax, panel) in enumerate(zip(row, maps, strict=True)):
+            after = ax in axes[-1] and with_after
+            _draw(ax, shape, panel, scale, after=after)
+            if not after:
+                ax.set_title(panel.title.replace("$", r"\$"), fontsize=11)
+            if number == 0:
+                ax.set_ylabel(f"{words}\nrow (px)")
+    for ax in axes[-1]:
+        ax.set_xlabel("column (px)")
+    return figure
+
+
+def _draw(
+    axes: Axes, shape: tuple[int, int], panel: Panel, scale: Normalize, *, after: bool
+) -> None:
+    colours = mpl.colormaps[COLOURS]
+    ny, nx = shape
+    axes.add_patch(Rectangle((0, 0), nx, ny, fill=False, edgecolor=GREY, linewidth=1))
+    for spot in panel.spots:
+        (top, left), (high, wide) = _shown(spot, shape)
+        sigma = spot.sigmas[after]
+        colour = colours(scale(sigma))
+        axes.add_patch(
+            Rectangle((left, top), wide, high, facecolor=colour, edgecolor="white", linewidth=1)
+        )
+        dark = abs(scale(sigma) - 0.5) > 0.33
+        axes.text(
+            left + wide / 2, top + high / 2, f"{sigma:.1f}".replace("-", "−"), ha="center",
+            va="center", fontsize=9, color="white" if dark else INK,
+        )  # fmt: skip
+    axes.set_xlim(-0.02 * nx, 1.02 * nx)
+    axes.set_ylim(1.02 * ny, -0.02 * ny)
+    axes.set_aspect("equal")
+
+
+def _shown(spot: Spot, shape: tuple[int, int]) -> tuple[tuple[float, float], tuple[float, float]]:
+    """First row and column, and rows and columns, large enough to be seen and within the window."""
+    starts, sizes = [], []
+    for (first, after), whole in zip((spot.rows, spot.columns), shape, strict=True):
+        size = max(after - first, SMALLEST * whole)
+        start = (first + after - size) / 2
+        starts.append(min(max(start, 0.0), whole - size))
+        sizes.append(size)
+    return (starts[0], starts[1]), (sizes[0], sizes[1])

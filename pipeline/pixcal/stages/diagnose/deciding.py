@@ -1,0 +1,75 @@
+"""Frames that an acquisition lacks and that would tell effects apart."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+
+from pixcal.model.acquisition import Acquisition
+from pixcal.simulation.effect import Effect
+from pixcal.stages.diagnose.parts import Table
+
+SAME_AXIS = 0.98
+"""Cosine of the angle below which two sets measure along one axis."""
+LADDER = 3
+"""Exposure times of flats that make a ladder."""
+MORE = "more frames of the same kind, with the phases in random order"
+
+
+def missing_frames(acquisition: Acquisition, tables: Mapping[str, Table]) -> dict[str, str]:
+    """Kinds of frames that are usual and that an acquisition does not have, each in words.
+
+    Parameters
+    ----------
+    acquisition : Acquisition
+    tables : mapping
+        As in ``frames.json``.
+
+    Returns
+    -------
+    dict
+        By kind, as in `Effect.told_by`.
+    """
+    axes = _axes([s.baseline_mm for s in acquisition.frames.fringes])
+    missing = {}
+    single = [name for name, lengths in axes if len(lengths) == 1]
+    if single:
+        missing["baseline"] = f"a second baseline along {' and '.join(single)}"
+    if len(axes) == 1:
+        missing["axis"] = "a fringe set along another axis"
+    for kind in ("dark", "flat"):
+        if kind not in tables:
+            missing[kind] = f"{kind} frames"
+    exposures = {t for t in tables.get("flat", {}).get("exptime_s", ()) if t is not None}
+    if len(exposures) < LADDER:
+        missing["ladder"] = f"a ladder of flats (at least {LADDER} exposure times)"
+    return missing
+
+
+def deciding(missing: Mapping[str, str], kinds: Iterable[type[Effect]] = (Effect,)) -> list[str]:
+    """Those of the missing frames that tell on some effects (default: on any)."""
+    wanted = {frames for kind in kinds for frames in kind.told_by}
+    return [words for frames, words in missing.items() if frames in wanted] or [MORE]
+
+
+def _axes(baselines: Iterable[Sequence[float]]) -> list[tuple[str, set[float]]]:
+    """Axes of the fringe sets, and the different lengths (mm) of their baselines."""
+    found: list[tuple[tuple[float, float], set[float]]] = []
+    for bx, by in baselines:
+        size = math.hypot(bx, by)
+        if size == 0:
+            continue
+        one = bx / size, by / size
+        for axis, lengths in found:
+            if abs(axis[0] * one[0] + axis[1] * one[1]) > SAME_AXIS:
+                lengths.add(round(size, 1))
+                break
+        else:
+            found.append((one, {round(size, 1)}))
+    return [(_axis_name(axis), lengths) for axis, lengths in found]
+
+
+def _axis_name(axis: tuple[float, float]) -> str:
+    if abs(axis[0]) > SAME_AXIS:
+        return "x"
+    if abs(axis[1]) > SAME_AXIS:
+        return "y"
+    return f"{math.degrees(math.atan2(axis[1], axis[0])) % 180:.0f}°"

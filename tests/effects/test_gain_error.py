@@ -1,0 +1,98 @@
+"""Gain error: the noise of light changes and its mean does not; found again, and told apart."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pixcal.effects.gain_error import GainError
+from pixcal.estimators.evidence import Evidence
+from pixcal.model.bench import Bench
+from pixcal.simulation.exposure import frames_of
+from pixcal.simulation.recording import recordings
+
+SHAPE = {"detector.shape": [41, 53]}
+
+
+@pytest.mark.parametrize("relative", [-0.4, 0.15, 2.0])
+def test_without_shot_noise_all_frames_stay(
+    make_effect_bench: Callable[..., Bench], relative: float
+) -> None:
+    bench = replace(make_effect_bench(SHAPE), shot_noise=False)
+    for recording in recordings(bench):
+        plain, on = (
+            frames_of(bench, recording, e).astype(int) for e in ((), (GainError(relative),))
+        )
+        # But for what is rounded the other way, now and then.
+        assert np.abs(on - plain).max() <= 1
+        assert np.mean(on != plain) < 0.02
+
+
+@pytest.mark.parametrize("relative", [-0.4, 0.15, 2.0])
+def test_shot_noise_is_that_of_the_true_electrons(
+    make_effect_bench: Callable[..., Bench], relative: float
+) -> None:
+    bench = make_effect_bench(SHAPE)
+    flat = [r for r in recordings(bench) if r.kind == "flat"][-1]
+    dark = next(r for r in recordings(bench) if r.kind == "bias")
+    variance = [
+        frames_of(bench, r, e).astype(float).var(axis=0, ddof=1).mean()
+        for r in (flat, dark)
+        for e in ((), (GainError(relative),))
+    ]
+    freedom = 19 * 41 * 53
+    assert (variance[1] - variance[3]) / (variance[0] - variance[2]) == pytest.approx(
+        1 / (1 + relative), rel=5 * np.sqrt(4 / freedom)
+    )
+    assert variance[3] == variance[2]
+
+
+def parts(evidence: Evidence) -> dict[str, Evidence]:
+    return {
+        "both": evidence,
+        "flats": replace(evidence, fringes={}),
+        "fringes": replace(evidence, stacks=evidence.of_kind("bias")),
+    }
+
+
+@pytest.mark.parametrize("relative", [-0.1, 0.03, 0.15])
+def test_its_size_is_found(acquired: Callable[..., Evidence], relative: float) -> None:
+    errors = {}
+    for name, evidence in parts(acquired(None, {"gain_error": {"relative": relative}})).items():
+        found = GainError.estimate(evidence)
+        assert found is not None
+        assert isinstance(found.effect, GainError)
+        errors[name] = found.errors["relative"]
+        assert abs(found.effect.relative - relative) < 3 * errors[name]
+        assert (found.significance > 5) or name == "flats"
+    assert errors["both"] < errors["fringes"] < 0.006
+    assert errors["flats"] < 0.016
+
+
+def test_nothing_is_found_where_the_gain_is_right(acquired: Callable[..., Evidence]) -> None:
+    for evidence in parts(acquired()).values():
+        found = GainError.estimate(evidence)
+        assert found is not None
+        assert found.significance < 3
+
+
+@pytest.mark.parametrize("other", ["ipc", "brighter_fatter", "row_noise", "nonlinearity"])
+def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: str) -> None:
+    found = GainError.estimate(acquired(None, {other: {}}))
+    assert found is not None
+    assert found.significance < 4
+
+
+def test_crosstalk_does_not_hide_it(acquired: Callable[..., Evidence]) -> None:
+    evidence = acquired(None, {"ipc": {}, "gain_error": {"relative": 0.05}})
+    found = GainError.estimate(evidence)
+    assert found is not None
+    assert isinstance(found.effect, GainError)
+    assert abs(found.effect.relative - 0.05) < 4 * found.errors["relative"] < 0.02
+
+
+def test_without_light_nothing_is_said(acquired: Callable[..., Evidence]) -> None:
+    evidence = acquired()
+    bare = replace(evidence, fringes={}, stacks=evidence.of_kind("bias"))
+    assert GainError.estimate(bare) is None

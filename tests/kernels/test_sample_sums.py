@@ -1,0 +1,82 @@
+"""Sums over samples, against NumPy on copies of them."""
+
+import numpy as np
+
+from pixcal.kernels.sample_sums import (
+    calm_residuals,
+    count_beyond,
+    frame_means,
+    level_sums,
+    neighbour_products,
+    pixel_moments,
+)
+
+SHAPE = (13, 19, 23)
+
+
+def some_frames() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Residuals with outliers and gaps, their variance, and the good pixels."""
+    rng = np.random.default_rng(11)
+    variance = rng.uniform(1, 9, SHAPE).astype(np.float32)
+    rest = (rng.standard_normal(SHAPE) * np.sqrt(variance)).astype(np.float32)
+    rest.flat[::97] *= 9
+    rest.flat[::89] = np.nan
+    good = rng.random(SHAPE[1:]) > 0.1
+    variance[:, ~good] = np.nan
+    return rest, variance, good
+
+
+def test_outliers_and_gaps_are_zero() -> None:
+    rest, variance, good = some_frames()
+    size = rest / np.sqrt(variance)
+    use = good & (np.abs(size) <= 8)
+    assert np.any(good & (np.abs(size) > 8))
+    calm, kept = calm_residuals(rest, variance, good, 8.0)
+    np.testing.assert_allclose(calm, np.where(use, size, 0), rtol=1e-6)
+    np.testing.assert_array_equal(kept, np.where(use, rest, 0))
+
+
+def test_outliers_are_counted_on_either_side() -> None:
+    rest, variance, good = some_frames()
+    size = (rest / np.sqrt(variance))[:, good]
+    limits = np.array([2.0, 5.0, 9.0])
+    below, above = count_beyond(rest, variance, good, limits)
+    assert above[-1] > 0
+    np.testing.assert_array_equal(below, [(size < -n).sum() for n in limits])
+    np.testing.assert_array_equal(above, [(size > n).sum() for n in limits])
+
+
+def test_sums_by_level_are_those_of_a_histogram() -> None:
+    rng = np.random.default_rng(12)
+    level, values, squared = rng.standard_normal((3, *SHAPE)).astype(np.float32)
+    good = rng.random(SHAPE[1:]) > 0.2
+    sums = np.zeros((4, 3))
+    level_sums(level, good, -1.0, 0.5, values, squared, sums)
+    # The first and the last bin take what is beyond them.
+    edges = [-np.inf, -0.5, 0.0, 0.5, np.inf]
+    own, weights = level[:, good], (1.0, values[:, good], squared[:, good] ** 2)
+    for n, weight in enumerate(weights):
+        each = np.broadcast_to(weight, own.shape).astype(float)
+        np.testing.assert_allclose(sums[:, n], np.histogram(own, edges, weights=each)[0], 1e-5)
+
+
+def test_moments_and_means_are_those_of_numpy() -> None:
+    rest, _, good = some_frames()
+    values = np.nan_to_num(rest)
+    second, fourth = pixel_moments(values)
+    np.testing.assert_allclose(second, (values.astype(float) ** 2).mean(axis=0))
+    np.testing.assert_allclose(fourth, (values.astype(float) ** 4).mean(axis=0))
+    values[:, ~good] = np.nan
+    np.testing.assert_allclose(frame_means(values, good), values[:, good].mean(axis=1, dtype=float))
+
+
+def test_neighbours_are_rows_down_and_columns_to_either_side() -> None:
+    rng = np.random.default_rng(13)
+    values = rng.standard_normal(SHAPE).astype(np.float32)
+    for dy, dx in ((0, 1), (1, 0), (2, 3), (1, -2)):
+        pairs = rng.random((SHAPE[1] - dy, SHAPE[2] - abs(dx))).astype(np.float32)
+        moved = np.roll(values, (-dy, -dx), axis=(1, 2))
+        first = max(0, -dx)
+        product = (values * moved)[:, : len(pairs), first : first + pairs.shape[1]]
+        expected = float((product * pairs).sum(dtype=float))
+        assert abs(neighbour_products(values, pairs, dy, dx) - expected) < 1e-3
