@@ -71,10 +71,10 @@ bench-full: $(INSTALLED) ## the same for 46 Mpix: time and memory (20 minutes, 6
 fuzz: $(INSTALLED) ## bad input in thousands of cases, for docs/fuzz.md (under ten minutes on two cores)
 	$(BIN)/python benchmarks/fuzz.py --write
 
-torture: $(TOOLS) ## faults of all kinds done on purpose, for docs/torture.md (a quarter of an hour)
+torture: $(TOOLS) ## faults of all kinds done on purpose, for docs/torture.md (12 minutes)
 	$(BIN)/python benchmarks/torture.py
 
-study-diagnose: $(INSTALLED) ## what the diagnosis claims by chance, and from which strength on it finds each effect (an hour)
+study-diagnose: $(INSTALLED) ## what the diagnosis claims by chance, and from which strength on it finds each effect (half an hour)
 	$(BIN)/python benchmarks/study_diagnose.py
 
 effect-pictures: $(INSTALLED) ## what every effect does to the offsets, for docs/effects (two minutes)

@@ -349,7 +349,7 @@ def main() -> None:
     """Play all cases, two at a time."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--nominal", type=int, default=40, help="acquisitions without an effect")
-    parser.add_argument("--seeds", type=int, default=3, help="for each effect and strength")
+    parser.add_argument("--seeds", type=int, default=2, help="for each effect and strength")
     parser.add_argument("--effects", nargs="*", default=list(effects()), help="default: all")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--publish", action="store_true", help="what was played, and no more")

@@ -12,6 +12,7 @@ import yaml
 
 from fuzzing.laws import RUNTIME, Answer, Broken, Case, Kind, lasting_folder, pixcal
 from fuzzing.night import Night
+from fuzzing.own_effects import GOOD
 
 SHAPE, COUNT = (16, 19), 50
 """As small as can be diagnosed: 24 frames in each half."""
@@ -152,28 +153,16 @@ def _artefacts(case: Case) -> Answer:
 
 # Effects of the user's own
 
-OWN = '''
-from dataclasses import dataclass
-import numpy as np
-from pixcal.model.config import quantity
-from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Effect, Estimate, Stage
-
-@dataclass(frozen=True)
-class Glow(Effect):
-    """Light of the amplifier."""
-
-    name, title, stage = "glow", "amplifier glow", Stage.LIGHT
-    domains, strengths, sources = ("intensity",), ("electrons",), ("a guess, to be measured",)
-    electrons: float = quantity(100.0, unit="e-", low=0, doc="in every pixel")
-
-    def photons(self, mean, shot):
-        return mean + self.electrons
-
+OWN = (
+    GOOD.replace("import Effect, Stage", "import Effect, Estimate, Stage").replace(
+        "from pixcal.model.config", "import numpy as np\nfrom pixcal.model.config"
+    )
+    + """
     @classmethod
     def estimate(cls, evidence):
         return Estimate(cls(electrons=50.0), {"electrons": 1.0}, 50.0, "made up")
-'''
+"""
+)
 ANSWER = 'return Estimate(cls(electrons=50.0), {"electrons": 1.0}, 50.0, "made up")'
 LIGHT = "return mean + self.electrons"
 BROKEN = (

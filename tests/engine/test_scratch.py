@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pixcal.engine import scratch as module
-from pixcal.engine.scratch import scratch
+from pixcal.engine.scratch import scratch_folder
 
 
 @pytest.fixture
@@ -20,12 +20,12 @@ def memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_it_is_in_memory_and_gone_at_the_end(memory: Path, tmp_path: Path) -> None:
-    with scratch(1000, tmp_path) as folder:
+    with scratch_folder(1000, tmp_path) as folder:
         assert folder.parent == memory
         (folder / "deep").mkdir()
         (folder / "deep" / "file").write_bytes(b"x")
     assert not list(memory.iterdir())
-    with pytest.raises(ZeroDivisionError), scratch(1000, tmp_path):
+    with pytest.raises(ZeroDivisionError), scratch_folder(1000, tmp_path):
         _ = 1 / 0
     assert not list(memory.iterdir())
 
@@ -38,7 +38,7 @@ def test_without_room_or_place_it_is_where_it_was_told(
     other.mkdir()
     if need == 1000:
         monkeypatch.setattr(module, "MEMORY", tmp_path / "no such place")
-    with scratch(need, other) as folder:
+    with scratch_folder(need, other) as folder:
         assert folder.parent == other
     assert not list(other.iterdir())
     assert not list(memory.iterdir())
@@ -48,7 +48,7 @@ KILLED = """
 import os, sys, pathlib
 from pixcal.engine import scratch
 scratch.MEMORY = pathlib.Path(sys.argv[1])
-with scratch.scratch(10, scratch.MEMORY) as folder:
+with scratch.scratch_folder(10, scratch.MEMORY) as folder:
     (folder / "file").write_bytes(b"x")
     os.kill(os.getpid(), 9)
 """
@@ -58,7 +58,7 @@ def test_a_folder_that_nobody_got_to_hold_is_removed_too(memory: Path, tmp_path:
     left = memory / "pixcal-scratch-abc"
     left.mkdir()
     os.utime(left, (1, 1))
-    with scratch(10, tmp_path):
+    with scratch_folder(10, tmp_path):
         assert not left.exists()
 
 
@@ -67,10 +67,10 @@ def test_what_a_killed_process_left_is_removed_and_what_is_in_use_is_not(
 ) -> None:
     subprocess.run([sys.executable, "-c", KILLED, str(memory)], check=False)
     (left,) = memory.iterdir()
-    with scratch(10, tmp_path) as used:
+    with scratch_folder(10, tmp_path) as used:
         assert left.exists(), "too young to be taken for abandoned"
         for folder in (left, used):
             os.utime(folder, (1, 1))
-        with scratch(10, tmp_path):
+        with scratch_folder(10, tmp_path):
             assert not left.exists()
             assert used.exists()

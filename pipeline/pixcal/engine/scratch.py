@@ -19,7 +19,7 @@ _YOUNG_S = 60.0
 
 
 @contextmanager
-def scratch(need: int, otherwise: Path) -> Iterator[Path]:
+def scratch_folder(need: int, otherwise: Path) -> Iterator[Path]:
     """A new folder, removed at the end.
 
     Parameters

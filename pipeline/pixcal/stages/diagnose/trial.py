@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.engine.scratch import scratch
+from pixcal.engine.scratch import scratch_folder
 from pixcal.estimators.battery import Curve, Key, measure
 from pixcal.estimators.battery.signature import signature_curve, signature_key
 from pixcal.estimators.evidence import Evidence
@@ -57,7 +57,7 @@ class Window:
         """A half of the frames, taken again with some effects (`NominalBench.simulate`)."""
         raw = self.bench.simulate(half, effects, seed, fitted=fitted)
         need = RUN_SHARE * sum(frames.nbytes for frames in raw.arrays.values())
-        with scratch(need, otherwise) as folder:
+        with scratch_folder(need, otherwise) as folder:
             return evidence_of(raw, folder / "run", self.part, self.whole)
 
 
