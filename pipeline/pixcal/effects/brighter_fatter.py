@@ -38,6 +38,7 @@ class BrighterFatter(Effect):
     domains = ("intensity", "noise", "space")
     strengths = ("shift_px_per_e",)
     told_by = ("ladder", "baseline")
+    quick = False
     sources = (
         "Antilogus et al. 2014, JINST 9, C03048: spots grow by up to 2 % over the full range; "
         "thinned sensors have it too",

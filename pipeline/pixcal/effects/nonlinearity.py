@@ -46,6 +46,7 @@ class Nonlinearity(Effect):
     domains = ("intensity",)
     strengths = ("quadratic", "cubic")
     told_by = ("ladder",)
+    quick = False
     sources = (
         "Rousset et al., table 1: 2 % linearity error of the GIGAPYX-4600 (design/paper.txt)",
         "Janesick, Photon Transfer (SPIE 2007), chapter 7: below 1 % of the source follower (V/V), "

@@ -30,7 +30,7 @@ _INDEPENDENT = 1e-3
 _NEGLIGIBLE = 1e-6
 
 _ROUNDS = 3
-"""Gauss-Newton steps; each gains a factor of the distortion's size."""
+"""Steps, all with the slopes of no distortion; each gains a factor of the distortion's size."""
 
 
 class Freedom:
@@ -197,54 +197,51 @@ def fit_distortions(
     covariance : (count, count) float64
         From the noise of the samples.
     """
-    fits = [_SetFit(fringes, margin) for fringes in sets]
+    fits = [_SetFit(fringes, distortion, count, margin) for fringes in sets]
+    known, information = (np.zeros(count), np.zeros(count)) if prior is None else prior
+    covariance = _inverse((sum(fit.normal for fit in fits) + np.diag(information))[None])[0]
     sizes = np.zeros(count)
     for _ in range(_ROUNDS):
-        normal, right = np.zeros((count, count)), np.zeros(count)
-        for fit in fits:
-            more, more_right = fit.sums(distortion, sizes)
-            normal += more
-            right += more_right
-        if prior is not None:
-            normal += np.diag(prior[1])
-            right += prior[1] * (prior[0] - sizes)
-        covariance = _inverse(normal[None])[0]
+        right = sum(fit.right(sizes) for fit in fits) + information * (known - sizes)
         sizes = sizes + covariance @ right
     return sizes, covariance
 
 
 class _SetFit:
-    """One set: its residuals, and what its fit took up of the distortion."""
+    """One set: its residuals, and what its fit took up of the distortion.
 
-    def __init__(self, fringes: FringeEvidence, margin: int) -> None:
-        self._fringes = fringes
+    Attributes
+    ----------
+    normal : (count, count) float64
+        Normal matrix of the sizes where there is no distortion.
+    """
+
+    def __init__(
+        self, fringes: FringeEvidence, distortion: Distortion, count: int, margin: int
+    ) -> None:
+        self._fringes, self._distortion = fringes, distortion
         self._freedom = Freedom(fringes, margin=margin)
         self._residual = self._freedom.left_over(self._freedom.of_good(fringes.residual))
         # Where there is no fit, the samples themselves act on the pixels around.
         seen = np.isfinite(fringes.electrons) & ~fringes.good
         self._fitted = np.nan_to_num(np.where(seen, fringes.electrons, fringes.model))
         self._signal = self._fitted
+        _, slopes = distortion(fringes, self._signal, np.zeros(count))
+        left = [self._freedom.left_over(self._freedom.of_good(slope)) for slope in slopes]
+        self._weighted = [self._freedom.weight * rest for rest in left]
+        self.normal = np.array([[_dot(a, b) for b in left] for a in self._weighted])
 
-    def sums(self, distortion: Distortion, sizes: F64) -> tuple[F64, F64]:
-        """Normal matrix and right-hand side for a step from some sizes to better ones."""
-        freedom = self._freedom
+    def right(self, sizes: F64) -> F64:
+        """Right-hand side for a step from some sizes to better ones."""
         residual = self._residual
         if np.any(sizes):
-            self._signal, residual = self._without(distortion, sizes)
-        _, slopes = distortion(self._fringes, self._signal, sizes)
-        left = [freedom.left_over(freedom.of_good(slope)) for slope in slopes]
-        weighted = [freedom.weight * rest for rest in left]
-        normal = np.array([[_dot(a, b) for b in left] for a in weighted])
-        return normal, np.array([_dot(a, residual) for a in weighted])
-
-    def _without(self, distortion: Distortion, sizes: F64) -> tuple[F32, F32]:
-        """Signal less what the fit took up of the distortion, and residual less what it left."""
-        freedom = self._freedom
-        change = freedom.of_good(distortion(self._fringes, self._signal, sizes)[0])
-        left = freedom.left_over(change)
-        signal = self._fitted.copy()
-        signal[:, freedom.good] -= change - left
-        return signal, self._residual - left
+            freedom = self._freedom
+            change = freedom.of_good(self._distortion(self._fringes, self._signal, sizes)[0])
+            left = freedom.left_over(change)
+            self._signal = self._fitted.copy()
+            self._signal[:, freedom.good] -= change - left
+            residual = residual - left
+        return np.array([_dot(a, residual) for a in self._weighted])
 
 
 def _dot(a: F32, b: F32) -> float:

@@ -1,8 +1,9 @@
 """What a part of an acquisition tells about its effects: samples, maps, frames, side by side."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from pixcal.kernels.bilinear import frame_sums
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+T = TypeVar("T")
 
 STRIPE = 4
 """Rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves."""
@@ -198,6 +200,16 @@ class Evidence:
     distance_mm: float
     notes: tuple[str, ...] = field(default=())
     origin: tuple[int, int] = (0, 0)
+    _found: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def once(self, name: str, *given: Any, make: Callable[[], T]) -> T:
+        """What follows from this evidence and what is given (hashable), made when first asked for.
+
+        For little things that several estimates need.
+        """
+        if (name, *given) not in self._found:
+            self._found[name, *given] = make()
+        return cast(T, self._found[name, *given])
 
     def level(self, fringes: FringeEvidence, signal: F32) -> F32:
         """Electrons in the pixels for a signal (t, y, x) of a set: flat and dark put back."""

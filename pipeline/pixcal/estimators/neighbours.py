@@ -68,6 +68,11 @@ def shared_charge(evidence: Evidence, shifts: F64) -> tuple[float, float] | None
     size, variance : float
         Of the shift by an electron, px; None where there are neither fringe frames nor flats.
     """
+    given = shifts.shape, shifts.tobytes()
+    return evidence.once("shared_charge", *given, make=lambda: _shared_charge(evidence, shifts))
+
+
+def _shared_charge(evidence: Evidence, shifts: F64) -> tuple[float, float] | None:
     n = 2 * len(DIRECTIONS) + 1
     normal, right = np.zeros((n, n)), np.zeros(n)
     for noise in _noises(evidence):

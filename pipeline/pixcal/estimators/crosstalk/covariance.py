@@ -132,14 +132,27 @@ def _powers(parts: Sequence[tuple[F32, F32, F32]], highest: int) -> tuple[F32, .
     From (factor, charge over sigma, one over sigma), all (t, y, x), to (y, x, t).
     """
     count = sum(len(factor) for factor, _, _ in parts)
-    factor, charge, one = np.empty((3, *parts[0][0].shape[1:], count), np.float32)
-    for out, arrays in zip((factor, charge, one), zip(*parts, strict=True), strict=True):
-        np.concatenate([a.transpose(1, 2, 0) for a in arrays], axis=2, out=out)
-    found = [factor * one]
-    charge /= np.maximum(one, TINY)
-    for _ in range(highest):
-        found.append(found[-1] * charge)
+    found = np.empty((highest + 1, *parts[0][0].shape[1:], count), np.float32)
+    first = 0
+    for part in parts:
+        _multiply_up(*(np.ascontiguousarray(a) for a in part), first, found)
+        first += len(part[0])
     return tuple(found)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _multiply_up(factor: F32, charge: F32, one: F32, first: int, powers: F32) -> None:
+    """The powers (n, y, x, t) of frames (t, y, x), from a place in time on."""
+    nt, ny, nx = factor.shape
+    for y in range(ny):
+        for left in range(0, nx, _COLUMNS):
+            for t in range(nt):
+                for x in range(left, min(left + _COLUMNS, nx)):
+                    value = factor[t, y, x] * one[t, y, x]
+                    ratio = charge[t, y, x] / max(one[t, y, x], TINY)
+                    for n in range(len(powers)):
+                        powers[n, y, x, first + t] = value
+                        value *= ratio
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

@@ -98,10 +98,13 @@ def class_sums(values: F64, first: Place) -> Iterator[tuple[Classes, F64]]:
     Rows first, then columns of those sums: the cost is that of the row periods.
     """
     wanted = periods((values.shape[-2], values.shape[-1]))
-    by_rows = {
-        n: np.stack([values[..., (a - first[0]) % n :: n, :].sum(-2) for a in range(n)], -2)
-        for n in {n for n, _ in wanted}
-    }
+    by_rows: dict[int, F64] = {}
+    for n in sorted({n for n, _ in wanted}, reverse=True):
+        # Of a multiple's sums there are few.
+        multiple = next((sums for longer, sums in by_rows.items() if longer % n == 0), None)
+        source, start = (values, first[0]) if multiple is None else (multiple, 0)
+        sums = [source[..., (a - start) % n :: n, :].sum(-2) for a in range(n)]
+        by_rows[n] = np.stack(sums, -2)
     for n, m in wanted:
         rows = by_rows[n]
         both = np.stack([rows[..., (b - first[1]) % m :: m].sum(-1) for b in range(m)], -1)
