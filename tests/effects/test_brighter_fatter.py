@@ -135,7 +135,10 @@ def test_its_size_is_found(acquired: Callable[..., Evidence], size: float) -> No
     found = BrighterFatter.estimate(acquired(None, {"brighter_fatter": {"shift_px_per_e": size}}))
     assert found is not None
     assert isinstance(found.effect, BrighterFatter)
-    assert abs(found.effect.shift_px_per_e - size) < 4 * found.errors["shift_px_per_e"] < 1e-8
+    # The falloff, which is found too, takes half of what is known of the size.
+    assert abs(found.effect.shift_px_per_e - size) < 4 * found.errors["shift_px_per_e"] < 2e-8
+    own = found.together[0]["shift_px_per_e"] if found.together else found.errors["shift_px_per_e"]
+    assert 4 * own < 1e-8
     assert found.significance > 8
     assert abs(found.details["of_noise"] - size) < 4 * found.details["of_noise_error"]
 
@@ -160,3 +163,33 @@ def test_what_looks_like_it_is_not_taken_for_it(
     found = BrighterFatter.estimate(acquired(None, {other: {}}))
     assert found is not None
     assert found.significance < 4
+
+
+@pytest.mark.parametrize("falloff", [0.35, 1.2])
+def test_by_itself_its_falloff_is_found_with_its_size(
+    acquired: Callable[..., Evidence], falloff: float
+) -> None:
+    changes = {"shift_px_per_e": 2e-7, "falloff_px": falloff}
+    found = BrighterFatter.estimate(acquired(None, {"brighter_fatter": changes}))
+    assert found is not None
+    assert isinstance(found.effect, BrighterFatter)
+    assert abs(found.effect.falloff_px - falloff) < 4 * found.errors["falloff_px"] < 0.4 * falloff
+    assert abs(found.effect.shift_px_per_e - 2e-7) < 4 * found.errors["shift_px_per_e"] < 1e-7
+    # A longer reach does with a smaller shift.
+    own, both = found.together
+    assert both["shift_px_per_e"] * both["falloff_px"] < 0
+    assert found.errors["shift_px_per_e"] == pytest.approx(
+        np.hypot(own["shift_px_per_e"], both["shift_px_per_e"])
+    )
+
+
+def test_beside_a_bent_response_it_is_not_taken_to_be_alone(
+    acquired: Callable[..., Evidence],
+) -> None:
+    both = {"brighter_fatter": {"shift_px_per_e": 2e-7}, "nonlinearity": {}}
+    found = BrighterFatter.estimate(acquired(None, both))
+    assert found is not None
+    assert isinstance(found.effect, BrighterFatter)
+    assert found.effect.falloff_px == 0.5
+    assert "falloff_px" not in found.errors
+    assert abs(found.effect.shift_px_per_e - 2e-7) < 4 * found.errors["shift_px_per_e"]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.middle import middle
 from pixcal.estimators.neighbours import shared_charge
-from pixcal.estimators.response import fit_response
+from pixcal.estimators.response import Boundaries, boundaries_alone, fit_response
 from pixcal.kernels.boundaries import REACH, area_changes, boundary_shifts, moved_charge
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
@@ -19,7 +19,14 @@ F32 = NDArray[np.float32]
 LEVEL = 5e4
 """Electrons at which powers of the level are one."""
 
+POWERS = 3
+"""Of the response that is free beside."""
+
 _DISAGREE = 4.0
+_THERE = 4.0
+"""Standard deviations beyond which it is there, with a response that is free beside."""
+_NEEDED = 12.0
+"""Chi-square of `POWERS` terms beyond which they are needed: one in 130 by chance."""
 _TURNS = 4
 """Of the inverse: each gains the size of the effect, a few per cent."""
 
@@ -105,7 +112,8 @@ class BrighterFatter(Effect):
         The noise alone tells it from a nonlinear response: a response couples no pixels. From
         crosstalk between pixels it differs because it rises with the square of the level. In the
         fringes it makes a second harmonic that depends on their spacing, which a response cannot;
-        that is far more precise, and is used as long as it does not contradict the noise.
+        that is far more precise, and is used as long as it does not contradict the noise. Where it
+        is there and explains all harmonics with some falloff, no response is taken to be beside it.
         """
         evidence = middle(evidence)
         falloff = cls().falloff_px
@@ -113,23 +121,50 @@ class BrighterFatter(Effect):
         noise = shared_charge(evidence, shifts)
         if noise is None:
             return None
-        size, variance = noise
+        size, variance = noise.size, noise.variance
         details = {"of_noise": size, "of_noise_error": float(np.sqrt(variance))}
         why = "noise that neighbours share rises with the square of the level"
         if evidence.fringes:
-            sizes, covariance = fit_response(evidence, LEVEL, 3, shifts)
+            sizes, covariance = fit_response(evidence, LEVEL, POWERS, shifts)
             harmonic, spread = float(sizes[-1]), float(covariance[-1, -1])
             details |= {"of_harmonics": harmonic, "of_harmonics_error": float(np.sqrt(spread))}
             if abs(harmonic - size) < _DISAGREE * np.sqrt(variance + spread):
                 size = (size / variance + harmonic / spread) / (1 / variance + 1 / spread)
                 variance = 1 / (1 / variance + 1 / spread)
                 why += ", and the second harmonic of the fringes depends on their spacing"
-        details["a_00"] = size * float(area_changes(falloff)[REACH, REACH])
         error = float(np.sqrt(variance))
-        return Estimate(
-            cls(float(np.clip(size, 0, 1e-5)), falloff),
-            {"shift_px_per_e": error},
-            float(size / error),
-            why,
-            details,
-        )
+        significance = float(size / error)
+        errors: dict[str, float] = {"shift_px_per_e": error}
+        together: tuple[dict[str, float], ...] = ()
+        alone = _alone(evidence, falloff) if significance > _THERE and evidence.fringes else None
+        if alone is not None:
+            falloff, size = alone.falloff_px, alone.shift
+            errors, together = _errors(alone)
+            why += "; no bent response is needed beside it"
+        details["a_00"] = size * float(area_changes(falloff)[REACH, REACH])
+        effect = cls(float(np.clip(size, 0, 1e-5)), falloff)
+        return Estimate(effect, errors, significance, why, details, together)
+
+
+def _alone(evidence: Evidence, falloff: float) -> Boundaries | None:
+    """Boundaries that leave nothing to a bent response, if noise does not speak against them.
+
+    A response that is free beside them makes them uncertain, and one uncertain beside the other
+    either seems to be needed.
+    """
+    found = boundaries_alone(evidence, LEVEL, POWERS, falloff)
+    noise = shared_charge(evidence, boundary_shifts(found.falloff_px))
+    if noise is None or found.against > _NEEDED:
+        return None
+    apart = abs(found.shift - noise.size)
+    return found if apart < _DISAGREE * np.hypot(found.shift_error, noise.variance**0.5) else None
+
+
+def _errors(found: Boundaries) -> tuple[dict[str, float], tuple[dict[str, float], ...]]:
+    """Of both parameters, and how they hang together."""
+    own = {"shift_px_per_e": found.shift_error}
+    if not np.isfinite(found.falloff_error):
+        return own, (own,)
+    both = {"shift_px_per_e": found.with_falloff, "falloff_px": found.falloff_error}
+    whole = float(np.hypot(found.shift_error, found.with_falloff))
+    return both | {"shift_px_per_e": whole}, (own, both)

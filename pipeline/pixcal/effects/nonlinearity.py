@@ -126,7 +126,8 @@ class Nonlinearity(Effect):
         if evidence.fringes:
             shifts = boundary_shifts(FALLOFF_PX)
             part = middle(evidence)
-            known = shared_charge(part, shifts)
+            noise = shared_charge(part, shifts)
+            known = None if noise is None else (noise.size, noise.variance)
             sizes, covariance = fit_response(part, level, 2, shifts, known)
             why = "second and third harmonic of the fringes' phase in the residuals"
         elif ladder is not None:

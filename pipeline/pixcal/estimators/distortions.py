@@ -207,6 +207,23 @@ def fit_distortions(
     return sizes, covariance
 
 
+def distortion_sums(
+    sets: Sequence[FringeEvidence], distortion: Distortion, count: int, *, margin: int = 0
+) -> tuple[F64, F64]:
+    """Normal matrix (count, count) and right-hand side (count,) about no distortion.
+
+    Parameters
+    ----------
+    sets, distortion, count, margin
+        As of `fit_distortions`. What holds for all sizes together holds for any of them.
+    """
+    normal, right = np.zeros((count, count)), np.zeros(count)
+    for fringes in sets:
+        fit = _SetFit(fringes, distortion, count, margin)
+        normal, right = normal + fit.normal, right + fit.right(np.zeros(count))
+    return normal, right
+
+
 class _SetFit:
     """One set: its residuals, and what its fit took up of the distortion.
 
@@ -227,9 +244,8 @@ class _SetFit:
         self._fitted = np.nan_to_num(np.where(seen, fringes.electrons, fringes.model))
         self._signal = self._fitted
         _, slopes = distortion(fringes, self._signal, np.zeros(count))
-        left = [self._freedom.left_over(self._freedom.of_good(slope)) for slope in slopes]
-        self._weighted = [self._freedom.weight * rest for rest in left]
-        self.normal = np.array([[_dot(a, b) for b in left] for a in self._weighted])
+        self._left = [self._freedom.left_over(self._freedom.of_good(slope)) for slope in slopes]
+        self.normal = np.array([self._weighted_dots(rest) for rest in self._left])
 
     def right(self, sizes: F64) -> F64:
         """Right-hand side for a step from some sizes to better ones."""
@@ -241,7 +257,11 @@ class _SetFit:
             self._signal = self._fitted.copy()
             self._signal[:, freedom.good] -= change - left
             residual = residual - left
-        return np.array([_dot(a, residual) for a in self._weighted])
+        return self._weighted_dots(residual)
+
+    def _weighted_dots(self, rest: F32) -> F64:
+        weighted = self._freedom.weight * rest
+        return np.array([_dot(left, weighted) for left in self._left])
 
 
 def _dot(a: F32, b: F32) -> float:

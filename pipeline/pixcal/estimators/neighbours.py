@@ -54,7 +54,21 @@ class _Noise:
     good: Mask
 
 
-def shared_charge(evidence: Evidence, shifts: F64) -> tuple[float, float] | None:
+@dataclass(frozen=True)
+class SharedCharge:
+    """Size of the brighter-fatter effect as the covariance of neighbours shows it.
+
+    Attributes
+    ----------
+    size, variance : float
+        Of the shift by an electron, px.
+    """
+
+    size: float
+    variance: float
+
+
+def shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
     """Size of the brighter-fatter effect from the covariance of neighbours.
 
     Parameters
@@ -65,14 +79,14 @@ def shared_charge(evidence: Evidence, shifts: F64) -> tuple[float, float] | None
 
     Returns
     -------
-    size, variance : float
-        Of the shift by an electron, px; None where there are neither fringe frames nor flats.
+    SharedCharge or None
+        None where there are neither fringe frames nor flats.
     """
     given = shifts.shape, shifts.tobytes()
     return evidence.once("shared_charge", *given, make=lambda: _shared_charge(evidence, shifts))
 
 
-def _shared_charge(evidence: Evidence, shifts: F64) -> tuple[float, float] | None:
+def _shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
     n = 2 * len(DIRECTIONS) + 1
     normal, right = np.zeros((n, n)), np.zeros(n)
     for noise in _noises(evidence):
@@ -88,7 +102,7 @@ def _shared_charge(evidence: Evidence, shifts: F64) -> tuple[float, float] | Non
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-9, hermitian=True)
     covariance = inverse / np.outer(scale, scale)
-    return float(covariance[-1] @ right), float(covariance[-1, -1])
+    return SharedCharge(float(covariance[-1] @ right), float(covariance[-1, -1]))
 
 
 def _sums(noise: _Noise, shared: F32, dy: int, dx: int) -> tuple[F64, F64]:

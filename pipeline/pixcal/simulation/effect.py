@@ -93,6 +93,9 @@ class Estimate:
         One sentence: which frames and which statistic told.
     details : mapping
         Numbers by which several ways of measuring can be compared.
+    together : tuple of mapping
+        Steps of several parameters at once, of independent errors of one sigma, where the errors
+        hang together; otherwise each parameter has an error of its own.
     """
 
     effect: "Effect"
@@ -100,6 +103,7 @@ class Estimate:
     significance: float
     why: str
     details: Mapping[str, Any] = field(default_factory=dict)
+    together: tuple[Mapping[str, float], ...] = ()
 
     @property
     def sure(self) -> "Effect":
@@ -119,8 +123,10 @@ class Estimate:
         """
         rng = np.random.default_rng([seed, zlib.crc32(effect.name.encode())])
         plain = to_plain(effect)
-        for key in sorted(self.errors):
-            _move(plain, re.findall(r"[^.\[\]]+", key), self.errors[key] * rng.standard_normal())
+        for steps in self.together or [{key: self.errors[key]} for key in sorted(self.errors)]:
+            size = rng.standard_normal()
+            for key, step in steps.items():
+                _move(plain, re.findall(r"[^.\[\]]+", key), step * size)
         try:
             return parse(type(effect), plain, effect.name)
         except InputError:
