@@ -192,16 +192,7 @@ def _of_fringes(fringes: FringeEvidence, area: float) -> _Search:
 
 
 def _of_darks(stack: Stack, evidence: Evidence, area: float) -> _Search:
-    rest = (stack.adu - np.median(stack.adu, axis=0)) * evidence.gain
-    rest = np.where(evidence.good, rest, np.nan)
-    rest -= np.nanmedian(rest, axis=(1, 2), keepdims=True) if evidence.good.any() else 0
-    seconds = np.nan_to_num(stack.exptime_s)
-    sigma = np.sqrt(evidence.read_noise**2 + np.maximum(evidence.dark_rate, 0) * seconds)
-    return _search(
-        rest.astype(np.float32),
-        np.broadcast_to(sigma, rest.shape).astype(np.float32),
-        area * seconds,
-    )
+    return _search(*evidence.dark_noise(stack), area * np.nan_to_num(stack.exptime_s))
 
 
 def _search(residual: F32, sigma: F32, exposure: float) -> _Search:

@@ -217,6 +217,22 @@ class Evidence:
         dark = np.maximum(self.dark_rate, 0) * seconds
         return signal * self.flat.astype(np.float32) + dark.astype(np.float32)
 
+    def dark_noise(self, stack: Stack) -> tuple[F32, F32]:
+        """Samples of darks less the median of each pixel and of each frame, and their sigma.
+
+        Returns
+        -------
+        rest, sigma : (t, y, x) float32
+            e-; NaN in pixels with flags.
+        """
+        rest = (stack.adu - np.median(stack.adu, axis=0)) * self.gain
+        rest = np.where(self.good, rest, np.nan)
+        rest -= np.nanmedian(rest, axis=(1, 2), keepdims=True) if self.good.any() else 0
+        seconds = np.nan_to_num(stack.exptime_s)
+        sigma = np.sqrt(self.read_noise**2 + np.maximum(self.dark_rate, 0) * seconds)
+        every = np.broadcast_to(sigma.astype(np.float32), rest.shape)
+        return rest.astype(np.float32), every
+
     def of_kind(self, kind: str) -> tuple[Stack, ...]:
         """Stacks of a kind, by exposure time."""
         return tuple(sorted((s for s in self.stacks if s.kind == kind), key=lambda s: s.exptime_s))

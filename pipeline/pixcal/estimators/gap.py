@@ -134,14 +134,16 @@ def expect_with(
         if any(key not in s for s in scaled_ones):
             continue
         own = np.stack([s[key] for s in scaled_ones])
-        change = own - values[:count]
+        same_seeds = values[:count]
+        change = own - same_seeds
         shift = change.mean(axis=0)
         mean[key] = nominal.mean[key] + shift
         more = (TOLERANCE**2 + error**2) * shift**2
         if count > 1:
             paired = change.var(axis=0, ddof=1)
             more += paired / count
-            more += np.maximum(own.var(axis=0, ddof=1) - nominal.noise[key], 0)
+            # What the effects add to the scatter; what few seeds have by chance is not theirs.
+            more += np.maximum(own.var(axis=0, ddof=1) - same_seeds.var(axis=0, ddof=1), 0)
         variance[key] = nominal.variance[key] + more
     return replace(nominal, mean=mean, variance=variance)
 

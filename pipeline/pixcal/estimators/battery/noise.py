@@ -11,6 +11,7 @@ from pixcal.kernels.sample_sums import count_beyond, neighbour_products
 STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4), (4, 0))
 """Rows and columns to a neighbour."""
 OUTLIERS = (5.0, 7.0, 10.0)
+LEAST_DARKS = 5
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
 MOST = 120
 """Frames for statistics of pairs of pixels."""
@@ -138,6 +139,23 @@ def outliers(look: Look) -> Curve:
     limits = np.array(OUTLIERS)
     count = count_beyond(look.found.residual, look.found.variance, look.good, limits)
     return Curve(np.concatenate([-limits, limits]), 2 * np.sqrt(np.concatenate(count)))
+
+
+@statistic(
+    "noise", "outliers in darks", x="sigma, low then high", unit="2 √count", sets=False, floor=1.0
+)
+def dark_outliers(evidence: Evidence) -> Curve | None:
+    """The same of samples of darks, which last longer and have less noise."""
+    limits, counts = np.array(OUTLIERS), np.zeros((2, len(OUTLIERS)))
+    stacks = [s for s in evidence.of_kind("dark") if len(s.adu) >= LEAST_DARKS]
+    for stack in stacks:
+        rest, sigma = evidence.dark_noise(stack)
+        # The read noise is that of most pixels.
+        spread = 1.4826 * float(np.nanmedian(np.abs(rest / sigma)))
+        variance = np.ascontiguousarray((max(spread, 1.0) * sigma) ** 2)
+        counts += count_beyond(np.nan_to_num(rest), variance, evidence.good, limits)
+    value = 2 * np.sqrt(counts.ravel())
+    return Curve(np.concatenate([-limits, limits]), value) if stacks else None
 
 
 @statistic("noise", "noise of the pixels", x="quantile", power=True)
