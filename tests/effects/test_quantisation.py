@@ -143,3 +143,16 @@ def test_other_effects_are_not_taken_for_it(
 def test_samples_that_are_no_codes_say_nothing() -> None:
     frames = np.random.default_rng(1).normal(500, 9, (5, 8, 8)).astype(np.float32)
     assert histogram([frames], np.ones((8, 8), bool)) is None
+
+
+def test_uneven_codes_are_as_uneven_where_float32_is_coarse() -> None:
+    """At 45 000 ADU samples lie 0.004 apart, and displaced thresholds 0.009 from their places."""
+    ripple = Quantisation(coarse_adu=0.0, dnl_rms=0.0, ripple=0.018)
+    for level in (3_000.0, 45_000.0):
+        rng = np.random.default_rng(5)
+        size = (1000, 1000)
+        adu = (level + 20 * rng.standard_normal(size)).astype(np.float32)
+        normals = rng.standard_normal(size).astype(np.float32)
+        codes = ripple.converted(adu, 1, 65535.0, normals).astype(int)
+        even = 2 * np.mean(codes % 2 == 0) - 1
+        assert even == pytest.approx(0.018, abs=4 / np.sqrt(codes.size))

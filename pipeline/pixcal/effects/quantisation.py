@@ -97,23 +97,40 @@ class Quantisation(Effect):
         shift += self.ripple * np.sin(phase) / (2 * np.sin(turn / 2))
         return np.asarray(number - 0.5 + np.clip(shift, -FARTHEST, FARTHEST))
 
-    def converted(self, adu: F32, specimen: int, top_adu: float) -> F32:
+    def converted(self, adu: F32, specimen: int, top_adu: float, normals: F32 | None = None) -> F32:
         """Codes in ADU: each sample passes the thresholds that it reaches.
 
         Thresholds that have changed places leave a code out, as in a flash converter that counts.
+
+        Parameters
+        ----------
+        adu : ndarray of float32
+            Samples. Large ones lie on a grid as coarse as thresholds are displaced.
+        specimen : int
+            Seed of the detector.
+        top_adu : float
+            Highest sample.
+        normals : ndarray of float32, optional
+            Standard normals by which samples are scattered over the meshes of that grid.
         """
         codes = int(top_adu / self.step_adu) + 3
         begins = _thresholds(self, specimen, codes)
         level = np.clip(adu / np.float32(self.step_adu), 0, np.float32(codes - 2))
         nearest = (level + np.float32(0.5)).astype(np.int32)
-        passed = nearest - 1 + (level >= begins[nearest])
-        passed += level >= begins[nearest + 1]
+        # Small numbers, on which there is no grid.
+        over = level - nearest.astype(np.float32)
+        if normals is not None:
+            over += np.spacing(level) * np.float32(0.5) * normals
+        passed = nearest - 1 + (over >= begins[nearest])
+        passed += over >= begins[nearest + 1] + np.float32(1)
         return np.asarray(np.maximum(passed, 0) * np.float32(self.step_adu), np.float32)
 
     def readout(self, adu: F32, shot: Shot) -> F32:
         """As in `Effect.readout`."""
         detector = shot.bench.detector
-        return self.converted(adu, detector.seed, detector.top_adu)
+        uneven = self.dnl_rms > 0 or self.ripple > 0
+        normals = shot.normals(self.name) if uneven else None
+        return self.converted(adu, detector.seed, detector.top_adu, normals)
 
     def restored(self, samples: F32, specimen: int) -> F32:
         """Samples in the middle of what their code spans: straight, as far as widths are known.
@@ -164,7 +181,8 @@ class Quantisation(Effect):
 
 @lru_cache(maxsize=4)
 def _thresholds(effect: Quantisation, specimen: int, codes: int) -> F32:
-    return effect.thresholds(specimen, codes).astype(np.float32)
+    """Where each code begins, from its number."""
+    return (effect.thresholds(specimen, codes) - np.arange(codes)).astype(np.float32)
 
 
 def _uneven(widths: CodeWidths) -> tuple[dict[str, float], dict[str, float], list[float]]:

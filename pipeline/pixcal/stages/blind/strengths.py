@@ -142,7 +142,7 @@ WAYS = (
     Way("quantisation", "scatter of the codes", 0.012, 0.0036, _only("dnl_rms", _CODES)),
     Way("quantisation", "ripple of the codes", 0.007, 0.0027,
         lambda s, rng: {"coarse_adu": 0.0, "dnl_rms": 0.0, "ripple": s,
-                        "ripple_phase_rad": float(rng.uniform(-np.pi, np.pi))}),
+                        "ripple_phase_rad": float(rng.choice([0.0, np.pi]))}),
     Way("rolling_shutter", "line time, us", 0.053, 0.0073, lambda s, rng: {"line_time_us": s}),
     Way("row_noise", "rows, e-", 0.75, 0.3, _only("row_rms", _ROWS)),
     Way("row_noise", "columns, e-", 0.7, 0.32, _only("column_rms", _ROWS)),
