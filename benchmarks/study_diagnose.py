@@ -31,7 +31,7 @@ from pixcal.model.bench import SCHEMA
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages import ingest, reduce, simulate
 from pixcal.stages.blind.strengths import ways_of
-from pixcal.stages.diagnose.nominal import nominal_bench
+from pixcal.stages.diagnose.measuring import nominal_bench
 from pixcal.stages.diagnose.search import SCREEN, Candidate, Search, differing, shrinkage
 from pixcal.stages.diagnose.stage import Look, look_at, weakly_seen
 from pixcal.stages.diagnose.trial import Curves, Trials, estimate, looked_at

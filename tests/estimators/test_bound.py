@@ -13,8 +13,8 @@ from pixcal.estimators.bound import (
     unweighted_variance,
 )
 from pixcal.estimators.fringes import FrameParameters
-from pixcal.estimators.scout import Tile
 from pixcal.estimators.sweep import phase_bound
+from pixcal.estimators.tile import Tile
 
 U = 2 * np.pi * (np.arange(20_000) + 0.5) / 20_000
 LIGHT = st.floats(10, 1e5)

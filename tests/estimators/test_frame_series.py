@@ -14,8 +14,8 @@ from pixcal.estimators.frame_series import (
     motion_series,
     without,
 )
-from pixcal.estimators.scout import Coding
 from pixcal.estimators.spectral_line import find_line, without_line
+from pixcal.estimators.tile import Coding
 from pixcal.estimators.variance_components import walk_power
 
 T = 297

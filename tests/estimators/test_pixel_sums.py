@@ -6,7 +6,8 @@ import pytest
 from pixcal.estimators.fringes import FrameParameters
 from pixcal.estimators.harmonics import PhaseWeights, moments, normal_matrices
 from pixcal.estimators.pixel_sums import FringeSums, SampleSums, pixel_sums
-from pixcal.estimators.scout import Coding, Tile, start_model
+from pixcal.estimators.tile import Coding, Tile
+from pixcal.estimators.tile_fit import start_model
 
 CODING = Coding(1.5, -300.0, 65535)
 

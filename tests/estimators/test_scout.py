@@ -8,7 +8,9 @@ import pytest
 from pixcal.estimators import scout as scouting
 from pixcal.estimators.fringes import FrameParameters, find_fringe_vector, smooth_phasor
 from pixcal.estimators.pixel_sums import phase_sigma
-from pixcal.estimators.scout import Coding, Scout, Tile, accumulate, start_model
+from pixcal.estimators.scout import Scout
+from pixcal.estimators.tile import Coding, Tile
+from pixcal.estimators.tile_fit import accumulate, start_model
 from pixcal.kernels.bilinear import solve_pixels
 from pixcal.model.errors import InputError
 

@@ -5,8 +5,8 @@ import pytest
 
 from pixcal.estimators.batches import plan_batches
 from pixcal.estimators.fringes import FrameParameters
-from pixcal.estimators.scout import Coding, Tile
 from pixcal.estimators.sweep import frames_to_prime, phase_bound, sweep_tile
+from pixcal.estimators.tile import Coding, Tile
 
 CODING = Coding(1.0, -300.0, 65535)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.fringes import grid
-from pixcal.estimators.scout import Coding
+from pixcal.estimators.tile import Coding
 from pixcal.kernels.bilinear import frame_sums
 
 F32 = NDArray[np.float32]

@@ -16,7 +16,8 @@ from pixcal.estimators.harmonics import (
     normal_matrices,
     normal_table,
 )
-from pixcal.estimators.scout import Coding, Tile, accumulate
+from pixcal.estimators.tile import Coding, Tile
+from pixcal.estimators.tile_fit import accumulate
 from pixcal.kernels.bilinear import N_SUMS, close_fringes, fringe_block, solve_pixels
 
 F32 = NDArray[np.float32]
@@ -59,7 +60,7 @@ def pixel_sums(
     Parameters
     ----------
     tile, coding, frames
-        As in `pixcal.estimators.scout.accumulate`.
+        As in `pixcal.estimators.tile_fit.accumulate`.
     model : (3, y, x) float32
         Start model.
     smooth : (y, x) complex128

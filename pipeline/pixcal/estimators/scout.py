@@ -17,13 +17,14 @@ from scipy.linalg import eigh
 from pixcal.estimators.fringes import (
     HONEST_FRINGES,
     FrameParameters,
-    SmoothPhasor,
     find_fringe_vector,
     grid,
     smooth_phasor,
 )
 from pixcal.estimators.gauge import gauge_matrix
-from pixcal.kernels.bilinear import N_SUMS, frame_sums, solve_pixels, sweep_block
+from pixcal.estimators.tile import Coding, Tile
+from pixcal.estimators.tile_fit import fit_tile, residual_chi2
+from pixcal.kernels.bilinear import frame_sums
 from pixcal.model.errors import InputError
 
 F32 = NDArray[np.float32]
@@ -50,46 +51,6 @@ halves it: what is left is less than this share of the frames' noise, which is l
 ABOVE_NOISE = 1.5
 """Least power of the weakest of three components over the next, which is noise: frames of two
 phases only have no third component, and noise in its place would pass for the fringes' shape."""
-
-
-@dataclass(frozen=True)
-class Coding:
-    """Electrons of a code: ``scale * code + offset``; ``fill`` marks a sample without weight."""
-
-    scale: float
-    offset: float
-    fill: int
-
-
-@dataclass
-class Tile:
-    """A part of the window.
-
-    Attributes
-    ----------
-    y, x : (int, int)
-        First pixel and the one after the last, along each axis.
-    read, shot : (y, x) float32
-        Variance of a sample: ``shot * model + read`` (e-²).
-    good : (y, x) bool
-        Pixels to learn from.
-    """
-
-    y: tuple[int, int]
-    x: tuple[int, int]
-    read: F32
-    shot: F32
-    good: NDArray[np.bool_]
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(y, x) size."""
-        return self.y[1] - self.y[0], self.x[1] - self.x[0]
-
-    @property
-    def centre(self) -> tuple[float, float]:
-        """Centre (y, x) in pixels of the window."""
-        return (self.y[0] + self.y[1] - 1) / 2, (self.x[0] + self.x[1] - 1) / 2
 
 
 def in_turn(function: Callable[[int], Any], numbers: Sequence[int]) -> list[Any]:
@@ -466,148 +427,3 @@ def _inverses(matrices: F64) -> F64:
     scale = np.where(scale > 0, scale, 1.0)
     both = scale[:, :, None] * scale[:, None, :]
     return np.asarray(np.linalg.pinv(matrices / both, rcond=1e-10, hermitian=True) / both)
-
-
-def residual_chi2(
-    tile: Tile,
-    codes: NDArray[np.uint16],
-    coding: Coding,
-    frames: FrameParameters,
-    theta: F64,
-) -> float:
-    """Median over a tile's pixels of the reduced chi-square."""
-    sums = accumulate(tile, [codes], coding, frames, theta.astype(np.float32))
-    _, _, chi2 = solve_pixels(sums)
-    reduced = chi2 / np.maximum(sums[10] - 3, 1)
-    return float(np.median(reduced[tile.good]))
-
-
-def accumulate(
-    tile: Tile,
-    blocks: Sequence[NDArray[np.uint16]],
-    coding: Coding,
-    frames: FrameParameters,
-    theta: F32,
-    sums: F64 | None = None,
-    variance: tuple[F32, F32] | None = None,
-) -> F64:
-    """Weighted sums of a tile over blocks of frames that follow one another.
-
-    Parameters
-    ----------
-    tile : Tile
-    blocks : sequence of (t, y, x) arrays
-        Stored codes; together as many frames as ``frames`` holds.
-    coding : Coding
-    frames : FrameParameters
-    theta : (3, y, x) float32
-        Start model.
-    sums : (N_SUMS, y, x) float64, optional
-        Sums to add to.
-    variance : (read, shot), optional
-        Instead of the tile's own.
-    """
-    sums = np.zeros((N_SUMS, *tile.shape)) if sums is None else sums
-    read, shot = variance or (tile.read, tile.shot)
-    g = frames.at(*tile.centre).astype(np.float32)
-    dk = frames.dk.astype(np.float32)
-    start = 0
-    for block in blocks:
-        for first in range(0, len(block), 64):
-            part = block[first : first + 64]
-            at = slice(start + first, start + first + len(part))
-            sweep_block(
-                part,
-                coding.scale,
-                coding.offset,
-                coding.fill,
-                g[at],
-                dk[at],
-                -(tile.shape[0] - 1) / 2,
-                -(tile.shape[1] - 1) / 2,
-                theta,
-                read,
-                shot,
-                sums,
-            )
-        start += len(block)
-    return sums
-
-
-def start_model(
-    tile: Tile,
-    blocks: Sequence[NDArray[np.uint16]],
-    coding: Coding,
-    frames: FrameParameters,
-    k: tuple[float, float],
-    start: F64 | None = None,
-) -> tuple[F32, SmoothPhasor]:
-    """Smooth model of a tile, for weights that do not know the pixel's own noise.
-
-    The phase and the visibility are smooth over the tile; the level is the pixel's own, known to a
-    part in a thousand, and only scales all the weights of that pixel together.
-
-    Parameters
-    ----------
-    tile, blocks, coding, frames
-        As in `accumulate`.
-    k : (float, float)
-        Fringe vector near the tile, rad/px.
-    start : (3, y, x) float64, optional
-        The pixels as they are known; else from an unweighted fit.
-
-    Returns
-    -------
-    theta : (3, y, x) float32
-        The model.
-    smooth : SmoothPhasor
-        Of alpha exp(i psi) / iota.
-    """
-    theta = _unweighted_pixels(tile, blocks, coding, frames) if start is None else start
-    iota = theta[0]
-    usable = np.isfinite(iota) & (iota > 0)
-    good = tile.good & usable
-    level = float(np.median(iota[good])) if good.any() else 1.0
-    iota = np.where(usable, iota, level)
-    phasor = np.asarray(np.where(usable, theta[2] + 1j * theta[1], 0.0) / iota, complex)
-    smooth = smooth_phasor(phasor, good, k)
-    model = np.stack([iota, iota * smooth.map.imag, iota * smooth.map.real])
-    return model.astype(np.float32), smooth
-
-
-def _unweighted_pixels(
-    tile: Tile, blocks: Sequence[NDArray[np.uint16]], coding: Coding, frames: FrameParameters
-) -> F64:
-    """Pixels (3, y, x) by plain least squares.
-
-    Where no sample is missing and the fringe vector is held the normal matrix is the same for all.
-    """
-    if frames.moving or any((block == coding.fill).any() for block in blocks):
-        nothing = np.zeros((3, *tile.shape), np.float32)
-        even = (np.ones(tile.shape, np.float32), np.zeros(tile.shape, np.float32))
-        return solve_pixels(accumulate(tile, blocks, coding, frames, nothing, variance=even))[0]
-    right: F64 = np.zeros((3, tile.good.size))
-    start = 0
-    # A few frames at a time: as floating point they are twice the size.
-    for few in (block[n : n + 8] for block in blocks for n in range(0, len(block), 8)):
-        g = frames.g[start : start + len(few)]
-        electrons = few.reshape(len(few), -1) * np.float32(coding.scale)
-        right += g.T.astype(np.float32) @ electrons + coding.offset * g.sum(axis=0)[:, None]
-        start += len(few)
-    theta = np.linalg.lstsq(frames.g.T @ frames.g, right, rcond=1e-9)[0]
-    return np.asarray(theta.reshape(3, *tile.shape))
-
-
-def fit_tile(
-    tile: Tile,
-    blocks: Sequence[NDArray[np.uint16]],
-    coding: Coding,
-    frames: FrameParameters,
-    k: tuple[float, float],
-    start: F64 | None = None,
-) -> tuple[F64, NDArray[np.complex128]]:
-    """Weighted fit of every pixel of a tile: theta (3, y, x) and the smooth phasor (y, x)."""
-    model, smooth = start_model(tile, blocks, coding, frames, k, start)
-    sums = accumulate(tile, blocks, coding, frames, model)
-    step, _, _ = solve_pixels(sums)
-    return model + step, smooth.map

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from pixcal.estimators.batches import Batches
 from pixcal.estimators.fringes import FrameParameters, SmoothPhasor, plane_wave, wrapped
 from pixcal.estimators.pixel_sums import PixelSums, pixel_sums
-from pixcal.estimators.scout import Coding, Tile, start_model
+from pixcal.estimators.tile import Coding, Tile
+from pixcal.estimators.tile_fit import start_model
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -23,7 +23,7 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.deciding import missing_frames
-from pixcal.stages.diagnose.nominal import nominal_bench
+from pixcal.stages.diagnose.measuring import nominal_bench
 from pixcal.stages.diagnose.parts import Half, evidence_of, take
 from pixcal.stages.diagnose.result import by_domain, describe
 from pixcal.stages.diagnose.search import CONFIRM, SCREEN, SURE, Candidate, Found, Search

@@ -18,8 +18,8 @@ from pixcal.estimators.batches import Batches, plan_batches
 from pixcal.estimators.fit_flags import fit_flags, usual_chi2
 from pixcal.estimators.fringes import FrameParameters
 from pixcal.estimators.geometry import tile_plane
-from pixcal.estimators.scout import Tile
 from pixcal.estimators.sweep import BOUND_PIXELS, TileMaps, frames_to_prime, sweep_tile
+from pixcal.estimators.tile import Tile
 from pixcal.estimators.tile_sums import Carrier, TileSums, sum_row
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse, quantity

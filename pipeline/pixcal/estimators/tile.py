@@ -1,0 +1,48 @@
+"""A part of the window whose samples are fitted at once, and how samples are stored."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Coding:
+    """Electrons of a code: ``scale * code + offset``; ``fill`` marks a sample without weight."""
+
+    scale: float
+    offset: float
+    fill: int
+
+
+@dataclass
+class Tile:
+    """A part of the window.
+
+    Attributes
+    ----------
+    y, x : (int, int)
+        First pixel and the one after the last, along each axis.
+    read, shot : (y, x) float32
+        Variance of a sample: ``shot * model + read`` (e-²).
+    good : (y, x) bool
+        Pixels to learn from.
+    """
+
+    y: tuple[int, int]
+    x: tuple[int, int]
+    read: F32
+    shot: F32
+    good: NDArray[np.bool_]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(y, x) size."""
+        return self.y[1] - self.y[0], self.x[1] - self.x[0]
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Centre (y, x) in pixels of the window."""
+        return (self.y[0] + self.y[1] - 1) / 2, (self.x[0] + self.x[1] - 1) / 2

@@ -1,0 +1,156 @@
+"""What effects ask a bench for, and when its frames were taken: as an acquisition tells."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.evidence import Evidence
+from pixcal.model.acquisition import Acquisition
+from pixcal.model.bench import (
+    SCHEMA,
+    Bench,
+    Rung,
+    SimulatedDetector,
+    SimulatedFrames,
+    SimulatedOptics,
+    SimulatedSet,
+)
+from pixcal.model.errors import InputError
+from pixcal.simulation.recording import Recording
+from pixcal.stages.diagnose.nominal import SetTruth
+from pixcal.stages.diagnose.parts import Table, groups
+
+
+def bench_of(
+    acquisition: Acquisition,
+    tables: Mapping[str, Table],
+    evidence: Evidence,
+    sets: Sequence[SetTruth],
+    dtypes: Mapping[str, np.dtype[Any]],
+) -> Bench:
+    """What effects ask a bench for; its own pixels and light are replaced by `Measured`.
+
+    Raises
+    ------
+    InputError
+        If the light goes beyond what a converter of 16 bits can give.
+    """
+    top = _top(acquisition, evidence, sets, dtypes)
+    d, o, shape = acquisition.detector, acquisition.optics, evidence.good.shape
+    window = next((f.window for f in evidence.fringes.values()), shape)
+    listed = [f"fringes/{s.name}" for s in acquisition.frames.fringes]
+    table = tables[listed[0]] if listed else next(iter(tables.values()))
+    times = np.array(table["time_s"], float)
+    exposure = max(float(table["exptime_s"][0] or 0.0), 1e-6)
+    period = float(np.median(np.diff(times))) if len(times) > 1 else exposure
+    contrast = [s.contrast for s in sets]
+    return Bench(
+        schema=SCHEMA,
+        detector=SimulatedDetector(
+            shape=(shape[0], shape[1]),
+            pitch_um=d.pitch_um,
+            gain_e_per_adu=evidence.gain,
+            read_noise_e=evidence.read_noise,
+            name=d.name,
+            chip=(window[0], window[1]),
+            origin_px=evidence.origin,
+            saturation_adu=top,
+            full_well_e=d.full_well_e,
+            bias_adu=float(np.clip(np.median(evidence.bias), 0, top - 1)),
+        ),
+        optics=SimulatedOptics(
+            wavelength_nm=o.wavelength_nm,
+            distance_mm=o.distance_mm,
+            beam_radius_mm=1e4,
+            visibility=float(np.clip(np.mean(contrast), 0.01, 1.0)) if contrast else 1.0,
+            fringes="straight",
+        ),
+        frames=SimulatedFrames(
+            exptime_s=exposure,
+            period_s=max(period, exposure),
+            flats=(Rung(exposure, 1),),
+            flat_rate_e_s=1.0,
+            fringes=tuple(
+                SimulatedSet(
+                    name=s.name,
+                    baseline_mm=s.baseline_mm,
+                    count=len(tables[f"fringes/{s.name}"]["time_s"]),
+                    peak_e=float(np.clip(np.max(truth.light) * (1 + truth.contrast), 1.0, 1e7)),
+                )
+                for s, truth in zip(acquisition.frames.fringes, sets, strict=True)
+            ),
+        ),
+    )
+
+
+def recordings_of(
+    bench: Bench, acquisition: Acquisition, tables: Mapping[str, Table], evidence: Evidence
+) -> tuple[list[Recording], list[tuple[str, NDArray[np.intp]]]]:
+    """Recordings, and where their frames are."""
+    start = _start(tables)
+    listed = {f"fringes/{s.name}": n for n, s in enumerate(acquisition.frames.fringes)}
+    recordings, places = [], []
+    for name, table in tables.items():
+        exposures = np.array([np.nan if t is None else t for t in table["exptime_s"]], float)
+        times = np.array(table["time_s"], float)
+        kind = name.split("/")[0]
+        own = [np.arange(len(times))] if name in listed else groups(exposures)
+        for n, numbers in enumerate(own):
+            exposure = float(exposures[numbers[0]])
+            exposure = 0.0 if np.isnan(exposure) else exposure
+            period = float(np.median(np.diff(times[numbers]))) if len(numbers) > 1 else exposure
+            electrons = _level(evidence, exposure) if kind == "flat" else 1.0
+            recordings.append(
+                Recording(
+                    bench, kind, listed.get(name, n), name, name, len(numbers), exposure,
+                    start[name] + float(times[numbers[0]]), period, electrons,
+                )
+            )  # fmt: skip
+            places.append((name, numbers))
+    return recordings, places
+
+
+def _start(tables: Mapping[str, Table]) -> dict[str, float]:
+    """Time of each array's first frame after the first of all, s; in order where unknown."""
+    stamps = {name: np.array(table["mjd"], float) for name, table in tables.items()}
+    if all(np.isfinite(s).all() for s in stamps.values()):
+        first = min(float(s.min()) for s in stamps.values())
+        return {name: float(s[0] - first) * 86400 for name, s in stamps.items()}
+    found, clock = {}, 0.0
+    for name, table in tables.items():
+        found[name] = clock
+        clock += float(np.ptp(np.array(table["time_s"], float)))
+    return found
+
+
+def _level(evidence: Evidence, exposure: float) -> float:
+    """Electrons of the flats of an exposure time, for unit response, without dark current."""
+    for stack in evidence.of_kind("flat"):
+        known = np.isfinite(stack.exptime_s)
+        if (not known and exposure == 0) or (known and np.isclose(stack.exptime_s, exposure)):
+            good = evidence.good & (evidence.flat > 0)
+            light = (stack.adu.mean(axis=0) - evidence.bias)[good] * evidence.gain
+            light = light - evidence.dark_rate[good] * exposure
+            return float(np.median(light / evidence.flat[good]))
+    return 1.0
+
+
+def _top(
+    acquisition: Acquisition,
+    evidence: Evidence,
+    sets: Sequence[SetTruth],
+    dtypes: Mapping[str, np.dtype[Any]],
+) -> float:
+    """Highest sample, ADU."""
+    ends = [np.iinfo(dtype).max for dtype in dtypes.values() if dtype.kind in "iu"]
+    top = float(min([65535, *ends]))
+    for truth in sets:
+        peak = float(np.median(truth.light)) * (1 + truth.contrast) / evidence.gain
+        if peak + float(np.median(evidence.bias)) > 65535:
+            raise InputError(
+                f"fringes reach {peak:.0f} ADU above the bias: samples above 65535 ADU cannot be "
+                "simulated; diagnose frames of a converter of 16 bits"
+            )
+    return min(top, acquisition.detector.saturation_adu or top)
