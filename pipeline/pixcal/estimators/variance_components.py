@@ -75,6 +75,11 @@ class Modes:
     least: F64
     share: float = 1.0
 
+    @property
+    def flat(self) -> F64:
+        """``parts`` as (m, n c c), for sums over all else."""
+        return self.parts.reshape(len(self.parts), -1)
+
 
 @dataclass(frozen=True)
 class Components:
@@ -202,7 +207,7 @@ class _State:
 
     def __init__(self, modes: Modes, size: F64) -> None:
         self.modes, self.size = modes, size
-        covariance = np.einsum("i,inab->nab", size, modes.parts)
+        covariance = (size @ modes.flat).reshape(modes.parts.shape[1:])
         root = np.linalg.cholesky(covariance)
         inverse = np.linalg.inv(root)
         self.weight = np.einsum("nba,nbc->nac", inverse, inverse)
@@ -223,12 +228,11 @@ class _State:
 
     def score(self) -> F64:
         """Slope of the log-likelihood (m,)."""
-        parts = self.modes.parts
-        seen = np.einsum("ina,na->i", np.einsum("inab,nb->ina", parts, self.pull), self.pull)
+        seen = self.pull[:, :, None] * self.pull[:, None, :]
         # What the fit of the known shapes takes away of the scatter.
         lost = sandwich(self.weighted, self.spread)
-        expected = np.einsum("inab,nab->i", parts, self.weight - lost)
-        return np.asarray(self.modes.share * (seen - expected) / 2)
+        more = self.modes.flat @ (seen - self.weight + lost).ravel()
+        return np.asarray(self.modes.share * more / 2)
 
     def information(self) -> F64:
         """Fisher's information of the sizes (m, m)."""
