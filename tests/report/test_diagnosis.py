@@ -413,6 +413,10 @@ def test_places_are_in_words(label: str, x: list[float], words: str) -> None:
     assert place({"x_label": label, "x": x}, 1) == words
 
 
+def test_a_curve_of_one_value_is_of_all_frames() -> None:
+    assert place({"x_label": "", "x": [0.0]}, 0) == "all frames"
+
+
 # Figures
 
 

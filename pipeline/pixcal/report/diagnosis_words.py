@@ -189,6 +189,8 @@ def worst(curve: Mapping[str, Any]) -> int:
 def place(curve: Mapping[str, Any], at: int) -> str:
     """Where in a curve a value is, in words."""
     label, name = str(curve["x_label"]), places(curve)[at]
+    if not label and len(curve["x"]) == 1:
+        return "all frames"
     if label in _AXES:
         return _AXES[label].phrase.format(name)
     if label.startswith("cycles a ") and curve["x"][at] > 0:

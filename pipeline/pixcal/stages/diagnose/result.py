@@ -266,6 +266,7 @@ def _entry(key: Key, final: Shrinkage, curve: Mapping[str, Any]) -> dict[str, An
     at = final.before[key].worst if key in final.where else final.after[key].worst
     set_name = "" if key[1] == DETECTOR else f"set {key[1]}, "
     x = curve["x"][at] if at < len(curve["x"]) else at
+    alone = not curve["x_label"] and len(curve["x"]) == 1
     return {
         "domain": curve["domain"],
         "statistic": key[0],
@@ -279,7 +280,7 @@ def _entry(key: Key, final: Shrinkage, curve: Mapping[str, Any]) -> dict[str, An
         "z_after": _rounded(float(final.after[key].sigmas[at])),
         "significance": _rounded(sigmas_of(final.before[key].log_chance)),
         "left": _rounded(final.gap.left.get(key, 0.0)),
-        "place": f"{set_name}{curve['x_label'] or 'value'} {x:.4g}",
+        "place": set_name + ("all frames" if alone else f"{curve['x_label'] or 'value'} {x:.4g}"),
     }
 
 
