@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Iterator
 from functools import partial
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import cloudpickle
+import psutil
 import pytest
 from distributed import LocalCluster
 
@@ -186,3 +188,28 @@ def test_progress_goes_to_stderr(quiet: bool, capfd: pytest.CaptureFixture[str])
     out, err = capfd.readouterr()
     assert out == ""
     assert err == "" if quiet else ("counting" in err and "4/4" in err)
+
+
+ORPHANS = """
+import time
+from pixcal.engine.local import run_in_processes
+run_in_processes(time.sleep, [60.0] * 4, 2, print)
+"""
+
+
+def test_workers_end_when_what_they_work_for_is_killed() -> None:
+    main = subprocess.Popen([sys.executable, "-c", ORPHANS])
+    try:
+        children: list[psutil.Process] = []
+        deadline = time.monotonic() + 60
+        # Workers, and what multiprocessing itself starts; both have begun their tasks.
+        while len(children) < 3 and time.monotonic() < deadline:
+            time.sleep(0.2)
+            children = psutil.Process(main.pid).children(recursive=True)
+        assert len(children) >= 3
+        time.sleep(3)
+    finally:
+        main.kill()
+        main.wait()
+    _, alive = psutil.wait_procs(children, timeout=20)
+    assert not alive

@@ -1,11 +1,13 @@
 """Tasks on this machine: one after the other, or by Dask's schedulers in threads or processes."""
 
+import os
 import signal
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import lru_cache, partial
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from typing import Any
 
 import dask
@@ -99,7 +101,18 @@ def _run_graph(
 @lru_cache(maxsize=1)
 def _process_pool(workers: int) -> ProcessPoolExecutor:
     """Worker processes, kept: each takes seconds to import what the tasks need."""
-    # Ctrl-C reaches them too; what to do about it is this process's business.
-    return ProcessPoolExecutor(
-        workers, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
-    )
+    return ProcessPoolExecutor(workers, get_context("spawn"), _begin_worker)
+
+
+def _begin_worker() -> None:
+    # Ctrl-C reaches workers too; what to do about it is the business of the process they work for.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End when the process that this one works for was killed: nobody else would end it."""
+    parent = parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
