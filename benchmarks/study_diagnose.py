@@ -392,12 +392,10 @@ def publish(played: Sequence[dict[str, Any]], out: Path) -> None:
     """Print the tables, draw the picture, and put both into the documentation."""
     nothing = [p for p in played if not p["effect"]]
     something = [p for p in played if p["effect"]]
-    tables = {
-        "nominal": nominal_table(nothing),
-        "power": power_table(something),
-        "wrong": wrong_table(something),
-    }
-    draw(something, out / "power.png")
+    tables = {"nominal": nominal_table(nothing)} if nothing else {}
+    if something:
+        tables |= {"power": power_table(something), "wrong": wrong_table(something)}
+        draw(something, out / "power.png")
     page = OUT.parent / "diagnose.md"
     text = page.read_text(encoding="utf-8")
     for name, table in tables.items():
