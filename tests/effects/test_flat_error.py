@@ -1,6 +1,7 @@
 """Flat error: as large as given, in iota and alpha alike, nothing in delta; found again."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -79,7 +80,7 @@ def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: s
 
 def test_without_flats_nothing_is_said(acquired: Callable[..., Evidence]) -> None:
     evidence = acquired()
-    bare = type(evidence)(**{**vars(evidence), "stacks": evidence.of_kind("bias")})
+    bare = replace(evidence, stacks=evidence.of_kind("bias"))
     assert FlatError.estimate(bare) is None
 
 

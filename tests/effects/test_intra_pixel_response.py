@@ -1,6 +1,7 @@
 """Intra-pixel response: visibility of a box; its width and scatter are found with two baselines."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -77,5 +78,5 @@ def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: s
 def test_one_interfringe_tells_nothing(acquired: Callable[..., Evidence]) -> None:
     evidence = acquired()
     one = {"vertical": evidence.fringes["vertical"]}
-    bare = type(evidence)(**{**vars(evidence), "fringes": one})
+    bare = replace(evidence, fringes=one)
     assert IntraPixelResponse.estimate(bare) is None

@@ -1,6 +1,7 @@
 """Straylight: visibility falls, offsets stay; slopes are found, fibres of unequal light are not."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,7 +75,7 @@ def test_a_rolling_shutter_is_not_taken_for_it(acquired: Callable[..., Evidence]
 def test_with_one_set_only_the_slope_across_is_told(acquired: Callable[..., Evidence]) -> None:
     evidence = acquired(None, {"straylight": {}})
     one = {"vertical": evidence.fringes["vertical"]}
-    found = Straylight.estimate(type(evidence)(**{**vars(evidence), "fringes": one}))
+    found = Straylight.estimate(replace(evidence, fringes=one))
     assert found is not None
     assert isinstance(found.effect, Straylight)
     assert abs(found.effect.slope_per_px[1] - -2e-5) < 4 * found.errors["slope_per_px[1]"]
