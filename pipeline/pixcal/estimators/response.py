@@ -178,8 +178,10 @@ def _best_falloff(found: Sequence[tuple[float, float, float, float]], otherwise:
     if error > TOLD:
         size, variance, _, against = found[otherwise]
         return Boundaries(FALLOFFS_PX[otherwise], np.inf, size, variance**0.5, 0.0, against)
-    # Not beyond what was tried.
-    there = float(np.clip(at[1] - slope / (2 * bend), *np.log([FALLOFFS_PX[0], FALLOFFS_PX[-1]])))
+    top = float(at[1] - slope / (2 * bend))
+    # Not beyond what was tried; how far that is from the best is not known then.
+    there = float(np.clip(top, *np.log([FALLOFFS_PX[0], FALLOFFS_PX[-1]])))
+    error = float(np.hypot(error, top - there))
     near = slice(best - 1, best + 2)
     bends = [np.polyfit(at - at[1], values[near], 2) for values in (sizes, variances, beside)]
     own = [float(np.polyval(coefficients, there - at[1])) for coefficients in bends]
