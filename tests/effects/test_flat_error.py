@@ -68,6 +68,7 @@ def test_its_size_is_found(acquired: Callable[..., Evidence], pixel_rms: float) 
     # Of the smooth part, what this window holds beyond a parabola.
     error = found.errors["smooth_rms"]
     assert abs(found.effect.smooth_rms - 2.5 * pixel_rms) < 4 * error < 2.5 * pixel_rms
+    assert abs(found.effect.scale_px - 4.0) < 4 * found.errors["scale_px"] < 2.0
     assert found.significance > 6
 
 

@@ -98,6 +98,21 @@ def test_the_foot_is_found(acquired: Callable[..., Evidence], foot: tuple[float,
     assert found.significance > 10
 
 
+def test_a_foot_far_aside_is_found_from_the_fringes_that_are_wider_there(
+    acquired: Callable[..., Evidence],
+) -> None:
+    """The fringe vector 120 mm from the foot is 9 % below the paraxial one, along the way."""
+    foot = (115.0, -30.0)
+    evidence = acquired(WINDOW, {"hyperbolic_fringes": {"foot_mm": list(foot)}})
+    found = HyperbolicFringes.estimate(evidence)
+    assert found is not None
+    assert isinstance(found.effect, HyperbolicFringes)
+    for n in (0, 1):
+        error = found.errors[f"foot_mm[{n}]"]
+        assert abs(found.effect.foot_mm[n] - foot[n]) < 4 * error < 8.0
+    assert found.details["share_at_foot"] == pytest.approx(1, abs=0.02)
+
+
 def test_a_ghost_is_not_taken_for_it(acquired: Callable[..., Evidence]) -> None:
     found = HyperbolicFringes.estimate(acquired(None, {"ghost_fringes": {}}))
     assert found is not None

@@ -13,6 +13,7 @@ from pixcal.estimators.map_fit import (
     polynomial,
     without,
 )
+from pixcal.estimators.ring_power import Ring, ring_power
 from pixcal.kernels.scene import TILE, DetectorMaps, LightMaps, Rows, chip_map
 from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity
@@ -25,6 +26,10 @@ Mask = NDArray[np.bool_]
 
 WAVES = 6
 """Plane waves that make up the smooth part."""
+SURE = 3.0
+"""Standard deviations of the smooth part from which its scale is fitted."""
+AGREE = 3.0
+"""Standard deviations within which waves of one length are all that neighbours share."""
 
 _CLIP = 5.0
 _MIN_PIXELS = 200
@@ -99,8 +104,7 @@ class FlatError(Effect):
         iota is of some frames of the fringes over some of the flats, alpha of the others over the
         others, and of another set where there is one: their product holds no noise. A ghost that
         stands still is in iota alone; one that follows the modulator, and crosstalk, are in alpha
-        alone. What neighbours share is smooth, as far as it is no parabola, which beams make too;
-        its scale is not fitted.
+        alone. What neighbours share is smooth; it is counted from a parabola, which beams make too.
         """
         flats = _two_flats(evidence)
         sets = [f for f in evidence.fringes.values() if len(f.g) >= _MIN_FRAMES]
@@ -111,18 +115,21 @@ class FlatError(Effect):
         iotas, alphas = zip(*(_structure(f, evidence.flat, flats, good) for f in sets), strict=True)
         n = len(sets)
         pairs = [(iotas[i], alphas[j]) for i in range(n) for j in range(n) if i != j or n == 1]
-        near = np.mean([neighbour_products(a, b, good) for a, b in pairs], axis=0)
         weight = int(np.count_nonzero(good))
-        all_of_it = near[0][good]
-        smooth = (4 * near[1] - near[2]) / 3
-        pixel_error = float(np.std((near[0] - smooth)[good]) / np.sqrt(weight))
+        near = np.mean([neighbour_products(a, b, good) for a, b in pairs], axis=0)
+        ring = ring_power(_shared_power(pairs, weight))
+        all_of_it, neighbours = near[0][good], ((4 * near[1] - near[2]) / 3)[good]
+        alone = float((all_of_it - neighbours).std() / np.sqrt(weight))
+        smooth, noise, smooth_error = _smooth(neighbours, ring)
         rms, errors = _roots(
-            np.array([(near[0] - smooth)[good].mean(), smooth[good].mean()]),
-            np.array([pixel_error, _smooth_error(pairs, weight)]),
+            np.array([all_of_it.mean() - smooth, smooth]),
+            np.array([np.hypot(alone, noise), smooth_error]),
         )
+        waves = ring.variance > SURE * ring.noise
         return Estimate(
-            cls(min(float(rms[0]), 0.5), min(float(rms[1]), 0.5)),
-            {"pixel_rms": float(errors[0]), "smooth_rms": float(errors[1])},
+            cls(*(min(float(v), 0.5) for v in rms), ring.scale if waves else cls().scale_px),
+            {"pixel_rms": float(errors[0]), "smooth_rms": float(errors[1])}
+            | ({"scale_px": ring.scale_error} if waves else {}),
             float(all_of_it.mean() / all_of_it.std() * np.sqrt(weight)),
             "structure that mean light and fringe amplitude share after division by the flat",
             {"variance": float(all_of_it.mean())},
@@ -163,12 +170,22 @@ def _structure(
     return maps[0], maps[1]
 
 
-def _smooth_error(pairs: list[tuple[F64, F64]], pixels: int) -> float:
-    """Of what two maps share: each wave of the window is one draw, of the scatter it shows."""
-    power = np.mean(
-        [(np.fft.fft2(a) * np.conj(np.fft.fft2(b))).real for a, b in pairs], axis=0
-    ) / (pixels * pairs[0][0].size)  # fmt: skip
-    return float(np.sqrt(2 * (power**2).sum()))
+def _shared_power(pairs: list[tuple[F64, F64]], pixels: int) -> F64:
+    """Mean cross power (y, x); its sum is the mean product of the pixels that count."""
+    products = [(np.fft.fft2(a) * np.conj(np.fft.fft2(b))).real for a, b in pairs]
+    return np.asarray(np.mean(products, axis=0) / (pixels * pairs[0][0].size))
+
+
+def _smooth(neighbours: F64, ring: Ring) -> tuple[float, float, float]:
+    """Variance of the smooth part, its error by noise, and that as one draw of many.
+
+    What neighbours share is all of it, whatever its shape. Waves of one length are better known,
+    and taken where they account for what neighbours share.
+    """
+    variance, noise = float(neighbours.mean()), float(neighbours.std() / np.sqrt(neighbours.size))
+    if abs(ring.variance - variance) < AGREE * np.hypot(noise, ring.noise):
+        return ring.variance, ring.noise, ring.error
+    return variance, noise, float(np.hypot(noise, ring.error))
 
 
 def _roots(variances: F64, errors: F64) -> tuple[F64, F64]:

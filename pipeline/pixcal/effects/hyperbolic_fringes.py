@@ -159,21 +159,39 @@ def _enough(found: FringeEvidence) -> bool:
 
 
 def _geometry(evidence: Evidence, found: FringeEvidence, foot: F64) -> Geometry:
-    """With the window's middle as the origin."""
+    """With the window's middle as the origin, and the measured fringe vector at the map's."""
     pitch, wavelength = evidence.pitch_um * 1e-3, evidence.wavelength_nm * 1e-6
     per_k = wavelength * evidence.distance_mm / (2 * np.pi * pitch)
-    return Geometry(
+    paraxial = Geometry(
         wavelength, pitch, float(foot[0]), float(foot[1]), evidence.distance_mm,
-        found.k[0] * per_k, found.k[1] * per_k,
+        float(np.hypot(*found.k)) * per_k, 0.0,
     )  # fmt: skip
+    # Far from the foot fringes are wider than in the paraxial limit: the phase is as good as
+    # linear in the baseline, whatever the foot.
+    size = paraxial.baseline_x
+    ways = [paraxial, replace(paraxial, baseline_x=0.0, baseline_y=size)]
+    y, x = _middle(found)
+    gradients = [
+        [optics.phase(x + dx, y + dy, g) - optics.phase(x - dx, y - dy, g) for g in ways]
+        for dx, dy in ((0.5, 0.0), (0.0, 0.5))
+    ]
+    baseline = size * np.linalg.solve(np.array(gradients, float), np.array(found.k))
+    return replace(paraxial, baseline_x=float(baseline[0]), baseline_y=float(baseline[1]))
+
+
+def _middle(found: FringeEvidence) -> tuple[float, float]:
+    """Middle (y, x) of the map, from the window's."""
+    ny, nx = found.good.shape
+    return (
+        found.origin[0] + (ny - found.window[0]) / 2,
+        found.origin[1] + (nx - found.window[1]) / 2,
+    )
 
 
 def _bending(evidence: Evidence, found: FringeEvidence, foot: F64) -> F64:
     y, x = centred(found.good.shape)
-    ny, nx = found.good.shape
-    y = y + found.origin[0] + (ny - found.window[0]) / 2
-    x = x + found.origin[1] + (nx - found.window[1]) / 2
-    return bending(x, y, _geometry(evidence, found, foot))
+    y0, x0 = _middle(found)
+    return bending(x + x0, y + y0, _geometry(evidence, found, foot))
 
 
 def _part(evidence: Evidence, found: FringeEvidence, signals: F64, foot: F64 | None) -> MapPart:
