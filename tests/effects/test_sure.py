@@ -5,6 +5,7 @@ import pytest
 
 from pixcal.effects.bias_drift import BiasDrift
 from pixcal.effects.ipc import Ipc
+from pixcal.effects.lag import Lag
 from pixcal.effects.straylight import Straylight
 from pixcal.simulation.effect import Effect, Estimate
 
@@ -35,6 +36,13 @@ def test_a_part_that_was_not_there_to_be_measured_is_no_sure_part() -> None:
     light = Straylight(share=0.05, slope_per_px=(1e-6, 0.0))
     found = sure(light, share=0.001, **{"slope_per_px[0]": 1e-5})
     assert found == Straylight(share=0.05, slope_per_px=(0.0, 0.0))
+
+
+def test_finer_points_that_may_be_nothing_are_left_out() -> None:
+    lag = Lag(share=1e-4, decay_frames=0.9, spread=0.7)
+    errors = {"share": 7e-6, "decay_frames": 0.08, "spread": 0.4}
+    assert sure(lag, **errors) == Lag(share=1e-4, decay_frames=0.9, spread=0.0)
+    assert sure(lag, **errors | {"spread": 0.2}) == lag
 
 
 def test_an_effect_stays_what_it_is_where_nothing_of_it_is_sure_or_errors_are_not_told() -> None:

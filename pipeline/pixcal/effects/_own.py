@@ -50,9 +50,10 @@ def _check(effect: type[Effect]) -> None:
         raise InputError(f"{effect.__name__} is not a dataclass: put @dataclass(frozen=True) there")
     default = effect()
     parse(effect, to_plain(default), effect.__name__)
-    unknown = set(effect.strengths) - {field.name for field in dataclasses.fields(effect)}
-    if unknown:
-        raise InputError(f"strengths names {', '.join(sorted(unknown))}, which is no field")
+    fields = {field.name for field in dataclasses.fields(effect)}
+    for what in ("strengths", "finer"):
+        if unknown := set(getattr(effect, what)) - fields:
+            raise InputError(f"{what} names {', '.join(sorted(unknown))}, which is no field")
     for name in ("halo", "frames_back"):
         if not 0 <= getattr(default, name) <= MOST_AROUND:
             raise InputError(f"{name} is not from 0 to {MOST_AROUND}")

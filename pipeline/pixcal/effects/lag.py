@@ -57,6 +57,7 @@ class Lag(Effect):
     stage = Stage.CHARGE
     domains = ("time", "intensity")
     strengths = ("share",)
+    finer = ("decay_frames", "spread")
     told_by = ("dark",)
     sources = (
         "Bonjour, Blanc and Kayal 2012, IEEE Electron Device Letters 33(12), 1735: lag of pinned "

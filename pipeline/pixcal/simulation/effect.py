@@ -107,12 +107,13 @@ class Estimate:
 
     @property
     def sure(self) -> "Effect":
-        """The effect without those of several strengths that may as well be zero.
+        """The effect without those of its strengths and finer points that may as well be zero.
 
         What is known badly may be tiny in some frames and wild in others.
         """
         nothing = self.effect.scaled(0.0)
         unsure = {n: getattr(nothing, n) for n in self.effect.strengths if not self._is_sure(n)}
+        unsure |= {n: 0.0 for n in self.effect.finer if not self._is_sure(n)}
         pruned = dataclasses.replace(self.effect, **unsure)
         return self.effect if pruned.is_null else pruned
 
@@ -156,6 +157,8 @@ class Effect:
         Where it shows: ``space``, ``time``, ``intensity``, ``noise``.
     strengths : tuple of str
         Fields that `scaled` multiplies: with all of them zero the effect does nothing.
+    finer : tuple of str
+        Fields beside these that may be zero, with the effect still there in its simplest form.
     told_by : tuple of str
         Frames that tell on it besides fringes of one set: ``dark``, ``flat``, ``ladder`` (of
         flats), ``baseline`` (a second one along an axis), ``axis`` (another one); if not said, any.
@@ -171,6 +174,7 @@ class Effect:
     stage: ClassVar[Stage]
     domains: ClassVar[tuple[str, ...]]
     strengths: ClassVar[tuple[str, ...]]
+    finer: ClassVar[tuple[str, ...]] = ()
     told_by: ClassVar[tuple[str, ...]] = ("dark", "flat", "ladder", "baseline", "axis")
     sources: ClassVar[tuple[str, ...]]
     quick: ClassVar[bool] = True
