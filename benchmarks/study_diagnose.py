@@ -316,8 +316,8 @@ def draw(played: Sequence[dict[str, Any]], file: Path) -> None:
     names = sorted({p["effect"] for p in played})
     columns = 5
     figure, axes = plt.subplots(
-        -(-len(names) // columns), columns, figsize=(11, 9), sharex=True, sharey=True, squeeze=False,
-        layout="constrained",
+        -(-len(names) // columns), columns, figsize=(11, 9), sharex=True, sharey=True,
+        squeeze=False, layout="constrained",
     )  # fmt: skip
     for axis in axes.flat[len(names) :]:
         axis.set_visible(False)
