@@ -1,17 +1,62 @@
-"""Likelihoods of a mixture, against SciPy."""
+"""Telegraph noise by its moments: unbiased however faint and slow; likelihoods against SciPy."""
 
 import numpy as np
+import pytest
 from scipy.special import logsumexp
 
-from pixcal.estimators.telegraph import _Mixture
+from pixcal.estimators.telegraph import Series, _Mixture, find_telegraph
+
+PERIOD_S = 0.14
+
+
+def jumping(
+    rng: np.random.Generator, share: float, amplitude: float, switching_s: float
+) -> list[Series]:
+    """Two series of the same pixels, of noise one and jumps with amplitudes about ``amplitude``."""
+    n = 16_000
+    jumps = np.where(rng.random(n) < share, amplitude * rng.standard_exponential(n), 0.0)
+    series = []
+    for frames in (30, 20):
+        anew = rng.random((frames, n)) < 1 - np.exp(-2 * PERIOD_S / switching_s)
+        turns = np.where(anew & (rng.random((frames, n)) < 0.5), -1.0, 1.0)
+        turns[0] = rng.choice([-1.0, 1.0], n)
+        noise = rng.standard_normal((frames, n)) + np.cumprod(turns, axis=0) * jumps / 2
+        series.append(Series(noise, np.arange(n), 1.0, PERIOD_S))
+    return series
+
+
+@pytest.mark.parametrize(
+    ("amplitude", "switching_s"), [(1.0, 0.8), (1.5, 0.8), (3.0, 0.4), (10.0, 1.5)]
+)
+def test_pixels_that_hardly_stand_out_tell_share_amplitude_and_time(
+    amplitude: float, switching_s: float
+) -> None:
+    found = find_telegraph(jumping(np.random.default_rng(8), 0.03, amplitude, switching_s))
+    assert found is not None
+    assert abs(found.share - 0.03) < 4 * found.share_error < 0.03
+    assert abs(found.amplitude - amplitude) < 4 * found.amplitude_error < amplitude
+    assert abs(found.switching_s - switching_s) < 4 * found.switching_error < 2 * switching_s
+    assert found.significance > 8
+
+
+def test_of_stays_longer_than_the_frames_no_more_is_said() -> None:
+    found = find_telegraph(jumping(np.random.default_rng(9), 0.03, 2.0, 40.0))
+    assert found is not None
+    assert found.switching_s <= 30 * PERIOD_S * 1.001
+    assert abs(found.amplitude - 2.0) < 4 * found.amplitude_error
 
 
 def test_the_likelihood_is_that_of_all_classes_even_where_numbers_underflow() -> None:
     rng = np.random.default_rng(3)
     logarithms = 30 * rng.standard_normal((40, 9))
     logarithms[7, 8] = 2000.0
-    weight = rng.random(9)
+    weight = rng.random(9) / 10
     weight[8] = 0.0
-    found = _Mixture.of(logarithms).log_likelihood(weight)
+    mixture = _Mixture.of(logarithms)
     with np.errstate(divide="ignore"):
-        np.testing.assert_allclose(found, logsumexp(logarithms, b=weight, axis=1), rtol=1e-12)
+        wanted = logsumexp(logarithms, b=weight, axis=1)
+    np.testing.assert_allclose(mixture.log_telegraph(weight), wanted, rtol=1e-12)
+    chance, of_class = mixture.chances(weight)
+    quiet = 1 - weight.sum()
+    np.testing.assert_allclose(chance, np.exp(wanted - np.logaddexp(np.log(quiet), wanted)))
+    np.testing.assert_allclose(of_class.sum(axis=1), 1)

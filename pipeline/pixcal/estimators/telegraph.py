@@ -10,12 +10,13 @@ their sums over pixels, weighted by the variance, have known mean and scatter.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize
-from scipy.special import expit, logsumexp
+from scipy.special import expit, logsumexp, softmax
 from scipy.stats import chi2
 
 from pixcal.kernels.significance import sigmas_of_best
@@ -28,11 +29,17 @@ AMPLITUDES = np.geomspace(0.1, 300, 90)
 NOISY = 3.0
 """Excess of the variance, in its own sigmas, from which a pixel's noise is looked at."""
 
-CLEAR = 1.0
-"""Excess of the variance, over the common one, from which a pixel's time is measured."""
+LIKELY = 0.1
+"""Chance of telegraph noise from which a pixel's frames are looked at for how long it stays."""
 
-_FEW = 5
+ROUNDS = 3
+"""Most, in which population and time are found, each with the other known."""
+
+SETTLED = 0.5
+"""Change of the time, over its error, after which no other round is needed."""
+
 _OUTLIER = 5.0
+_DRAWN = 600
 _LEAST = 8
 _UNDERFLOW = 1e-200
 
@@ -94,11 +101,21 @@ def find_telegraph(series: Sequence[Series]) -> Telegraph | None:
     if not parts:
         return None
     flat_top, staying, noisy = _signs(parts)
-    switching, switching_error = _switching(parts)
-    share, amplitude, errors = _population(parts, switching)
+    # A pixel's variance is high by telegraph noise or by chance: how much is which, the population
+    # tells; how much of it a few frames hold, the time.
+    found = _population(parts, 0.0)
+    switching, switching_error = _switching(parts, found)
+    for _ in range(ROUNDS):
+        before = switching
+        if before == 0:
+            break
+        found = _population(parts, switching)
+        switching, switching_error = _switching(parts, found)
+        if abs(switching - before) < SETTLED * switching_error:
+            break
     return Telegraph(
-        share, amplitude, switching, *errors, switching_error,
-        sigmas_of_best(flat_top, staying), flat_top, staying, noisy,
+        found.share, found.amplitude, switching, found.share_error, found.amplitude_error,
+        switching_error, sigmas_of_best(flat_top, staying), flat_top, staying, noisy,
     )  # fmt: skip
 
 
@@ -118,6 +135,14 @@ class _Moments:
     """Of the variance: fewer than the samples have where pixels differ anyway."""
     sigma: float
     period_s: float
+    frames: int
+    """That most pixels have."""
+
+    def of(self, pixels: NDArray[np.intp]) -> "_Moments":
+        """Of some pixels (ascending) alone."""
+        own = np.isin(self.pixel, pixels)
+        names = ("pixel", "count", "variance", "kurtosis", "neighbours")
+        return replace(self, **{name: getattr(self, name)[own] for name in names})
 
     @property
     def excess(self) -> F64:
@@ -157,6 +182,7 @@ def _moments(series: Series) -> _Moments | None:
         dof / max(float(wide), 1.0) ** 2,
         series.sigma * float(np.sqrt(centre)),
         series.period_s if np.isfinite(series.period_s) and series.period_s > 0 else 1.0,
+        int(np.median(n)),
     )
 
 
@@ -178,109 +204,183 @@ def _signs(parts: Sequence[_Moments]) -> tuple[float, float, int]:
     return flat / flat_variance**0.5, stay / stay_variance**0.5, len(noisy)
 
 
-def _seen(keep: float, count: float) -> tuple[float, float]:
-    """What is seen in a number of frames of a variance of one that stays by ``keep`` a frame.
-
-    Returns
-    -------
-    variance : float
-        About the mean of the frames.
-    neighbours : float
-        As in `_Moments`.
-    """
-    n = int(count)
-    lag = np.arange(1, n)
-    powers = keep**lag
-    # Correlation with the mean: of all frames on average, and of the first or last one.
-    mean = (n + 2 * np.sum((n - lag) * powers)) / n**2
-    end = (1 + powers.sum()) / n
-    variance = n * (1 - mean) / (n - 1)
-    return float(variance), float(keep - ((n + 1) * mean - 2 * end) / (n - 1))
-
-
 def _keep(switching_s: float, period_s: float) -> float:
     return float(np.exp(-2 * period_s / switching_s)) if switching_s > 0 else 0.0
 
 
-def _switching(parts: Sequence[_Moments]) -> tuple[float, float]:
-    """Mean stay in a level and its error, s, from neighbouring frames of the noisy pixels."""
+def _switching(parts: Sequence[_Moments], population: "_Population") -> tuple[float, float]:
+    """Mean stay in a level and its error, s, from neighbouring frames."""
     period = min(m.period_s for m in parts)
-    # Of pixels that barely stand out many do so by chance, and too far.
-    clear = max((np.count_nonzero(m.excess > CLEAR) for m in parts), default=0) >= _FEW
-    excesses = [np.where(m.excess > CLEAR * clear, m.excess, 0) for m in parts]
+    # The others say nothing of it.
+    few = population.pixels[population.chance > LIKELY]
+    if not len(few):
+        return 0.0, period
+    own = [m.of(few) for m in parts]
 
     def rest(log_time: float) -> tuple[float, float]:
         """Products of neighbours beyond those for a time, and their error."""
+        classes = [_Classes.of(m, population.unit, float(np.exp(log_time))) for m in own]
+        chance, of_class = _Mixture.of(_joined(few, own, classes)).chances(population.weight)
         total = square = 0.0
-        for m, excess in zip(parts, excesses, strict=True):
-            count = float(np.median(m.count))
-            variance, neighbours = _seen(_keep(np.exp(log_time), m.period_s), count)
-            expected = neighbours / variance * excess
-            left = np.where(excess > 0, m.neighbours + 1 / m.count - expected, 0)
+        for m, one in zip(own, classes, strict=True):
+            at = np.searchsorted(few, m.pixel)
+            expected = np.einsum("nk,nk->n", of_class[at], one.neighbours)
+            left = chance[at] * (m.neighbours + 1 / m.count - chance[at] * expected)
             total += float(left.sum())
             square += float(left @ left)
         return total, square**0.5
 
-    low, high = np.log(0.1 * period), np.log(1e3 * period)
+    # Of longer stays the frames do not tell how long.
+    longest = max(m.period_s * m.frames for m in parts)
+    low, high = np.log(0.1 * period), np.log(max(longest, period))
 
     def solved(more: float) -> float:
         """Logarithm of the time for which so much more than was measured is expected."""
         if rest(high)[0] + more >= 0:
             return float(high)
-        return float(brentq(lambda v: rest(v)[0] + more, low, high, xtol=1e-4))
+        return float(brentq(lambda v: rest(v)[0] + more, low, high, xtol=3e-3))
 
     none, error = rest(low)
     if none <= 3 * error:
-        longest = float(np.exp(solved(error))) if none + error > 0 else 0.0
-        return 0.0, max(longest, period)
+        at_most = float(np.exp(solved(error))) if none + error > 0 else 0.0
+        return 0.0, max(at_most, period)
     found = solved(0.0)
     slope = abs(rest(found + 0.05)[0] - rest(found - 0.05)[0]) / 0.1
     return float(np.exp(found)), float(np.exp(found) * rest(found)[1] / max(slope, 1e-12))
 
 
-def _population(
-    parts: Sequence[_Moments], switching_s: float
-) -> tuple[float, float, tuple[float, float]]:
-    """Share of the pixels, their mean amplitude (e-), and the errors of both."""
+@dataclass(frozen=True)
+class _Population:
+    """Pixels with telegraph noise.
+
+    Attributes
+    ----------
+    share, amplitude, share_error, amplitude_error : float
+        Of the pixels; mean, e-.
+    unit : float
+        Noise that `AMPLITUDES` are over, e-.
+    weight : (class,) float64
+        Share of the pixels in each class of amplitudes.
+    pixels : (n,) int
+        All that there are.
+    chance : (n,) float64
+        That each is one of them.
+    """
+
+    share: float
+    amplitude: float
+    share_error: float
+    amplitude_error: float
+    unit: float
+    weight: F64
+    pixels: NDArray[np.intp]
+    chance: F64
+
+
+def _population(parts: Sequence[_Moments], switching_s: float) -> _Population:
+    """Of how many pixels, and how strong, for a mean stay in a level."""
     pixels = np.unique(np.concatenate([m.pixel for m in parts]))
     unit = min(m.sigma for m in parts)
-    log_ratio = np.zeros((len(pixels), len(AMPLITUDES)))
-    for m in parts:
-        count = float(np.median(m.count))
-        seen, _ = _seen(_keep(switching_s, m.period_s), count)
-        variance = 1 + seen * (AMPLITUDES * unit / m.sigma / 2) ** 2
-        ratio = m.dof / 2 * (m.variance[:, None] * (1 - 1 / variance) - np.log(variance))
-        np.add.at(log_ratio, np.searchsorted(pixels, m.pixel), ratio)
+    classes = [_Classes.of(m, unit, switching_s) for m in parts]
+    mixture = _Mixture.of(_joined(pixels, parts, classes))
+    del classes
 
-    mixture = _Mixture.of(log_ratio)
-
-    def cost(p: F64) -> float:
+    def weights(p: F64) -> F64:
+        """Share of the pixels in each class of amplitudes."""
         share, mean = expit(p[0]), np.exp(p[1])
         weight = AMPLITUDES / mean * np.exp(-AMPLITUDES / mean) * np.gradient(np.log(AMPLITUDES))
-        # Amplitudes below those looked at do nothing.
-        telegraph = mixture.log_likelihood(share * weight)
-        return -float(np.logaddexp(np.log(max(1 - share * weight.sum(), 1e-12)), telegraph).sum())
+        return np.asarray(share * weight)
+
+    def cost(p: F64) -> float:
+        return -float(mixture.log_likelihood(weights(p)).sum())
 
     start = np.array([-4.0, 1.0])
     best = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-3}).x
     share, mean = float(expit(best[0])), float(np.exp(best[1]))
+    of_all = unit, weights(best), pixels, mixture.chances(weights(best))[0]
     covariance = _curvature(cost, best)
     if covariance is None:
-        return share, unit * mean, (1.0, unit * mean)
+        return _Population(share, unit * mean, 1.0, unit * mean, *of_all)
     errors = np.sqrt(np.diag(covariance))
-    return (
-        share,
-        unit * mean,
-        (
-            float(min(errors[0] * share * (1 - share) + 1e-9, 1.0)),
-            float(unit * mean * errors[1]),
-        ),
-    )
+    share_error = float(min(errors[0] * share * (1 - share) + 1e-9, 1.0))
+    amplitude_error = float(unit * mean * errors[1])
+    return _Population(share, unit * mean, share_error, amplitude_error, *of_all)
+
+
+@dataclass(frozen=True)
+class _Classes:
+    """Of each pixel of a series, for each amplitude that it may have; (n, class) float64.
+
+    Attributes
+    ----------
+    log_ratio
+        Likelihood of its variance over that of a quiet pixel's, logarithms.
+    neighbours
+        Products of neighbouring frames that it should then have, as in `_Moments`.
+    """
+
+    log_ratio: F64
+    neighbours: F64
+
+    @classmethod
+    def of(cls, m: _Moments, unit: float, switching_s: float) -> "_Classes":
+        added = (AMPLITUDES * unit / m.sigma / 2) ** 2
+        variance = 1 + added
+        levels = m.dof / 2 * (m.variance[:, None] * (1 - 1 / variance) - np.log(variance))
+        largest = levels.max(axis=1, keepdims=True)
+        likely = np.exp(levels - largest)
+        chances, products = _levels(_keep(switching_s, m.period_s), m.frames)
+        mixed = np.maximum(likely @ chances, _UNDERFLOW)
+        return cls(np.log(mixed) + largest, (likely @ products) * added / mixed)
+
+
+@lru_cache(maxsize=64)
+def _levels(keep: float, count: int) -> tuple[F64, F64]:
+    """What a pixel of an amplitude shows in a number of frames, by its stays.
+
+    One that stays long shows more or less of its two levels, or only one: it looks as if it had
+    another amplitude.
+
+    Returns
+    -------
+    chances : (level, class) float64
+        That a pixel of a class has the variance that those of another have on average.
+    products : (level, class) float64
+        That chance, times the products of neighbouring frames it then has over its full variance.
+    """
+    rng = np.random.default_rng(0)
+    turns = np.where(rng.random((count, _DRAWN)) < (1 - keep) / 2, -1.0, 1.0)
+    states = np.cumprod(turns, axis=0)
+    states -= states.mean(axis=0)
+    seen = (states**2).sum(axis=0) / (count - 1)
+    near = (states[1:] * states[:-1]).sum(axis=0) / (count - 1)
+    step = np.log(AMPLITUDES[1] / AMPLITUDES[0])
+    moves = np.rint(np.log(np.maximum(seen, 1e-12)) / 2 / step).astype(int)
+    classes = np.arange(len(AMPLITUDES))
+    chances, products = np.zeros((2, len(classes), len(classes)))
+    for move in np.unique(moves):
+        at = np.clip(classes + move, 0, classes[-1]), classes
+        np.add.at(chances, at, np.mean(moves == move))
+        np.add.at(products, at, near[moves == move].sum() / _DRAWN)
+    return chances, products
+
+
+def _joined(
+    pixels: NDArray[np.intp], parts: Sequence[_Moments], classes: Sequence[_Classes]
+) -> F64:
+    """Logarithms (pixel, class) of the likelihood ratios of all series together."""
+    total = np.zeros((len(pixels), len(AMPLITUDES)))
+    for m, one in zip(parts, classes, strict=True):
+        np.add.at(total, np.searchsorted(pixels, m.pixel), one.log_ratio)
+    return total
 
 
 @dataclass(frozen=True)
 class _Mixture:
-    """Likelihoods (pixel, class) over the largest of each pixel, and the logarithm of that."""
+    """Likelihood ratios (pixel, class) over the largest of each pixel, and the logarithm of that.
+
+    Pixels that are of no class are quiet; their ratio is one.
+    """
 
     ratio: F64
     largest: F64
@@ -291,14 +391,26 @@ class _Mixture:
         largest = logarithms.max(axis=1)
         return cls(np.exp(logarithms - largest[:, None]), largest, logarithms)
 
-    def log_likelihood(self, weight: F64) -> F64:
-        """Of each pixel, with weights (class,) of the classes."""
+    def log_telegraph(self, weight: F64) -> F64:
+        """Of each pixel, of all classes with their weights (class,)."""
         total = self.ratio @ weight
         found = self.largest + np.log(np.maximum(total, _UNDERFLOW))
         # Where the largest has hardly any weight the others have been rounded to nothing.
         lost = total <= _UNDERFLOW
         found[lost] = logsumexp(self.logarithms[lost], b=weight, axis=1)
         return found
+
+    def log_likelihood(self, weight: F64) -> F64:
+        """Of each pixel, quiet or not."""
+        # Amplitudes below those looked at do nothing.
+        quiet = np.log(max(1 - weight.sum(), 1e-12))
+        return np.asarray(np.logaddexp(quiet, self.log_telegraph(weight)))
+
+    def chances(self, weight: F64) -> tuple[F64, F64]:
+        """Of each pixel, that it is not quiet; and then of which class, (pixel, class)."""
+        chance = np.exp(self.log_telegraph(weight) - self.log_likelihood(weight))
+        of_class = softmax(self.logarithms + np.log(np.maximum(weight, _UNDERFLOW)), axis=1)
+        return np.asarray(chance), np.asarray(of_class)
 
 
 def _curvature(cost: Callable[[F64], float], at: F64, step: float = 0.05) -> F64 | None:
