@@ -125,9 +125,10 @@ class FlatError(Effect):
             np.array([all_of_it.mean() - smooth, smooth]),
             np.array([np.hypot(alone, noise), smooth_error]),
         )
+        pixel, whole = (min(float(v), 0.5) for v in rms)
         waves = ring.variance > SURE * ring.noise
         return Estimate(
-            cls(*(min(float(v), 0.5) for v in rms), ring.scale if waves else cls().scale_px),
+            cls(pixel, whole, ring.scale if waves else cls().scale_px),
             {"pixel_rms": float(errors[0]), "smooth_rms": float(errors[1])}
             | ({"scale_px": ring.scale_error} if waves else {}),
             float(all_of_it.mean() / all_of_it.std() * np.sqrt(weight)),
