@@ -99,6 +99,7 @@ def run(folder: Path, again: bool, keep: bool, limit: int | None, runtime: "Runt
     epilog=examples(
         "pixcal blind score exam --sealed truth.json",
         "pixcal blind score exam --sealed truth.json --oracle 20 --write docs/blind.md",
+        "pixcal blind score exam --sealed truth.json --also exam-2 truth-2.json",
     )
 )
 @cases_argument
@@ -118,12 +119,26 @@ def run(folder: Path, again: bool, keep: bool, limit: int | None, runtime: "Runt
     type=click.Path(path_type=Path),
     help="Markdown page that the table goes to, between its marks.",
 )
+@click.option(
+    "--also",
+    metavar="DIR FILE",
+    type=(click.Path(path_type=Path), click.Path(path_type=Path)),
+    multiple=True,
+    help="Another examination of the same size, and its truth, to be scored together; repeatable.",
+)
 @runtime_options
-def score(folder: Path, sealed: Path, oracle: int, write: Path | None, runtime: "Runtime") -> None:
+def score(
+    folder: Path,
+    sealed: Path,
+    oracle: int,
+    write: Path | None,
+    also: tuple[tuple[Path, Path], ...],
+    runtime: "Runtime",
+) -> None:
     """Open the seal and hold every diagnosis against its truth."""
     from pixcal.stages import blind as stage  # here: for a fast `pixcal --help`
 
-    found = stage.score(folder, sealed, stage.ScoreConfig(oracle, write), runtime)
+    found = stage.score(folder, sealed, stage.ScoreConfig(oracle, write, also), runtime)
     _show(found)
     for file in (folder / "score.json", folder / "score.md"):
         click.echo(f"  {file}")

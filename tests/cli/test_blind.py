@@ -37,6 +37,53 @@ def test_an_examination_from_beginning_to_end(
     assert json.loads((exam / "score.json").read_text())["parts"]["1"]["cases"] == 1
 
 
+def sat(folder: Path, seed: int, size: str, capsys: pytest.CaptureFixture[str]) -> list[str]:
+    """An examination of one case, in which nothing was found: folder and truth."""
+    exam, sealed = folder / f"exam-{seed}", folder / f"truth-{seed}.json"
+    drawn = ["--cases", "1", "--seed", str(seed), "--size", size, "--quiet"]
+    assert invoke(["blind", "make", *drawn, "--out", str(exam), "--sealed", str(sealed)]) == 0
+    products = exam / "runs" / "case-0001" / "products"
+    products.mkdir(parents=True)
+    gap = {"after": 1.0, "where": []}
+    diagnosis = {"verdict": "no gap", "causes": [], "candidates": [], "gap": gap}
+    (products / "diagnosis.json").write_text(json.dumps(diagnosis))
+    capsys.readouterr()
+    return [str(exam), str(sealed)]
+
+
+def test_examinations_are_scored_together(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (one, its), (other, others) = (sat(tmp_path, seed, "tiny", capsys) for seed in (3, 1004))
+    command = ["blind", "score", one, "--sealed", its, "--quiet"]
+    assert invoke([*command, "--also", other, others]) == 0
+    assert "note: exam-3/case-0001: " in capsys.readouterr().out
+    score = json.loads((Path(one) / "score.json").read_text())
+    assert score["seed"] == [3, 1004]
+    assert score["made"] == 2
+    assert [case["case"] for case in score["cases"]] == ["exam-3/case-0001", "exam-1004/case-0001"]
+    assert score["parts"]["1"]["cases"] == 2
+    # One of them is for development.
+    assert score["purpose"] == "development"
+    assert "seeds 3, 1004" in (Path(one) / "score.md").read_text()
+    assert not (Path(other) / "score.json").exists()
+
+
+def test_what_does_not_go_together_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (one, its), (other, others) = (
+        sat(tmp_path, seed, size, capsys) for seed, size in ((3, "tiny"), (4, "small"))
+    )
+    command = ["blind", "score", one, "--sealed", its, "--quiet"]
+    assert invoke([*command, "--also", one, its]) == 2
+    assert "given twice; name each once" in capsys.readouterr().err
+    assert invoke([*command, "--also", other, others]) == 2
+    assert "of size small" in capsys.readouterr().err
+    assert invoke([*command, "--also", other, its]) == 2
+    assert not (Path(one) / "score.json").exists()
+
+
 @pytest.mark.parametrize(
     ("args", "words"),
     [

@@ -52,13 +52,17 @@ class ScoreConfig:
     Attributes
     ----------
     oracle : int
-        Cases of parts 1 and 4, the first of them, whose true effects are simulated as well.
+        Cases of parts 1 and 4, the first of them, whose true effects are simulated as well; of each
+        examination.
     write : Path, optional
         Page that the table goes to, between the marks of the examination's size.
+    also : tuple of (Path, Path)
+        Further examinations of the same size that are scored together with it: folder and truth.
     """
 
     oracle: int = 0
     write: Path | None = None
+    also: tuple[tuple[Path, Path], ...] = ()
 
 
 def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> dict[str, Any]:
@@ -83,8 +87,66 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
     Raises
     ------
     InputError
-        If the truth is not the one that the cases were made with, or no case was sat.
+        If the truth is not the one that the cases were made with, no case was sat, or examinations
+        of several sizes are given.
     """
+    marked = [
+        _marked(own, truth, config, runtime) for own, truth in ((folder, sealed), *config.also)
+    ]
+    first = marked[0]
+    for one in marked[1:]:
+        if one.paper.size != first.paper.size:
+            raise InputError(
+                f"--also {one.folder}: of size {one.paper.size}, {folder} of {first.paper.size}; "
+                "score them apart"
+            )
+    if len({one.paper.commitment for one in marked}) < len(marked):
+        raise InputError("--also: an examination is given twice; name each once")
+    named = [one.named(apart=len(marked) > 1) for one in marked]
+    missing = [case for _, own in named for case in own]
+    seeds = [one.opened.examination.seed for one in marked]
+    purposes = {purpose_of(seed) for seed in seeds}
+    found = summary([g for grades, _ in named for g in grades]) | {
+        "schema": SCHEMA,
+        "purpose": "development" if "development" in purposes else "examination",
+        # Who has it can draw the cases that are still to be sat.
+        "seed": None if missing else seeds[0] if len(seeds) == 1 else seeds,
+        "size": first.paper.size,
+        "made": sum(len(one.paper.cases) for one in marked),
+        "missing": missing,
+        "sittings": _sittings([one.folder / RUNS / g.case for one in marked for g in one.grades]),
+        "notes": list(dict.fromkeys(n for one in marked for n in one.opened.examination.notes)),
+    }
+    write_json(folder / PRODUCT, found)
+    text = as_markdown(found)
+    (folder / TABLE).write_text(text, encoding="utf-8")
+    if config.write is not None:
+        write_between(config.write, first.paper.size, text)
+    return found
+
+
+@dataclass(frozen=True)
+class _Marked:
+    """An examination, opened."""
+
+    folder: Path
+    paper: Paper
+    opened: Sealed
+    grades: list[Grade]
+    missing: list[str]
+
+    def named(self, apart: bool) -> tuple[list[Grade], list[str]]:
+        """Grades, and cases that are missing; with the folder's name where there are several."""
+        if not apart:
+            return self.grades, self.missing
+        place = self.folder.resolve().name
+        return (
+            [replace(g, case=f"{place}/{g.case}") for g in self.grades],
+            [f"{place}/{case}" for case in self.missing],
+        )
+
+
+def _marked(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> _Marked:
     paper = read_paper(folder)
     opened = read_seal(sealed, paper.commitment)
     if len(paper.cases) != len(opened.examination.truths):
@@ -100,23 +162,7 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
     if config.oracle:
         grades = _with_oracle(folder, opened, dict(zip(sat, grades, strict=True)), config, runtime)
     missing = [name for n, name in enumerate(paper.cases) if n not in sat]
-    found = summary(grades) | {
-        "schema": SCHEMA,
-        "purpose": purpose_of(opened.examination.seed),
-        # Who has it can draw the cases that are still to be sat.
-        "seed": None if missing else opened.examination.seed,
-        "size": paper.size,
-        "made": len(paper.cases),
-        "missing": missing,
-        "sittings": _sittings(folder, [g.case for g in grades]),
-        "notes": list(opened.examination.notes),
-    }
-    write_json(folder / PRODUCT, found)
-    text = as_markdown(found)
-    (folder / TABLE).write_text(text, encoding="utf-8")
-    if config.write is not None:
-        write_between(config.write, paper.size, text)
-    return found
+    return _Marked(folder, paper, opened, grades, missing)
 
 
 def _was_sat(run_dir: Path) -> bool:
@@ -154,12 +200,12 @@ def _graded(folder: Path, paper: Paper, opened: Sealed, number: int) -> Grade:
     return replace(found, offsets=errors)
 
 
-def _sittings(folder: Path, cases: Sequence[str]) -> dict[str, Any]:
+def _sittings(cases: Sequence[Path]) -> dict[str, Any]:
     """By how many versions of the code the cases were diagnosed, how long that took, what failed.
 
     One is right: what was changed after a part of the seal was opened is no blind examination.
     """
-    files = [folder / RUNS / case / SAT for case in cases]
+    files = [case / SAT for case in cases]
     told = [_sitting(file) for file in files if file.is_file()]
     return {
         "codes": sorted({one["code"] for one in told}),

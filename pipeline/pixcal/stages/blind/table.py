@@ -29,7 +29,8 @@ def as_markdown(score: Plain) -> str:
 def _about(score: Plain) -> str:
     told = f"{len(score['cases'])} cases, size {score['size']}"
     if score["seed"] is not None:
-        told += f", seed {score['seed']}"
+        seeds = score["seed"] if isinstance(score["seed"], list) else [score["seed"]]
+        told += f", seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
     if score["missing"]:
         told += f"; **{len(score['missing'])} of {score['made']} are not diagnosed yet**"
     if score["purpose"] == "development":
