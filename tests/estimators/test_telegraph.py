@@ -56,7 +56,7 @@ def test_the_likelihood_is_that_of_all_classes_even_where_numbers_underflow() ->
     with np.errstate(divide="ignore"):
         wanted = logsumexp(logarithms, b=weight, axis=1)
     np.testing.assert_allclose(mixture.log_telegraph(weight), wanted, rtol=1e-12)
-    chance, of_class = mixture.chances(weight)
+    chance, of_class = mixture.chance(weight), mixture.shares(weight)
     quiet = 1 - weight.sum()
     np.testing.assert_allclose(chance, np.exp(wanted - np.logaddexp(np.log(quiet), wanted)))
     np.testing.assert_allclose(of_class.sum(axis=1), 1)

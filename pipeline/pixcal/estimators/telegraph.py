@@ -9,7 +9,7 @@ of neighbouring frames, each over the variance, do not depend on the variance (B
 their sums over pixels, weighted by the variance, have known mean and scatter.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -220,11 +220,13 @@ def _switching(parts: Sequence[_Moments], population: "_Population") -> tuple[fl
     def rest(log_time: float) -> tuple[float, float]:
         """Products of neighbours beyond those for a time, and their error."""
         classes = [_Classes.of(m, population.unit, float(np.exp(log_time))) for m in own]
-        chance, of_class = _Mixture.of(_joined(few, own, classes)).chances(population.weight)
+        mixture = _Mixture.of(_joined(few, own, classes))
+        chance = mixture.chance(population.weight)
+        of_class = mixture.shares(population.weight)
         total = square = 0.0
         for m, one in zip(own, classes, strict=True):
             at = np.searchsorted(few, m.pixel)
-            expected = np.einsum("nk,nk->n", of_class[at], one.neighbours)
+            expected = np.einsum("nk,nk->n", of_class[at], one.neighbours())
             left = chance[at] * (m.neighbours + 1 / m.count - chance[at] * expected)
             total += float(left.sum())
             square += float(left @ left)
@@ -281,9 +283,9 @@ def _population(parts: Sequence[_Moments], switching_s: float) -> _Population:
     """Of how many pixels, and how strong, for a mean stay in a level."""
     pixels = np.unique(np.concatenate([m.pixel for m in parts]))
     unit = min(m.sigma for m in parts)
-    classes = [_Classes.of(m, unit, switching_s) for m in parts]
+    # One after the other: each is large.
+    classes = (_Classes.of(m, unit, switching_s) for m in parts)
     mixture = _Mixture.of(_joined(pixels, parts, classes))
-    del classes
 
     def weights(p: F64) -> F64:
         """Share of the pixels in each class of amplitudes."""
@@ -297,7 +299,7 @@ def _population(parts: Sequence[_Moments], switching_s: float) -> _Population:
     start = np.array([-4.0, 1.0])
     best = minimize(cost, start, method="Nelder-Mead", options={"xatol": 1e-3, "fatol": 1e-3}).x
     share, mean = float(expit(best[0])), float(np.exp(best[1]))
-    of_all = unit, weights(best), pixels, mixture.chances(weights(best))[0]
+    of_all = unit, weights(best), pixels, mixture.chance(weights(best))
     covariance = _curvature(cost, best)
     if covariance is None:
         return _Population(share, unit * mean, 1.0, unit * mean, *of_all)
@@ -309,29 +311,53 @@ def _population(parts: Sequence[_Moments], switching_s: float) -> _Population:
 
 @dataclass(frozen=True)
 class _Classes:
-    """Of each pixel of a series, for each amplitude that it may have; (n, class) float64.
+    """Pixels of a series, for each amplitude that they may have.
 
     Attributes
     ----------
-    log_ratio
-        Likelihood of its variance over that of a quiet pixel's, logarithms.
-    neighbours
-        Products of neighbouring frames that it should then have, as in `_Moments`.
+    likely : (n, class) float64
+        Likelihood of each pixel's variance over the largest of its own.
+    largest : (n, 1) float64
+        The logarithm of that, over the likelihood of a quiet pixel.
+    added : (class,) float64
+        Variance that an amplitude adds, over the common one.
+    chances, products : (level, class) float64
+        From `_levels`.
     """
 
-    log_ratio: F64
-    neighbours: F64
+    likely: F64
+    largest: F64
+    added: F64
+    chances: F64
+    products: F64
 
     @classmethod
     def of(cls, m: _Moments, unit: float, switching_s: float) -> "_Classes":
         added = (AMPLITUDES * unit / m.sigma / 2) ** 2
-        variance = 1 + added
-        levels = m.dof / 2 * (m.variance[:, None] * (1 - 1 / variance) - np.log(variance))
+        levels = m.variance[:, None] * (added / (1 + added))
+        levels -= np.log1p(added)
+        levels *= m.dof / 2
         largest = levels.max(axis=1, keepdims=True)
-        likely = np.exp(levels - largest)
-        chances, products = _levels(_keep(switching_s, m.period_s), m.frames)
-        mixed = np.maximum(likely @ chances, _UNDERFLOW)
-        return cls(np.log(mixed) + largest, (likely @ products) * added / mixed)
+        levels -= largest
+        np.exp(levels, out=levels)
+        of_levels = _levels(_keep(switching_s, m.period_s), m.frames)
+        return cls(levels, largest, added, *of_levels)
+
+    def mixed(self) -> F64:
+        """Likelihoods (n, class) by what a pixel may have shown of its amplitude."""
+        mixed = self.likely @ self.chances
+        return np.asarray(np.maximum(mixed, _UNDERFLOW, out=mixed))
+
+    def log_ratio(self) -> F64:
+        """Logarithms (n, class) of the likelihoods over that of a quiet pixel."""
+        mixed = self.mixed()
+        np.log(mixed, out=mixed)
+        mixed += self.largest
+        return mixed
+
+    def neighbours(self) -> F64:
+        """Products of neighbouring frames (n, class) to be expected, as in `_Moments`."""
+        return np.asarray((self.likely @ self.products) * self.added / self.mixed())
 
 
 @lru_cache(maxsize=64)
@@ -366,12 +392,12 @@ def _levels(keep: float, count: int) -> tuple[F64, F64]:
 
 
 def _joined(
-    pixels: NDArray[np.intp], parts: Sequence[_Moments], classes: Sequence[_Classes]
+    pixels: NDArray[np.intp], parts: Sequence[_Moments], classes: Iterable[_Classes]
 ) -> F64:
     """Logarithms (pixel, class) of the likelihood ratios of all series together."""
     total = np.zeros((len(pixels), len(AMPLITUDES)))
     for m, one in zip(parts, classes, strict=True):
-        np.add.at(total, np.searchsorted(pixels, m.pixel), one.log_ratio)
+        np.add.at(total, np.searchsorted(pixels, m.pixel), one.log_ratio())
     return total
 
 
@@ -406,11 +432,14 @@ class _Mixture:
         quiet = np.log(max(1 - weight.sum(), 1e-12))
         return np.asarray(np.logaddexp(quiet, self.log_telegraph(weight)))
 
-    def chances(self, weight: F64) -> tuple[F64, F64]:
-        """Of each pixel, that it is not quiet; and then of which class, (pixel, class)."""
-        chance = np.exp(self.log_telegraph(weight) - self.log_likelihood(weight))
-        of_class = softmax(self.logarithms + np.log(np.maximum(weight, _UNDERFLOW)), axis=1)
-        return np.asarray(chance), np.asarray(of_class)
+    def chance(self, weight: F64) -> F64:
+        """Of each pixel, that it is not quiet."""
+        return np.asarray(np.exp(self.log_telegraph(weight) - self.log_likelihood(weight)))
+
+    def shares(self, weight: F64) -> F64:
+        """Chances (pixel, class) of the classes, if it is not."""
+        logarithms = self.logarithms + np.log(np.maximum(weight, _UNDERFLOW))
+        return np.asarray(softmax(logarithms, axis=1))
 
 
 def _curvature(cost: Callable[[F64], float], at: F64, step: float = 0.05) -> F64 | None:
