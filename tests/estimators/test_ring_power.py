@@ -5,7 +5,13 @@ import pytest
 from numpy.typing import NDArray
 
 from pixcal.estimators.map_fit import polynomial, without
-from pixcal.estimators.ring_power import Ring, ring_power
+from pixcal.estimators.ring_power import (
+    NARROW,
+    Ring,
+    _of_long_waves,
+    _of_short_waves,
+    ring_power,
+)
 
 F64 = NDArray[np.float64]
 SHAPE = (61, 67)
@@ -71,3 +77,13 @@ def test_nothing_at_all_is_nothing() -> None:
     found = ring_power(np.zeros(SHAPE))
     assert found.variance == 0
     assert np.isinf(found.scale_error)
+
+
+@pytest.mark.parametrize("shape", [(61, 67), (40, 128)])
+def test_templates_of_short_and_long_waves_agree_where_they_meet(shape: tuple[int, int]) -> None:
+    scale = min(shape) / NARROW
+    short, long = _of_short_waves(shape, scale), _of_long_waves(shape, scale)
+    assert short.sum() == pytest.approx(1)
+    assert 0.9 < long.sum() < 1
+    assert abs(short - long).sum() < 0.4
+    assert np.corrcoef(short.ravel(), long.ravel())[0, 1] > 0.95

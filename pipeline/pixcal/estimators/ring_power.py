@@ -11,6 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import j0
 
 from pixcal.estimators.map_fit import polynomial, without
 
@@ -22,7 +23,10 @@ WIDEST = 4
 """Windows are this many times as wide as the longest scale: longer waves are parabolas there."""
 STEP = 0.1
 """Of the logarithm of the scales that are tried."""
+NARROW = 12
+"""Windows are this many times as wide as scales of which a parabola takes nothing that matters."""
 DIRECTIONS = 16
+"""Of longer waves, whose ring has no more places."""
 EDGE = 0.02
 """Of the template's highest power, beyond which the ring ends."""
 _PARABOLA = 2
@@ -106,13 +110,30 @@ def _templates(shape: tuple[int, int]) -> tuple[F64, F64]:
     """Scales (n,) and the mean power (n, y * x) of waves of unit variance on a window."""
     longest = max(min(shape) / WIDEST, SHORTEST * np.exp(4 * STEP))
     scales = np.exp(np.arange(np.log(SHORTEST), np.log(longest), STEP))
+    short = [_of_short_waves(shape, s) for s in scales if s < min(shape) / NARROW]
+    long = [_of_long_waves(shape, s) for s in scales[len(short) :]]
+    return scales, np.stack([*short, *long]).reshape(len(scales), -1)
+
+
+def _of_short_waves(shape: tuple[int, int], scale: float) -> F64:
+    """Mean power (y, x) of all directions: transform of the Bessel function that products follow.
+
+    A parabola takes next to nothing of them.
+    """
+    ny, nx = shape
+    dy, dx = np.arange(1 - ny, ny)[:, None], np.arange(1 - nx, nx)
+    products = (1 - abs(dy) / ny) * (1 - abs(dx) / nx) * j0(np.hypot(dy, dx) / scale)
+    wrapped = np.zeros(shape)
+    np.add.at(wrapped, (dy % ny, dx % nx), products)
+    return np.asarray(np.fft.fft2(wrapped).real / wrapped.size)
+
+
+def _of_long_waves(shape: tuple[int, int], scale: float) -> F64:
+    """Mean power (y, x) of waves of some directions, less what a parabola takes of each."""
     free = polynomial(shape, _PARABOLA).reshape(-1, shape[0] * shape[1]).T
     y, x = np.mgrid[: shape[0], : shape[1]].reshape(2, -1).astype(float)
     angle = np.pi * (np.arange(DIRECTIONS) + 0.5) / DIRECTIONS
-    templates = []
-    for scale in scales:
-        phase = (np.outer(x, np.cos(angle)) + np.outer(y, np.sin(angle))) / scale
-        waves = without(np.sqrt(2) * np.hstack([np.cos(phase), np.sin(phase)]), free)
-        power = np.abs(np.fft.fft2(waves.T.reshape(-1, *shape))) ** 2
-        templates.append(power.mean(axis=0).ravel() / y.size**2)
-    return scales, np.stack(templates)
+    phase = (np.outer(x, np.cos(angle)) + np.outer(y, np.sin(angle))) / scale
+    waves = without(np.sqrt(2) * np.hstack([np.cos(phase), np.sin(phase)]), free)
+    power = np.abs(np.fft.fft2(waves.T.reshape(-1, *shape))) ** 2
+    return np.asarray(power.mean(axis=0) / y.size**2)
