@@ -90,18 +90,10 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
         If the truth is not the one that the cases were made with, no case was sat, or examinations
         of several sizes are given.
     """
-    marked = [
-        _marked(own, truth, config, runtime) for own, truth in ((folder, sealed), *config.also)
-    ]
+    exams = [(folder, sealed), *config.also]
+    _require_alike([own for own, _ in exams])
+    marked = [_marked(own, truth, config, runtime) for own, truth in exams]
     first = marked[0]
-    for one in marked[1:]:
-        if one.paper.size != first.paper.size:
-            raise InputError(
-                f"--also {one.folder}: of size {one.paper.size}, {folder} of {first.paper.size}; "
-                "score them apart"
-            )
-    if len({one.paper.commitment for one in marked}) < len(marked):
-        raise InputError("--also: an examination is given twice; name each once")
     named = [one.named(apart=len(marked) > 1) for one in marked]
     missing = [case for _, own in named for case in own]
     seeds = [one.opened.examination.seed for one in marked]
@@ -123,6 +115,19 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
     if config.write is not None:
         write_between(config.write, first.paper.size, text)
     return found
+
+
+def _require_alike(folders: Sequence[Path]) -> None:
+    """Refuse what cannot be scored together, before the long work."""
+    papers = [read_paper(folder) for folder in folders]
+    for folder, paper in zip(folders, papers, strict=True):
+        if paper.size != papers[0].size:
+            raise InputError(
+                f"--also {folder}: of size {paper.size}, {folders[0]} of {papers[0].size}; "
+                "score them apart"
+            )
+    if len({paper.commitment for paper in papers}) < len(papers):
+        raise InputError("--also: an examination is given twice; name each once")
 
 
 @dataclass(frozen=True)
