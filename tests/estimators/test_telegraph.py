@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from pixcal.estimators.telegraph import Series, _Mixture, find_telegraph
+from pixcal.estimators.telegraph.classes import Mixture
+from pixcal.estimators.telegraph.find import find_telegraph
+from pixcal.estimators.telegraph.moments import Series
 
 PERIOD_S = 0.14
 
@@ -52,7 +54,7 @@ def test_the_likelihood_is_that_of_all_classes_even_where_numbers_underflow() ->
     logarithms[7, 8] = 2000.0
     weight = rng.random(9) / 10
     weight[8] = 0.0
-    mixture = _Mixture.of(logarithms)
+    mixture = Mixture.of(logarithms)
     with np.errstate(divide="ignore"):
         wanted = logsumexp(logarithms, b=weight, axis=1)
     np.testing.assert_allclose(mixture.log_telegraph(weight), wanted, rtol=1e-12)

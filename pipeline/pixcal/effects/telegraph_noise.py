@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.distortions import Freedom
 from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
-from pixcal.estimators.telegraph import Series, Telegraph, find_telegraph
+from pixcal.estimators.telegraph.find import Telegraph, find_telegraph
+from pixcal.estimators.telegraph.moments import Series
 from pixcal.kernels.scene import TILE, chip_map
 from pixcal.kernels.synthesis import BLOCK_ROWS
 from pixcal.model.bench import SimulatedDetector

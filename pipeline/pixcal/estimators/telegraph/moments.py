@@ -1,0 +1,128 @@
+"""Moments of each pixel's noise, and what they say of jumps.
+
+A pixel that is noisier than others need not jump. Of Gaussian noise of any size the kurtosis and
+the correlation of neighbouring frames, each over the variance, do not depend on it (Basu's
+theorem); so their sums over pixels, weighted by the variance, have known mean and scatter.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+F64 = NDArray[np.float64]
+
+NOISY = 3.0
+"""Excess of the variance, in its own sigmas, from which a pixel's noise is looked at."""
+
+_OUTLIER = 5.0
+_LEAST = 8
+
+
+@dataclass(frozen=True)
+class Series:
+    """Noise of pixels in frames that follow one another.
+
+    Attributes
+    ----------
+    noise : (t, n) float64
+        Over the common noise, about the pixel's mean; NaN where there is none.
+    pixel : (n,) int
+        Which pixels.
+    sigma : float
+        The common noise, e-.
+    period_s : float
+        From frame to frame; nan when unknown.
+    """
+
+    noise: F64
+    pixel: NDArray[np.intp]
+    sigma: float
+    period_s: float
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Of the noise of each pixel of a series, in units of the common noise."""
+
+    pixel: NDArray[np.intp]
+    count: F64
+    """Samples."""
+    variance: F64
+    kurtosis: F64
+    """Excess, unbiased."""
+    neighbours: F64
+    """Sum of products of neighbouring frames, over the degrees of freedom of the variance."""
+    dof: float
+    """Of the variance: fewer than the samples have where pixels differ anyway."""
+    sigma: float
+    period_s: float
+    frames: int
+    """That most pixels have."""
+
+    def of(self, pixels: NDArray[np.intp]) -> "Moments":
+        """Of some pixels (ascending) alone."""
+        own = np.isin(self.pixel, pixels)
+        names = ("pixel", "count", "variance", "kurtosis", "neighbours")
+        return replace(self, **{name: getattr(self, name)[own] for name in names})
+
+    @property
+    def excess(self) -> F64:
+        """Variance beyond the common one; zero where that is not clear."""
+        excess = self.variance - 1
+        return np.where(excess > NOISY * np.sqrt(2 / self.dof), excess, 0)
+
+
+def moments_of(series: Series) -> Moments | None:
+    x = series.noise - np.nanmedian(series.noise, axis=0)
+    # One wild sample is a particle's; noise of two levels has more of them, or none.
+    wild = np.abs(x) > _OUTLIER
+    x[wild & (wild.sum(axis=0) == 1)] = np.nan
+    n = np.isfinite(x).sum(axis=0).astype(float)
+    used = n > _LEAST
+    if not used.any():
+        return None
+    x, n = x[:, used], n[used]
+    x = np.nan_to_num(x - np.nanmean(x, axis=0))
+    square = (x**2).sum(axis=0)
+    square = np.maximum(square, 1e-12)
+    variance = square / (n - 1)
+    kurtosis = n * (x**4).sum(axis=0) / square**2 - 3
+    kurtosis = (n - 1) / ((n - 2) * (n - 3)) * ((n + 1) * kurtosis + 6)
+    neighbours = (x[1:] * x[:-1]).sum(axis=0) / (n - 1)
+    dof = float(np.median(n)) - 1
+    centre = np.median(variance) * dof / chi2.median(dof)
+    # Half the pixels lie between the quartiles, whatever the noisy ones do.
+    low, high = np.quantile(variance / centre, (0.25, 0.75))
+    wide = (high - low) / np.diff(chi2.ppf((0.25, 0.75), dof) / dof)[0]
+    return Moments(
+        series.pixel[used],
+        n,
+        variance / centre,
+        kurtosis,
+        neighbours / centre,
+        dof / max(float(wide), 1.0) ** 2,
+        series.sigma * float(np.sqrt(centre)),
+        series.period_s if np.isfinite(series.period_s) and series.period_s > 0 else 1.0,
+        int(np.median(n)),
+    )
+
+
+def signs(parts: Sequence[Moments]) -> tuple[float, float, int]:
+    """How much flatter noisy pixels' noise is, and how much more it stays, than Gaussian noise."""
+    flat = flat_variance = stay = stay_variance = 0.0
+    noisy: set[int] = set()
+    for m in parts:
+        n, part = m.count, m.excess / (1 + m.excess)
+        of_kurtosis = 24 * n * (n - 1) ** 2 / ((n - 3) * (n - 2) * (n + 3) * (n + 5))
+        flat -= float(part**2 @ m.kurtosis)
+        flat_variance += float(part**4 @ of_kurtosis)
+        # Mean and variance for white noise, exact (Moran 1948, Biometrika 35, 255).
+        stay += float(part @ (m.neighbours / m.variance + 1 / n))
+        stay_variance += float(part**2 @ ((n - 2) ** 2 / (n**2 * (n - 1))))
+        noisy.update(m.pixel[m.excess > 0].tolist())
+    if not flat_variance:
+        return 0.0, 0.0, 0
+    return flat / flat_variance**0.5, stay / stay_variance**0.5, len(noisy)
