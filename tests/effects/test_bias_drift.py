@@ -9,12 +9,14 @@ import pytest
 from pixcal.effects.bias_drift import BiasDrift
 from pixcal.effects.row_noise import RowNoise
 from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.frame_offset import fringe_offsets
+from pixcal.estimators.frame_offset import FEWEST, fringe_offsets
 from pixcal.kernels.processes import brownian
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
+
+Offset = Callable[[np.ndarray], np.ndarray]
 
 
 def in_the_dark(evidence: Evidence, bench: Bench, *on: Effect) -> Evidence:
@@ -28,6 +30,35 @@ def in_the_dark(evidence: Evidence, bench: Bench, *on: Effect) -> Evidence:
             time = np.arange(r.count) * r.period_s
             stacks.append(replace(stack, adu=frames, time_s=time, start_s=r.start_s))
     return replace(evidence, stacks=tuple(stacks), fringes={})
+
+
+def levelled(
+    evidence: Evidence, rng: np.random.Generator, offset: Offset, **count: int
+) -> Evidence:
+    """Bias and dark frames of read noise (some of rows) with an offset (e-) by their times."""
+    stacks = []
+    for stack in evidence.stacks:
+        n = count.get(stack.kind, 0)
+        if n:
+            start, step = {"bias": (0.0, 0.14), "dark": (8.4, 0.5)}[stack.kind]
+            stacks.append((stack, start, step * np.arange(n)))
+    levels = offset(np.concatenate([start + time for _, start, time in stacks]))
+    made = []
+    for stack, start, time in stacks:
+        adu = rng.normal(0, 16, (len(time), *evidence.good.shape))
+        adu += rng.normal(0, 1, (len(time), evidence.good.shape[0], 1))
+        own, levels = levels[: len(time)], levels[len(time) :]
+        adu = (adu + own[:, None, None]).astype(np.float32)
+        made.append(replace(stack, adu=adu, time_s=time, start_s=start))
+    return replace(evidence, stacks=tuple(made), fringes={})
+
+
+def walking(rng: np.random.Generator, walk: float) -> Offset:
+    def offset(time: np.ndarray) -> np.ndarray:
+        steps = np.sqrt(np.diff(time, prepend=0.0) / 3600)
+        return np.asarray(walk * np.cumsum(steps * rng.standard_normal(len(time))))
+
+    return offset
 
 
 def test_the_walk_spreads_with_the_root_of_time_and_remembers() -> None:
@@ -121,6 +152,42 @@ def test_a_walk_is_found(
     assert isinstance(found.effect, BiasDrift)
     assert abs(found.effect.walk_e_h - 120) < 4 * found.errors["walk_e_h"] < 100
     assert found.significance > 5
+
+
+@pytest.mark.parametrize("count", [{"bias": 29}, {"bias": 29, "dark": 11}])
+def test_what_a_walk_explains_as_well_is_no_ramp(
+    acquired: Callable[..., Evidence], count: dict[str, int]
+) -> None:
+    evidence, rng, walk = acquired(), np.random.default_rng(12), 200.0
+    pulls, ramps = [], 0
+    for _ in range(60):
+        found = BiasDrift.estimate(levelled(evidence, rng, walking(rng, walk), **count))
+        assert found is not None
+        assert isinstance(found.effect, BiasDrift)
+        pulls.append((found.effect.walk_e_h - walk) / found.errors["walk_e_h"])
+        ramps += found.effect.ramp_e_h != 0
+    assert ramps <= 2
+    assert abs(np.mean(pulls)) < 1
+    assert np.std(pulls) < 1.5
+    steady = BiasDrift.estimate(levelled(evidence, rng, lambda t: 2.0 * t, **count))
+    assert steady is not None
+    assert isinstance(steady.effect, BiasDrift)
+    assert steady.effect.ramp_e_h == pytest.approx(7200, abs=4 * steady.errors["ramp_e_h"])
+
+
+def test_few_frames_count_and_nothing_in_them_is_nothing(
+    acquired: Callable[..., Evidence],
+) -> None:
+    evidence, rng = acquired(), np.random.default_rng(14)
+    seen = []
+    for _ in range(60):
+        found = BiasDrift.estimate(levelled(evidence, rng, np.zeros_like, dark=FEWEST))
+        assert found is not None
+        seen.append(found.significance)
+    assert np.mean(np.array(seen) > 1.645) < 0.12
+    assert max(seen) < 3.5
+    fewer = levelled(evidence, rng, np.zeros_like, dark=FEWEST - 1)
+    assert BiasDrift.estimate(fewer) is None
 
 
 def test_a_settling_is_found(

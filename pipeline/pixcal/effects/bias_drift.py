@@ -35,6 +35,8 @@ F64 = NDArray[np.float64]
 HOUR_S = 3600.0
 SURE = 4.0
 """Standard deviations from which a settling is told from a ramp and a walk."""
+STEADY = 3.0
+"""The same for a ramp and a walk; below, a walk explains the frames as well."""
 SETTLINGS = 8
 """Time constants tried, from some steps to the length of the run."""
 WORTH = 0.3
@@ -102,13 +104,17 @@ class BiasDrift(Effect):
         """Levels of frames without light against time; of fringes what is not light.
 
         A change of the dark current would look the same in one stack of darks; where there are bias
-        frames, they hold it down.
+        frames, they hold it down. Of few frames a walk may look like a ramp: what both explain is
+        given to the walk, for a ramp would go on for ever.
         """
         every = _all_series(evidence)
         if not every:
             return None
         ramp = [_ramp(s) for s in every]
         full = estimate_components(offset_modes(every, ramp))
+        level = estimate_components(offset_modes(every, [r[:, :0] for r in ramp]))
+        # The walk being found anew without the ramp: beside a ramp that is a walk little is left.
+        steady = float(np.sqrt(2 * max(full.profile - level.profile, 0.0)))
         none = estimate_components(offset_modes(every, ramp), absent=(0, 1))
         changes = [joint_log_chance(full, none, full.size[:2])]
         best, settling = _settling(every, full)
@@ -117,6 +123,8 @@ class BiasDrift(Effect):
         slope = float(found.beta[0])
         slope_error = float(np.sqrt(found.shape_covariance((1,))[0, 0]))
         changes.append(log_chance((slope / slope_error) ** 2 / 2))
+        if not best and steady < STEADY:
+            found, slope = level, 0.0
         (jitter, jitter_error), (walk, walk_error) = found.root(0), found.root(1)
         per_hour = float(np.sqrt(HOUR_S))
         values = {"jitter_rms": jitter, "ramp_e_h": slope, "walk_e_h": walk * per_hour}
@@ -136,7 +144,7 @@ class BiasDrift(Effect):
             "levels of " + ", ".join(dict.fromkeys(s.name for s in every)) + " against time, beyond"
             " the noise of pixels, rows and columns",
             {"noise_sigmas": sigmas(changes[0]), "settling_sigmas": sigmas(changes[1]),
-             "ramp_sigmas": slope / slope_error},
+             "ramp_sigmas": sigmas(changes[2]), "ramp_over_walk_sigmas": steady},
         )  # fmt: skip
 
 

@@ -9,7 +9,8 @@ from scipy.special import log_ndtr
 
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.frame_series import FrameSeries
-from pixcal.estimators.fringe_motion import Hop, Motion, motion_of, ramps_and_colour
+from pixcal.estimators.fringe_motion import Hop, Motion, colour_of, motion_of, ramps_and_colour
+from pixcal.estimators.hopping import Hopping, find_hopping, scatter_of
 from pixcal.estimators.variance_components import log_chance_of_any, sigmas, signed_sigmas
 from pixcal.kernels import optics
 from pixcal.kernels.scene import FrameStates, geometry
@@ -20,6 +21,8 @@ from pixcal.simulation.recording import Recording
 F64 = NDArray[np.float64]
 
 HOUR_S = 3600.0
+LEVEL = 1.5
+"""Scatter about two levels, over that from frame to frame, up to which there are no more."""
 
 
 @dataclass(frozen=True)
@@ -139,14 +142,25 @@ def _colour(series: FrameSeries) -> F64:
 
 
 def _hops(motion: Motion, jumps: Sequence[Hop]) -> tuple[dict[str, float], dict[str, float]]:
-    """Size and rate of the hops; up and down count alike."""
+    """Size and rate of the hops; up and down count alike.
+
+    Those that stand out are the start; short stays between them are told by the likelihood, unless
+    the colour does more than hop between two levels.
+    """
     size, error = np.array([abs(h.size) for h in jumps]), np.array([h.error for h in jumps])
     weight = 1 / error**2
-    hours = sum(float(np.ptp(s.time_s)) + s.step_s for s in motion.raw) / HOUR_S
+    seconds = sum(float(np.ptp(s.time_s)) + s.step_s for s in motion.raw)
+    hop, rate = float(size @ weight / weight.sum()), len(jumps) / seconds
+    found = Hopping(
+        hop, float(1 / np.sqrt(weight.sum())), rate, float(np.sqrt(len(jumps))) / seconds
+    )
+    colours, bases = [colour_of(s) for s in motion.raw], [colour_of(s) for s in motion.series]
+    slopes = [float(np.polyfit(np.arange(len(b)), b, 1)[0]) for b in bases]
+    levels = find_hopping(colours, [s.step_s for s in motion.raw], slopes, hop, rate)
+    alike = 0.5 < levels.size / hop < 2
+    if alike and all(n < LEVEL * scatter_of(c) for n, c in zip(levels.noise, colours, strict=True)):
+        found = levels
     return (
-        {"hop": float(size @ weight / weight.sum()), "hops_per_h": len(jumps) / hours},
-        {
-            "hop": float(1 / np.sqrt(weight.sum())),
-            "hops_per_h": float(np.sqrt(len(jumps)) / hours),
-        },
+        {"hop": found.size, "hops_per_h": found.rate * HOUR_S},
+        {"hop": found.error, "hops_per_h": found.rate_error * HOUR_S},
     )

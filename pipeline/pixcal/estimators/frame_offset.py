@@ -19,8 +19,8 @@ from pixcal.estimators.variance_components import Modes, cosine_modes, walk_powe
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-FEWEST = 12
-"""Frames from which something is learnt."""
+FEWEST = 8
+"""Frames from which something is learnt; of fewer, chance is not what it is taken for."""
 FEWEST_PIXELS = 16
 """In each quarter."""
 CONTRASTS = np.array([[1, 1, -1, -1], [1, -1, 1, -1], [1, -1, -1, 1]]) / 4

@@ -146,6 +146,13 @@ def ramps_and_colour(series: FrameSeries) -> F64:
     return np.concatenate([ramps(series), colour[..., None]], axis=2)
 
 
+def colour_of(series: FrameSeries) -> F64:
+    """Relative change (t,) of the wavelength that each frame's vector shows by itself."""
+    k = np.array(series.k)
+    weight = np.linalg.solve(series.noise, k)
+    return np.asarray(-(series.values @ weight) / (k @ weight))
+
+
 def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
     """Jumps of the wavelength: along the fringe vector, and sharp among what else moves it.
 
@@ -153,9 +160,7 @@ def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
     that neither noise, jitter nor drift is taken for a hop. The narrowest difference that shows a
     hop places it.
     """
-    k = np.array(series.k)
-    weight = np.linalg.solve(series.noise, k)
-    along = -(series.values @ weight) / (k @ weight)
+    k, along = np.array(series.k), colour_of(series)
     across = series.values @ np.array([-k[1], k[0]]) / (k @ k)
     rest, found = along, dict[int, float]()
     for width in HOP_WINDOWS:

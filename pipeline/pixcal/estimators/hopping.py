@@ -1,0 +1,167 @@
+"""Hops between two levels, as a hidden Markov model: how far, and how often.
+
+Short stays on a level hide in the noise of the frames, and counting what stands out of it leaves
+them out. Here every frame has a chance of either level, given all frames; size, rate, and the base
+of each series (a ramp) with its noise are those of maximum likelihood, by the algorithm of Baum,
+Petrie, Soules & Weiss 1970 (Ann. Math. Statist. 41, 164).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.kernels.two_states import likely_states
+
+F64 = NDArray[np.float64]
+
+ROUNDS = 200
+SETTLED = 1e-4
+"""Growth of the log-likelihood at which they end."""
+BASES = 33
+"""Levels tried for the base of each series, to begin with."""
+LEAST_NOISE, FEWEST_HOPS = 1e-3, 0.01
+"""Of the size, and in all of the time: what is smaller counts as this."""
+STEP = 0.2
+"""Of the rate's logarithm, and of the size over the noise, over which the likelihood bends."""
+
+
+@dataclass(frozen=True)
+class Hopping:
+    """Two levels and the hops between them.
+
+    Attributes
+    ----------
+    size, error : float
+        Of a hop, in the series' unit.
+    rate, rate_error : float
+        Of hops, 1/s.
+    noise : tuple of float
+        Standard deviation of each series about its levels, where these were looked at.
+    """
+
+    size: float
+    error: float
+    rate: float
+    rate_error: float
+    noise: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Series:
+    values: F64
+    step_s: float
+    base: F64
+    noise: float
+    second: F64
+    changes: float = 0.0
+    likelihood: float = 0.0
+
+    def weighed(self, size: float, rate: float) -> "_Series":
+        """With the chances of its states, and the likelihood of all."""
+        off = self.values - self.base
+        odds = size * (off - size / 2) / self.noise**2
+        second, changes, growth = likely_states(odds, _change(rate, self.step_s))
+        first = -len(off) * np.log(self.noise) - float(off @ off) / (2 * self.noise**2)
+        return replace(self, second=second, changes=changes, likelihood=first + growth)
+
+
+def find_hopping(
+    values: Sequence[F64], steps_s: Sequence[float], slopes: Sequence[float], size: float,
+    rate: float,
+) -> Hopping:  # fmt: skip
+    """Hops of a common size and rate in several series.
+
+    Parameters
+    ----------
+    values : sequence of (t,) float64
+    steps_s : sequence of float
+        From frame to frame.
+    slopes : sequence of float
+        Of the bases, for a frame; to begin with, like the others.
+    size, rate : float
+        1/s.
+    """
+    series = zip(values, steps_s, slopes, strict=True)
+    every = [_begun(*one, size, rate) for one in series]
+    seconds = sum(s.step_s * len(s.values) for s in every)
+    last = -np.inf
+    for _ in range(ROUNDS):
+        every = [s.weighed(size, rate) for s in every]
+        likelihood = sum(s.likelihood for s in every)
+        if likelihood - last < SETTLED:
+            break
+        last = likelihood
+        size = _size(every) or size
+        every = [_settled(s, size) for s in every]
+        expected = sum(_change(rate, s.step_s) * (len(s.values) - 1) for s in every)
+        rate = max(rate * sum(s.changes for s in every) / expected, FEWEST_HOPS / seconds)
+
+    def of_size(step: float) -> float:
+        # The bases go along.
+        moved = [replace(s, base=s.base - step * size * _ramp_of(s.second)) for s in every]
+        return sum(s.weighed(size * (1 + step), rate).likelihood for s in moved)
+
+    def of_rate(step: float) -> float:
+        return sum(s.weighed(size, rate * np.exp(step)).likelihood for s in every)
+
+    step = STEP * min(s.noise for s in every) / size
+    return Hopping(
+        size, abs(size) * _error(of_size, step), rate, rate * _error(of_rate, STEP),
+        tuple(s.noise for s in every),
+    )  # fmt: skip
+
+
+def _error(likelihood: Callable[[float], float], step: float) -> float:
+    """One sigma, from the bend of a logarithm of the likelihood at its top."""
+    bend = 2 * likelihood(0.0) - likelihood(-step) - likelihood(step)
+    return abs(step) / float(np.sqrt(max(bend, 1e-9)))
+
+
+def scatter_of(values: F64) -> float:
+    """Standard deviation of a series from frame to frame, as if nothing but noise were in it."""
+    return 1.4826 * float(np.median(np.abs(np.diff(values)))) / float(np.sqrt(2)) or 1e-300
+
+
+def _change(rate: float, step_s: float) -> float:
+    """Chance that the number of hops in a step is odd."""
+    return float(-np.expm1(-2 * rate * step_s) / 2)
+
+
+def _begun(values: F64, step_s: float, slope: float, size: float, rate: float) -> _Series:
+    """With the likeliest base on a grid."""
+    ramp = slope * (np.arange(len(values)) - (len(values) - 1) / 2)
+    noise = max(scatter_of(values), LEAST_NOISE * abs(size))
+    flat = values - ramp
+    bases = np.linspace(flat.min() - size / 2, flat.max() - size / 2, BASES)
+    nothing = np.zeros(len(values))
+    tried = [
+        _Series(values, step_s, ramp + base, noise, nothing).weighed(size, rate) for base in bases
+    ]
+    return max(tried, key=lambda s: s.likelihood)
+
+
+def _ramp_of(values: F64) -> F64:
+    """The part of a series that is a ramp."""
+    time = np.linspace(-1, 1, len(values))
+    return np.asarray(values.mean() + time * (time @ values) / (time @ time))
+
+
+def _size(every: Sequence[_Series]) -> float:
+    """Size of the hops, beside a ramp of each series; zero where all stay on one level."""
+    seen = total = 0.0
+    for s in every:
+        ramp = _ramp_of(s.second)
+        total += float(s.second.sum() - s.second @ ramp) / s.noise**2
+        seen += float((s.second - ramp) @ s.values) / s.noise**2
+    return seen / total if total > 0 else 0.0
+
+
+def _settled(s: _Series, size: float) -> _Series:
+    """With the base and the noise that go with its states."""
+    base = _ramp_of(s.values - size * s.second)
+    off = s.values - base
+    square = off**2 - 2 * size * s.second * off + size**2 * s.second
+    noise = max(float(np.sqrt(max(square.mean(), 0.0))), LEAST_NOISE * abs(size))
+    return replace(s, base=base, noise=noise)

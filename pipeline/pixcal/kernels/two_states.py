@@ -1,0 +1,56 @@
+"""A hidden state that is one of two: how likely each is in every frame, all frames being known."""
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def likely_states(odds: F64, change: float) -> tuple[F64, float, float]:
+    """Forward and backward through a series (Rabiner 1989, Proc. IEEE 77, 257).
+
+    Parameters
+    ----------
+    odds : (t,) float64
+        Of each frame by itself, the log-likelihood of the second state less that of the first.
+    change : float
+        Chance of a change from frame to frame; both states are as likely at the beginning.
+
+    Returns
+    -------
+    second : (t,) float64
+        Chance of the second state.
+    changes : float
+        Expected number of changes.
+    likelihood : float
+        Logarithm, over that of the first state alone.
+    """
+    n = len(odds)
+    ahead, second = np.empty(n), np.empty(n)
+    # Of the frames so far, the chance of the second state; of those to come, of the first state
+    # (one, other) their likelihood.
+    before, likelihood, stay = 0.5, 0.0, 1.0 - change
+    for t in range(n):
+        if t:
+            before = ahead[t - 1] * stay + (1.0 - ahead[t - 1]) * change
+        high = max(odds[t], 0.0)
+        one, other = (1.0 - before) * np.exp(-high), before * np.exp(odds[t] - high)
+        ahead[t] = other / (one + other)
+        likelihood += np.log(one + other) + high
+    one, other, changes = 0.5, 0.5, 0.0
+    for t in range(n - 1, -1, -1):
+        own_one, own_other = (1.0 - ahead[t]) * one, ahead[t] * other
+        second[t] = own_other / (own_one + own_other)
+        if t == 0:
+            break
+        high = max(odds[t], 0.0)
+        one, other = one * np.exp(-high), other * np.exp(odds[t] - high)
+        up, down = (1.0 - ahead[t - 1]) * change * other, ahead[t - 1] * change * one
+        still = ((1.0 - ahead[t - 1]) * one + ahead[t - 1] * other) * stay
+        changes += (up + down) / (up + down + still)
+        one, other = stay * one + change * other, stay * other + change * one
+        total = one + other
+        one, other = one / total, other / total
+    return second, changes, likelihood
