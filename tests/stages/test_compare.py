@@ -324,7 +324,8 @@ def test_a_map_and_its_copy_agree_too_well(make: Any, tmp_path: Path) -> None:
     one = make("one", seed=1)
     shutil.copytree(one, tmp_path / "copy")
     facts = only_pair(tmp_path / "out", one, tmp_path / "copy")["delta_x"]
-    assert facts["difference_px"] == 0
+    # A difference of sums of squares: zero to the root of a float's precision.
+    assert facts["difference_px"] < 1e-7 * max(facts["rms_px"])
     assert "share frames" in facts["suspicion"]
 
 
