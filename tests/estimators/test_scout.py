@@ -75,7 +75,7 @@ def test_turns_left_out_would_change_nothing_that_noise_does_not_hide(bench, mon
         scout, codes = scout_of(bench(shape=(67, 83), frames=250, vector_noise=motion))
         frames = scout.prime([codes])
         found[settled], turns[settled] = np.hstack([frames.g, frames.dk]), len(taken)
-        _, _, normal = scout._frame_step([codes], frames, scout.moving)
+        _, _, normal = scout._frame_step(scout._samples([codes]), frames, scout.moving)
     few, all_of_them = found.values()
     size = 5 if scout.moving else 3
     change = (few - all_of_them)[:, :size]
@@ -103,6 +103,18 @@ def test_solving_later_frames_agrees_with_solving_all(bench):
     frames = scout.prime([codes])
     again = scout.solve([codes[150:]])
     np.testing.assert_allclose(again.g, frames.g[150:], atol=2e-5)
+
+
+def test_some_pixels_tell_frames_of_fringes_as_wide_as_even_steps_would_be(bench, monkeypatch):
+    """A quarter of the pixels, and fringes of 4 px: every fourth has the same phase in all rows."""
+    made = bench(shape=(60, 64), frames=120, interfringe=4.0)
+    found = []
+    for most in (scouting.MAX_PIXELS, 60 * 64 // 4):
+        monkeypatch.setattr(scouting, "MAX_PIXELS", most)
+        scout, codes = scout_of(made)
+        scout.prime([codes])
+        found.append(scout.solve([codes[80:]]).g)
+    np.testing.assert_allclose(found[1], found[0], atol=2e-3)
 
 
 def test_phase_ramp_instead_of_random_phases(bench):

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.kernels.bilinear import frame_moments, interpolate_periodic
+from pixcal.kernels.fringe_sums import frame_moments, interpolate_periodic
 
 F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
@@ -75,23 +75,23 @@ class FrameMoments:
 
     Attributes
     ----------
-    g : (t, 3) float32
+    exact : (t, 3) float64
         (B, A cos phi, A sin phi).
-    unit : (t, 3) float32
-        (cos phi, sin phi, f), f the frame's own weight.
+    rows : (t, 5) float32
+        (B, A, cos phi, sin phi, f), f the frame's own weight.
     """
 
     exact: F64
-    g: NDArray[np.float32]
-    unit: NDArray[np.float32]
+    rows: NDArray[np.float32]
     kept: dict[tuple[int, int], C128] = field(default_factory=dict)
 
     @classmethod
     def of(cls, g: F64) -> "FrameMoments":
         """Of frames (t, 3)."""
         amplitude = np.maximum(np.hypot(g[:, 1], g[:, 2]), 1e-30)
-        unit = np.column_stack([g[:, 1:] / amplitude[:, None], frame_weights(g)])
-        return cls(g, g.astype(np.float32), unit.astype(np.float32))
+        unit = g[:, 1:] / amplitude[:, None]
+        rows = np.column_stack([g[:, 0], amplitude, unit, frame_weights(g)])
+        return cls(g, rows.astype(np.float32))
 
     def sums(self, part: slice) -> C128:
         """`moments` of some frames."""

@@ -18,7 +18,8 @@ from pixcal.estimators.harmonics import (
 )
 from pixcal.estimators.tile import Coding, Tile
 from pixcal.estimators.tile_fit import accumulate
-from pixcal.kernels.bilinear import N_SUMS, close_fringes, fringe_block, solve_pixels
+from pixcal.kernels.bilinear import N_SUMS, solve_pixels
+from pixcal.kernels.fringe_sums import close_fringes, fringe_block, turn_table
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -116,7 +117,7 @@ class FringeSums:
         scale = tile.shot.ravel() * level
         good = tile.good.ravel()
         ratio = tile.read.ravel() / scale
-        visibility = np.abs(smooth).ravel()
+        visibility = np.maximum(np.abs(smooth).ravel(), 1e-30)
         typical = (float(np.median(v[good])) if good.any() else 1.0 for v in (visibility, ratio))
         self.weights = PhaseWeights.of(*typical)
         self.series = self.weights.series(1)
@@ -127,8 +128,8 @@ class FringeSums:
         self.psi = np.angle(smooth).ravel().astype(np.float32)
         self.place = np.remainder(self.psi / np.float32(2 * np.pi), np.float32(1))
         # One visibility for the tile, so that the normal matrix depends on the phase alone.
-        self.s = np.float32(self.weights.visibility) * np.sin(self.psi)
-        self.c = np.float32(self.weights.visibility) * np.cos(self.psi)
+        unit = smooth.ravel() * (self.weights.visibility / visibility)
+        self.s, self.c = unit.imag.astype(np.float32), unit.real.astype(np.float32)
         self.at: list[slice] = []
         self.parts: list[slice] = []
         n = level.size
@@ -137,13 +138,12 @@ class FringeSums:
 
     def add(self, codes: NDArray[np.uint16], at: slice) -> None:
         """As in `PixelSums`."""
-        g, unit = self.moments.g, self.moments.unit
         flat = codes.reshape(len(codes), -1)
         for first in range(0, len(codes), 64):
             now = slice(at.start + first, min(at.start + first + 64, at.stop))
             self.any_lost |= fringe_block(
                 flat[first : first + 64], self.coding.scale, self.coding.offset, self.coding.fill,
-                g[now], unit[now], self.weights.rho, self.level, self.s, self.c,
+                self.moments.rows[now], self.weights.rho, self.level, self.s, self.c,
                 self.part, self.lost,
             )  # fmt: skip
         self.at.append(at)
@@ -155,32 +155,33 @@ class FringeSums:
         part = slice(self.at[0].start, self.at[-1].stop)
         self.at = []
         self.parts.append(part)
-        self.total += self.part
-        if self.any_lost:
-            self.total_lost += self.lost
         return part
 
     def close(self) -> tuple[F32, F32]:
         """As in `PixelSums`."""
-        turn, sigma = (np.full(self.level.size, np.nan, np.float32) for _ in range(2))
-        if (part := self._end_part()) is not None:
-            table = normal_table(self.moments.sums(part), self.series, BATCH_TABLE)
-            close_fringes(
-                table, self.place, self.level, self.s, self.c, self.part, self.lost, self.any_lost,
-                self.spread, turn, sigma,
-            )  # fmt: skip
-        self.part[:] = 0
+        if (part := self._end_part()) is None:
+            nothing = np.full(self.shape, np.nan, np.float32)
+            return nothing, nothing
+        turn, sigma = (np.empty(self.level.size, np.float32) for _ in range(2))
+        normal = normal_table(self.moments.sums(part), self.series, BATCH_TABLE)
+        close_fringes(
+            normal, turn_table(normal), self.place, self.level, self.weights.visibility, self.part,
+            self.lost, self.any_lost, self.spread, self.total, turn, sigma,
+        )  # fmt: skip
         if self.any_lost:
+            self.total_lost += self.lost
             self.lost[:], self.any_lost = 0, False
         return turn.reshape(self.shape), sigma.reshape(self.shape)
 
     def finish(self) -> tuple[F64, F64, F64, F64]:
         """As in `PixelSums`."""
         self._end_part()
+        self.total += self.part
+        self.total_lost += self.lost
         psi = self.psi.astype(float)
         frame_sums = np.sum([self.moments.sums(part) for part in self.parts], axis=0)
         normal = normal_matrices(frame_sums, self.series, psi) - self.total_lost[:6]
-        count = len(self.moments.g) - self.total_lost[6]
+        count = len(self.moments.rows) - self.total_lost[6]
         step, inverse, square = solve_pixels(np.concatenate([normal, self.total]))
         theta = self.level * np.stack([np.ones_like(self.s), self.s, self.c]) + step
         # The samples' variance is scale * (1 / w + excess): what exceeds the weights' own goes

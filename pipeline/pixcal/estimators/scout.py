@@ -8,6 +8,7 @@ these tiles known, every frame is then solved by itself, block after block.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -30,10 +31,15 @@ from pixcal.model.errors import InputError
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Pixels = NDArray[np.intp] | slice
+Samples = tuple[NDArray[np.intp], NDArray[np.uint16]]
+"""Flat numbers of pixels of a tile, and their codes (t, p)."""
 Each = Callable[[Callable[[int], Any], Sequence[int]], list[Any]]
 
 MAX_PIXELS = 20_000
 """Pixels that frames are solved with: their noise then adds some 2e-4 to a map's variance."""
+FEW = 4
+"""Of so many of these one is enough to start with: that only gives weights, and the point about
+which a moving phase is linear."""
 MIN_FRAMES = 6
 """Three unknowns a pixel, and as many again to tell whether they fit."""
 ODD_VISIBILITY = 12.0
@@ -148,23 +154,34 @@ class Scout:
         start : FrameParameters, optional
             Where to start; else from an unweighted fit.
         """
-        if start is None:
-            start = self._unweighted(codes)
-        frames = start
+        samples = self._samples(codes)
+        frames = self._unweighted(samples) if start is None else start
         # Weights come from the step before: where the phase is linear one is enough.
         for _ in range(3 if self.moving else 1):
-            frames, _, _ = self._frame_step(codes, frames, self.moving)
+            frames, _, _ = self._frame_step(samples, frames, self.moving)
         return frames
 
-    def _unweighted(self, codes: Sequence[NDArray[np.uint16]]) -> FrameParameters:
+    def _samples(self, codes: Sequence[NDArray[np.uint16]]) -> list[Samples]:
+        """Of each tile, the samples that frames are solved with."""
+
+        def taken(n: int) -> Samples:
+            picked, size = self._picked(self.tiles[n]), self.tiles[n].good.size
+            if 4 * len(picked) > 3 * size:
+                # Those of no use are zero in theta, and take less time than leaving them out.
+                picked = np.arange(size)
+            return picked, _taken(codes[n], picked)
+
+        return self.each(taken, range(len(self.tiles)))
+
+    def _unweighted(self, samples: Sequence[Samples]) -> FrameParameters:
         """Frames by plain least squares."""
         matrix: F64 = np.zeros((3, 3))
-        right: F64 = np.zeros((len(codes[0]), 3))
-        for tile, theta, block in zip(self.tiles, self.theta, codes, strict=True):
-            picked = self._picked(tile)
-            design = theta.reshape(3, -1)[:, picked]
+        right: F64 = np.zeros((len(samples[0][1]), 3))
+        for theta, (picked, codes) in zip(self.theta, samples, strict=True):
+            few = _scattered(len(picked), -(-len(picked) // FEW))
+            design = theta.reshape(3, -1)[:, picked[few]]
             matrix = matrix + design @ design.T
-            right = right + self._electrons(block, picked) @ design.T.astype(np.float32)
+            right = right + self._electrons(codes, few) @ design.T.astype(np.float32)
         g = np.asarray(np.linalg.solve(matrix, right.T).T, dtype=np.float64)
         return FrameParameters(g, np.zeros((len(g), 2)), self.reference)
 
@@ -177,10 +194,9 @@ class Scout:
             )
 
     def _picked(self, tile: Tile) -> NDArray[np.intp]:
-        """Flat numbers of the good pixels that frames are solved with, evenly taken."""
+        """Flat numbers of the good pixels that frames are solved with."""
         good = np.flatnonzero(tile.good)
-        wanted = max(1, MAX_PIXELS // len(self.tiles))
-        return good[:: max(1, -(-len(good) // wanted))]
+        return good[_scattered(len(good), max(1, MAX_PIXELS // len(self.tiles)))]
 
     def _electrons(self, codes: NDArray[np.uint16], picked: Pixels) -> F32:
         """Samples (t, p) in electrons, for first values that know no weights.
@@ -321,26 +337,22 @@ class Scout:
             tile.good &= good
         self._require_pixels()
         frames = FrameParameters(g / norm, frames.dk, self.reference)
-        frames, _, normal = self._frame_step(codes, frames, self.moving)
+        frames, _, normal = self._frame_step(self._samples(codes), frames, self.moving)
         return frames, normal
 
     def _frame_step(
-        self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters, moving: bool
+        self, samples: Sequence[Samples], frames: FrameParameters, moving: bool
     ) -> tuple[FrameParameters, F64, F64]:
         """One Gauss-Newton step of every frame; its size and normal matrices (t, 5, 5) too."""
         n = len(frames.g)
         g, dk = frames.g.astype(np.float32), frames.dk.astype(np.float32)
 
         def sums_of(number: int) -> tuple[F64, F64]:
-            tile, theta, block = self.tiles[number], self.theta[number], codes[number]
+            tile, theta, (picked, codes) = self.tiles[number], self.theta[number], samples[number]
             packed, right = np.zeros((n, 15)), np.zeros((n, 5))
-            picked = self._picked(tile)
-            if 4 * len(picked) > 3 * tile.good.size:
-                # Those of no use are zero in theta, and take less time than leaving them out.
-                picked = np.arange(tile.good.size)
             yy, xx = np.divmod(picked, tile.shape[1])
             frame_sums(
-                _taken(block, picked),
+                codes,
                 self.coding.scale,
                 self.coding.offset,
                 self.coding.fill,
@@ -377,7 +389,7 @@ class Scout:
         self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters
     ) -> float:
         """Mean of dk' C^-1 dk / 2 over frames: that of the samples' noise without motion."""
-        _, step, normal = self._frame_step(codes, frames, moving=True)
+        _, step, normal = self._frame_step(self._samples(codes), frames, moving=True)
         seen = normal[:, 0, 0] > 0
         covariance = _inverses(normal[seen])[:, 3:, 3:]
         dk = step[seen, 3:]
@@ -403,6 +415,14 @@ def _like_most(theta: F64, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
     away = np.abs(visibility - np.median(visibility[good])) if good.any() else visibility
     usual = np.median(away[good]) if good.any() else 0.0
     return np.asarray(good & (away < ODD_VISIBILITY * usual + 1e-9))
+
+
+@lru_cache(maxsize=64)
+def _scattered(n: int, wanted: int) -> NDArray[np.intp]:
+    """Some of ``n`` numbers, at random: at even steps pixels may all have the same phase."""
+    if wanted >= n:
+        return np.arange(n)
+    return np.sort(np.random.default_rng(n).permutation(n)[:wanted])
 
 
 def _parts(n: int) -> list[slice]:

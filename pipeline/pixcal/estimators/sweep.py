@@ -167,10 +167,17 @@ class _BatchSums:
             chi2=reduced.astype(np.float32),
             count=count.astype(np.float32),
             smooth=self.smooth,
-            batch_phase=wrapped(self.turn - turn),
+            batch_phase=self._relative_to(turn),
             batch_sigma=self.sigma,
             bound=phase_bound(self.tile, theta, self.frames, bound_pixels),
         )
+
+    def _relative_to(self, turn: F32) -> F32:
+        """Phases of the batches (batch, y, x) relative to those of the run; the batches' change."""
+        self.turn -= turn
+        # Most are near: to wrap them all would take longer than to look.
+        near = not len(self.turn) or np.abs(self.turn).max() < np.pi
+        return self.turn if near else wrapped(self.turn)
 
 
 def phase_bound(tile: Tile, theta: F64, frames: FrameParameters, number: int = BOUND_PIXELS) -> F64:

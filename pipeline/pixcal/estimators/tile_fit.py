@@ -6,8 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.fringes import FrameParameters, SmoothPhasor, smooth_phasor
+from pixcal.estimators.harmonics import FrameMoments
 from pixcal.estimators.tile import Coding, Tile
 from pixcal.kernels.bilinear import N_SUMS, solve_pixels, sweep_block
+from pixcal.kernels.fringe_sums import fringe_block
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -123,23 +125,28 @@ def start_model(
 def _unweighted_pixels(
     tile: Tile, blocks: Sequence[NDArray[np.uint16]], coding: Coding, frames: FrameParameters
 ) -> F64:
-    """Pixels (3, y, x) by plain least squares.
+    """Pixels (3, y, x) by plain least squares, but for the frames' own weights.
 
     Where no sample is missing and the fringe vector is held the normal matrix is the same for all.
     """
-    if frames.moving or any((block == coding.fill).any() for block in blocks):
-        nothing = np.zeros((3, *tile.shape), np.float32)
+    n = tile.good.size
+    moments = FrameMoments.of(frames.g)
+    sums, missing, start = np.zeros((4, n)), np.zeros((7, n)), 0
+    nothing = np.zeros(n, np.float32)
+    simple = not frames.moving
+    for part in (block[a : a + 64] for block in blocks for a in range(0, len(block), 64)):
+        at = slice(start, start + len(part))
+        start += len(part)
+        simple = simple and not fringe_block(
+            part.reshape(len(part), n), coding.scale, coding.offset, coding.fill,
+            moments.rows[at], 0.0, nothing, nothing, nothing, sums, missing,
+        )  # fmt: skip
+    if not simple:
+        model = np.zeros((3, *tile.shape), np.float32)
         even = (np.ones(tile.shape, np.float32), np.zeros(tile.shape, np.float32))
-        return solve_pixels(accumulate(tile, blocks, coding, frames, nothing, variance=even))[0]
-    right: F64 = np.zeros((3, tile.good.size))
-    start = 0
-    # A few frames at a time: as floating point they are twice the size.
-    for few in (block[n : n + 8] for block in blocks for n in range(0, len(block), 8)):
-        g = frames.g[start : start + len(few)]
-        electrons = few.reshape(len(few), -1) * np.float32(coding.scale)
-        right += g.T.astype(np.float32) @ electrons + coding.offset * g.sum(axis=0)[:, None]
-        start += len(few)
-    theta = np.linalg.lstsq(frames.g.T @ frames.g, right, rcond=1e-9)[0]
+        return solve_pixels(accumulate(tile, blocks, coding, frames, model, variance=even))[0]
+    weighted = moments.rows[:, 4].astype(float) * frames.g.T
+    theta = np.linalg.lstsq(weighted @ frames.g, sums[:3], rcond=1e-9)[0]
     return np.asarray(theta.reshape(3, *tile.shape))
 
 

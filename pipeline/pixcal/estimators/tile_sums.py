@@ -125,14 +125,16 @@ def sum_row(
     modes = local_modes(carrier, plane, shape)
     usable = (good & np.isfinite(phase)).ravel()
     weight = np.where(usable, 1 / np.where(usable, sigma.ravel(), 1.0).astype(float) ** 2, 0.0)
-    maps = np.zeros((1 + len(batches), phase.size))
-    maps[0] = wrapped(phase - plane.on(shape)).ravel()
-    maps[1:] = batches.reshape(len(batches), phase.size)
-    maps[:, ~usable] = 0.0
-    np.nan_to_num(maps, copy=False)
-    weighted = modes * weight
-    normal, right = weighted @ modes.T, weighted @ maps.T
-    square = float(weight @ maps[0] ** 2)
+    rest = np.where(usable, wrapped(phase - plane.on(shape)).ravel(), 0.0)
+    root = np.sqrt(weight)
+    modes *= root
+    normal, right = modes @ modes.T, np.empty((N_LOCAL, 1 + len(batches)))
+    right[:, 0] = modes @ (root * rest)
+    # Small numbers, all of them noise: float32 is enough, and takes a third of the time.
+    several = np.where(usable, batches.reshape(len(batches), phase.size), np.float32(0))
+    several[np.isnan(several)] = 0
+    right[:, 1:] = (modes.astype(np.float32) * root.astype(np.float32)) @ several.T
+    square = float(weight @ rest**2)
     facts = [*plane.centre, plane.phase, plane.kx, plane.ky, plane.sigma, plane.ratio]
     return np.concatenate(
         [np.array([*facts, square, float(usable.sum())]), normal.ravel(), right.ravel()]

@@ -27,6 +27,7 @@ from pixcal.stages.fit import Config as FitConfig
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
 from pixcal.stages.fit.maps import Totals, write_maps
 from pixcal.stages.fit.products import header_of, plan_products, publish_maps
+from pixcal.stages.fit.sweep import FORMAT as SWEEP_FORMAT
 from pixcal.stages.fit.sweep import Config as SweepConfig
 from pixcal.stages.fit.sweep import load_run, nominal_vector, sweep_set
 from pixcal.stages.reduce.ingested import Ingested
@@ -182,7 +183,7 @@ def _sweep(
     run_dir: Path, made: Build, plan: Treatments, acquisition: Acquisition, runtime: Runtime
 ) -> tuple[Path, Mapping[str, Json]]:
     """Where the swept sets are, and their summaries: those of the fit, unless samples change."""
-    of_fit = require(run_dir, "sweep", 2)
+    of_fit = require(run_dir, "sweep", SWEEP_FORMAT)
     if not plan.on_samples:
         return run_dir / "sweep" / "sweep.zarr", of_fit.summary["sets"]
     again = replace(made, folder=made.scratch)

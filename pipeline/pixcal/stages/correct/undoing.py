@@ -26,6 +26,7 @@ from pixcal.kernels.crosstalk import FILL_REACH, filled
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.evidence import Part, fitted_theta
+from pixcal.stages.fit.sweep import BATCH_MAPS
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
@@ -190,8 +191,9 @@ def _halve(swept: Swept, writers: dict[str, ArrayWriter], middle: int, at: tuple
     """Phases of the halves of the frames relative to the whole, and their errors, from batches."""
     y, x = swept.source.ranges(at)
     every = (0, swept.n_batches)
-    phase = ArrayReader(swept.folder / "batch_phase").read(every, y, x)
-    sigma = ArrayReader(swept.folder / "batch_sigma").read(every, y, x)
+    phase, sigma = (
+        ArrayReader(swept.folder / name).read(every, y, x).astype(np.float32) for name in BATCH_MAPS
+    )
     found = [mean_of(phase[part], sigma[part]) for part in (slice(middle), slice(middle, None))]
     for n, name in enumerate(("half_phase", "half_sigma")):
         writers[name].write((0, y[0], x[0]), np.stack([f[n] for f in found]))

@@ -24,6 +24,9 @@ F64 = NDArray[np.float64]
 
 SAME_AS_SWEPT = ("iota", "alpha", "chi2", "mask")
 """Maps of a set that are those of its sweep."""
+MANTISSA = 12
+"""Binary digits kept of the batches' maps: the others, far below their noise, would take as much
+disk again."""
 TOLD = 4000
 """Errors that a tile tells for the median of all."""
 
@@ -161,11 +164,12 @@ def _write_set(
     bad = flags != 0
     phase = ArrayReader(fitted.swept / "phase").read(y, x)
     shape = (phase.shape[0], phase.shape[1])
-    surfaces = (removed.T @ local_modes(fitted.carrier, plane, shape)).reshape(-1, *shape)
+    modes = local_modes(fitted.carrier, plane, shape)
+    surface = (removed[:, 0] @ modes).reshape(shape)
     k = float(np.hypot(*fitted.shape.vector(*plane.centre)))
     scale = np.float32(np.sqrt(fitted.noise) / k)
     start = (y[0], x[0])
-    delta = ((wrapped(phase - plane.on(shape)) - surfaces[0]) / k).astype(np.float32)
+    delta = ((wrapped(phase - plane.on(shape)) - surface) / k).astype(np.float32)
     sigma = np.asarray(ArrayReader(fitted.swept / "sigma").read(y, x) * scale)
     delta[bad] = sigma[bad] = np.nan
     writers["delta"].write(start, delta)
@@ -173,15 +177,16 @@ def _write_set(
     if fitted.n_batches:
         everything = (0, fitted.n_batches)
         for name, array in (("batch_delta", "batch_phase"), ("batch_sigma", "batch_sigma")):
-            maps = ArrayReader(fitted.swept / array).read(everything, y, x)
+            maps = ArrayReader(fitted.swept / array).read(everything, y, x).astype(np.float32)
             if name == "batch_delta":
-                maps -= surfaces[1:].astype(np.float32)
+                surfaces = removed[:, 1:].T.astype(np.float32) @ modes.astype(np.float32)
+                maps -= surfaces.reshape(maps.shape)
                 maps *= np.float32(1 / k)
                 maps += delta
             else:
                 maps *= scale
             maps[:, bad] = np.nan
-            writers[name].write((0, *start), maps)
+            writers[name].write((0, *start), _rounded(maps))
     return delta, sigma, flags
 
 
@@ -242,6 +247,14 @@ def _write_frames(folder: Path, maps: Path) -> None:
 def outputs_of(both: bool) -> tuple[str, ...]:
     """Maps that sets give together, whose axes differ or not."""
     return ("delta_x", "delta_y") if both else ("delta_fringe",)
+
+
+def _rounded(values: F32) -> F32:
+    """Rounded to `MANTISSA` digits, in place; what is no number stays none."""
+    bits, dropped = values.view(np.uint32), 23 - MANTISSA
+    bits += np.uint32(1 << (dropped - 1))
+    bits &= np.uint32(0xFFFFFFFF ^ ((1 << dropped) - 1))
+    return values
 
 
 def _some(values: F32) -> F32:

@@ -39,12 +39,14 @@ from pixcal.storage.artefact import (
 )
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
 
-FORMAT = 2
+FORMAT = 3
 CHI2_SAMPLES = 4096
 """Chi-squares kept in all to tell the usual one from (at least `MIN_SAMPLES` of a tile)."""
 MIN_SAMPLES = 16
 MAPS = ("iota", "alpha", "phase", "sigma", "chi2")
 BATCH_MAPS = ("batch_phase", "batch_sigma")
+BATCH_DTYPE = "<f2"
+"""Half precision rounds them by a few thousandths of their noise, and halves the time they take."""
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,7 @@ def _create_maps(folder: Path, source: ReducedSet, n_batches: int) -> dict[str, 
     )
     for name in BATCH_MAPS if n_batches else ():
         writers[name] = create_array(
-            folder / name, (n_batches, ny, nx), "<f4", dims=("batch", "y", "x"),
+            folder / name, (n_batches, ny, nx), BATCH_DTYPE, dims=("batch", "y", "x"),
             chunks=(n_batches, cy, cx), fill_value=np.nan,
         )  # fmt: skip
     width = 1 + _bound_pixels(source) + _chi2_pixels(source)
@@ -240,7 +242,9 @@ def _sweep_task(job: _Job, at: tuple[int, int]) -> None:
     for name in MAPS:
         writers[name].write(start, getattr(maps, name))
     for name in BATCH_MAPS if "batch_phase" in writers else ():
-        writers[name].write((0, *start), getattr(maps, name))
+        # Of values that half precision does not hold (errors above 65504 rad) nothing is known.
+        with np.errstate(over="ignore"):
+            writers[name].write((0, *start), getattr(maps, name).astype(BATCH_DTYPE))
     flags = fit_flags(
         mask, maps.iota, maps.alpha, maps.sigma, maps.chi2, maps.count, job.noise, job.chi2_limit
     )
