@@ -9,6 +9,8 @@ DOCS := $(VENV)/.installed-docs
 SEED ?= 2004
 # Compiled on first use: most of what is installed is never imported.
 PIP := $(BIN)/python -m pip --quiet install --no-compile
+# Where it is set, every process would compile all that it imports: seconds each.
+unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .PHONY: study-diagnose help install demo test lint smoke wheel-check docs doc-pages precision bench bench-full fuzz effect-pictures reproduce reproduce-full blind blind-full clean
