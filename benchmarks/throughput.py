@@ -1,7 +1,8 @@
 """Speed of ingest, reduce and fit against the barest scan of the same data: ``make bench``.
 
 Scans and fits of one cube are interleaved in one run and told as ratios: machines differ and drift,
-ratios less. The scan decodes every chunk with the fit's own reader and adds its samples.
+ratios less. The scan decodes every chunk with the fit's own reader and adds its samples; a second
+one adds them with their weights, by the fit's own kernel: no fit can take less.
 ``--full`` is ``make bench-full``: the whole detector, 46 Mpix x 64 frames x 2 sets.
 """
 
@@ -9,6 +10,7 @@ import argparse
 import shutil
 import statistics
 import tempfile
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +57,8 @@ def rates(work: Workload, repeat: int) -> None:
     times: dict[tuple[str, str], list[float]] = {}
 
     def take(state: str, threads: int) -> None:
-        for name, go in (("scan", work.scan), ("fit", work.fit)):
+        weighted = partial(work.scan, weighted=True)
+        for name, go in (("scan", work.scan), ("weighted", weighted), ("fit", work.fit)):
             if state == "cold":
                 work.chill()
             times.setdefault((f"{state}, {threads} threads", name), []).append(go(threads))
@@ -64,12 +67,14 @@ def rates(work: Workload, repeat: int) -> None:
         for state, threads in (("warm", 1), ("warm", 2), ("cold", 2)):
             take(state, threads)
     for case in dict.fromkeys(case for case, _ in times):
-        scans, fits = times[case, "scan"], times[case, "fit"]
+        scans, least, fits = (times[case, name] for name in ("scan", "weighted", "fit"))
         ratios = [b / a for a, b in zip(scans, fits, strict=True)]
+        floors = [b / a for a, b in zip(scans, least, strict=True)]
         print(
             f"{case}: scan {gb / statistics.median(scans):.2f} GB/s, "
             f"fit {gb / statistics.median(fits):.2f} GB/s, "
-            f"fit / scan {statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f})"
+            f"fit / scan {statistics.median(ratios):.2f} ({min(ratios):.2f} to {max(ratios):.2f}); "
+            f"weighted / plain scan {statistics.median(floors):.2f}"
         )
     one, two = times["warm, 1 threads", "fit"], times["warm, 2 threads", "fit"]
     gains = [a / b for a, b in zip(one, two, strict=True)]

@@ -14,8 +14,10 @@ from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime
+from pixcal.kernels.fringe_sums import fringe_block
 from pixcal.stages import fit, ingest, reduce, simulate
 from pixcal.stages.reduced_set import ReducedSet
 
@@ -27,6 +29,30 @@ def seconds(work: Callable[[], object]) -> float:
     begin = time.perf_counter()
     work()
     return time.perf_counter() - begin
+
+
+def plain_sum(codes: NDArray[np.uint16]) -> None:
+    """Add the samples of a chunk."""
+    codes.sum(dtype=np.uint32)
+
+
+def weighted_sums(source: ReducedSet) -> Callable[[NDArray[np.uint16]], None]:
+    """What adds the samples of a chunk of a set to the sums of its pixels, as a fit does."""
+    n_frames, *tile = source.signal.chunks
+    pixels, coding = int(np.prod(tile)), source.coding
+    phase = 2.4 * np.arange(n_frames)
+    one = np.ones(n_frames)
+    rows = np.column_stack([one, 0.9 * one, np.cos(phase), np.sin(phase), one]).astype(np.float32)
+    level, sine, cosine = (np.full(pixels, v, np.float32) for v in (2e4, 0.6, 0.6))
+    sums, missing = np.zeros((4, pixels)), np.zeros((7, pixels))
+
+    def add(codes: NDArray[np.uint16]) -> None:
+        fringe_block(
+            codes.reshape(n_frames, pixels), coding.scale, coding.offset, coding.fill, rows, 0.01,
+            level, sine, cosine, sums, missing,
+        )  # fmt: skip
+
+    return add
 
 
 @dataclass(frozen=True)
@@ -106,18 +132,26 @@ class Workload:
         for stage in ("sweep", "fit"):
             shutil.rmtree(self.run / stage, ignore_errors=True)
 
-    def scan(self, threads: int) -> float:
+    def scan(self, threads: int, *, weighted: bool = False) -> float:
         """Seconds to decode all chunks and add their samples, shared among threads.
 
         The barest use of the fit's own reader: one buffer for each thread.
+
+        Parameters
+        ----------
+        threads : int
+        weighted : bool
+            Add them as the fit does, each sample with its weight, by the fit's own kernel: what no
+            fit can do without.
         """
 
         def part(number: int) -> None:
             for source in self.sources:
                 buffer = np.empty(source.signal.chunks, source.signal.dtype)
+                add = weighted_sums(source) if weighted else plain_sum
                 for tile in source.tiles()[number::threads]:
                     for block in range(source.n_blocks):
-                        source.signal.read_chunk((block, *tile), buffer).sum(dtype=np.uint32)
+                        add(source.signal.read_chunk((block, *tile), buffer))
 
         workers = [threading.Thread(target=part, args=(n,)) for n in range(threads)]
 

@@ -87,6 +87,28 @@ def test_an_effect_is_found_and_closes_the_gap(with_lag: Path) -> None:
     assert (with_lag / "diagnose" / "manifest.json").stat().st_mtime_ns == made
 
 
+def test_other_random_numbers_of_the_simulations_change_no_more_than_the_interval(
+    with_lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = diagnosed(with_lag, only=FEW)
+    run = tmp_path / "run"
+    shutil.copytree(with_lag, run, ignore=shutil.ignore_patterns("diagnose", "products"))
+    taken = trial.Window.evidence
+
+    def with_other_seeds(self: trial.Window, half: Any, effects: Any, seed: int, *more: Any) -> Any:
+        return taken(self, half, effects, seed + 50_000, *more)
+
+    monkeypatch.setattr(trial.Window, "evidence", with_other_seeds)
+    again = diagnosed(run, only=FEW)
+    assert again["verdict"] == found["verdict"]
+    assert again["gap"]["where"] != found["gap"]["where"]
+    (one,), (other,) = found["causes"], again["causes"]
+    assert one["effect"] == other["effect"]
+    assert one["parameters"] == other["parameters"]
+    low, high = one["gap_closed_interval"]
+    assert low - 0.05 <= other["gap_closed"] <= high + 0.05
+
+
 def test_a_run_that_was_stopped_goes_on(
     with_lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -260,28 +282,6 @@ def test_windows_of_a_large_detector_lie_apart_on_its_chunks() -> None:
     assert len({*chosen_windows((180, 200))[1]}) == 4
     whole, (same,) = chosen_windows((61, 67))
     assert whole == same == ((0, 61), (0, 67))
-
-
-def test_other_random_numbers_of_the_simulations_change_no_more_than_the_interval(
-    with_lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = diagnosed(with_lag, only=FEW)
-    run = tmp_path / "run"
-    shutil.copytree(with_lag, run, ignore=shutil.ignore_patterns("diagnose", "products"))
-    taken = trial.Window.evidence
-
-    def with_other_seeds(self: trial.Window, half: Any, effects: Any, seed: int, *more: Any) -> Any:
-        return taken(self, half, effects, seed + 50_000, *more)
-
-    monkeypatch.setattr(trial.Window, "evidence", with_other_seeds)
-    again = diagnosed(run, only=FEW)
-    assert again["verdict"] == found["verdict"]
-    assert again["gap"]["where"] != found["gap"]["where"]
-    (one,), (other,) = found["causes"], again["causes"]
-    assert one["effect"] == other["effect"]
-    assert one["parameters"] == other["parameters"]
-    low, high = one["gap_closed_interval"]
-    assert low - 0.05 <= other["gap_closed"] <= high + 0.05
 
 
 def test_the_window_that_is_off_is_named(
