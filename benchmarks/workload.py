@@ -47,9 +47,11 @@ def weighted_sums(source: ReducedSet) -> Callable[[NDArray[np.uint16]], None]:
     sums, missing = np.zeros((4, pixels)), np.zeros((7, pixels))
 
     def add(codes: NDArray[np.uint16]) -> None:
+        flat = codes.reshape(len(codes), -1)
+        n = flat.shape[1]
         fringe_block(
-            codes.reshape(n_frames, pixels), coding.scale, coding.offset, coding.fill, rows, 0.01,
-            level, sine, cosine, sums, missing,
+            flat, coding.scale, coding.offset, coding.fill, rows[: len(flat)], 0.01,
+            level[:n], sine[:n], cosine[:n], sums[:, :n], missing[:, :n],
         )  # fmt: skip
 
     return add
@@ -135,7 +137,7 @@ class Workload:
     def scan(self, threads: int, *, weighted: bool = False) -> float:
         """Seconds to decode all chunks and add their samples, shared among threads.
 
-        The barest use of the fit's own reader: one buffer for each thread.
+        The barest use of the fit's own reader.
 
         Parameters
         ----------
@@ -147,11 +149,10 @@ class Workload:
 
         def part(number: int) -> None:
             for source in self.sources:
-                buffer = np.empty(source.signal.chunks, source.signal.dtype)
                 add = weighted_sums(source) if weighted else plain_sum
                 for tile in source.tiles()[number::threads]:
-                    for block in range(source.n_blocks):
-                        add(source.signal.read_chunk((block, *tile), buffer))
+                    for codes in source.blocks(tile):
+                        add(codes)
 
         workers = [threading.Thread(target=part, args=(n,)) for n in range(threads)]
 

@@ -99,6 +99,16 @@ def test_hops_are_found(acquired: Acquired, hop: float, rate: float) -> None:
     assert found.significance > 6
 
 
+def test_beside_a_walk_the_error_of_hops_is_honest(acquired: Acquired) -> None:
+    hop, rate, walk = 3e-4, 250.0, 3e-3
+    found = WavelengthDrift.estimate(acquired(None, drift(hop=hop, hops_per_h=rate, walk=walk)))
+    assert found is not None
+    assert isinstance(found.effect, WavelengthDrift)
+    assert abs(found.effect.walk - walk) < 4 * found.errors["walk"] < 3 * walk
+    assert abs(found.effect.hop - hop) < 4 * found.errors["hop"] < 0.5 * hop
+    assert abs(found.effect.hops_per_h - rate) < 4 * found.errors["hops_per_h"] < 3 * rate
+
+
 @pytest.mark.parametrize(
     "alike",
     [

@@ -23,6 +23,8 @@ F64 = NDArray[np.float64]
 HOUR_S = 3600.0
 LEVEL = 1.5
 """Scatter about two levels, over that from frame to frame, up to which there are no more."""
+CALM = 2.0
+"""Errors of a walk up to which the levels hold still."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +107,7 @@ class WavelengthDrift(Effect):
         ramps = abs(values["ramp"] / errors["ramp"])
         jumps = [hop for hops in motion.hops.values() for hop in hops]
         if jumps:
-            hopping = _hops(motion, jumps)
+            hopping = _hops(motion, jumps, walks=values["walk"] > CALM * errors["walk"])
             values, errors = values | hopping[0], errors | hopping[1]
         # A ramp goes either way.
         chance = log_chance_of_any([log_ndtr(-drifts), np.log(2) + log_ndtr(-ramps)])
@@ -141,25 +143,29 @@ def _colour(series: FrameSeries) -> F64:
     return ramps_and_colour(series)[..., 2:]
 
 
-def _hops(motion: Motion, jumps: Sequence[Hop]) -> tuple[dict[str, float], dict[str, float]]:
+def _hops(
+    motion: Motion, jumps: Sequence[Hop], *, walks: bool
+) -> tuple[dict[str, float], dict[str, float]]:
     """Size and rate of the hops; up and down count alike.
 
     Those that stand out are the start; short stays between them are told by the likelihood, unless
-    the colour does more than hop between two levels.
+    the colour does more than hop between two levels. Beside a walk only the rate is taken from it:
+    levels that wander make its size worse than that of the hops one by one.
     """
     size, error = np.array([abs(h.size) for h in jumps]), np.array([h.error for h in jumps])
     weight = 1 / error**2
     seconds = sum(float(np.ptp(s.time_s)) + s.step_s for s in motion.raw)
     hop, rate = float(size @ weight / weight.sum()), len(jumps) / seconds
-    found = Hopping(
-        hop, float(1 / np.sqrt(weight.sum())), rate, float(np.sqrt(len(jumps))) / seconds
-    )
+    # They may scatter by more than the noise.
+    excess = float(weight @ (size - hop) ** 2) / max(len(jumps) - 1, 1)
+    own_error = float(np.sqrt(max(excess, 1.0) / weight.sum()))
+    found = Hopping(hop, own_error, rate, float(np.sqrt(len(jumps))) / seconds)
     colours, bases = [colour_of(s) for s in motion.raw], [colour_of(s) for s in motion.series]
     slopes = [float(np.polyfit(np.arange(len(b)), b, 1)[0]) for b in bases]
     levels = find_hopping(colours, [s.step_s for s in motion.raw], slopes, hop, rate)
     alike = 0.5 < levels.size / hop < 2
     if alike and all(n < LEVEL * scatter_of(c) for n, c in zip(levels.noise, colours, strict=True)):
-        found = levels
+        found = replace(levels, size=hop, error=own_error) if walks else levels
     return (
         {"hop": found.size, "hops_per_h": found.rate * HOUR_S},
         {"hop": found.error, "hops_per_h": found.rate_error * HOUR_S},

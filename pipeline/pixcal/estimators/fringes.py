@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from math import gcd
 from typing import TypeVar
 
 import numpy as np
@@ -251,8 +252,10 @@ def smooth_phasor(
     use = good.ravel()
     while degree > 0 and min(shape) < 4 * (degree + 1):
         degree -= 1
-    # Some thousand pixels are enough: an odd step takes all columns in turn.
-    step = max(1, len(parts) // MOST_PIXELS) | 1
+    # Some thousand pixels are enough, of all columns: the step and their number share no factor.
+    step = max(1, len(parts) // MOST_PIXELS)
+    while gcd(step, shape[1]) > 1:
+        step += 1
     parts, use = parts[::step], use[::step]
     every, basis = polynomial_basis(shape, degree), polynomial_basis(shape, degree, step)
     fit = np.zeros((basis.shape[1], 2))

@@ -125,9 +125,10 @@ def start_model(
 def _unweighted_pixels(
     tile: Tile, blocks: Sequence[NDArray[np.uint16]], coding: Coding, frames: FrameParameters
 ) -> F64:
-    """Pixels (3, y, x) by plain least squares, but for the frames' own weights.
+    """Pixels (3, y, x) by least squares that do not weight them.
 
-    Where no sample is missing and the fringe vector is held the normal matrix is the same for all.
+    Where no sample is missing and the fringe vector is held the normal matrix is the same for all,
+    and frames have their own weights; else all samples count alike.
     """
     n = tile.good.size
     moments = FrameMoments.of(frames.g)
@@ -138,8 +139,9 @@ def _unweighted_pixels(
         at = slice(start, start + len(part))
         start += len(part)
         simple = simple and not fringe_block(
-            part.reshape(len(part), n), coding.scale, coding.offset, coding.fill,
-            moments.rows[at], 0.0, nothing, nothing, nothing, sums, missing,
+            np.ascontiguousarray(part).reshape(len(part), n),
+            coding.scale, coding.offset, coding.fill, moments.rows[at], 0.0,
+            nothing, nothing, nothing, sums, missing,
         )  # fmt: skip
     if not simple:
         model = np.zeros((3, *tile.shape), np.float32)

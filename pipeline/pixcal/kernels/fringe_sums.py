@@ -294,10 +294,11 @@ def _steps(
 ) -> None:
     """Steps from the start model across and along its phasor, and their covariance."""
     one = np.float32(1)
-    size = np.float32(table.shape[0] - 1)
+    size, last = np.float32(table.shape[0] - 1), table.shape[0] - 2
     for i in range(place.size):
         at = place[i] * size
-        j = int(at)
+        # A phase a hair below zero is a whole turn in single precision.
+        j = min(int(at), last)
         q = at - np.float32(j)
         p = one - q
         low, high = table[j], table[j + 1]
