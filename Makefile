@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip --quiet install --no-compile
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: study-diagnose help install demo test lint smoke wheel-check docs doc-pages precision bench bench-full fuzz effect-pictures reproduce reproduce-full blind blind-full clean
+.PHONY: study-diagnose help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-full fuzz effect-pictures reproduce reproduce-full blind blind-full clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 17
@@ -40,8 +40,12 @@ $(DOCS): $(INSTALLED)
 demo: $(INSTALLED) ## calibrate the sample acquisition into demo/
 	$(BIN)/pixcal run data_samples/demo --out demo
 
-test: $(TOOLS) ## run the tests, two files at a time
-	$(BIN)/pytest -n 2 --dist loadfile
+# Three files at a time on two cores: some tests wait for processes of their own.
+test: $(TOOLS) ## run the tests
+	$(BIN)/pytest -n 3 --dist loadfile -m "not long"
+
+test-long: $(TOOLS) ## run the tests that take longest (minutes)
+	$(BIN)/pytest -n 2 -m long
 
 lint: $(TOOLS) ## check style and types
 	$(BIN)/ruff check .

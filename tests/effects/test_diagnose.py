@@ -87,6 +87,7 @@ def test_an_effect_is_found_and_closes_the_gap(with_lag: Path) -> None:
     assert (with_lag / "diagnose" / "manifest.json").stat().st_mtime_ns == made
 
 
+@pytest.mark.long
 def test_other_random_numbers_of_the_simulations_change_no_more_than_the_interval(
     with_lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -284,6 +285,7 @@ def test_windows_of_a_large_detector_lie_apart_on_its_chunks() -> None:
     assert whole == same == ((0, 61), (0, 67))
 
 
+@pytest.mark.long
 def test_the_window_that_is_off_is_named(
     reduced: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -581,7 +581,7 @@ def test_galsim_that_is_missing_is_named(flat: Recording, monkeypatch: pytest.Mo
 # A whole examination, so that the diagnosis cannot rot.
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_strong_effects_are_found_and_nothing_is_claimed(tmp_path: Path) -> None:
     """Development cases, whose seed is no examination's; a minute in all."""
     rows = drawn("row_noise", 12.0)

@@ -79,7 +79,7 @@ def test_odd_paths(bench: Bench) -> None:
     assert places.hard_names(bench, ["Übung, 夜 -'*?\n $HOME"]).tried == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_worker_that_dies(bench: Bench) -> None:
     with workers.cluster() as address:
         assert workers.killed(bench, address, "ingest", 1, SEED).tried == 1
