@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -38,20 +39,19 @@ def plain_sum(codes: NDArray[np.uint16]) -> None:
 
 def weighted_sums(source: ReducedSet) -> Callable[[NDArray[np.uint16]], None]:
     """What adds the samples of a chunk of a set to the sums of its pixels, as a fit does."""
-    n_frames, *tile = source.signal.chunks
-    pixels, coding = int(np.prod(tile)), source.coding
-    phase = 2.4 * np.arange(n_frames)
-    one = np.ones(n_frames)
+    coding, phase, one = source.coding, 2.4 * np.arange(source.block), np.ones(source.block)
     rows = np.column_stack([one, 0.9 * one, np.cos(phase), np.sin(phase), one]).astype(np.float32)
-    level, sine, cosine = (np.full(pixels, v, np.float32) for v in (2e4, 0.6, 0.6))
-    sums, missing = np.zeros((4, pixels)), np.zeros((7, pixels))
+
+    @cache
+    def of_pixels(n: int) -> tuple[NDArray[Any], ...]:
+        model = (np.full(n, value, np.float32) for value in (2e4, 0.6, 0.6))
+        return *model, np.zeros((4, n)), np.zeros((7, n))
 
     def add(codes: NDArray[np.uint16]) -> None:
         flat = codes.reshape(len(codes), -1)
-        n = flat.shape[1]
         fringe_block(
             flat, coding.scale, coding.offset, coding.fill, rows[: len(flat)], 0.01,
-            level[:n], sine[:n], cosine[:n], sums[:, :n], missing[:, :n],
+            *of_pixels(flat.shape[1]),
         )  # fmt: skip
 
     return add
