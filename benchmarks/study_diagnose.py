@@ -40,10 +40,10 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
 OUT = Path(__file__).parents[1] / "docs" / "diagnose"
-HERE = Runtime(cluster="sync")
+HERE, PROCESSES = Runtime(cluster="sync"), Runtime(cluster="processes", quiet=False)
 STRENGTHS = (0.3, 1.0, 3.0, 10.0)
 """Times the threshold (`pixcal.stages.blind.strengths`), of each way in turn."""
-REFERENCES, POOL = 16, 64
+REFERENCES, POOL = 16, 192
 """Simulations of the nominal bench that an acquisition is held against, and those they are drawn
 from where only chances count: with the same ones for all, chances would go together."""
 FIRST_SEED, SEEDS_APART = 5000, 10
@@ -97,22 +97,22 @@ class Stage:
 
 
 @lru_cache(maxsize=2)
-def set_up(folder: Path, ramp: bool) -> Stage:
-    """Record, reduce and simulate the bench (once in a process)."""
+def set_up(folder: Path, ramp: bool, runtime: Runtime = HERE) -> Stage:
+    """Record, reduce and simulate the bench (once; processes that come later read what is left)."""
     own = folder / ("ramp" if ramp else "random")
-    look, nominal = own / "look.pickle", own / "run"
-    if not look.exists():
-        own.mkdir(parents=True, exist_ok=True)
+    recorded, nominal, scratch = own / "recorded", own / "run", own / "scratch"
+    if not recorded.exists():
+        scratch.mkdir(parents=True)
         (own / "bench.yaml").write_text(yaml.safe_dump(bench(ramp)))
         simulate.run(own / "bench.yaml", own / "acq", simulate.Config(), HERE)
         ingest.run(own / "acq", nominal, ingest.Config(), HERE)
         reduce.run(nominal, reduce.Config(), HERE)
         shutil.rmtree(own / "acq")
-        look.touch()
-    scratch = Path(tempfile.mkdtemp(dir=own))
+        recorded.touch()
     found = look_at(nominal, scratch, HERE)
-    trials = Trials(found.windows, scratch, HERE)
-    (curves,) = trials.curves([()], POOL, "nominal bench")
+    trials = Trials(found.windows, scratch, runtime)
+    # Chances are looked at where the phases are random.
+    (curves,) = trials.curves([()], REFERENCES if ramp else POOL, "nominal bench")
     assert not isinstance(curves, str)
     return Stage(found, tuple(curves), scratch)
 
@@ -208,13 +208,10 @@ def play(folder: Path, case: tuple[str, float, int]) -> dict[str, Any]:
         told = shrinkage(data, search.nominal, found.final, where)
         result["told"] = [1 - told.gap.total, *(1 - v for v in reversed(told.interval))]
         # Of what is random a few simulations differ more than fitted and true parameters do: of
-        # both as many as of the nominal bench.
-        known = replace(trials, estimates={})
-        for key, by, on in (
-            ("closed", trials, found.final.effects),
-            ("closed_by_truth", known, truth),
-        ):
-            (curves,) = by.curves([on], REFERENCES, key)
+        # both as many as of the nominal bench, and none moved by the errors of its parameters.
+        as_they_are = replace(trials, estimates={}, _made={})
+        for key, on in (("closed", found.final.effects), ("closed_by_truth", truth)):
+            (curves,) = as_they_are.curves([on], REFERENCES, key)
             if not isinstance(curves, str):
                 trial = search.held_against(on, curves)
                 left = shrinkage(data, search.nominal, trial, where).gap.total
@@ -324,9 +321,12 @@ def power_table(played: Sequence[dict[str, Any]]) -> str:
         cells = []
         for strength in STRENGTHS:
             here = [p for p in own if p["strength"] == strength]
+            if not here:
+                cells.append("-")
+                continue
             found = sum(name in p["taken"] for p in here)
             others = sum(any(t != name for t in p["taken"]) for p in here)
-            sigmas = np.median([p["sigmas"] or 0.0 for p in here]) if here else np.nan
+            sigmas = np.median([p["sigmas"] or 0.0 for p in here])
             cells.append(
                 f"{found}/{len(here)} ({sigmas:.1f} σ)" + (f", others {others}" if others else "")
             )
@@ -410,11 +410,8 @@ def main() -> None:
             print(json.dumps(result), file=lines, flush=True)
 
         for ramp in {case[0] in RAMPS for case in pending}:
-            set_up(Path(folder), ramp)
-        run_tasks(
-            partial(play, Path(folder)), pending, Runtime(cluster="processes", quiet=False),
-            label="acquisitions", done=noted,
-        )  # fmt: skip
+            set_up(Path(folder), ramp, PROCESSES)
+        run_tasks(partial(play, Path(folder)), pending, PROCESSES, label="acquisitions", done=noted)
     publish(played, options.out)
 
 
