@@ -100,17 +100,18 @@ class Stage:
 def set_up(folder: Path, ramp: bool, runtime: Runtime = HERE) -> Stage:
     """Record, reduce and simulate the bench (once; processes that come later read what is left)."""
     own = folder / ("ramp" if ramp else "random")
-    recorded, nominal, scratch = own / "recorded", own / "run", own / "scratch"
+    recorded, nominal, kept = own / "recorded", own / "run", own / "simulations"
     if not recorded.exists():
-        scratch.mkdir(parents=True)
+        kept.mkdir(parents=True)
         (own / "bench.yaml").write_text(yaml.safe_dump(bench(ramp)))
         simulate.run(own / "bench.yaml", own / "acq", simulate.Config(), HERE)
         ingest.run(own / "acq", nominal, ingest.Config(), HERE)
         reduce.run(nominal, reduce.Config(), HERE)
         shutil.rmtree(own / "acq")
         recorded.touch()
+    scratch = Path(tempfile.mkdtemp(dir=own))
     found = look_at(nominal, scratch, HERE)
-    trials = Trials(found.windows, scratch, runtime)
+    trials = Trials(found.windows, kept, runtime)
     # Chances are looked at where the phases are random.
     (curves,) = trials.curves([()], REFERENCES if ramp else POOL, "nominal bench")
     assert not isinstance(curves, str)
