@@ -1,9 +1,10 @@
 """What the diagnosis claims by chance, and from which strength on it finds each effect.
 
-One small bench is recorded and reduced as a user's would be; its nominal bench then plays the
-reality again and again, with other random numbers, with nothing in it or with one effect of some
-strength. Every step of the search is that of ``pixcal diagnose``. What is played goes to
-``docs/diagnose/study.jsonl``, where an interrupted study goes on; tables and picture into the page.
+With nothing in it, every acquisition is of another detector, recorded, reduced and diagnosed as a
+user's would be. With effects, one bench is recorded and reduced; its nominal bench then plays the
+reality again and again, with other random numbers and one effect of some strength, and every step
+of the search is that of ``pixcal diagnose``. What is played goes to ``docs/diagnose/study.jsonl``,
+where an interrupted study goes on; tables and picture into the page.
 """
 
 import argparse
@@ -12,29 +13,36 @@ import shutil
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, lru_cache, partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
 import yaml
+from scipy.special import ndtr
 from scipy.stats import binomtest, kstest
 
 from pixcal.effects import effects, parse_effects
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.battery import Curve, Key, battery
+from pixcal.estimators.battery import battery
 from pixcal.estimators.battery.signature import signature_curve, signature_key
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.gap import Reference, compare, expect_nominal, flagged
+from pixcal.estimators.gap import Reference, compare, flagged
 from pixcal.model.bench import SCHEMA
 from pixcal.simulation.effect import Effect, Estimate
-from pixcal.stages import ingest, reduce, simulate
+from pixcal.stages import diagnose, ingest, reduce, simulate
 from pixcal.stages.blind.strengths import ways_of
 from pixcal.stages.diagnose.measuring import nominal_bench
-from pixcal.stages.diagnose.search import SCREEN, Candidate, Search, differing, shrinkage
+from pixcal.stages.diagnose.search import (
+    SCREEN,
+    Candidate,
+    Search,
+    differing,
+    looks_like,
+    shrinkage,
+)
 from pixcal.stages.diagnose.stage import Look, look_at, weakly_seen
-from pixcal.stages.diagnose.trial import Curves, Trials, estimate, looked_at
+from pixcal.stages.diagnose.trial import Curves, Trials, Window, estimate, looked_at
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -43,9 +51,8 @@ OUT = Path(__file__).parents[1] / "docs" / "diagnose"
 HERE, PROCESSES = Runtime(cluster="sync"), Runtime(cluster="processes", quiet=False)
 STRENGTHS = (0.3, 1.0, 3.0, 10.0)
 """Times the threshold (`pixcal.stages.blind.strengths`), of each way in turn."""
-REFERENCES, POOL = 16, 192
-"""Simulations of the nominal bench that an acquisition is held against, and those they are drawn
-from where only chances count: with the same ones for all, chances would go together."""
+REFERENCES = 16
+"""Simulations of the nominal bench that an acquisition is held against."""
 FIRST_SEED, SEEDS_APART = 5000, 10
 REFITTED = tuple(n for n, kind in effects().items() if kind.undo is not Effect.undo)
 """Effects that are undone on the measured maps before they are simulated: the bench is measured
@@ -58,14 +65,14 @@ RAMPS = ("phase_modulator_error",)
 """Effects that are looked for in a set whose phase is a ramp."""
 
 
-def bench(ramp: bool) -> dict[str, Any]:
+def bench(ramp: bool, seed: int = 9000) -> dict[str, Any]:
     """Two sets of 300 frames on 61 x 67 pixels, with bias, darks and a ladder of flats."""
     law = {"phase_law": "ramp", "phase_step_rad": 0.35} if ramp else {}
     return {
         "schema": SCHEMA,
-        "seed": 9000,
+        "seed": seed,
         "detector": {
-            "seed": 9001, "shape": [61, 67], "pitch_um": 4.4, "gain_e_per_adu": 1.0,
+            "seed": seed + 1, "shape": [61, 67], "pitch_um": 4.4, "gain_e_per_adu": 1.0,
             "read_noise_e": 16.0, "bias_adu": 500, "bias_pixel_rms_adu": 4.0, "dark_e_s": 24.0,
             "prnu_rms": 0.01, "delta_rms_px": 2.0e-3, "hot_fraction": 0.004,
             "hot_rate_e_s": 3.0e4,
@@ -93,6 +100,7 @@ class Stage:
 
     look: Look
     nominal: tuple[Curves, ...]
+    seen: list[dict[str, float]]
     scratch: Path
 
 
@@ -103,53 +111,79 @@ def set_up(folder: Path, ramp: bool, runtime: Runtime = HERE) -> Stage:
     recorded, nominal, kept = own / "recorded", own / "run", own / "simulations"
     if not recorded.exists():
         kept.mkdir(parents=True)
-        (own / "bench.yaml").write_text(yaml.safe_dump(bench(ramp)))
-        simulate.run(own / "bench.yaml", own / "acq", simulate.Config(), HERE)
-        ingest.run(own / "acq", nominal, ingest.Config(), HERE)
-        reduce.run(nominal, reduce.Config(), HERE)
-        shutil.rmtree(own / "acq")
+        record(bench(ramp), own, nominal)
         recorded.touch()
     scratch = Path(tempfile.mkdtemp(dir=own))
     found = look_at(nominal, scratch, HERE)
     trials = Trials(found.windows, kept, runtime)
-    # Chances are looked at where the phases are random.
-    (curves,) = trials.curves([()], REFERENCES if ramp else POOL, "nominal bench")
+    (curves,) = trials.curves([()], REFERENCES, "nominal bench")
     assert not isinstance(curves, str)
-    return Stage(found, tuple(curves), scratch)
+    signatures = kept / "signatures.json"
+    if not signatures.exists():
+        work = partial(seen, found.first, scratch)
+        sizes = run_tasks(work, range(REFERENCES), runtime, label="estimates of a nominal bench")
+        signatures.write_text(json.dumps(sizes))
+    return Stage(found, tuple(curves), json.loads(signatures.read_text()), scratch)
 
 
-@cache
-def signature(folder: Path, ramp: bool, name: str) -> tuple[Key, list[Curve]]:
-    """What an effect's estimate sees in the simulations of the nominal bench."""
-    stage, kind = set_up(folder, ramp), effects()[name]
-    curves = []
-    for seed in range(REFERENCES):
-        window = stage.look.first
-        found = estimate(window.evidence(window.test, (), seed, stage.scratch), kind)
-        size = found.significance if isinstance(found, Estimate) else 0.0
-        curves.append(signature_curve(size))
-    return signature_key(name, kind.domains[0]), curves
+def record(bench: dict[str, Any], folder: Path, run: Path) -> None:
+    """Take the frames of a bench, and reduce them."""
+    (folder / "bench.yaml").write_text(yaml.safe_dump(bench))
+    simulate.run(folder / "bench.yaml", folder / "acq", simulate.Config(), HERE)
+    ingest.run(folder / "acq", run, ingest.Config(), HERE)
+    reduce.run(run, reduce.Config(), HERE)
+    shutil.rmtree(folder / "acq")
+
+
+def seen(window: Window, scratch: Path, seed: int) -> dict[str, float]:
+    """What the estimates of all effects see in a simulation of the nominal bench."""
+    evidence = window.evidence(window.test, (), seed, scratch)
+    found = {name: estimate(evidence, kind) for name, kind in effects().items()}
+    return {n: e.significance if isinstance(e, Estimate) else 0.0 for n, e in found.items()}
 
 
 def truth_of(name: str, strength: float, seed: int) -> tuple[Effect, ...]:
-    """An effect in one of its ways, so many times as strong as its threshold; none without name."""
-    if not name:
-        return ()
+    """An effect in one of its ways, so many times as strong as its threshold."""
     ways = ways_of()[name]
-    way = ways[seed // SEEDS_APART % len(ways)]
+    way = ways[(seed // SEEDS_APART + STRENGTHS.index(strength)) % len(ways)]
     drawn = way.make(strength * way.threshold("small"), np.random.default_rng(seed))
     return tuple(parse_effects({name: drawn}, name))
 
 
 def play(folder: Path, case: tuple[str, float, int]) -> dict[str, Any]:
-    """Let the bench play the reality once: name of an effect (or none), strength, seed."""
+    """Play the reality once: name of an effect (or none), strength, seed."""
     name, strength, seed = case
+    found = played_with(folder, name, strength, seed) if name else played_nominal(folder, seed)
+    return {"effect": name, "strength": strength, "seed": seed, **found}
+
+
+def played_nominal(folder: Path, seed: int) -> dict[str, Any]:
+    """A detector of its own with nothing in it, diagnosed by the command."""
+    with tempfile.TemporaryDirectory(dir=folder) as own:
+        run = Path(own, "run")
+        record(bench(False, seed), Path(own), run)
+        diagnose.run(run, diagnose.Config(), HERE)
+        diagnosis = json.loads((run / "products" / "diagnosis.json").read_text())
+        curves = json.loads((run / "diagnose" / "curves.json").read_text())
+    return {
+        "taken": [cause["effect"] for cause in diagnosis["causes"]],
+        "gap": bool(diagnosis["gap"]["total"]),
+        "chances": {
+            f"{c['statistic']} {c['set']}": float(ndtr(-c["significance"]))
+            for c in curves
+            if c["statistic"] in battery() and not battery()[c["statistic"]].floor
+        },
+    }
+
+
+def played_with(folder: Path, name: str, strength: float, seed: int) -> dict[str, Any]:
+    """The one bench with an effect."""
     stage = set_up(folder, name in RAMPS)
     window = stage.look.first
     truth = truth_of(name, strength, seed)
     learn, test = (
-        window.evidence(half, truth, seed + n, stage.scratch, fitted=False)
-        for n, half in enumerate((window.learn, window.test))
+        window.evidence(half, truth, seed, stage.scratch, fitted=False)
+        for half in (window.learn, window.test)
     )
     candidates = {}
     for other, kind in effects().items():
@@ -177,34 +211,33 @@ def play(folder: Path, case: tuple[str, float, int]) -> dict[str, Any]:
     else:
         scratch = Path(tempfile.mkdtemp(dir=folder))
         trials = Trials((window,), scratch, HERE, signatures, estimates, SCREEN)
-        known = [signature(folder, name in RAMPS, kind.name) for kind in signatures]
         reference = Reference.of(
             [
-                curves | {key: own[number] for key, own in known}
-                for number, curves in enumerate(stage.nominal[:REFERENCES])
+                curves
+                | {
+                    signature_key(kind.name, kind.domains[0]): signature_curve(sizes[kind.name])
+                    for kind in signatures
+                }
+                for curves, sizes in zip(stage.nominal, stage.seen, strict=True)
             ]
         )
     data = reference.on_scale(looked_at(test, signatures))
 
     def again(on: tuple[Effect, ...], names: Sequence[str]) -> dict[str, float]:
-        evidence = window.evidence(window.learn, on, seed + 2, trials.scratch)
+        evidence = window.evidence(window.learn, on, seed + 1, trials.scratch)
         found = {n: estimate(evidence, effects()[n]) for n in names}
         return {n: e.significance for n, e in found.items() if isinstance(e, Estimate)}
 
     search = Search(reference, data, trials.curves, again)
     found = search.run(candidates)
     before = compare(data, search.nominal.expected)
-    own = candidates[name].estimate if name else None
+    own = candidates[name].estimate
     result: dict[str, Any] = {
-        "effect": name,
-        "strength": strength,
-        "seed": seed,
         "taken": list(found.taken),
         "gap": bool(flagged(before)),
-        "chances": _chances(stage, test, seed) if not name else [],
         "sigmas": own.significance if own else None,
     }
-    if name and name in found.taken:
+    if name in found.taken:
         where = differing(search.nominal, found.final, data)
         told = shrinkage(data, search.nominal, found.final, where)
         result["told"] = [1 - told.gap.total, *(1 - v for v in reversed(told.interval))]
@@ -218,24 +251,18 @@ def play(folder: Path, case: tuple[str, float, int]) -> dict[str, Any]:
                 left = shrinkage(data, search.nominal, trial, where).gap.total
                 result[key] = 1 - left
     if where := flagged(before):
-        result["closed_by_wrong"] = {
-            other: 1 - shrinkage(data, search.nominal, one.alone, where).gap.total
-            for other, one in candidates.items()
-            if one.alone is not None and other != name
-        }
+        result["closed_by_wrong"], result["closed_by_alike"] = {}, {}
+        for other, wrong in candidates.items():
+            if wrong.alone is None or other == name:
+                continue
+            # Of which it is told that the frames do not tell it from the true one.
+            alike = other in found.alike.get(name, ()) or wrong.reason == looks_like(name)
+            told = shrinkage(data, search.nominal, wrong.alone, where)
+            result["closed_by_alike" if alike else "closed_by_wrong"][other] = [
+                1 - told.gap.total,
+                1 - told.interval[1],
+            ]
     return result
-
-
-def _chances(stage: Stage, test: Evidence, seed: int) -> list[float]:
-    """Of all statistics but counts, whose chances come in steps; against references of its own."""
-    drawn = np.random.default_rng(seed).choice(POOL, REFERENCES, replace=False)
-    reference = Reference.of([stage.nominal[n] for n in drawn])
-    differences = compare(reference.on_scale(looked_at(test, ())), expect_nominal(reference))
-    return [
-        float(np.exp(one.log_chance))
-        for key, one in differences.items()
-        if not battery()[key[0]].floor
-    ]
 
 
 def nominal_table(played: Sequence[dict[str, Any]]) -> str:
@@ -243,7 +270,7 @@ def nominal_table(played: Sequence[dict[str, Any]]) -> str:
     count = len(played)
     claims = sum(bool(p["taken"]) for p in played)
     gaps = sum(p["gap"] for p in played)
-    chances = np.concatenate([p["chances"] for p in played])
+    chances = np.array([chance for p in played for chance in p["chances"].values()])
     share = [float(np.mean(chances < limit)) for limit in (0.1, 0.01, 0.001)]
     rows = [
         ("nominal acquisitions", count),
@@ -276,20 +303,32 @@ def shares_table(played: Sequence[dict[str, Any]]) -> str:
 
 def wrong_table(played: Sequence[dict[str, Any]]) -> str:
     """What innocent effects close by themselves of the gap that another makes."""
-    closed = [
-        (share, other, p["effect"])
-        for p in played
-        for other, share in p.get("closed_by_wrong", {}).items()
-    ]
-    shares = np.array([share for share, *_ in closed])
-    rows: list[tuple[Any, ...]] = [
-        ("innocent effects tried", len(closed)),
-        ("share closed: median", f"{np.median(shares):.3f}"),
-        ("95 % close at most", f"{np.quantile(shares, 0.95):.3f}"),
-    ]
-    most = sorted(closed, reverse=True)[:MOST_WRONG]
-    told = ", ".join(f"{other} of {name}'s {share:.2f}" for share, other, name in most)
-    return _table(("", ""), [*rows, ("the most", told)])
+    rows: list[tuple[Any, ...]] = []
+    for what, of in (
+        ("innocent effects tried", "closed_by_wrong"),
+        ("effects tried that the answer says look like the true one", "closed_by_alike"),
+    ):
+        closed = [
+            (share, least, other, p["effect"])
+            for p in played
+            for other, (share, least) in p.get(of, {}).items()
+        ]
+        rows.append((what, len(closed)))
+        if not closed:
+            continue
+        shares = np.array([share for share, *_ in closed])
+        most = sorted(closed, reverse=True)[:MOST_WRONG]
+        told = ", ".join(f"{other} of {name}'s {share:.2f}" for share, _, other, name in most)
+        rows += [
+            ("share closed: median", f"{np.median(shares):.3f}"),
+            ("95 % close at most", f"{np.quantile(shares, 0.95):.3f}"),
+            (
+                f"close more than {ALIKE:g} by their whole interval",
+                sum(least > ALIKE for _, least, *_ in closed),
+            ),
+            ("the most", told),
+        ]
+    return _table(("", ""), rows)
 
 
 def _ks(chances: np.ndarray) -> str:
@@ -299,9 +338,11 @@ def _ks(chances: np.ndarray) -> str:
 
 def _unlike(played: Sequence[dict[str, Any]]) -> str:
     """A twentieth is what chance lets expect."""
-    by_statistic = np.array([p["chances"] for p in played]).T
-    off = sum(kstest(own, "uniform").pvalue < 0.05 for own in by_statistic)
-    return f"{off} of {len(by_statistic)}"
+    names = set.intersection(*(set(p["chances"]) for p in played))
+    by_statistic = {name: [p["chances"][name] for p in played] for name in sorted(names)}
+    off = [n for n, own in by_statistic.items() if kstest(own, "uniform").pvalue < 0.05]
+    print("chances not uniform:", ", ".join(off))
+    return f"{len(off)} of {len(by_statistic)}"
 
 
 def _share(found: int, count: int) -> str:
@@ -410,7 +451,7 @@ def main() -> None:
             played.append(result)
             print(json.dumps(result), file=lines, flush=True)
 
-        for ramp in {case[0] in RAMPS for case in pending}:
+        for ramp in {case[0] in RAMPS for case in pending if case[0]}:
             set_up(Path(folder), ramp, PROCESSES)
         run_tasks(partial(play, Path(folder)), pending, PROCESSES, label="acquisitions", done=noted)
     publish(played, options.out)

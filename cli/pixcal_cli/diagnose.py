@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from pixcal.model.errors import InputError
 from pixcal_cli import results
 from pixcal_cli.options import examples, run_argument, runtime_options
 
@@ -13,8 +14,20 @@ if TYPE_CHECKING:
 
 
 def effect_list(text: str) -> tuple[str, ...]:
-    """Names of effects, divided by commas."""
-    return tuple(name.strip() for name in text.split(",") if name.strip())
+    """Names of effects, divided by commas.
+
+    Raises
+    ------
+    InputError
+        If there are none: without the option every effect is a candidate.
+    """
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    if not names:
+        raise InputError(
+            f"--effects {text!r:.80}: no name of an effect; write names with commas between them, "
+            "or leave the option out for all effects"
+        )
+    return names
 
 
 @click.command(
@@ -29,7 +42,7 @@ def effect_list(text: str) -> tuple[str, ...]:
     "--effects",
     "chosen",
     type=effect_list,
-    default="",
+    default=None,
     metavar="NAMES",
     help="Candidates, divided by commas; a name after '-' is left out. [default: all]",
 )
@@ -49,7 +62,7 @@ def effect_list(text: str) -> tuple[str, ...]:
 @runtime_options
 def diagnose(
     run: Path,
-    chosen: tuple[str, ...],
+    chosen: tuple[str, ...] | None,
     own: tuple[Path, ...],
     nominal: Path | None,
     runtime: "Runtime",
@@ -58,8 +71,8 @@ def diagnose(
     from pixcal.stages import diagnose as stage  # here: for a fast `pixcal --help`
 
     config = stage.Config(
-        only=tuple(name for name in chosen if not name.startswith("-")),
-        without=tuple(name[1:] for name in chosen if name.startswith("-")),
+        only=tuple(name for name in chosen or () if not name.startswith("-")),
+        without=tuple(name[1:] for name in chosen or () if name.startswith("-")),
         own=own,
         nominal=nominal,
     )

@@ -165,7 +165,7 @@ def _allan_row(curve: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def show_diagnosis(run: Path) -> None:
-    """Print the verdict, the causes, and where the gap is, worst first."""
+    """Print the verdict, the causes, where the gap is, worst first, and frames that tell more."""
     found = read_json(run / "diagnose" / "diagnosis.json")
     gap = found["gap"]
     low, high = gap["interval"]
@@ -177,13 +177,19 @@ def show_diagnosis(run: Path) -> None:
             cause["effect"],
             "{:.3f} [{:.3f}, {:.3f}]".format(cause["gap_closed"], *cause["gap_closed_interval"]),
             f"{cause['gain_over_rest']:.3f}",
-            f"{cause['p_value']:.1e}",
+            _chance(cause["p_value"]),
             ", ".join(cause["not_told_apart_from"]) or "-",
         )
         for cause in found["causes"]
     ]
     if causes:
         show_table(("cause", "gap closed", "over the rest", "p", "or else"), causes)
+    for cause in found["causes"]:
+        if cause["would_decide"]:
+            others = " or ".join(cause["not_told_apart_from"])
+            click.echo(
+                f"  to tell {cause['effect']} from {others}: {'; '.join(cause['would_decide'])}"
+            )
     rows = [
         (
             f"{entry['domain']}: {entry['title']}",
@@ -199,10 +205,18 @@ def show_diagnosis(run: Path) -> None:
         show_table(("where", "place", "measured", "nominal", "with causes", "sigma"), rows)
         if len(gap["where"]) > MOST_ROWS:
             click.echo(f"  and {len(gap['where']) - MOST_ROWS} more in diagnosis.json")
+    if found["more_would_tell"]:
+        click.echo(f"  to tell more: {'; '.join(found['more_would_tell'])}")
 
 
 MOST_ROWS = 8
 """Differences that are printed."""
+LEAST_CHANCE = 1e-12
+"""Smallest p-value that means something."""
+
+
+def _chance(p: float) -> str:
+    return f"< {LEAST_CHANCE:.0e}" if p <= LEAST_CHANCE else f"{p:.1e}"
 
 
 def show_report(run: Path) -> None:

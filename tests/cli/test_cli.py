@@ -402,6 +402,57 @@ def test_the_rows_of_an_allan_deviation(tmp_path: Path, capsys: pytest.CaptureFi
     assert note == "note: c: too short"
 
 
+def test_a_diagnosis_names_frames_that_would_decide(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cause: dict[str, Any] = {
+        "effect": "lag",
+        "gap_closed": 0.9,
+        "gap_closed_interval": [0.8, 0.95],
+        "gain_over_rest": 0.9,
+        "p_value": 1e-12,
+        "not_told_apart_from": ["ipc", "glow"],
+        "would_decide": ["dark frames", "a second baseline along x and y"],
+    }
+    sure = cause | {
+        "effect": "row_noise", "p_value": 1.1e-12, "not_told_apart_from": [], "would_decide": [],
+    }  # fmt: skip
+    found = {
+        "verdict": "partly explained",
+        "causes": [cause, sure],
+        "gap": {"after": 0.5, "interval": [0.4, 0.6], "where": []},
+        "more_would_tell": ["flat frames", "a fringe set along another axis"],
+    }
+    (tmp_path / "diagnose").mkdir()
+    file = tmp_path / "diagnose/diagnosis.json"
+    file.write_text(json.dumps(found))
+    results.show_diagnosis(tmp_path)
+    _, _, lag, row_noise, *frames = (" ".join(row) for row in cells(capsys.readouterr().out))
+    assert lag == "lag 0.900 [0.800, 0.950] 0.900 < 1e-12 ipc, glow"
+    assert row_noise == "row_noise 0.900 [0.800, 0.950] 0.900 1.1e-12 -"
+    assert frames == [
+        "to tell lag from ipc or glow: dark frames; a second baseline along x and y",
+        "to tell more: flat frames; a fringe set along another axis",
+    ]
+    file.write_text(json.dumps(found | {"causes": [sure], "more_would_tell": []}))
+    results.show_diagnosis(tmp_path)
+    assert "to tell" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("names", ["", " , ", ","])
+def test_candidates_without_a_name_are_refused(
+    names: str, calls: list[tuple[str, tuple[Any, ...]]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert invoke(["diagnose", "RUN", "--effects", names]) == 2
+    assert not calls
+    assert f"--effects {names!r}: no name of an effect; write names" in capsys.readouterr().err
+    assert invoke(["diagnose", "RUN"]) == 0
+    assert invoke(["diagnose", "RUN", "--effects", "lag, ipc,-row_noise,"]) == 0
+    every, some = (args[1] for _, args in calls)
+    assert (every.only, every.without) == ((), ())
+    assert (some.only, some.without) == (("lag", "ipc"), ("row_noise",))
+
+
 def test_a_damaged_result_is_named(tmp_path: Path) -> None:
     (tmp_path / "fit").mkdir()
     (tmp_path / "fit/fit.json").write_text("{")

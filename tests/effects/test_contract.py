@@ -14,7 +14,7 @@ from pixcal.model.bench import Bench
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps, Stage
-from pixcal.simulation.exposure import Camera, frames_of
+from pixcal.simulation.exposure import Camera, frames_of, states_of
 from pixcal.simulation.recording import Recording, recordings
 
 ROOT = Path(__file__).parents[2]
@@ -102,6 +102,27 @@ def test_frames_do_not_depend_on_how_the_work_is_cut(cls: type[Effect], short: B
             for frames in (range(recording.count - 1, recording.count), range(1)):
                 for frame, samples in Camera(short, rows, [effect]).expose(recording, frames):
                     assert np.array_equal(samples, whole[frame, rows[0] : rows[1]])
+
+
+@EVERY
+def test_windows_share_what_happens_to_frames_and_not_the_noise_of_pixels(
+    cls: type[Effect], short: Bench
+) -> None:
+    recording = by_stem(short)["vertical"]
+    other = dataclasses.replace(recording, window=1)
+    for one, same in zip(
+        dataclasses.astuple(states_of(recording, [strong(cls)])),
+        dataclasses.astuple(states_of(other, [strong(cls)])),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one, same)
+    here, there = (frames_of(short, r, [strong(cls)]) for r in (recording, other))
+    difference = here.astype(float) - there
+    assert difference.std() > np.sqrt(2) * short.detector.read_noise_e
+    # The level of a frame is the same but for the noise of its pixels and the place of hits.
+    if cls.name != "cosmic_hits":
+        noise = np.sqrt(2 * (here.mean() + short.detector.read_noise_e**2 + 3**2 * 100))
+        assert np.abs(difference.mean(axis=(1, 2))).max() < 6 * noise / np.sqrt(here[0].size)
 
 
 @EVERY

@@ -7,11 +7,15 @@ import numpy as np
 import pytest
 
 from pixcal.estimators.battery import Curve, Key
-from pixcal.estimators.gap import Reference
+from pixcal.estimators.gap import Reference, compare, flagged
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.search import (
+    CONFIRM,
+    LEAST,
     LEAST_OF_HINTED,
+    MOST,
+    SCREEN,
     Candidate,
     Found,
     Search,
@@ -52,7 +56,10 @@ PATTERNS: Mapping[str, Mapping[int, float]] = {
     "mimic": {0: 1.0, 1: 0.5, 4: 1.0},
     "unknown": {2: 1.0, 3: 1.0, 4: 1.0, 5: 1.0, 1: 1.0},
     "little": {5: 1.0},
+    **{f"single {row}": {row: 1.0} for row in range(len(KEYS))},
 }
+SINGLE = tuple(f"single {row}" for row in range(len(KEYS)))
+"""Effects that move a curve each; one more than are taken."""
 
 
 def curves(
@@ -192,6 +199,85 @@ def test_a_stand_in_for_an_unknown_cause_is_not_claimed() -> None:
     assert not found.taken
     assert left == pytest.approx(1, abs=0.02)
     assert "stays unexplained" in found.candidates["little"].reason
+
+
+def test_a_cause_beyond_the_most_is_told_that_no_more_were_sought() -> None:
+    truth = dict.fromkeys(SINGLE, 0.03)
+    found, _ = search(truth, [candidate(label, 0.03) for label in SINGLE])
+    (left_out,) = set(SINGLE) - set(found.taken)
+    assert len(found.taken) == MOST
+    assert "no more are sought" in found.candidates[left_out].reason
+
+
+def test_an_effect_that_was_hinted_at_and_not_taken_is_told_so() -> None:
+    """Seeds differ in how much likelier the unseen frames get: some lie between the two marks."""
+    reasons = {}
+    for seed in range(800, 840):
+        found, _ = search({"left": 0.03, "little": 0.0035}, [
+            candidate("left", 0.03), candidate("little", 0.0035, sigmas=3.0),
+        ], None, seed)  # fmt: skip
+        reasons[seed] = found.candidates["little"].reason
+    told = [r for r in reasons.values() if "only hint at" in r]
+    assert told
+    for reason in told:
+        gain = float(reason.split("by ")[1].split(" in")[0])
+        assert LEAST <= gain < LEAST_OF_HINTED
+
+
+def test_each_cause_is_weighed_alone_by_as_many_simulations_as_all_together() -> None:
+    benches: dict[frozenset[str], int] = {}
+
+    def noted(
+        wanted: Sequence[Sequence[Effect]], seeds: int, label: str
+    ) -> list[list[dict[Key, Curve]] | str]:
+        for bench in wanted:
+            name = frozenset(e.label for e in bench if isinstance(e, Toy))
+            benches[name] = max(benches.get(name, 0), seeds)
+        return simulate(wanted, seeds, label)
+
+    sizes = {"left": 0.03, "right": 0.02, "little": 0.03}
+    data = REFERENCE.on_scale(curves((), 500, sizes))
+    found = Search(REFERENCE, data, noted, lambda *_: {}).run(
+        {label: candidate(label, size) for label, size in sizes.items()}
+    )
+    assert set(found.taken) == set(sizes)
+    for name in sizes:
+        assert benches[frozenset({name})] == CONFIRM
+
+
+def test_what_opens_elsewhere_widens_the_interval_of_what_is_left() -> None:
+    """A stand-in that does what the data do not show."""
+    data = REFERENCE.on_scale(curves((), 500, {"left": 0.03}))
+    benches = [(candidate("mimic", 0.03).estimate.effect,)]  # type: ignore[union-attr]
+    (made,) = simulate(benches, CONFIRM, "")
+    assert not isinstance(made, str)
+    tried = Search(REFERENCE, data, simulate, lambda *_: {})
+    trial = tried.held_against(benches[0], made)
+    where = flagged(compare(data, tried.nominal.expected))
+    told = shrinkage(data, tried.nominal, trial, where)
+    opened = flagged(told.after) - where
+    assert opened
+    assert told.gap.total > 0.2
+    assert told.interval[0] > 0.5 * told.gap.total
+
+
+def test_where_fewer_effects_are_refused_all_stay(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = simulate
+
+    def fails(
+        benches: Sequence[Sequence[Effect]], seeds: int, label: str
+    ) -> list[list[dict[Key, Curve]] | str]:
+        return [
+            "not by itself" if [e.name for e in bench] == ["right"] and seeds > SCREEN else made
+            for bench, made in zip(benches, plain(benches, seeds, label), strict=True)
+        ]
+
+    monkeypatch.setitem(globals(), "simulate", fails)
+    truth = {"left": 0.03, "right": 0.02}
+    found, left = search(truth, [candidate(label, size) for label, size in truth.items()])
+    assert set(found.taken) == {e.name for e in found.final.effects}
+    assert set(found.without) == set(found.taken)
+    assert left < 0.05
 
 
 def test_nothing_is_claimed_of_nothing() -> None:

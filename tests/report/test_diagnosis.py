@@ -85,7 +85,9 @@ def a_diagnosis(
             "domains": {"space": [0.3, 0.02], "time": [0.0, 0.0], "intensity": [0.0, 0.0],
                         "noise": [0.7, 0.01]},
             "absolute": [{"quantity": "offset rows", "unit": "px", "measured": 2e-3,
-                          "simulated": 3e-5, "after": 1.9e-3}],
+                          "simulated": 3e-5, "after": 1.9e-3,
+                          "simulated_interval": [2e-5, 4e-5], "after_interval": [1.8e-3, 2.1e-3],
+                          "with_only": {"lag": 1.7e-3, "mine": 4e-5}}],
         } | gap,
         "candidates": [
             {"effect": "ipc", "gap_closed": 0.0, "rejected_because": "not seen (0.4 sigma)",
@@ -198,13 +200,19 @@ def test_causes_come_with_their_numbers() -> None:
     )
     assert "3.0\u00a0% [1.0, 6.0] of the gap is left" in answer(section).text
     assert [row[:4] for row in table(section, "Causes").rows] == [
-        ["1. what lag is (lag)", "80\u00a0% [75, 83]", "61\u00a0%", "< 10⁻¹⁵"],
+        ["1. what lag is (lag)", "80\u00a0% [75, 83]", "61\u00a0%", "< 10⁻¹²"],
         ["2. what mine is (mine)", "20\u00a0% [75, 83]", "5.0\u00a0%", "3.0 × 10⁻⁴"],
     ]
     assert "Charge stays. What gave it away: frames follow others." in text_of(section)
     assert list(table(section, "Parameters of lag").rows) == [
         ["share", "0.002000 ± 0.000020", "e⁻/µm", "left behind"]
     ]
+    units = table(section, "In units of the bench (intervals: one sigma)")
+    assert units.header[2:] == ["measured", "nominal", "with causes", "lag only", "mine only"]
+    assert list(units.rows[0])[2:] == [
+        "0.00200", "3.00 × 10⁻⁵ [2.00 × 10⁻⁵, 4.00 × 10⁻⁵]", "0.00190 [0.00180, 0.00210]",
+        "0.00170", "4.00 × 10⁻⁵",
+    ]  # fmt: skip
     assert [b.title for b in section.blocks if isinstance(b, Plate)] == [
         "The gap", "What gave away what lag is (lag)", "What gave away what mine is (mine)",
     ]  # fmt: skip

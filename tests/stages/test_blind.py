@@ -476,7 +476,7 @@ def test_offsets_are_held_against_the_truth_in_bounds(
     reduce.run(run_dir, reduce.Config(), SYNC)
     causes = [] if named is None else [{"effect": named.effect, "parameters": named.parameters}]
     inputs = {"reduce": require(run_dir, "reduce", 1).key}
-    with build(run_dir, "diagnose", 2, {"own": [], "nominal": {}}, inputs) as made:
+    with build(run_dir, "diagnose", 3, {"own": [], "nominal": {}}, inputs) as made:
         write_json(made.folder / "diagnosis.json", {"verdict": "explained", "causes": causes})
     correct.run(run_dir, correct.Config(), SYNC)
     found = offset_errors(

@@ -25,6 +25,7 @@ from pixcal.stages.correct.restored_set import RestoredSet
 from pixcal.stages.correct.treatment import ABSORBED, LEFT, treatments
 from pixcal.stages.correct.uncertainty import moved
 from pixcal.stages.correct.undoing import undone
+from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import build, require, write_json
 from pixcal.storage.cube import create_group, write_array
@@ -63,7 +64,7 @@ def seen_through(bench: Any, act: Callable[[F64], F64]) -> Any:
 def diagnosed(run: Path, *causes: Effect | dict[str, Any], verdict: str = "explained") -> None:
     """Write the diagnosis that a run would have."""
     inputs = {"reduce": require(run, "reduce", 1).key}
-    with build(run, "diagnose", 2, {"own": [], "nominal": {}}, inputs) as made:
+    with build(run, "diagnose", DIAGNOSIS_FORMAT, {"own": [], "nominal": {}}, inputs) as made:
         found = [
             {"effect": c.name, "parameters": to_plain(c)} if isinstance(c, Effect) else c
             for c in causes
@@ -299,7 +300,8 @@ def test_without_a_diagnosis_it_says_what_to_run(make_bench, write_reduced, tmp_
     with pytest.raises(InputError, match=r"diagnose: not there yet; run 'pixcal diagnose"):
         correct.run(run, correct.Config(), SYNC)
     assert not (run / "fit").exists()
-    with build(run, "diagnose", 2, {"own": [], "nominal": {}}, {"reduce": "earlier"}) as made:
+    of = {"own": [], "nominal": {}}
+    with build(run, "diagnose", DIAGNOSIS_FORMAT, of, {"reduce": "earlier"}) as made:
         write_json(made.folder / "diagnosis.json", {"verdict": "no gap", "causes": []})
     with pytest.raises(InputError, match="reduced otherwise; run 'pixcal diagnose"):
         correct.run(run, correct.Config(), SYNC)
@@ -322,6 +324,20 @@ def test_an_effect_of_the_users_own_is_asked_for(coupled, tmp_path):
     file.write_text(spoilt)
     with pytest.raises(InputError, match="'glow': undo gives no finite maps"):
         correct.run(again, correct.Config(own=(file,)), SYNC)
+
+
+def test_a_file_of_the_users_own_may_be_in_any_encoding_of_python(coupled, tmp_path):
+    """What depends on it depends on its bytes."""
+    _, run, *_ = coupled
+    again = tmp_path / "run"
+    shutil.copytree(run, again)
+    file = tmp_path / "glow.py"
+    keys = set()
+    for author in ("Andr\xe9", "Ren\xe9"):
+        file.write_bytes(f"# coding: latin-1\n# by {author}\n{GLOW}".encode("latin-1"))
+        diagnosed(again, {"effect": "glow", "parameters": {}})
+        keys.add(correct.run(again, correct.Config(own=(file,)), SYNC).key)
+    assert len(keys) == 2
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from pixcal.effects import effects
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.simulation.effect import Effect
-from pixcal.stages.diagnose.deciding import MORE, deciding, missing_frames
+from pixcal.stages.diagnose.deciding import MORE, OTHER_ORDER, deciding, missing_frames
 
 LADDER = (0.01, 0.02, 0.03)
 FOUR = ((6.0, 0.0), (-9.0, 0.1), (0.0, 6.0), (0.0, 9.0))
@@ -47,7 +47,7 @@ def missing(
     [
         (missing(FOUR, LADDER), ("ipc", "mine"), [MORE]),
         (missing(FOUR, LADDER, dark=False), ("ipc",), ["dark frames"]),
-        (missing(FOUR, LADDER, dark=False), ("lag", "contrast_noise"), ["dark frames"]),
+        (missing(FOUR, LADDER, dark=False), ("row_noise", "contrast_noise"), ["dark frames"]),
         (missing(FOUR, LADDER, dark=False), ("contrast_noise",), [MORE]),
         (missing(((6, 0), (0, 6)), LADDER), ("ipc",), ["a second baseline along x and y"]),
         (missing(((6, 0), (9, 0), (0, 6)), LADDER), ("ipc",), ["a second baseline along y"]),
@@ -56,7 +56,7 @@ def missing(
          ["a fringe set along another axis"]),
         (missing(FOUR, LADDER[:1]), ("nonlinearity",),
          ["a ladder of flats (at least 3 exposure times)"]),
-        (missing(FOUR, LADDER[:1]), ("lag",), [MORE]),
+        (missing(FOUR, LADDER[:1]), ("row_noise",), [MORE]),
         (missing(FOUR, ()), ("mine",),
          ["flat frames", "a ladder of flats (at least 3 exposure times)"]),
     ],
@@ -66,6 +66,58 @@ def test_frames_that_would_decide_are_those_that_are_missing(
 ) -> None:
     kinds = effects() | {"mine": Mine}
     assert deciding(lacking, [kinds[name] for name in names]) == words
+
+
+BARE = missing(((6, 0),), (), dark=False)
+"""Fringes of one set, and nothing else."""
+
+
+@pytest.mark.parametrize(
+    ("names", "kinds"),
+    [
+        # An error of the modulator shows in a ramp; in random phases, what mixes frames.
+        (("rolling_shutter", "phase_modulator_error"), ("phases",)),
+        (("lag", "contrast_noise"), ("phases",)),
+        (("lag", "nonlinearity"), ("ladder", "phases")),
+        # The second harmonic of a response does not depend on the fringes' spacing.
+        (("nonlinearity", "brighter_fatter"), ("baseline",)),
+        # Crosstalk shows at hot pixels, and in the noise in proportion to the level.
+        (("ipc", "brighter_fatter"), ("dark", "flat", "ladder")),
+        # Both lower the visibility of close fringes; only crosstalk makes neighbours share noise.
+        (("ipc", "intra_pixel_response"), ("dark", "flat")),
+        # A ghost beats with all fringes at the same vector; what is in pixels does not.
+        (("straylight", "ghost_fringes"), ("baseline",)),
+        (("hyperbolic_fringes", "ghost_fringes"), ("baseline",)),
+        # Motion adds the same to all fringe vectors, a change of colour in proportion to them.
+        (("fringe_drift", "wavelength_drift"), ("baseline", "axis")),
+        (("intensity_noise", "bias_drift"), ("dark",)),
+        # Frames that show both alike are better than none; where they are of no use, more frames.
+        (("row_noise", "bias_drift"), ("dark",)),
+        (("fringe_drift", "fringe_jitter"), ()),
+        (("intensity_noise", "contrast_noise"), ()),
+        # Of three, what is not the same for all.
+        (("ipc", "brighter_fatter", "intra_pixel_response"), ("dark", "flat", "ladder")),
+    ],
+)
+def test_frames_that_tell_on_one_effect_and_not_on_the_other_decide(
+    names: tuple[str, ...], kinds: tuple[str, ...]
+) -> None:
+    words = [BARE[kind] for kind in BARE if kind in kinds] or [MORE]
+    for order in (names, names[::-1]):
+        assert deciding(BARE, [effects()[name] for name in order]) == words
+
+
+def test_what_tells_on_all_is_asked_for_once_nothing_parts_them() -> None:
+    """Also where all frames that would part them are there."""
+    both = [effects()[name] for name in ("nonlinearity", "brighter_fatter")]
+    assert set(both[0].told_by) & set(both[1].told_by) == {"ladder"}
+    lacking = missing(FOUR, LADDER[:1])
+    assert deciding(lacking, both) == [lacking["ladder"]]
+
+
+def test_another_order_of_the_phases_is_asked_for_only_of_fringes() -> None:
+    assert missing(FOUR, LADDER) == {"phases": OTHER_ORDER}
+    assert missing((), LADDER) == {}
 
 
 def test_effects_name_kinds_of_frames_that_there_are() -> None:

@@ -212,7 +212,7 @@ def write_diagnose(run: Path, verdict: str = "explained", effects: tuple[str, ..
                 "domains": {"time": [1.0, 0.03]}},
     }  # fmt: skip
     inputs = {"reduce": read_manifest(run / "reduce").key}
-    with build(run, "diagnose", 2, {"effects": list(effects), "nominal": {}}, inputs) as made:
+    with build(run, "diagnose", 3, {"effects": list(effects), "nominal": {}}, inputs) as made:
         write_json(made.folder / "diagnosis.json", facts)
         write_json(made.folder / "curves.json", [curve])
 

@@ -81,7 +81,7 @@ class CosmicHits(Effect):
         detector = shot.bench.detector
         pitch = detector.pitch_um
         area = np.prod([(n + 2 * MARGIN_PX) * pitch * 1e-4 for n in detector.shape])
-        rng = shot.rng(self.name)
+        rng = shot.recording.pixel_rng(self.name, shot.frame)
         count = int(rng.poisson(self.rate_cm2_s * area * shot.recording.exptime_s))
         if not count:
             return charge

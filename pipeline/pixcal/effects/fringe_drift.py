@@ -54,7 +54,7 @@ class FringeDrift(Effect):
     stage = Stage.LIGHT
     domains = ("time", "space")
     strengths = ("ramp", "settle", "walk", "vibration")
-    told_by = ("baseline", "axis")
+    told_by = ()
     sources = (
         "Rousset et al., sections 4.2, 4.3 and 5.2: thermal deformations and low-frequency "
         "vibrations move Kx, Ky; one of two data sets drifts after 30 minutes",

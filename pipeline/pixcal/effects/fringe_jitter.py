@@ -29,7 +29,7 @@ class FringeJitter(Effect):
     stage = Stage.LIGHT
     domains = ("time", "space")
     strengths = ("rms",)
-    told_by = ("baseline", "axis")
+    told_by = ()
     sources = (
         "Rousset et al., sections 4.2 and 5.2: fringe residuals are laid to changing Kx, Ky",
         "C. G. Gordon 1992, Proc. SPIE 1619, 71: laboratory floors of 12 to 50 um/s rms (curves "

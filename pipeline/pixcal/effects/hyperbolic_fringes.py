@@ -48,7 +48,7 @@ class HyperbolicFringes(Effect):
     stage = Stage.LIGHT
     domains = ("space",)
     strengths = ("share",)
-    told_by = ("baseline", "axis")
+    told_by = ("axis",)
     sources = (
         "Rousset et al., section 5.2 and figures 5, 14 and 15: fibres at 40 cm, (18 mm, 18 mm) "
         "from the middle of the window (design/paper.txt)",

@@ -66,7 +66,7 @@ class Ipc(Effect):
     stage = Stage.SIGNAL
     domains = ("space", "noise")
     strengths = ("couplings",)
-    told_by = ("dark", "baseline")
+    told_by = ("dark", "flat", "baseline")
     quick = False
     sources = (
         "Rousset et al., section 5.1: period of four rows, 2-3 % vertical, 0.6 % horizontal, "

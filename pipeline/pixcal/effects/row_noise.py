@@ -62,7 +62,8 @@ class RowNoise(Effect):
 
     def readout(self, adu: F32, shot: Shot) -> F32:
         """As in `Effect.readout`."""
-        rows, columns = self.offsets(shot.bench.detector.shape, shot.rng(self.name))
+        rng = shot.recording.pixel_rng(self.name, shot.frame)
+        rows, columns = self.offsets(shot.bench.detector.shape, rng)
         gain = shot.bench.detector.gain_e_per_adu
         own = rows[slice(*shot.rows), None] / gain
         return adu + own.astype(np.float32) + (columns / gain).astype(np.float32)

@@ -37,7 +37,7 @@ class Straylight(Effect):
     stage = Stage.LIGHT
     domains = ("space",)
     strengths = ("share", "slope_per_px")
-    told_by = ("flat", "axis")
+    told_by = ("axis",)
     sources = (
         "Rousset et al., eq. 3: straylight is a part of the mean term B iota (design/paper.txt)",
         "Harvey et al. 2012, Opt. Eng. 51, 013402: a clean surface of 2 nm rms scatters "

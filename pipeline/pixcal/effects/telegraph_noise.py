@@ -74,7 +74,7 @@ class TelegraphNoise(Effect):
             rows, columns, amplitudes = _pixels(detector, block, self.share)
             if not len(rows):
                 continue
-            seed = int(recording.rng(self.name, block).integers(1 << 62))
+            seed = int(recording.pixel_rng(self.name, block).integers(1 << 62))
             states = _states(seed, recording.count, len(rows), keep)
             up = np.unpackbits(states[shot.frame], count=len(rows))
             step = (up - np.float32(0.5)) * amplitudes * np.float32(self.amplitude_e)

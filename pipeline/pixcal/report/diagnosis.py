@@ -270,7 +270,10 @@ def _maps(found: Diagnosis) -> Iterator[Block]:
     shape = found.facts.get("looked_at", {}).get("shape")
     places = found.facts["gap"].get("places", ())
     panels = maps.panels(shape, places, found.curves) if shape else []
-    if panels:
+    if not panels:
+        where = "window" if places else "cell of the window"
+        yield Words(f"No {where} is off by more than {maps.ASIDE:g} σ by itself.")
+    else:
         what = (
             "Windows that were looked at (drawn larger than they are), and the statistic that is "
             "furthest off in each, by domain"
@@ -339,26 +342,32 @@ def _sigma(value: float) -> str:
 
 
 def _absolute(found: Diagnosis) -> Iterator[Block]:
-    causes = bool(found.facts["causes"])
+    causes = [cause["effect"] for cause in found.facts["causes"]]
+    each = causes if len(causes) > 1 else []
     rows = []
     for entry in found.facts["gap"]["absolute"]:
         digits = _digits(entry["measured"], entry["simulated"])
-        values = ["measured", "simulated", *(["after"] if causes else [])]
-        rows.append(
-            [entry["quantity"], unit(entry["unit"]), *(number(entry[k], digits) for k in values)]
-        )
+        row = [entry["quantity"], unit(entry["unit"]), number(entry["measured"], digits)]
+        for key in ("simulated", "after") if causes else ("simulated",):
+            ends = [number(end, digits) for end in entry.get(f"{key}_interval", ())]
+            interval = f" [{', '.join(ends)}]" if ends else ""
+            row.append(number(entry[key], digits) + interval)
+        row += [number(entry.get("with_only", {}).get(name), digits) for name in each]
+        rows.append(row)
     if rows:
-        header = ["quantity", "unit", "measured", "nominal", *(["with causes"] if causes else [])]
-        yield from folded(Table("In units of the bench", header, rows), SHOWN, "quantities")
+        after = ["with causes", *(f"{name} only" for name in each)] if causes else []
+        header = ["quantity", "unit", "measured", "nominal", *after]
+        title = "In units of the bench (intervals: one sigma)"
+        yield from folded(Table(title, header, rows), SHOWN, "quantities")
 
 
 # What remains
 
 
 def _remainder(found: Diagnosis) -> Iterator[Block]:
+    if more := _advice("What could tell more", found.facts.get("more_would_tell")):
+        yield Words(more.strip(), "advice")
     if not found.facts["causes"]:
-        if more := _advice("What could tell more", found.facts.get("more_would_tell")):
-            yield Words(more.strip(), "advice")
         return
     gap = found.facts["gap"]
     left = sorted(

@@ -33,7 +33,7 @@ def with_interval(value: float, ends: Sequence[float]) -> str:
 
 def chance(p: float) -> str:
     """A p-value; below any size that means something, a limit."""
-    return "< 10⁻¹⁵" if p < 1e-15 else number(float(p), 2)
+    return "< 10⁻¹²" if p <= 1e-12 else number(float(p), 2)
 
 
 def listed(names: Iterable[str], last: str = "and") -> str:

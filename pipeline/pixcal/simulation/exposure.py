@@ -126,7 +126,7 @@ class _Shot:
         out = np.empty(((end - begin) * BLOCK_ROWS, width), np.float32)
         for block in range(begin, end):
             at = (block - begin) * BLOCK_ROWS
-            fill_normal(self.recording.rng(effect, frame, block), out[at : at + BLOCK_ROWS])
+            fill_normal(self.recording.pixel_rng(effect, frame, block), out[at : at + BLOCK_ROWS])
         skip = first - begin * BLOCK_ROWS
         return out[skip : skip + last - first]
 
@@ -216,9 +216,9 @@ class _Chain:
     def _normals(self, frame: int) -> list[F32]:
         """Shot and read noise of a frame; made once for both."""
         if getattr(self, "_drawn", (-1, []))[0] != frame:
-            bench = self.camera.bench
+            width = self.camera.bench.detector.shape[1]
             drawn = synthesis.block_normals(
-                self.camera.rows, bench.detector.shape[1], bench.seed, (*self.recording.key, frame)
+                self.camera.rows, width, self.recording.pixel_seed, (*self.recording.key, frame)
             )
             self._drawn: tuple[int, list[F32]] = (frame, drawn)
         return self._drawn[1]

@@ -10,6 +10,8 @@ from pixcal.kernels.synthesis import Stream, generator
 from pixcal.model.bench import Bench
 
 KINDS = ("bias", "dark", "flat", "fringes")
+SEEDS_APART = 1_000_003
+"""From the seed of one window's pixels to that of the next."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,9 @@ class Recording:
         First frame after the start of the acquisition, and from frame to frame.
     electrons : float
         Electrons for unit light: of a flat its mean, of fringes as in `electrons_per_unit`.
+    window : int
+        Which, where several windows of a detector are simulated by themselves: they share what
+        happens to a frame, and not the noise of their pixels.
     """
 
     bench: Bench
@@ -44,6 +49,7 @@ class Recording:
     start_s: float
     period_s: float
     electrons: float
+    window: int = 0
 
     @property
     def key(self) -> tuple[int, int]:
@@ -52,8 +58,20 @@ class Recording:
 
     def rng(self, effect: str, *key: int) -> np.random.Generator:
         """Random numbers of an effect, the same whoever asks, in whatever order."""
+        return self._rng(self.bench.seed, effect, *key)
+
+    @property
+    def pixel_seed(self) -> int:
+        """Seed of what differs from pixel to pixel, and so from window to window."""
+        return self.bench.seed + SEEDS_APART * self.window
+
+    def pixel_rng(self, effect: str, *key: int) -> np.random.Generator:
+        """As `rng`, of what differs from pixel to pixel."""
+        return self._rng(self.pixel_seed, effect, *key)
+
+    def _rng(self, seed: int, effect: str, *key: int) -> np.random.Generator:
         name = zlib.crc32(effect.encode())
-        return generator(self.bench.seed, Stream.EFFECT, name, *self.key, *key)
+        return generator(seed, Stream.EFFECT, name, *self.key, *key)
 
 
 def recordings(bench: Bench) -> list[Recording]:

@@ -53,7 +53,10 @@ class Shot(Protocol):
         """Charge of another frame, without this effect; None outside the recording."""
 
     def rng(self, effect: str, *key: int) -> np.random.Generator:
-        """Random numbers of an effect in this frame, the same for all rows."""
+        """Random numbers of an effect in this frame, the same for all rows.
+
+        What differs from pixel to pixel is drawn with ``recording.pixel_rng``.
+        """
 
     def normals(self, effect: str, frame: int | None = None) -> F32:
         """Standard normals (y, x) of an effect, the same however rows are cut.

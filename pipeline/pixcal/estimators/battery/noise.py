@@ -23,6 +23,13 @@ def variance_by_level(look: Look) -> Curve:
     return Curve(np.arange(LEVELS, dtype=float), look.by_level[1])
 
 
+@statistic("noise", "noise of the residuals", unit="e-", x="", power=True)
+def residual_noise(look: Look) -> Curve:
+    """Mean square of the residuals."""
+    squares = np.einsum("tp,tp->p", look.electrons, look.electrons) / len(look.electrons)
+    return Curve(np.zeros(1), np.array([float(squares[look.good.ravel()].mean())]))
+
+
 @statistic("noise", "variance of the residuals by place", x="cell of 4 × 4", power=True)
 def variance_by_place(look: Look) -> Curve | None:
     """Mean square of residuals over their noise, in cells of the window, row by row."""

@@ -5,6 +5,7 @@ swept again; what acts on maps, on the maps that the sweep left. Shapes of the f
 what remains, and sets combined, by the code of the fit.
 """
 
+import hashlib
 import json
 import shutil
 from collections.abc import Mapping
@@ -98,7 +99,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         run_dir / "diagnose",
     )
     plain: Json = {
-        "own": [path.read_text(encoding="utf-8") for path in config.own],
+        "own": [hashlib.sha256(path.read_bytes()).hexdigest() for path in config.own],
         "effects": [t.plain for t in plan.every],
     }
     inputs = {"fit": fitted.key, "diagnose": diagnosed.key}

@@ -11,11 +11,17 @@ SAME_AXIS = 0.98
 """Cosine of the angle below which two sets measure along one axis."""
 LADDER = 3
 """Exposure times of flats that make a ladder."""
-MORE = "more frames of the same kind, with the phases in random order"
+OTHER_ORDER = (
+    "fringes with the phases in another order (a ramp of many steps a turn if they are random, "
+    "random if they are a ramp)"
+)
+"""A ramp shows the modulator's error, and nothing of light that a frame has of its neighbours; of
+random phases the reverse is true. Tables of frames do not say which of them there are."""
+MORE = "more frames of the same kind"
 
 
 def missing_frames(acquisition: Acquisition, tables: Mapping[str, Table]) -> dict[str, str]:
-    """Kinds of frames that are usual and that an acquisition does not have, each in words.
+    """Kinds of frames that are of use and that an acquisition does not have, each in words.
 
     Parameters
     ----------
@@ -41,13 +47,23 @@ def missing_frames(acquisition: Acquisition, tables: Mapping[str, Table]) -> dic
     exposures = {t for t in tables.get("flat", {}).get("exptime_s", ()) if t is not None}
     if len(exposures) < LADDER:
         missing["ladder"] = f"a ladder of flats (at least {LADDER} exposure times)"
+    if axes:
+        missing["phases"] = OTHER_ORDER
     return missing
 
 
 def deciding(missing: Mapping[str, str], kinds: Iterable[type[Effect]] = (Effect,)) -> list[str]:
-    """Those of the missing frames that tell on some effects (default: on any)."""
-    wanted = {frames for kind in kinds for frames in kind.told_by}
-    return [words for frames, words in missing.items() if frames in wanted] or [MORE]
+    """Those of the missing frames that tell effects apart, or all that tell on them (default: any).
+
+    What tells on one effect and not on another parts them; what tells on all of them only where
+    nothing else is missing, for each is known better then.
+    """
+    told = [set(kind.told_by) for kind in kinds]
+    some, every = told[0].union(*told), told[0].intersection(*told)
+    for wanted in (some - every, some):
+        if frames := [words for name, words in missing.items() if name in wanted]:
+            return frames
+    return [MORE]
 
 
 def _axes(baselines: Iterable[Sequence[float]]) -> list[tuple[str, set[float]]]:

@@ -24,7 +24,7 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, FringeMaps, Stage
 from pixcal.simulation.exposure import Camera
-from pixcal.simulation.recording import Recording
+from pixcal.simulation.recording import SEEDS_APART, Recording
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
 
@@ -200,7 +200,13 @@ class NominalBench:
     places: tuple[tuple[str, NDArray[np.intp]], ...]
 
     def simulate(
-        self, half: Half, effects: Sequence[Effect], seed: int, *, fitted: bool = True
+        self,
+        half: Half,
+        effects: Sequence[Effect],
+        seed: int,
+        *,
+        fitted: bool = True,
+        window: int = 0,
     ) -> Raw:
         """Frames of a half of the acquisition, from this bench with some effects.
 
@@ -212,20 +218,24 @@ class NominalBench:
             Of everything random; the same seed gives the same noise with other effects.
         fitted : bool
             The measured maps have the effects in them, which are undone before they act anew.
+        window : int
+            Which of the detector's, for noise of its own; what happens to a frame is the same in
+            all of them.
 
         Raises
         ------
         InputError
             If an effect and the bench do not go together.
         """
-        detector = replace(self.bench.detector, seed=seed)
+        own_seed = seed + SEEDS_APART * window
+        detector = replace(self.bench.detector, seed=own_seed)
         bench = replace(self.bench, seed=seed, detector=detector)
         for effect in effects:
             effect.check(bench)
         camera = Camera(
             bench,
             (0, bench.detector.shape[0]),
-            [self._drawn(effects if fitted else (), seed), *effects],
+            [self._drawn(effects if fitted else (), own_seed), *effects],
         )
         arrays = {
             name: np.empty((len(frames), *bench.detector.shape), self.dtypes[name])
@@ -233,7 +243,7 @@ class NominalBench:
         }
         for recording, (name, numbers) in zip(self.recordings, self.places, strict=True):
             wanted = np.flatnonzero(np.isin(numbers, half.frames[name]))
-            own = replace(recording, bench=bench)
+            own = replace(recording, bench=bench, window=window)
             for first, after in _runs(wanted):
                 for frame, samples in camera.expose(own, range(first, after)):
                     at = int(np.searchsorted(half.frames[name], numbers[frame]))

@@ -32,6 +32,10 @@ LEFT = 0.25
 STILL = 6.0
 """standard deviations: less can be the simulation of the effects themselves."""
 DOMAINS = ("space", "time", "intensity", "noise")
+ALWAYS = ("allan_of_batches", "offset_by_place", "residual_noise")
+"""Statistics told in units of the bench even where nothing differs."""
+LEAST_CHANCE = 1e-12
+"""Smallest that is told: of tails further out nobody knows the shape."""
 SHOWN = 3
 """Statistics named that gave a cause away."""
 
@@ -78,7 +82,7 @@ def describe(
                 domain: [_rounded(v) for v in final.gap.of_domain(domain)] for domain in DOMAINS
             },
             "where": _where(final, by_key),
-            "absolute": _absolute(final, by_key),
+            "absolute": _absolute(found, final, by_key, reference),
             "places": list(places),
         },
         "candidates": [
@@ -141,16 +145,16 @@ def _cause(
     estimate = candidate.estimate
     assert estimate is not None
     effect = next(e for e in found.final.effects if e.name == name)
-    only = candidate.alone if candidate.alone is not None and len(found.taken) > 1 else found.final
-    alone = shrinkage(data, found.nominal, only, where)
+    alone = shrinkage(data, found.nominal, candidate.alone or found.final, where)
     without = shrinkage(data, found.nominal, found.without[name], where)
     gain = found.final.log_likelihood - found.without[name].log_likelihood
     alike = found.alike.get(name, ())
     kinds = [type(e.effect) for n in (name, *alike) if (e := found.candidates[n].estimate)]
-    # Two independent parts of the frames, joined by Fisher's rule.
-    log_both = float(log_ndtr(-estimate.significance)) - max(gain, 0.0)
-    trials = len(found.candidates) * candidate.ways
-    chance = trials * np.exp(max(log_both, -600.0)) * (1 - max(log_both, -600.0))
+    # Two independent parts of the frames, joined by Fisher's rule. A likelihood ratio of e^gain has
+    # a chance of at most e^-gain (Markov's inequality).
+    own = estimate.significance * candidate.share
+    log_both = max(float(log_ndtr(-own)) - max(gain, 0.0), -600.0)
+    chance = len(found.candidates) * candidate.ways * np.exp(log_both) * (1 - log_both)
     return {
         "effect": name,
         "title": effect.title,
@@ -159,7 +163,7 @@ def _cause(
         "gap_closed": _rounded(1 - alone.gap.total),
         "gap_closed_interval": [_rounded(1 - v) for v in reversed(alone.interval)],
         "gain_over_rest": _rounded(without.gap.total - final.gap.total),
-        "p_value": float(min(1.0, chance)),
+        "p_value": float(np.clip(chance, LEAST_CHANCE, 1.0)),
         "sigmas": _rounded(estimate.significance),
         "why": estimate.why,
         "given_away_by": _telling(found.without[name], found.final, data),
@@ -266,6 +270,8 @@ def _entry(key: Key, final: Shrinkage, curve: Mapping[str, Any]) -> dict[str, An
     at = final.before[key].worst if key in final.where else final.after[key].worst
     set_name = "" if key[1] == DETECTOR else f"set {key[1]}, "
     x = curve["x"][at] if at < len(curve["x"]) else at
+    # Of chance, all statistics being looked at.
+    log_chance = final.before[key].log_chance + np.log(len(final.before))
     alone = not curve["x_label"] and len(curve["x"]) == 1
     return {
         "domain": curve["domain"],
@@ -278,29 +284,45 @@ def _entry(key: Key, final: Shrinkage, curve: Mapping[str, Any]) -> dict[str, An
         "after": curve["with_effects"]["value"][at],
         "z": _rounded(float(final.before[key].sigmas[at])),
         "z_after": _rounded(float(final.after[key].sigmas[at])),
-        "significance": _rounded(sigmas_of(final.before[key].log_chance)),
+        "significance": _rounded(max(sigmas_of(log_chance), 0.0)),
         "left": _rounded(final.gap.left.get(key, 0.0)),
         "place": set_name + ("all frames" if alone else f"{curve['x_label'] or 'value'} {x:.4g}"),
     }
 
 
-def _absolute(final: Shrinkage, curves: Mapping[Key, dict[str, Any]]) -> list[dict[str, Any]]:
-    """What differs in units of the bench, and the stability of the offsets in any case."""
+def _absolute(
+    found: Found,
+    final: Shrinkage,
+    curves: Mapping[Key, dict[str, Any]],
+    reference: Reference,
+) -> list[dict[str, Any]]:
+    """What differs in units of the bench, with all causes and with each alone; some in any case.
+
+    Intervals are of one sigma: where a measurement may lie if the simulation is right.
+    """
     keys: Sequence[Key] = [k for k in curves if curves[k]["unit"] in ("px", "e-", "rad")]
+    only = {n: trial for n in found.taken if (trial := found.candidates[n].alone) is not None}
     rows = []
     for key in keys:
         curve = curves[key]
-        if key not in final.where and key[0] != "allan_of_batches":
+        if key not in final.where and key[0] not in ALWAYS:
             continue
         at = final.before[key].worst
         quantity = curve["title"] + ("" if key[1] == DETECTOR else f" ({key[1]})")
+        nominal, after = curve["nominal"], curve["with_effects"]
         rows.append(
             {
                 "quantity": quantity,
                 "unit": curve["unit"],
                 "measured": curve["measured"][at],
-                "simulated": curve["nominal"]["value"][at],
-                "after": curve["with_effects"]["value"][at],
+                "simulated": nominal["value"][at],
+                "simulated_interval": [nominal["low"][at], nominal["high"][at]],
+                "after": after["value"][at],
+                "after_interval": [after["low"][at], after["high"][at]],
+                "with_only": {
+                    name: _band(trial.expected, key, reference.usual[key])["value"][at]
+                    for name, trial in only.items()
+                },
             }
         )
     return rows

@@ -85,6 +85,8 @@ class Candidate:
         With it alone in the bench.
     ways : int
         In how many ways it was tried, of which the likeliest was taken.
+    share : float
+        Of its significance, what the effects taken before it do not bring about.
     """
 
     name: str
@@ -92,6 +94,7 @@ class Candidate:
     reason: str = ""
     alone: Trial | None = None
     ways: int = 1
+    share: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -116,6 +119,11 @@ class Found:
     without: Mapping[str, Trial]
     candidates: Mapping[str, Candidate]
     alike: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+
+def looks_like(name: str) -> str:
+    """Why an effect is not sought any more beside another that was taken."""
+    return f"what {name} does looks like it"
 
 
 class Search:
@@ -166,6 +174,8 @@ class Search:
             if not gains:
                 break
             own = {n: g for n, g in gains.items() if g >= self._least(candidates[n])}
+            for name in gains.keys() - own.keys():
+                candidates[name].reason = self._too_little(gains[name])
             if not own:
                 break
             best = max(own, key=lambda n: own[n])
@@ -177,14 +187,17 @@ class Search:
             current = confirmed
             effects[best] = trials[best][1]
             taken.append(best)
+            candidates[best].share = shares[best]
+            candidates[best].reason = ""
             near = [n for n, g in gains.items() if n != best and g > gains[best] - LEAST]
             shares = self._unexplained(tuple(effects.values()), open_ones)
             alike[best] = tuple(n for n in near if shares.get(n, 1.0) < 1 - EXPLAINED)
             for name in [n for n, share in shares.items() if share < 1 - EXPLAINED]:
-                candidates[name].reason = f"what {best} does looks like it"
+                candidates[name].reason = looks_like(best)
                 del open_ones[name], shares[name]
-        for candidate in open_ones.values():
-            candidate.reason = candidate.reason or "the unseen frames get no likelier with it"
+        if len(taken) == MOST:
+            for candidate in open_ones.values():
+                candidate.reason = f"{MOST} causes were found before it, and no more are sought"
         return self._ablated(taken, effects, current, candidates, alike)
 
     def _drop_unseen(
@@ -205,6 +218,16 @@ class Search:
                     f"{beside if current.effects else ''})"
                 )
                 del open_ones[name]
+
+    @staticmethod
+    def _too_little(gain: float) -> str:
+        """Why an effect that was tried is not taken."""
+        if gain < LEAST:
+            return "the unseen frames get no likelier with it"
+        return (
+            f"the unseen frames get likelier with it (by {gain:.1f} in the logarithm), but less "
+            f"than the {LEAST_OF_HINTED:g} asked of what the first frames only hint at"
+        )
 
     @staticmethod
     def _least(candidate: Candidate) -> float:
@@ -301,10 +324,20 @@ class Search:
             dropped = self._worthless(current, without) or self._doubtful(current, without)
             if dropped is None:
                 break
-            least, candidates[dropped[0]].reason = dropped
+            least, reason = dropped
+            rest = tuple(e for n, e in effects.items() if n != least)
+            fewer = self._confirmed(rest) if rest else self.nominal
+            if isinstance(fewer, str):
+                break
+            candidates[least].reason = reason
             taken.remove(least)
             del effects[least]
-            current = self._start(tuple(effects.values()))
+            current = fewer
+        for name in taken:
+            # Of as many simulations as all together: three tell little of what is random.
+            alone = self._confirmed((effects[name],))
+            if not isinstance(alone, str):
+                candidates[name].alone = alone
         return Found(
             self.nominal, current, tuple(taken), without, candidates,
             {n: alike[n] for n in taken if alike.get(n)},
@@ -377,7 +410,8 @@ DRAWS = 200
 def shrinkage(data: Mapping[Key, F64], nominal: Trial, other: Trial, where: set[Key]) -> Shrinkage:
     """The gap with some effects, against the nominal bench's.
 
-    The interval comes from expectations shifted by their own scatter.
+    The interval comes from expectations shifted by their own scatter, of all curves: what opens
+    where there was no gap counts too.
     """
     before = compare(data, nominal.expected)
     after = compare(data, other.expected)
@@ -389,7 +423,6 @@ def shrinkage(data: Mapping[Key, F64], nominal: Trial, other: Trial, where: set[
         mean = {
             k: m + np.sqrt(expected.variance[k]) * rng.standard_normal(len(m))
             for k, m in expected.mean.items()
-            if k in where
         }
         doubled = {k: 2 * expected.variance[k] for k in mean}
         moved = replace(expected, mean=mean, variance=doubled)

@@ -4,6 +4,7 @@ The frames are parted: on the first half effects are fitted, on the second they 
 data and every simulation of them are reduced and fitted by the same stages.
 """
 
+import hashlib
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -11,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from pixcal.effects import effect_of_file, effects, parse_effects
+from pixcal.effects import known_effects, parse_effects
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.evidence import Evidence
@@ -50,7 +51,7 @@ from pixcal.storage.artefact import (
     write_json,
 )
 
-FORMAT = 2
+FORMAT = 3
 REFERENCES = 16
 """Simulations of the nominal bench."""
 EVIDENCE_BYTES = 34
@@ -96,11 +97,12 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         If the run was not reduced, a name of an effect is unknown, or the frames cannot be fitted.
     """
     reduced = require(run_dir, "reduce", 1)
-    kinds = _kinds(config)
-    base = _base(config.nominal)
+    known = known_effects(config.own)
+    kinds = _kinds(config, known)
+    base = _base(config.nominal, known)
     plain = {
         "effects": sorted(kinds),
-        "own": [path.read_text(encoding="utf-8") for path in config.own],
+        "own": [hashlib.sha256(path.read_bytes()).hexdigest() for path in config.own],
         "nominal": {e.name: to_plain(e) for e in base},
     }
     with lock(run_dir):
@@ -127,32 +129,33 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         return require(run_dir, "diagnose", FORMAT)
 
 
-def _kinds(config: Config) -> dict[str, type[Effect]]:
+def _kinds(config: Config, known: Mapping[str, type[Effect]]) -> dict[str, type[Effect]]:
     """The candidates by name."""
-    known = dict(effects())
-    for path in config.own:
-        own = effect_of_file(path)
-        if own.name in known:
-            raise InputError(f"{path}: its effect is named {own.name!r} as another; rename it")
-        known[own.name] = own
     for name in (*config.only, *config.without):
         if name not in known:
             raise InputError(
                 f"--effects {name!r:.80}: unknown effect; known are {', '.join(known)}"
             )
-    return {
+        if name in config.only and name in config.without:
+            raise InputError(
+                f"--effects: {name} is a candidate and left out; write either '{name}' or '-{name}'"
+            )
+    kinds = {
         name: kind
         for name, kind in known.items()
         if (not config.only or name in config.only) and name not in config.without
     }
+    if not kinds:
+        raise InputError("--effects: every effect is left out; keep at least one as a candidate")
+    return kinds
 
 
-def _base(nominal: Path | None) -> Effects:
+def _base(nominal: Path | None, known: Mapping[str, type[Effect]]) -> Effects:
     """Effects that the nominal bench has from the start."""
     if nominal is None:
         return ()
     bench = load_bench(nominal)
-    found = list(parse_effects(bench.effects, str(nominal)))
+    found = list(parse_effects(bench.effects, str(nominal), known))
     if bench.optics.fringes == "exact":
         found.append(parse_effects({"hyperbolic_fringes": {}}, str(nominal))[0])
     return tuple(found)

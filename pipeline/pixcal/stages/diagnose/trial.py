@@ -52,10 +52,17 @@ class Window:
     whole: tuple[int, int]
 
     def evidence(
-        self, half: Half, effects: Effects, seed: int, otherwise: Path, *, fitted: bool = True
+        self,
+        half: Half,
+        effects: Effects,
+        seed: int,
+        otherwise: Path,
+        *,
+        fitted: bool = True,
+        number: int = 0,
     ) -> Evidence:
         """A half of the frames, taken again with some effects (`NominalBench.simulate`)."""
-        raw = self.bench.simulate(half, effects, seed, fitted=fitted)
+        raw = self.bench.simulate(half, effects, seed, fitted=fitted, window=number)
         need = RUN_SHARE * sum(frames.nbytes for frames in raw.arrays.values())
         with scratch_folder(need, otherwise) as folder:
             return evidence_of(raw, folder / "run", self.part, self.whole)
@@ -195,7 +202,7 @@ def _made(
     effects, seed, number = item
     window = windows[number]
     try:
-        evidence = window.evidence(window.test, effects, seed + 1000 * number, scratch)
+        evidence = window.evidence(window.test, effects, seed, scratch, number=number)
         return looked_at(evidence, signatures)
     except InputError as error:
         return str(error)

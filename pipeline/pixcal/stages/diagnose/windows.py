@@ -11,8 +11,8 @@ from pixcal.stages.evidence import Part
 
 SIDE = 128
 """Pixels along the side of a window on a large detector: those of a chunk of the cube."""
-LARGEST = 160
-"""Rows or columns of a detector that is taken whole."""
+LARGEST = 288
+"""Rows or columns of a detector that are taken whole; of more, windows do not overlap."""
 APART = 4
 """Sides of a window that a detector has at least where windows lie on chunks."""
 SAMPLES = 6_000_000
@@ -25,7 +25,7 @@ def chosen_windows(shape: tuple[int, int]) -> tuple[Part, tuple[Part, ...]]:
     """The window that effects are fitted on, and those that they are tried on.
 
     A small detector is one window, and only the frames are parted. On a large one, effects are
-    fitted in the middle and tried in four other places as well.
+    fitted in the middle and tried in four other places (two, where one side is short).
     """
     if max(shape) <= LARGEST:
         return whole_of(shape), (whole_of(shape),)
@@ -33,6 +33,8 @@ def chosen_windows(shape: tuple[int, int]) -> tuple[Part, tuple[Part, ...]]:
     def place(share_y: float, share_x: float) -> Part:
         spans = []
         for size, share in zip(shape, (share_y, share_x), strict=True):
+            if size <= LARGEST:
+                share = 0.5
             side = min(SIDE, size)
             # On chunks of the cube, where there are enough to lie apart on.
             grid = SIDE if size >= APART * SIDE else 1
