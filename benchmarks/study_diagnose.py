@@ -12,6 +12,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -424,28 +425,34 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2, help="for each effect and strength")
     parser.add_argument("--effects", nargs="*", default=list(effects()), help="default: all")
     parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--work", type=Path, help="folder that keeps the bench, to go on faster")
     parser.add_argument("--publish", action="store_true", help="what was played, and no more")
     options = parser.parse_args()
     names = options.effects
-    cases = [("", 0.0, FIRST_SEED + SEEDS_APART * n) for n in range(options.nominal)]
-    cases += [
-        (name, strength, FIRST_SEED + 100_000 + SEEDS_APART * n)
+    rounds: list[list[tuple[str, float, int]]] = [
+        [
+            (name, strength, FIRST_SEED + 100_000 + SEEDS_APART * n)
+            for strength in STRENGTHS
+            for name in names
+        ]
         for n in range(options.seeds)
-        for strength in STRENGTHS
-        for name in names
     ]
+    rounds[0] += [("", 0.0, FIRST_SEED + SEEDS_APART * n) for n in range(options.nominal)]
     # So that an interrupted study has some of all.
-    np.random.default_rng(1).shuffle(cases)
-    cases = [(str(name), float(strength), int(seed)) for name, strength, seed in cases]
+    rng = np.random.default_rng(1)
+    cases = [own[n] for own in rounds for n in rng.permutation(len(own))]
     options.out.mkdir(parents=True, exist_ok=True)
-    record = options.out / "study.jsonl"
+    if options.work:
+        options.work.mkdir(parents=True, exist_ok=True)
+    journal = options.out / "study.jsonl"
     played: list[dict[str, Any]] = []
-    if record.exists():
+    if journal.exists():
         # What an interrupted study has played is not played again.
-        played = [json.loads(line) for line in record.read_text().splitlines()]
+        played = [json.loads(line) for line in journal.read_text().splitlines()]
     known = {(p["effect"], p["strength"], p["seed"]) for p in played}
     pending = [case for case in cases if case not in known and not options.publish]
-    with tempfile.TemporaryDirectory() as folder, record.open("a") as lines:
+    place = nullcontext(options.work) if options.work else tempfile.TemporaryDirectory()
+    with place as folder, journal.open("a") as lines:
 
         def noted(_: int, result: dict[str, Any]) -> None:
             played.append(result)

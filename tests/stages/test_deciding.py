@@ -8,7 +8,7 @@ from pixcal.effects import effects
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.simulation.effect import Effect
-from pixcal.stages.diagnose.deciding import MORE, OTHER_ORDER, deciding, missing_frames
+from pixcal.stages.diagnose.deciding import MORE, RAMP, RANDOM, deciding, missing_frames
 
 LADDER = (0.01, 0.02, 0.03)
 FOUR = ((6.0, 0.0), (-9.0, 0.1), (0.0, 6.0), (0.0, 9.0))
@@ -35,11 +35,15 @@ def an_acquisition(baselines: Sequence[tuple[float, float]]) -> Acquisition:
 
 
 def missing(
-    baselines: Sequence[tuple[float, float]], flats: Sequence[float], *, dark: bool = True
+    baselines: Sequence[tuple[float, float]],
+    flats: Sequence[float],
+    *,
+    dark: bool = True,
+    steps: Sequence[float] = (0.0, 0.3),
 ) -> dict[str, str]:
     tables = {"flat": {"exptime_s": [*flats, *flats]}} if flats else {}
     tables |= {"dark": {"exptime_s": [1.0]}} if dark else {}
-    return missing_frames(an_acquisition(baselines), tables)
+    return missing_frames(an_acquisition(baselines), tables, steps if baselines else ())
 
 
 @pytest.mark.parametrize(
@@ -68,7 +72,7 @@ def test_frames_that_would_decide_are_those_that_are_missing(
     assert deciding(lacking, [kinds[name] for name in names]) == words
 
 
-BARE = missing(((6, 0),), (), dark=False)
+BARE = missing(((6, 0),), (), dark=False, steps=(0.0,))
 """Fringes of one set, and nothing else."""
 
 
@@ -76,9 +80,8 @@ BARE = missing(((6, 0),), (), dark=False)
     ("names", "kinds"),
     [
         # An error of the modulator shows in a ramp; in random phases, what mixes frames.
-        (("rolling_shutter", "phase_modulator_error"), ("phases",)),
-        (("lag", "contrast_noise"), ("phases",)),
-        (("lag", "nonlinearity"), ("ladder", "phases")),
+        (("rolling_shutter", "phase_modulator_error"), ("ramp",)),
+        (("lag", "nonlinearity"), ("ladder",)),
         # The second harmonic of a response does not depend on the fringes' spacing.
         (("nonlinearity", "brighter_fatter"), ("baseline",)),
         # Crosstalk shows at hot pixels, and in the noise in proportion to the level.
@@ -115,12 +118,21 @@ def test_what_tells_on_all_is_asked_for_once_nothing_parts_them() -> None:
     assert deciding(lacking, both) == [lacking["ladder"]]
 
 
-def test_another_order_of_the_phases_is_asked_for_only_of_fringes() -> None:
-    assert missing(FOUR, LADDER) == {"phases": OTHER_ORDER}
-    assert missing((), LADDER) == {}
+@pytest.mark.parametrize(
+    ("steps", "lacks"),
+    [((0.0, 0.0), {"ramp": RAMP}), ((0.3, 0.2), {"random": RANDOM}), ((0.0, 0.3), {}), ((), {})],
+)
+def test_phases_are_asked_for_that_no_set_has(
+    steps: tuple[float, ...], lacks: dict[str, str]
+) -> None:
+    lacking = missing(FOUR if steps else (), LADDER, steps=steps)
+    assert lacking == lacks
+    both = [effects()[name] for name in ("rolling_shutter", "phase_modulator_error")]
+    assert deciding(lacking, both) == list(lacks.values() or [MORE])
 
 
 def test_effects_name_kinds_of_frames_that_there_are() -> None:
-    known = {*missing((), ()), *missing(((4, 4),), (), dark=False)}
+    bare = [missing(((4, 4),), (), dark=False, steps=(step,)) for step in (0.0, 0.3)]
+    known = {kind for lacking in bare for kind in lacking}
     for kind in (*effects().values(), Effect):
         assert set(kind.told_by) <= known

@@ -58,7 +58,7 @@ class Lag(Effect):
     domains = ("time", "intensity")
     strengths = ("share",)
     finer = ("decay_frames", "spread")
-    told_by = ("phases",)
+    told_by = ("random",)
     sources = (
         "Bonjour, Blanc and Kayal 2012, IEEE Electron Device Letters 33(12), 1735: lag of pinned "
         "photodiodes by barriers, pockets and traps of the transfer gate",

@@ -45,7 +45,7 @@ class PhaseModulatorError(Effect):
     stage = Stage.LIGHT
     domains = ("time",)
     strengths = ("first_rad", "second_rad")
-    told_by = ("phases",)
+    told_by = ("ramp",)
     sources = (
         "Cheng & Wyant 1985, Appl. Opt. 24, 3049: nonlinearity of a calibrated piezo below 1 %",
         "Ai & Wyant 1987, Appl. Opt. 26, 1112: quadratic nonlinearity of piezos in phase-shifting "

@@ -36,7 +36,7 @@ class RollingShutter(Effect):
     stage = Stage.LIGHT
     domains = ("time", "space")
     strengths = ("line_time_us",)
-    told_by = ("phases",)
+    told_by = ("random",)
     sources = (
         "Pyxalis GIGAPYX-4600 as in Rousset et al.: 5456 rows at 152 frames/s are 1.2 us a row; at "
         "the 7 frames/s of the paper's bench 26 us",

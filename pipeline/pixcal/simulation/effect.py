@@ -161,8 +161,8 @@ class Effect:
         Fields beside these that may be zero, with the effect still there in its simplest form.
     told_by : tuple of str
         Frames that tell on it besides fringes of one set: ``dark``, ``flat``, ``ladder`` (of
-        flats), ``baseline`` (a second one along an axis), ``axis`` (another one), ``phases`` (in
-        another order); if not said, any but the last.
+        flats), ``baseline`` (a second one along an axis), ``axis`` (another one), ``ramp`` or
+        ``random`` (of the phases); if not said, any but the last two.
     sources : tuple of str
         Where the default sizes come from.
     quick : bool

@@ -11,16 +11,16 @@ SAME_AXIS = 0.98
 """Cosine of the angle below which two sets measure along one axis."""
 LADDER = 3
 """Exposure times of flats that make a ladder."""
-OTHER_ORDER = (
-    "fringes with the phases in another order (a ramp of many steps a turn if they are random, "
-    "random if they are a ramp)"
-)
+RAMP = "fringes whose phase is a ramp, of many steps a turn"
+RANDOM = "fringes with random phases"
 """A ramp shows the modulator's error, and nothing of light that a frame has of its neighbours; of
-random phases the reverse is true. Tables of frames do not say which of them there are."""
+random phases the reverse is true."""
 MORE = "more frames of the same kind"
 
 
-def missing_frames(acquisition: Acquisition, tables: Mapping[str, Table]) -> dict[str, str]:
+def missing_frames(
+    acquisition: Acquisition, tables: Mapping[str, Table], steps: Sequence[float]
+) -> dict[str, str]:
     """Kinds of frames that are of use and that an acquisition does not have, each in words.
 
     Parameters
@@ -28,6 +28,8 @@ def missing_frames(acquisition: Acquisition, tables: Mapping[str, Table]) -> dic
     acquisition : Acquisition
     tables : mapping
         As in ``frames.json``.
+    steps : sequence of float
+        Step of each set's phase, rad; zero where the phases are random.
 
     Returns
     -------
@@ -47,8 +49,10 @@ def missing_frames(acquisition: Acquisition, tables: Mapping[str, Table]) -> dic
     exposures = {t for t in tables.get("flat", {}).get("exptime_s", ()) if t is not None}
     if len(exposures) < LADDER:
         missing["ladder"] = f"a ladder of flats (at least {LADDER} exposure times)"
-    if axes:
-        missing["phases"] = OTHER_ORDER
+    if steps and not any(steps):
+        missing["ramp"] = RAMP
+    if steps and all(steps):
+        missing["random"] = RANDOM
     return missing
 
 

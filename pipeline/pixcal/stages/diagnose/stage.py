@@ -328,7 +328,9 @@ def look_at(
             },
             "kinds": [kind for kind in ("bias", "dark", "flat") if kind in ingested.tables],
             "sets": {s.name: list(s.baseline_mm) for s in acquisition.frames.fringes},
-            "missing_frames": missing_frames(acquisition, ingested.tables),
+            "missing_frames": missing_frames(
+                acquisition, ingested.tables, [s.step for s in windows[0].bench.measured.sets]
+            ),
         },
         runtime,
         few,
