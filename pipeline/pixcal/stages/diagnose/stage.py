@@ -389,9 +389,10 @@ def weakly_seen(
     candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]]
 ) -> tuple[type[Effect], ...]:
     """Candidates that the frames they were fitted on show; slow ones if the battery may not."""
+    # By name: the order of candidates is none of curves.
     return tuple(
         kinds[name]
-        for name, candidate in candidates.items()
+        for name, candidate in sorted(candidates.items())
         if candidate.estimate is not None
         and candidate.estimate.significance >= SURE
         and (kinds[name].quick or candidate.estimate.significance < CLEAR)
