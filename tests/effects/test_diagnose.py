@@ -12,10 +12,13 @@ import yaml
 from astropy.io import fits
 
 from pixcal.effects import effects, known_effects
+from pixcal.effects.intra_pixel_response import IntraPixelResponse
+from pixcal.effects.straylight import Straylight
 from pixcal.engine.run import Runtime
 from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect
 from pixcal.stages import correct, diagnose, fit, ingest, reduce, simulate
 from pixcal.stages.diagnose import stage, trial, windows
 from pixcal.stages.diagnose.stage import look_at
@@ -329,6 +332,32 @@ def test_windows_that_are_tried_do_not_overlap(shape: tuple[int, int]) -> None:
         seen[y0:y1, x0:x1] += 1
     assert seen.max() == 1
     assert len(tried) == (4 if min(shape) > 288 else 2)
+
+
+@pytest.mark.parametrize("effect", [Straylight(share=0.05), IntraPixelResponse()])
+def test_what_an_effect_takes_from_the_fringes_is_not_taken_twice(
+    effect: Effect, reduced: Callable[..., Path], tmp_path: Path
+) -> None:
+    """The bench was measured with the effect in it: with the effect it looks as it was measured."""
+    changes = {"frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
+    run = reduced({effect.name: to_plain(effect)}, changes)
+    window = look_at(run, tmp_path, SYNC).first
+
+    def seen(on: tuple[Effect, ...]) -> dict[str, tuple[float, float]]:
+        evidence = window.evidence(window.test, on, 3, tmp_path)
+        return {
+            name: (
+                float(np.median(f.theta[0][f.good]) * f.g[:, 0].mean()),
+                float(np.median((np.hypot(*f.theta[1:]) / f.theta[0])[f.good])),
+            )
+            for name, f in evidence.fringes.items()
+        }
+
+    without, again = seen(()), seen((effect,))
+    assert len(again) == 2
+    for name, (light, contrast) in again.items():
+        assert light == pytest.approx(without[name][0], rel=2e-3)
+        assert contrast == pytest.approx(without[name][1], rel=2e-3)
 
 
 def test_windows_are_exposed_together(

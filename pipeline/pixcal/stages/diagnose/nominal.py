@@ -133,6 +133,8 @@ class FittedSet:
         rad/px.
     origin : (int, int)
     flat : (y, x) float64, optional
+    light, contrast : float
+        What mean and contrast of the fringes are times those that were measured.
     """
 
     theta: F64
@@ -141,6 +143,8 @@ class FittedSet:
     k: tuple[float, float]
     origin: tuple[int, int]
     flat: F64 | None = None
+    light: float = 1.0
+    contrast: float = 1.0
 
     def without(self, effects: Sequence[Effect]) -> "FittedSet":
         """The same with effects undone that act on maps: offsets as fitted with them known."""
@@ -157,7 +161,9 @@ class FittedSet:
             straight_modes(before.theta, self.k),
             size,
         )
-        return replace(self, delta=delta, flat=maps.flat)
+        light = _middle(maps.theta[0] / before.theta[0])
+        fringe = _middle(np.hypot(*maps.theta[1:]) / np.hypot(*before.theta[1:]))
+        return replace(self, delta=delta, flat=maps.flat, light=light, contrast=fringe / light)
 
     @cached_property
     def offsets(self) -> Offsets:
@@ -265,7 +271,22 @@ class NominalBench:
         maps = replace(self.measured.maps, delta_x=delta[0], delta_y=delta[1])
         if fits[0].flat is not None:
             maps = replace(maps, response=np.maximum(fits[0].flat, 0).astype(np.float32))
-        return replace(self.measured, maps=maps)
+        # As the bench was without what the effects take from the fringes, and do anew.
+        sets = tuple(
+            replace(
+                own,
+                light=own.light * np.float32(fit.light),
+                contrast=min(own.contrast * fit.contrast, 1.0),
+            )
+            for own, fit in zip(self.measured.sets, fits, strict=True)
+        )
+        return replace(self.measured, maps=maps, sets=sets)
+
+
+def _middle(ratio: F64) -> float:
+    """Median of what is finite; 1 where nothing is."""
+    finite = ratio[np.isfinite(ratio)]
+    return float(np.median(finite)) if finite.size else 1.0
 
 
 def _runs(numbers: NDArray[np.intp]) -> list[tuple[int, int]]:
