@@ -174,6 +174,9 @@ def played_nominal(folder: Path, seed: int) -> dict[str, Any]:
             for c in curves
             if c["statistic"] in battery() and not battery()[c["statistic"]].floor
         },
+        "estimates": {
+            c["effect"]: float(ndtr(-c["sigmas"])) for c in diagnosis["candidates"] if "sigmas" in c
+        },
     }
 
 
@@ -283,6 +286,20 @@ def nominal_table(played: Sequence[dict[str, Any]]) -> str:
         ("furthest off a uniform distribution (Kolmogorov-Smirnov)", _ks(chances)),
         ("statistics whose own chances differ from that with p < 0.05", _unlike(played)),
     ]
+    own = [p["estimates"] for p in played if p.get("estimates")]
+    if own:
+        every = np.array([chance for found in own for chance in found.values()])
+        best = np.array([len(found) * min(found.values()) for found in own])
+        rows += [
+            ("estimates of effects with a chance below 0.1", f"{np.mean(every < 0.1):.3f}"),
+            ("below 0.01", f"{np.mean(every < 0.01):.4f}"),
+            ("below 0.001", f"{np.mean(every < 0.001):.5f}"),
+            (
+                "acquisitions whose most significant estimate has, times the number of "
+                "candidates, a chance below 0.1",
+                _share(int((best < 0.1).sum()), len(best)),
+            ),
+        ]
     return _table(("", ""), rows)
 
 

@@ -360,6 +360,26 @@ def test_what_an_effect_takes_from_the_fringes_is_not_taken_twice(
         assert contrast == pytest.approx(without[name][1], rel=2e-3)
 
 
+def test_every_acquisition_is_held_against_random_numbers_of_its_own(
+    reduced: Callable[..., Path], tmp_path: Path
+) -> None:
+    """Of its frames; a fault of chance in sixteen simulations is not that of all nights."""
+    short = {"frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
+    first, again, other = (
+        look_at(reduced(None, short | {"seed": seed}), tmp_path, SYNC).first for seed in (3, 3, 4)
+    )
+    assert first.seed == again.seed != other.seed
+
+    def noise(window: trial.Window) -> np.ndarray:
+        simulated = window.bench.simulate(window.test, (), window.seed)
+        frames = simulated.arrays["bias"].astype(float)
+        return (frames - frames.mean(axis=0)).ravel()
+
+    one, same, another = map(noise, (first, again, other))
+    np.testing.assert_array_equal(one, same)
+    assert abs(np.corrcoef(one, another)[0, 1]) < 5 / np.sqrt(one.size)
+
+
 def test_windows_are_exposed_together(
     reduced: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -369,6 +389,7 @@ def test_windows_are_exposed_together(
     changes = {"frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
     look = look_at(reduced(None, changes | {"detector.shape": [85, 89]}), tmp_path, SYNC)
     assert len(look.windows) == 4
+    assert len({window.seed for window in look.windows}) == 1
     trials = trial.Trials(look.windows, tmp_path, SYNC)
     trials.curves([()], 2, "nominal bench")
     simulated = [[trials.of_window(n, (), 2)[seed] for n in range(4)] for seed in (0, 1)]

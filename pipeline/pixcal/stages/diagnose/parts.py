@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +59,14 @@ class Raw:
     arrays: Mapping[str, Frames]
     tables: Mapping[str, Table]
     reduction: reduce.Config
+
+    @property
+    def checksum(self) -> int:
+        """Of all samples; however they are kept on the disk."""
+        found = 0
+        for name in sorted(self.arrays):
+            found = crc32(np.ascontiguousarray(self.arrays[name]).data, found)
+        return found
 
 
 def groups(exposures: NDArray[np.float64]) -> list[NDArray[np.intp]]:

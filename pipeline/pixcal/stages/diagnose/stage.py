@@ -294,11 +294,13 @@ def look_at(
     windows: list[Window] = []
     measured: list[Curves] = []
     signatures: tuple[type[Effect], ...] = ()
+    seed: int | None = None
     for part in dict.fromkeys((first, *parts)):
         halves: list[Evidence] = []
         for half in (own.learn, own.test):
             folder = scratch / f"data-{len(windows)}-{len(halves)}"
             raw = take(ingested, acquisition, half, part, reduction)
+            seed = raw.checksum if seed is None else seed
             try:
                 halves.append(evidence_of(raw, folder, part, shape))
             except InputError as error:
@@ -311,7 +313,8 @@ def look_at(
         bench = nominal_bench(
             acquisition, ingested.tables, halves, (own.learn, own.test), reduction, dtypes
         )
-        windows.append(Window(part, bench, own.learn, own.test, shape))
+        assert seed is not None
+        windows.append(Window(part, bench, own.learn, own.test, shape, seed))
         if part in parts:
             measured.append(looked_at(halves[1], signatures))
     return Look(

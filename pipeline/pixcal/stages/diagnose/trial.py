@@ -43,6 +43,9 @@ class Window:
         Frames that effects are fitted on, and frames that they are tried on.
     whole : (int, int)
         Rows and columns of the detector's window.
+    seed : int
+        To which those of simulations are added: every acquisition is held against other random
+        numbers, so that what chance does to one is not done to all of them.
     """
 
     part: Part
@@ -50,6 +53,7 @@ class Window:
     learn: Half
     test: Half
     whole: tuple[int, int]
+    seed: int = 0
 
     def evidence(
         self,
@@ -62,7 +66,8 @@ class Window:
         number: int = 0,
     ) -> Evidence:
         """A half of the frames, taken again with some effects (`NominalBench.simulate`)."""
-        raw = self.bench.simulate(half, effects, seed, fitted=fitted, window=number)
+        own = self.seed + seed
+        raw = self.bench.simulate(half, effects, own, fitted=fitted, window=number)
         need = RUN_SHARE * sum(frames.nbytes for frames in raw.arrays.values())
         with scratch_folder(need, otherwise) as folder:
             return evidence_of(raw, folder / "run", self.part, self.whole)
