@@ -15,13 +15,14 @@ from PIL import Image
 from pixcal.estimators.battery import DETECTOR, battery
 from pixcal.estimators.battery.noise import OUTLIERS, STEPS
 from pixcal.report import blocks as blocks_module
+from pixcal.report import curve_places, diagnosis_words
 from pixcal.report import diagnosis_maps as maps
-from pixcal.report import diagnosis_words
 from pixcal.report.blocks import Block, Fold, Plate, Section, Words
 from pixcal.report.contents import Contents, Diagnosis, EffectWords, StageRecord
+from pixcal.report.curve_places import place, places
 from pixcal.report.diagnosis import diagnosis
 from pixcal.report.diagnosis_figures import Bar, Closed, curves_figure, gap_figure
-from pixcal.report.diagnosis_words import place, places
+from pixcal.report.diagnosis_words import percent, with_interval
 from pixcal.report.drawing import png
 from pixcal.report.page import render
 from pixcal.report.tables import Table
@@ -399,7 +400,7 @@ def test_names_of_places_are_those_of_the_battery() -> None:
     limits = [*(-x for x in OUTLIERS), *OUTLIERS]
     outliers = places({"x_label": "sigma, low then high", "x": limits})
     assert outliers == [f"{v:+.0f}".replace("-", "−") for v in limits]
-    assert set(diagnosis_words._AXES) <= {s.x_label for s in battery().values()}
+    assert set(curve_places._AXES) <= {s.x_label for s in battery().values()}
     assert diagnosis_words.DETECTOR == DETECTOR
 
 
@@ -487,3 +488,10 @@ def test_hostile_text_is_shown_as_it_is_and_does_nothing() -> None:
     shown = html.unescape(re.sub(r"<[^>]*>", " ", page))
     assert shown.count("<script>alert('") > 8
     assert 'alt="What gave away &lt;script&gt;' in page
+
+
+def test_shares_have_no_digits_that_mean_nothing() -> None:
+    assert percent(1.4e-7) == percent(0.0) == "0\u00a0%"
+    assert percent(0.00451) == "0.45\u00a0%"
+    assert with_interval(0.99612, [0.8618, 1.0]) == "100\u00a0% [86, 100]"
+    assert with_interval(2e-7, [0.0, 3e-6]) == "0\u00a0% [0, 0]"

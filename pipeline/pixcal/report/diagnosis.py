@@ -8,6 +8,7 @@ from pixcal.report import diagnosis_figures as figures
 from pixcal.report import diagnosis_maps as maps
 from pixcal.report.blocks import Block, Fold, Section, Words, folded, plate
 from pixcal.report.contents import Contents, Diagnosis, EffectWords
+from pixcal.report.curve_places import place
 from pixcal.report.diagnosis_words import (
     DETECTOR,
     answer,
@@ -16,7 +17,6 @@ from pixcal.report.diagnosis_words import (
     level,
     listed,
     percent,
-    place,
     unit,
     with_interval,
     worst,

@@ -13,7 +13,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
 from pixcal.report.colours import BAND, BLUE, GREY, INK, RED
-from pixcal.report.diagnosis_words import DETECTOR, axis_label, percent, places, unit
+from pixcal.report.curve_places import axis_label, places
+from pixcal.report.diagnosis_words import DETECTOR, percent, unit
 from pixcal.report.drawing import WIDE, Unit, finish, new_figure, unit_for
 
 F64 = NDArray[np.float64]

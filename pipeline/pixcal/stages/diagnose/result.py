@@ -19,6 +19,7 @@ from pixcal.estimators.gap import (
     sigmas_of,
 )
 from pixcal.model.config import to_plain
+from pixcal.report.curve_places import place
 from pixcal.stages.diagnose.deciding import deciding
 from pixcal.stages.diagnose.search import Candidate, Found, Shrinkage, Trial, differing, shrinkage
 
@@ -269,10 +270,8 @@ def _where(final: Shrinkage, curves: Mapping[Key, dict[str, Any]]) -> list[dict[
 def _entry(key: Key, final: Shrinkage, curve: Mapping[str, Any]) -> dict[str, Any]:
     at = final.before[key].worst if key in final.where else final.after[key].worst
     set_name = "" if key[1] == DETECTOR else f"set {key[1]}, "
-    x = curve["x"][at] if at < len(curve["x"]) else at
     # Of chance, all statistics being looked at.
     log_chance = final.before[key].log_chance + np.log(len(final.before))
-    alone = not curve["x_label"] and len(curve["x"]) == 1
     return {
         "domain": curve["domain"],
         "statistic": key[0],
@@ -286,7 +285,7 @@ def _entry(key: Key, final: Shrinkage, curve: Mapping[str, Any]) -> dict[str, An
         "z_after": _rounded(float(final.after[key].sigmas[at])),
         "significance": _rounded(max(sigmas_of(log_chance), 0.0)),
         "left": _rounded(final.gap.left.get(key, 0.0)),
-        "place": set_name + ("all frames" if alone else f"{curve['x_label'] or 'value'} {x:.4g}"),
+        "place": set_name + place(curve, at),
     }
 
 

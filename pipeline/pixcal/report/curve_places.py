@@ -1,0 +1,87 @@
+"""The places of a statistic's curve in words: which row, which neighbour, which period."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pixcal.report.text import number
+
+_STEPS = ("x+1", "y+1", "x+1 y+1", "x−1 y+1", "x+2", "y+2", "x+3", "y+3", "x+4", "y+4")
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """The places of a curve: the label of the axis, a place within a sentence, its names."""
+
+    label: str
+    phrase: str
+    names: tuple[str, ...] = ()
+
+
+_AXES = {
+    "neighbour": _Axis("neighbour", "neighbour {}", _STEPS),
+    "neighbour, by level": _Axis("neighbour, level by level", "neighbour {}", _STEPS[:4] * 8),
+    "row of four, down then right": _Axis(
+        "neighbour, row modulo 4",
+        "neighbour {}",
+        tuple(f"{step} r{row}" for step in ("y+1", "x+1") for row in range(4)),
+    ),
+    "left, right, above, below": _Axis("neighbour", "neighbour {}", ("x−1", "x+1", "y−1", "y+1")),
+    "rows, columns": _Axis("", "{}", ("rows", "columns")),
+    "cell of 4 × 4": _Axis(
+        "cell of the window",
+        "cell {}",
+        tuple(f"{row},{column}" for row in range(1, 5) for column in range(1, 5)),
+    ),
+    "contrast, light of each pair": _Axis("maps", "{}", ("contrast", "light") * 20),
+    "term": _Axis(
+        "contrast V, then intensity B",
+        "{}",
+        tuple(f"{of} {f} {n}φ" for of in "VB" for n in ("", 2, 3) for f in ("cos", "sin")),
+    ),
+    "sigma, low then high": _Axis(
+        "beyond so many σ", "beyond {} σ", ("−5", "−7", "−10", "+5", "+7", "+10")
+    ),
+    "quantile": _Axis("quantile of the pixels", "{} quantile"),
+    "bin of level": _Axis("level, dark to bright", "level bin {}, 0 the darkest"),
+    "period, rows": _Axis("period, rows", "every {} rows"),
+    "period, columns": _Axis("period, columns", "every {} columns"),
+    "frames before": _Axis("other frame", "frame {}"),
+    "harmonic (cosine, sine)": _Axis("harmonic", "{}"),
+    "batches averaged": _Axis("batches averaged", "batches averaged: {}"),
+}
+"""By ``x_label`` of ``curves.json``, where numbers alone would say little."""
+
+
+def axis_label(curve: Mapping[str, Any]) -> str:
+    """What the places of a curve are."""
+    label = str(curve["x_label"])
+    return _AXES[label].label if label in _AXES else label
+
+
+def places(curve: Mapping[str, Any]) -> list[str]:
+    """A name for each value of a curve."""
+    label, x = str(curve["x_label"]), list(curve["x"])
+    names = _AXES[label].names if label in _AXES else ()
+    if len(names) >= len(x):
+        return list(names[: len(x)])
+    if label == "harmonic (cosine, sine)":
+        return [f"{'sin' if v % 1 else 'cos'} {int(v) if int(v) > 1 else ''}ψ" for v in x]
+    if label == "frames before":
+        return [f"t{-int(v):+d}".replace("-", "−") for v in x]
+    if label == "quantile":
+        return [f"{100 * v:g} %" for v in x]
+    return [number(int(v)) if v == int(v) else number(v, 3) for v in x]
+
+
+def place(curve: Mapping[str, Any], at: int) -> str:
+    """Where in a curve a value is, in words."""
+    label, name = str(curve["x_label"]), places(curve)[at]
+    if not label and len(curve["x"]) == 1:
+        return "all frames"
+    if label in _AXES:
+        return _AXES[label].phrase.format(name)
+    if label.startswith("cycles a ") and curve["x"][at] > 0:
+        period = number(1 / curve["x"][at], 2)
+        return f"periods of {period} {'px' if label.endswith('pixel') else 'frames'}"
+    return f"{label} {name}".strip()
