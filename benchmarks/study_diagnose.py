@@ -33,16 +33,11 @@ from pixcal.model.bench import SCHEMA
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages import diagnose, ingest, reduce, simulate
 from pixcal.stages.blind.strengths import ways_of
+from pixcal.stages.diagnose.look import Look, look_at
 from pixcal.stages.diagnose.measuring import nominal_bench
-from pixcal.stages.diagnose.search import (
-    SCREEN,
-    Candidate,
-    Search,
-    differing,
-    looks_like,
-    shrinkage,
-)
-from pixcal.stages.diagnose.stage import Look, look_at, weakly_seen
+from pixcal.stages.diagnose.search import SCREEN, Candidate, Search, looks_like
+from pixcal.stages.diagnose.shrinkage import differing, shrinkage
+from pixcal.stages.diagnose.stage import weakly_seen
 from pixcal.stages.diagnose.trial import Curves, Trials, Window, estimate, looked_at
 
 matplotlib.use("Agg")

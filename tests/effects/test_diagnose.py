@@ -21,7 +21,7 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.stages import correct, diagnose, fit, ingest, reduce, simulate
 from pixcal.stages.diagnose import stage, trial, windows
-from pixcal.stages.diagnose.stage import look_at
+from pixcal.stages.diagnose.look import look_at
 from pixcal.stages.diagnose.windows import chosen_windows, split
 from pixcal_cli.main import invoke
 

@@ -12,16 +12,14 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.search import (
     CONFIRM,
-    LEAST,
     LEAST_OF_HINTED,
     MOST,
     SCREEN,
     Candidate,
     Found,
     Search,
-    differing,
-    shrinkage,
 )
+from pixcal.stages.diagnose.shrinkage import LEAST, differing, shrinkage
 
 KEYS: tuple[Key, ...] = (
     ("harmonics", "a"),

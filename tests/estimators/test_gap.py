@@ -16,7 +16,7 @@ from pixcal.estimators.gap import (
     remaining,
     scaled,
 )
-from pixcal.stages.diagnose.search import LEAST
+from pixcal.stages.diagnose.shrinkage import LEAST
 
 LINEAR: Key = ("harmonics", "a")
 POWER: Key = ("contrast_of_frames", "a")

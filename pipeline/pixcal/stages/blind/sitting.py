@@ -21,7 +21,7 @@ from pixcal.model.errors import ClusterError, DamagedError, PlanError
 from pixcal.stages import correct, diagnose, ingest, reduce
 from pixcal.stages.blind.benches import LAYOUTS, MOST_SETS
 from pixcal.stages.blind.paper import RUNS, read_paper
-from pixcal.stages.diagnose.stage import ESTIMATE_BYTES, EVIDENCE_BYTES
+from pixcal.stages.diagnose.look import ESTIMATE_BYTES, EVIDENCE_BYTES
 from pixcal.storage.artefact import read_json, write_json
 
 PRODUCTS = "products"

@@ -21,7 +21,8 @@ from pixcal.estimators.gap import (
 from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place
 from pixcal.stages.diagnose.deciding import deciding
-from pixcal.stages.diagnose.search import Candidate, Found, Shrinkage, Trial, differing, shrinkage
+from pixcal.stages.diagnose.search import Candidate, Found
+from pixcal.stages.diagnose.shrinkage import Shrinkage, Trial, differing, shrinkage
 
 F64 = NDArray[np.float64]
 

@@ -7,26 +7,24 @@ candidate is allowed for: the same estimate is made on a simulation with the eff
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.battery import Key
 from pixcal.estimators.gap import (
-    Difference,
     Expectation,
-    Gap,
     Reference,
     compare,
     expect_nominal,
     expect_with,
     flagged,
-    likelier,
     log_likelihood,
     remaining,
 )
 from pixcal.simulation.effect import Effect, Estimate
+from pixcal.stages.diagnose.shrinkage import LEAST, Trial, differing
 from pixcal.stages.diagnose.trial import Curves, Effects
 
 F64 = NDArray[np.float64]
@@ -35,10 +33,9 @@ SURE = 4.0
 """Standard deviations that the estimate on the first frames must have; or, where there is a gap,"""
 HINTED = 1.5
 """as an effect that another looks like may have no more by itself."""
-LEAST = 5.0
-"""By which an effect must raise the log-likelihood of unseen data."""
 LEAST_OF_HINTED = 12.0
-"""The same for an effect that the first frames only hint at."""
+"""By which an effect that the first frames only hint at must raise the log-likelihood of unseen
+data; others by `LEAST`."""
 SCREEN = 3
 """Simulations of a candidate; of what was taken, `CONFIRM`."""
 CONFIRM = 8
@@ -53,22 +50,6 @@ EXPLAINED = 0.7
 
 Simulate = Callable[[Sequence[Effects], int, str], Sequence[list[Curves] | str]]
 Estimates = Callable[[Effects, Sequence[str]], Mapping[str, float]]
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A bench held against the data.
-
-    Attributes
-    ----------
-    effects : tuple of Effect
-    expected : Expectation
-    log_likelihood : float
-    """
-
-    effects: Effects
-    expected: Expectation
-    log_likelihood: float
 
 
 @dataclass
@@ -381,64 +362,3 @@ class Search:
         # All at once, side by side; below they are at hand.
         self._simulate(list(benches.values()), CONFIRM, "one left out")
         return {name: self._start(benches.get(name, ())) for name in taken}
-
-
-@dataclass(frozen=True)
-class Shrinkage:
-    """How far the gap shrinks, with its interval (5 to 95 %).
-
-    Attributes
-    ----------
-    before, after : mapping
-        Differences of the curves.
-    where : set
-        Curves that make up the gap.
-    gap : Gap
-    interval : (float, float)
-    """
-
-    before: Mapping[Key, Difference]
-    after: Mapping[Key, Difference]
-    where: set[Key]
-    gap: Gap
-    interval: tuple[float, float]
-
-
-DRAWS = 200
-
-
-def shrinkage(data: Mapping[Key, F64], nominal: Trial, other: Trial, where: set[Key]) -> Shrinkage:
-    """The gap with some effects, against the nominal bench's.
-
-    The interval comes from expectations shifted by their own scatter, of all curves: what opens
-    where there was no gap counts too.
-    """
-    before = compare(data, nominal.expected)
-    after = compare(data, other.expected)
-    gap = remaining(before, after, where)
-    rng = np.random.default_rng(17)
-    draws = []
-    for _ in range(DRAWS):
-        expected = other.expected
-        mean = {
-            k: m + np.sqrt(expected.variance[k]) * rng.standard_normal(len(m))
-            for k, m in expected.mean.items()
-        }
-        doubled = {k: 2 * expected.variance[k] for k in mean}
-        moved = replace(expected, mean=mean, variance=doubled)
-        draws.append(remaining(before, compare(data, moved), where).total if where else 0.0)
-    low, high = np.quantile(draws, (0.05, 0.95))
-    return Shrinkage(
-        before, after, where, gap, (min(float(low), gap.total), max(float(high), gap.total))
-    )
-
-
-def differing(nominal: Trial, final: Trial, data: Mapping[Key, F64]) -> set[Key]:
-    """Curves that make up the gap: those that differ, and those by which causes were told."""
-    where = flagged(compare(data, nominal.expected))
-    if not final.effects:
-        return where
-    gains = likelier(data, nominal.expected, final.expected)
-    where |= {key for key, gain in gains.items() if gain > LEAST / 2}
-    # A cause that many curves tell a little each is still told by the one that does it best.
-    return where or {max(gains, key=lambda key: gains[key])}

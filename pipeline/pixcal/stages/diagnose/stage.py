@@ -6,40 +6,29 @@ data and every simulation of them are reduced and fitted by the same stages.
 
 import hashlib
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pixcal.effects import known_effects, parse_effects
-from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.gap import Reference, compare, expect_nominal, expect_with
-from pixcal.model.acquisition import Acquisition
 from pixcal.model.bench import load_bench
-from pixcal.model.config import parse, quantity, to_plain
+from pixcal.model.config import quantity, to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate
-from pixcal.stages import reduce
-from pixcal.stages.diagnose.deciding import missing_frames
-from pixcal.stages.diagnose.measuring import nominal_bench
-from pixcal.stages.diagnose.parts import Half, evidence_of, take
+from pixcal.stages.diagnose.look import Look, look_at, plain_part
 from pixcal.stages.diagnose.result import by_domain, describe
 from pixcal.stages.diagnose.search import CONFIRM, SCREEN, SURE, Candidate, Found, Search
 from pixcal.stages.diagnose.trial import (
-    Curves,
     Effects,
     Trials,
-    Window,
-    averaged,
     estimate,
-    looked_at,
 )
-from pixcal.stages.diagnose.windows import chosen_windows, split, whole_of
-from pixcal.stages.evidence import Part
-from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.diagnose.windows import whole_of
 from pixcal.storage.artefact import (
     Manifest,
     artefact_key,
@@ -54,18 +43,9 @@ from pixcal.storage.artefact import (
 FORMAT = 3
 REFERENCES = 16
 """Simulations of the nominal bench."""
-EVIDENCE_BYTES = 34
-"""Evidence in memory and the run that it is made of, for each sample of all fringe sets (measured,
-as the next two)."""
-LOOK_BYTES = 50
-"""What the statistics of one set need beside it, for each sample of the largest set."""
-ESTIMATE_BYTES = 130
-"""What the hungriest estimate, that of crosstalk, needs beside it."""
 LEARN_SEED = 900_000
 CLEAR = 20.0
 """Standard deviations from which an effect whose estimate is slow is left to the battery."""
-FEWEST_FRAMES = 24
-"""Fringe frames in each half."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +187,7 @@ def _diagnose(
     )
 
 
-def _places(look: "Look", trials: Trials, base: Effects, found: Found) -> list[dict[str, Any]]:
+def _places(look: Look, trials: Trials, base: Effects, found: Found) -> list[dict[str, Any]]:
     """How far each window is off by itself, unless one is all there is."""
     if len(look.windows) == 1 and look.windows[0].part == whole_of(look.windows[0].whole):
         return []
@@ -220,156 +200,8 @@ def _places(look: "Look", trials: Trials, base: Effects, found: Found) -> list[d
         if found.taken:
             bench = (*base, *found.final.effects)
             final = compare(data, expect_with(own, trials.of_window(number, bench, CONFIRM)))
-        places.append({"window": _plain_part(window.part), "domains": by_domain(nominal, final)})
+        places.append({"window": plain_part(window.part), "domains": by_domain(nominal, final)})
     return places
-
-
-@dataclass(frozen=True)
-class Look:
-    """What is looked at.
-
-    Attributes
-    ----------
-    first : Window
-        That effects are fitted on.
-    windows : tuple of Window
-        That they are tried on.
-    each : tuple of mapping
-        Curves of the test frames of each window.
-    measured : mapping
-        Their mean.
-    facts : dict
-        What is told of it.
-    runtime, few : Runtime
-        With as many workers as fit the memory: of simulations, and of estimates.
-    """
-
-    first: Window
-    windows: tuple[Window, ...]
-    each: tuple[Curves, ...]
-    measured: Curves
-    facts: dict[str, Any]
-    runtime: Runtime
-    few: Runtime
-
-
-def look_at(
-    run_dir: Path,
-    scratch: Path,
-    runtime: Runtime,
-    learnt: Callable[[Evidence, Runtime], Sequence[type[Effect]]] = lambda *_: (),
-) -> Look:
-    """Take the parts of a reduced run that are looked at, and measure their nominal bench.
-
-    Parameters
-    ----------
-    run_dir, scratch : Path
-    runtime : Runtime
-    learnt : callable
-        Is given the evidence that effects are fitted on, and how to run estimates in the memory
-        that there is; tells whose estimates are statistics too.
-
-    Raises
-    ------
-    InputError
-        If there are too few frames, or a part cannot be fitted.
-    """
-    ingested = Ingested(run_dir / "ingest")
-    file = run_dir / "ingest" / "acquisition.json"
-    acquisition = parse(Acquisition, read_json(file), str(file))
-    reduction = _reduction(run_dir)
-    shape = ingested.shape
-    first, parts = chosen_windows(shape)
-    pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
-    own = split(ingested.tables, pixels)
-    _enough(own.test)
-    largest, evidence = _samples(own.test, pixels)
-    need = EVIDENCE_BYTES * evidence + LOOK_BYTES * largest
-    estimates = ESTIMATE_BYTES * largest
-    for_estimates = make_plan("diagnose", estimates, EVIDENCE_BYTES * evidence, runtime)
-    plan = make_plan("diagnose", need, 0, runtime)
-    few = runtime.with_workers(for_estimates.workers)
-    runtime = runtime.with_workers(plan.workers)
-    dtypes = {name: array.dtype for name, array in ingested.arrays.items()}
-    windows: list[Window] = []
-    measured: list[Curves] = []
-    signatures: tuple[type[Effect], ...] = ()
-    seed: int | None = None
-    for part in dict.fromkeys((first, *parts)):
-        halves: list[Evidence] = []
-        for half in (own.learn, own.test):
-            folder = scratch / f"data-{len(windows)}-{len(halves)}"
-            raw = take(ingested, acquisition, half, part, reduction)
-            seed = raw.checksum if seed is None else seed
-            try:
-                halves.append(evidence_of(raw, folder, part, shape))
-            except InputError as error:
-                which = ("first", "second")[len(halves)]
-                reason = str(error).replace(f"{folder}: ", "")
-                raise InputError(f"{run_dir}: the {which} half of its frames: {reason}") from error
-            shutil.rmtree(folder)
-        if not windows:
-            signatures = tuple(learnt(halves[0], few))
-        bench = nominal_bench(
-            acquisition, ingested.tables, halves, (own.learn, own.test), reduction, dtypes
-        )
-        assert seed is not None
-        windows.append(Window(part, bench, own.learn, own.test, shape, seed))
-        if part in parts:
-            measured.append(looked_at(halves[1], signatures))
-    return Look(
-        windows[0],
-        tuple(w for w in windows if w.part in parts),
-        tuple(measured),
-        averaged(measured),
-        {
-            "shape": list(shape),
-            "fitted_on": {"window": _plain_part(first), "frames": _plain_half(own.learn)},
-            "tried_on": {
-                "windows": [_plain_part(p) for p in parts],
-                "frames": _plain_half(own.test),
-            },
-            "kinds": [kind for kind in ("bias", "dark", "flat") if kind in ingested.tables],
-            "sets": {s.name: list(s.baseline_mm) for s in acquisition.frames.fringes},
-            "missing_frames": missing_frames(
-                acquisition, ingested.tables, [s.step for s in windows[0].bench.measured.sets]
-            ),
-        },
-        runtime,
-        few,
-    )
-
-
-def _samples(half: Half, pixels: int) -> tuple[int, int]:
-    """Samples of a window: of the largest fringe set, and of all; without fringes of all frames."""
-    counts = [len(frames) for name, frames in half.frames.items() if "/" in name]
-    counts = counts or [sum(map(len, half.frames.values()))]
-    return pixels * max(counts), pixels * sum(counts)
-
-
-def _enough(half: Half) -> None:
-    for name, frames in half.frames.items():
-        if "/" in name and len(frames) < FEWEST_FRAMES:
-            raise InputError(
-                f"{name}: half of its frames are {len(frames)}; diagnose needs {FEWEST_FRAMES} in "
-                "each half, for effects are fitted on one and tried on the other"
-            )
-
-
-def _plain_part(part: Part) -> list[list[int]]:
-    return [list(part[0]), list(part[1])]
-
-
-def _plain_half(half: Half) -> dict[str, list[int]]:
-    return {
-        name: [int(frames[0]), int(frames[-1]), len(frames)] for name, frames in half.frames.items()
-    }
-
-
-def _reduction(run_dir: Path) -> reduce.Config:
-    plain = dict(require(run_dir, "reduce", 1).config)
-    known = {k: v for k, v in plain.items() if k in reduce.Config.__dataclass_fields__}
-    return parse(reduce.Config, known, str(run_dir / "reduce" / "manifest.json"))
 
 
 def _candidates(
