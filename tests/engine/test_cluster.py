@@ -174,7 +174,13 @@ def test_what_is_left_is_taken_back_and_workers_are_idle(
     if cause == "ctrl-c":
         me = threading.main_thread().ident
         assert me is not None
-        threading.Timer(0.7, signal.pthread_kill, [me, signal.SIGINT]).start()
+
+        def interrupt_at_work() -> None:
+            # Not before: while the library connects, Python may be where it cannot raise.
+            eventually(lambda: any(tmp_path.glob("*.ended")))
+            signal.pthread_kill(me, signal.SIGINT)
+
+        threading.Thread(target=interrupt_at_work).start()
     task = partial(leave_mark, tmp_path, 3 if cause == "failure" else -1)
     with pytest.raises(expected):
         run_tasks(task, range(400), cluster.runtime, label="marks")

@@ -42,7 +42,7 @@ from pixcal.stages.blind.seal import read_seal
 from pixcal.stages.blind.sitting import share
 from pixcal.stages.blind.strengths import STRONGEST, WAYS, Way
 from pixcal.stages.blind.table import as_markdown, write_between
-from pixcal.stages.diagnose import stage as diagnose_stage
+from pixcal.stages.diagnose import look
 from pixcal.storage.artefact import build, require, write_json
 
 SYNC = Runtime(cluster="sync")
@@ -300,8 +300,8 @@ def test_each_case_gets_the_memory_that_it_asks_for(
     assert over.workers == at_once
     half, sets = 128 * 128 * 300, 3
     make_plan(
-        "diagnose", diagnose_stage.ESTIMATE_BYTES * half,
-        diagnose_stage.EVIDENCE_BYTES * half * sets, each,
+        "diagnose", look.ESTIMATE_BYTES * half,
+        look.EVIDENCE_BYTES * half * sets, each,
     )  # fmt: skip
     with pytest.raises(PlanError, match="cases"):
         share("cases", "standard", 10, replace(runtime, memory=1 << 30))
