@@ -42,7 +42,7 @@ demo: $(INSTALLED) ## calibrate the sample acquisition into demo/
 
 # Three files at a time on two cores: some tests wait for processes of their own.
 test: $(TOOLS) ## run the tests
-	$(BIN)/pytest -n 3 --dist loadfile -m "not long"
+	$(BIN)/pytest -n 3 --dist loadfile -m "not long" --durations=15
 
 test-long: $(TOOLS) ## run the tests that take longest (minutes)
 	$(BIN)/pytest -n 2 -m long
