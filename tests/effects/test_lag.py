@@ -87,6 +87,23 @@ def test_long_lag_does_not_depend_on_where_one_begins(
         assert np.array_equal(samples, whole[n, 5:18])
 
 
+def test_noise_is_drawn_once_for_a_frame_wherever_one_begins(
+    make_effect_bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench, lag = make_effect_bench(SMALL), Lag(0.05, 1.5, 0.1)
+    drawn: list[tuple[int, ...]] = []
+    rng = Recording.pixel_rng
+
+    def counted(recording: Recording, effect: str, *key: int) -> np.random.Generator:
+        drawn.append(key)
+        return rng(recording, effect, *key)
+
+    monkeypatch.setattr(Recording, "pixel_rng", counted)
+    for _ in Camera(bench, (5, 18), [lag]).expose(of_kind(bench, "fringes"), range(20, 35)):
+        pass
+    assert sorted(drawn) == [(frame, 0) for frame in range(20 - lag.frames_back, 35)]
+
+
 @pytest.mark.parametrize("lag", [Lag(0.02, 0.0, 0.0), Lag(0.05, 1.5, 0.0)])
 def test_frames_are_restored(make_effect_bench: Callable[..., Bench], lag: Lag) -> None:
     bench = quiet(make_effect_bench(SMALL))

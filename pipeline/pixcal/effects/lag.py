@@ -107,10 +107,7 @@ class Lag(Effect):
 
     def _left_behind(self, charge: F32, shot: Shot, frame: int) -> F32:
         """Electrons of a frame that stay: each by its own chance, so that noise stays white."""
-        share = np.full_like(charge, self.share)
-        if self.spread:
-            pixels = _pixels(shot.bench.detector, shot.rows)
-            share *= np.clip(1 + np.float32(self.spread) * pixels, 0, 1 / self.share)
+        share = _shares(self, shot.bench.detector, shot.rows)
         left = share * charge
         if shot.bench.shot_noise:
             chance = np.sqrt(np.maximum(left * (1 - share), 0))
@@ -194,6 +191,16 @@ def _pixels(detector: SimulatedDetector, rows: Rows) -> F32:
     return chip_map(detector, rows, Lag.name, lambda rng: rng.standard_normal(TILE))
 
 
+@lru_cache(maxsize=4)
+def _shares(lag: Lag, detector: SimulatedDetector, rows: Rows) -> F32:
+    """Share (y, x) that stays behind in each pixel."""
+    ny, nx = rows[1] - rows[0], detector.shape[1]
+    share = np.full((ny, nx), lag.share, np.float32)
+    if lag.spread:
+        share *= np.clip(1 + np.float32(lag.spread) * _pixels(detector, rows), 0, 1 / lag.share)
+    return share
+
+
 def _contrast_steps(fringes: FringeEvidence, lag: Lag) -> tuple[F64, F64] | None:
     """Shares (lag,) that come out 1, 2, ... frames later, and their information (lag, lag).
 
@@ -275,8 +282,9 @@ def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
         return None
     freedom = Freedom(fringes, HARMONICS)
     residual = freedom.left_over(freedom.of_good(fringes.residual))
-    before = _square_of_shares(fringes, freedom, residual, 1)
-    after = [_square_of_shares(fringes, freedom, residual, -n) for n in range(1, CONTROLS + 1)]
+    weighted = freedom.weight * residual
+    before = _square_of_shares(fringes, freedom, weighted, 1)
+    after = [_square_of_shares(fringes, freedom, weighted, -n) for n in range(1, CONTROLS + 1)]
     value, error = np.array(after).T
     noise = np.hypot(before[1], np.sqrt((error**2).mean() / CONTROLS))
     scatter = value.std(ddof=1) * np.sqrt(1 + 1 / CONTROLS)
@@ -284,9 +292,12 @@ def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
 
 
 def _square_of_shares(
-    fringes: FringeEvidence, freedom: Freedom, residual: F32, step: int
+    fringes: FringeEvidence, freedom: Freedom, weighted: F32, step: int
 ) -> tuple[float, float]:
-    """Mean square of the pixels' shares of another frame, less that of their noise; its error."""
+    """Mean square of the pixels' shares of another frame, less that of their noise; its error.
+
+    From the residuals (t, n), times their weights.
+    """
     other = np.roll(fringes.g, step, axis=0).T.astype(np.float32)
     other[:, slice(0, step) if step > 0 else slice(step, None)] = 0
     own, weight, theta = freedom.of_time, freedom.weight, fringes.theta[:, freedom.good]
@@ -301,7 +312,7 @@ def _square_of_shares(
     taken = np.einsum("nij,jn->in", freedom.pixel_inverse, along)
     information = np.einsum("in,ijn,jn->n", theta, squares, theta)
     information -= np.einsum("kn,kn->n", along, taken)
-    right = np.einsum("in,in->n", theta, other @ (weight * residual))
+    right = np.einsum("in,in->n", theta, other @ weighted)
     told = information > 1e-3 * np.median(information)
     share, variance = right[told] / information[told], 1 / information[told]
     square = share**2 - variance

@@ -8,6 +8,7 @@ before it has them made again.
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,12 +22,13 @@ from pixcal.kernels.scene import (
     frame_states,
     light_maps,
 )
-from pixcal.kernels.synthesis import BLOCK_ROWS, fill_normal
+from pixcal.kernels.synthesis import BLOCK_ROWS
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.recording import Recording
 
 F32 = NDArray[np.float32]
+K = TypeVar("K", tuple[int, int], tuple[int, str])
 
 
 class Camera:
@@ -118,17 +120,28 @@ class _Shot:
         return self.recording.rng(effect, self.frame, *key)
 
     def normals(self, effect: str, frame: int | None = None) -> F32:
-        """Standard normals (y, x) of an effect, the same however rows are cut."""
+        """Standard normals (y, x) of an effect, the same however rows are cut; read only."""
         frame = self.frame if frame is None else frame
-        first, last = self.rows
-        width = self.bench.detector.shape[1]
-        begin, end = first // BLOCK_ROWS, -(-last // BLOCK_ROWS)
-        out = np.empty(((end - begin) * BLOCK_ROWS, width), np.float32)
-        for block in range(begin, end):
-            at = (block - begin) * BLOCK_ROWS
-            fill_normal(self.recording.pixel_rng(effect, frame, block), out[at : at + BLOCK_ROWS])
-        skip = first - begin * BLOCK_ROWS
-        return out[skip : skip + last - first]
+        looks_back = self._chain.effects[self._at].frames_back > 0
+        return self._chain.normals(effect, frame, keep=looks_back)
+
+
+class _Latest(dict[K, F32]):
+    """Arrays of the last few frames, by a key that begins with the frame.
+
+    Of the earliest frame goes first, whenever it was put in: an exposure that begins within a
+    recording puts in the frames before it in falling order.
+    """
+
+    def __init__(self, most: int) -> None:
+        super().__init__()
+        self._most = most
+
+    def keep(self, key: K, array: F32) -> None:
+        """Put an array in."""
+        while len(self) >= self._most:
+            del self[min(self)]
+        self[key] = array
 
 
 class _Chain:
@@ -140,9 +153,10 @@ class _Chain:
         d = camera.bench.detector
         self.dark = camera.maps.dark_rate * np.float32(recording.exptime_s)
         self.well = np.inf if d.full_well_e is None else d.full_well_e
-        self._charges: dict[tuple[int, int], F32] = {}
+        back = [1 + e.frames_back for e in self.effects if e.frames_back]
         # Of a frame and of those before it, each before and after the effect that looks back.
-        self._kept = 2 * (1 + max((e.frames_back for e in self.effects), default=0))
+        self._charges = _Latest[tuple[int, int]](2 * max(back, default=1))
+        self._kept_normals = _Latest[tuple[int, str]](sum(back))
         self._samples = np.empty(self.dark.shape, np.uint16)
 
     @cached_property
@@ -186,16 +200,29 @@ class _Chain:
         synthesis.collect(light, self.dark, shot, bench.shot_noise, self.well, charge)
         for at, effect in enumerate(self.effects[:upto]):
             if effect.frames_back:
-                self._keep((frame, at), charge)
+                self._charges.keep((frame, at), charge)
             charge = effect.charge(charge, _Shot(self, frame, at))
-        self._keep(key, charge)
+        self._charges.keep(key, charge)
         return charge
 
-    def _keep(self, key: tuple[int, int], charge: F32) -> None:
-        """For effects that ask for it in later frames."""
-        while len(self._charges) >= self._kept:
-            self._charges.pop(next(iter(self._charges)))
-        self._charges[key] = charge
+    def normals(self, effect: str, frame: int, *, keep: bool) -> F32:
+        """Standard normals of an effect in a frame; kept for effects that ask for them again."""
+        key = (frame, effect)
+        if key in self._kept_normals:
+            return self._kept_normals[key]
+        first, last = self.camera.rows
+        begin, end = first // BLOCK_ROWS, -(-last // BLOCK_ROWS)
+        width = self.camera.bench.detector.shape[1]
+        out = np.empty(((end - begin) * BLOCK_ROWS, width), np.float32)
+        for block in range(begin, end):
+            at = (block - begin) * BLOCK_ROWS
+            rng = self.recording.pixel_rng(effect, frame, block)
+            synthesis.fill_normal(rng, out[at : at + BLOCK_ROWS])
+        skip = first - begin * BLOCK_ROWS
+        drawn = out[skip : skip + last - first]
+        if keep:
+            self._kept_normals.keep(key, drawn)
+        return drawn
 
     def samples(self, frame: int) -> NDArray[np.uint16]:
         """Codes of a frame."""

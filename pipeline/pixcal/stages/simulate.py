@@ -56,6 +56,9 @@ FRAMES_PER_TASK = 128
 _BYTES_PER_PIXEL = 160
 """Peak of a task for each pixel of its rows: maps, phases in float64, one frame (measured)."""
 
+_BYTES_PER_FRAME_BACK = 12
+"""For each pixel and frame that an effect looks back to: charge before and after, and its noise."""
+
 _BYTES_PER_COMPRESSED_SAMPLE = 10
 """Peak of a task for each sample of a file that is compressed (measured)."""
 
@@ -166,7 +169,7 @@ def acquire(
         Makes the frames of some rows, called with bench, rows and effects.
     """
     recorded = recordings(bench)
-    runtime = _fitting(bench, recorded, runtime)
+    runtime = _fitting(bench, recorded, effects, runtime)
     _write_frames(bench, effects, recorded, folder, runtime, camera)
     _write_description(bench, folder)
 
@@ -187,7 +190,7 @@ def _build(
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
     recorded = recordings(plan)
-    runtime = _fitting(plan, recorded, runtime)
+    runtime = _fitting(plan, recorded, effects, runtime)
     _write_truth(plan, effects, recorded, truth_made, runtime)
     bench, *own = sources
     shutil.copyfile(bench, truth_made / "bench.yaml")
@@ -258,10 +261,13 @@ def _blocks(bench: Bench) -> list[Rows]:
     return [(row, min(row + step, ny)) for row in range(0, ny, step)]
 
 
-def _fitting(bench: Bench, recorded: list[Recording], runtime: Runtime) -> Runtime:
+def _fitting(
+    bench: Bench, recorded: list[Recording], effects: Effects, runtime: Runtime
+) -> Runtime:
     """The runtime with as many workers as fit the memory."""
     ny, nx = bench.detector.shape
-    need = min(ny, synthesis.BLOCK_ROWS) * nx * _BYTES_PER_PIXEL
+    back = sum(1 + e.frames_back for e in effects if e.frames_back)
+    need = min(ny, synthesis.BLOCK_ROWS) * nx * (_BYTES_PER_PIXEL + _BYTES_PER_FRAME_BACK * back)
     for recording in recorded:
         if recording.folder in bench.frames.compress:
             planes = min(bench.frames.per_file, recording.count)
