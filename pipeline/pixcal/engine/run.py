@@ -58,6 +58,11 @@ class Runtime:
             return 1
         return self.workers or len(os.sched_getaffinity(0))
 
+    @property
+    def here(self) -> "Runtime":
+        """The same in this process, for what is too large to be sent about."""
+        return self if self.cluster == "sync" else replace(self, cluster="threads")
+
     def with_workers(self, workers: int) -> "Runtime":
         """The same with another number of local workers, as a memory plan asks for."""
         return replace(self, workers=workers)

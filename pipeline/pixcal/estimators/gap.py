@@ -208,29 +208,33 @@ class Difference:
 
 def compare(data: Mapping[Key, F64], expected: Expectation) -> dict[Key, Difference]:
     """Curves of the data (on the reference's scales) against an expectation."""
-    found = {}
-    offs = {key: data[key] - mean for key, mean in expected.mean.items() if key in data}
-    errors = {key: np.sqrt(expected.variance[key]) for key in offs}
+    keys = [key for key in expected.mean if key in data]
+    if not keys:
+        return {}
     # All values at once: a call of SciPy's distributions takes longer than a curve.
-    pulls = [np.zeros(0), *(np.abs(off) / errors[key] for key, off in offs.items())]
-    every_tail = student.logsf(np.concatenate(pulls), expected.dof)
-    ends = np.cumsum([len(p) for p in pulls[1:]])
-    for (key, off), tails in zip(offs.items(), np.split(every_tail, ends), strict=False):
-        sigmas = -ndtri_exp(np.minimum(tails, -1e-300)) * np.sign(off)
-        tails = tails + np.log(2)
-        beyond = np.maximum(np.abs(off) - ALLOWED * errors[key], 0) ** 2
-        any_of = _any_of(float(np.min(tails)), expected.independent[key])
-        excess = float((beyond / expected.noise[key]).sum())
-        found[key] = Difference(sigmas, any_of, excess)
-    return found
+    sizes = [len(data[key]) for key in keys]
+    starts = np.cumsum([0, *sizes[:-1]])
+    off = np.concatenate([data[key] - expected.mean[key] for key in keys])
+    error = np.sqrt(np.concatenate([expected.variance[key] for key in keys]))
+    noise = np.concatenate([expected.noise[key] for key in keys])
+    tails = student.logsf(np.abs(off) / error, expected.dof)
+    sigmas = -ndtri_exp(np.minimum(tails, -1e-300)) * np.sign(off)
+    least = np.minimum.reduceat(tails, starts) + np.log(2)
+    any_of = _any_of(least, np.array([expected.independent[key] for key in keys]))
+    beyond = np.maximum(np.abs(off) - ALLOWED * error, 0) ** 2
+    excess = np.add.reduceat(beyond / noise, starts)
+    return {
+        key: Difference(sigmas[first : first + size], float(chance), float(more))
+        for key, first, size, chance, more in zip(keys, starts, sizes, any_of, excess, strict=True)
+    }
 
 
-def _any_of(log_chance: float, count: float) -> float:
+def _any_of(log_chance: F64, count: F64) -> F64:
     """Logarithm of the chance that the least of some independent chances is as small."""
-    if log_chance < -30:
-        return log_chance + float(np.log(count))
-    none = count * np.log1p(-min(np.exp(log_chance), 1 - 1e-15))
-    return float(np.log(-np.expm1(none)))
+    none = count * np.log1p(-np.minimum(np.exp(log_chance), 1 - 1e-15))
+    tiny = log_chance < -30
+    many = np.log(-np.expm1(np.where(tiny, -1.0, none)))
+    return np.asarray(np.where(tiny, log_chance + np.log(count), many))
 
 
 def flagged(differences: Mapping[Key, Difference]) -> set[Key]:

@@ -3,11 +3,12 @@
 import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pixcal.engine.plan import make_plan
-from pixcal.engine.run import Runtime
+from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.evidence import Evidence
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
@@ -16,7 +17,7 @@ from pixcal.simulation.effect import Effect
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.deciding import missing_frames
 from pixcal.stages.diagnose.measuring import nominal_bench
-from pixcal.stages.diagnose.parts import Half, evidence_of, take
+from pixcal.stages.diagnose.parts import Half, Raw, evidence_of, take
 from pixcal.stages.diagnose.trial import Curves, Window, averaged, looked_at
 from pixcal.stages.diagnose.windows import chosen_windows, split
 from pixcal.stages.evidence import Part
@@ -106,18 +107,15 @@ def look_at(
     signatures: tuple[type[Effect], ...] = ()
     seed: int | None = None
     for part in dict.fromkeys((first, *parts)):
-        halves: list[Evidence] = []
-        for half in (own.learn, own.test):
-            folder = scratch / f"data-{len(windows)}-{len(halves)}"
-            raw = take(ingested, acquisition, half, part, reduction)
-            seed = raw.checksum if seed is None else seed
-            try:
-                halves.append(evidence_of(raw, folder, part, shape))
-            except InputError as error:
-                which = ("first", "second")[len(halves)]
-                reason = str(error).replace(f"{folder}: ", "")
-                raise InputError(f"{run_dir}: the {which} half of its frames: {reason}") from error
-            shutil.rmtree(folder)
+        raws = [take(ingested, acquisition, h, part, reduction) for h in (own.learn, own.test)]
+        seed = raws[0].checksum if seed is None else seed
+        halves = run_tasks(
+            partial(_evidence, run_dir, scratch, part, shape),
+            list(enumerate(raws)),
+            runtime.here,
+            label=f"window {len(windows) + 1}",
+        )
+        del raws
         if not windows:
             signatures = tuple(learnt(halves[0], few))
         bench = nominal_bench(
@@ -148,6 +146,21 @@ def look_at(
         runtime,
         few,
     )
+
+
+def _evidence(
+    run_dir: Path, scratch: Path, part: Part, shape: tuple[int, int], item: tuple[int, Raw]
+) -> Evidence:
+    number, raw = item
+    folder = scratch / f"data-{number}"
+    try:
+        found = evidence_of(raw, folder, part, shape)
+    except InputError as error:
+        which = ("first", "second")[number]
+        reason = str(error).replace(f"{folder}: ", "")
+        raise InputError(f"{run_dir}: the {which} half of its frames: {reason}") from error
+    shutil.rmtree(folder)
+    return found
 
 
 def _samples(half: Half, pixels: int) -> tuple[int, int]:

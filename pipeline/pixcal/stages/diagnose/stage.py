@@ -7,7 +7,7 @@ data and every simulation of them are reduced and fitted by the same stages.
 import hashlib
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -237,7 +237,7 @@ def weakly_seen(
 def _estimates(
     evidence: Evidence, kinds: Mapping[str, type[Effect]], runtime: Runtime, label: str
 ) -> dict[str, Estimate | str | None]:
-    # Here, for the evidence is too large to be sent about.
-    here = runtime if runtime.cluster == "sync" else replace(runtime, cluster="threads")
-    results = run_tasks(partial(estimate, evidence), list(kinds.values()), here, label=label)
+    results = run_tasks(
+        partial(estimate, evidence), list(kinds.values()), runtime.here, label=label
+    )
     return dict(zip(kinds, results, strict=True))

@@ -87,7 +87,7 @@ def scout_set(
     places, tiles = [places[n] for n in order], [tiles[n] for n in order]
     ny, nx = source.shape
     # Here, whatever does the rest: in other processes nothing would be kept for the sweep.
-    here = replace(runtime, cluster="sync" if runtime.cluster == "sync" else "threads", quiet=True)
+    here = replace(runtime.here, quiet=True)
     if runtime.remote:
         here = here.with_workers(0)
     # The chunks kept; the first look's codes, copies of a tile's share, and its Gram matrix; for
