@@ -88,7 +88,8 @@ def parse_effects(
     for name, values in plain.items():
         if name not in known:
             raise InputError(
-                f"{where}: effects: unknown effect {name!r:.80}; known are {', '.join(known)}"
+                f"{where}: effects: unknown effect {name!r:.80}; known are {', '.join(known)}; "
+                "one of your own is known with --own and its file"
             )
         parameters = {} if values is None else values
         found.append(parse(known[name], parameters, where, key=f"effects.{name}"))
