@@ -58,6 +58,12 @@ def with_lag(reduced: Callable[..., Path]) -> Path:
     return reduced({"lag": {"share": 0.004}})
 
 
+@pytest.fixture
+def few_references(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests that do not ask what is chance: simulating takes most of the time."""
+    monkeypatch.setattr(stage, "REFERENCES", 6)
+
+
 def diagnosed(run: Path, **options: Any) -> dict[str, Any]:
     diagnose.run(run, diagnose.Config(**options), SYNC)
     found: dict[str, Any] = json.loads((run / "products" / "diagnosis.json").read_text())
@@ -122,6 +128,7 @@ def test_other_random_numbers_of_the_simulations_change_no_more_than_the_interva
         assert max(first[0], second[0]) <= min(first[1], second[1])
 
 
+@pytest.mark.usefixtures("few_references")
 def test_a_run_that_was_stopped_goes_on(
     with_lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -134,7 +141,7 @@ def test_a_run_that_was_stopped_goes_on(
 
     def stops(*args: Any) -> Any:
         made.append(1)
-        if len(made) == 10:
+        if len(made) == 4:
             raise KeyboardInterrupt
         return make(*args)
 
@@ -145,8 +152,8 @@ def test_a_run_that_was_stopped_goes_on(
         (run / "products" / "diagnosis.json").read_text()
     )
     assert diagnosed(run, only=only) == whole
-    # Ten begun, nine of them kept, of sixteen and what the search asked for.
-    assert len(made) == 17
+    # Four begun, three of them kept, of six.
+    assert len(made) == 7
     assert not list((run / ".partial").glob("diagnose-*"))
 
 
@@ -227,8 +234,6 @@ def test_an_effect_of_the_users_own_is_found(reduced: Callable[..., Path], tmp_p
     run = reduced()
     raw = run.parent / "acq"
     for path in sorted(raw.glob("vertical/*.fits")) + sorted(raw.glob("horizontal/*.fits")):
-        from astropy.io import fits
-
         with fits.open(path, mode="update", memmap=False) as hdus:
             frames = hdus[0].data.astype(float)
             frames[1::2] = (frames[1::2] - 500) * 1.01 + 500
@@ -240,8 +245,12 @@ def test_an_effect_of_the_users_own_is_found(reduced: Callable[..., Path], tmp_p
     assert found["causes"][0]["parameters"]["size"] == pytest.approx(0.01, rel=0.05)
 
 
+@pytest.mark.usefixtures("few_references")
 def test_an_effect_of_the_users_own_may_be_in_the_nominal_bench(
-    with_lag: Path, tmp_path: Path, make_effect_bench: Callable[..., Bench]
+    with_lag: Path,
+    tmp_path: Path,
+    make_effect_bench: Callable[..., Bench],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Its file is in any encoding that Python reads."""
     file = tmp_path / "flicker.py"
@@ -252,6 +261,9 @@ def test_an_effect_of_the_users_own_may_be_in_the_nominal_bench(
     line = ["diagnose", str(with_lag), "--nominal", str(nominal), "--effects", "row_noise"]
     line += ["--cluster", "sync", "--quiet"]
     assert invoke(line) == 2
+    told = capsys.readouterr().err
+    assert "unknown effect 'flicker'" in told
+    assert "--own" in told
     assert invoke([*line, "--own", str(file)]) == 0
     config = json.loads((with_lag / "diagnose" / "manifest.json").read_text())["config"]
     assert config["nominal"] == {"flicker": {"size": 0.01}}

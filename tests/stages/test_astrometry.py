@@ -2,7 +2,7 @@
 
 import shutil
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from pixcal.engine.run import Runtime
 from pixcal.kernels.optics import Geometry, phase
 from pixcal.model.acquisition import Detector as Declared
 from pixcal.model.errors import InputError, PlanError
+from pixcal.report.drawing import png
 from pixcal.stages import astrometry
 from pixcal.stages.astrometry import Config, error_map, simulation, stage
 from pixcal.stages.astrometry.detector import Detector, open_components
@@ -91,6 +92,14 @@ def added(a: dict[str, F64], b: dict[str, F64]) -> dict[str, F64]:
 
 MASKED = ((40, 60), (41, 60), (70, 20), (12, 100))
 SIGMA, SCATTER = 2e-4, 3e-3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _undrawn() -> Iterator[None]:
+    """Pictures take longer than what is tested here; `tests/report` looks at them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stage, "png", lambda figure: b"")
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -359,8 +368,11 @@ def test_the_same_bits_however_it_runs(case: Path, tmp_path: Path, runtime: Runt
     assert found[0] == found[1]
 
 
-def test_it_is_made_once_and_again_when_maps_change(case: Path, tmp_path: Path) -> None:
+def test_it_is_made_once_and_again_when_maps_change(
+    case: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = tmp_path / "run"
+    monkeypatch.setattr(stage, "png", png)
     shutil.copytree(case / "run", run)
     config = Config(stars=10, positions=2)
     first = astrometry.run(run, config, SYNC)
@@ -371,6 +383,7 @@ def test_it_is_made_once_and_again_when_maps_change(case: Path, tmp_path: Path) 
     assert manifest.stat().st_mtime_ns == made
     with Image.open(run / "products" / "astrometry.png") as picture:
         assert min(picture.size) > 1000
+    monkeypatch.undo()
     assert astrometry.run(run, replace(config, seed=1), SYNC).key != first.key
     make_run(tmp_path / "next", offsets(8, 1e-3), SIGMA)
     shutil.copyfile(

@@ -46,6 +46,12 @@ def fitted(bench: Any, write_reduced: Any, tmp_path_factory: pytest.TempPathFact
     return run
 
 
+@pytest.fixture(autouse=True)
+def _undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures, but those of `fitted`, take longer than what is tested here."""
+    monkeypatch.setattr(crests, "png", lambda figure: b"")
+
+
 def found(run: Path) -> dict[str, Any]:
     sets: dict[str, Any] = read_json(run / "products" / "crests.json")["sets"]
     return sets

@@ -357,6 +357,7 @@ def test_another_diagnosis_makes_another_page(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.usefixtures("without_figures")
 def test_one_set_gives_the_fringe_axis(tmp_path: Path) -> None:
     page = page_of(make_run(tmp_path / "run", (23, 40), ("diagonal",), masked=False))
     assert "δ along the fringe axis" in section(page, "maps")
