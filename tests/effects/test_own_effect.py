@@ -103,3 +103,14 @@ def test_a_name_that_is_taken_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'glow' already"):
         known_effects([GLOW, GLOW])
     assert known_effects() == effects()
+
+
+@pytest.mark.parametrize("written", ["", "domains = ()", 'domains = ("spatial",)'])
+def test_where_it_shows_must_be_said(tmp_path: Path, written: str) -> None:
+    file = tmp_path / "mine.py"
+    text = GLOW.read_text()
+    given = 'domains, strengths = ("space", "intensity"), ("rate",)'
+    assert given in text
+    file.write_text(text.replace(given, f'strengths = ("rate",)\n    {written}'))
+    with pytest.raises(InputError, match="domains is missing or not a tuple out of space, time"):
+        known_effects([file])

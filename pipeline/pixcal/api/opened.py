@@ -27,7 +27,7 @@ FORMATS = {
     "reduce": 1,
     "fit": 1,
     "allan": 1,
-    "diagnose": 3,
+    "diagnose": 4,
     "corrected": 1,
     "report": 1,
 }

@@ -10,7 +10,7 @@ import numpy as np
 
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError, PixcalError
-from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.effect import DOMAINS, Effect, Estimate, Stage
 
 STEPS = ("states", "detector", "light", "photons", "charge", "signal", "readout")
 """Steps of the exposure: each gives back what it is given first, changed."""
@@ -54,6 +54,9 @@ def _check(effect: type[Effect]) -> None:
     for what in ("strengths", "finer"):
         if unknown := set(getattr(effect, what)) - fields:
             raise InputError(f"{what} names {', '.join(sorted(unknown))}, which is no field")
+    domains = getattr(effect, "domains", None)
+    if not isinstance(domains, tuple) or not domains or not set(domains) <= set(DOMAINS):
+        raise InputError(f"domains is missing or not a tuple out of {', '.join(DOMAINS)}")
     for name in ("halo", "frames_back"):
         if not 0 <= getattr(default, name) <= MOST_AROUND:
             raise InputError(f"{name} is not from 0 to {MOST_AROUND}")

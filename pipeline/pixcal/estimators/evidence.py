@@ -18,6 +18,8 @@ T = TypeVar("T")
 
 STRIPE = 4
 """Rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves."""
+SATURATED = 1e-3
+"""Share of saturated samples from which flats tell nothing of levels and noise."""
 NO_SAMPLE = -(1 << 30)
 """Electrons that stand for a sample without weight."""
 
@@ -180,6 +182,7 @@ class Evidence:
     good : (y, x) bool
         Pixels without flags.
     saturation_adu : float
+        Declared, or the end of the samples' type.
     pitch_um, wavelength_nm, distance_mm : float
         Nominal bench.
     origin : (int, int)
@@ -232,6 +235,15 @@ class Evidence:
         sigma = np.sqrt(self.read_noise**2 + np.maximum(self.dark_rate, 0) * seconds)
         every = np.broadcast_to(sigma.astype(np.float32), rest.shape)
         return rest.astype(np.float32), every
+
+    @property
+    def ladder(self) -> tuple[Stack, ...]:
+        """Flats by exposure time, without those that are saturated in part."""
+        return tuple(s for s in self.of_kind("flat") if self._saturated(s) < SATURATED)
+
+    def _saturated(self, stack: Stack) -> float:
+        """Share of the samples of good pixels."""
+        return float((stack.adu[:, self.good] >= self.saturation_adu).mean())
 
     def of_kind(self, kind: str) -> tuple[Stack, ...]:
         """Stacks of a kind, by exposure time."""

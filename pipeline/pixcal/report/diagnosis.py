@@ -420,8 +420,10 @@ def _largest(found: Diagnosis) -> Iterator[Block]:
 
 
 def _candidates(found: Diagnosis) -> Iterator[Block]:
+    causes = {c["effect"] for c in found.facts["causes"]}
     tried = sorted(
-        found.facts["candidates"], key=lambda c: (-c["gap_closed"], -(c.get("sigmas") or 0.0))
+        (c for c in found.facts["candidates"] if c["effect"] not in causes),
+        key=lambda c: (-c["gap_closed"], -(c.get("sigmas") or 0.0)),
     )
     if not tried:
         return
@@ -449,10 +451,21 @@ def _looked_at(found: Diagnosis) -> Iterator[Block]:
     rows = [["window", _window(one["window"]), "; ".join(map(_window, other["windows"]))]]
     names = dict.fromkeys([*one["frames"], *other["frames"]])
     rows += [[n, _frames(one["frames"].get(n)), _frames(other["frames"].get(n))] for n in names]
-    yield Fold(
-        "Which frames were looked at",
-        [Table("Frames and windows", ["", "effects fitted on", "effects judged on"], rows)],
-    )
+    blocks: list[Table | Words] = [
+        Table("Frames and windows", ["", "effects fitted on", "effects judged on"], rows)
+    ]
+    if facts.get("shared"):
+        blocks.append(
+            Words(
+                f"Too short to part: {listed(facts['shared'])}; what these frames tell of an "
+                "effect was judged on the same frames."
+            )
+        )
+    blocks += [
+        Words(f"Left out: {_window(one['window'])}. {one['reason']}")
+        for one in facts.get("left_out", ())
+    ]
+    yield Fold("Which frames were looked at", blocks)
 
 
 def _window(ends: Sequence[Sequence[int]]) -> str:

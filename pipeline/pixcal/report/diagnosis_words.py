@@ -62,15 +62,15 @@ def answer(diagnosis: Diagnosis) -> str:
     count = differing(diagnosis)
     if verdict == "no gap":
         return (
-            f"No gap: on frames kept out of every fit, none of {looked} statistics differs from "
-            "the nominal simulation by more than chance."
+            f"No gap: on frames that no effect was fitted on, none of {looked} statistics differs "
+            "from the nominal simulation by more than chance."
         )
     where = main_domains(gap)
     if verdict == "unexplained":
         return (
             f"Unexplained: the data differ from the nominal simulation in {count} of {looked} "
             f"statistics{where}, and none of the {len(facts['candidates'])} effects that were "
-            "tried closes the gap."
+            "considered closes the gap."
         )
     causes = listed(effect_title(diagnosis, c["effect"]) for c in facts["causes"])
     one = len(facts["causes"]) == 1

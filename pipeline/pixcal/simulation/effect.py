@@ -37,6 +37,10 @@ SURE = 3.0
 """Errors that a strength must have to stand beside others of the same effect."""
 
 
+DOMAINS = ("space", "time", "intensity", "noise")
+"""Where an effect may show."""
+
+
 class Stage(IntEnum):
     """Where in the chain from fibre to file an effect acts; effects are applied in this order."""
 
@@ -154,7 +158,7 @@ class Effect:
         In a few words, for people.
     stage : Stage
     domains : tuple of str
-        Where it shows: ``space``, ``time``, ``intensity``, ``noise``.
+        Where it shows: one or more of `DOMAINS`, the first before all.
     strengths : tuple of str
         Fields that `scaled` multiplies: with all of them zero the effect does nothing.
     finer : tuple of str

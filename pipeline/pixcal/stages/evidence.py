@@ -70,7 +70,7 @@ def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice
         dark_rate=maps["dark_rate"].astype(float),
         flat=maps["flat"].astype(float),
         good=maps["mask"] == 0,
-        saturation_adu=float(acquisition.detector.saturation_adu or np.inf),
+        saturation_adu=min(map(ingested.saturation, ingested.arrays)),
         pitch_um=acquisition.detector.pitch_um,
         wavelength_nm=acquisition.optics.wavelength_nm,
         distance_mm=acquisition.optics.distance_mm,

@@ -59,7 +59,7 @@ from pixcal.storage.folder import INDEX
 
 STAGE = "report"
 FORMAT = 1
-SHOWN_STAGES = {"ingest": 1, "reduce": 1, "sweep": 3, "fit": 1, "allan": 1, "diagnose": 3}
+SHOWN_STAGES = {"ingest": 1, "reduce": 1, "sweep": 3, "fit": 1, "allan": 1, "diagnose": 4}
 """Stages and the formats of theirs that are understood."""
 FIGURE_BYTES = 192 << 20
 """Matplotlib, one figure and the page."""

@@ -38,7 +38,7 @@ def residual_by_level(look: Look) -> Curve:
 def photon_transfer(evidence: Evidence) -> Curve | None:
     """Variance of differences of flats over what shot and read noise give, for each level."""
     values = []
-    for stack in evidence.of_kind("flat"):
+    for stack in evidence.ladder:
         if len(stack.adu) < 2:
             continue
         light = (stack.adu - evidence.bias.astype(np.float32))[:, evidence.good] * np.float32(
@@ -55,7 +55,7 @@ def photon_transfer(evidence: Evidence) -> Curve | None:
 def flat_ladder(evidence: Evidence) -> Curve | None:
     """Electrons a second of each level, over their mean."""
     levels, times = [], []
-    for stack in evidence.of_kind("flat"):
+    for stack in evidence.ladder:
         if np.isfinite(stack.exptime_s) and stack.exptime_s > 0:
             light = (stack.adu.mean(axis=0) - evidence.bias)[evidence.good] * evidence.gain
             dark = evidence.dark_rate[evidence.good] * stack.exptime_s

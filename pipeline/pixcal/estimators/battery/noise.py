@@ -194,7 +194,7 @@ def read_noise(evidence: Evidence) -> Curve | None:
 def flat_neighbours(evidence: Evidence) -> Curve | None:
     """Correlation of differences of flats."""
     value: list[float] = []
-    for stack in evidence.of_kind("flat"):
+    for stack in evidence.ladder:
         if len(stack.adu) >= 4:
             light = (stack.adu - evidence.bias.astype(np.float32)) * evidence.good
             light = light / light.sum(axis=(1, 2), keepdims=True) * light[0].sum()

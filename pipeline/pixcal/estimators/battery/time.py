@@ -135,7 +135,8 @@ def allan_of_batches(look: Look) -> Curve | None:
 
 def _of_stacks(kind: str) -> Statistic:
     def measured(evidence: Evidence) -> Curve | None:
-        stacks = [s for s in evidence.of_kind(kind) if len(s.adu) >= MIN_FRAMES]
+        every = evidence.ladder if kind == "flat" else evidence.of_kind(kind)
+        stacks = [s for s in every if len(s.adu) >= MIN_FRAMES]
         if not stacks:
             return None
         values = []

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.evidence import Evidence, Stack
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.bench import (
     SCHEMA,
@@ -27,6 +27,7 @@ def bench_of(
     acquisition: Acquisition,
     tables: Mapping[str, Table],
     evidence: Evidence,
+    whole: tuple[int, int],
     sets: Sequence[SetTruth],
     dtypes: Mapping[str, np.dtype[Any]],
 ) -> Bench:
@@ -39,7 +40,6 @@ def bench_of(
     """
     top = _top(acquisition, evidence, sets, dtypes)
     d, o, shape = acquisition.detector, acquisition.optics, evidence.good.shape
-    window = next((f.window for f in evidence.fringes.values()), shape)
     listed = [f"fringes/{s.name}" for s in acquisition.frames.fringes]
     table = tables[listed[0]] if listed else next(iter(tables.values()))
     times = np.array(table["time_s"], float)
@@ -54,7 +54,7 @@ def bench_of(
             gain_e_per_adu=evidence.gain,
             read_noise_e=evidence.read_noise,
             name=d.name,
-            chip=(window[0], window[1]),
+            chip=whole,
             origin_px=evidence.origin,
             saturation_adu=top,
             full_well_e=d.full_well_e,
@@ -89,7 +89,7 @@ def recordings_of(
     bench: Bench, acquisition: Acquisition, tables: Mapping[str, Table], evidence: Evidence
 ) -> tuple[list[Recording], list[tuple[str, NDArray[np.intp]]]]:
     """Recordings, and where their frames are."""
-    start = _start(tables)
+    start, lamp = _start(tables), _lamp(evidence)
     listed = {f"fringes/{s.name}": n for n, s in enumerate(acquisition.frames.fringes)}
     recordings, places = [], []
     for name, table in tables.items():
@@ -101,7 +101,9 @@ def recordings_of(
             exposure = float(exposures[numbers[0]])
             exposure = 0.0 if np.isnan(exposure) else exposure
             period = float(np.median(np.diff(times[numbers]))) if len(numbers) > 1 else exposure
-            electrons = _level(evidence, exposure) if kind == "flat" else 1.0
+            electrons = 1.0
+            if kind == "flat":
+                electrons = lamp * exposure if lamp and exposure else _level(evidence, exposure)
             recordings.append(
                 Recording(
                     bench, kind, listed.get(name, n), name, name, len(numbers), exposure,
@@ -125,16 +127,30 @@ def _start(tables: Mapping[str, Table]) -> dict[str, float]:
     return found
 
 
+def _lamp(evidence: Evidence) -> float:
+    """Electrons a second of the flats, for unit response: a linear detector shows one rate.
+
+    Zero without flats of a known exposure time that are not saturated.
+    """
+    rates = [_light(evidence, s) / s.exptime_s for s in evidence.ladder if s.exptime_s > 0]
+    return max(float(np.mean(rates)), 0.0) if rates else 0.0
+
+
 def _level(evidence: Evidence, exposure: float) -> float:
-    """Electrons of the flats of an exposure time, for unit response, without dark current."""
+    """Electrons of the flats of an exposure time, for unit response."""
     for stack in evidence.of_kind("flat"):
         known = np.isfinite(stack.exptime_s)
         if (not known and exposure == 0) or (known and np.isclose(stack.exptime_s, exposure)):
-            good = evidence.good & (evidence.flat > 0)
-            light = (stack.adu.mean(axis=0) - evidence.bias)[good] * evidence.gain
-            light = light - evidence.dark_rate[good] * exposure
-            return float(np.median(light / evidence.flat[good]))
+            return _light(evidence, stack)
     return 1.0
+
+
+def _light(evidence: Evidence, stack: Stack) -> float:
+    """Electrons of a stack, for unit response, without dark current."""
+    good = evidence.good & (evidence.flat > 0)
+    light = (stack.adu.mean(axis=0) - evidence.bias)[good] * evidence.gain
+    light = light - evidence.dark_rate[good] * np.nan_to_num(stack.exptime_s)
+    return float(np.median(light / evidence.flat[good]))
 
 
 def _top(

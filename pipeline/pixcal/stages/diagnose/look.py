@@ -7,6 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.evidence import Evidence
@@ -19,7 +21,7 @@ from pixcal.stages.diagnose.deciding import missing_frames
 from pixcal.stages.diagnose.measuring import nominal_bench
 from pixcal.stages.diagnose.parts import Half, Raw, evidence_of, take
 from pixcal.stages.diagnose.trial import Curves, Window, averaged, looked_at
-from pixcal.stages.diagnose.windows import chosen_windows, split
+from pixcal.stages.diagnose.windows import Split, chosen_windows, split
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.artefact import read_json, require
@@ -27,6 +29,8 @@ from pixcal.storage.artefact import read_json, require
 EVIDENCE_BYTES = 34
 """Evidence in memory and the run that it is made of, for each sample of all fringe sets (measured,
 as the next two)."""
+CALIBRATION_BYTES = 12
+"""A sample of bias, dark or flat: as it was read, in the run made of it, and as a real number."""
 LOOK_BYTES = 50
 """What the statistics of one set need beside it, for each sample of the largest set."""
 ESTIMATE_BYTES = 130
@@ -95,31 +99,46 @@ def look_at(
     own = split(ingested.tables, pixels)
     _enough(own.test)
     largest, evidence = _samples(own.test, pixels)
-    need = EVIDENCE_BYTES * evidence + LOOK_BYTES * largest
+    calibration = (
+        CALIBRATION_BYTES
+        * pixels
+        * sum(len(frames) for name, frames in own.test.frames.items() if "/" not in name)
+    )
+    need = EVIDENCE_BYTES * evidence + LOOK_BYTES * largest + calibration
     estimates = ESTIMATE_BYTES * largest
-    for_estimates = make_plan("diagnose", estimates, EVIDENCE_BYTES * evidence, runtime)
+    held = EVIDENCE_BYTES * evidence + calibration
+    for_estimates = make_plan("diagnose", estimates, held, runtime)
     plan = make_plan("diagnose", need, 0, runtime)
     few = runtime.with_workers(for_estimates.workers)
     runtime = runtime.with_workers(plan.workers)
     dtypes = {name: array.dtype for name, array in ingested.arrays.items()}
     windows: list[Window] = []
+    left_out: list[dict[str, Any]] = []
     measured: list[Curves] = []
     signatures: tuple[type[Effect], ...] = ()
     seed: int | None = None
     for part in dict.fromkeys((first, *parts)):
         raws = [take(ingested, acquisition, h, part, reduction) for h in (own.learn, own.test)]
         seed = raws[0].checksum if seed is None else seed
-        halves = run_tasks(
-            partial(_evidence, run_dir, scratch, part, shape),
-            list(enumerate(raws)),
-            runtime.here,
-            label=f"window {len(windows) + 1}",
-        )
-        del raws
+        try:
+            halves = run_tasks(
+                partial(_evidence, run_dir, scratch, part, shape),
+                list(enumerate(raws)),
+                runtime.here,
+                label=f"window {len(windows) + len(left_out) + 1}",
+            )
+        except InputError as error:
+            # In a corner there may be no light; effects are fitted in the middle.
+            if part == first or len(left_out) == len(parts) - 1:
+                raise
+            left_out.append({"window": plain_part(part), "reason": str(error)})
+            continue
+        finally:
+            del raws
         if not windows:
             signatures = tuple(learnt(halves[0], few))
         bench = nominal_bench(
-            acquisition, ingested.tables, halves, (own.learn, own.test), reduction, dtypes
+            acquisition, ingested.tables, halves, (own.learn, own.test), shape, reduction, dtypes
         )
         assert seed is not None
         windows.append(Window(part, bench, own.learn, own.test, shape, seed))
@@ -134,9 +153,11 @@ def look_at(
             "shape": list(shape),
             "fitted_on": {"window": plain_part(first), "frames": _plain_half(own.learn)},
             "tried_on": {
-                "windows": [plain_part(p) for p in parts],
+                "windows": [plain_part(w.part) for w in windows if w.part in parts],
                 "frames": _plain_half(own.test),
             },
+            "left_out": left_out,
+            "shared": shared(own),
             "kinds": [kind for kind in ("bias", "dark", "flat") if kind in ingested.tables],
             "sets": {s.name: list(s.baseline_mm) for s in acquisition.frames.fringes},
             "missing_frames": missing_frames(
@@ -168,6 +189,15 @@ def _samples(half: Half, pixels: int) -> tuple[int, int]:
     counts = [len(frames) for name, frames in half.frames.items() if "/" in name]
     counts = counts or [sum(map(len, half.frames.values()))]
     return pixels * max(counts), pixels * sum(counts)
+
+
+def shared(own: Split) -> list[str]:
+    """Arrays too short to part: effects are fitted and tried on the same frames of them."""
+    return [
+        name
+        for name, frames in own.learn.frames.items()
+        if np.intersect1d(frames, own.test.frames[name]).size
+    ]
 
 
 def _enough(half: Half) -> None:

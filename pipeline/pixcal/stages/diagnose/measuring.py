@@ -33,6 +33,7 @@ def nominal_bench(
     tables: Mapping[str, Table],
     evidence: Sequence[Evidence],
     halves: Sequence[Half],
+    whole: tuple[int, int],
     reduction: reduce.Config,
     dtypes: Mapping[str, np.dtype[Any]],
 ) -> NominalBench:
@@ -47,6 +48,8 @@ def nominal_bench(
         Of the same pixels, e.g. two halves of the frames.
     halves : sequence of Half
         The frames of each.
+    whole : (int, int)
+        Rows and columns of the detector's window.
     reduction : reduce.Config
     dtypes : mapping
         Of the samples of each array.
@@ -79,7 +82,7 @@ def nominal_bench(
         dark_rate=np.maximum(_mean([_uncoupled(e.dark_rate) for e in evidence]), 0),
         mask=np.where(good, 0, 1).astype(np.uint8),
     )
-    bench = bench_of(acquisition, tables, one, sets, dtypes)
+    bench = bench_of(acquisition, tables, one, whole, sets, dtypes)
     recordings, places = recordings_of(bench, acquisition, tables, one)
     return NominalBench(
         acquisition,

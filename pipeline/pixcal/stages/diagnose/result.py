@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr
+from scipy.special import log_ndtr, ndtr
 
 from pixcal import __version__
 from pixcal.estimators.battery import DETECTOR, Curve, Key
@@ -20,6 +20,7 @@ from pixcal.estimators.gap import (
 )
 from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place
+from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.deciding import deciding
 from pixcal.stages.diagnose.search import Candidate, Found
 from pixcal.stages.diagnose.shrinkage import Shrinkage, Trial, differing, shrinkage
@@ -33,7 +34,6 @@ LEFT = 0.25
 """and share of any one statistic's that is off by more than"""
 STILL = 6.0
 """standard deviations: less can be the simulation of the effects themselves."""
-DOMAINS = ("space", "time", "intensity", "noise")
 ALWAYS = ("allan_of_batches", "offset_by_place", "residual_noise")
 """Statistics told in units of the bench even where nothing differs."""
 LEAST_CHANCE = 1e-12
@@ -87,11 +87,7 @@ def describe(
             "absolute": _absolute(found, final, by_key, reference),
             "places": list(places),
         },
-        "candidates": [
-            _candidate(c, found, data, where)
-            for c in found.candidates.values()
-            if c.name not in found.taken
-        ],
+        "candidates": [_candidate(c, found, data, where) for c in found.candidates.values()],
         "more_would_tell": (
             deciding(facts["missing_frames"])
             if verdict in ("unexplained", "partly explained")
@@ -156,7 +152,11 @@ def _cause(
     # a chance of at most e^-gain (Markov's inequality).
     own = estimate.significance * candidate.share
     log_both = max(float(log_ndtr(-own)) - max(gain, 0.0), -600.0)
-    chance = len(found.candidates) * candidate.ways * np.exp(log_both) * (1 - log_both)
+    chance = np.exp(log_both) * (1 - log_both)
+    if facts["shared"] and not facts["sets"]:
+        # Both parts hold the same frames: the second says nothing new.
+        chance = float(ndtr(-own))
+    chance *= len(found.candidates) * candidate.ways
     return {
         "effect": name,
         "title": effect.title,

@@ -311,6 +311,9 @@ class Search:
             if isinstance(fewer, str):
                 break
             candidates[least].reason = reason
+            for candidate in candidates.values():
+                if candidate.reason == looks_like(least):
+                    candidate.reason = f"what {least} does looks like it, and {least}: {reason}"
             taken.remove(least)
             del effects[least]
             current = fewer

@@ -40,7 +40,7 @@ from pixcal.storage.artefact import (
     write_json,
 )
 
-FORMAT = 3
+FORMAT = 4
 REFERENCES = 16
 """Simulations of the nominal bench."""
 LEARN_SEED = 900_000
@@ -163,14 +163,18 @@ def _diagnose(
     trials = Trials(look.windows, scratch, look.runtime, signatures, estimates, SCREEN)
     (nominal,) = trials.curves([base], REFERENCES, "nominal bench")
     if isinstance(nominal, str):
-        raise InputError(f"--nominal: {nominal}")
+        where = "--nominal" if base else f"{run_dir}: its nominal bench"
+        raise InputError(f"{where}: {nominal}")
     reference = Reference.of(nominal)
     data = reference.on_scale(look.measured)
 
     def again(on: Effects, names: Sequence[str]) -> dict[str, float]:
         """Significance of candidates on the first frames taken again with some effects."""
         window = look.first
-        evidence = window.evidence(window.learn, (*base, *on), LEARN_SEED, scratch)
+        try:
+            evidence = window.evidence(window.learn, (*base, *on), LEARN_SEED, scratch)
+        except InputError:
+            return {}  # These frames do not tell what the effects look like.
         found = _estimates(evidence, {n: kinds[n] for n in names}, look.few, "estimate again")
         return {n: e.significance for n, e in found.items() if isinstance(e, Estimate)}
 
