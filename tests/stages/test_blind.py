@@ -43,6 +43,7 @@ from pixcal.stages.blind.sitting import share
 from pixcal.stages.blind.strengths import STRONGEST, WAYS, Way
 from pixcal.stages.blind.table import as_markdown, write_between
 from pixcal.stages.diagnose import look
+from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
 from pixcal.storage.artefact import build, require, write_json
 
 SYNC = Runtime(cluster="sync")
@@ -476,7 +477,7 @@ def test_offsets_are_held_against_the_truth_in_bounds(
     reduce.run(run_dir, reduce.Config(), SYNC)
     causes = [] if named is None else [{"effect": named.effect, "parameters": named.parameters}]
     inputs = {"reduce": require(run_dir, "reduce", 1).key}
-    with build(run_dir, "diagnose", 3, {"own": [], "nominal": {}}, inputs) as made:
+    with build(run_dir, "diagnose", DIAGNOSIS_FORMAT, {"own": [], "nominal": {}}, inputs) as made:
         write_json(made.folder / "diagnosis.json", {"verdict": "explained", "causes": causes})
     correct.run(run_dir, correct.Config(), SYNC)
     found = offset_errors(

@@ -16,6 +16,7 @@ from pixcal.engine.run import Runtime
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.report import blocks as blocks_module
 from pixcal.stages import report
+from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
 from pixcal.storage.artefact import build, read_manifest, write_json
 from pixcal.storage.cube import create_group, write_array
 
@@ -212,7 +213,9 @@ def write_diagnose(run: Path, verdict: str = "explained", effects: tuple[str, ..
                 "domains": {"time": [1.0, 0.03]}},
     }  # fmt: skip
     inputs = {"reduce": read_manifest(run / "reduce").key}
-    with build(run, "diagnose", 3, {"effects": list(effects), "nominal": {}}, inputs) as made:
+    with build(
+        run, "diagnose", DIAGNOSIS_FORMAT, {"effects": list(effects), "nominal": {}}, inputs
+    ) as made:
         write_json(made.folder / "diagnosis.json", facts)
         write_json(made.folder / "curves.json", [curve])
 
