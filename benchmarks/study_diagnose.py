@@ -1,20 +1,20 @@
 """What the diagnosis claims by chance, and from which strength on it finds each effect.
 
-With nothing in it, every acquisition is of another detector, recorded, reduced and diagnosed as a
-user's would be. With effects, one bench is recorded and reduced; its nominal bench then plays the
-reality again and again, with other random numbers and one effect of some strength, and every step
-of the search is that of ``pixcal diagnose``. What is played goes to ``docs/diagnose/study.jsonl``,
-where an interrupted study goes on; tables and picture into the page.
+Every acquisition is of another detector, with nothing in it or one effect of some strength, and is
+recorded, reduced and diagnosed as a user's would be. What is played goes to
+``docs/diagnose/study.jsonl``, where an interrupted study goes on, as long as the code is the same;
+tables and picture into the page.
 """
 
 import argparse
+import hashlib
 import json
 import shutil
+import sys
 import tempfile
 from collections.abc import Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +24,19 @@ import yaml
 from scipy.special import ndtr
 from scipy.stats import binomtest, kstest
 
+import pixcal
 from pixcal.effects import effects, parse_effects
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.battery import battery
-from pixcal.estimators.battery.signature import signature_curve, signature_key
-from pixcal.estimators.gap import Reference, compare, flagged
+from pixcal.estimators.gap import compare, flagged
 from pixcal.model.bench import SCHEMA
-from pixcal.simulation.effect import Effect, Estimate
+from pixcal.model.config import to_plain
+from pixcal.simulation.effect import Effect
 from pixcal.stages import diagnose, ingest, reduce, simulate
 from pixcal.stages.blind.strengths import ways_of
-from pixcal.stages.diagnose.look import Look, look_at
-from pixcal.stages.diagnose.measuring import nominal_bench
-from pixcal.stages.diagnose.search import SCREEN, Candidate, Search, looks_like
+from pixcal.stages.diagnose.inquiry import REFERENCES, Inquiry, inquire
+from pixcal.stages.diagnose.search import looks_like
 from pixcal.stages.diagnose.shrinkage import differing, shrinkage
-from pixcal.stages.diagnose.stage import weakly_seen
-from pixcal.stages.diagnose.trial import Curves, Trials, Window, estimate, looked_at
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -47,12 +45,12 @@ OUT = Path(__file__).parents[1] / "docs" / "diagnose"
 HERE, PROCESSES = Runtime(cluster="sync"), Runtime(cluster="processes", quiet=False)
 STRENGTHS = (0.3, 1.0, 3.0, 10.0)
 """Times the threshold (`pixcal.stages.blind.strengths`), of each way in turn."""
-REFERENCES = 16
-"""Simulations of the nominal bench that an acquisition is held against."""
 FIRST_SEED, SEEDS_APART = 5000, 10
-REFITTED = tuple(n for n, kind in effects().items() if kind.undo is not Effect.undo)
-"""Effects that are undone on the measured maps before they are simulated: the bench is measured
-anew with each of them, where the others share one."""
+CODE = (
+    "effects", "estimators", "kernels", "model", "simulation", "stages/diagnose", "stages/fit",
+    "stages/reduce", "stages/blind/strengths.py", "stages/evidence.py", "stages/simulate.py",
+)  # fmt: skip
+"""Of pixcal, what a play depends on."""
 MOST_WRONG = 3
 """That are named in a table."""
 ALIKE = 0.05
@@ -90,38 +88,6 @@ def bench(ramp: bool, seed: int = 9000) -> dict[str, Any]:
     }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Stage:
-    """The bench, and what its simulations look like."""
-
-    look: Look
-    nominal: tuple[Curves, ...]
-    seen: list[dict[str, float]]
-    scratch: Path
-
-
-@lru_cache(maxsize=2)
-def set_up(folder: Path, ramp: bool, runtime: Runtime = HERE) -> Stage:
-    """Record, reduce and simulate the bench (once; processes that come later read what is left)."""
-    own = folder / ("ramp" if ramp else "random")
-    recorded, nominal, kept = own / "recorded", own / "run", own / "simulations"
-    if not recorded.exists():
-        kept.mkdir(parents=True)
-        record(bench(ramp), own, nominal)
-        recorded.touch()
-    scratch = Path(tempfile.mkdtemp(dir=own))
-    found = look_at(nominal, scratch, HERE)
-    trials = Trials(found.windows, kept, runtime)
-    (curves,) = trials.curves([()], REFERENCES, "nominal bench")
-    assert not isinstance(curves, str)
-    signatures = kept / "signatures.json"
-    if not signatures.exists():
-        work = partial(seen, found.first, scratch)
-        sizes = run_tasks(work, range(REFERENCES), runtime, label="estimates of a nominal bench")
-        signatures.write_text(json.dumps(sizes))
-    return Stage(found, tuple(curves), json.loads(signatures.read_text()), scratch)
-
-
 def record(bench: dict[str, Any], folder: Path, run: Path) -> None:
     """Take the frames of a bench, and reduce them."""
     (folder / "bench.yaml").write_text(yaml.safe_dump(bench))
@@ -129,13 +95,6 @@ def record(bench: dict[str, Any], folder: Path, run: Path) -> None:
     ingest.run(folder / "acq", run, ingest.Config(), HERE)
     reduce.run(run, reduce.Config(), HERE)
     shutil.rmtree(folder / "acq")
-
-
-def seen(window: Window, scratch: Path, seed: int) -> dict[str, float]:
-    """What the estimates of all effects see in a simulation of the nominal bench."""
-    evidence = window.evidence(window.test, (), seed, scratch)
-    found = {name: estimate(evidence, kind) for name, kind in effects().items()}
-    return {n: e.significance if isinstance(e, Estimate) else 0.0 for n, e in found.items()}
 
 
 def truth_of(name: str, strength: float, seed: int) -> tuple[Effect, ...]:
@@ -150,7 +109,17 @@ def play(folder: Path, case: tuple[str, float, int]) -> dict[str, Any]:
     """Play the reality once: name of an effect (or none), strength, seed."""
     name, strength, seed = case
     found = played_with(folder, name, strength, seed) if name else played_nominal(folder, seed)
-    return {"effect": name, "strength": strength, "seed": seed, **found}
+    return {"effect": name, "strength": strength, "seed": seed, "code": code(), **found}
+
+
+@cache
+def code() -> str:
+    """Checksum of the code that plays."""
+    root, found = Path(pixcal.__file__).parent, hashlib.sha256()
+    for part in CODE:
+        for file in sorted((root / part).rglob("*.py")) or [root / part]:
+            found.update(file.read_bytes())
+    return found.hexdigest()[:12]
 
 
 def played_nominal(folder: Path, seed: int) -> dict[str, Any]:
@@ -176,59 +145,20 @@ def played_nominal(folder: Path, seed: int) -> dict[str, Any]:
 
 
 def played_with(folder: Path, name: str, strength: float, seed: int) -> dict[str, Any]:
-    """The one bench with an effect."""
-    stage = set_up(folder, name in RAMPS)
-    window = stage.look.first
+    """A detector of its own with an effect, through all that the command does."""
     truth = truth_of(name, strength, seed)
-    learn, test = (
-        window.evidence(half, truth, seed, stage.scratch, fitted=False)
-        for half in (window.learn, window.test)
-    )
-    candidates = {}
-    for other, kind in effects().items():
-        one = estimate(learn, kind)
-        candidates[other] = (
-            Candidate(other, one)
-            if isinstance(one, Estimate)
-            else Candidate(other, None, str(one or "no evidence"))
-        )
-    signatures = weakly_seen(candidates, effects())
-    estimates = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
-    if name in REFITTED:
-        b = window.bench
-        own_bench = nominal_bench(
-            b.acquisition, b.tables, [learn, test], (window.learn, window.test), b.reduction,
-            b.dtypes,
-        )  # fmt: skip
-        window = replace(window, bench=own_bench)
-        trials = Trials(
-            (window,), Path(tempfile.mkdtemp(dir=folder)), HERE, signatures, estimates, SCREEN
-        )
-        (nominal,) = trials.curves([()], REFERENCES, "nominal bench")
-        assert not isinstance(nominal, str)
-        reference = Reference.of(nominal)
-    else:
-        scratch = Path(tempfile.mkdtemp(dir=folder))
-        trials = Trials((window,), scratch, HERE, signatures, estimates, SCREEN)
-        reference = Reference.of(
-            [
-                curves
-                | {
-                    signature_key(kind.name, kind.domains[0]): signature_curve(sizes[kind.name])
-                    for kind in signatures
-                }
-                for curves, sizes in zip(stage.nominal, stage.seen, strict=True)
-            ]
-        )
-    data = reference.on_scale(looked_at(test, signatures))
+    plain = bench(name in RAMPS, seed) | {"effects": {e.name: to_plain(e) for e in truth}}
+    with tempfile.TemporaryDirectory(dir=folder) as own:
+        record(plain, Path(own), Path(own, "run"))
+        scratch = Path(own, "scratch")
+        scratch.mkdir()
+        return marked(inquire(Path(own, "run"), effects(), (), scratch, HERE), name, truth)
 
-    def again(on: tuple[Effect, ...], names: Sequence[str]) -> dict[str, float]:
-        evidence = window.evidence(window.learn, on, seed + 1, trials.scratch)
-        found = {n: estimate(evidence, effects()[n]) for n in names}
-        return {n: e.significance for n, e in found.items() if isinstance(e, Estimate)}
 
-    search = Search(reference, data, trials.curves, again)
-    found = search.run(candidates)
+def marked(made: Inquiry, name: str, truth: tuple[Effect, ...]) -> dict[str, Any]:
+    """What was found, held against the truth."""
+    search, found, data = made.search, made.found, made.data
+    candidates = found.candidates
     before = compare(data, search.nominal.expected)
     own = candidates[name].estimate
     result: dict[str, Any] = {
@@ -242,13 +172,15 @@ def played_with(folder: Path, name: str, strength: float, seed: int) -> dict[str
         result["told"] = [1 - told.gap.total, *(1 - v for v in reversed(told.interval))]
         # Of what is random a few simulations differ more than fitted and true parameters do: of
         # both as many as of the nominal bench, and none moved by the errors of its parameters.
-        as_they_are = replace(trials, estimates={}, _made={})
+        as_they_are = replace(made.trials, estimates={}, _made={})
         for key, on in (("closed", found.final.effects), ("closed_by_truth", truth)):
             (curves,) = as_they_are.curves([on], REFERENCES, key)
             if not isinstance(curves, str):
                 trial = search.held_against(on, curves)
                 left = shrinkage(data, search.nominal, trial, where).gap.total
                 result[key] = 1 - left
+        result["parameters"] = [to_plain(e) for e in found.final.effects if e.name == name]
+        result["truth"] = [to_plain(e) for e in truth]
     if where := flagged(before):
         result["closed_by_wrong"], result["closed_by_alike"] = {}, {}
         for other, wrong in candidates.items():
@@ -443,7 +375,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=2, help="for each effect and strength")
     parser.add_argument("--effects", nargs="*", default=list(effects()), help="default: all")
     parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--work", type=Path, help="folder that keeps the bench, to go on faster")
     parser.add_argument("--publish", action="store_true", help="what was played, and no more")
     options = parser.parse_args()
     names = options.effects
@@ -460,24 +391,23 @@ def main() -> None:
     rng = np.random.default_rng(1)
     cases = [own[n] for own in rounds for n in rng.permutation(len(own))]
     options.out.mkdir(parents=True, exist_ok=True)
-    if options.work:
-        options.work.mkdir(parents=True, exist_ok=True)
     journal = options.out / "study.jsonl"
     played: list[dict[str, Any]] = []
     if journal.exists():
         # What an interrupted study has played is not played again.
         played = [json.loads(line) for line in journal.read_text().splitlines()]
+        others = [p for p in played if p.get("code") != code()]
+        played = [p for p in played if p.get("code") == code()]
+        if others:
+            print(f"{len(others)} plays of other code are left out", file=sys.stderr)
     known = {(p["effect"], p["strength"], p["seed"]) for p in played}
     pending = [case for case in cases if case not in known and not options.publish]
-    place = nullcontext(options.work) if options.work else tempfile.TemporaryDirectory()
-    with place as folder, journal.open("a") as lines:
+    with tempfile.TemporaryDirectory() as folder, journal.open("a") as lines:
 
         def noted(_: int, result: dict[str, Any]) -> None:
             played.append(result)
             print(json.dumps(result), file=lines, flush=True)
 
-        for ramp in {case[0] in RAMPS for case in pending if case[0]}:
-            set_up(Path(folder), ramp, PROCESSES)
         run_tasks(partial(play, Path(folder)), pending, PROCESSES, label="acquisitions", done=noted)
     publish(played, options.out)
 

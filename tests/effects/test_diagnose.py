@@ -22,7 +22,7 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.stages import correct, diagnose, fit, ingest, reduce, simulate
-from pixcal.stages.diagnose import stage, trial, windows
+from pixcal.stages.diagnose import inquiry, stage, trial, windows
 from pixcal.stages.diagnose.look import look_at
 from pixcal.stages.diagnose.windows import chosen_windows, split
 from pixcal_cli.main import invoke
@@ -63,7 +63,7 @@ def with_lag(reduced: Callable[..., Path]) -> Path:
 @pytest.fixture
 def few_references(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests that do not ask what is chance: simulating takes most of the time."""
-    monkeypatch.setattr(stage, "REFERENCES", 6)
+    monkeypatch.setattr(inquiry, "REFERENCES", 6)
 
 
 def diagnosed(run: Path, **options: Any) -> dict[str, Any]:

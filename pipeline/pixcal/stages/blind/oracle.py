@@ -20,10 +20,10 @@ from pixcal.simulation.effect import Effect
 from pixcal.stages import ingest, reduce
 from pixcal.stages.blind.cases import effects_of
 from pixcal.stages.blind.draw import Truth
+from pixcal.stages.diagnose.inquiry import REFERENCES
 from pixcal.stages.diagnose.look import look_at
 from pixcal.stages.diagnose.search import CONFIRM
 from pixcal.stages.diagnose.shrinkage import Trial, differing, shrinkage
-from pixcal.stages.diagnose.stage import REFERENCES
 from pixcal.stages.diagnose.trial import Trials
 from pixcal.storage.artefact import read_json
 

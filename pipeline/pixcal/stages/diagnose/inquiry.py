@@ -1,0 +1,178 @@
+"""A reduced run is looked at, its nominal bench simulated, and causes of the gap are searched."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.battery import Key
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.gap import Reference, compare, expect_nominal, expect_with
+from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect, Estimate
+from pixcal.stages.diagnose.look import Look, look_at, plain_part
+from pixcal.stages.diagnose.result import by_domain
+from pixcal.stages.diagnose.search import CONFIRM, SCREEN, SURE, Candidate, Found, Search
+from pixcal.stages.diagnose.trial import Effects, Trials, estimate
+from pixcal.stages.diagnose.windows import whole_of
+
+F64 = NDArray[np.float64]
+
+REFERENCES = 16
+"""Simulations of the nominal bench."""
+LEARN_SEED = 900_000
+CLEAR = 20.0
+"""Standard deviations from which an effect whose estimate is slow is left to the battery."""
+
+
+@dataclass(frozen=True)
+class Inquiry:
+    """A search, and all that it was made of.
+
+    Attributes
+    ----------
+    base : tuple of Effect
+        That the nominal bench has from the start.
+    look : Look
+    trials : Trials
+    reference : Reference
+    data : mapping
+        Curves of the data on the reference's scales.
+    search : Search
+    found : Found
+    """
+
+    base: Effects
+    look: Look
+    trials: Trials
+    reference: Reference
+    data: Mapping[Key, F64]
+    search: Search
+    found: Found
+
+
+def inquire(
+    run_dir: Path,
+    kinds: Mapping[str, type[Effect]],
+    base: Effects,
+    scratch: Path,
+    runtime: Runtime,
+) -> Inquiry:
+    """Look at a reduced run, simulate its nominal bench, and search for causes.
+
+    Parameters
+    ----------
+    run_dir : Path
+    kinds : mapping
+        The candidates by name.
+    base : tuple of Effect
+        That the nominal bench has from the start.
+    scratch : Path
+        Keeps simulations: an inquiry that was stopped goes on with them.
+    runtime : Runtime
+
+    Raises
+    ------
+    InputError
+        If the frames cannot be fitted or the nominal bench not be simulated.
+    """
+    candidates: dict[str, Candidate] = {}
+    signatures: tuple[type[Effect], ...] = ()
+
+    def learnt(evidence: Evidence, few: Runtime) -> tuple[type[Effect], ...]:
+        nonlocal signatures
+        candidates.update(_candidates(evidence, kinds, base, few))
+        signatures = weakly_seen(candidates, kinds)
+        return signatures
+
+    look = look_at(run_dir, scratch, runtime, learnt)
+    estimates = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
+    trials = Trials(look.windows, scratch, look.runtime, signatures, estimates, SCREEN)
+    (nominal,) = trials.curves([base], REFERENCES, "nominal bench")
+    if isinstance(nominal, str):
+        where = "--nominal" if base else f"{run_dir}: its nominal bench"
+        raise InputError(f"{where}: {nominal}")
+    reference = Reference.of(nominal)
+    data = reference.on_scale(look.measured)
+
+    def again(on: Effects, names: Sequence[str]) -> dict[str, float]:
+        """Significance of candidates on the first frames taken again with some effects."""
+        window = look.first
+        try:
+            evidence = window.evidence(window.learn, (*base, *on), LEARN_SEED, scratch)
+        except InputError:
+            return {}  # These frames do not tell what the effects look like.
+        found = _estimates(evidence, {n: kinds[n] for n in names}, look.few, "estimate again")
+        return {n: e.significance for n, e in found.items() if isinstance(e, Estimate)}
+
+    search = Search(
+        reference,
+        data,
+        lambda benches, seeds, label: trials.curves(
+            [(*base, *bench) for bench in benches], seeds, label
+        ),
+        again,
+    )
+    return Inquiry(base, look, trials, reference, data, search, search.run(candidates))
+
+
+def places(made: Inquiry) -> list[dict[str, Any]]:
+    """How far each window is off by itself, unless one is all there is."""
+    look, trials = made.look, made.trials
+    if len(look.windows) == 1 and look.windows[0].part == whole_of(look.windows[0].whole):
+        return []
+    places = []
+    for number, window in enumerate(look.windows):
+        own = Reference.of(trials.of_window(number, made.base, REFERENCES))
+        data = own.on_scale(look.each[number])
+        nominal = compare(data, expect_nominal(own))
+        final = nominal
+        if made.found.taken:
+            bench = (*made.base, *made.found.final.effects)
+            final = compare(data, expect_with(own, trials.of_window(number, bench, CONFIRM)))
+        places.append({"window": plain_part(window.part), "domains": by_domain(nominal, final)})
+    return places
+
+
+def _candidates(
+    evidence: Evidence, kinds: Mapping[str, type[Effect]], base: Effects, runtime: Runtime
+) -> dict[str, Candidate]:
+    there = {effect.name for effect in base}
+    tried = {name: kind for name, kind in kinds.items() if name not in there}
+    found = _estimates(evidence, tried, runtime, "estimate effects")
+    candidates = {}
+    for name, one in found.items():
+        if isinstance(one, Estimate):
+            candidates[name] = Candidate(name, one)
+        else:
+            reason = one or "the acquisition holds no frames that could tell"
+            candidates[name] = Candidate(name, None, reason)
+    return candidates
+
+
+def weakly_seen(
+    candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]]
+) -> tuple[type[Effect], ...]:
+    """Candidates that the frames they were fitted on show; slow ones if the battery may not."""
+    # By name: the order of candidates is none of curves.
+    return tuple(
+        kinds[name]
+        for name, candidate in sorted(candidates.items())
+        if candidate.estimate is not None
+        and candidate.estimate.significance >= SURE
+        and (kinds[name].quick or candidate.estimate.significance < CLEAR)
+    )
+
+
+def _estimates(
+    evidence: Evidence, kinds: Mapping[str, type[Effect]], runtime: Runtime, label: str
+) -> dict[str, Estimate | str | None]:
+    results = run_tasks(
+        partial(estimate, evidence), list(kinds.values()), runtime.here, label=label
+    )
+    return dict(zip(kinds, results, strict=True))
