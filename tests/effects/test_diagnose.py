@@ -12,6 +12,7 @@ import yaml
 from astropy.io import fits
 
 from pixcal.effects import effects, known_effects
+from pixcal.effects.hyperbolic_fringes import HyperbolicFringes
 from pixcal.effects.intra_pixel_response import IntraPixelResponse
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.effects.straylight import Straylight
@@ -411,7 +412,13 @@ def test_windows_that_are_tried_do_not_overlap(shape: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize(
-    "effect", [Straylight(share=0.05), IntraPixelResponse(), Nonlinearity(-0.03, 0.01)]
+    "effect",
+    [
+        Straylight(share=0.05),
+        IntraPixelResponse(),
+        Nonlinearity(-0.03, 0.01),
+        HyperbolicFringes((90.0, -100.0)),
+    ],
 )
 def test_what_an_effect_takes_from_the_fringes_is_not_taken_twice(
     effect: Effect, reduced: Callable[..., Path], tmp_path: Path
@@ -421,19 +428,21 @@ def test_what_an_effect_takes_from_the_fringes_is_not_taken_twice(
     run = reduced({effect.name: to_plain(effect)}, changes)
     window = look_at(run, tmp_path, SYNC).first
 
-    def seen(on: tuple[Effect, ...]) -> dict[str, tuple[float, float]]:
+    def seen(on: tuple[Effect, ...]) -> dict[str, tuple[float, float, float]]:
         evidence = window.evidence(window.test, on, 3, tmp_path)
         return {
             name: (
                 float(np.median(f.theta[0][f.good]) * f.g[:, 0].mean()),
                 float(np.median((np.hypot(*f.theta[1:]) / f.theta[0])[f.good])),
+                float(np.hypot(*f.k)),
             )
             for name, f in evidence.fringes.items()
         }
 
     without, again = seen(()), seen((effect,))
     assert len(again) == 2
-    for name, (light, contrast) in again.items():
+    for name, (light, contrast, k) in again.items():
+        assert k == pytest.approx(without[name][2], rel=5e-4)
         assert light == pytest.approx(without[name][0], rel=2e-3)
         assert contrast == pytest.approx(without[name][1], rel=2e-3)
 

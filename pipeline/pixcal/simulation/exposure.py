@@ -76,6 +76,10 @@ class Camera:
         for frame in frames:
             yield frame, chain.samples(frame)[keep]
 
+    def light(self, recording: Recording) -> LightMaps:
+        """Mean and fringe amplitude of a recording on these rows and those around, e-."""
+        return _Chain(self, recording).light
+
 
 class _Shot:
     """`pixcal.simulation.shot.Shot` of a chain, seen by the effect at a place in it."""

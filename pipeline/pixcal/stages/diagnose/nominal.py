@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.corrected import corrected_offsets, phase_change, straight_modes
+from pixcal.estimators.fringes import grid
 from pixcal.estimators.structure import Offsets, true_offsets
 from pixcal.estimators.wander import Wander
 from pixcal.kernels.crosstalk import filled
@@ -244,11 +245,11 @@ class NominalBench:
         bench = replace(self.bench, seed=seed, detector=detector)
         for effect in effects:
             effect.check(bench)
-        camera = Camera(
-            bench,
-            (0, bench.detector.shape[0]),
-            [self._drawn(effects if fitted else (), own_seed, undone), *effects],
-        )
+        rows = (0, bench.detector.shape[0])
+        measured = self._drawn(effects if fitted else (), own_seed, undone)
+        if fitted and effects:
+            measured = self._of_measured_k(measured, bench, effects)
+        camera = Camera(bench, rows, [measured, *effects])
         arrays = {
             name: np.empty((len(frames), *bench.detector.shape), self.dtypes[name])
             for name, frames in half.frames.items()
@@ -264,6 +265,28 @@ class NominalBench:
                     at = int(np.searchsorted(half.frames[name], numbers[frame]))
                     arrays[name][at] = samples
         return Raw(self.acquisition, arrays, select(self.tables, half), self.reduction)
+
+    def _of_measured_k(
+        self, measured: Measured, bench: Bench, effects: Sequence[Effect]
+    ) -> Measured:
+        """The bench whose fringe vectors are those that were measured when effects have acted."""
+        rows = (0, bench.detector.shape[0])
+        before, after = Camera(bench, rows, [measured]), Camera(bench, rows, [measured, *effects])
+        sets = list(measured.sets)
+        for recording in self.recordings:
+            if recording.kind == "fringes":
+                own = replace(recording, bench=bench)
+                one, other = (
+                    light.alpha_cos + 1j * light.alpha_sin
+                    for light in (before.light(own), after.light(own))
+                )
+                turn = other * one.conj()
+                y, x = grid(turn.shape)
+                dky = np.angle(np.sum(turn[1:] * turn[:-1].conj()))
+                dkx = np.angle(np.sum(turn[:, 1:] * turn[:, :-1].conj()))
+                n = recording.number
+                sets[n] = replace(sets[n], psi=sets[n].psi - (dkx * x + dky * y))
+        return replace(measured, sets=tuple(sets))
 
     def _drawn(self, effects: Sequence[Effect], seed: int, undone: "_Undone") -> Measured:
         """As measured, with offsets that can be true where the effects are what they are."""
