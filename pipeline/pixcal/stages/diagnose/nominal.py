@@ -285,7 +285,9 @@ class NominalBench:
                 dky = np.angle(np.sum(turn[1:] * turn[:-1].conj()))
                 dkx = np.angle(np.sum(turn[:, 1:] * turn[:, :-1].conj()))
                 n = recording.number
-                sets[n] = replace(sets[n], psi=sets[n].psi - (dkx * x + dky * y))
+                found, (kx, ky) = sets[n], sets[n].k
+                # Of offsets too, which the effects see as places.
+                sets[n] = replace(found, psi=found.psi - dkx * x - dky * y, k=(kx - dkx, ky - dky))
         return replace(measured, sets=tuple(sets))
 
     def _drawn(self, effects: Sequence[Effect], seed: int, undone: "_Undone") -> Measured:
