@@ -175,13 +175,14 @@ def _evidence(
     number, raw = item
     folder = scratch / f"data-{number}"
     try:
-        found = evidence_of(raw, folder, part, shape)
+        return evidence_of(raw, folder, part, shape)
     except InputError as error:
         which = ("first", "second")[number]
         reason = str(error).replace(f"{folder}: ", "")
         raise InputError(f"{run_dir}: the {which} half of its frames: {reason}") from error
-    shutil.rmtree(folder)
-    return found
+    finally:
+        # Stages would take what is left of one window for up to date in the next.
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _samples(half: Half, pixels: int) -> tuple[int, int]:
