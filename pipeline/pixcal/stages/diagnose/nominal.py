@@ -22,17 +22,13 @@ from pixcal.estimators.wander import Wander
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.bench import Bench, SimulatedDetector
+from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, FringeMaps, Stage
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import SEEDS_APART, Recording
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
-
-PHASES = 16
-"""Of a fringe that is undone sample by sample."""
-ACROSS = 9
-"""Pixels along the side of a frame whose level is undone."""
+from pixcal.stages.diagnose.undone import Undone
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -240,7 +236,7 @@ class NominalBench:
             If an effect and the bench do not go together.
         """
         own_seed = seed + SEEDS_APART * window
-        undone = _Undone(effects if fitted else (), self.bench.detector)
+        undone = Undone(effects if fitted else (), self.bench.detector)
         detector = replace(self.bench.detector, seed=own_seed)
         bench = replace(self.bench, seed=seed, detector=detector)
         for effect in effects:
@@ -290,7 +286,7 @@ class NominalBench:
                 sets[n] = replace(found, psi=found.psi - dkx * x - dky * y, k=(kx - dkx, ky - dky))
         return replace(measured, sets=tuple(sets))
 
-    def _drawn(self, effects: Sequence[Effect], seed: int, undone: "_Undone") -> Measured:
+    def _drawn(self, effects: Sequence[Effect], seed: int, undone: Undone) -> Measured:
         """As measured, with offsets that can be true where the effects are what they are."""
         if not self.fits:
             return self.measured
@@ -317,50 +313,6 @@ class NominalBench:
                 )
             )
         return replace(self.measured, maps=maps, sets=tuple(sets))
-
-
-@dataclass(frozen=True)
-class _Undone:
-    """Levels of light as they were before effects that are undone on samples, over those after."""
-
-    effects: Sequence[Effect]
-    detector: SimulatedDetector
-
-    def fringes(self, light: float, contrast: float) -> tuple[float, float]:
-        """Of the mean (e-) of fringes, and of their contrast.
-
-        As the fit finds them, whose weights let harmonics of the phase have a part in both.
-        """
-        cosine = np.cos(2 * np.pi * np.arange(PHASES) / PHASES)
-        measured = light * (1 + contrast * cosine)
-        samples = self._before(measured)
-        if samples is measured or not contrast > 0:
-            return 1.0, 1.0
-        weight = (np.maximum(measured, 0) + self.detector.read_noise_e**2 + 1) ** -0.5
-        design = np.stack([np.ones(PHASES), cosine], axis=1) * weight[:, None]
-        mean, amplitude = np.linalg.lstsq(design, samples * weight, rcond=None)[0]
-        return mean / light, amplitude / mean / contrast
-
-    def lamp(self, recordings: Sequence[Recording]) -> float:
-        """Of the lamp of the flats; of those below saturation, or all."""
-        d = self.detector
-        levels = np.array([r.electrons for r in recordings if r.kind == "flat" and r.electrons > 0])
-        if not levels.size:
-            return 1.0
-        below = levels < (d.top_adu - d.bias_adu) * d.gain_e_per_adu
-        levels = levels[below] if below.any() else levels
-        return float(np.mean(self._before(levels) / levels))
-
-    def _before(self, levels: F64) -> F64:
-        """Even frames of these levels (e-) without the effects."""
-        frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
-        found = start = np.asarray(frames, np.float32)
-        for effect in sorted(self.effects, key=lambda e: (e.stage, e.name), reverse=True):
-            undone = effect.undo_samples(found)
-            found = found if undone is None else undone
-        if found is start:
-            return levels
-        return np.asarray(found[:, ACROSS // 2, ACROSS // 2], float)
 
 
 def _middle(ratio: F64) -> float:
