@@ -163,6 +163,7 @@ def marked(made: Inquiry, name: str, truth: tuple[Effect, ...]) -> dict[str, Any
     own = candidates[name].estimate
     result: dict[str, Any] = {
         "taken": list(found.taken),
+        "alike": {taken: list(others) for taken, others in found.alike.items()},
         "gap": bool(flagged(before)),
         "sigmas": own.significance if own else None,
     }
@@ -306,6 +307,11 @@ def _table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     return "\n".join([lines[0], "|" + "---|" * len(header), *lines[1:]])
 
 
+def strangers(p: dict[str, Any]) -> list[str]:
+    """Effects claimed that were not there, and not said to look like the one that was."""
+    return [t for t in p["taken"] if t != p["effect"] and p["effect"] not in p["alike"].get(t, ())]
+
+
 def power_table(played: Sequence[dict[str, Any]]) -> str:
     """Share of acquisitions in which each effect was found, by its strength."""
     rows = []
@@ -318,7 +324,7 @@ def power_table(played: Sequence[dict[str, Any]]) -> str:
                 cells.append("-")
                 continue
             found = sum(name in p["taken"] for p in here)
-            others = sum(any(t != name for t in p["taken"]) for p in here)
+            others = sum(bool(strangers(p)) for p in here)
             sigmas = np.median([p["sigmas"] or 0.0 for p in here])
             cells.append(
                 f"{found}/{len(here)} ({sigmas:.1f} σ)" + (f", others {others}" if others else "")
@@ -350,8 +356,7 @@ def draw(played: Sequence[dict[str, Any]], file: Path) -> None:
             np.mean([name in p["taken"] for p in own if p["strength"] == s]) for s in STRENGTHS
         ]
         wrong = [
-            np.mean([any(t != name for t in p["taken"]) for p in own if p["strength"] == s])
-            for s in STRENGTHS
+            np.mean([bool(strangers(p)) for p in own if p["strength"] == s]) for s in STRENGTHS
         ]
         axis.semilogx(STRENGTHS, share, "o-", color="#2b6ca3", label="found")
         axis.semilogx(STRENGTHS, wrong, "x:", color="#b5482f", label="another claimed")

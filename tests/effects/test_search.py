@@ -145,13 +145,35 @@ def test_effects_that_no_unseen_frame_tells_apart_are_named_together() -> None:
 
 
 def test_an_effect_below_its_threshold_is_not_tried() -> None:
-    """Where nothing differs 4 standard deviations are asked for, where there is a gap 1.5."""
+    """Where nothing differs 4 standard deviations are asked for; where there is a gap 1.5 beside a
+    candidate that is sure, 1 beside others that are not."""
     found, _ = search({}, [candidate("left", 2 * NOISE, sigmas=3.9)])
     assert "3.9 sigma" in found.candidates["left"].reason
     assert found.candidates["left"].alone is None
-    found, _ = search({"left": 0.03}, [candidate("left", 0.03, sigmas=1.4)])
+    found, _ = search({"left": 0.03}, [candidate("left", 0.03, 1.4), candidate("right", 0.03, 4.1)])
     assert not found.taken
     assert "1.4 sigma" in found.candidates["left"].reason
+    found, _ = search({"left": 0.03}, [candidate("left", 0.03, 0.9), candidate("right", 0.03, 3.9)])
+    assert not found.taken
+    assert "0.9 sigma" in found.candidates["left"].reason
+
+
+def test_where_no_candidate_is_sure_the_fainter_one_may_be_the_cause() -> None:
+    found, _ = search({"left": 0.03}, [candidate("left", 0.03, 1.1), candidate("mimic", 0.03, 2.0)])
+    assert found.taken == ("left",)
+    assert not found.alike
+
+
+@pytest.mark.parametrize("sigmas", [50.0, 1.6])
+def test_one_that_does_as_well_alone_and_nothing_beside_is_not_told_apart(sigmas: float) -> None:
+    """However little its own estimate says of what the other brings about in it."""
+    twin = candidate("left", 0.03, sigmas)
+    object.__setattr__(twin, "name", "twin")
+    assert twin.estimate is not None
+    object.__setattr__(twin.estimate.effect, "name", "twin")
+    found, _ = search({"left": 0.03}, [candidate("left", 0.03, sigmas), twin], {})
+    (first,) = found.taken
+    assert found.alike == {first: ({"left": "twin", "twin": "left"}[first],)}
 
 
 def test_once_nothing_differs_only_what_is_sure_is_tried() -> None:

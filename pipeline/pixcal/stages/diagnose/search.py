@@ -32,7 +32,9 @@ F64 = NDArray[np.float64]
 SURE = 4.0
 """Standard deviations that the estimate on the first frames must have; or, where there is a gap,"""
 HINTED = 1.5
-"""as an effect that another looks like may have no more by itself."""
+"""as an effect that another looks like may have no more by itself;"""
+FAINT = 1.0
+"""where no candidate is sure: of some that are only hinted at, the true one may be the faintest."""
 LEAST_OF_HINTED = 12.0
 """By which an effect that the first frames only hint at must raise the log-likelihood of unseen
 data; others by `LEAST`."""
@@ -170,9 +172,10 @@ class Search:
             taken.append(best)
             candidates[best].share = shares[best]
             candidates[best].reason = ""
-            near = [n for n, g in gains.items() if n != best and g > gains[best] - LEAST]
+            # But for those that are taken beside it later.
+            enough = max(gains[best] - LEAST, LEAST)
+            alike[best] = tuple(n for n, g in gains.items() if n != best and g > enough)
             shares = self._unexplained(tuple(effects.values()), open_ones)
-            alike[best] = tuple(n for n in near if shares.get(n, 1.0) < 1 - EXPLAINED)
             for name in [n for n, share in shares.items() if share < 1 - EXPLAINED]:
                 candidates[name].reason = looks_like(best)
                 del open_ones[name], shares[name]
@@ -188,10 +191,17 @@ class Search:
 
         Where something differs, also those are tried that could not be told from another effect.
         """
-        least = HINTED if flagged(compare(self.data, current.expected)) else SURE
-        for name, candidate in list(open_ones.items()):
+        sizes = {
+            name: candidate.estimate.significance * shares.get(name, 1.0)
+            for name, candidate in open_ones.items()
+            if candidate.estimate is not None
+        }
+        least = SURE
+        if flagged(compare(self.data, current.expected)):
+            least = HINTED if max(sizes.values(), default=0.0) >= SURE else FAINT
+        for name, size in sizes.items():
+            candidate = open_ones[name]
             assert candidate.estimate is not None
-            size = candidate.estimate.significance * shares.get(name, 1.0)
             if size < least or candidate.estimate.effect.is_null:
                 beside = f" beside {' and '.join(e.name for e in current.effects)}"
                 candidate.reason = (
@@ -324,7 +334,7 @@ class Search:
                 candidates[name].alone = alone
         return Found(
             self.nominal, current, tuple(taken), without, candidates,
-            {n: alike[n] for n in taken if alike.get(n)},
+            {n: near for n in taken if (near := tuple(a for a in alike[n] if a not in taken))},
         )  # fmt: skip
 
     def _worthless(self, current: Trial, without: Mapping[str, Trial]) -> tuple[str, str] | None:
