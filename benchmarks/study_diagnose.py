@@ -283,6 +283,38 @@ def wrong_table(played: Sequence[dict[str, Any]]) -> str:
     return _table(("", ""), rows)
 
 
+def strengths_table(played: Sequence[dict[str, Any]]) -> str:
+    """Fitted strengths over the true ones: of those of several numbers, the part along the true.
+
+    Of couplings the sum of their shares.
+    """
+
+    def numbers(value: Any) -> np.ndarray:
+        if isinstance(value, list) and value and isinstance(value[0], dict):
+            value = sum(one["share"] for one in value)
+        return np.array(value or 0.0, float)
+
+    ratios: dict[tuple[str, str], list[float]] = {}
+    for p in played:
+        for fitted, true in zip(p.get("parameters", ()), p.get("truth", ()), strict=True):
+            for name in effects()[p["effect"]].strengths:
+                own, truth = (numbers(one.get(name)) for one in (fitted, true))
+                if np.any(truth):
+                    ratio = float((own * truth).sum() / (truth * truth).sum())
+                    ratios.setdefault((p["effect"], name), []).append(ratio)
+    rows = [
+        (
+            effect,
+            f"`{name}`",
+            len(own),
+            f"{np.median(own):.3f}",
+            f"{min(own):.2f} to {max(own):.2f}",
+        )
+        for (effect, name), own in sorted(ratios.items())
+    ]
+    return _table(("effect", "strength", "times found", "median", "from least to most"), rows)
+
+
 def _ks(chances: np.ndarray) -> str:
     """Of one acquisition many statistics hang together, so only the distance is told."""
     return f"{kstest(chances, 'uniform').statistic:.3f}"
@@ -426,6 +458,7 @@ def publish(played: Sequence[dict[str, Any]], out: Path) -> None:
         tables |= {
             "power": power_table(something),
             "shares": shares_table(something),
+            "strengths": strengths_table(something),
             "wrong": wrong_table(something),
         }
         draw(something, out / "power.png")
