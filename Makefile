@@ -80,7 +80,7 @@ fuzz: $(INSTALLED) ## bad input in thousands of cases, for docs/fuzz.md (under t
 torture: $(TOOLS) ## faults of all kinds done on purpose, for docs/torture.md (12 minutes)
 	$(BIN)/python benchmarks/torture.py
 
-study-diagnose: $(INSTALLED) ## what the diagnosis claims by chance, and from which strength on it finds each effect (an hour or two)
+study-diagnose: $(INSTALLED) ## what the diagnosis claims by chance, and from which strength on it finds each effect (hours)
 	$(BIN)/python benchmarks/study_diagnose.py
 
 effect-pictures: $(INSTALLED) ## what every effect does to the offsets, for docs/effects (two minutes)
