@@ -1,6 +1,7 @@
 """Sums over samples, against NumPy on copies of them."""
 
 import numpy as np
+import pytest
 
 from pixcal.kernels.sample_sums import (
     calm_residuals,
@@ -70,13 +71,18 @@ def test_moments_and_means_are_those_of_numpy() -> None:
     np.testing.assert_allclose(frame_means(values, good), values[:, good].mean(axis=1, dtype=float))
 
 
-def test_neighbours_are_rows_down_and_columns_to_either_side() -> None:
+@pytest.mark.parametrize("every", [1, 3])
+def test_neighbours_are_rows_down_and_columns_to_either_side(every: int) -> None:
     rng = np.random.default_rng(13)
     values = rng.standard_normal(SHAPE).astype(np.float32)
-    for dy, dx in ((0, 1), (1, 0), (2, 3), (1, -2)):
-        pairs = rng.random((SHAPE[1] - dy, SHAPE[2] - abs(dx))).astype(np.float32)
+    steps = np.array([(0, 1), (1, 0), (2, 3), (1, -2)])
+    pairs = rng.random((len(steps), *SHAPE[1:])).astype(np.float32)
+    found = neighbour_products(values, pairs, steps, every)
+    for own, weight, (dy, dx) in zip(found, pairs, steps, strict=True):
         moved = np.roll(values, (-dy, -dx), axis=(1, 2))
+        rows, columns = SHAPE[1] - dy, SHAPE[2] - abs(dx)
         first = max(0, -dx)
-        product = (values * moved)[:, : len(pairs), first : first + pairs.shape[1]]
-        expected = float((product * pairs).sum(dtype=float))
-        assert abs(neighbour_products(values, pairs, dy, dx) - expected) < 1e-3
+        product = (values * moved)[::every, :rows, first : first + columns]
+        expected = (product * weight[:rows, :columns]).sum(axis=(0, 2), dtype=float)
+        np.testing.assert_allclose(own[:rows], expected, atol=1e-4)
+        assert not own[rows:].any()

@@ -13,7 +13,8 @@ import pytest
 from PIL import Image
 
 from pixcal.estimators.battery import DETECTOR, battery
-from pixcal.estimators.battery.noise import OUTLIERS, STEPS
+from pixcal.estimators.battery.look import STEPS
+from pixcal.estimators.battery.noise import OUTLIERS
 from pixcal.report import blocks as blocks_module
 from pixcal.report import curve_places, diagnosis_words
 from pixcal.report import diagnosis_maps as maps

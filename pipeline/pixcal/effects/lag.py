@@ -1,5 +1,6 @@
 """Charge that stays behind in the pixel and comes out with later frames."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -12,6 +13,7 @@ from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.middle import middle
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
+from pixcal.kernels.transfer import left_behind
 from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
@@ -108,11 +110,10 @@ class Lag(Effect):
     def _left_behind(self, charge: F32, shot: Shot, frame: int) -> F32:
         """Electrons of a frame that stay: each by its own chance, so that noise stays white."""
         share = _shares(self, shot.bench.detector, shot.rows)
-        left = share * charge
-        if shot.bench.shot_noise:
-            chance = np.sqrt(np.maximum(left * (1 - share), 0))
-            left += chance * shot.normals(self.name, frame)
-        return np.asarray(np.clip(left, 0, np.maximum(charge, 0)))
+        left = np.empty_like(charge)
+        noise = shot.normals(self.name, frame) if shot.bench.shot_noise else np.zeros_like(charge)
+        left_behind(charge, share, noise, left)
+        return left
 
     def restored(self, frames: F32) -> F32:
         """Frames without lag, from those with it.
@@ -283,36 +284,55 @@ def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
     freedom = Freedom(fringes, HARMONICS)
     residual = freedom.left_over(freedom.of_good(fringes.residual))
     weighted = freedom.weight * residual
-    before = _square_of_shares(fringes, freedom, weighted, 1)
-    after = [_square_of_shares(fringes, freedom, weighted, -n) for n in range(1, CONTROLS + 1)]
+    steps = (1, *range(-1, -CONTROLS - 1, -1))
+    before, *after = _squares_of_shares(fringes, freedom, weighted, steps)
     value, error = np.array(after).T
     noise = np.hypot(before[1], np.sqrt((error**2).mean() / CONTROLS))
     scatter = value.std(ddof=1) * np.sqrt(1 + 1 / CONTROLS)
     return before[0] - float(value.mean()), float(max(noise, scatter))
 
 
-def _square_of_shares(
-    fringes: FringeEvidence, freedom: Freedom, weighted: F32, step: int
-) -> tuple[float, float]:
-    """Mean square of the pixels' shares of another frame, less that of their noise; its error.
+def _squares_of_shares(
+    fringes: FringeEvidence, freedom: Freedom, weighted: F32, steps: Sequence[int]
+) -> list[tuple[float, float]]:
+    """Mean square of the pixels' shares of the frame some steps before, less that of their noise;
+    its error.
 
     From the residuals (t, n), times their weights.
     """
-    other = np.roll(fringes.g, step, axis=0).T.astype(np.float32)
-    other[:, slice(0, step) if step > 0 else slice(step, None)] = 0
+    others = np.zeros((len(steps), *fringes.g.T.shape), np.float32)
+    for other, step in zip(others, steps, strict=True):
+        other[:] = np.roll(fringes.g, step, axis=0).T
+        other[:, slice(0, step) if step > 0 else slice(step, None)] = 0
     own, weight, theta = freedom.of_time, freedom.weight, fringes.theta[:, freedom.good]
-    k = len(own)
-    mixed = ((own[:, None] * other).reshape(3 * k, -1) @ weight).reshape(k, 3, -1)
+    count = weight.shape[1]
     upper = np.triu_indices(3)
-    squares = np.empty((3, 3, weight.shape[1]))
-    squares[upper] = squares[upper[::-1]] = (other[upper[0]] * other[upper[1]]) @ weight
-    # The other frame is a sum of the pixel's maps, less what the pixel can have of its own; of that
-    # nothing is left in the residuals.
-    along = np.einsum("kin,in->kn", mixed, theta)
-    taken = np.einsum("nij,jn->in", freedom.pixel_inverse, along)
-    information = np.einsum("in,ijn,jn->n", theta, squares, theta)
-    information -= np.einsum("kn,kn->n", along, taken)
-    right = np.einsum("in,in->n", theta, other @ weighted)
+
+    def summed(products: F32, samples: F32) -> F32:
+        """Sums over time (..., n) of products (..., t) with samples (t, n); all in one product."""
+        found = products.reshape(-1, products.shape[-1]) @ samples
+        return found.reshape(*products.shape[:-1], count)
+
+    mixed = summed(own[:, None] * others[:, None], weight)
+    rights = summed(others, weighted)
+    found = []
+    for own_squares, own_mixed, own_right in zip(
+        summed(others[:, upper[0]] * others[:, upper[1]], weight), mixed, rights, strict=True
+    ):
+        squares = np.empty((3, 3, count))
+        squares[upper] = squares[upper[::-1]] = own_squares
+        # The other frame is a sum of the pixel's maps, less what the pixel can have of its own; of
+        # that nothing is left in the residuals.
+        along = np.einsum("kin,in->kn", own_mixed, theta)
+        taken = np.einsum("nij,jn->in", freedom.pixel_inverse, along)
+        information = np.einsum("in,ijn,jn->n", theta, squares, theta)
+        information -= np.einsum("kn,kn->n", along, taken)
+        found.append(_mean_square(np.einsum("in,in->n", theta, own_right), information))
+    return found
+
+
+def _mean_square(right: F64, information: F64) -> tuple[float, float]:
+    """Mean square of shares less that of their noise, and its error, from normal equations (n,)."""
     told = information > 1e-3 * np.median(information)
     share, variance = right[told] / information[told], 1 / information[told]
     square = share**2 - variance

@@ -74,7 +74,10 @@ class RowNoise(Effect):
         rows = self.row_rms * rng.standard_normal(ny)
         columns = self.column_rms * rng.standard_normal(nx)
         rows += self.interlace_rms * rng.standard_normal() * (1 - 2 * (np.arange(ny) % 2))
-        return rows + self.flicker_rms * flicker(rng, ny), columns
+        # Last, so that without it the others are what they are with it.
+        if self.flicker_rms:
+            rows += self.flicker_rms * flicker(rng, ny)
+        return rows, columns
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:

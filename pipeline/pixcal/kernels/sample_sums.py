@@ -129,22 +129,36 @@ def frame_means(values: Any, good: Mask) -> F64:
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
-def neighbour_products(values: F32, pairs: F32, dy: int, dx: int) -> float:
-    """Sum of the products of samples (t, y, x) with those some rows and columns on.
+def neighbour_products(values: F32, pairs: F32, steps: NDArray[np.intp], every: int = 1) -> F64:
+    """Sums of the products of samples with those some rows and columns on, all steps in one sweep.
 
     Parameters
     ----------
     values : (t, y, x) float32
-    pairs : (y - dy, x - abs(dx)) float32
-        Weight of each pair, by the place of its first row and of its column that is further left.
-    dy, dx : int
+    pairs : (step, y, x) float32
+        Weight of each pair, by the place of its first row and of its column that is further left;
+        those that reach beyond the edges are not looked at.
+    steps : (step, 2) int
         Rows down, not negative, and columns to the right.
+    every : int
+        Only every so many frames.
+
+    Returns
+    -------
+    (step, y) float64
+        By the first row.
     """
-    total, here, there = 0.0, max(0, -dx), max(0, dx)
-    for t in range(values.shape[0]):
-        for y in range(pairs.shape[0]):
-            line = np.float32(0)
-            for x in range(pairs.shape[1]):
-                line += pairs[y, x] * values[t, y, here + x] * values[t, y + dy, there + x]
-            total += float(line)
-    return total
+    sums = np.zeros((len(steps), values.shape[1]))
+    for t in range(0, values.shape[0], every):
+        for n in range(len(steps)):
+            dy, dx = steps[n]
+            here, there, width = max(0, -dx), max(0, dx), values.shape[2] - abs(dx)
+            for y in range(values.shape[1] - dy):
+                weight = pairs[n, y]
+                one = values[t, y, here : here + width]
+                other = values[t, y + dy, there : there + width]
+                line = np.float32(0)
+                for x in range(width):
+                    line += weight[x] * one[x] * other[x]
+                sums[n, y] += np.float64(line)
+    return sums

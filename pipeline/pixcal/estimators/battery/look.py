@@ -1,5 +1,6 @@
 """One fringe set as the statistics look at it: residuals in units of their noise, maps, frames."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -9,7 +10,12 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.evidence import Evidence, FringeEvidence
 from pixcal.estimators.structure import clipped, flattened, smooth_surface
-from pixcal.kernels.sample_sums import calm_residuals, level_sums, pixel_moments
+from pixcal.kernels.sample_sums import (
+    calm_residuals,
+    level_sums,
+    neighbour_products,
+    pixel_moments,
+)
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -76,6 +82,16 @@ class Look:
         second, fourth = pixel_moments(self.residual)
         return second, fourth
 
+    @property
+    def thinned(self) -> int:
+        """One of so many frames is enough for statistics of pairs of pixels."""
+        return max(1, len(self.residual) // MOST)
+
+    @cached_property
+    def neighbours(self) -> tuple[F64, F64]:
+        """Products of residuals over their noise and those of neighbours (`neighbour_sums`)."""
+        return neighbour_sums(self.residual, self.good, STEPS, self.thinned)
+
     @cached_property
     def remainders(self) -> NDArray[np.intp] | None:
         """How often codes of good pixels have each remainder on division by `CODES`.
@@ -135,6 +151,30 @@ CODES = 64
 """Codes whose remainders are told apart, a power of two."""
 CELLS = 4
 """Cells of the window along each side."""
+STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4), (4, 0))
+"""Rows and columns to a neighbour."""
+MOST = 120
+"""Frames for statistics of pairs of pixels."""
+
+
+def neighbour_sums(
+    values: F32, good: Mask, steps: Sequence[tuple[int, int]], every: int = 1
+) -> tuple[F64, F64]:
+    """Products of samples (t, y, x) with those of neighbours, where both pixels are good.
+
+    Returns
+    -------
+    sums, count : (step, y) float64
+        By the row of the first pixel, and of how many pairs.
+    """
+    ny, nx = good.shape
+    pairs = np.zeros((len(steps), ny, nx), np.float32)
+    for own, (dy, dx) in zip(pairs, steps, strict=True):
+        here = (slice(0, ny - dy), slice(max(0, -dx), nx - max(0, dx)))
+        there = (slice(dy, ny), slice(max(0, dx), nx + min(0, dx)))
+        own[: ny - dy, : nx - abs(dx)] = good[here] & good[there]
+    sums = neighbour_products(values, pairs, np.array(steps), every)
+    return sums, pairs.sum(axis=2, dtype=float) * len(range(0, len(values), every))
 
 
 def by_cell(values: F64, good: Mask) -> F64 | None:

@@ -4,17 +4,23 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from pixcal.estimators.battery import Curve, Statistic, statistic
-from pixcal.estimators.battery.look import CELLS, F32, F64, LEVELS, Look, Mask, by_cell
+from pixcal.estimators.battery.look import (
+    CELLS,
+    F32,
+    F64,
+    LEVELS,
+    STEPS,
+    Look,
+    Mask,
+    by_cell,
+    neighbour_sums,
+)
 from pixcal.estimators.evidence import Evidence
-from pixcal.kernels.sample_sums import count_beyond, neighbour_products
+from pixcal.kernels.sample_sums import count_beyond
 
-STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4), (4, 0))
-"""Rows and columns to a neighbour."""
 OUTLIERS = (5.0, 7.0, 10.0)
 LEAST_DARKS = 5
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
-MOST = 120
-"""Frames for statistics of pairs of pixels."""
 
 
 @statistic("noise", "variance of the residuals by level", x="bin of level", power=True)
@@ -48,48 +54,37 @@ def variance_by_time(look: Look) -> Curve:
 @statistic("noise", "correlation of neighbours", x="neighbour")
 def neighbours(look: Look) -> Curve:
     """Correlation of the residuals of pixels some rows and columns apart."""
-    rest = look.residual[:: max(1, len(look.residual) // MOST)]
-    value = [_correlation(rest, look.good, step) for step in STEPS]
-    return Curve(np.arange(len(STEPS), dtype=float), np.array(value))
+    sums, count = look.neighbours
+    return Curve(np.arange(len(STEPS), dtype=float), _mean_product(sums, count))
 
 
 @statistic("noise", "correlation of neighbours by row", x="row of four, down then right")
 def neighbours_by_row(look: Look) -> Curve:
     """Correlation with the pixel below and to the right, for each row of four."""
-    rest = look.residual[:: max(1, len(look.residual) // MOST)]
-    rows = np.arange(look.good.shape[0])[:, None] + look.found.origin[0]
-    value = [
-        _correlation(rest, look.good & (rows % 4 == row), step, look.good)
-        for step in ((1, 0), (0, 1))
-        for row in range(4)
-    ]
-    value = list(np.array(value) - np.repeat(np.reshape(value, (2, 4)).mean(axis=1), 4))
-    return Curve(np.arange(8.0), np.array(value))
+    sums, count = (of[[STEPS.index((1, 0)), STEPS.index((0, 1))]] for of in look.neighbours)
+    row = (np.arange(look.good.shape[0]) + look.found.origin[0]) % 4
+    value = np.stack(
+        [_mean_product(sums[:, row == n], count[:, row == n]) for n in range(4)], axis=1
+    )
+    return Curve(np.arange(8.0), (value - value.mean(axis=1, keepdims=True)).ravel())
 
 
 @statistic("noise", "correlation of neighbours, bright less dark", x="neighbour")
 def neighbours_by_level(look: Look) -> Curve:
     """Covariance over shot noise in bright samples less that in dark ones."""
-    keep = slice(None, None, max(1, len(look.residual) // MOST))
+    keep = slice(None, None, look.thinned)
     rest, model = look.residual[keep], look.found.model[keep]
     bright = (model > np.median(model[::4, look.good])).astype(np.float32)
-    parts = (rest * bright, rest * (1 - bright))
-    value = [
-        2 * (_correlation(parts[0], look.good, step) - _correlation(parts[1], look.good, step))
-        for step in STEPS[:4]
-    ]
-    return Curve(np.arange(4.0), np.array(value))
+    one, other = (
+        _mean_product(*neighbour_sums(rest * part, look.good, STEPS[:4]))
+        for part in (bright, 1 - bright)
+    )
+    return Curve(np.arange(4.0), 2 * (one - other))
 
 
-def _correlation(rest: F32, good: Mask, step: tuple[int, int], other: Mask | None = None) -> float:
-    """Mean product (t, y, x) of pixels and their neighbours that are both good."""
-    dy, dx = step
-    ny, nx = good.shape
-    here = (slice(0, ny - dy), slice(max(0, -dx), nx - max(0, dx)))
-    there = (slice(dy, ny), slice(max(0, dx), nx + min(0, dx)))
-    pairs = good[here] & (good if other is None else other)[there]
-    total = neighbour_products(rest, pairs.astype(np.float32), dy, dx)
-    return float(total) / max(len(rest) * int(pairs.sum()), 1)
+def _mean_product(sums: F64, count: F64) -> F64:
+    """Mean (step,) of sums by rows and their numbers of pairs (step, y)."""
+    return np.asarray(sums.sum(axis=1) / np.maximum(count.sum(axis=1), 1))
 
 
 def _line_power(rest: F32, good: Mask) -> F64:
@@ -200,7 +195,8 @@ def flat_neighbours(evidence: Evidence) -> Curve | None:
             light = light / light.sum(axis=(1, 2), keepdims=True) * light[0].sum()
             steps = _calm(np.asarray(light[1::2] - light[:-1:2], np.float32), evidence.good)
             square = float((steps[:, evidence.good] ** 2).mean())
-            value += [_correlation(steps, evidence.good, s) / square for s in STEPS[:4]]
+            sums = neighbour_sums(steps, evidence.good, STEPS[:4])
+            value += list(_mean_product(*sums) / square)
     return Curve(np.arange(len(value), dtype=float), np.array(value)) if value else None
 
 

@@ -1,0 +1,37 @@
+"""Charge that stays behind: binomial, and never more than there is."""
+
+import numpy as np
+import pytest
+
+from pixcal.kernels.transfer import left_behind
+
+SHAPE = (211, 307)
+
+
+def stays(charge: float, share: float, seed: int | None = 0) -> np.ndarray:
+    normal = np.zeros(SHAPE)
+    if seed is not None:
+        normal = np.random.default_rng(seed).standard_normal(SHAPE)
+    out = np.full(SHAPE, np.nan, np.float32)
+    full = (np.full(SHAPE, value, np.float32) for value in (charge, share))
+    left_behind(*full, normal.astype(np.float32), out)
+    return out
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.5])
+def test_mean_and_variance_are_binomial(share: float) -> None:
+    charge = 1e4
+    found, variance = stays(charge, share), charge * share * (1 - share)
+    assert found.mean() == pytest.approx(charge * share, abs=5 * np.sqrt(variance / found.size))
+    assert found.var() == pytest.approx(variance, rel=5 * np.sqrt(2 / found.size), abs=1e-9)
+
+
+def test_without_noise_it_is_the_share() -> None:
+    np.testing.assert_allclose(stays(5000.0, 0.02, None), 100.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("charge", [-3.0, 0.0, 0.5, 3.0])
+def test_no_more_stays_than_there_is(charge: float) -> None:
+    found = stays(charge, 0.4)
+    assert found.min() >= 0
+    assert found.max() <= max(charge, 0.0)
