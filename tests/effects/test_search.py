@@ -78,7 +78,7 @@ REFERENCE = Reference.of([curves((), seed) for seed in range(16)])
 
 
 def simulate(
-    benches: Sequence[Sequence[Effect]], seeds: int, _: str
+    benches: Sequence[Sequence[Effect]], seeds: int, _: str, asked: Sequence[str]
 ) -> list[list[dict[Key, Curve]] | str]:
     return [
         "not on this bench"
@@ -180,10 +180,10 @@ def test_once_nothing_differs_only_what_is_sure_is_tried() -> None:
     tried: list[frozenset[str]] = []
 
     def noted(
-        benches: Sequence[Sequence[Effect]], seeds: int, label: str
+        benches: Sequence[Sequence[Effect]], seeds: int, label: str, asked: Sequence[str]
     ) -> list[list[dict[Key, Curve]] | str]:
         tried.extend(frozenset(e.label for e in b if isinstance(e, Toy)) for b in benches)
-        return simulate(benches, seeds, label)
+        return simulate(benches, seeds, label, asked)
 
     def sought(sigmas: float, mimicked: float) -> Found:
         tried.clear()
@@ -199,6 +199,30 @@ def test_once_nothing_differs_only_what_is_sure_is_tried() -> None:
         assert found.taken == ("left",)
         assert frozenset({"left", "right"}) not in tried
         assert "3.0 sigma beside left" in found.candidates["right"].reason
+
+
+def test_what_will_be_estimated_again_is_asked_for_when_a_bench_is_confirmed() -> None:
+    """So that both can be done side by side."""
+    asked: list[tuple[tuple[Effect, ...], tuple[str, ...]]] = []
+    estimated: list[tuple[tuple[Effect, ...], tuple[str, ...]]] = []
+
+    def noted(
+        benches: Sequence[Sequence[Effect]], seeds: int, label: str, names: Sequence[str]
+    ) -> list[list[dict[Key, Curve]] | str]:
+        if names:
+            asked.append((tuple(benches[0]), tuple(names)))
+        return simulate(benches, seeds, label, names)
+
+    def estimates(effects: tuple[Effect, ...], names: Sequence[str]) -> dict[str, float]:
+        estimated.append((effects, tuple(names)))
+        return {}
+
+    data = REFERENCE.on_scale(curves((), 500, {"left": 0.03, "right": 0.02}))
+    made = [candidate("left", 0.03), candidate("right", 0.02), candidate("little", 0.02)]
+    found = Search(REFERENCE, data, noted, estimates).run({c.name: c for c in made})
+    assert set(found.taken) == {"left", "right"}
+    assert len(estimated) == 2
+    assert asked == estimated
 
 
 def test_an_effect_that_is_only_hinted_at_passes_a_higher_mark() -> None:
@@ -248,12 +272,12 @@ def test_each_cause_is_weighed_alone_by_as_many_simulations_as_all_together() ->
     benches: dict[frozenset[str], int] = {}
 
     def noted(
-        wanted: Sequence[Sequence[Effect]], seeds: int, label: str
+        wanted: Sequence[Sequence[Effect]], seeds: int, label: str, asked: Sequence[str]
     ) -> list[list[dict[Key, Curve]] | str]:
         for bench in wanted:
             name = frozenset(e.label for e in bench if isinstance(e, Toy))
             benches[name] = max(benches.get(name, 0), seeds)
-        return simulate(wanted, seeds, label)
+        return simulate(wanted, seeds, label, asked)
 
     sizes = {"left": 0.03, "right": 0.02, "little": 0.03}
     data = REFERENCE.on_scale(curves((), 500, sizes))
@@ -269,7 +293,7 @@ def test_what_opens_elsewhere_widens_the_interval_of_what_is_left() -> None:
     """A stand-in that does what the data do not show."""
     data = REFERENCE.on_scale(curves((), 500, {"left": 0.03}))
     benches = [(candidate("mimic", 0.03).estimate.effect,)]  # type: ignore[union-attr]
-    (made,) = simulate(benches, CONFIRM, "")
+    (made,) = simulate(benches, CONFIRM, "", ())
     assert not isinstance(made, str)
     tried = Search(REFERENCE, data, simulate, lambda *_: {})
     trial = tried.held_against(benches[0], made)
@@ -285,11 +309,11 @@ def test_where_fewer_effects_are_refused_all_stay(monkeypatch: pytest.MonkeyPatc
     plain = simulate
 
     def fails(
-        benches: Sequence[Sequence[Effect]], seeds: int, label: str
+        benches: Sequence[Sequence[Effect]], seeds: int, label: str, asked: Sequence[str]
     ) -> list[list[dict[Key, Curve]] | str]:
         return [
             "not by itself" if [e.name for e in bench] == ["right"] and seeds > SCREEN else made
-            for bench, made in zip(benches, plain(benches, seeds, label), strict=True)
+            for bench, made in zip(benches, plain(benches, seeds, label, asked), strict=True)
         ]
 
     monkeypatch.setitem(globals(), "simulate", fails)
@@ -332,11 +356,11 @@ def test_a_bench_that_fails_only_when_confirmed_costs_its_candidate(
     plain = simulate
 
     def fails(
-        benches: Sequence[Sequence[Effect]], seeds: int, label: str
+        benches: Sequence[Sequence[Effect]], seeds: int, label: str, asked: Sequence[str]
     ) -> list[list[dict[Key, Curve]] | str]:
         return [
             "no light left" if seeds > 3 and any(e.name == "left" for e in bench) else made
-            for bench, made in zip(benches, plain(benches, seeds, label), strict=True)
+            for bench, made in zip(benches, plain(benches, seeds, label, asked), strict=True)
         ]
 
     monkeypatch.setitem(globals(), "simulate", fails)

@@ -53,3 +53,17 @@ def test_every_process_has_an_interpreter_of_its_own() -> None:
     runtime = Runtime("processes", 4, 2 * BASE_BYTES + 3 * MIB)
     assert make_plan("it", MIB, MIB, runtime).workers == 1
     assert make_plan("it", MIB, MIB, Runtime("threads", 4, runtime.memory)).workers == 4
+
+
+def test_fewer_workers_than_asked_for_are_told_once(capsys: pytest.CaptureFixture[str]) -> None:
+    runtime = Runtime("processes", 3, 2 * BASE_BYTES + 3 * MIB, quiet=False)
+    for _ in range(2):
+        assert make_plan("half of it", MIB, MIB, runtime).workers == 1
+    told = capsys.readouterr().err
+    assert told == (
+        f"half of it: 1 of 3 workers in the {2 * BASE_BYTES // MIB + 3} MiB of --memory; "
+        f"{4 * BASE_BYTES // MIB + 4} MiB for all\n"
+    )
+    make_plan("the other half", MIB, MIB, Runtime("processes", 3, runtime.memory))
+    make_plan("all of it", MIB, MIB, Runtime("threads", 3, runtime.memory, quiet=False))
+    assert not capsys.readouterr().err

@@ -73,3 +73,19 @@ def test_nothing_is_made_twice(tmp_path: Path, made: list[Any]) -> None:
     assert mean["lines", "detector"].value == pytest.approx([5.0])
     (apart,) = one.of_window(1, (LAG, ROWS), 1)
     assert apart["lines", "detector"].value == pytest.approx([10.0])
+
+
+def test_what_is_done_beside_is_done_once_and_only_if_any_is_made(
+    tmp_path: Path, made: list[Any]
+) -> None:
+    one, times = trials(tmp_path), list[int]()
+    plain = trials(tmp_path / "plain").curves([(ROWS,)], 5, "test")
+    made.clear()
+    found = one.curves([(ROWS,)], 5, "test", lambda: times.append(len(made)))
+    again = one.curves([(ROWS,)], 5, "test", lambda: times.append(len(made)))
+    assert times == [0]
+    assert len(made) == 5
+    np.testing.assert_equal(
+        *([[c["lines", "detector"].value for c in f] for (f,) in (plain, found)])
+    )  # type: ignore[index]
+    assert again == found

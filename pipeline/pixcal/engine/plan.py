@@ -1,6 +1,8 @@
 """Plan memory in whole numbers before anything is read."""
 
+import sys
 from dataclasses import dataclass
+from functools import cache
 
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import PlanError
@@ -42,8 +44,8 @@ class Plan:
 def make_plan(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtime) -> Plan:
     """Choose the number of workers so that the work fits the memory allowed.
 
-    On a Dask cluster the tasks must fit the memory limits of its workers; ``--memory`` holds for
-    this process alone.
+    Fewer than asked for are told on stderr. On a Dask cluster the tasks must fit the memory limits
+    of its workers; ``--memory`` holds for this process alone.
 
     Raises
     ------
@@ -62,7 +64,19 @@ def make_plan(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtim
     if plan.total > runtime.memory:
         need, have = plan.total / 2**20, runtime.memory / 2**20
         raise PlanError(f"--memory: {what} needs {need:.0f} MiB, {have:.0f} MiB are allowed")
+    if workers < runtime.n_workers and not runtime.quiet:
+        all_of_them = Plan(bytes_per_task, shared_bytes, runtime.n_workers).total
+        _tell(
+            f"{what}: {workers} of {runtime.n_workers} workers in the {runtime.memory >> 20} MiB "
+            f"of --memory; {-(-all_of_them >> 20)} MiB for all"
+        )
     return plan
+
+
+@cache
+def _tell(note: str) -> None:
+    """On stderr, once."""
+    print(note, file=sys.stderr)
 
 
 def _plan_on_cluster(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtime) -> Plan:

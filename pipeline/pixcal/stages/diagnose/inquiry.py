@@ -18,7 +18,7 @@ from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.look import Look, look_at, plain_part
 from pixcal.stages.diagnose.result import by_domain
 from pixcal.stages.diagnose.search import CONFIRM, SCREEN, SURE, Candidate, Found, Search
-from pixcal.stages.diagnose.trial import Effects, Trials, estimate
+from pixcal.stages.diagnose.trial import Curves, Effects, Trials, estimate
 from pixcal.stages.diagnose.windows import whole_of
 
 F64 = NDArray[np.float64]
@@ -100,24 +100,37 @@ def inquire(
     reference = Reference.of(nominal)
     data = reference.on_scale(look.measured)
 
-    def again(on: Effects, names: Sequence[str]) -> dict[str, float]:
-        """Significance of candidates on the first frames taken again with some effects."""
+    def asked_again(on: Effects, names: Sequence[str], few: Runtime) -> dict[str, float]:
         window = look.first
         try:
             evidence = window.evidence(window.learn, (*base, *on), LEARN_SEED, scratch)
         except InputError:
             return {}  # These frames do not tell what the effects look like.
-        found = _estimates(evidence, {n: kinds[n] for n in names}, look.few, "estimate again")
+        found = _estimates(evidence, {n: kinds[n] for n in names}, few, "estimate again")
         return {n: e.significance for n, e in found.items() if isinstance(e, Estimate)}
 
-    search = Search(
-        reference,
-        data,
-        lambda benches, seeds, label: trials.curves(
-            [(*base, *bench) for bench in benches], seeds, label
-        ),
-        again,
-    )
+    answers: dict[tuple[Effects, tuple[str, ...]], dict[str, float]] = {}
+
+    def simulate(
+        benches: Sequence[Effects], seeds: int, label: str, asked: Sequence[str]
+    ) -> list[list[Curves] | str]:
+        """Curves of benches; what is asked of the first is answered meanwhile, if there is room."""
+
+        def answer() -> None:
+            one = Runtime(cluster="sync")
+            answers[benches[0], tuple(asked)] = asked_again(benches[0], asked, one)
+
+        return trials.curves(
+            [(*base, *bench) for bench in benches], seeds, label,
+            answer if asked and look.room else None,
+        )  # fmt: skip
+
+    def again(on: Effects, names: Sequence[str]) -> dict[str, float]:
+        """Significance of candidates on the first frames taken again with some effects."""
+        answer = answers.pop((on, tuple(names)), None)
+        return asked_again(on, names, look.few) if answer is None else answer
+
+    search = Search(reference, data, simulate, again)
     return Inquiry(base, look, trials, reference, data, search, search.run(candidates))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.engine.plan import make_plan
+from pixcal.engine.plan import Plan, make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.evidence import Evidence
 from pixcal.model.acquisition import Acquisition
@@ -57,6 +57,8 @@ class Look:
         What is told of it.
     runtime, few : Runtime
         With as many workers as fit the memory: of simulations, and of estimates.
+    room : bool
+        Whether estimates on frames that are taken again fit in beside simulations, here.
     """
 
     first: Window
@@ -66,6 +68,7 @@ class Look:
     facts: dict[str, Any]
     runtime: Runtime
     few: Runtime
+    room: bool = False
 
 
 def look_at(
@@ -110,6 +113,11 @@ def look_at(
     for_estimates = make_plan("diagnose", estimates, held, runtime)
     plan = make_plan("diagnose", need, 0, runtime)
     few = runtime.with_workers(for_estimates.workers)
+    room = (
+        runtime.cluster == "threads"
+        and plan.workers > 1
+        and Plan(need, held + estimates, plan.workers - 1).total <= runtime.memory
+    )
     runtime = runtime.with_workers(plan.workers)
     dtypes = {name: array.dtype for name, array in ingested.arrays.items()}
     windows: list[Window] = []
@@ -166,6 +174,7 @@ def look_at(
         },
         runtime,
         few,
+        room,
     )
 
 

@@ -50,7 +50,7 @@ LITTLE = 0.1
 EXPLAINED = 0.7
 """Share of a candidate's significance that another effect may bring about."""
 
-Simulate = Callable[[Sequence[Effects], int, str], Sequence[list[Curves] | str]]
+Simulate = Callable[[Sequence[Effects], int, str, Sequence[str]], Sequence[list[Curves] | str]]
 Estimates = Callable[[Effects, Sequence[str]], Mapping[str, float]]
 
 
@@ -118,7 +118,8 @@ class Search:
     data : mapping
         Curves of the unseen data on the reference's scales.
     simulate : callable
-        Curves of several benches: ``simulate(benches, seeds, label)``.
+        Curves of several benches: ``simulate(benches, seeds, label, asked)``; the candidates
+        ``asked`` are those that `estimates` will be called with for the first bench.
     estimates : callable
         Significance that some candidates have on a simulation of the first frames with some
         effects: ``estimates(effects, names)``.
@@ -163,7 +164,7 @@ class Search:
                 break
             best = max(own, key=lambda n: own[n])
             del open_ones[best]
-            confirmed = self._confirmed((*effects.values(), trials[best][1]))
+            confirmed = self._confirmed((*effects.values(), trials[best][1]), asked=[*open_ones])
             if isinstance(confirmed, str):
                 candidates[best].reason = f"cannot be simulated: {confirmed}"
                 continue
@@ -254,7 +255,7 @@ class Search:
             candidate.ways = max(candidate.ways, len(ways))
             options += [(name, way) for way in ways]
         benches = [(*effects.values(), effect) for _, effect in options]
-        simulated = self._simulate(benches, SCREEN, f"candidates, round {len(effects) + 1}")
+        simulated = self._simulate(benches, SCREEN, f"candidates, round {len(effects) + 1}", ())
         found: dict[str, tuple[Trial, Effect]] = {}
         refused: dict[str, str] = {}
         for (name, effect), bench, curves in zip(options, benches, simulated, strict=True):
@@ -274,9 +275,11 @@ class Search:
             error = min(1.0, 1 / max(candidate.estimate.significance, 1.0))
         return expect_with(self.reference, curves, error)
 
-    def _confirmed(self, effects: Effects, simulations: int = CONFIRM) -> Trial | str:
+    def _confirmed(
+        self, effects: Effects, simulations: int = CONFIRM, asked: Sequence[str] = ()
+    ) -> Trial | str:
         """A bench with some effects, or why it cannot be simulated."""
-        (curves,) = self._simulate([effects], simulations, "confirm")
+        (curves,) = self._simulate([effects], simulations, "confirm", asked)
         return curves if isinstance(curves, str) else self.held_against(effects, curves)
 
     def _start(self, effects: Effects, simulations: int = CONFIRM) -> Trial:
@@ -373,5 +376,5 @@ class Search:
             for name in (taken if len(taken) > 1 else ())
         }
         # All at once, side by side; below they are at hand.
-        self._simulate(list(benches.values()), CONFIRM, "one left out")
+        self._simulate(list(benches.values()), CONFIRM, "one left out", ())
         return {name: self._start(benches.get(name, ())) for name in taken}

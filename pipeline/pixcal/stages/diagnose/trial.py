@@ -1,6 +1,6 @@
 """The bench taken again: simulations of the windows that are looked at, through the same stages."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -100,7 +100,11 @@ class Trials:
     _made: dict[tuple[frozenset[Effect], int], list[Curves] | str] = field(default_factory=dict)
 
     def curves(
-        self, benches: Sequence[Effects], seeds: int, label: str
+        self,
+        benches: Sequence[Effects],
+        seeds: int,
+        label: str,
+        beside: Callable[[], None] | None = None,
     ) -> list[list[Curves] | str]:
         """Statistics of several benches.
 
@@ -110,6 +114,8 @@ class Trials:
             Effects of each.
         seeds : int
             Simulations of each, seeds 0, 1, ...
+        beside : callable, optional
+            Done along with them in this process, if any is to be made.
 
         Returns
         -------
@@ -121,7 +127,7 @@ class Trials:
         places = range(len(self.windows))
         items = [(tuple(bench), seed, n) for bench, seed in missing for n in places]
         if items:
-            results = self._simulated(items, label)
+            results = self._simulated(items, label, beside)
             for number, one in enumerate(missing):
                 own = results[number * len(places) : (number + 1) * len(places)]
                 wrong = [r for r in own if isinstance(r, str)]
@@ -135,10 +141,19 @@ class Trials:
             found.append(wrong[0] if wrong else right)
         return found
 
-    def _simulated(self, items: Sequence[tuple[Effects, int, int]], label: str) -> list[Any]:
+    def _simulated(
+        self,
+        items: Sequence[tuple[Effects, int, int]],
+        label: str,
+        beside: Callable[[], None] | None,
+    ) -> list[Any]:
         work = partial(_kept_or_made, self.windows, self.scratch, self.signatures)
         moved = [(self._moved(effects, seed), seed, n) for effects, seed, n in items]
-        results = run_tasks(work, moved, self.runtime, label=label)
+        if beside is None:
+            results = run_tasks(work, moved, self.runtime, label=label)
+        else:
+            others: list[Callable[[], Any]] = [partial(work, item) for item in moved]
+            _, *results = run_tasks(_call, [beside, *others], self.runtime.here, label=label)
         # What is refused as moved may do as it was.
         again = [
             n
@@ -159,6 +174,10 @@ class Trials:
         """Statistics of a window by itself, of a bench that `curves` has simulated."""
         made = [self._made[frozenset(bench), seed] for seed in range(seeds)]
         return [r[number] for r in made if not isinstance(r, str)]
+
+
+def _call(task: Callable[[], Any]) -> Any:
+    return task()
 
 
 def _kept_or_made(
