@@ -114,11 +114,12 @@ def sweep_block(
         the start model), weighted square of that residual, number of samples.
     """
     ny, nx = codes.shape[1], codes.shape[2]
-    p = [np.empty(nx, np.float32) for _ in range(11)]
+    p = np.empty((11, nx), np.float32)
     s, o, f = np.float32(scale), np.float32(offset), np.float32(fill)
     for row in range(ny):
         for k in range(11):
-            p[k][:] = np.float32(0)
+            for i in range(nx):
+                p[k, i] = 0
         t0, t1, t2 = theta[0, row], theta[1, row], theta[2, row]
         _sweep_row(
             codes, row, s, o, f, g, dk, np.float32(y0 + row), np.float32(x0),
@@ -128,7 +129,7 @@ def sweep_block(
         _count_row(codes, row, fill, p[10])
         for k in range(11):
             for i in range(nx):
-                sums[k, row, i] += p[k][i]
+                sums[k, row, i] += p[k, i]
 
 
 GROUP = 1024
@@ -170,17 +171,18 @@ def frame_sums(
     """
     s, o, f = np.float32(scale), np.float32(offset), np.float32(fill)
     n = codes.shape[1]
-    kept = [np.empty(min(GROUP, n), np.float32) for _ in range(5)]
-    theta = np.ascontiguousarray(theta)
+    kept = np.empty((5, GROUP), np.float32)
     for first in range(0, n, GROUP):
         stop = min(first + GROUP, n)
-        h1, h2, turn, w, wr = [k[: stop - first] for k in kept]
+        m = stop - first
+        h1, h2, turn, w, wr = kept[0, :m], kept[1, :m], kept[2, :m], kept[3, :m], kept[4, :m]
         h0, t1, t2 = theta[0, first:stop], theta[1, first:stop], theta[2, first:stop]
         xs, ys, shots, reads = x[first:stop], y[first:stop], shot[first:stop], read[first:stop]
         for t in range(codes.shape[0]):
             kx, ky = dk[t, 0], dk[t, 1]
             if kx == 0 and ky == 0:
-                h1[:], h2[:] = t1, t2
+                for i in range(m):
+                    h1[i], h2[i] = t1[i], t2[i]
             else:
                 _turn_pixels(t1, t2, kx, ky, ys, xs, h1, h2)
             _weigh_pixels(

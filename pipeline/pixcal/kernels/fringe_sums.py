@@ -79,9 +79,9 @@ def _count_fill(codes: Any, first: int, stop: int, fill: int, count: Any) -> Non
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _holds(codes: Any, fill: int) -> bool:
     found = False
-    flat = codes.reshape(-1)
-    for i in range(flat.size):
-        found |= flat[i] == fill
+    for t in range(codes.shape[0]):
+        for i in range(codes.shape[1]):
+            found |= codes[t, i] == fill
     return bool(found)
 
 
@@ -127,7 +127,7 @@ def fringe_block(
         Whether any sample had no weight.
     """
     n = codes.shape[1]
-    p = [np.empty(GROUP, np.float32) for _ in range(5)]
+    p = np.empty((5, GROUP), np.float32)
     sc, of, rh = np.float32(scale), np.float32(offset), np.float32(rho)
     # As wide as the codes: comparing wider numbers takes four times as long.
     mark = np.uint16(fill)
@@ -135,7 +135,8 @@ def fringe_block(
     for first in range(0, n, GROUP):
         stop = min(first + GROUP, n)
         for k in range(5):
-            p[k][:] = np.float32(0)
+            for i in range(GROUP):
+                p[k, i] = 0
         _fringe_group(
             codes, first, stop, sc, of, frames, rh, level[first:stop], s[first:stop],
             c[first:stop], p[0], p[1], p[2], p[3],
@@ -143,7 +144,7 @@ def fringe_block(
         if filled:
             _count_fill(codes, first, stop, mark, p[4])
             for i in range(stop - first):
-                if p[4][i] > 0:
+                if p[4, i] > 0:
                     at = first + i
                     _without_fill(
                         codes[:, at], sc, of, fill, frames, rh,
@@ -151,7 +152,7 @@ def fringe_block(
                     )  # fmt: skip
         for k in range(4):
             for i in range(stop - first):
-                sums[k, first + i] += p[k][i]
+                sums[k, first + i] += p[k, i]
     return bool(filled)
 
 
@@ -180,10 +181,9 @@ def _without_fill(
         b1 += w * r * a1
         b2 += w * r * a2
         rr += w * r * r
-    p[0][i], p[1][i], p[2][i], p[3][i] = b0, b1, b2, rr
+    p[0, i], p[1, i], p[2, i], p[3, i] = b0, b1, b2, rr
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def turn_table(table: F64) -> F32:
     """What turns the right-hand sums of a pixel into its step from the start model.
 
@@ -199,26 +199,23 @@ def turn_table(table: F64) -> F32:
         phasor (along growing phase), three for the step along it; variance across, covariance,
         variance along. NaN where the frames do not give all three unknowns.
     """
-    size = table.shape[1]
-    out = np.empty((size + 1, 9), np.float32)
-    for j in range(size):
-        a, b, c = table[0, j], table[1, j], table[2, j]
-        d, e, f = table[3, j], table[4, j], table[5, j]
-        i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
-        i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
-        det = a * i00 + b * i01 + c * i02
-        one = 1.0 / det if det > SINGULAR * a * d * f else np.nan
-        sin, cos = np.sin(2 * np.pi * j / size) * one, np.cos(2 * np.pi * j / size) * one
-        across1, across2 = cos * i11 - sin * i12, cos * i12 - sin * i22
-        along1, along2 = sin * i11 + cos * i12, sin * i12 + cos * i22
-        out[j, 0], out[j, 1], out[j, 2] = cos * i01 - sin * i02, across1, across2
-        out[j, 3], out[j, 4], out[j, 5] = sin * i01 + cos * i02, along1, along2
-        sin, cos = np.sin(2 * np.pi * j / size), np.cos(2 * np.pi * j / size)
-        out[j, 6] = cos * across1 - sin * across2
-        out[j, 7] = sin * across1 + cos * across2
-        out[j, 8] = sin * along1 + cos * along2
-    out[size] = out[0]
-    return out
+    a, b, c, d, e, f = table
+    i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
+    i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
+    det = a * i00 + b * i01 + c * i02
+    solvable = det > SINGULAR * a * d * f
+    one = np.where(solvable, 1 / np.where(solvable, det, 1.0), np.nan)
+    phase = 2 * np.pi * np.arange(table.shape[1]) / table.shape[1]
+    sin, cos = np.sin(phase), np.cos(phase)
+    across = [(cos * i01 - sin * i02), (cos * i11 - sin * i12), (cos * i12 - sin * i22)]
+    along = [(sin * i01 + cos * i02), (sin * i11 + cos * i12), (sin * i12 + cos * i22)]
+    squares = [
+        cos * across[1] - sin * across[2],
+        sin * across[1] + cos * across[2],
+        sin * along[1] + cos * along[2],
+    ]
+    turned = (one * np.stack([*across, *along, *squares])).T.astype(np.float32)
+    return np.concatenate([turned, turned[:1]])
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -264,11 +261,13 @@ def close_fringes(
         Written: rad.
     """
     n = place.size
-    kept = [np.empty(min(GROUP, n), np.float32) for _ in range(5)]
+    kept = np.empty((5, GROUP), np.float32)
     v = np.float32(visibility)
     for first in range(0, n, GROUP):
         stop = min(first + GROUP, n)
-        across, along, vaa, vab, vbb = [k[: stop - first] for k in kept]
+        m = stop - first
+        across, along = kept[0, :m], kept[1, :m]
+        vaa, vab, vbb = kept[2, :m], kept[3, :m], kept[4, :m]
         _steps(turns, place[first:stop], part[:, first:stop], across, along, vaa, vab, vbb)
         _angles(
             across, along, vaa, vab, vbb, level[first:stop], v, spread[first:stop],
@@ -354,7 +353,10 @@ def _angle_without_fill(
     at = place * size
     j = int(at) % size
     k = j + 1 if j + 1 < size else 0
-    n = normal[:, j] + (at - np.floor(at)) * (normal[:, k] - normal[:, j]) - missing[:6]
+    part = at - np.floor(at)
+    n = np.empty(6)
+    for m in range(6):
+        n[m] = normal[m, j] + part * (normal[m, k] - normal[m, j]) - missing[m]
     i00, i01 = n[3] * n[5] - n[4] * n[4], n[2] * n[4] - n[1] * n[5]
     i02, i11 = n[1] * n[4] - n[2] * n[3], n[0] * n[5] - n[2] * n[2]
     i12, i22 = n[1] * n[2] - n[0] * n[4], n[0] * n[3] - n[1] * n[1]

@@ -89,7 +89,10 @@ def _median_of_columns(rows: Any, out: Any) -> None:
 def _median_and_deviation(frames: Any, median: Any, deviation: Any) -> None:
     rows = np.empty((frames.shape[0], frames.shape[2]), np.float32)
     for y in range(frames.shape[1]):
-        rows[:] = frames[:, y]
+        # A loop: assigning the slice takes seconds to compile.
+        for t in range(frames.shape[0]):
+            for x in range(frames.shape[2]):
+                rows[t, x] = frames[t, y, x]
         _median_of_columns(rows, median[y])
         for t in range(frames.shape[0]):
             for x in range(frames.shape[2]):

@@ -97,7 +97,8 @@ class HotPixels:
         x[:, :, 1] -= step[:, 1]
         found = np.zeros((6, len(links), classes.count, 2))
         sigma = np.hypot(self.sigma, doubt * self.value)
-        _by_class(self.value, sigma, self.charge, classes.of(y, x), found)
+        order = np.argsort(self.value, axis=0)
+        _by_class(self.value, sigma, self.charge, order, classes.of(y, x), found)
         return ClassShares(*found)
 
     def level_dependence(
@@ -279,14 +280,15 @@ def _surroundings(values: F64, y: NDArray[np.intp], x: NDArray[np.intp], size: i
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _by_class(value: Any, sigma: Any, charge: Any, classes: Any, found: Any) -> None:
+def _by_class(value: Any, sigma: Any, charge: Any, order: Any, classes: Any, found: Any) -> None:
     pixels, links, sides = value.shape
     v, s, q = np.empty(pixels), np.empty(pixels), np.empty(pixels)
     for link in range(links):
         for side in range(sides):
             for number in range(found.shape[2]):
                 n = 0
-                for h in range(pixels):
+                for place in range(pixels):
+                    h = order[place, link, side]
                     if classes[h, link, side] == number and sigma[h, link, side] < np.inf:
                         v[n], s[n], q[n] = value[h, link, side], sigma[h, link, side], charge[h]
                         n += 1
@@ -296,23 +298,39 @@ def _by_class(value: Any, sigma: Any, charge: Any, classes: Any, found: Any) -> 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _agreed(v: Any, s: Any, q: Any, found: Any) -> None:
-    """Sums of values: of less weight where they disagree by more than chance."""
-    w = 1 / s**2
-    order = np.argsort(v)
-    half, at = 0.5 * w.sum(), 0.0
-    middle = v[order[0]]
-    for i in order:
+    """Sums of values, in rising order: of less weight where they disagree by more than chance."""
+    # In loops: expressions of arrays take seconds to compile.
+    w = np.empty(v.size)
+    half = 0.0
+    for i in range(v.size):
+        w[i] = 1 / s[i] ** 2
+        half += 0.5 * w[i]
+    at, middle = 0.0, v[0]
+    for i in range(v.size):
         middle = v[i]
         at += w[i]
         if at >= half:
             break
-    near = np.abs(v - middle) < CLIP * s
-    if near.sum() < 2 or 2 * near.sum() <= len(v):
-        near[:] = True
-    w = w * near
-    mean, charge = (w * v).sum() / w.sum(), (w * q).sum() / w.sum()
-    square, product = (w * (q - charge) ** 2).sum(), (w * (q - charge) * (v - mean)).sum()
-    freedom, rest = near.sum() - 1, (w * (v - mean) ** 2).sum()
+    near = 0
+    for i in range(v.size):
+        near += abs(v[i] - middle) < CLIP * s[i]
+    if near < 2 or 2 * near <= v.size:
+        near = v.size
+    else:
+        for i in range(v.size):
+            w[i] *= abs(v[i] - middle) < CLIP * s[i]
+    total = mean = charge = 0.0
+    for i in range(v.size):
+        total += w[i]
+        mean += w[i] * v[i]
+        charge += w[i] * q[i]
+    mean, charge = mean / total, charge / total
+    square = product = rest = 0.0
+    for i in range(v.size):
+        square += w[i] * (q[i] - charge) ** 2
+        product += w[i] * (q[i] - charge) * (v[i] - mean)
+        rest += w[i] * (v[i] - mean) ** 2
+    freedom, less = near - 1, 1.0
     if freedom >= ENOUGH and square > 0:
         # What rises with the charge is told apart later.
         freedom, rest = freedom - 1, rest - product**2 / square
@@ -320,6 +338,5 @@ def _agreed(v: Any, s: Any, q: Any, found: Any) -> None:
         # Reduced chi-square that chance passes once in a thousand (Wilson and Hilferty's cube).
         usual = (1 - 2 / (9 * freedom) + 3.09 * np.sqrt(2 / (9 * freedom))) ** 3
         less = freedom / rest if rest > usual * freedom else 1.0
-        w, square, product = w * less, square * less, product * less
-    found[0], found[1], found[2], found[3], found[4] = w.sum(), mean, charge, square, product
-    found[5] = len(v)
+    found[0], found[1], found[2] = total * less, mean, charge
+    found[3], found[4], found[5] = square * less, product * less, v.size
