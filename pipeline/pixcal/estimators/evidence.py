@@ -295,7 +295,7 @@ def free_frames(
     frame_sums(
         np.ascontiguousarray(codes[:, good]), coding.scale, coding.offset, coding.fill,
         start, turned, y[good].astype(np.float32), x[good].astype(np.float32),
-        theta[:, good].astype(np.float32), read_variance[good].astype(np.float32),
+        np.ascontiguousarray(theta[:, good], np.float32), read_variance[good].astype(np.float32),
         shot_factor[good].astype(np.float32), packed, right,
     )  # fmt: skip
     normal = np.zeros((n, 5, 5))

@@ -360,7 +360,7 @@ class Scout:
                 dk,
                 (yy + tile.y[0] - self.reference[0]).astype(np.float32),
                 (xx + tile.x[0] - self.reference[1]).astype(np.float32),
-                theta[:, yy, xx].astype(np.float32),
+                np.ascontiguousarray(theta[:, yy, xx], np.float32),
                 tile.read[yy, xx],
                 tile.shot[yy, xx],
                 packed,
