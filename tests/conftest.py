@@ -238,6 +238,7 @@ def _reduced_run(bench: Bench, run: Path) -> Path:
     }
     with build(run, "ingest", 1, {}, {}) as made:
         write_json(made.folder / "acquisition.json", acquisition)
+        write_json(made.folder / "frames.json", {})
     with build(run, "reduce", 1, {}, {"ingest": "x"}) as made:
         create_group(made.folder / "reduced.zarr")
         for name in bench.sets:

@@ -70,6 +70,7 @@ def show_reduce(run: Path) -> None:
 
 def show_fit(run: Path) -> None:
     """Print one row for each fringe set: how good its map of offsets is, and the bound."""
+    sets = read_json(run / "fit" / "fit.json")["sets"]
     rows = [
         (
             name,
@@ -81,7 +82,7 @@ def show_fit(run: Path) -> None:
             _number(_ratio(found["sigma_median_px"], found["crb_median_px"]), 3),
             _number(found["chi2_reduced"], 4),
         )
-        for name, found in read_json(run / "fit" / "fit.json")["sets"].items()
+        for name, found in sets.items()
     ]
     header = [
         "set",
@@ -94,6 +95,9 @@ def show_fit(run: Path) -> None:
         "chi2",
     ]
     show_table(header, rows)
+    # Fits of earlier versions have no such note.
+    notes = {name: found.get("period_note") for name, found in sets.items()}
+    show_notes([f"{name}: {note}" for name, note in notes.items() if note])
 
 
 def show_correction(run: Path) -> None:
@@ -234,8 +238,6 @@ def show_run(run: Path, *, fitted: bool, diagnosed: bool) -> None:
     for stage, show in steps.items():
         click.echo(f"\n{stage}")
         show(run)
-    if not fitted:
-        click.echo("\nacquisition.yaml lists no fringes: there is nothing to fit")
     click.echo("\nproducts")
     for file in sorted((run / "products").iterdir()):
         click.echo(f"  {file}")

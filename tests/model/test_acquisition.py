@@ -63,11 +63,19 @@ def test_optional_keys_may_be_absent() -> None:
     assert found.frames.fringes == ()
 
 
+def test_a_detector_needs_no_optics(tmp_path: Path) -> None:
+    data = example()
+    del data["optics"], data["frames"]["fringes"]
+    found = parse(Acquisition, data, "f")
+    assert found.optics is None
+    assert parse(Acquisition, to_plain(found), "f") == found
+
+
 MISTAKES: list[tuple[list[Any], Any, list[str]]] = [
     (["schema"], "pixcal/acquisition/9", ["schema", "pixcal/acquisition/9", SCHEMA]),
     (["detector", "pitch_um"], 0, ["detector.pitch_um", "below 0.01 um"]),
     (["detector", "pitch_um"], "4.4 um", ["detector.pitch_um", "um"]),
-    (["detector", "pitch_mm"], 1, ["detector", "pitch_mm", "pitch_um"]),
+    (["detector", "pitch_mm"], 1, ["detector", "pitch_mm", "mean 'pitch_um'?"]),
     (["detector", "read_noise_e"], -1, ["detector.read_noise_e", "below 0 e-"]),
     (["detector", "saturation_adu"], 0, ["detector.saturation_adu"]),
     (["optics", "wavelength_nm"], [632.8], ["optics.wavelength_nm", "list"]),

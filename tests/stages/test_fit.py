@@ -85,6 +85,8 @@ def test_products_follow_the_interface(fitted):
         assert hdus["MASK"].data.dtype == np.uint8
         header = hdus[0].header
         assert header["INDIGEST"] == result["input"]
+        assert header["PIXSIZE1"] == 4.4
+        assert (header["MODEL"], header["MODELOPT"]) == ("paraxial", "auto")
         assert header["M1_4"] == "cos(psi)*iota/alpha"
         assert header["CREATOR"].startswith("pixcal")
     assert not (run / "products" / "delta_fringe.fits").exists()
@@ -269,6 +271,20 @@ def test_no_fringes_is_an_input_error_that_names_the_set(make_bench, write_reduc
     run = write_reduced(make_bench(frames=60, visibility=1e-9), tmp_path / "run")
     with pytest.raises(InputError, match="'vertical'"):
         fit.run(run, fit.Config(), Runtime())
+
+
+def test_a_baseline_wrong_by_a_factor_is_pointed_out(make_bench, write_reduced, reseal, tmp_path):
+    run = write_reduced(make_bench(frames=60), tmp_path / "run")
+    file = run / "ingest" / "acquisition.json"
+    listed = json.loads(file.read_text())
+    listed["frames"]["fringes"][0]["baseline_mm"][0] /= 3
+    file.write_text(json.dumps(listed))
+    reseal(run / "ingest")
+    fit.run(run, fit.Config(), Runtime())
+    found = json.loads((run / "products" / "fit.json").read_text())["sets"]
+    assert "period is 5 px, but baseline_mm" in found["vertical"]["period_note"]
+    assert "give 15 px" in found["vertical"]["period_note"]
+    assert found["horizontal"]["period_note"] == ""
 
 
 def test_reduce_must_come_first(tmp_path):

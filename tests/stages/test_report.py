@@ -384,11 +384,21 @@ def test_without_allan_the_rest_is_shown(tmp_path: Path) -> None:
 @pytest.mark.parametrize("sets", [(), ("vertical",)])
 def test_without_a_fit_the_detector_is_shown(tmp_path: Path, sets: tuple[str, ...]) -> None:
     page = page_of(make_run(tmp_path / "run", (37, 29), sets, stages=("ingest", "reduce")))
-    assert re.findall(r'<section id="(\w+)">', page) == list(SECTIONS)
+    of_fringes = ["maps", "levels", "temporal", "noise", "allan", "removed"]
+    shown = [name for name in SECTIONS if sets or name not in of_fringes]
+    assert re.findall(r'<section id="(\w+)">', page) == shown
     assert "<img" in section(page, "detector")
-    reason = "there is no fit; run 'pixcal fit'" if sets else "the acquisition has no fringe sets"
-    for name in ("maps", "levels", "temporal", "noise"):
-        assert reason in words(section(page, name))
+    for name in of_fringes[:4] if sets else ():
+        assert "there is no fit; run 'pixcal fit'" in words(section(page, name))
+
+
+@pytest.mark.usefixtures("without_figures")
+def test_a_detector_without_fringes_is_no_bench(tmp_path: Path) -> None:
+    page = words(page_of(make_run(tmp_path / "run", (37, 29), (), stages=("ingest", "reduce"))))
+    assert "CHIP: detector" in page
+    assert "The detector: gain 1.0100 ± 0.0040 e⁻/ADU, read noise 16.00 e⁻ (declared)." in page
+    for word in ("fibre", "fringe set", "632.8", "offsets from"):
+        assert word not in page.split("Acquisition as understood")[0], word
 
 
 @pytest.mark.usefixtures("without_figures")

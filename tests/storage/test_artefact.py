@@ -199,6 +199,14 @@ def test_what_must_have_been_run(tmp_path: Path) -> None:
         require(tmp_path, "allan", 1)
 
 
+@pytest.mark.parametrize("stage", ["fit", "allan", "corrected"])
+def test_without_fringes_no_command_is_advised_that_needs_them(tmp_path: Path, stage: str) -> None:
+    with build(tmp_path, "ingest", 1, {}, {}) as made:
+        write_json(made.folder / "acquisition.json", {"frames": {"fringes": []}})
+    with pytest.raises(InputError, match=f"lists no fringes, so there is no {stage}$"):
+        require(tmp_path, stage, 1)
+
+
 def test_a_damaged_manifest_is_named(tmp_path: Path) -> None:
     complete(tmp_path)
     file = tmp_path / "fit" / MANIFEST

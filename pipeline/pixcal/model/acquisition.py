@@ -94,13 +94,13 @@ class Frames:
         _check_globs("flat", self.flat)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Acquisition:
     """Contents of ``acquisition.yaml``."""
 
     schema: str = quantity(choices=(SCHEMA,))
     detector: Detector = quantity()
-    optics: Optics = quantity()
+    optics: Optics | None = quantity(None)
     frames: Frames = quantity()
 
     def __post_init__(self) -> None:
@@ -108,9 +108,16 @@ class Acquisition:
         for name in names:
             if names.count(name) > 1:
                 raise InputError(f"frames.fringes: two sets are named {name!r}; rename one")
+        if self.frames.fringes and self.optics is None:
+            raise InputError("optics: missing; with fringes give its wavelength_nm and distance_mm")
         kinds = (self.frames.bias, self.frames.dark, self.frames.flat, self.frames.fringes)
         if not any(kinds):
             raise InputError("frames: no files are listed; give globs")
+
+    @property
+    def fibres(self) -> Optics:
+        """The bench's optics; where there are no fringes, stand-ins that nothing depends on."""
+        return self.optics or Optics(wavelength_nm=632.8, distance_mm=400.0)
 
 
 def load_acquisition(path: Path) -> Acquisition:

@@ -5,6 +5,7 @@ them with `quantity`. `to_plain` and `to_yaml` write out what `parse` reads.
 """
 
 import dataclasses
+import difflib
 import math
 import re
 import types
@@ -168,8 +169,10 @@ def parse(cls: type[T], data: Any, where: str, *, key: str = "") -> T:
     fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for name in data:
         if name not in fields:
+            near = difflib.get_close_matches(name, fields, n=1)
+            meant = f"; did you mean {near[0]!r}? The" if near else "; the"
             known = ", ".join(fields)
-            raise InputError(f"{place}: unknown key {name!r:.80}; the keys here are {known}")
+            raise InputError(f"{place}: unknown key {name!r:.80}{meant} keys here are {known}")
     values: dict[str, Any] = {}
     for name, field in fields.items():
         path = f"{key}.{name}" if key else name

@@ -201,6 +201,11 @@ class Contents:
     warnings: tuple[str, ...] = ()
 
     @property
+    def has_fringes(self) -> bool:
+        """Whether the acquisition lists any."""
+        return bool(self.acquisition.get("frames", {}).get("fringes"))
+
+    @property
     def pitch_um(self) -> float:
         """Pixel pitch."""
         return float(self.acquisition["detector"]["pitch_um"])

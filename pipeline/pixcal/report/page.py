@@ -6,9 +6,10 @@ from importlib.resources import files
 from jinja2 import Environment, StrictUndefined
 
 from pixcal import __version__
-from pixcal.report import detector_figures, map_figures, set_figures
+from pixcal.report import map_figures, set_figures
 from pixcal.report.blocks import Block, Plate, Section, plate
 from pixcal.report.contents import Contents, OffsetMap
+from pixcal.report.detector_page import detector
 from pixcal.report.diagnosis import diagnosis
 from pixcal.report.summary import FlagSummary
 from pixcal.report.tables import (
@@ -18,8 +19,6 @@ from pixcal.report.tables import (
     flag_table,
     flat_rows,
     frames_table,
-    is_table,
-    reduction_tables,
     stage_tables,
 )
 from pixcal.report.text import (
@@ -31,14 +30,6 @@ from pixcal.report.text import (
 from pixcal.report.verdict import cards, findings, headline
 
 NOT_MEASURED = "Not measured"
-
-DETECTOR_MAPS = {
-    "bias": ("bias", "ADU"),
-    "dark_rate": ("dark current", "e⁻/s"),
-    "flat": ("flat", "relative response"),
-    "read_noise": ("read noise", "e⁻"),
-}
-"""Title and unit of each map of the reduction."""
 
 
 def render(contents: Contents) -> str:
@@ -54,50 +45,43 @@ def render(contents: Contents) -> str:
     str
         HTML without any reference to something outside it.
     """
-    sections = [
-        diagnosis(contents),
-        _maps(contents),
-        _levels(contents),
-        _temporal(contents),
-        _residuals(contents),
-        _allan(contents),
-        _detector(contents),
-        _masks(contents),
-        _removed(contents),
-        _provenance(contents),
-    ]
+    of_fringes = (_maps, _levels, _temporal, _residuals, _allan) if contents.has_fringes else ()
+    chapters = (
+        diagnosis, *of_fringes, detector, _masks,
+        *((_removed,) if contents.has_fringes else ()), _provenance,
+    )  # fmt: skip
     text = files("pixcal.report").joinpath("page.html.j2").read_text(encoding="utf-8")
     environment = Environment(
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    detector = contents.acquisition["detector"]
+    what = "pixel offsets" if contents.has_fringes else "detector"
+    name = contents.acquisition["detector"].get("name")
     return environment.from_string(text).render(
-        title=f"{detector['name']}: pixel offsets" if detector.get("name") else "Pixel offsets",
+        title=f"{name}: {what}" if name else what.capitalize(),
         subtitle=_subtitle(contents),
         headline=headline(contents),
         cards=cards(contents),
         findings=findings(contents),
-        sections=sections,
+        sections=[chapter(contents) for chapter in chapters],
         version=__version__,
     )
 
 
 def _subtitle(contents: Contents) -> str:
-    detector, optics = contents.acquisition["detector"], contents.acquisition["optics"]
+    pitch, optics = contents.pitch_um, contents.acquisition.get("optics")
     flags = contents.flags or contents.detector.flags
     parts = [f"{flags.shape[1]} × {flags.shape[0]} px"] if flags else []
-    parts.append(f"pitch {number(detector['pitch_um'])} µm")
-    parts.append(f"{number(optics['wavelength_nm'], 4)} nm")
-    parts.append(f"{number(optics['distance_mm'], 4)} mm from the fibres")
+    parts.append(f"pitch {number(pitch)} µm")
+    if contents.has_fringes and optics:
+        parts.append(f"{number(optics['wavelength_nm'], 4)} nm")
+        parts.append(f"{number(optics['distance_mm'], 4)} mm from the fibres")
     starts = [a.first_mjd for a in contents.arrays if a.first_mjd is not None]
     if starts:
         parts.append(f"first frame {date_of_mjd(min(starts))} UTC")
     return " · ".join(parts)
 
 
-def _missing(contents: Contents, what: str, stage: str) -> str:
-    if not contents.acquisition.get("frames", {}).get("fringes"):
-        return f"{NOT_MEASURED}: the acquisition has no fringe sets."
+def _missing(what: str, stage: str) -> str:
     return f"{NOT_MEASURED}: {what}; run 'pixcal {stage}' and make the report again."
 
 
@@ -113,7 +97,7 @@ def _maps(contents: Contents) -> Section:
     for offset in contents.offsets:
         blocks += _offset_plates(offset, contents)
     if not blocks:
-        lead = _missing(contents, "there is no fit", "fit")
+        lead = _missing("there is no fit", "fit")
     return Section("maps", "Maps of the offsets", lead, blocks)
 
 
@@ -178,7 +162,7 @@ def _levels(contents: Contents) -> Section:
         for s in contents.sets
     ]
     if not blocks:
-        lead = _missing(contents, "there is no fit", "fit")
+        lead = _missing("there is no fit", "fit")
     return Section("levels", "Level and visibility", lead, blocks)
 
 
@@ -204,7 +188,7 @@ def _temporal(contents: Contents) -> Section:
         for s in contents.sets
     ]
     if not blocks:
-        lead = _missing(contents, "there is no fit", "fit")
+        lead = _missing("there is no fit", "fit")
     return Section("temporal", "Frame by frame", lead, blocks)
 
 
@@ -223,7 +207,7 @@ def _residuals(contents: Contents) -> Section:
         for s in contents.sets
     ]
     if not blocks:
-        lead = _missing(contents, "there is no fit", "fit")
+        lead = _missing("there is no fit", "fit")
     return Section("noise", "Residuals", lead, blocks)
 
 
@@ -247,50 +231,8 @@ def _allan(contents: Contents) -> Section:
     if measured:
         blocks.append(allan_table(measured))
     else:
-        lead = _missing(contents, "there is no Allan deviation", "allan")
+        lead = _missing("there is no Allan deviation", "allan")
     return Section("allan", "Allan deviation", lead, blocks)
-
-
-def _detector(contents: Contents) -> Section:
-    detector = contents.detector
-    panels = [
-        (title, unit, detector.maps[key])
-        for key, (title, unit) in DETECTOR_MAPS.items()
-        if key in detector.maps
-    ]
-    blocks: list[Block] = []
-    if panels:
-        blocks.append(
-            plate(
-                "Calibration maps",
-                "Colours span the 0.5th to the 99.5th percentile. Good: smooth or random maps. "
-                "Bad: rows, columns or blocks in the read noise, fringes in the flat (coherent "
-                "light), a flat that follows the dark current (dark subtraction).",
-                map_figures.map_row(panels),
-            )
-        )
-        rows = [
-            [title, unit, *(number(v, 4) for v in (m.median, m.robust_std, m.mean, m.std))]
-            for title, unit, m in panels
-        ]
-        header = ["map", "unit", "median", "robust σ", "mean", "σ"]
-        blocks.append(Table("Calibration maps in numbers", header, rows))
-    linearity = detector.facts.get("linearity") or {}
-    if is_table(linearity.get("levels")):
-        blocks.append(
-            plate(
-                "Linearity",
-                "Departure of each flat level from the straight line over exposure time. Good: "
-                "within a few tenths of a per cent, without trend. Bad: a curve that grows towards "
-                "the full well (nonlinear response), or scatter (an unsteady lamp).",
-                detector_figures.linearity(linearity["levels"]),
-            )
-        )
-    blocks += reduction_tables(detector.facts)
-    lead = "Bias, dark current, flat and read noise, and what the ladder of flats says."
-    if not blocks:
-        lead = f"{NOT_MEASURED}: the reduction left no calibration maps."
-    return Section("detector", "Detector", lead, blocks)
 
 
 def _masks(contents: Contents) -> Section:
@@ -350,8 +292,8 @@ def _provenance(contents: Contents) -> Section:
     if contents.arrays:
         blocks.append(frames_table(contents.arrays))
     blocks += stage_tables(contents.stages)
-    blocks.append(
-        Table("Acquisition as understood", ["key", "value"], flat_rows(contents.acquisition))
-    )
+    # Detector frames alone have no optics.
+    listed = {key: value for key, value in contents.acquisition.items() if value is not None}
+    blocks.append(Table("Acquisition as understood", ["key", "value"], flat_rows(listed)))
     lead = "What this page was made from. Equal keys mean equal results."
     return Section("provenance", "Provenance", lead, blocks)

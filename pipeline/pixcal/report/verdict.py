@@ -40,10 +40,11 @@ class Finding:
 def headline(contents: Contents) -> str:
     """One sentence on the whole run."""
     if not contents.sets:
+        if not contents.has_fringes:
+            return detector_headline(contents.detector.facts)
         return (
-            "No offsets were measured: "
-            + ("the fit has not been run." if _has_fringes(contents) else "no fringe sets.")
-            + " This page holds what the detector frames show."
+            "No offsets were measured: the fit has not been run. This page holds what the detector "
+            "frames show."
         )
     parts = []
     for offset in contents.offsets:
@@ -56,8 +57,19 @@ def headline(contents: Contents) -> str:
     return f"The median pixel is calibrated in {' and '.join(parts)}."
 
 
-def _has_fringes(contents: Contents) -> bool:
-    return bool(contents.acquisition.get("frames", {}).get("fringes"))
+def detector_headline(facts: dict[str, Any]) -> str:
+    """Gain and read noise in a sentence, measured where they could be."""
+    parts = []
+    for key, name, unit in (
+        ("gain_e_per_adu", "gain", "e⁻/ADU"),
+        ("read_noise_e", "read noise", "e⁻"),
+    ):
+        entry = facts.get(key, {})
+        if entry.get("measured") is not None:
+            parts.append(f"{name} {with_error(entry['measured'], entry.get('error'))} {unit}")
+        elif entry.get("used") is not None:
+            parts.append(f"{name} {number(entry['used'], 4)} {unit} (declared)")
+    return f"The detector: {', '.join(parts)}." if parts else "The detector was not measured."
 
 
 def cards(contents: Contents) -> list[Card]:
@@ -140,7 +152,7 @@ def findings(contents: Contents) -> list[Finding]:
     made = [Finding(CHECK, _sentence(text)) for text in contents.warnings]
     if not contents.acquisition.get("frames", {}).get("flat"):
         made.append(Finding(CHECK, "There are no flat frames: the flat is taken as 1 everywhere."))
-    if _has_fringes(contents) and not contents.sets:
+    if contents.has_fringes and not contents.sets:
         made.append(Finding(CHECK, "The fit has not been run: there are no maps of offsets yet."))
     for fringes in contents.sets:
         made += _of_set(fringes)
@@ -182,6 +194,8 @@ def _of_set(fringes: FringeSet) -> Iterator[Finding]:
             f"so all errors were multiplied by {number(scale, 4)}. Gain or read noise may be off, "
             "or the model misses something.",
         )
+    if facts.get("period_note"):
+        yield Finding(CHECK, _sentence(f"{name}: {facts['period_note']}"))
     if facts.get("fringe_vector_moves"):
         yield Finding(
             CHECK, f"{name}: the fringe vector moves from frame to frame and was fitted in each."

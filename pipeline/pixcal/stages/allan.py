@@ -50,8 +50,6 @@ from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_g
 
 FORMAT = 1
 SCHEMA = "pixcal/allan/1"
-BATCH_FRAMES = 500
-"""Frames of a batch in a long run (paper, section 4.3); shorter batches are pointed out."""
 MIN_BATCHES = 3
 TILES_A_SIDE = 4
 """A task takes a square of as many of the fit's chunks a side: one file of each length."""
@@ -195,8 +193,6 @@ def _measure_set(
         for region in config.regions
     }
     notes = [batches.note] if batches.note else []
-    if batches.frames < BATCH_FRAMES:
-        notes.append(f"batches have {batches.frames} frames, fewer than the usual {BATCH_FRAMES}")
     return main | {
         "warnings": notes + main["warnings"],
         "region": config.region,

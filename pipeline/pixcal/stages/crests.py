@@ -197,8 +197,8 @@ def _nominal(acquisition: Acquisition, name: str, source: ReducedSet) -> Geometr
     pitch = acquisition.detector.pitch_um * 1e-3
     ny, nx = source.shape
     return Geometry(
-        acquisition.optics.wavelength_nm * 1e-6, pitch, (nx - 1) / 2 * pitch, (ny - 1) / 2 * pitch,
-        acquisition.optics.distance_mm, *baseline,
+        acquisition.fibres.wavelength_nm * 1e-6, pitch, (nx - 1) / 2 * pitch, (ny - 1) / 2 * pitch,
+        acquisition.fibres.distance_mm, *baseline,
     )  # fmt: skip
 
 

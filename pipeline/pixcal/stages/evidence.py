@@ -72,8 +72,8 @@ def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice
         good=maps["mask"] == 0,
         saturation_adu=min(map(ingested.saturation, ingested.arrays)),
         pitch_um=acquisition.detector.pitch_um,
-        wavelength_nm=acquisition.optics.wavelength_nm,
-        distance_mm=acquisition.optics.distance_mm,
+        wavelength_nm=acquisition.fibres.wavelength_nm,
+        distance_mm=acquisition.fibres.distance_mm,
         origin=(y[0], x[0]),
     )
 

@@ -27,7 +27,8 @@ from pixcal.report.contents import (
     Series,
     StageRecord,
 )
-from pixcal.report.page import DETECTOR_MAPS, render
+from pixcal.report.detector_page import DETECTOR_MAPS
+from pixcal.report.page import render
 from pixcal.report.summary import (
     BAND_ROWS,
     DETAIL,

@@ -65,6 +65,7 @@ __all__ = [
 ]
 
 _KEY_IN_NAME = 16
+_FROM_FRINGES = ("sweep", "fit", "allan", "crests", "corrected", "astrometry")
 
 
 def _command(run: Path, stage: str) -> str:
@@ -98,6 +99,8 @@ def require(run: Path, stage: str, format: int) -> Manifest:
         error.advice = f"make it again with '{command}'"
         raise
     if manifest is None:
+        if stage in _FROM_FRINGES and _without_fringes(run):
+            raise InputError(f"{run}: the acquisition lists no fringes, so there is no {stage}")
         raise InputError(f"{folder}: not there yet; run '{command}' first")
     if manifest.stage != stage or manifest.format != format:
         raise InputError(
@@ -105,6 +108,14 @@ def require(run: Path, stage: str, format: int) -> Manifest:
             f"{stage}/{format}; run '{command}' again"
         )
     return manifest
+
+
+def _without_fringes(run: Path) -> bool:
+    """Whether the acquisition that was ingested has detector frames alone."""
+    try:
+        return not read_json(run / "ingest" / "acquisition.json")["frames"]["fringes"]
+    except (DamagedError, LookupError):
+        return False
 
 
 @dataclass

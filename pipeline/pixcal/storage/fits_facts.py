@@ -5,7 +5,7 @@ be read without (`integer`) is an error.
 """
 
 import math
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from astropy.io import fits
@@ -86,3 +86,8 @@ def time_stamp_mjd(headers: tuple[fits.Header, ...]) -> float | None:
                 moment = moment.replace(tzinfo=UTC)
             return (moment - _MJD_EPOCH).total_seconds() / _SECONDS_A_DAY
     return None
+
+
+def date_of(mjd: float) -> str:
+    """UTC date and time of a modified Julian date, as ``DATE-OBS`` has it, to the millisecond."""
+    return (_MJD_EPOCH + timedelta(days=mjd)).isoformat("T", "milliseconds").partition("+")[0]

@@ -45,7 +45,7 @@ class SetModes:
         geometry = None
         if facts["model"] == "hyperbolic":
             geometry = Geometry(
-                acquisition.optics.wavelength_nm * 1e-6,
+                acquisition.fibres.wavelength_nm * 1e-6,
                 acquisition.detector.pitch_um * 1e-3,
                 *(facts["geometry"][f"{name}_mm"] for name in PARAMETERS),
             )

@@ -259,7 +259,7 @@ def fitted_shape(
             f"{run}: fitted with {facts['model']!r} fringes, whose modes are not known"
         )
     geometry = Geometry(
-        acquisition.optics.wavelength_nm * 1e-6,
+        acquisition.fibres.wavelength_nm * 1e-6,
         acquisition.detector.pitch_um * 1e-3,
         *(facts["geometry"][f"{name}_mm"] for name in PARAMETERS),
     )

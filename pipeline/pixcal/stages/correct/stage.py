@@ -258,7 +258,7 @@ def _publish(run_dir: Path, plan: Treatments) -> None:
     if result["outputs"]:
         fits = {name: facts["fit"] for name, facts in result["sets"].items()}
         key = read_json(folder / "manifest.json")["key"]
-        cards, history = header_of(result | {"sets": fits}, key)
+        cards, history = header_of(run_dir, result | {"sets": fits}, key)
         cards.append(("NEFFECT", len(plan.undone), "effects undone"))
         for n, effect in enumerate(plan.undone, start=1):
             cards.append((f"EFFECT{n}", effect.name, "effect undone"))

@@ -39,7 +39,7 @@ def bench_of(
         If the light goes beyond what a converter of 16 bits can give.
     """
     top = _top(acquisition, evidence, sets, dtypes)
-    d, o, shape = acquisition.detector, acquisition.optics, evidence.good.shape
+    d, o, shape = acquisition.detector, acquisition.fibres, evidence.good.shape
     listed = [f"fringes/{s.name}" for s in acquisition.frames.fringes]
     table = tables[listed[0]] if listed else next(iter(tables.values()))
     times = np.array(table["time_s"], float)

@@ -33,6 +33,8 @@ RED = 2.5
 EXCESS = 50.0
 """Fall then asked of each term over that of terms of no cause: the power of steps falls with the
 order of the term, and two stitches reach 15."""
+FAR_PERIOD = 0.15
+"""Relative departure of the fringe period from the nominal one that is worth a note."""
 
 
 @dataclass(frozen=True)
@@ -167,9 +169,9 @@ def _start(
         reference=(float(facts["reference"][0]), float(facts["reference"][1])),
         scale=max(source.shape) / 2,
         planes=planes,
-        wavelength_mm=acquisition.optics.wavelength_nm * 1e-6,
+        wavelength_mm=acquisition.fibres.wavelength_nm * 1e-6,
         pitch_mm=acquisition.detector.pitch_um * 1e-3,
-        distance_mm=acquisition.optics.distance_mm,
+        distance_mm=acquisition.fibres.distance_mm,
         baseline_mm=baseline,
     )
 
@@ -257,6 +259,7 @@ def describe(fitted: FittedSet, masked: int, sigma_px: float) -> dict[str, Any]:
         "ky": ky,
         "nominal_kx": facts["nominal_k"][0],
         "nominal_ky": facts["nominal_k"][1],
+        "period_note": _period_note(k, float(np.hypot(*facts["nominal_k"]))),
         "phase_at_origin_rad": float(np.remainder(origin, 2 * np.pi)),
         "axis": [kx / k, ky / k],
         "visibility": float(1 / ratio),
@@ -276,3 +279,14 @@ def describe(fitted: FittedSet, masked: int, sigma_px: float) -> dict[str, Any]:
         "model": fitted.model,
         "evidence": fitted.evidence,
     }
+
+
+def _period_note(k: float, nominal: float) -> str:
+    """What to say of a fringe vector (rad/px) far from the nominal length; "" if it is not."""
+    if abs(nominal / k - 1) <= FAR_PERIOD:
+        return ""
+    return (
+        f"the fringe period is {2 * np.pi / k:.3g} px, but baseline_mm, wavelength_nm and "
+        f"distance_mm of acquisition.yaml give {2 * np.pi / nominal:.3g} px; correct whichever is "
+        "wrong"
+    )

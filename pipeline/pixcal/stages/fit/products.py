@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import DamagedError
+from pixcal.stages.fit.sweep import load_run
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.fits_facts import date_of
 from pixcal.storage.products import Card, is_whole, write_map
 
 PIXEL_BYTES = 9
@@ -51,31 +53,36 @@ def publish(run_dir: Path) -> None:
     """Write the products of a complete fit."""
     result = read_json(run_dir / "fit" / "fit.json")
     key = read_json(run_dir / "fit" / "manifest.json")["key"]
-    cards, history = header_of(result, key)
+    cards, history = header_of(run_dir, result, key)
     publish_maps(run_dir, run_dir / "fit" / "fit.zarr", result["outputs"], cards, history)
     write_json(run_dir / "products" / "fit.json", result)
 
 
-def header_of(result: dict[str, Any], key: str) -> tuple[list[Card], list[str]]:
+def header_of(run_dir: Path, result: dict[str, Any], key: str) -> tuple[list[Card], list[str]]:
     """Cards and HISTORY lines of the maps of a fit.
 
     Parameters
     ----------
+    run_dir : Path
     result : dict
         As in ``fit.json``.
     key : str
         Of the artefact that holds the maps.
     """
-    cards: list[Card] = [
+    models = {facts["model"] for facts in result["sets"].values()}
+    cards = [
+        *_detector_cards(run_dir),
         ("PIXCALID", key, "key of the fit"),
         ("INDIGEST", result["input"], "digest of the acquisition"),
-        ("MODEL", result["model"], "shape of the fringes"),
+        ("MODEL", "+".join(sorted(models)), "shape of the fringes, as fitted"),
+        ("MODELOPT", result["model"], "shape of the fringes that was asked for"),
         ("NSETS", len(result["sets"]), "fringe sets used"),
     ]
     history = []
     for n, (name, facts) in enumerate(result["sets"].items(), start=1):
         cards += [
             (f"SET{n}", name, "name of the fringe set"),
+            (f"MODEL{n}", facts["model"], "shape of the fringes, as fitted"),
             (f"NFRAME{n}", facts["frames"], "frames used"),
             (f"KX{n}", facts["kx"], "[rad/px] fringe vector along x at the centre"),
             (f"KY{n}", facts["ky"], "[rad/px] fringe vector along y at the centre"),
@@ -88,6 +95,30 @@ def header_of(result: dict[str, Any], key: str) -> tuple[list[Card], list[str]]:
         ]
         history.append(f"set {name}: modes removed: {', '.join(facts['removed_modes'])}")
     return cards, history
+
+
+def _detector_cards(run_dir: Path) -> list[Card]:
+    """Which detector it is, and when its fringes were recorded (where the frames say)."""
+    detector = load_run(run_dir)[0].detector
+    cards: list[Card] = [
+        ("DETECTOR", detector.name, "name of the detector"),
+        ("PIXSIZE1", detector.pitch_um, "[um] pixel pitch along x"),
+        ("PIXSIZE2", detector.pitch_um, "[um] pixel pitch along y"),
+    ]
+    tables = read_json(run_dir / "ingest" / "frames.json")
+    stamps = [
+        mjd
+        for name, table in tables.items()
+        if name.startswith("fringes/")
+        for mjd in table.get("mjd", ())
+        if mjd is not None
+    ]
+    if stamps:
+        cards += [
+            ("DATE-OBS", date_of(min(stamps)), "UTC of the first fringe frame"),
+            ("MJD-OBS", min(stamps), "[d] the same as modified Julian date"),
+        ]
+    return cards
 
 
 def publish_maps(

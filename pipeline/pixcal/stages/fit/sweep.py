@@ -60,7 +60,7 @@ class Config:
 def nominal_vector(acquisition: Acquisition, name: str) -> tuple[float, float]:
     """Nominal fringe vector (kx, ky) of a set in rad/px (paper, equation 4)."""
     (baseline,) = (s.baseline_mm for s in acquisition.frames.fringes if s.name == name)
-    optics = acquisition.optics
+    optics = acquisition.fibres
     per_mm = (
         2 * np.pi * acquisition.detector.pitch_um * 1e3
         / (optics.wavelength_nm * optics.distance_mm)

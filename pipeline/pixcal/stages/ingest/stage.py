@@ -186,7 +186,7 @@ def _check(
         _common_dtype(array, its_files)
     tables, warnings = {}, []
     for array, its_files in by_array.items():
-        frames, odd = tabulate(array, its_files, described.optics.frame_period_s)
+        frames, odd = tabulate(array, its_files, described.fibres.frame_period_s)
         tables[array] = frames
         warnings += odd
     return tables, warnings

@@ -1,0 +1,59 @@
+"""The detector's chapter of the page."""
+
+from pixcal.report import detector_figures, map_figures
+from pixcal.report.blocks import Block, Section, plate
+from pixcal.report.contents import Contents
+from pixcal.report.tables import Table, is_table, reduction_tables
+from pixcal.report.text import number
+
+DETECTOR_MAPS = {
+    "bias": ("bias", "ADU"),
+    "dark_rate": ("dark current", "e⁻/s"),
+    "flat": ("flat", "relative response"),
+    "read_noise": ("read noise", "e⁻"),
+}
+"""Title and unit of each map of the reduction."""
+
+
+def detector(contents: Contents) -> Section:
+    """What the bias, dark and flat frames show."""
+    found = contents.detector
+    panels = [
+        (title, unit, found.maps[key])
+        for key, (title, unit) in DETECTOR_MAPS.items()
+        # A map of one value is what the reduction takes where there are no frames.
+        if key in found.maps and found.maps[key].std > 0
+    ]
+    blocks: list[Block] = []
+    if panels:
+        blocks.append(
+            plate(
+                "Calibration maps",
+                "Colours span the 0.5th to the 99.5th percentile. Good: smooth or random maps. "
+                "Bad: rows, columns or blocks in the read noise, fringes in the flat (coherent "
+                "light), a flat that follows the dark current (dark subtraction).",
+                map_figures.map_row(panels),
+            )
+        )
+        rows = [
+            [title, unit, *(number(v, 4) for v in (m.median, m.robust_std, m.mean, m.std))]
+            for title, unit, m in panels
+        ]
+        header = ["map", "unit", "median", "robust σ", "mean", "σ"]
+        blocks.append(Table("Calibration maps in numbers", header, rows))
+    linearity = found.facts.get("linearity") or {}
+    if is_table(linearity.get("levels")):
+        blocks.append(
+            plate(
+                "Linearity",
+                "Departure of each flat level from the straight line over exposure time. Good: "
+                "within a few tenths of a per cent, without trend. Bad: a curve that grows towards "
+                "the full well (nonlinear response), or scatter (an unsteady lamp).",
+                detector_figures.linearity(linearity["levels"]),
+            )
+        )
+    blocks += reduction_tables(found.facts)
+    lead = "Bias, dark current, flat and read noise, and what the ladder of flats says."
+    if not blocks:
+        lead = "Not measured: the reduction left no calibration maps."
+    return Section("detector", "Detector", lead, blocks)
