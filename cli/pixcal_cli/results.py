@@ -228,8 +228,23 @@ def show_report(run: Path) -> None:
     click.echo(f"  {run / 'products' / 'report.html'}")
 
 
+def show_advice(run: Path) -> None:
+    """Print which map to use, what limits it, and what each cause does to it."""
+    from pixcal.stages.correct import HEADER, advice  # here: for a fast `pixcal --help`
+
+    found = advice(run)
+    if found is None:
+        return
+    click.echo()
+    for sentence in found.sentences:
+        click.echo(sentence)
+    if found.rows:
+        show_table(HEADER, found.rows)
+
+
 def show_run(run: Path, *, fitted: bool, diagnosed: bool) -> None:
-    """Print the results of all steps, and where the products are."""
+    """Print which map to use, the results of all steps, and where the products are."""
+    show_advice(run)
     if warnings := read_json(run / "ingest" / MANIFEST)["summary"]["warnings"]:
         click.echo("\ningest")
         show_notes(warnings)

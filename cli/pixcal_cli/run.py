@@ -50,7 +50,7 @@ def run(
 ) -> None:
     """Do all steps, from the acquisition ACQ to the report under RUN."""
     # Here, not at the top: for a fast `pixcal --help`.
-    from pixcal.stages import allan, diagnose, fit, ingest, reduce, report
+    from pixcal.stages import allan, correct, diagnose, fit, ingest, reduce, report
 
     with results.announce("ingest", run / "ingest"):
         ingest.run(acquisition, run, ingest.Config(overwrite=overwrite, cubes=cubes), runtime)
@@ -70,6 +70,12 @@ def run(
             # The maps are good without it.
             click.echo(f"diagnose: not possible: {error}")
             diagnosed = False
+    if diagnosed and fringes:
+        config = correct.Config(fit=fit.Config(model=model))
+        with results.announce("corrected", run / "corrected"):
+            refused = correct.attempt(run, config, runtime)
+        if refused is not None:
+            click.echo(f"corrected: not possible, the fitted maps stand: {refused}")
     with results.announce("report", run / "report"):
         report.run(run, report.Config(), runtime)
     results.show_run(run, fitted=fringes, diagnosed=diagnosed)

@@ -83,7 +83,21 @@ def run(
         except InputError as error:
             # The maps are good without it.
             warnings.warn(f"not diagnosed: {error}", stacklevel=2)
+        else:
+            _correct(out, reduced, model, runtime or Runtime())
     return write_report(out, runtime=runtime)
+
+
+def _correct(out: StrPath, reduced: Run, model: str, runtime: Runtime) -> None:
+    """Make the corrected maps; where that is not possible the fitted ones stand."""
+    from pixcal.stages import correct
+    from pixcal.stages import fit as stage
+
+    if not reduced.acquisition.frames.fringes:
+        return
+    refused = correct.attempt(Path(out), correct.Config(fit=stage.Config(model=model)), runtime)
+    if refused is not None:
+        warnings.warn(f"maps not corrected: {refused}", stacklevel=3)
 
 
 def ingest(

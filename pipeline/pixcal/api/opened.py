@@ -27,8 +27,8 @@ FORMATS = {
     "reduce": 1,
     "fit": 1,
     "allan": 1,
-    "diagnose": 4,
-    "corrected": 1,
+    "diagnose": 5,
+    "corrected": 2,
     "report": 1,
 }
 """Formats of the artefacts that are read here."""

@@ -186,6 +186,10 @@ class Contents:
         Where the run was diagnosed.
     warnings : tuple of str
         Sentences that the stages left.
+    advice : tuple of str
+        Which map to use, and what limits it.
+    causes : tuple of tuple of str
+        What each cause does to the map, and what is done about it; the header first.
     """
 
     acquisition: dict[str, Any]
@@ -199,6 +203,8 @@ class Contents:
     allan_measured: bool = False
     diagnosis: Diagnosis | None = None
     warnings: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()
+    causes: tuple[tuple[str, ...], ...] = ()
 
     @property
     def has_fringes(self) -> bool:

@@ -60,11 +60,20 @@ def render(contents: Contents) -> str:
         title=f"{name}: {what}" if name else what.capitalize(),
         subtitle=_subtitle(contents),
         headline=headline(contents),
+        advice=contents.advice,
+        causes=_causes(contents),
         cards=cards(contents),
         findings=findings(contents),
         sections=[chapter(contents) for chapter in chapters],
         version=__version__,
     )
+
+
+def _causes(contents: Contents) -> list[Block]:
+    if not contents.causes:
+        return []
+    header, *rows = contents.causes
+    return [Table("What each cause does to the map", header, rows)]
 
 
 def _subtitle(contents: Contents) -> str:

@@ -45,6 +45,7 @@ from pixcal.report.summary import (
     summarise_flags,
 )
 from pixcal.simulation.effect import Effect
+from pixcal.stages.correct import HEADER, advice
 from pixcal.storage.artefact import (
     MANIFEST,
     Manifest,
@@ -60,8 +61,18 @@ from pixcal.storage.folder import INDEX
 
 STAGE = "report"
 FORMAT = 1
-SHOWN_STAGES = {"ingest": 1, "reduce": 1, "sweep": 3, "fit": 1, "allan": 1, "diagnose": 4}
+SHOWN_STAGES = {
+    "ingest": 1,
+    "reduce": 1,
+    "sweep": 3,
+    "fit": 1,
+    "allan": 1,
+    "diagnose": 5,
+    "corrected": 2,
+}
 """Stages and the formats of theirs that are understood."""
+COMMANDS = {"sweep": "fit", "corrected": "fit --with-diagnosis"}
+"""That make stages of another name."""
 FIGURE_BYTES = 192 << 20
 """Matplotlib, one figure and the page."""
 
@@ -125,6 +136,7 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
     jobs = _jobs(run_dir, fit)
     results = _summaries(jobs, runtime)
     sets = _sets(run_dir, fit, measured, results)
+    told = advice(run_dir)
     return Contents(
         acquisition=read_json(run_dir / "ingest" / "acquisition.json"),
         stages=tuple(
@@ -147,6 +159,8 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
         flags=results.get("flags/products"),
         diagnosis=_diagnosis(run_dir / "diagnose") if "diagnose" in manifests else None,
         warnings=_warnings(manifests, facts),
+        advice=() if told is None else told.sentences,
+        causes=(HEADER, *told.rows) if told is not None and told.rows else (),
     )
 
 
@@ -293,7 +307,7 @@ def _warnings(manifests: Mapping[str, Manifest], facts: Mapping[str, Any]) -> tu
         for made_from, key in manifest.inputs.items():
             present = manifests.get(made_from)
             if present is not None and present.key != key:
-                command = "fit" if stage == "sweep" else stage
+                command = COMMANDS.get(stage, stage)
                 found.append(
                     f"{stage} was made from an earlier {made_from}: run 'pixcal {command}' again."
                 )

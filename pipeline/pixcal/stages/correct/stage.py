@@ -20,9 +20,8 @@ from pixcal.model.errors import DamagedError, InputError
 from pixcal.stages import fit
 from pixcal.stages.correct.gain import Maps, measure_gain
 from pixcal.stages.correct.restored_set import RestoredSet
-from pixcal.stages.correct.treatment import HYPERBOLIC, Treatments, treatments
 from pixcal.stages.correct.uncertainty import parameter_errors
-from pixcal.stages.correct.undoing import Swept, undo_on_maps
+from pixcal.stages.correct.undoing import Swept, sides_of, undo_on_maps
 from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
 from pixcal.stages.fit import Config as FitConfig
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
@@ -33,6 +32,7 @@ from pixcal.stages.fit.sweep import Config as SweepConfig
 from pixcal.stages.fit.sweep import load_run, nominal_vector, sweep_set
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
+from pixcal.stages.treatment import HYPERBOLIC, Treatments, treatments
 from pixcal.storage.artefact import (
     Build,
     Manifest,
@@ -47,7 +47,7 @@ from pixcal.storage.artefact import (
 from pixcal.storage.cube import create_group
 from pixcal.storage.products import Card, is_whole
 
-FORMAT = 1
+FORMAT = 2
 SUFFIX = "_corrected"
 """Of the names of the products."""
 
@@ -116,6 +116,24 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         return require(run_dir, "corrected", FORMAT)
 
 
+def attempt(run_dir: Path, config: Config, runtime: Runtime) -> str | None:
+    """As `run`, for those to whom the fitted maps are good without it.
+
+    Returns
+    -------
+    str or None
+        Why there are no corrected maps, where they cannot be made; those of another fit are
+        removed.
+    """
+    try:
+        run(run_dir, config, runtime)
+    except (InputError, ArithmeticError, LookupError, MemoryError, ValueError) as error:
+        publish_maps(run_dir, run_dir / "corrected" / "corrected.zarr", (), [], [], SUFFIX)
+        (run_dir / "products" / "correction.json").unlink(missing_ok=True)
+        return str(error) or type(error).__name__
+    return None
+
+
 def _correct(
     run_dir: Path, made: Build, plan: Treatments, acquisition: Acquisition, runtime: Runtime
 ) -> Json:
@@ -148,8 +166,13 @@ def _corrected_maps(
     swept, facts = _sweep(run_dir, made, plan, acquisition, runtime)
     model = HYPERBOLIC if plan.bent else before["model"]
     fitted, halves, left = [], {}, {}
-    for name in names:
-        own = _swept_set(run_dir, swept / name, before["sets"][name], plan, acquisition, name)
+    own_sets = [
+        _swept_set(run_dir, swept / name, before["sets"][name], plan, acquisition, name)
+        for name in names
+    ]
+    sides = sides_of(own_sets)
+    for name, closed in zip(names, own_sets, strict=True):
+        own = replace(closed, open_sides=sides)
         target = made.scratch / "undone" / name
         undo_on_maps(own, target, runtime, name)
         halves[name] = own.has_halves
@@ -168,6 +191,7 @@ def _corrected_maps(
     return {
         "outputs": list(totals.outputs),
         "model": model,
+        "open_sides": dict(zip(("top", "bottom", "left", "right"), sides, strict=True)),
         "sets": {
             f.name: _of_set(f, totals, gain["sets"][f.name], before["sets"][f.name], plan)
             | {"parameter_error_px": left[f.name]}

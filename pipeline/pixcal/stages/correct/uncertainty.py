@@ -99,7 +99,7 @@ def _tile(
     y, x = swept.source.ranges(at)
     part = swept.around(y, x)
     inside = swept.inside(y, x)
-    maps, good = maps_of(swept, part)
+    maps, good, _ = maps_of(swept, part)
     size = float(np.hypot(*swept.k))
     found = []
     for effect in swept.effects:

@@ -17,6 +17,7 @@ from pixcal.model.config import quantity, to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.inquiry import inquire, places
+from pixcal.stages.diagnose.on_map import on_map
 from pixcal.stages.diagnose.result import describe
 from pixcal.stages.diagnose.trial import Effects
 from pixcal.storage.artefact import (
@@ -30,7 +31,7 @@ from pixcal.storage.artefact import (
     write_json,
 )
 
-FORMAT = 4
+FORMAT = 5
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,10 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
                     places(own),
                 )  # fmt: skip
                 shutil.rmtree(scratch, ignore_errors=True)
+                named = {effect.name: effect for effect in own.found.final.effects}
+                fits = [fit for window in own.look.windows for fit in window.bench.fits]
+                for cause in diagnosis["causes"]:
+                    cause["on_map"] = on_map(named[cause["effect"]], fits, run_dir)
                 write_json(made.folder / "diagnosis.json", diagnosis)
                 write_json(made.folder / "curves.json", curves)
                 made.summary.update(

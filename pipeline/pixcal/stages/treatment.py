@@ -14,6 +14,8 @@ from pixcal.simulation.effect import Effect
 HYPERBOLIC = "hyperbolic"
 """The shape of fringes (`pixcal.estimators.models`) that takes up `HyperbolicFringes`."""
 IN_CORRECTED = "in the corrected fit"
+CORRECTED = ("undone on maps", "undone on samples", IN_CORRECTED)
+"""Treatments after which the corrected maps are free of an effect."""
 ABSORBED = {
     "bias_drift": "a level that all pixels share moves the free intensity of a frame",
     "contrast_noise": "every frame of the fit has an amplitude of its own",
@@ -63,6 +65,19 @@ class Treatment:
     errors: Mapping[str, float]
     how: str
     why: str
+
+    @property
+    def corrects(self) -> bool:
+        """Whether corrected maps are made without it."""
+        return self.how in CORRECTED
+
+    @property
+    def action(self) -> str:
+        """As in ``diagnosis.json``: what is to be done about the map."""
+        if self.corrects:
+            return "corrected"
+        absorbed = self.how in ("in the fit", "absorbed by the fit") or self.effect.name in LEFT
+        return "unaffected" if absorbed else "fix the bench"
 
     @property
     def plain(self) -> dict[str, Any]:
@@ -173,6 +188,11 @@ def treatments(
         (effect,) = parse_effects({name: parameters}, str(where), known)
         every.append(Treatment(effect, origin, errors, *_treated(effect, asked, models)))
     return Treatments(tuple(every))
+
+
+def treatment_of(effect: Effect, asked: str, models: Mapping[str, str]) -> Treatment:
+    """What to do about an effect that a diagnosis found; parameters as in `treatments`."""
+    return Treatment(effect, "diagnosis", {}, *_treated(effect, asked, models))
 
 
 def _treated(effect: Effect, asked: str, models: Mapping[str, str]) -> tuple[str, str]:

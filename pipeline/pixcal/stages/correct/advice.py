@@ -1,0 +1,186 @@
+"""Which map to use, what limits it, and what each cause does to it: for the terminal and report."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from pixcal.effects import known_effects, parse_effects
+from pixcal.model.errors import InputError
+from pixcal.stages.correct.stage import FORMAT, SUFFIX
+from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
+from pixcal.stages.treatment import treatment_of
+from pixcal.storage.artefact import MANIFEST, read_json, require
+
+Json = Mapping[str, Any]
+
+HEADER = ("effect", "size", "on the map (rms, maximum)", "what is done about it")
+NOT_MEASURED = {"rms_px": 0.0, "max_px": 0.0, "action": "not measured"}
+"""In the place of ``on_map`` where a diagnosis has none."""
+MATTERS = 0.3
+"""Share of SIGMA from which an error that SIGMA does not hold limits a map."""
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What a reader of the maps must know first.
+
+    Attributes
+    ----------
+    sentences : tuple of str
+        Which maps to use, and what limits them.
+    rows : tuple of (str, str, str, str)
+        A row for each cause, under `HEADER`.
+    """
+
+    sentences: tuple[str, ...]
+    rows: tuple[tuple[str, str, str, str], ...]
+
+
+def advice(run_dir: Path) -> Advice | None:
+    """What the fit, the diagnosis and the correction say together; None without a fit.
+
+    Parameters
+    ----------
+    run_dir : Path
+        A run; without a diagnosis only the fitted maps are spoken of.
+    """
+    if not (run_dir / "fit" / MANIFEST).exists():
+        return None
+    fit = read_json(run_dir / "fit" / "fit.json")
+    if not fit["outputs"]:
+        return None
+    diagnosis = _diagnosis(run_dir)
+    correction = _correction(run_dir)
+    causes = diagnosis["causes"] if diagnosis else ()
+    rows = tuple(_row(cause, correction) for cause in causes)
+    made = correction is not None and correction["outputs"]
+    source: Json = correction if made and correction is not None else fit
+    names = [f"{name}{SUFFIX if made else ''}.fits" for name in source["outputs"]]
+    use = f"Use {' and '.join(names)}: {_about(diagnosis, correction)}."
+    return Advice((use, _limit(fit, diagnosis, correction)), rows)
+
+
+def _diagnosis(run_dir: Path) -> Json | None:
+    if not (run_dir / "diagnose" / MANIFEST).exists():
+        return None
+    require(run_dir, "diagnose", DIAGNOSIS_FORMAT)
+    found: Json = read_json(run_dir / "diagnose" / "diagnosis.json")
+    return found
+
+
+def _correction(run_dir: Path) -> Json | None:
+    """That of the present fit and diagnosis."""
+    if not (run_dir / "corrected" / MANIFEST).exists():
+        return None
+    made = require(run_dir, "corrected", FORMAT)
+    for stage, key in made.inputs.items():
+        if read_json(run_dir / stage / MANIFEST)["key"] != key:
+            return None
+    found: Json = read_json(run_dir / "corrected" / "correction.json")
+    return found
+
+
+def _on_map(cause: Json) -> Json:
+    found: Json = cause.get("on_map", NOT_MEASURED)
+    return found
+
+
+def _about(diagnosis: Json | None, correction: Json | None) -> str:
+    if diagnosis is None:
+        return "as fitted; no diagnosis was made, so effects that bias them are not known"
+    if correction is not None and correction["outputs"]:
+        freed = [e["effect"] for e in correction["effects"] if _corrects(e["treatment"])]
+        return f"the offsets as fitted, corrected for {' and '.join(freed)}"
+    if any(_on_map(c)["action"] == "corrected" for c in diagnosis["causes"]):
+        return "as fitted, NOT corrected for the effects below that could be"
+    return "as fitted; nothing that the diagnosis found needs a correction"
+
+
+def _corrects(how: str) -> bool:
+    return how.startswith("undone") or how == "in the corrected fit"
+
+
+def _limit(fit: Json, diagnosis: Json | None, correction: Json | None) -> str:
+    """The largest of what errors hold, and of what they do not."""
+    made = correction if correction is not None and correction["outputs"] else None
+    if made is None:
+        sigma = {name: facts["sigma_median_px"] for name, facts in fit["sets"].items()}
+    else:
+        sigma = {name: facts["sigma_median_px"]["after"] for name, facts in made["sets"].items()}
+    least = min((s for s in sigma.values() if s), default=math.nan)
+    told = ", ".join(f"{s:.2g} px ({name})" for name, s in sigma.items() if s)
+    others = [
+        c for c in (diagnosis or {}).get("causes", ())
+        if _on_map(c)["rms_px"] > MATTERS * least
+        and not (made and _on_map(c)["action"] == "corrected")
+    ]  # fmt: skip
+    if others:
+        worst = max(others, key=lambda c: _on_map(c)["rms_px"])
+        return (
+            f"Limited by {worst['effect']}, which moves offsets by "
+            f"{_on_map(worst)['rms_px']:.2g} px rms; the noise is {told}."
+        )
+    if diagnosis is not None and diagnosis["verdict"] in ("unexplained", "partly explained"):
+        return (
+            f"The noise is {told}, but the diagnosis leaves a part of the gap without a cause: "
+            "a bias of the maps cannot be excluded."
+        )
+    kept = [
+        e for facts in (made["sets"].values() if made else ())
+        for e in facts["parameter_error_px"].values() if e
+    ]  # fmt: skip
+    if kept and max(kept) > MATTERS * least:
+        return (
+            f"Limited by noise, {told}, which includes the error of the correction, up to "
+            f"{max(kept):.2g} px rms."
+        )
+    return f"Limited by photon and read noise: {told}; more frames make it smaller."
+
+
+def _row(cause: Json, correction: Json | None) -> tuple[str, str, str, str]:
+    own = _on_map(cause)
+    moved = "none" if not own["rms_px"] else f"{own['rms_px']:.2g} px, {own['max_px']:.2g} px"
+    return cause["effect"], size_of(cause), moved, _done(cause, correction)
+
+
+def _done(cause: Json, correction: Json | None) -> str:
+    action = _on_map(cause)["action"]
+    why = next((e for e in (correction or {}).get("effects", ())
+                if e["effect"] == cause["effect"]), None)  # fmt: skip
+    if action == "corrected":
+        if why is not None and _corrects(why["treatment"]):
+            return "corrected"
+        return "NOT corrected: see 'pixcal fit RUN --with-diagnosis'"
+    reason = why["why"] if why is not None else _reason(cause)
+    return f"{action}: {reason}" if reason else str(action)
+
+
+def _reason(cause: Json) -> str:
+    try:
+        (effect,) = parse_effects({cause["effect"]: cause["parameters"]}, "diagnosis")
+    except InputError:
+        return ""  # An effect of the user's own.
+    return treatment_of(effect, "auto", {}).why
+
+
+def size_of(cause: Json) -> str:
+    """The strengths of an effect in a few words."""
+    kind = known_effects().get(cause["effect"])
+    if kind is None:
+        return "-"
+    units = {f.name: f.metadata.get("unit", "") for f in fields(kind)}
+    parts = []
+    for name in kind.strengths:
+        value = cause["parameters"].get(name)
+        if isinstance(value, Sequence) and value and isinstance(value[0], Mapping):
+            largest = max((abs(one.get("share", 0.0)) for one in value), default=0.0)
+            parts.append(f"{len(value)} {name}, largest {100 * largest:.2g} %")
+        elif isinstance(value, int | float) and value:
+            parts.append(f"{name} {value:.3g} {units[name]}".strip())
+        elif isinstance(value, Sequence) and value:
+            numbers = [v for v in value if isinstance(v, int | float)]
+            if numbers:
+                parts.append(f"{name} up to {max(map(abs, numbers)):.3g} {units[name]}".strip())
+    return "; ".join(parts) or "-"

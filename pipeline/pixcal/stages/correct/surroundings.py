@@ -1,0 +1,107 @@
+"""What lies around the pixels of a tile: flagged pixels, and what is beyond the window.
+
+A flagged pixel has been fitted like the others, and what it gives to its neighbours follows from
+that: only where its samples are missing or saturated is it taken to be like those around it. The
+window may be a part of a larger detector, whose pixels give to those at its border, or end with
+the chip, where nothing comes from beyond: the maps tell, side by side.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.model.flags import PixelFlag
+from pixcal.simulation.effect import FringeMaps
+
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Sides = tuple[bool, bool, bool, bool]
+"""Top, bottom, left and right of the window, rows counted from the top."""
+
+CLOSED: Sides = (False, False, False, False)
+BEYOND = 8
+"""Pixels beyond an open side that are taken to be there."""
+UNKNOWN = int(PixelFlag.SATURATED | PixelFlag.NO_DATA)
+"""Flags of pixels whose fit tells nothing of their light."""
+DEPTH, SKIPPED = 24, 4
+"""Lines of pixels that tell what the one at the border should be; those beside it do not count."""
+CLEAR = 9.0
+"""Difference of chi-square by which one side is told by itself; others go by all together."""
+SIGNS = ((0, 0), (0, 1), (1, 0), (1, 1))
+"""Of neighbours, so that the errors of any two of them add up in squares on average."""
+
+
+def scatter_of(phase: F64) -> float:
+    """Robust scatter (rad) of phases from pixel to pixel, from differences of neighbours."""
+    apart = np.abs(np.diff(phase, axis=1))
+    apart = apart[np.isfinite(apart)]
+    return float(1.4826 * np.median(apart) / np.sqrt(2)) if apart.size else 0.0
+
+
+def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, scatter: float) -> list[FringeMaps]:
+    """The maps with what is not known of some pixels moved by its error, in `SIGNS`.
+
+    Parameters
+    ----------
+    maps : FringeMaps
+    unknown : (y, x) bool
+        Inside the window: their light may be anything from none to twice that around them.
+    beyond : (y, x) bool
+        Beyond the window: their light is known, their offsets are not.
+    scatter : float
+        Of the offsets, as phases, rad.
+    """
+    y, x = np.indices(unknown.shape)
+    y, x = y + maps.origin[0], x + maps.origin[1]
+    found = []
+    for a, b in SIGNS:
+        sign = 1.0 - 2.0 * ((a * y + b * x) % 2)
+        z = (maps.theta[2] + 1j * maps.theta[1]) * np.exp(1j * scatter * sign * beyond)
+        z *= np.where(unknown, 1 + sign, 1.0)
+        theta = np.stack([maps.theta[0], z.imag, z.real])
+        found.append(FringeMaps(theta, maps.k, maps.origin, maps.flat))
+    return found
+
+
+def usable(theta: F64, mask: NDArray[np.uint8]) -> Mask:
+    """Pixels (y, x) whose fit tells what light they had, flagged or not."""
+    return np.asarray(np.isfinite(theta).all(axis=0) & (mask & UNKNOWN == 0))
+
+
+def border_misfit(theta: F64, k: tuple[float, float], good: Mask) -> float:
+    """How far the first line of pixels is off from what the next ones let expect: a chi-square.
+
+    Parameters
+    ----------
+    theta : (3, line, pixel) float64
+        Maps of the strip along a side, the line at the border first.
+    k : (float, float)
+        Fringe vector along the lines and from line to line, rad/px.
+    good : (line, pixel) bool
+    """
+    lines, pixels = good.shape
+    y, x = np.arange(lines)[:, None], np.arange(pixels)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        z = (theta[2] + 1j * theta[1]) / theta[0] * np.exp(-1j * (k[0] * x + k[1] * y))
+        z /= np.nanmean(np.where(good, z, np.nan))
+        value = np.log(z)
+    depth = np.arange(SKIPPED, lines)
+    total = 0.0
+    for part in (value.real, value.imag):
+        own = np.where(good & np.isfinite(part), part, np.nan)
+        own = own - np.nanmedian(own[SKIPPED:], axis=0)
+        mean = np.nanmedian(own, axis=1)
+        spread = 1.4826 * np.nanmedian(np.abs(own[SKIPPED:] - mean[SKIPPED:, None]))
+        error = spread * np.sqrt(np.pi / 2 / max(int(good[0].sum()), 1))
+        if not (error > 0 and np.isfinite(mean).all()):
+            continue
+        _, start = np.polyfit(depth, mean[depth], 1)
+        total += float(((mean[0] - start) / error) ** 2)
+    return total
+
+
+def decided(misfits: F64) -> Sides:
+    """Which sides are open, from the chi-squares (side, closed or open)."""
+    gain = misfits[:, 0] - misfits[:, 1]
+    together = bool(gain.sum() > 0)
+    top, bottom, left, right = (bool(g > 0) if abs(g) > CLEAR else together for g in gain.tolist())
+    return top, bottom, left, right

@@ -1,0 +1,90 @@
+"""What each cause does to the map of offsets: how far it moves them, and what is to be done."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.corrected import phase_change, straight_modes
+from pixcal.estimators.modes import solve_modes
+from pixcal.kernels.crosstalk import filled
+from pixcal.simulation.effect import Effect, FringeMaps
+from pixcal.stages.diagnose.nominal import FittedSet
+from pixcal.stages.treatment import treatment_of
+from pixcal.storage.artefact import MANIFEST, read_json
+
+F64 = NDArray[np.float64]
+
+PHASES = 12
+"""Frames, spread over a fringe, of which an effect on samples is undone."""
+LEAST_SIGNAL = 1.0
+"""Of a sample (e-), below which its shot noise is not taken."""
+
+
+def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str, Any]:
+    """Rms and maximum (px) of the change of the offsets by an effect, and what is to be done.
+
+    The change is that of undoing the effect on the maps of the fit, without the modes that the fit
+    removes. It is zero where the free parameters of the fit take the effect up.
+
+    Parameters
+    ----------
+    effect : Effect
+    fits : iterable of FittedSet
+        Maps of every fringe set and window.
+    run_dir : Path
+        Whose fit tells the shape of the fringes that was fitted.
+    """
+    action = treatment_of(effect, *_shapes(run_dir)).action
+    square, count, most = 0.0, 0, 0.0
+    for fit in fits if action != "unaffected" else ():
+        change = _change(effect, fit)
+        square += float(change @ change)
+        count += change.size
+        most = max(most, float(np.max(np.abs(change), initial=0.0)))
+    rms = float(np.sqrt(square / count)) if count else 0.0
+    return {"rms_px": _rounded(rms), "max_px": _rounded(most), "action": action}
+
+
+def _shapes(run_dir: Path) -> tuple[str, Mapping[str, str]]:
+    """Shape of the fringes that was asked for, and the one fitted to each set."""
+    if not (run_dir / "fit" / MANIFEST).exists():
+        return "auto", {}
+    sets = read_json(run_dir / "fit" / "fit.json")["sets"]
+    asked = read_json(run_dir / "fit" / MANIFEST)["config"].get("model", "auto")
+    return asked, {name: facts["model"] for name, facts in sets.items()}
+
+
+def _change(effect: Effect, fit: FittedSet) -> F64:
+    """Change (pixel,) of the offsets of good pixels by an effect, px; modes taken off."""
+    good = np.isfinite(fit.theta).all(axis=0) & np.isfinite(fit.delta)
+    maps = FringeMaps(filled(fit.theta, fit.k), fit.k, fit.origin, fit.flat)
+    after = effect.undo(maps) or _undone_on_samples(effect, maps) or effect.predict(maps)
+    if after is None or not good.any():
+        return np.zeros(0)
+    change = -phase_change(maps.theta, after.theta)[good]
+    modes = straight_modes(maps.theta, fit.k)[:, good]
+    taken = solve_modes(modes @ modes.T, (modes @ change)[:, None])[:, 0]
+    return np.asarray((change - taken @ modes) / np.hypot(*fit.k))
+
+
+def _undone_on_samples(effect: Effect, maps: FringeMaps) -> FringeMaps | None:
+    """Maps that a fit finds in frames without noise that an effect was undone on."""
+    phi = 2 * np.pi * np.arange(PHASES) / PHASES
+    frames = np.stack([np.ones(PHASES), np.cos(phi), np.sin(phi)])
+    flat = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat
+    charge = np.einsum("mt,myx->tyx", frames, maps.theta * flat)
+    undone = effect.undo_samples(charge.astype(np.float32))
+    if undone is None:
+        return None
+    weight = 1 / np.maximum(charge, LEAST_SIGNAL)
+    normal = np.einsum("mt,nt,tyx->yxmn", frames, frames, weight)
+    right = np.einsum("mt,tyx->yxm", frames, weight * undone)
+    theta = np.moveaxis(np.linalg.solve(normal, right[..., None])[..., 0], -1, 0)
+    return FringeMaps(theta, maps.k, maps.origin, maps.flat)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")

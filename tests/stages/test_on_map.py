@@ -1,0 +1,63 @@
+"""What a cause does to the map of offsets, and what a reader is told of it."""
+
+import numpy as np
+import pytest
+
+from pixcal.effects.brighter_fatter import BrighterFatter
+from pixcal.effects.ipc import Ipc
+from pixcal.effects.lag import Lag
+from pixcal.effects.nonlinearity import Nonlinearity
+from pixcal.simulation.effect import FringeMaps
+from pixcal.stages.correct.advice import size_of
+from pixcal.stages.diagnose.nominal import FittedSet
+from pixcal.stages.diagnose.on_map import on_map
+
+K = (0.03, 2 * np.pi / 9)
+
+
+def fitted(effect=None, shape=(48, 52)):
+    """Maps of straight fringes, with an effect that acts on maps."""
+    y, x = np.indices(shape, float)
+    psi = K[0] * x + K[1] * y
+    theta = np.stack([np.full(shape, 2e4), 1.8e4 * np.sin(psi), 1.8e4 * np.cos(psi)])
+    maps = FringeMaps(theta, K)
+    maps = maps if effect is None else effect.predict(maps)
+    return FittedSet(maps.theta, np.zeros(shape), np.full(shape, 1e-4), K, (0, 0))
+
+
+def test_crosstalk_that_repeats_moves_rows_by_its_share(tmp_path):
+    """A share k from the row above turns the phase by k sin K in one row of two."""
+    share = 0.02
+    effect = Ipc.of_rows([np.array([[0, 0, 0], [0, 0, 0], [0, share, 0]]), np.zeros((3, 3))])
+    found = on_map(effect, [fitted(effect)], tmp_path)
+    expected = share * np.sin(K[1]) / np.hypot(*K) / 2
+    assert found["action"] == "corrected"
+    assert found["rms_px"] == pytest.approx(expected, rel=0.1)
+    assert found["max_px"] >= found["rms_px"]
+
+
+def test_the_same_crosstalk_everywhere_is_a_shift_that_no_map_holds(tmp_path):
+    effect = Ipc.nearest(0.01)
+    inside = fitted(effect)
+    inside.theta[:, [0, -1]] = inside.theta[:, :, [0, -1]] = np.nan
+    # What the first row does not get reaches the second, with the square of the share.
+    assert on_map(effect, [inside], tmp_path)["rms_px"] < 0.01 * 0.01
+
+
+def test_what_the_fit_takes_up_moves_nothing(tmp_path):
+    found = on_map(Lag(), [fitted()], tmp_path)
+    assert found == {"rms_px": 0.0, "max_px": 0.0, "action": "unaffected"}
+
+
+@pytest.mark.parametrize("effect", [Nonlinearity(), BrighterFatter()])
+def test_what_acts_on_samples_moves_offsets_in_proportion(effect, tmp_path):
+    one, double = (on_map(effect.scaled(f), [fitted()], tmp_path)["rms_px"] for f in (1, 2))
+    assert one > 0
+    assert double == pytest.approx(2 * one, rel=0.15)
+
+
+def test_the_size_of_an_effect_is_told_in_its_units():
+    couplings = [{"share": 0.03}, {"share": -0.001}]
+    cause = {"effect": "ipc", "parameters": {"couplings": couplings}}
+    assert size_of(cause) == "2 couplings, largest 3 %"
+    assert size_of({"effect": "one of your own", "parameters": {}}) == "-"
