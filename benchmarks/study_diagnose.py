@@ -55,13 +55,10 @@ MOST_WRONG = 3
 """That are named in a table."""
 ALIKE = 0.05
 """By which shares of the gap may differ."""
-RAMPS = ("phase_modulator_error",)
-"""Effects that are looked for in a set whose phase is a ramp."""
 
 
-def bench(ramp: bool, seed: int = 9000) -> dict[str, Any]:
+def bench(seed: int = 9000) -> dict[str, Any]:
     """Two sets of 300 frames on 61 x 67 pixels, with bias, darks and a ladder of flats."""
-    law = {"phase_law": "ramp", "phase_step_rad": 0.35} if ramp else {}
     return {
         "schema": SCHEMA,
         "seed": seed,
@@ -81,7 +78,7 @@ def bench(ramp: bool, seed: int = 9000) -> dict[str, Any]:
             "flat_rate_e_s": 1.25e6,
             "flats": [{"exptime_s": 0.01 * n, "count": 20} for n in (1, 2, 3)],
             "fringes": [
-                {"name": name, "baseline_mm": baseline, "count": 300, "peak_e": 45000, **law}
+                {"name": name, "baseline_mm": baseline, "count": 300, "peak_e": 45000}
                 for name, baseline in (("vertical", [11.5, 0.0]), ("horizontal", [0.0, 6.4]))
             ],
         },
@@ -126,7 +123,7 @@ def played_nominal(folder: Path, seed: int) -> dict[str, Any]:
     """A detector of its own with nothing in it, diagnosed by the command."""
     with tempfile.TemporaryDirectory(dir=folder) as own:
         run = Path(own, "run")
-        record(bench(False, seed), Path(own), run)
+        record(bench(seed), Path(own), run)
         diagnose.run(run, diagnose.Config(), HERE)
         diagnosis = json.loads((run / "products" / "diagnosis.json").read_text())
         curves = json.loads((run / "diagnose" / "curves.json").read_text())
@@ -147,7 +144,7 @@ def played_nominal(folder: Path, seed: int) -> dict[str, Any]:
 def played_with(folder: Path, name: str, strength: float, seed: int) -> dict[str, Any]:
     """A detector of its own with an effect, through all that the command does."""
     truth = truth_of(name, strength, seed)
-    plain = bench(name in RAMPS, seed) | {"effects": {e.name: to_plain(e) for e in truth}}
+    plain = bench(seed) | {"effects": {e.name: to_plain(e) for e in truth}}
     with tempfile.TemporaryDirectory(dir=folder) as own:
         record(plain, Path(own), Path(own, "run"))
         scratch = Path(own, "scratch")

@@ -65,8 +65,8 @@ def test_its_size_is_found(acquired: Callable[..., Evidence], relative: float) -
         assert isinstance(found.effect, GainError)
         errors[name] = found.errors["relative"]
         assert abs(found.effect.relative - relative) < 3 * errors[name]
-        assert (found.significance > 5) or name == "flats"
-    assert errors["both"] < errors["fringes"] < 0.006
+        assert (found.significance > 4) or name == "flats"
+    assert errors["both"] < errors["fringes"] < 0.009
     assert errors["flats"] < 0.016
 
 
@@ -89,7 +89,7 @@ def test_crosstalk_does_not_hide_it(acquired: Callable[..., Evidence]) -> None:
     found = GainError.estimate(evidence)
     assert found is not None
     assert isinstance(found.effect, GainError)
-    assert abs(found.effect.relative - 0.05) < 4 * found.errors["relative"] < 0.02
+    assert abs(found.effect.relative - 0.05) < 4 * found.errors["relative"] < 0.03
 
 
 def test_without_light_nothing_is_said(acquired: Callable[..., Evidence]) -> None:

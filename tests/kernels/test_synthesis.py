@@ -149,9 +149,11 @@ def test_samples_are_rounded_and_clipped() -> None:
     noise = rng.standard_normal(SHAPE).astype(np.float32)
     out = np.zeros(SHAPE, np.uint16)
     adu = np.empty_like(electrons)
-    synthesis.amplify(electrons, bias, noise, 5.0, 2.5, adu)
+    read = rng.uniform(3, 7, SHAPE).astype(np.float32)
+    gain = rng.uniform(2, 3, SHAPE).astype(np.float32)
+    synthesis.amplify(electrons, bias, noise, read, gain, adu)
     synthesis.convert(adu, 200, out)
-    exact = (electrons + 5.0 * noise.astype(np.float64)) / 2.5 + bias
+    exact = (electrons + read * noise.astype(np.float64)) / gain + bias
     assert np.abs(out - np.clip(exact, 0, 200)).max() <= 0.5 + 1e-4
     assert out.max() == 200
     assert out.min() == 0

@@ -8,7 +8,7 @@ from pixcal.effects import effects
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.simulation.effect import Effect
-from pixcal.stages.diagnose.deciding import MORE, RAMP, RANDOM, deciding, missing_frames
+from pixcal.stages.diagnose.deciding import MORE, RANDOM, deciding, missing_frames
 
 LADDER = (0.01, 0.02, 0.03)
 FOUR = ((6.0, 0.0), (-9.0, 0.1), (0.0, 6.0), (0.0, 9.0))
@@ -79,8 +79,6 @@ BARE = missing(((6, 0),), (), dark=False, steps=(0.0,))
 @pytest.mark.parametrize(
     ("names", "kinds"),
     [
-        # An error of the modulator shows in a ramp; in random phases, what mixes frames.
-        (("rolling_shutter", "phase_modulator_error"), ("ramp",)),
         (("lag", "nonlinearity"), ("ladder",)),
         # The second harmonic of a response does not depend on the fringes' spacing.
         (("nonlinearity", "brighter_fatter"), ("baseline",)),
@@ -120,14 +118,14 @@ def test_what_tells_on_all_is_asked_for_once_nothing_parts_them() -> None:
 
 @pytest.mark.parametrize(
     ("steps", "lacks"),
-    [((0.0, 0.0), {"ramp": RAMP}), ((0.3, 0.2), {"random": RANDOM}), ((0.0, 0.3), {}), ((), {})],
+    [((0.0, 0.0), {}), ((0.3, 0.2), {"random": RANDOM}), ((0.0, 0.3), {}), ((), {})],
 )
 def test_phases_are_asked_for_that_no_set_has(
     steps: tuple[float, ...], lacks: dict[str, str]
 ) -> None:
     lacking = missing(FOUR if steps else (), LADDER, steps=steps)
     assert lacking == lacks
-    both = [effects()[name] for name in ("rolling_shutter", "phase_modulator_error")]
+    both = [effects()[name] for name in ("rolling_shutter", "intensity_noise")]
     assert deciding(lacking, both) == list(lacks.values() or [MORE])
 
 

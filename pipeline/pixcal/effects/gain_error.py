@@ -19,8 +19,9 @@ F64 = NDArray[np.float64]
 
 STEPS = np.array([(0, 0), (0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)])
 """Rows and columns from a pixel to itself and to those that it may share its noise with."""
-FLOOR = 1e-3
-"""Error of a share of the variance that is left however many samples there are."""
+FLOOR = 5e-3
+"""Error of a share of the variance that is left however many samples there are: no owner knows the
+gain of a detector better than this, and amplifiers differ by as much."""
 
 _CLIP = 6.0
 _DISAGREE = 4.0

@@ -187,6 +187,9 @@ class Evidence:
         Nominal bench.
     origin : (int, int)
         Row and column of the part's first pixel in the window.
+    photon_transfer : (float, float, float)
+        Gain that photon transfer gives (e-/ADU), its error, and the reduced chi-square; nan where
+        it gives none.
     """
 
     fringes: Mapping[str, FringeEvidence]
@@ -203,6 +206,7 @@ class Evidence:
     distance_mm: float
     notes: tuple[str, ...] = field(default=())
     origin: tuple[int, int] = (0, 0)
+    photon_transfer: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     _found: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def once(self, name: str, *given: Any, make: Callable[[], T]) -> T:

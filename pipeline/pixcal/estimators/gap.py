@@ -24,7 +24,7 @@ TOLERANCE = 0.05
 """Share of what an effect does that its simulation may be wrong by."""
 ALLOWED = 2.0
 """Standard deviations that a value may be off by before it counts as a gap."""
-CHANCE = 0.01
+CHANCE = 1e-3
 """Chance, of all statistics together, below which a difference is a gap."""
 
 

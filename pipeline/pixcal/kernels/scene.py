@@ -33,6 +33,10 @@ class DetectorMaps:
     """ADU."""
     dark_rate: Float32
     """e-/s."""
+    read_noise: Float32
+    """e- rms."""
+    gain: Float32
+    """e-/ADU."""
     mask: NDArray[np.uint8]
     """`PixelFlag.HOT` and `PixelFlag.DEAD`."""
 
@@ -128,6 +132,8 @@ def _chip_tile(d: SimulatedDetector, ty: int, tx: int) -> DetectorMaps:
         response=response,
         bias=normal(Stream.BIAS, d.bias_pixel_rms_adu) + column_bias,
         dark_rate=dark,
+        read_noise=np.full(TILE, d.read_noise_e, np.float32),
+        gain=np.full(TILE, d.gain_e_per_adu, np.float32),
         mask=np.where(dead, PixelFlag.DEAD, np.where(hot, PixelFlag.HOT, 0)).astype(np.uint8),
     )
 

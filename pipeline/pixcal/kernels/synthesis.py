@@ -173,7 +173,12 @@ def poisson_quantile(mean: float, w: float) -> int:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def amplify(
-    signal: Float32, bias: Float32, normal: Float32, read_noise: float, gain: float, out: Float32
+    signal: Float32,
+    bias: Float32,
+    normal: Float32,
+    read_noise: Float32,
+    gain: Float32,
+    out: Float32,
 ) -> None:
     """Electrons in ADU, with read noise and bias.
 
@@ -185,15 +190,15 @@ def amplify(
         ADU.
     normal : ndarray of float32, shape (y, x)
         Standard normals.
-    read_noise, gain : float
+    read_noise, gain : ndarray of float32, shape (y, x)
         e- rms and e-/ADU.
     out : ndarray of float32, shape (y, x)
         ADU.
     """
-    noise, scale = np.float32(read_noise), np.float32(1.0 / gain)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
-            out[i, j] = (signal[i, j] + noise * normal[i, j]) * scale + bias[i, j]
+            electrons = signal[i, j] + read_noise[i, j] * normal[i, j]
+            out[i, j] = electrons / gain[i, j] + bias[i, j]
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

@@ -165,8 +165,8 @@ class Effect:
         Fields beside these that may be zero, with the effect still there in its simplest form.
     told_by : tuple of str
         Frames that tell on it besides fringes of one set: ``dark``, ``flat``, ``ladder`` (of
-        flats), ``baseline`` (a second one along an axis), ``axis`` (another one), ``ramp`` or
-        ``random`` (of the phases); if not said, any but the last two.
+        flats), ``baseline`` (a second one along an axis), ``axis`` (another one), ``random``
+        (of the phases); if not said, any but the last.
     sources : tuple of str
         Where the default sizes come from.
     quick : bool

@@ -236,9 +236,8 @@ class _Chain:
             signal = effect.signal(signal, _Shot(self, frame, at))
         adu = np.empty_like(signal)
         read = self._normals(frame)[1]
-        synthesis.amplify(
-            signal, self.camera.maps.bias, read, d.read_noise_e, d.gain_e_per_adu, adu
-        )
+        maps = self.camera.maps
+        synthesis.amplify(signal, maps.bias, read, maps.read_noise, maps.gain, adu)
         for at, effect in enumerate(self.effects):
             adu = effect.readout(adu, _Shot(self, frame, at))
         synthesis.convert(adu, d.top_adu, self._samples)

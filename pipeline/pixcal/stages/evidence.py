@@ -75,7 +75,15 @@ def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice
         wavelength_nm=acquisition.fibres.wavelength_nm,
         distance_mm=acquisition.fibres.distance_mm,
         origin=(y[0], x[0]),
+        photon_transfer=_photon_transfer(used["gain_e_per_adu"]),
     )
+
+
+def _photon_transfer(gain: dict[str, Any]) -> tuple[float, float, float]:
+    """Gain measured, its error and reduced chi-square; nan where there is none."""
+    found = (gain.get(key) for key in ("measured", "error", "chi2_reduced"))
+    value, error, chi2 = (np.nan if v is None else float(v) for v in found)
+    return value, error, chi2
 
 
 def _fringes(

@@ -25,7 +25,6 @@ ABSORBED = {
     "intensity_noise": "every frame of the fit has an intensity of its own",
     "lag": "the frame before is a sum of the same maps: the fit takes it up; only the scatter of "
     "the share moves phases, by hundredths of the bound",
-    "phase_modulator_error": "the fit finds the phase of every frame",
     "wavelength_drift": "every frame of the fit has a phase and, where it moves, a fringe vector",
 }
 """Effects that the free parameters of the fit take up, and how (measured: docs/correct.md)."""

@@ -56,29 +56,19 @@ def _low_orders(name: str) -> Statistic:
     def measured(look: Look) -> Curve:
         """Over what a map as red as this one has by chance."""
         values = look.maps[name]
-        if name == "contrast":
-            values = _without_beams(values, look.found.k)
         terms = legendre(values.shape, 4 if name == "contrast" else 3)
         size = fit_terms(values, terms)
         rest = values - np.tensordot(size, terms, 1)
         good = np.isfinite(rest)
         variance = float(np.nanvar(rest)) * redness(rest)
         error = np.sqrt(variance / (terms[:, good] ** 2).sum(axis=1))
-        first = 3 if name != "contrast" else 1
+        # Two Gaussian beams make a contrast that bends in any direction, but no more than that.
+        first = 3 if name != "contrast" else 6
         return Curve(np.arange(first, len(terms), dtype=float), (size / error)[first:])
 
     measured.__name__ = f"{name}_bending"
     title = f"{name}: bending over the window"
     return statistic("space", title, unit="sigma", x="Legendre term")(measured)
-
-
-def _without_beams(values: F64, k: tuple[float, float]) -> F64:
-    """A map of the contrast without its change along the baseline: beams are unequal."""
-    ny, nx = values.shape
-    y, x = np.arange(ny)[:, None] - (ny - 1) / 2, np.arange(nx)[None, :] - (nx - 1) / 2
-    along = (k[0] * x + k[1] * y) / np.hypot(k[0] * nx, k[1] * ny)
-    terms = np.stack([along, along**2])
-    return np.asarray(values - np.tensordot(fit_terms(values, terms), terms, 1))
 
 
 def _scales(name: str) -> Statistic:

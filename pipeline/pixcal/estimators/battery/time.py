@@ -8,7 +8,6 @@ from scipy.fft import dct
 from pixcal.estimators.battery import Curve, Statistic, statistic
 from pixcal.estimators.battery.look import F64, Look
 from pixcal.estimators.evidence import Evidence
-from pixcal.kernels.processes import ramp_step
 from pixcal.kernels.sample_sums import frame_means
 
 SERIES = {
@@ -91,21 +90,6 @@ def frames_by_phase(look: Look) -> Curve:
     ]
     value = np.concatenate(values)
     return Curve(np.arange(len(value), dtype=float), value)
-
-
-@statistic("time", "how evenly the phases lie", x="harmonic")
-def phases(look: Look) -> Curve:
-    """Size of the mean of exp(i n phi); of a ramp, of its departures at the turn's harmonics."""
-    phi = look.found.phi
-    step = ramp_step(phi)
-    if not step:
-        return Curve(np.array([1.0, 2.0]), np.abs([np.exp(1j * n * phi).mean() for n in (1, 2)]))
-    command = step * np.arange(len(phi))
-    rest = np.unwrap(np.angle(np.exp(1j * (phi - command))))
-    jumps = np.diff(rest) - np.diff(rest).mean()
-    middle = (command[1:] + command[:-1]) / 2
-    size = [abs(np.mean(jumps * np.exp(-1j * n * middle))) for n in (1, 2)]
-    return Curve(np.array([1.0, 2.0]), np.array(size))
 
 
 @statistic("time", "offsets from batch to batch", unit="px", x="batches averaged", power=True)

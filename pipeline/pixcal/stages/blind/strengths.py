@@ -135,8 +135,6 @@ WAYS = (
     Way("lag", "share", 3.3e-5, 1.4e-5,
         lambda s, rng: {"share": s, "decay_frames": float(rng.choice([0.0, rng.uniform(1, 3)]))}),
     Way("nonlinearity", "quadratic", 0.0011, 4.3e-4, _bent),
-    Way("phase_modulator_error", "one period a turn, rad", 1.8e-4, 6.5e-5,
-        lambda s, rng: {"first_rad": s, "second_rad": float(s * rng.uniform(0, 1))}),
     Way("quantisation", "step beyond 1 ADU, ADU", 1.0, 1.0,
         lambda s, rng: {"coarse_adu": float(np.ceil(s)), "dnl_rms": 0.0, "ripple": 0.0}),
     Way("quantisation", "scatter of the codes", 0.012, 0.0036, _only("dnl_rms", _CODES)),

@@ -11,10 +11,8 @@ SAME_AXIS = 0.98
 """Cosine of the angle below which two sets measure along one axis."""
 LADDER = 3
 """Exposure times of flats that make a ladder."""
-RAMP = "fringes whose phase is a ramp, of many steps a turn"
 RANDOM = "fringes with random phases"
-"""A ramp shows the modulator's error, and nothing of light that a frame has of its neighbours; of
-random phases the reverse is true."""
+"""A ramp of equal steps shows nothing of light that a frame has of its neighbours."""
 MORE = "more frames of the same kind"
 
 
@@ -49,8 +47,6 @@ def missing_frames(
     exposures = {t for t in tables.get("flat", {}).get("exptime_s", ()) if t is not None}
     if len(exposures) < LADDER:
         missing["ladder"] = f"a ladder of flats (at least {LADDER} exposure times)"
-    if steps and not any(steps):
-        missing["ramp"] = RAMP
     if steps and all(steps):
         missing["random"] = RANDOM
     return missing

@@ -45,7 +45,7 @@ def bench_of(
     times = np.array(table["time_s"], float)
     exposure = max(float(table["exptime_s"][0] or 0.0), 1e-6)
     period = float(np.median(np.diff(times))) if len(times) > 1 else exposure
-    contrast = [s.contrast for s in sets]
+    contrast = [float(np.median(s.contrast)) for s in sets]
     return Bench(
         schema=SCHEMA,
         detector=SimulatedDetector(
@@ -77,7 +77,7 @@ def bench_of(
                     name=s.name,
                     baseline_mm=s.baseline_mm,
                     count=len(tables[f"fringes/{s.name}"]["time_s"]),
-                    peak_e=float(np.clip(np.max(truth.light) * (1 + truth.contrast), 1.0, 1e7)),
+                    peak_e=float(np.clip(np.max(truth.light * (1 + truth.contrast)), 1.0, 1e7)),
                 )
                 for s, truth in zip(acquisition.frames.fringes, sets, strict=True)
             ),
@@ -163,7 +163,7 @@ def _top(
     ends = [np.iinfo(dtype).max for dtype in dtypes.values() if dtype.kind in "iu"]
     top = float(min([65535, *ends]))
     for truth in sets:
-        peak = float(np.median(truth.light)) * (1 + truth.contrast) / evidence.gain
+        peak = float(np.median(truth.light * (1 + truth.contrast))) / evidence.gain
         if peak + float(np.median(evidence.bias)) > 65535:
             raise InputError(
                 f"fringes reach {peak:.0f} ADU above the bias: samples above 65535 ADU cannot be "

@@ -7,15 +7,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
+from pixcal.estimators.amplifiers import relative_gain
 from pixcal.estimators.evidence import Evidence, FringeEvidence
+from pixcal.estimators.pixel_read_noise import PixelNoise
 from pixcal.estimators.structure import smooth_surface
-from pixcal.estimators.wander import wander_of
 from pixcal.kernels.processes import ramp_step
+from pixcal.kernels.sample_sums import calm_residuals, pixel_moments
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.model.acquisition import Acquisition
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.description import bench_of, recordings_of
-from pixcal.stages.diagnose.nominal import FittedSet, Measured, NominalBench, SetTruth
+from pixcal.stages.diagnose.nominal import (
+    FittedSet,
+    Measured,
+    MeasuredGain,
+    NominalBench,
+    SetTruth,
+)
 from pixcal.stages.diagnose.parts import Half, Table
 
 F32 = NDArray[np.float32]
@@ -26,6 +34,15 @@ HOT = 40.0
 HOT_REACH = 2
 """Pixels around a hot one that may have got some of its charge: at most a share of `SHARED`."""
 SHARED = 0.1
+DECLARED_ERROR = 0.01
+"""Relative error that a declared gain may well have."""
+WILD = 8.0
+"""Standard deviations beyond which a residual is left out."""
+NO_TEST = 10.0
+"""Reduced chi-square of the photon transfer beyond which its gain is not believed."""
+TWO_BEAMS = 2
+"""Degree, over a window, of the logarithm of the contrast of two Gaussian beams (their intensities'
+ratio is the exponential of a quadratic form)."""
 
 
 def nominal_bench(
@@ -80,8 +97,12 @@ def nominal_bench(
         response=flat,
         bias=_mean([e.bias for e in evidence]),
         dark_rate=np.maximum(_mean([_uncoupled(e.dark_rate) for e in evidence]), 0),
+        read_noise=np.full(good.shape, one.read_noise, np.float32),
+        gain=np.full(good.shape, one.gain, np.float32),
         mask=np.where(good, 0, 1).astype(np.uint8),
     )
+    # Where frames are too few to part, every part holds the same ones.
+    parts = evidence if parted("bias", halves) else evidence[:1]
     bench = bench_of(acquisition, tables, one, whole, sets, dtypes)
     recordings, places = recordings_of(bench, acquisition, tables, one)
     return NominalBench(
@@ -91,10 +112,18 @@ def nominal_bench(
         dtypes,
         bench,
         Measured(maps, sets),
+        PixelNoise.of([s.adu for e in parts for s in e.of_kind("bias")], good),
+        _gain(evidence, flat.astype(float), good, with_flats),
         fits,
         tuple(recordings),
         tuple(places),
     )
+
+
+def parted(name: str, halves: Sequence[Half]) -> bool:
+    """Whether the parts hold different frames of an array."""
+    first, *others = (set(h.frames.get(name, ())) for h in halves)
+    return not any(first & other for other in others)
 
 
 def _mean(maps: Sequence[F64]) -> F32:
@@ -161,11 +190,7 @@ def _set_truth(
     good = np.all([f.good for f in found], axis=0)
     iota = np.mean([f.theta[0] * np.mean(f.g[:, 0]) for f in found], axis=0)
     surface = smooth_surface(np.where(good, iota, np.nan), good)
-    contrast = [
-        np.nanmedian(np.where(good, np.hypot(*f.theta[1:]) / f.theta[0], np.nan))
-        * np.median(np.hypot(f.g[:, 1], f.g[:, 2]) / f.g[:, 0])
-        for f in found
-    ]
+    contrast = np.mean([_contrast(f, good) for f in found], axis=0)
     ny, nx = good.shape
     y, x = np.arange(ny)[:, None] - (ny - 1) / 2, np.arange(nx)[None, :] - (nx - 1) / 2
     plane = one.k[0] * x + one.k[1] * y
@@ -173,9 +198,57 @@ def _set_truth(
     psi = plane + np.angle(phasor.sum())
     return SetTruth(
         light=np.maximum(surface, 0).astype(np.float32),
-        contrast=float(np.mean(contrast)),
+        contrast=np.clip(contrast, 0, 1).astype(np.float32),
         psi=psi,
         k=one.k,
         step=ramp_step(one.phi),
-        wander=wander_of(found, frames, count, ramp_step(one.phi)),
+        phi=_phases(found, frames, count),
     )
+
+
+def _contrast(found: FringeEvidence, good: NDArray[np.bool_]) -> F64:
+    """Contrast (y, x) as two Gaussian beams can make it, smooth over the window."""
+    alpha = np.hypot(*found.theta[1:])
+    used = good & (alpha > 0) & (found.theta[0] > 0)
+    log = np.where(used, np.log(np.where(used, alpha / found.theta[0], 1.0)), np.nan)
+    surface = smooth_surface(log, used, TWO_BEAMS)
+    of_frames = np.median(np.hypot(found.g[:, 1], found.g[:, 2]) / found.g[:, 0])
+    return np.asarray(np.exp(surface) * of_frames)
+
+
+def _phases(found: Sequence[FringeEvidence], frames: Sequence[NDArray[np.intp]], count: int) -> F64:
+    """Phase (t,) of every frame of a set, counted from the first part's maps; NaN where unknown."""
+    phi = np.full(count, np.nan)
+    first = found[0].theta[2] + 1j * found[0].theta[1]
+    for one, numbers in zip(found, frames, strict=True):
+        both = found[0].good & one.good
+        z = one.theta[2] + 1j * one.theta[1]
+        phi[numbers] = one.phi + np.angle(np.vdot(first[both], z[both]))
+    return phi
+
+
+def _gain(
+    evidence: Sequence[Evidence], flat: F64, good: NDArray[np.bool_], with_flats: bool
+) -> MeasuredGain:
+    """Gain as flats and declaration tell together, and of each amplifier where flats show steps."""
+    amplifiers = np.ones(good.shape)
+    noise = [n for e in evidence for n in _noise_ratios(e)]
+    if with_flats and noise:
+        amplifiers = relative_gain(flat, np.mean(noise, axis=0), good)
+    means, weights = [1.0], [DECLARED_ERROR**-2]
+    for one in evidence:
+        value, error, chi2 = one.photon_transfer
+        if np.isfinite(value) and error > 0 and chi2 < NO_TEST:
+            means.append(value / one.gain)
+            weights.append((one.gain / error) ** 2)
+    mean = float(np.average(means, weights=weights))
+    return MeasuredGain(amplifiers, mean, float(np.sum(weights) ** -0.5))
+
+
+def _noise_ratios(one: Evidence) -> list[F64]:
+    """Mean squares (y, x) of residuals over what shot and read noise give, of each fringe set."""
+    found = []
+    for f in one.fringes.values():
+        calm, _ = calm_residuals(f.residual, f.variance, f.good, WILD)
+        found.append(pixel_moments(calm)[0])
+    return found

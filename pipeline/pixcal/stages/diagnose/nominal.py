@@ -1,10 +1,12 @@
-"""The nominal bench of an acquisition: the paper's simple simulation, with what was measured in it.
+"""The nominal bench of an acquisition: an ordinary, well-behaved bench as its own frames show it.
 
-Straight fringes with one fringe vector a set, constant intensity and visibility, a linear detector
-whose pixels and frames know nothing of each other, shot and read noise; bias, dark current, flat
-and offsets as measured. Offsets keep everything that true ones can have; fringes, rows or columns
-that repeat, and bending are taken out of them, for no foundry makes these: they are what a
-simulation must bring about by some effect.
+Straight fringes with one fringe vector a set, two beams whose contrast varies over the window as
+two Gaussian beams can make it, constant intensity and visibility, the phases as they were; a
+linear detector whose pixels and frames know nothing of each other; bias, dark current, read noise
+pixel by pixel, gain of each amplifier, flat and offsets as measured. What is known only within an
+error is drawn anew in every simulation. Offsets keep everything that true ones can have; fringes,
+rows or columns that repeat, and curvature are taken out of them, for no foundry makes these: they
+are what a simulation must bring about by some effect.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,8 +19,8 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.corrected import corrected_offsets, phase_change, straight_modes
 from pixcal.estimators.fringes import grid
+from pixcal.estimators.pixel_read_noise import PixelNoise
 from pixcal.estimators.structure import Offsets, true_offsets
-from pixcal.estimators.wander import Wander
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
 from pixcal.model.acquisition import Acquisition
@@ -33,6 +35,9 @@ from pixcal.stages.diagnose.undone import Undone
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+_GAIN, _NOISE = 101, 102
+"""Keys of random numbers."""
+
 
 @dataclass(frozen=True)
 class SetTruth:
@@ -42,24 +47,24 @@ class SetTruth:
     ----------
     light : (y, x) float32
         Mean, for unit response, e-.
-    contrast : float
-        Fringe amplitude over the mean.
+    contrast : (y, x) float32
+        Fringe amplitude over the mean, a smooth surface.
     psi : (y, x) float64
         Phase of the pixels if they had no offsets, rad.
     k : (float, float)
         Fringe vector, rad/px.
     step : float
-        Of a ramp of the phase, rad; zero: random phases.
-    wander : Wander
-        What a ramp's phases are besides.
+        Of a ramp of the phase, rad; zero: no ramp.
+    phi : (t,) float64
+        Phase of every frame as measured, rad; NaN for frames that were not looked at.
     """
 
     light: F32
-    contrast: float
+    contrast: F32
     psi: F64
     k: tuple[float, float]
     step: float
-    wander: Wander
+    phi: F64
 
     def phase(self, delta_x: F32, delta_y: F32) -> F64:
         """Phase (y, x) of the pixels at their offsets (px), rad."""
@@ -90,7 +95,7 @@ class Measured(Effect):
         m, own = self.maps, slice(*rows)
         return DetectorMaps(
             m.delta_x[own], m.delta_y[own], m.response[own], m.bias[own], m.dark_rate[own],
-            m.mask[own],
+            m.read_noise[own], m.gain[own], m.mask[own],
         )  # fmt: skip
 
     def light(
@@ -102,7 +107,7 @@ class Measured(Effect):
         own, cut = self.sets[recording.number], slice(*rows)
         psi = own.phase(self.maps.delta_x, self.maps.delta_y)[cut]
         iota = maps.response * own.light[cut]
-        alpha = np.float32(own.contrast) * iota
+        alpha = own.contrast[cut] * iota
         return LightMaps(
             iota,
             (alpha * np.sin(psi)).astype(np.float32),
@@ -112,11 +117,8 @@ class Measured(Effect):
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         """As in `Effect.states`."""
         own, count = self.sets[recording.number], recording.count
-        if own.step:
-            command = own.step * np.arange(count, dtype=np.float64)
-            phi = command + own.wander.drawn(command, recording.rng(self.name))
-        else:
-            phi = 2 * np.pi * recording.rng(self.name).random(count)
+        drawn = 2 * np.pi * recording.rng(self.name).random(count)
+        phi = np.where(np.isnan(own.phi), drawn, own.phi)
         still = np.zeros(count)
         return FrameStates(phi, np.ones(count), np.ones(count), still, still)
 
@@ -174,6 +176,28 @@ class FittedSet:
 
 
 @dataclass(frozen=True)
+class MeasuredGain:
+    """Gain of the amplifiers over the one that electrons were counted with.
+
+    Attributes
+    ----------
+    amplifiers : (y, x) float64
+        Of each pixel's amplifier over the detector's mean.
+    relative, error : float
+        Of the detector, and its 1-sigma error.
+    """
+
+    amplifiers: F64
+    relative: float
+    error: float
+
+    def drawn(self, rng: np.random.Generator) -> F32:
+        """Gain (y, x) over the one used, as it may be within its error."""
+        common = max(self.relative + self.error * rng.standard_normal(), 0.1)
+        return (common * self.amplifiers).astype(np.float32)
+
+
+@dataclass(frozen=True)
 class NominalBench:
     """An acquisition's nominal bench, ready to take the same frames again.
 
@@ -189,6 +213,9 @@ class NominalBench:
         Geometry and what effects ask for.
     measured : Measured
         Without offsets.
+    noise : PixelNoise, optional
+        Read noise of the pixels.
+    gain : MeasuredGain
     fits : tuple of FittedSet
         What was fitted of each fringe set.
     recordings : tuple of Recording
@@ -203,6 +230,8 @@ class NominalBench:
     dtypes: Mapping[str, np.dtype[Any]]
     bench: Bench
     measured: Measured
+    noise: PixelNoise | None
+    gain: MeasuredGain
     fits: tuple[FittedSet, ...]
     recordings: tuple[Recording, ...]
     places: tuple[tuple[str, NDArray[np.intp]], ...]
@@ -245,6 +274,7 @@ class NominalBench:
         measured = self._drawn(effects if fitted else (), own_seed, undone)
         if fitted and effects:
             measured = self._of_measured_k(measured, bench, effects)
+        measured = self._electronics(measured, seed, own_seed)
         camera = Camera(bench, rows, [measured, *effects])
         arrays = {
             name: np.empty((len(frames), *bench.detector.shape), self.dtypes[name])
@@ -286,6 +316,22 @@ class NominalBench:
                 sets[n] = replace(found, psi=found.psi - dkx * x - dky * y, k=(kx - dkx, ky - dky))
         return replace(measured, sets=tuple(sets))
 
+    def _electronics(self, measured: Measured, seed: int, own_seed: int) -> Measured:
+        """With gain and read noise drawn within what is known of them; samples keep their level."""
+        gain = self.gain.drawn(np.random.default_rng([seed, _GAIN]))
+        m = measured.maps
+        noise = m.read_noise * gain
+        if self.noise is not None:
+            noise = noise * self.noise.drawn(np.random.default_rng([own_seed, _NOISE]))
+        maps = replace(
+            m,
+            response=m.response * gain,
+            dark_rate=m.dark_rate * gain,
+            read_noise=noise,
+            gain=m.gain * gain,
+        )
+        return replace(measured, maps=maps)
+
     def _drawn(self, effects: Sequence[Effect], seed: int, undone: Undone) -> Measured:
         """As measured, with offsets that can be true where the effects are what they are."""
         if not self.fits:
@@ -304,12 +350,15 @@ class NominalBench:
         # As the bench was without what the effects take from the fringes, and do anew.
         sets = []
         for own, fit in zip(self.measured.sets, fits, strict=True):
-            light, contrast = undone.fringes(float(np.median(own.light)), own.contrast)
+            light, contrast = undone.fringes(
+                float(np.median(own.light)), float(np.median(own.contrast))
+            )
+            times = np.float32(fit.contrast * contrast)
             sets.append(
                 replace(
                     own,
                     light=own.light * np.float32(fit.light * light),
-                    contrast=min(own.contrast * fit.contrast * contrast, 1.0),
+                    contrast=np.minimum(own.contrast * times, np.float32(1)),
                 )
             )
         return replace(self.measured, maps=maps, sets=tuple(sets))

@@ -1,0 +1,104 @@
+"""Amplifiers of slightly different gain: steps in the flat that the noise has as well.
+
+A step of the response between two blocks of columns or rows is one of the gain if the shot noise
+steps with it: of two amplifiers the one with more e-/ADU gives fewer ADU for the same light, and
+its noise, counted with the common gain, is smaller by the same factor. Where the pixels
+themselves respond differently the noise follows the light, and does not step.
+"""
+
+import numpy as np
+from numpy.polynomial.legendre import legvander
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+MOST = 7
+"""Boundaries that are looked for along each axis."""
+NARROWEST = 8
+"""Rows or columns of an amplifier at least."""
+SIGNIFICANT = 6.0
+"""Standard deviations of a step of the flat."""
+SMOOTH = 2
+"""Degree of what the lamp does beside the steps."""
+
+
+def relative_gain(flat: F64, noise: F64, good: Mask) -> F64:
+    """Gain (y, x) of every pixel's amplifier over that of the whole detector.
+
+    Parameters
+    ----------
+    flat : (y, x) float64
+        Relative response as flats show it, counted with one gain.
+    noise : (y, x) float64
+        Mean square of samples about their mean over what shot and read noise give by that gain.
+    good : (y, x) bool
+
+    Returns
+    -------
+    (y, x) float64
+        Mean 1; exactly 1 where no boundary was found.
+    """
+    log_gain = np.zeros(flat.shape)
+    used = good & (flat > 0) & (noise > 0)
+    response = np.where(used, np.log(np.where(used, flat, 1.0)), np.nan)
+    squares = np.where(used, noise, np.nan)
+    for axis in (0, 1):
+        along = _profile(response, axis)
+        steps = _boundaries(along)
+        if not steps:
+            continue
+        size, _ = _sizes(along, steps)
+        in_noise, error = _sizes(_profile(squares, axis), steps)
+        place = np.arange(flat.shape[axis])
+        for number, step in enumerate(steps):
+            of_gain = (in_noise[number] - size[number]) ** 2 < in_noise[number] ** 2
+            clear = abs(size[number]) > 2 * error[number]
+            if of_gain and clear:
+                log_gain -= np.expand_dims(size[number] * (place >= step), 1 - axis)
+    return np.asarray(np.exp(log_gain - log_gain.mean()))
+
+
+def _profile(values: F64, axis: int) -> F64:
+    """Median of each row (axis 0) or column (1); of empty ones that of all."""
+    count = np.isfinite(values).sum(axis=1 - axis)
+    found = np.full(values.shape[axis], np.nanmedian(values))
+    kept = np.compress(count > 0, values, axis=axis)
+    found[count > 0] = np.nanmean(kept, axis=1 - axis)
+    return found
+
+
+def _boundaries(along: F64) -> list[int]:
+    """First places of the blocks after the first, most significant steps first, in order."""
+    steps: list[int] = []
+    noise = 1.4826 * float(np.median(np.abs(np.diff(along)))) / np.sqrt(2)
+    places = range(NARROWEST, len(along) - NARROWEST + 1)
+    while noise > 0 and len(steps) < MOST:
+        free = [p for p in places if all(abs(p - s) >= NARROWEST for s in steps)]
+        basis = np.linalg.qr(_terms(len(along), steps))[0]
+        rest = along - basis @ (basis.T @ along)
+        best, at = 0.0, 0
+        for place in free:
+            step = (np.arange(len(along)) >= place).astype(float)
+            step -= basis @ (basis.T @ step)
+            size = abs(step @ rest) / np.linalg.norm(step)
+            best, at = max((best, at), (float(size), place))
+        if best < SIGNIFICANT * noise:
+            break
+        steps.append(at)
+    return sorted(steps)
+
+
+def _terms(count: int, steps: list[int]) -> F64:
+    smooth = legvander(np.linspace(-1, 1, count), SMOOTH)
+    return np.column_stack([smooth, *[(np.arange(count) >= s).astype(float) for s in steps]])
+
+
+def _sizes(along: F64, steps: list[int]) -> tuple[F64, F64]:
+    """Steps of a profile, and their errors by its scatter."""
+    terms = _terms(len(along), steps)
+    inverse = np.linalg.inv(terms.T @ terms)
+    fitted = inverse @ (terms.T @ along)
+    scatter = float(np.var(along - terms @ fitted)) * len(along) / (len(along) - terms.shape[1])
+    first = SMOOTH + 1
+    return fitted[first:], np.sqrt(np.diag(inverse)[first:] * scatter)

@@ -1,0 +1,47 @@
+"""Read noise of the pixels, drawn as they scatter in truth."""
+
+import numpy as np
+import pytest
+
+from pixcal.estimators.pixel_read_noise import FEWEST, PixelNoise
+
+SHAPE = (70, 61)
+GOOD = np.ones(SHAPE, bool)
+
+
+def frames(spread: float, count: int, seed: int = 5) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    sigma = 15 * np.exp(spread * rng.standard_normal(SHAPE))
+    return (sigma * rng.standard_normal((count, *SHAPE))).astype(np.float32)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.2])
+@pytest.mark.parametrize("counts", [(40,), (19, 22)])
+def test_variances_seen_again_scatter_as_those_that_were_measured(
+    spread: float, counts: tuple[int, ...]
+) -> None:
+    """Of frames with the noise drawn, quantiles of the pixels' variances are those of the data."""
+    stacks = [frames(spread, n, seed) for seed, n in enumerate(counts)] if len(counts) == 1 else [
+        frames(spread, sum(counts))[a:b] for a, b in ((0, counts[0]), (counts[0], sum(counts)))
+    ]  # fmt: skip
+    noise = PixelNoise.of(stacks, GOOD)
+    rng = np.random.default_rng(1)
+    drawn = noise.drawn(rng)
+    again = drawn * rng.standard_normal((sum(counts), *SHAPE))
+    seen = np.var(np.concatenate(stacks), axis=0, ddof=1)
+    scale = np.mean(seen)
+    quantiles = (0.05, 0.5, 0.95, 0.99)
+    one = np.quantile(seen / scale, quantiles)
+    other = np.quantile(np.var(again, axis=0, ddof=1), quantiles)
+    assert other == pytest.approx(one, rel=0.06)
+
+
+def test_a_noisy_pixel_stays_noisy() -> None:
+    stack = frames(0.1, 40)
+    stack[:, 7, 11] *= 10
+    drawn = PixelNoise.of([stack], GOOD).drawn(np.random.default_rng(2))
+    assert drawn[7, 11] == pytest.approx(10, rel=0.4)
+
+
+def test_too_few_frames_tell_nothing() -> None:
+    assert PixelNoise.of([frames(0.1, FEWEST - 1)], GOOD) is None
