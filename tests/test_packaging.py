@@ -40,6 +40,7 @@ def test_the_wheel_holds_the_packages_their_types_and_the_sample(wheel: Path) ->
         packed = set(archive.namelist())
     expected = names_in(ROOT / "pipeline", "*.py", "*.pyi", "*.j2", "py.typed")
     expected |= names_in(ROOT / "cli", "*.py", "py.typed")
+    expected |= names_in(ROOT / "bench", "*.py")
     expected |= {f"pixcal/samples/{name}" for name in names_in(ROOT / "data_samples", "*")}
     rest = {name for name in packed if ".dist-info/" not in name}
     assert rest == expected

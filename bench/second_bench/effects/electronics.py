@@ -1,0 +1,180 @@
+"""Readout: noise of lines, wandering levels, restless pixels and converters."""
+
+from typing import Any
+
+import numpy as np
+
+from second_bench.effects.fringes import SLOW
+from second_bench.effects.law import law
+from second_bench.model import F64, Bench, Frame, Run, Step, stream
+
+_Drawn = dict[str, Any]
+
+
+def _lines(size: float, axis: int) -> Step:
+    def adds(e: F64, frame: Frame) -> F64:
+        one: F64 = frame.rng.standard_normal((e.shape[0], 1) if axis == 0 else (1, e.shape[1]))
+        return e + size * one
+
+    return adds
+
+
+@law("row_noise", "rows", 0.5, 10, "e- rms")
+def rows(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Every row of every frame has an offset."""
+    bench.offset.append(_lines(size, 0))
+    return {}
+
+
+@law("row_noise", "columns", 0.5, 10, "e- rms")
+def columns(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Every column of every frame has an offset."""
+    bench.offset.append(_lines(size, 1))
+    return {}
+
+
+@law("row_noise", "correlated", 0.5, 10, "e- rms")
+def correlated(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """The reference wanders while rows are read: neighbouring rows have much in common."""
+    kept = float(rng.uniform(0.4, 0.85))
+
+    def adds(e: F64, frame: Frame) -> F64:
+        steps: F64 = frame.rng.standard_normal((e.shape[0],))
+        level = np.empty_like(steps)
+        level[0] = steps[0]
+        for n in range(1, len(steps)):
+            level[n] = kept * level[n - 1] + np.sqrt(1 - kept**2) * steps[n]
+        return np.asarray(e + size * level[:, None])
+
+    bench.offset.append(adds)
+    return {"correlation": kept}
+
+
+def _drifting(course: str) -> Any:
+    def drifts(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+        for run in bench.runs:
+            moved = size * rng.uniform(0.7, 1.3) * SLOW[course](run.frames, rng)
+            run.level_e = run.level_e + moved
+        return {}
+
+    return drifts
+
+
+for _course in SLOW:
+    law("bias_drift", _course, 2, 80, "e- over each run")(_drifting(_course))
+
+
+@law("bias_drift", "night", 4, 120, "e- over the night")
+def night(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """One warming-up through all runs."""
+    end = max(run.start_s + run.frames * bench.period_s for run in bench.runs)
+    scale = float(rng.uniform(0.3, 2)) * end
+    for run in bench.runs:
+        seconds = run.start_s + np.arange(run.frames) * bench.period_s
+        share = (1 - np.exp(-seconds / scale)) / (1 - np.exp(-end / scale))
+        run.level_e = run.level_e + size * share
+    return {"scale_s": scale}
+
+
+def switching(run: Run, dwell_s: F64, period_s: float, rng: np.random.Generator) -> F64:
+    """Two-level states (t, pixel) of traps that dwell low and high for times (2, pixel), s."""
+    leave = 1 - np.exp(-period_s / dwell_s)
+    state = np.empty((run.frames, dwell_s.shape[1]))
+    high = rng.random(dwell_s.shape[1]) < dwell_s[1] / dwell_s.sum(0)
+    for n in range(run.frames):
+        high ^= rng.random(high.shape) < np.where(high, leave[1], leave[0])
+        state[n] = high
+    return state
+
+
+def _telegraph(bench: Bench, share: float, amplitude: Any, rng: np.random.Generator) -> None:
+    ny, nx = bench.shape
+    where = np.flatnonzero(rng.random(ny * nx) < share)
+    dwell = np.exp(rng.uniform(np.log(0.1), np.log(3), (2, len(where))))
+    own = amplitude(len(where)) * rng.choice([-1, 1], len(where))
+    state = {
+        run.name: switching(run, dwell, bench.period_s, stream(bench.seed, "traps", run.name))
+        for run in bench.runs
+    }
+
+    def switches(e: F64, frame: Frame) -> F64:
+        out = e.copy()
+        out.flat[where] += own * state[frame.run.name][frame.index]
+        return out
+
+    bench.offset.append(switches)
+
+
+@law("telegraph_noise", "population", 15, 250, "e-, the median")
+def population(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Amplitudes and dwell times over more than a decade, unequal up and down."""
+    share = float(np.exp(rng.uniform(np.log(0.005), np.log(0.04))))
+    _telegraph(bench, share, lambda n: size * np.exp(rng.uniform(-1.15, 1.15, n)), rng)
+    return {"share": share}
+
+
+@law("telegraph_noise", "exponential", 15, 250, "e-, the mean")
+def exponential(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Amplitudes spread exponentially, as those of MOS transistors (Wang et al. 2006)."""
+    share = float(np.exp(rng.uniform(np.log(0.005), np.log(0.04))))
+    _telegraph(bench, share, lambda n: rng.exponential(size, n), rng)
+    return {"share": share}
+
+
+def _coarse(bench: Bench, rng: np.random.Generator) -> None:
+    """A converter of 12 bits or so, whose steps are of the size of the noise."""
+    coarse = float(rng.uniform(8, 30)) / bench.gain_e_per_adu
+    bench.gain_e_per_adu *= coarse
+    bench.declared_gain *= coarse
+    # The level stays well above the first code.
+    bench.bias_adu = 100 + (bench.bias_adu - bench.bias_adu.mean()) / coarse
+    bench.notes["gain_e_per_adu"] = bench.gain_e_per_adu
+
+
+def _codes(bench: Bench) -> int:
+    return int(1.6 * bench.peak_e / bench.gain_e_per_adu + bench.bias_adu.max()) + 64
+
+
+@law("quantisation", "missing", 0.02, 0.3, "of the codes")
+def missing(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Codes that never come; the next one comes instead."""
+    _coarse(bench, rng)
+    there = rng.random(_codes(bench)) >= size
+    there[-1] = True
+    following = np.flatnonzero(there)
+    code = following[np.searchsorted(following, np.arange(len(there)))].astype(float)
+
+    def converts(adu: F64, _: Frame) -> F64:
+        return np.asarray(code[np.clip(np.rint(adu), 0, len(code) - 1).astype(int)])
+
+    bench.samples.append(converts)
+    return {"gain_e_per_adu": bench.gain_e_per_adu}
+
+
+@law("quantisation", "steps", 0.05, 0.6, "codes rms")
+def steps(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Thresholds beside their places, as those of a flash or ramp converter."""
+    _coarse(bench, rng)
+    count = _codes(bench)
+    thresholds = np.sort(np.arange(1, count) - 0.5 + rng.normal(0, size, count - 1))
+    bench.samples.append(lambda adu, _: np.searchsorted(thresholds, adu).astype(float))
+    return {"gain_e_per_adu": bench.gain_e_per_adu}
+
+
+@law("quantisation", "weights", 5e-4, 0.01, "rms of a bit's weight")
+def weights(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Successive approximation with references that are off."""
+    _coarse(bench, rng)
+    bits = int(np.ceil(np.log2(_codes(bench))))
+    true = 2.0 ** np.arange(bits) * (1 + size * rng.standard_normal(bits))
+
+    def converts(adu: F64, _: Frame) -> F64:
+        rest, code = adu + 0.5, np.zeros_like(adu)
+        for bit in reversed(range(bits)):
+            reached = rest >= true[bit]
+            rest = rest - reached * true[bit]
+            code += reached * 2.0**bit
+        return code
+
+    bench.samples.append(converts)
+    return {"gain_e_per_adu": bench.gain_e_per_adu, "weights": true.tolist()}

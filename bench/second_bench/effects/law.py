@@ -1,0 +1,64 @@
+"""Effects by name, each with the laws that it follows in the world."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from second_bench.model import Bench
+
+Apply = Callable[[Bench, float, np.random.Generator], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Law:
+    """One way in which an effect comes.
+
+    Attributes
+    ----------
+    effect, name : str
+        The effect's name is pixcal's, where pixcal knows it.
+    weak, strong : float
+        Sizes at strengths 0 and 1.
+    unit : str
+        Of the size.
+    apply : callable
+        Changes a bench by a size; gives what was drawn beside it.
+    known : bool
+        Whether pixcal has this effect.
+    decidable : bool
+        Whether frames of the bench can show it at all.
+    varied_phases : bool
+        Whether it shows only where the phase step differs from frame to frame.
+    """
+
+    effect: str
+    name: str
+    weak: float
+    strong: float
+    unit: str
+    apply: Apply
+    known: bool = True
+    decidable: bool = True
+    varied_phases: bool = False
+
+
+LAWS: list[Law] = []
+
+
+def law(
+    effect: str, name: str, weak: float, strong: float, unit: str, **flags: bool
+) -> Callable[[Apply], Apply]:
+    """Enter a law into `LAWS`."""
+
+    def entered(apply: Apply) -> Apply:
+        LAWS.append(Law(effect, name, weak, strong, unit, apply, **flags))
+        return apply
+
+    return entered
+
+
+def laws_of(effect: str) -> list[Law]:
+    """Laws of an effect; none if there is no such effect."""
+    return [one for one in LAWS if one.effect == effect]

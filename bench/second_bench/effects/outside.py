@@ -1,0 +1,88 @@
+"""Effects that pixcal has no name for: the honest answer is that something is unexplained."""
+
+from typing import Any
+
+import numpy as np
+
+from second_bench.effects.law import law
+from second_bench.model import F64, Bench, Frame
+
+_Drawn = dict[str, Any]
+
+
+@law("charge_transfer", "traps", 150, 5000, "e- that the traps of a column hold", known=False)
+def charge_transfer(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Charge that traps take on its way to the output, and give back behind it.
+
+    By Pyxel's model of distortion (Short et al. 2013): the tail grows with the way and less than
+    with the charge.
+    """
+    from pyxel.models.charge_transfer.utils_cdm import (
+        run_cdm_parallel,
+    )
+
+    beta, volume, well = 0.37, 1e-10, 1.5 * bench.peak_e
+    step = 1e-3
+    release = np.array([step * rng.uniform(0.6, 3)])
+    density = np.array([size / (2 * volume * bench.shape[0])])
+
+    def transfers(e: F64, _: Frame) -> F64:
+        return np.asarray(
+            run_cdm_parallel(
+                np.ascontiguousarray(e), beta, volume, step, well, 1.2e7, release, density,
+                np.array([1e-10]),
+            )
+        )  # fmt: skip
+
+    bench.charge.append(transfers)
+    return {"release_rows": float(release[0] / step)}
+
+
+@law("modulated_glow", "corner", 8, 400, "e- at the corner", known=False)
+def modulated_glow(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Light of the modulator's driver leaks in: bright where its voltage is high."""
+    x, y = bench.grid()
+    ny, nx = bench.shape
+    corner = rng.choice([-0.5, 0.5], 2)
+    glow = size * np.exp(-np.hypot(x / nx - corner[0], y / ny - corner[1]) / rng.uniform(0.1, 0.4))
+
+    def glows(e: F64, frame: Frame) -> F64:
+        if frame.run.kind != "fringes":
+            return e
+        voltage = (frame.run.phase[frame.index] % (2 * np.pi)) / (2 * np.pi)
+        return np.asarray(e + frame.rng.poisson(glow * voltage**2))
+
+    bench.charge.append(glows)
+    return {"corner": corner.tolist()}
+
+
+@law("pickup", "tone", 1, 25, "e- amplitude", known=False)
+def pickup(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """A tone of a power supply, as the pixels are read one after the other."""
+    ny, nx = bench.shape
+    turns = float(np.exp(rng.uniform(np.log(0.003), np.log(0.3))))
+    order = np.arange(ny)[:, None] * (nx + 20) + np.arange(nx)
+
+    def hums(e: F64, frame: Frame) -> F64:
+        phase = 2 * np.pi * (turns * order + frame.rng.random())
+        return np.asarray(e + size * np.sin(phase))
+
+    bench.offset.append(hums)
+    return {"turns_per_pixel": turns}
+
+
+@law("pixel_nonlinearity", "quadratic", 1e-3, 0.015, "rms at the peak", known=False)
+def pixel_nonlinearity(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Every pixel bends its own way, and all together not at all."""
+    own = size * rng.standard_normal(bench.shape)
+    own -= own.mean()
+    bench.signal.append(lambda e, _: e * (1 - own * e / bench.peak_e))
+    return {}
+
+
+@law("mirror_crosstalk", "halves", 3e-4, 0.01, "of the mirrored pixel", known=False)
+def mirror_crosstalk(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
+    """Two outputs that are read at once, from both sides inwards, and couple."""
+    sign = float(rng.choice([-1, 1]))
+    bench.signal.append(lambda e, _: e + sign * size * e[:, ::-1])
+    return {"sign": sign}
