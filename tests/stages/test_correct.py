@@ -22,8 +22,8 @@ from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages import correct, fit
 from pixcal.stages.correct.gain import repeating
 from pixcal.stages.correct.restored_set import RestoredSet
+from pixcal.stages.correct.swept import undone
 from pixcal.stages.correct.uncertainty import moved
-from pixcal.stages.correct.undoing import undone
 from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.treatment import ABSORBED, LEFT, treatments

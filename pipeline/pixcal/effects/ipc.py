@@ -12,6 +12,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pixcal.estimators.crosstalk.dense import dense_kernel
 from pixcal.estimators.crosstalk.joined import Kernel, measure
 from pixcal.estimators.crosstalk.maps import map_periods
 from pixcal.estimators.evidence import Evidence
@@ -33,6 +34,8 @@ from pixcal.simulation.shot import Shot
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+LEAST_SHARE = 2e-5
+"""Couplings below do not move offsets by what matters, and take time."""
 MIN_FLAT = 0.01
 """Least response that maps are divided by."""
 
@@ -192,6 +195,39 @@ class Ipc(Effect):
             lambda theta: uncouple_fringes(theta, self.couplings, maps.origin),
             lambda flat: uncouple(flat, self._at_small_signals, maps.origin),
         )
+
+    def measured_again(self, parts: Sequence[Evidence]) -> Estimate | None:
+        """All couplings within two pixels, and those found beyond, of the period that was found.
+
+        Shares that the frames do not show are shrunk by their errors, not dropped: of many small
+        ones the sum matters. The details hold their covariance.
+        """
+        if not self.couplings or any(c.per_ke for c in self.couplings):
+            return None
+        found = dense_kernel(parts, self.couplings)
+        if found is None:
+            return None
+        sigma = np.sqrt(np.diag(found.covariance))
+        return Estimate(
+            type(self)(
+                # Those that are zero cost nothing, and their errors hang together with the others'.
+                tuple(c if abs(c.share) > LEAST_SHARE else c.scaled(0.0) for c in found.couplings)
+            ),
+            {f"couplings[{n}].share": float(s) for n, s in enumerate(sigma)},
+            float("nan"),
+            "every coupling within two pixels, measured on all frames",
+            {"covariance": found.covariance.tolist(), "pattern_px": found.pattern_px},
+        )
+
+    def phase_slopes(self, maps: FringeMaps) -> F64:
+        """As in `Effect.phase_slopes`: a receiver loses a share of its source's fringe."""
+        flat = 1.0 if maps.flat is None else maps.flat
+        z = (maps.theta[2] + 1j * maps.theta[1]) * flat
+        found = np.zeros((len(self.couplings), *z.shape))
+        for own, c in zip(found, self.couplings, strict=True):
+            here, there = c.places((z.shape[0], z.shape[1]), maps.origin)
+            own[there] = -np.imag(z[here] / z[there])
+        return found
 
     @property
     def undo_halo(self) -> int:

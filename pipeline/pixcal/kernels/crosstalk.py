@@ -89,6 +89,10 @@ def _spans(size: int, first: int, every: int, at: int, step: int) -> tuple[slice
     return slice(begin, high, every), slice(begin + step, high + step, every)
 
 
+def _acts(coupling: Coupling) -> bool:
+    return coupling.share != 0
+
+
 def couple(
     signal: NDArray[Any], couplings: Sequence[Coupling], first: tuple[int, int] = (0, 0)
 ) -> NDArray[Any]:
@@ -103,7 +107,7 @@ def couple(
         First row and column of the array in the window.
     """
     out = signal.copy()
-    for c in couplings:
+    for c in filter(_acts, couplings):
         here, there = c.places((signal.shape[-2], signal.shape[-1]), first)
         source = signal[(..., *here)]
         moved = source * signal.dtype.type(c.share)
@@ -132,7 +136,7 @@ def couple_fringes(
         First row and column of the maps in the window.
     """
     out = theta.copy()
-    for c in couplings:
+    for c in filter(_acts, couplings):
         here, there = c.places((theta.shape[1], theta.shape[2]), first)
         source = theta[(slice(None), *here)]
         moved = c.share * source

@@ -267,6 +267,26 @@ class Effect:
         """
         return None
 
+    def measured_again(self, parts: Sequence[Evidence]) -> Estimate | None:
+        """The effect as a correction needs it, from all frames; None if it is as good as it is.
+
+        Parameters
+        ----------
+        parts : sequence of Evidence
+            Of the same pixels, with different frames; calibration frames are in the first.
+        """
+        return None
+
+    def phase_slopes(self, maps: FringeMaps) -> F64 | None:
+        """Change (n, y, x) of the undone phase, rad, by each parameter that has a covariance.
+
+        Parameters
+        ----------
+        maps : FringeMaps
+            After `undo`.
+        """
+        return None
+
     @property
     def undo_halo(self) -> int:
         """Pixels around a piece of the window that undoing the effect on it depends on."""

@@ -5,11 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pixcal.effects import known_effects, parse_effects
 from pixcal.effects.hyperbolic_fringes import HyperbolicFringes
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
+
+F64 = NDArray[np.float64]
 
 HYPERBOLIC = "hyperbolic"
 """The shape of fringes (`pixcal.estimators.models`) that takes up `HyperbolicFringes`."""
@@ -57,6 +62,8 @@ class Treatment:
         ``undone on samples``, ``undone on maps``, ``in the fit``, ``in the corrected fit``,
         ``absorbed by the fit`` or ``not undone``.
     why : str
+    covariance : (n, n) float64, optional
+        Of the parameters, where they were measured together.
     """
 
     effect: Effect
@@ -64,6 +71,7 @@ class Treatment:
     errors: Mapping[str, float]
     how: str
     why: str
+    covariance: F64 | None = None
 
     @property
     def corrects(self) -> bool:
@@ -133,6 +141,11 @@ class Treatments:
     def errors(self) -> dict[str, Mapping[str, float]]:
         """Of the parameters of each effect."""
         return {t.effect.name: t.errors for t in self.every}
+
+    @property
+    def covariances(self) -> dict[str, F64]:
+        """Of the parameters of effects that were measured together."""
+        return {t.effect.name: t.covariance for t in self.every if t.covariance is not None}
 
     @property
     def undone(self) -> tuple[Effect, ...]:

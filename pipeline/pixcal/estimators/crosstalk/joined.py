@@ -194,11 +194,11 @@ def _ways(
     if noise is not None and "covariance" in ways:
         before = {replace(c, share=0.0, per_ke=0.0): c.share for c in known}
         shares = np.array([before.get(c, 0.0) for c in _couplings(picks)])
-        ways["covariance"] = _any_gain(ways["covariance"], noise, shares)
+        ways["covariance"] = any_gain(ways["covariance"], noise, shares)
     return ways
 
 
-def _any_gain(sums: Sums, noise: Products, shares: F64) -> Sums:
+def any_gain(sums: Sums, noise: Products, shares: F64) -> Sums:
     """Sums where all shares may be wrong by the error of the shot noise they are measured in."""
     normal, right = sums
     slope = normal @ shares

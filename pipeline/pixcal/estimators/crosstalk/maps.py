@@ -123,10 +123,16 @@ def without(values: F64, modes: F64) -> F64:
 
 def _slope(found: FringeEvidence, couplings: Sequence[Coupling], good: Mask) -> C128:
     """Derivative (n, pixel) of the log of what couplings multiply the fringe by."""
-    shape, first = (good.shape[0], good.shape[1]), found.origin
+    return _slope_at(found.k, couplings, good, found.origin)
+
+
+def _slope_at(
+    k: tuple[float, float], couplings: Sequence[Coupling], good: Mask, first: tuple[int, int]
+) -> C128:
+    shape = (good.shape[0], good.shape[1])
     light = 1 - outflow(couplings, shape, first)
     fringe = light.astype(complex)
-    turns = [np.exp(-1j * (found.k[0] * c.dx + found.k[1] * c.dy)) for c in couplings]
+    turns = [np.exp(-1j * (k[0] * c.dx + k[1] * c.dy)) for c in couplings]
     for c, turn in zip(couplings, turns, strict=True):
         there = c.places(shape, first)[1]
         light[there] += c.share
@@ -137,6 +143,27 @@ def _slope(found: FringeEvidence, couplings: Sequence[Coupling], good: Mask) -> 
         own[there] += turn / fringe[there] - 1 / light[there]
         own[here] -= 1 / fringe[here] - 1 / light[here]
     return np.asarray(slope[:, good])
+
+
+def response_slopes(
+    k: tuple[float, float], couplings: Sequence[Coupling], classes: Classes
+) -> C128:
+    """Derivative (n, class) of the log of what couplings multiply the fringe by.
+
+    Parameters
+    ----------
+    k : (float, float)
+        Fringe vector (kx, ky), rad/px.
+    couplings : sequence of Coupling
+        Of the period of the classes.
+    classes : Classes
+    """
+    reach = max(max(abs(c.dy), abs(c.dx)) for c in couplings)
+    rows, columns = (period * -(-reach // period) for period in (classes.rows, classes.columns))
+    shape = (2 * rows + classes.rows, 2 * columns + classes.columns)
+    inside = np.zeros(shape, bool)
+    inside[rows : rows + classes.rows, columns : columns + classes.columns] = True
+    return _slope_at(k, couplings, inside, (0, 0))
 
 
 def _widths(found: FringeEvidence, couplings: Sequence[Coupling], good: Mask) -> F64:

@@ -226,11 +226,11 @@ def _without_zeros(normal: F64, right: F64, basis: F64, gain: float) -> F64:
 
 def _pick(information: Information, classes: Classes, step: Place, basis: F64) -> Pick:
     used = np.nonzero(np.any(basis, axis=1))[0]
-    couplings = (_coupling(classes, *divmod(int(u), 2), step) for u in used)
+    couplings = (coupling_of(classes, *divmod(int(u), 2), step) for u in used)
     return Pick(tuple(couplings), basis[used], information.only(used))
 
 
-def _coupling(classes: Classes, number: int, back: int, step: Place) -> Coupling:
+def coupling_of(classes: Classes, number: int, back: int, step: Place) -> Coupling:
     if not back:
         return classes.coupling(number, step, 0.0)
     return classes.coupling(classes.shifted(number, step), (-step[0], -step[1]), 0.0)

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.stages.correct.undoing import HALVES, mean_of
+from pixcal.stages.correct.swept import HALVES
+from pixcal.stages.correct.undoing import mean_of
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.cube import ArrayReader
 

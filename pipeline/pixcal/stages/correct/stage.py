@@ -7,6 +7,7 @@ what remains, and sets combined, by the code of the fit.
 
 import hashlib
 import json
+import math
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -18,10 +19,13 @@ from pixcal.engine.run import Runtime
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.stages import fit
+from pixcal.stages.correct.again import measured_again
 from pixcal.stages.correct.gain import Maps, measure_gain
 from pixcal.stages.correct.restored_set import RestoredSet
+from pixcal.stages.correct.sides import sides_of
+from pixcal.stages.correct.swept import Swept
 from pixcal.stages.correct.uncertainty import parameter_errors
-from pixcal.stages.correct.undoing import Swept, sides_of, undo_on_maps
+from pixcal.stages.correct.undoing import undo_on_maps
 from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
 from pixcal.stages.fit import Config as FitConfig
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
@@ -112,7 +116,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             with build(run_dir, "corrected", FORMAT, plain, inputs) as made:
                 made.summary = _correct(run_dir, made, plan, acquisition, runtime)
         if not _published(run_dir):
-            _publish(run_dir, plan)
+            _publish(run_dir)
         return require(run_dir, "corrected", FORMAT)
 
 
@@ -138,6 +142,7 @@ def _correct(
     run_dir: Path, made: Build, plan: Treatments, acquisition: Acquisition, runtime: Runtime
 ) -> Json:
     before = read_json(run_dir / "fit" / "fit.json")
+    plan = measured_again(run_dir, plan, runtime)
     result: Json = {
         "schema": "pixcal/correction/1",
         "pixcal": __version__,
@@ -173,10 +178,12 @@ def _corrected_maps(
     sides = sides_of(own_sets)
     for name, closed in zip(names, own_sets, strict=True):
         own = replace(closed, open_sides=sides)
+        left[name] = parameter_errors(own, plan.errors, runtime, plan.covariances)
+        left_px = math.hypot(*(error for error in left[name].values() if error is not None))
+        own = replace(own, left=left_px * math.hypot(*own.k))
         target = made.scratch / "undone" / name
         undo_on_maps(own, target, runtime, name)
         halves[name] = own.has_halves
-        left[name] = parameter_errors(own, plan.errors, runtime)
         fitted.append(fit_set(target, own.source, facts[name], acquisition, name, model))
     group = made.folder / "corrected.zarr"
     totals = write_maps(group, fitted, runtime)
@@ -273,7 +280,7 @@ def _published(run_dir: Path) -> bool:
     )
 
 
-def _publish(run_dir: Path, plan: Treatments) -> None:
+def _publish(run_dir: Path) -> None:
     """Write the products; without effects to undo, ``correction.json`` alone."""
     folder = run_dir / "corrected"
     result = read_json(folder / "correction.json")
@@ -283,12 +290,11 @@ def _publish(run_dir: Path, plan: Treatments) -> None:
         fits = {name: facts["fit"] for name, facts in result["sets"].items()}
         key = read_json(folder / "manifest.json")["key"]
         cards, history = header_of(run_dir, result | {"sets": fits}, key)
-        cards.append(("NEFFECT", len(plan.undone), "effects undone"))
-        for n, effect in enumerate(plan.undone, start=1):
-            cards.append((f"EFFECT{n}", effect.name, "effect undone"))
-        for t in plan.every:
-            if t.how.startswith("undone"):
-                told = json.dumps(t.plain["parameters"])
-                history.append(f"{t.effect.name}: {t.how}: {told}")
+        undone = [e for e in result["effects"] if e["treatment"].startswith("undone")]
+        cards.append(("NEFFECT", len(undone), "effects undone"))
+        for n, effect in enumerate(undone, start=1):
+            cards.append((f"EFFECT{n}", effect["effect"], "effect undone"))
+            told = json.dumps(effect["parameters"])
+            history.append(f"{effect['effect']}: {effect['treatment']}: {told}")
     publish_maps(run_dir, folder / "corrected.zarr", result["outputs"], cards, history, SUFFIX)
     write_json(run_dir / "products" / "correction.json", result)

@@ -94,8 +94,10 @@ def border_misfit(theta: F64, k: tuple[float, float], good: Mask) -> float:
         error = spread * np.sqrt(np.pi / 2 / max(int(good[0].sum()), 1))
         if not (error > 0 and np.isfinite(mean).all()):
             continue
-        _, start = np.polyfit(depth, mean[depth], 1)
-        total += float(((mean[0] - start) / error) ** 2)
+        slope, start = np.polyfit(depth, mean[depth], 1)
+        # What an effect that is not quite known leaves in lines is no sign of a border.
+        lines_apart = 1.4826 * np.median(np.abs(mean[depth] - start - slope * depth))
+        total += float((mean[0] - start) ** 2 / (error**2 + lines_apart**2))
     return total
 
 

@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pixcal.effects import parse_effects
 from pixcal.engine.plan import make_plan
@@ -15,8 +16,11 @@ from pixcal.estimators.modes import solve_modes
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
-from pixcal.stages.correct.undoing import PIXEL_BYTES, Swept, maps_of
+from pixcal.stages.correct.swept import Swept, maps_of, undone
+from pixcal.stages.correct.undoing import PIXEL_BYTES
 from pixcal.stages.fit.scouting import scout_tiles
+
+F64 = NDArray[np.float64]
 
 TILES = 9
 """Tiles, spread over the window, that tell for all: errors of parameters repeat over it."""
@@ -55,12 +59,15 @@ def _add(plain: Any, path: Sequence[str], step: float) -> None:
 
 
 def parameter_errors(
-    swept: Swept, errors: Mapping[str, Mapping[str, float]], runtime: Runtime
+    swept: Swept,
+    errors: Mapping[str, Mapping[str, float]],
+    runtime: Runtime,
+    covariances: Mapping[str, F64] = {},
 ) -> dict[str, float | None]:
     """Rms (px) of what the errors of each effect's parameters leave in the offsets of a set.
 
-    Parameters are moved one by one, and what each does is added in squares: errors that go together
-    are not known here.
+    Where their covariance is known and the effect tells what each does (`Effect.phase_slopes`), all
+    together; else parameters are moved one by one, and what each does is added in squares.
 
     Parameters
     ----------
@@ -68,6 +75,8 @@ def parameter_errors(
     errors : mapping
         By effect, then by parameter.
     runtime : Runtime
+    covariances : mapping
+        By effect: of all parameters that have slopes.
 
     Returns
     -------
@@ -80,7 +89,7 @@ def parameter_errors(
     need = (cy + 2 * swept.halo) * (cx + 2 * swept.halo) * PIXEL_BYTES
     plan = make_plan("errors of the parameters", need, 0, runtime)
     told = run_tasks(
-        partial(_tile, swept, others),
+        partial(_tile, swept, others, covariances),
         tiles,
         runtime.with_workers(plan.workers),
         label="parameters",
@@ -93,7 +102,10 @@ def parameter_errors(
 
 
 def _tile(
-    swept: Swept, others: Mapping[str, Sequence[Effect]], at: tuple[int, int]
+    swept: Swept,
+    others: Mapping[str, Sequence[Effect]],
+    covariances: Mapping[str, F64],
+    at: tuple[int, int],
 ) -> list[tuple[float, int]]:
     """Sum of squares (px²) and pixels, for each effect."""
     y, x = swept.source.ranges(at)
@@ -103,16 +115,19 @@ def _tile(
     size = float(np.hypot(*swept.k))
     found = []
     for effect in swept.effects:
-        after = effect.undo(maps)
-        assert after is not None
+        after, _ = undone(maps, (effect,))
         modes = straight_modes(after.theta[(slice(None), *inside)], swept.k)[:, good[inside]]
+        covariance = covariances.get(effect.name)
+        slopes = None if covariance is None else effect.phase_slopes(after)
+        if covariance is None or slopes is None:
+            steps = [o for other in others[effect.name] if (o := other.undo(maps)) is not None]
+            slopes = np.array([phase_change(after.theta, o.theta) for o in steps])
+            covariance = np.eye(len(steps))
         square = 0.0
-        for other in others[effect.name]:
-            off = other.undo(maps)
-            assert off is not None
-            change = phase_change(after.theta, off.theta)[inside][good[inside]] / size
-            taken = solve_modes(modes @ modes.T, (modes @ change)[:, None])[:, 0]
-            square += float(((change - taken @ modes) ** 2).sum())
+        if len(slopes):
+            change = slopes[(slice(None), *inside)][:, good[inside]] / size
+            change -= solve_modes(modes @ modes.T, modes @ change.T).T @ modes
+            square = float(np.einsum("np,np->", covariance @ change, change))
         found.append((square, int(good[inside].sum())))
         maps = after
     return found

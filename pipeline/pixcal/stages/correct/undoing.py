@@ -9,10 +9,8 @@ chunks of the cube, so results depend neither on memory nor on workers.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,24 +20,12 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.corrected import phase_change
 from pixcal.estimators.fringes import wrapped
 from pixcal.estimators.geometry import tile_plane
-from pixcal.estimators.tile_sums import Carrier, TileSums, sum_row
-from pixcal.kernels.crosstalk import FILL_REACH, filled
-from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Effect, FringeMaps
-from pixcal.stages.correct.surroundings import (
-    BEYOND,
-    CLOSED,
-    DEPTH,
-    Sides,
-    border_misfit,
-    decided,
-    disturbed,
-    scatter_of,
-    usable,
-)
-from pixcal.stages.evidence import Part, fitted_theta
+from pixcal.estimators.tile_sums import TileSums, sum_row
+from pixcal.simulation.effect import FringeMaps
+from pixcal.stages.correct.surroundings import disturbed, scatter_of
+from pixcal.stages.correct.swept import HALVES, Swept, maps_of, padded, undone
+from pixcal.stages.evidence import Part
 from pixcal.stages.fit.sweep import BATCH_MAPS
-from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
 from pixcal.storage.links import link_files
@@ -48,93 +34,12 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-HALVES = 2
 PIXEL_BYTES = 500
 """Peak of a tile's task for each of its pixels, those around it included (measured),"""
 EFFECT_BYTES = 40
 """and for each effect."""
-ALONG = 1024
-"""Pixels along a side that tell whether it is open."""
 SAME = ("chi2", "mask", "g", "dk", "time")
 """Arrays of a sweep that stay."""
-
-
-@dataclass(frozen=True)
-class Swept:
-    """A set as swept, and what its maps are to be freed of.
-
-    Attributes
-    ----------
-    folder : Path
-        ``sweep.zarr/<set name>``.
-    source : ReducedSet
-        For the tiles.
-    effects : tuple of Effect
-        In the order in which they are undone.
-    k : (float, float)
-        Fringe vector at the centre, rad/px.
-    flat : Path, optional
-        Map that samples were divided by.
-    read_noise : float
-        e-.
-    open_sides : (bool, bool, bool, bool)
-        Where the detector goes on beyond the window: top, bottom, left, right.
-    """
-
-    folder: Path
-    source: ReducedSet
-    effects: tuple[Effect, ...]
-    k: tuple[float, float]
-    flat: Path | None
-    read_noise: float
-    open_sides: Sides = CLOSED
-
-    @property
-    def n_batches(self) -> int:
-        """Batches of the sweep."""
-        return int(ArrayReader(self.folder / "batch_count").shape[0])
-
-    @property
-    def variants(self) -> int:
-        """Of the maps: the halves, where there are batches to make them of, and the effects."""
-        return HALVES * self.has_halves + len(self.effects)
-
-    @property
-    def has_halves(self) -> bool:
-        """Whether there are batches in both halves of the frames."""
-        counts = ArrayReader(self.folder / "batch_count").read()
-        middle = len(counts) // 2
-        return bool(counts[:middle].any() and counts[middle:].any())
-
-    @property
-    def carrier(self) -> Carrier:
-        """That phases are relative to."""
-        facts = read_json(self.folder / "scout.json")
-        (kx, ky), (y, x) = facts["k"], facts["reference"]
-        return Carrier((float(kx), float(ky)), (float(y), float(x)))
-
-    @property
-    def halo(self) -> int:
-        """Pixels around a tile that are read with it."""
-        return FILL_REACH + sum(effect.undo_halo for effect in self.effects)
-
-    def around(self, y: tuple[int, int], x: tuple[int, int]) -> Part:
-        """A tile with its halo, as far as the detector goes: beyond the window at open sides."""
-        ny, nx = self.source.shape
-        top, bottom, left, right = (BEYOND * is_open for is_open in self.open_sides)
-        rows = (max(-top, y[0] - self.halo), min(ny + bottom, y[1] + self.halo))
-        return rows, (max(-left, x[0] - self.halo), min(nx + right, x[1] + self.halo))
-
-    def within(self, part: Part) -> Part:
-        """The share of the window in a part."""
-        (y0, y1), (x0, x1) = part
-        ny, nx = self.source.shape
-        return (max(0, y0), min(ny, y1)), (max(0, x0), min(nx, x1))
-
-    def inside(self, y: tuple[int, int], x: tuple[int, int]) -> tuple[slice, slice]:
-        """Where a tile lies in its surroundings."""
-        rows, columns = self.around(y, x)
-        return slice(y[0] - rows[0], y[1] - rows[0]), slice(x[0] - columns[0], x[1] - columns[0])
 
 
 def undo_on_maps(swept: Swept, target: Path, runtime: Runtime, name: str) -> None:
@@ -253,14 +158,14 @@ def _undo_tile(
     factor = np.prod(_noise_factors(swept, maps), axis=0)[inside]
     own_error = ArrayReader(swept.folder / "sigma").read(y, x) * factor
     beside = _of_neighbours(swept, maps, after, known, part)[inside]
-    sigma = np.hypot(own_error, beside).astype(np.float32)
+    sigma = np.sqrt(own_error**2 + beside**2 + swept.left**2).astype(np.float32)
     iota, alpha = after.theta[0][inside], np.hypot(after.theta[1], after.theta[2])[inside]
     variants: list[F64] = []
     errors: list[F64] = []
     if swept.has_halves:
         for n in range(HALVES):
             half = ArrayReader(target / "half_phase")
-            own = _padded(half.read((n, n + 1), *swept.within(part))[0].astype(float), swept, part)
+            own = padded(half.read((n, n + 1), *swept.within(part))[0].astype(float), swept, part)
             its = undone(_turned(maps, own), swept.effects)[1]
             rest = np.sum(its, axis=0) - change if its else 0.0
             variants.append((own + rest)[inside])
@@ -280,43 +185,13 @@ def _undo_tile(
     writers["sums"].write((*at, 0), row[None, None])
 
 
-def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
-    """What was fitted on a part; what is not known there is like the pixels around it.
-
-    Returns
-    -------
-    maps : FringeMaps
-    good, known : (y, x) bool
-        Pixels that have an offset, and those whose light is known, flagged ones included.
-    """
-    there = swept.within(part)
-    theta = fitted_theta(swept.folder, there, swept.carrier.reference)
-    mask = ArrayReader(swept.folder / "mask").read(*there)
-    known = usable(theta, mask)
-    good = known & (mask == 0)
-    theta[:, ~known] = np.nan
-    theta = filled(_padded(theta, swept, part), swept.k)
-    flat = None
-    if swept.flat is not None:
-        flat = _padded(ArrayReader(swept.flat).read(*there).astype(float), swept, part, 1.0)
-    maps = FringeMaps(theta, swept.k, (part[0][0], part[1][0]), flat)
-    return maps, _padded(good, swept, part, False), _padded(known, swept, part, False)
-
-
-def _padded(values: NDArray[Any], swept: Swept, part: Part, fill: float = np.nan) -> NDArray[Any]:
-    """Values (..., y, x) of the window's share in a part, with what lies beyond filled."""
-    pads = [(0, 0)] * (values.ndim - 2)
-    pads += [(t[0] - p[0], p[1] - t[1]) for p, t in zip(part, swept.within(part), strict=True)]
-    return np.pad(values, pads, constant_values=fill)
-
-
 def _of_neighbours(
     swept: Swept, maps: FringeMaps, after: FringeMaps, known: Mask, part: Part
 ) -> F64:
     """Error (y, x) of a pixel's phase that comes from neighbours whose light is not known, rad."""
     if known.all() or not any(effect.undo_halo for effect in swept.effects):
         return np.zeros(known.shape)
-    within = _padded(np.ones([b - a for a, b in swept.within(part)], bool), swept, part, False)
+    within = padded(np.ones([b - a for a, b in swept.within(part)], bool), swept, part, False)
     phase = ArrayReader(swept.folder / "phase").read(*swept.within(part)).astype(float)
     others = disturbed(maps, within & ~known, ~within, scatter_of(phase))
     steps = [phase_change(after.theta, undone(o, swept.effects)[0].theta) for o in others]
@@ -324,72 +199,11 @@ def _of_neighbours(
     return np.asarray(np.where(known, error, 0.0))
 
 
-def sides_of(sets: Sequence[Swept]) -> Sides:
-    """Where the detector goes on beyond the window, as the maps of all sets tell."""
-    misfits = np.zeros((4, 2))
-    for swept in sets:
-        if any(effect.undo_halo for effect in swept.effects):
-            for side in range(4):
-                misfits[side] += [_misfit(swept, side, is_open) for is_open in (False, True)]
-    return decided(misfits)
-
-
-def _misfit(swept: Swept, side: int, is_open: bool) -> float:
-    """Misfit of the pixels at one side, that being open or not."""
-    shape = swept.source.shape
-    axis, last = divmod(side, 2)
-    strip = [(0, shape[0]), (0, shape[1])]
-    length = shape[1 - axis]
-    middle = max(0, (length - ALONG) // 2)
-    strip[1 - axis] = (middle, min(length, middle + ALONG))
-    strip[axis] = (max(0, shape[axis] - DEPTH), shape[axis]) if last else (0, DEPTH)
-    if min(shape) < 2 * DEPTH:
-        return 0.0
-    y, x = strip
-    sides = [False] * 4
-    sides[side] = is_open
-    one = replace(swept, open_sides=(sides[0], sides[1], sides[2], sides[3]))
-    part, inside = one.around(y, x), one.inside(y, x)
-    maps, good, _ = maps_of(one, part)
-    theta, good = undone(maps, swept.effects)[0].theta[(slice(None), *inside)], good[inside]
-    kx, ky = swept.k
-    if axis:
-        theta, good, kx, ky = theta.swapaxes(1, 2), good.T, ky, kx
-    if last:
-        theta, good, ky = theta[:, ::-1], good[::-1], -ky
-    return border_misfit(theta, (kx, ky), good)
-
-
 def _turned(maps: FringeMaps, phase: F64) -> FringeMaps:
     """Maps with their phase moved."""
     iota, sine, cosine = maps.theta
     z = (cosine + 1j * sine) * np.exp(1j * np.nan_to_num(phase))
     return FringeMaps(np.stack([iota, z.imag, z.real]), maps.k, maps.origin, maps.flat)
-
-
-def undone(maps: FringeMaps, effects: Sequence[Effect]) -> tuple[FringeMaps, list[F64]]:
-    """Maps without effects, and by how much each has moved the phase (y, x), rad.
-
-    Raises
-    ------
-    InputError
-        If an effect gives back what is no map of the same pixels.
-    """
-    steps = []
-    for effect in effects:
-        after = effect.undo(maps)
-        if (
-            not isinstance(after, FringeMaps)
-            or after.theta.shape != maps.theta.shape
-            or not np.isfinite(after.theta).all()
-        ):
-            raise InputError(
-                f"effect {effect.name!r}: undo gives no finite maps of the shape it is given; "
-                "mend its file"
-            )
-        steps.append(phase_change(maps.theta, after.theta))
-        maps = after
-    return maps, steps
 
 
 def _noise_factors(swept: Swept, maps: FringeMaps) -> F64:

@@ -1,0 +1,162 @@
+"""A set as it was swept, and what its maps are to be freed of."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.corrected import phase_change
+from pixcal.estimators.tile_sums import Carrier
+from pixcal.kernels.crosstalk import FILL_REACH, filled
+from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect, FringeMaps
+from pixcal.stages.correct.surroundings import BEYOND, CLOSED, Sides, usable
+from pixcal.stages.evidence import Part, fitted_theta
+from pixcal.stages.reduced_set import ReducedSet
+from pixcal.storage.artefact import read_json
+from pixcal.storage.cube import ArrayReader
+
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+HALVES = 2
+"""Parts of the frames that are corrected each for itself."""
+
+
+@dataclass(frozen=True)
+class Swept:
+    """A set as swept, and what its maps are to be freed of.
+
+    Attributes
+    ----------
+    folder : Path
+        ``sweep.zarr/<set name>``.
+    source : ReducedSet
+        For the tiles.
+    effects : tuple of Effect
+        In the order in which they are undone.
+    k : (float, float)
+        Fringe vector at the centre, rad/px.
+    flat : Path, optional
+        Map that samples were divided by.
+    read_noise : float
+        e-.
+    left : float
+        Rms of the error of the phase that the errors of the effects' parameters leave, rad.
+    open_sides : (bool, bool, bool, bool)
+        Where the detector goes on beyond the window: top, bottom, left, right.
+    """
+
+    folder: Path
+    source: ReducedSet
+    effects: tuple[Effect, ...]
+    k: tuple[float, float]
+    flat: Path | None
+    read_noise: float
+    left: float = 0.0
+    open_sides: Sides = CLOSED
+
+    @property
+    def n_batches(self) -> int:
+        """Batches of the sweep."""
+        return int(ArrayReader(self.folder / "batch_count").shape[0])
+
+    @property
+    def variants(self) -> int:
+        """Of the maps: the halves, where there are batches to make them of, and the effects."""
+        return HALVES * self.has_halves + len(self.effects)
+
+    @property
+    def has_halves(self) -> bool:
+        """Whether there are batches in both halves of the frames."""
+        counts = ArrayReader(self.folder / "batch_count").read()
+        middle = len(counts) // 2
+        return bool(counts[:middle].any() and counts[middle:].any())
+
+    @property
+    def carrier(self) -> Carrier:
+        """That phases are relative to."""
+        facts = read_json(self.folder / "scout.json")
+        (kx, ky), (y, x) = facts["k"], facts["reference"]
+        return Carrier((float(kx), float(ky)), (float(y), float(x)))
+
+    @property
+    def halo(self) -> int:
+        """Pixels around a tile that are read with it."""
+        return FILL_REACH + sum(effect.undo_halo for effect in self.effects)
+
+    def around(self, y: tuple[int, int], x: tuple[int, int]) -> Part:
+        """A tile with its halo, as far as the detector goes: beyond the window at open sides."""
+        ny, nx = self.source.shape
+        top, bottom, left, right = (BEYOND * is_open for is_open in self.open_sides)
+        rows = (max(-top, y[0] - self.halo), min(ny + bottom, y[1] + self.halo))
+        return rows, (max(-left, x[0] - self.halo), min(nx + right, x[1] + self.halo))
+
+    def within(self, part: Part) -> Part:
+        """The share of the window in a part."""
+        (y0, y1), (x0, x1) = part
+        ny, nx = self.source.shape
+        return (max(0, y0), min(ny, y1)), (max(0, x0), min(nx, x1))
+
+    def inside(self, y: tuple[int, int], x: tuple[int, int]) -> tuple[slice, slice]:
+        """Where a tile lies in its surroundings."""
+        rows, columns = self.around(y, x)
+        return slice(y[0] - rows[0], y[1] - rows[0]), slice(x[0] - columns[0], x[1] - columns[0])
+
+
+def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
+    """What was fitted on a part; what is not known there is like the pixels around it.
+
+    Returns
+    -------
+    maps : FringeMaps
+    good, known : (y, x) bool
+        Pixels that have an offset, and those whose light is known, flagged ones included.
+    """
+    there = swept.within(part)
+    theta = fitted_theta(swept.folder, there, swept.carrier.reference)
+    mask = ArrayReader(swept.folder / "mask").read(*there)
+    known = usable(theta, mask)
+    good = known & (mask == 0)
+    theta[:, ~known] = np.nan
+    theta = filled(padded(theta, swept, part), swept.k)
+    flat = None
+    if swept.flat is not None:
+        flat = padded(ArrayReader(swept.flat).read(*there).astype(float), swept, part, 1.0)
+    maps = FringeMaps(theta, swept.k, (part[0][0], part[1][0]), flat)
+    return maps, padded(good, swept, part, False), padded(known, swept, part, False)
+
+
+def padded(values: NDArray[Any], swept: Swept, part: Part, fill: float = np.nan) -> NDArray[Any]:
+    """Values (..., y, x) of the window's share in a part, with what lies beyond filled."""
+    pads = [(0, 0)] * (values.ndim - 2)
+    pads += [(t[0] - p[0], p[1] - t[1]) for p, t in zip(part, swept.within(part), strict=True)]
+    return np.pad(values, pads, constant_values=fill)
+
+
+def undone(maps: FringeMaps, effects: Sequence[Effect]) -> tuple[FringeMaps, list[F64]]:
+    """Maps without effects, and by how much each has moved the phase (y, x), rad.
+
+    Raises
+    ------
+    InputError
+        If an effect gives back what is no map of the same pixels.
+    """
+    steps = []
+    for effect in effects:
+        after = effect.undo(maps)
+        if (
+            not isinstance(after, FringeMaps)
+            or after.theta.shape != maps.theta.shape
+            or not np.isfinite(after.theta).all()
+        ):
+            raise InputError(
+                f"effect {effect.name!r}: undo gives no finite maps of the shape it is given; "
+                "mend its file"
+            )
+        steps.append(phase_change(maps.theta, after.theta))
+        maps = after
+    return maps, steps
