@@ -120,3 +120,18 @@ def test_what_comes_again_in_a_pixel_is_no_hit(acquired: Callable[..., Evidence]
 
 def test_without_darks_and_fringes_nothing_is_said(acquired: Callable[..., Evidence]) -> None:
     assert CosmicHits.estimate(replace(acquired(), fringes={}, stacks=())) is None
+
+
+def test_without_an_exposure_time_frames_last_as_long_as_they_are_apart(
+    acquired: Callable[..., Evidence],
+) -> None:
+    given = acquired(None, {"cosmic_hits": {"rate_cm2_s": 20_000.0}})
+    unknown = {name: replace(fringes, exptime_s=np.nan) for name, fringes in given.fringes.items()}
+    known, found = (
+        CosmicHits.estimate(replace(given, fringes=fringes, stacks=()))
+        for fringes in (given.fringes, unknown)
+    )
+    assert known is not None
+    assert found is not None
+    rates = [e.effect.rate_cm2_s for e in (known, found) if isinstance(e.effect, CosmicHits)]
+    assert rates[1] == pytest.approx(rates[0] * 0.02 / 0.14, rel=1e-6)

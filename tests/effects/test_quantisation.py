@@ -118,13 +118,47 @@ def test_step_and_widths_are_found(
     found = Quantisation.estimate(acquired(None, {"quantisation": given}))
     assert found is not None
     assert found.significance > 10
-    for name in Quantisation.strengths:
+    for name in ("coarse_adu", "dnl_rms", "ripple"):
         value, error = getattr(found.effect, name), found.errors[name]
         assert abs(value - given[name]) < 4 * error, name
         assert error < 0.12 * max(given[name], 0.05), name
     if given["ripple"]:
         assert isinstance(found.effect, Quantisation)
         assert found.effect.ripple_codes == pytest.approx(given.get("ripple_codes", 2), rel=1e-3)
+
+
+BITS = (0.07, 0.1, 0.1, -0.2, -0.14, 0.2, -0.1, 0.6, 0.3, -0.1, -1.3, 1.1)
+
+
+def test_wrong_bits_give_the_codes_of_successive_approximation() -> None:
+    samples = ramp(300.0, 3900.0, 50)
+    left, expected = samples.astype(float) + 0.5, np.zeros(samples.size)
+    for bit in reversed(range(12)):
+        weight = 2**bit + BITS[bit]
+        taken = left >= weight
+        left -= weight * taken
+        expected += taken * 2**bit
+    codes = Quantisation(0.0, 0.0, 0.0, bits=BITS).converted(samples, 0, TOP)
+    assert np.mean(codes != expected) < 1e-4
+
+
+def test_wrong_bits_are_found_where_only_shot_noise_spans_a_step(
+    acquired: Callable[..., Evidence],
+) -> None:
+    given = {"coarse_adu": 0.0, "dnl_rms": 0.0, "ripple": 0.0, "bits": list(BITS)}
+    found = Quantisation.estimate(
+        acquired({"detector.gain_e_per_adu": 40.0}, {"quantisation": given})
+    )
+    assert found is not None
+    assert isinstance(found.effect, Quantisation)
+    assert found.significance > 10
+    for bit in range(6):
+        error = found.errors[f"bits[{bit}]"]
+        assert abs(found.effect.bits[bit] - BITS[bit]) < max(4 * error, 0.02), bit
+        assert error < 0.03
+    even = Quantisation.estimate(acquired({"detector.gain_e_per_adu": 40.0}))
+    assert even is not None
+    assert even.significance < 4
 
 
 @pytest.mark.parametrize(

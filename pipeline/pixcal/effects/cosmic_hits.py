@@ -81,8 +81,11 @@ class CosmicHits(Effect):
         detector = shot.bench.detector
         pitch = detector.pitch_um
         area = np.prod([(n + 2 * MARGIN_PX) * pitch * 1e-4 for n in detector.shape])
-        rng = shot.recording.pixel_rng(self.name, shot.frame)
-        count = int(rng.poisson(self.rate_cm2_s * area * shot.recording.exptime_s))
+        recording = shot.recording
+        rng = recording.pixel_rng(self.name, shot.frame)
+        # Where no exposure time is known, frames with light last as long as they are apart.
+        seconds = recording.exptime_s or (recording.period_s if recording.kind != "bias" else 0.0)
+        count = int(rng.poisson(self.rate_cm2_s * area * seconds))
         if not count:
             return charge
         found = charge.copy()
@@ -188,7 +191,10 @@ def _searches(evidence: Evidence) -> Iterator[_Search]:
 
 def _of_fringes(fringes: FringeEvidence, area: float) -> _Search:
     residual = np.where(fringes.good, fringes.residual, np.nan)
-    return _search(residual, np.sqrt(fringes.variance), area * np.nan_to_num(fringes.exptime_s))
+    # As in `CosmicHits.charge`.
+    known = fringes.exptime_s > 0
+    seconds = fringes.exptime_s if known else float(np.median(np.diff(fringes.time_s)))
+    return _search(residual, np.sqrt(fringes.variance), area * seconds)
 
 
 def _of_darks(stack: Stack, evidence: Evidence, area: float) -> _Search:

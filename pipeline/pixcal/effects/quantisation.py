@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from pixcal.estimators.code_density import (
 )
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.variance_components import sigmas
-from pixcal.kernels.significance import sigmas_of_best
+from pixcal.kernels.significance import sigmas_of_best, sigmas_of_chi2
 from pixcal.kernels.synthesis import Stream, generator
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
@@ -37,15 +38,16 @@ class Quantisation(Effect):
 
     One converter, or one ramp, for all columns. Displacements that are independent leave the
     response straight: codes differ in width, by chance and by a ripple, and one of no width is
-    missing. The round-off itself is no more than noise of step²/12 as long as the noise before it
-    spans half a step; so maps do not show it, unless read noise is lower than that.
+    missing. A bit whose weight is off makes codes wide or narrow wherever the bit changes, and
+    bends the response. The round-off itself is no more than noise of step²/12 as long as the noise
+    before it spans half a step; so maps do not show it, unless read noise is lower than that.
     """
 
     name = "quantisation"
     title = "steps and uneven codes of the converter"
     stage = Stage.CONVERTER
     domains = ("noise", "intensity")
-    strengths = ("coarse_adu", "dnl_rms", "ripple")
+    strengths = ("coarse_adu", "dnl_rms", "ripple", "bits")
     told_by = ("ladder",)
     sources = (
         "IEEE Std 1241-2010: code widths from histograms; round-off of step/sqrt(12) rms",
@@ -71,6 +73,9 @@ class Quantisation(Effect):
     ripple_phase_rad: float = quantity(
         0.0, unit="rad", low=-7, high=7, doc="phase of the ripple at code zero"
     )
+    bits: tuple[float, ...] = quantity(
+        (), unit="codes", low=-1000, high=1000, doc="error of each bit's weight, the least first"
+    )
 
     @property
     def step_adu(self) -> float:
@@ -95,7 +100,8 @@ class Quantisation(Effect):
         # Sum of the ripple of all codes below.
         phase = turn * (number - 0.5) + self.ripple_phase_rad
         shift += self.ripple * np.sin(phase) / (2 * np.sin(turn / 2))
-        return np.asarray(number - 0.5 + np.clip(shift, -FARTHEST, FARTHEST))
+        begins = number - 0.5 + np.clip(shift, -FARTHEST, FARTHEST)
+        return np.asarray(begins + (number[:, None] >> np.arange(len(self.bits)) & 1) @ self.bits)
 
     def converted(self, adu: F32, specimen: int, top_adu: float, normals: F32 | None = None) -> F32:
         """Codes in ADU: each sample passes the thresholds that it reaches.
@@ -114,6 +120,9 @@ class Quantisation(Effect):
             Standard normals by which samples are scattered over the meshes of that grid.
         """
         codes = int(top_adu / self.step_adu) + 3
+        if any(self.bits):
+            found = np.searchsorted(_reached(self, specimen, codes), adu / self.step_adu, "right")
+            return np.asarray(np.maximum(found - 1, 0) * self.step_adu, np.float32)
         begins = _thresholds(self, specimen, codes)
         level = np.clip(adu / np.float32(self.step_adu), 0, np.float32(codes - 2))
         nearest = (level + np.float32(0.5)).astype(np.int32)
@@ -152,16 +161,23 @@ class Quantisation(Effect):
         """Step by the codes that never come, widths by how often the others do.
 
         None where samples are no whole numbers, or too few. Where the noise is below one step the
-        light is no smooth function of the code, so widths are not told.
+        light is no smooth function of the code: then fringes tell, from where shot noise is as
+        large as a step.
         """
-        frames = [s.adu for s in evidence.stacks] + [f.adu for f in evidence.fringes.values()]
-        counts = histogram(frames, evidence.good) if frames else None
+        fringes = [f.adu for f in evidence.fringes.values()]
+        counts = histogram([*(s.adu for s in evidence.stacks), *fringes], evidence.good)
         if counts is None or not counts.any():
             return None
         step, step_error = step_of(counts)
-        own = converter_counts(counts, step)
-        widths = code_widths(own, evidence.read_noise / evidence.gain / step)
-        values = {"coarse_adu": step - 1, "dnl_rms": 0.0, "ripple": 0.0}
+        noise, first = evidence.read_noise / evidence.gain / step, 0.0
+        if noise < 1 and fringes:
+            counts = histogram(fringes, evidence.good)
+            first = float(np.median(evidence.bias)) / step + (1 - noise**2) * step * evidence.gain
+            noise = 1.0
+        widths = (
+            None if counts is None else code_widths(converter_counts(counts, step), noise, first)
+        )
+        values: dict[str, Any] = {"coarse_adu": step - 1, "dnl_rms": 0.0, "ripple": 0.0}
         errors = {"coarse_adu": step_error}
         found = [-1.0 if step == 1 else min((step - 1) / step_error, 1e6)]
         if widths is not None:
@@ -185,12 +201,32 @@ def _thresholds(effect: Quantisation, specimen: int, codes: int) -> F32:
     return (effect.thresholds(specimen, codes) - np.arange(codes)).astype(np.float32)
 
 
-def _uneven(widths: CodeWidths) -> tuple[dict[str, float], dict[str, float], list[float]]:
-    """Scatter and ripple of the widths, their errors, and how sure they are."""
+@lru_cache(maxsize=4)
+def _reached(effect: Quantisation, specimen: int, codes: int) -> F64:
+    """From where on a sample is given a code or a higher one: a bit is taken if it fits."""
+    begins = effect.thresholds(specimen, codes)
+    return np.asarray(np.minimum.accumulate(begins[::-1])[::-1])
+
+
+def _uneven(widths: CodeWidths) -> tuple[dict[str, Any], dict[str, float], list[float]]:
+    """Wrong bits, scatter and ripple of the widths, their errors, and how sure they are."""
     variance, error, scatter_sigmas = widths.scatter()
     line = widths.ripple(variance)
     sure = sigmas(line.log_chance)
-    values, errors = {"ripple": 0.0}, {"ripple": line.amplitude_error}
+    values: dict[str, Any] = {"ripple": 0.0}
+    errors = {"ripple": line.amplitude_error}
+    # Of displaced thresholds neighbouring widths have up to twice the scatter of the others.
+    bits, covariance = widths.bits(2 * variance)
+    chi2 = float(bits @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ bits)
+    wrong = sigmas_of_chi2(chi2, max(int((np.diag(covariance) > 0).sum()), 1))
+    if wrong > max(SURE, sure):
+        rest = widths.without(bits).scatter()[0]
+        bits, covariance = widths.bits(2 * rest)
+        values, errors, others = _uneven(widths.without(bits))
+        values["bits"] = tuple(map(float, bits))
+        spread = np.sqrt(np.diag(covariance))
+        errors |= {f"bits[{n}]": float(e) for n, e in enumerate(spread) if e}
+        return values, errors, [wrong, *others]
     if sure > SURE:
         share = 1.0 if line.period == 2 else 0.5
         for _ in range(2):

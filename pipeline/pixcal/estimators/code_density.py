@@ -5,7 +5,7 @@ changes quickly from code to code is the converter: the counts against a local f
 """
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -31,6 +31,7 @@ TIE = 0.01
 _ORDER = 3
 _LEAST_HALF, _MOST_HALF = 4, 12
 _CALM = 101
+_NO_CHANGE = 1e-6
 LOWEST_RIPPLE = 1 / 16
 """Turns a code."""
 
@@ -194,6 +195,31 @@ class CodeWidths:
         sigmas = float(chance @ excess / np.sqrt(chance.sum()))
         return size / more, error / more, sigmas
 
+    def bits(self, scatter: float) -> tuple[F64, F64]:
+        """By how much each bit's weight is off, in codes, the least first; and the covariance.
+
+        A bit that does not change within the codes at hand gets nothing. The common factor of all
+        weights, a gain, does not change the local widths: the smallest errors are given.
+        """
+        codes = np.arange(self.number[-1] + len(self.kernel))
+        every = 1 << np.arange(int(codes[-1]).bit_length())
+        weighs = (codes[:, None] & every > 0).astype(float)
+        steps = np.diff(weighs, axis=0)
+        design = np.stack([np.convolve(s, self.kernel, "same") for s in steps.T], 1)[self.number]
+        weight = 1 / (self.variance + max(scatter, 0.0))
+        normal = (design.T * weight) @ design
+        scale = 1 / np.sqrt(np.maximum(np.diag(normal), _NO_CHANGE))
+        inverse = np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-6, hermitian=True)
+        covariance = inverse * np.outer(scale, scale)
+        return covariance @ (design.T @ (weight * self.width)), covariance
+
+    def without(self, bits: F64) -> "CodeWidths":
+        """The rest, once the wrong weights of bits (codes) are taken out."""
+        codes = np.arange(self.number[-1] + len(self.kernel))
+        begins = (codes[:, None] >> np.arange(len(bits)) & 1) @ bits
+        taken = np.convolve(np.diff(begins), self.kernel, "same")[self.number]
+        return replace(self, width=self.width - taken)
+
     def ripple(self, scatter: float) -> Ripple:
         """The strongest line, over chance and a scatter of the widths (variance)."""
         weight = 1 / (self.variance + max(scatter, 0.0))
@@ -236,7 +262,7 @@ class CodeWidths:
         return Ripple(1 / best, abs(found), float(error), float(np.angle(found)), chance)
 
 
-def code_widths(counts: F64, noise: float) -> CodeWidths | None:
+def code_widths(counts: F64, noise: float, first: float = 0.0) -> CodeWidths | None:
     """Widths from the counts of a converter's codes; None where too few came up.
 
     Parameters
@@ -244,6 +270,8 @@ def code_widths(counts: F64, noise: float) -> CodeWidths | None:
     counts : (n,) float64
     noise : float
         Least noise of a sample, in codes.
+    first : float
+        Code from which the noise is at least that.
     """
     half = int(np.clip(noise / 2, _LEAST_HALF, _MOST_HALF))
     if noise < 1 or len(counts) < 2 * _CALM:
@@ -253,7 +281,7 @@ def code_widths(counts: F64, noise: float) -> CodeWidths | None:
     # Weights that hardly depend on the code's own count.
     calm = uniform_filter1d(expected, length)
     used = (uniform_filter1d(counts, length) > FEWEST_COUNTS) & (calm > FEWEST_COUNTS)
-    used &= expected > 0
+    used &= (expected > 0) & (np.arange(len(counts)) >= first + half)
     if np.count_nonzero(used) < FEWEST_CODES:
         return None
     kernel = -savgol_coeffs(length, _ORDER)
