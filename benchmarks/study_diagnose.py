@@ -89,7 +89,7 @@ def record(bench: dict[str, Any], folder: Path, run: Path) -> None:
     """Take the frames of a bench, and reduce them."""
     (folder / "bench.yaml").write_text(yaml.safe_dump(bench))
     simulate.run(folder / "bench.yaml", folder / "acq", simulate.Config(), HERE)
-    ingest.run(folder / "acq", run, ingest.Config(), HERE)
+    ingest.run(folder / "acq", run, ingest.Config(copy=True), HERE)
     reduce.run(run, reduce.Config(), HERE)
     shutil.rmtree(folder / "acq")
 

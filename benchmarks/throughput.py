@@ -154,7 +154,7 @@ def full(scratch: Path) -> None:
             f"{used['peak'] / 2**20:.0f} MiB, planned {used['planned'] / 2**20:.0f}, "
             f"limit {LIMIT_MIB}"
         )
-        if stage == "ingest":
+        if stage == "reduce":
             work.forget_frames()
     scans = work.scan(2)
     again = work.fit(2)

@@ -109,20 +109,20 @@ class Workload:
         )
 
     def ingest(self) -> float:
-        """Seconds; the frames are removed afterwards."""
-        took = seconds(
+        """Seconds."""
+        return seconds(
             lambda: ingest.run(self.folder / "acq", self.run, ingest.Config(), Runtime())
         )
-        self.forget_frames()
-        return took
 
     def forget_frames(self) -> None:
-        """Remove the acquisition: the run has it."""
+        """Remove the acquisition: it was reduced."""
         shutil.rmtree(self.folder / "acq", ignore_errors=True)
 
     def reduce(self) -> float:
-        """Seconds."""
-        return seconds(lambda: reduce.run(self.run, reduce.Config(), Runtime()))
+        """Seconds; the frames are removed afterwards."""
+        took = seconds(lambda: reduce.run(self.run, reduce.Config(), Runtime()))
+        self.forget_frames()
+        return took
 
     def fit(self, threads: int) -> float:
         """Seconds of a fit from the start; what an earlier one left is removed before."""

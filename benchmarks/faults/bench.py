@@ -19,8 +19,8 @@ SHAPE = (137, 150)
 
 HOW_IT_RAN = frozenset({"chunks_read", "passes"})
 """Counts of readings, which are more when a run was cut short; in `tiles` as well."""
-OF_A_MANIFEST = frozenset({"files", "seal"})
-"""Digests of files that hold such counts."""
+OF_A_MANIFEST = frozenset({"files", "seal", "acquisition"})
+"""Digests of files that hold such counts, and where the FITS files are from there."""
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import click
 from pixcal_cli import results
 from pixcal_cli.options import (
     acquisition_argument,
+    copy_option,
     cubes_option,
     examples,
     out_run_option,
@@ -22,23 +23,31 @@ if TYPE_CHECKING:
 @click.command(
     epilog=examples(
         "pixcal ingest data_samples/demo --out demo",
-        "pixcal ingest data_samples/demo --out demo --cubes s3://bucket/cubes",
+        "pixcal ingest data_samples/demo --out demo --copy --cubes s3://bucket/cubes",
     )
 )
 @acquisition_argument
 @out_run_option
 @overwrite_option
+@copy_option
 @cubes_option
 @runtime_options
 def ingest(
-    acquisition: Path, run: Path, overwrite: bool, cubes: str | None, runtime: "Runtime"
+    acquisition: Path,
+    run: Path,
+    overwrite: bool,
+    copy: bool,
+    cubes: str | None,
+    runtime: "Runtime",
 ) -> None:
-    """Copy the frames of the acquisition ACQ into checksummed cubes.
+    """Check every frame of the acquisition ACQ, and catalogue it.
 
-    ACQ is a directory with acquisition.yaml and FITS files.
+    ACQ is a directory with acquisition.yaml and FITS files. Later steps read these files where they
+    are; only compressed ones are copied into cubes.
     """
     from pixcal.stages import ingest as stage  # here: for a fast `pixcal --help`
 
     with results.announce("ingest", run / "ingest"):
-        stage.run(acquisition, run, stage.Config(overwrite=overwrite, cubes=cubes), runtime)
+        config = stage.Config(overwrite=overwrite, copy=copy, cubes=cubes)
+        stage.run(acquisition, run, config, runtime)
     results.show_ingest(run)

@@ -54,6 +54,11 @@ out_run_option = click.option(
 overwrite_option = click.option(
     "--overwrite", is_flag=True, help="Replace what was ingested from another acquisition."
 )
+copy_option = click.option(
+    "--copy",
+    is_flag=True,
+    help="Copy the samples of all frames: later steps do without the files of ACQ.",
+)
 cubes_option = click.option(
     "--cubes",
     metavar="PLACE",

@@ -43,10 +43,16 @@ def show_ingest(run: Path) -> None:
     """Print one row for each array of frames, and what looked odd."""
     summary = read_json(run / "ingest" / MANIFEST)["summary"]
     rows = [
-        (name, found["shape"][0], f"{found['shape'][2]} × {found['shape'][1]}", found["dtype"])
+        (
+            name,
+            found["shape"][0],
+            f"{found['shape'][2]} × {found['shape'][1]}",
+            found["dtype"],
+            "copied" if found["copied"] else "in their files",
+        )
         for name, found in summary["arrays"].items()
     ]
-    show_table(("array", "frames", "x × y", "type"), rows)
+    show_table(("array", "frames", "x × y", "type", "samples"), rows)
     show_notes(summary["warnings"])
 
 

@@ -10,6 +10,7 @@ from pixcal.model.errors import InputError
 from pixcal_cli import results
 from pixcal_cli.options import (
     acquisition_argument,
+    copy_option,
     cubes_option,
     examples,
     gain_option,
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 @acquisition_argument
 @out_run_option
 @overwrite_option
+@copy_option
 @gain_option
 @model_option
 @cubes_option
@@ -42,6 +44,7 @@ def run(
     acquisition: Path,
     run: Path,
     overwrite: bool,
+    copy: bool,
     gain: str,
     model: str,
     cubes: str | None,
@@ -53,7 +56,8 @@ def run(
     from pixcal.stages import allan, correct, diagnose, fit, ingest, reduce, report
 
     with results.announce("ingest", run / "ingest"):
-        ingest.run(acquisition, run, ingest.Config(overwrite=overwrite, cubes=cubes), runtime)
+        config = ingest.Config(overwrite=overwrite, copy=copy, cubes=cubes)
+        ingest.run(acquisition, run, config, runtime)
     with results.announce("reduce", run / "reduce"):
         reduce.run(run, reduce.Config(gain=gain, cubes=cubes), runtime)
     fringes = bool(load_acquisition(acquisition).frames.fringes)

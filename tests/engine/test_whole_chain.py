@@ -21,8 +21,8 @@ from pixcal.stages import allan, crests, fit, ingest, reduce, simulate
 
 HOW_IT_RAN = {"chunks_read", "passes"}
 """What differs with the runtime: other processes do not share what the scout keeps in memory."""
-OF_A_MANIFEST = {"files", "seal"}
-"""Digests of files that hold such counts."""
+OF_A_MANIFEST = {"files", "seal", "acquisition"}
+"""Digests of files that hold such counts, and where the FITS files are from there."""
 
 
 Chain = Callable[[Runtime], Path]

@@ -11,6 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import google_crc32c
 import numpy as np
 import pytest
 import zarr
@@ -20,8 +21,9 @@ from numpy.typing import NDArray
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import InputError, PlanError
 from pixcal.stages.ingest import stage as ingest
+from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage import fits_rows, frames
-from pixcal.storage.cube import ArrayReader, ArrayWriter
+from pixcal.storage.cube import ArrayWriter
 from pixcal.storage.sources import SourceFile
 
 YAML = """\
@@ -67,7 +69,7 @@ def save_frames(folder: Path, data: NDArray[Any], name: str = "f{}.fits") -> Non
 
 
 def read(out: Path, array: str = "fringes/vertical") -> NDArray[Any]:
-    return ArrayReader(out / "ingest/raw.zarr" / array).read()
+    return Ingested(out / "ingest").arrays[array].read()
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -83,16 +85,19 @@ def acquisition(tmp_path: Path) -> Path:
     return folder
 
 
-def test_artefact(acquisition: Path, tmp_path: Path) -> None:
-    manifest = ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+@pytest.mark.parametrize("copy", [False, True])
+def test_artefact(acquisition: Path, tmp_path: Path, copy: bool) -> None:
+    manifest = ingest.run(acquisition, tmp_path / "run", ingest.Config(copy=copy), SYNC)
     np.testing.assert_array_equal(read(tmp_path / "run"), noise((70, 67, 131)))
     np.testing.assert_array_equal(read(tmp_path / "run", "bias"), noise((3, 67, 131), 1))
     folder = tmp_path / "run/ingest"
     assert sorted(p.name for p in folder.iterdir()) == [
         "acquisition.json",
+        "catalogue.zarr",
+        "files.json",
         "frames.json",
         "manifest.json",
-        "raw.zarr",
+        *(["raw.zarr"] if copy else []),
     ]
     tables = json.loads((folder / "frames.json").read_text())
     assert set(tables) == {"bias", "fringes/vertical"}
@@ -100,6 +105,7 @@ def test_artefact(acquisition: Path, tmp_path: Path) -> None:
     assert table["file"] == [f"v/f{n}.fits" for n in range(70)]
     assert table["time_s"] == pytest.approx(np.arange(70) * 0.14)
     assert table["exptime_s"] == [0.1] * 70
+    assert table["largest_adu"] == noise((70, 67, 131)).max(axis=(1, 2)).tolist()
     assert {len(column) for column in table.values()} == {70}
     assert set(manifest.inputs) == {"bias", "fringes/vertical"}
     arrays = manifest.summary["arrays"]
@@ -107,8 +113,14 @@ def test_artefact(acquisition: Path, tmp_path: Path) -> None:
     assert arrays["fringes/vertical"]["dtype"] == "uint16"
     assert arrays["fringes/vertical"]["digest"] != arrays["bias"]["digest"]
     assert manifest.summary["warnings"] == []
-    group = zarr.open_group(folder / "raw.zarr", mode="r")
-    np.testing.assert_array_equal(group["fringes"]["vertical"][65:], noise((70, 67, 131))[65:])
+    catalogue = zarr.open_group(folder / "catalogue.zarr", mode="r")
+    of_frame = [
+        google_crc32c.value((f ^ 0x8000).astype(">u2").tobytes()) for f in noise((70, 67, 131))
+    ]
+    np.testing.assert_array_equal(catalogue["fringes"]["vertical"][:, 0, 0], of_frame)
+    if copy:
+        group = zarr.open_group(folder / "raw.zarr", mode="r")
+        np.testing.assert_array_equal(group["fringes"]["vertical"][65:], noise((70, 67, 131))[65:])
 
 
 @pytest.mark.parametrize("shape", [(1, 7, 5), (64, 128, 128), (65, 129, 127), (3, 600, 40)])
@@ -119,16 +131,16 @@ def test_sizes(tmp_path: Path, shape: tuple[int, int, int]) -> None:
     np.testing.assert_array_equal(read(tmp_path / "run"), noise(shape))
 
 
-@pytest.mark.parametrize("cluster", ["threads", "processes"])
+@pytest.mark.parametrize(("cluster", "copy"), [("threads", True), ("processes", False)])
 def test_workers_and_bands_do_not_matter(
-    tmp_path: Path, cluster: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, cluster: str, copy: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder = describe(tmp_path / "acq")
     save_frames(folder / "v", noise((5, 700, 1000)))
-    ingest.run(folder, tmp_path / "one", ingest.Config(), SYNC)
+    ingest.run(folder, tmp_path / "one", ingest.Config(copy=copy), SYNC)
     monkeypatch.setattr(ingest, "_BAND_ROWS", (256,))
     two = Runtime(cluster=cluster, workers=2)
-    ingest.run(folder, tmp_path / "two", ingest.Config(), two)
+    ingest.run(folder, tmp_path / "two", ingest.Config(copy=copy), two)
     assert tree(tmp_path / "one/ingest") == tree(tmp_path / "two/ingest")
 
 
@@ -216,38 +228,49 @@ def test_up_to_date_is_skipped(
     first = ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
     monkeypatch.setattr(ingest, "run_tasks", None)
     moved = acquisition.rename(tmp_path / "moved")
-    assert ingest.run(moved, tmp_path / "run", ingest.Config(overwrite=True), SYNC) == first
+    with pytest.raises(InputError, match=r"the frames of .* are not there any more; run 'pixcal"):
+        read(tmp_path / "run")
+    second = ingest.run(moved, tmp_path / "run", ingest.Config(overwrite=True), SYNC)
+    assert second.key == first.key
+    np.testing.assert_array_equal(read(tmp_path / "run"), noise((70, 67, 131)))
 
 
 @pytest.mark.parametrize("name", ["f{}.fits", "f{}.fits.gz"])
-def test_resumed_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    folder = describe(tmp_path / "acq")
+@pytest.mark.parametrize("copy", [False, True])
+def test_resumed_after_a_kill(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, copy: bool
+) -> None:
+    folder, config = describe(tmp_path / "acq"), ingest.Config(copy=copy)
     save_frames(folder / "v", noise((150, 20, 140)), name)
-    ingest.run(folder, tmp_path / "whole", ingest.Config(), SYNC)
+    ingest.run(folder, tmp_path / "whole", config, SYNC)
     write = ArrayWriter.write
-    written: list[tuple[int, ...]] = []
+    written: list[tuple[str, int]] = []
 
     def killed(self: ArrayWriter, start: tuple[int, ...], data: NDArray[Any]) -> None:
-        if len(written) == 1:
-            # In the middle of the block: one chunk is there, and another is half written.
-            write(self, start, data[:, :, :128])
-            (self.path / "c/1/0/.1.aside").write_bytes(b"half")
+        if len(written) == 2:
+            # In the middle of the block: a chunk may be there, and another is half written.
+            if self.shape[1:] == (20, 140):
+                write(self, start, data[:, :, :128])
+            half = self.path / f"c/{start[0] // self.chunks[0]}/0/.0.aside"
+            half.parent.mkdir(parents=True, exist_ok=True)
+            half.write_bytes(b"half")
             raise KeyboardInterrupt
-        written.append(tuple(start))
+        resumed(self, start, data)
+
+    def resumed(self: ArrayWriter, start: tuple[int, ...], data: NDArray[Any]) -> None:
+        written.append(("raw" if self.shape[1:] == (20, 140) else "facts", start[0]))
         write(self, start, data)
 
     monkeypatch.setattr(ArrayWriter, "write", killed)
     with pytest.raises(KeyboardInterrupt):
-        ingest.run(folder, tmp_path / "run", ingest.Config(), SYNC)
+        ingest.run(folder, tmp_path / "run", config, SYNC)
     assert not (tmp_path / "run/ingest").exists()
-
-    def resumed(self: ArrayWriter, start: tuple[int, ...], data: NDArray[Any]) -> None:
-        written.append(tuple(start))
-        write(self, start, data)
-
     monkeypatch.setattr(ArrayWriter, "write", resumed)
-    ingest.run(folder, tmp_path / "run", ingest.Config(), SYNC)
-    assert written == [(0, 0, 0), (64, 0, 0), (128, 0, 0)]
+    ingest.run(folder, tmp_path / "run", config, SYNC)
+    if copy or name.endswith("gz"):
+        assert written == [(of, t) for t in (0, 64, 128) for of in ("raw", "facts")]
+    else:
+        assert written == [("facts", t) for t in range(0, 150, 16)]
     assert tree(tmp_path / "whole/ingest") == tree(tmp_path / "run/ingest")
     assert not list((tmp_path / "run/.partial").iterdir())
 
@@ -271,13 +294,65 @@ def test_another_acquisition_is_refused(tmp_path: Path) -> None:
     assert digests[0] != digests[1]
 
 
-def test_another_format_is_refused(
+def test_another_format_is_made_anew(
     acquisition: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
-    monkeypatch.setattr(ingest, "FORMAT", ingest.FORMAT + 1)
-    with pytest.raises(InputError, match=r"\(format changed since\).*--overwrite"):
+    with monkeypatch.context() as patch:
+        patch.setattr(ingest, "FORMAT", ingest.FORMAT - 1)
         ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+    ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+    ingest.run(acquisition, tmp_path / "fresh", ingest.Config(), SYNC)
+    assert tree(tmp_path / "run/ingest") == tree(tmp_path / "fresh/ingest")
+
+
+@pytest.mark.parametrize("name", ["f{}.fits", "f{}.fits.gz"])
+def test_copied_when_asked_for_later(tmp_path: Path, name: str) -> None:
+    """And then nothing needs the files any more; what is a copy stays one."""
+    folder, run = describe(tmp_path / "acq"), tmp_path / "run"
+    save_frames(folder / "v", noise((5, 67, 131)), name)
+    first = ingest.run(folder, run, ingest.Config(), SYNC)
+    assert (run / "ingest/raw.zarr").exists() is name.endswith("gz")
+    second = ingest.run(folder, run, ingest.Config(copy=True), SYNC)
+    assert second.key == first.key
+    assert ingest.run(folder, run, ingest.Config(), SYNC) == second
+    shutil.rmtree(folder)
+    np.testing.assert_array_equal(read(run), noise((5, 67, 131)))
+
+
+def test_run_and_frames_moved_together(acquisition: Path, tmp_path: Path) -> None:
+    ingest.run(acquisition, acquisition / "run", ingest.Config(), SYNC)
+    moved = acquisition.rename(tmp_path / "moved")
+    np.testing.assert_array_equal(read(moved / "run"), noise((70, 67, 131)))
+
+
+@pytest.mark.parametrize(
+    ("rows", "columns"), [((0, 67), (0, 131)), ((3, 20), (128, 131)), ((66, 67), (0, 1))]
+)
+def test_any_block_is_read(
+    acquisition: Path, tmp_path: Path, rows: tuple[int, int], columns: tuple[int, int]
+) -> None:
+    ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+    block = Ingested(tmp_path / "run/ingest").arrays["fringes/vertical"].read((3, 9), rows, columns)
+    np.testing.assert_array_equal(block, noise((70, 67, 131))[3:9, slice(*rows), slice(*columns)])
+
+
+def test_frame_that_changed_since_is_named(acquisition: Path, tmp_path: Path) -> None:
+    """By its time, its size, or its bytes alone; only where it is read."""
+    ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
+    array = Ingested(tmp_path / "run/ingest").arrays["fringes/vertical"]
+    file = acquisition / "v/f3.fits"
+    body, facts = bytearray(file.read_bytes()), file.stat()
+    body[2880 + 777] ^= 4
+    file.write_bytes(body)
+    with pytest.raises(InputError, match=r"v/f3\.fits: changed since it was ingested"):
+        array.read()
+    os.utime(file, ns=(facts.st_atime_ns, facts.st_mtime_ns))
+    with pytest.raises(InputError, match=r"v/f3\.fits: its bytes are not those"):
+        array.read()
+    array.read((4, 70))
+    file.unlink()
+    with pytest.raises(InputError, match=r"v/f3\.fits: cannot be read"):
+        array.read()
 
 
 def test_file_changed_while_read(
@@ -454,13 +529,13 @@ def test_chunks_are_linked_or_else_copied(
     bench: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, links: bool, cluster: str
 ) -> None:
     run = tmp_path / "run"
-    ingest.run(bench, run, ingest.Config(), SYNC)
+    ingest.run(bench, run, ingest.Config(copy=True), SYNC)
     chunk = run / "ingest/raw.zarr/fringes/vertical/c/1/0/1"
     inode, content = chunk.stat().st_ino, tree(run / "ingest/raw.zarr")
     a_gain(bench)
     if not links:
         monkeypatch.setattr(Path, "hardlink_to", without_links)
-    ingest.run(bench, run, ingest.Config(), Runtime(cluster=cluster, workers=2))
+    ingest.run(bench, run, ingest.Config(copy=True), Runtime(cluster=cluster, workers=2))
     assert (chunk.stat().st_ino == inode) is links
     assert chunk.stat().st_nlink == 1
     assert tree(run / "ingest/raw.zarr") == content
@@ -485,10 +560,13 @@ def test_copies_that_fill_the_disk_are_told(
         ingest.run(bench, tmp_path / "run", ingest.Config(), SYNC)
 
 
-@pytest.mark.parametrize("damage", ["missing", "cut", "altered", "tables", "planes"])
+@pytest.mark.parametrize(
+    "damage", ["missing", "cut", "altered", "facts", "tables", "planes", "files"]
+)
 def test_damaged_arrays_are_read_again(bench: Path, tmp_path: Path, damage: str) -> None:
     run, fresh = tmp_path / "run", tmp_path / "fresh"
-    ingest.run(bench, run, ingest.Config(), SYNC)
+    config = ingest.Config(copy=damage in ("missing", "cut", "altered"))
+    ingest.run(bench, run, config, SYNC)
     chunk = run / "ingest/raw.zarr/fringes/vertical/c/1/0/1"
     tables = run / "ingest/frames.json"
     if damage == "missing":
@@ -497,13 +575,18 @@ def test_damaged_arrays_are_read_again(bench: Path, tmp_path: Path, damage: str)
         os.truncate(chunk, chunk.stat().st_size - 5)
     elif damage == "altered":
         chunk.write_bytes(chunk.read_bytes()[:-1] + b"?")
+    elif damage == "facts":
+        facts = run / "ingest/catalogue.zarr/fringes/vertical/c/1/0/0"
+        facts.write_bytes(facts.read_bytes()[:-1] + b"?")
+    elif damage == "files":
+        os.truncate(run / "ingest/files.json", 1000)
     elif damage == "tables":
         os.truncate(tables, 1000)
     else:
         tables.write_text(tables.read_text().replace("v/f69.fits", "v/f68.fits"))
     a_gain(bench)
-    ingest.run(bench, run, ingest.Config(), SYNC)
-    ingest.run(bench, fresh, ingest.Config(), SYNC)
+    ingest.run(bench, run, config, SYNC)
+    ingest.run(bench, fresh, config, SYNC)
     assert tree(run / "ingest") == tree(fresh / "ingest")
 
 
@@ -524,7 +607,8 @@ def test_taking_over_resumed_after_a_kill(
     bench: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
     run, fresh = tmp_path / "run", tmp_path / "fresh"
-    ingest.run(bench, run, ingest.Config(), SYNC)
+    config = ingest.Config(copy=True)
+    ingest.run(bench, run, config, SYNC)
     before = tree(run / "ingest")
     save_frames(bench / "bias", noise((130, 67, 131), 5))
     link, write = Path.hardlink_to, ArrayWriter.write
@@ -544,17 +628,19 @@ def test_taking_over_resumed_after_a_kill(
         patch.setattr(
             Path, "hardlink_to", killed_after(linked, 4 if moment == "linking" else -1, link)
         )
-        patch.setattr(ArrayWriter, "write", killed_after(written, 1, write))
+        patch.setattr(ArrayWriter, "write", killed_after(written, 2, write))
         with pytest.raises(KeyboardInterrupt):
-            ingest.run(bench, run, ingest.Config(), SYNC)
+            ingest.run(bench, run, config, SYNC)
     assert tree(run / "ingest") == before
     monkeypatch.setattr(Path, "hardlink_to", counted(link, linked))
     monkeypatch.setattr(ArrayWriter, "write", counted(write, written))
-    ingest.run(bench, run, ingest.Config(), SYNC)
-    assert len(linked) == 2 + 4  # the chunks of 12 flats and 70 fringe frames, each once
-    assert [call[1][0] for call in written] == [0, 64, 128]
+    ingest.run(bench, run, config, SYNC)
+    # The chunks of 12 flats and 70 fringe frames, each once, and of their catalogues.
+    assert len(linked) == (2 + 4) + (1 + 5)
+    raw = [call[1][0] for call in written if call[0].dtype == np.uint16]
+    assert raw == [0, 64, 128]
     monkeypatch.undo()
-    ingest.run(bench, fresh, ingest.Config(), SYNC)
+    ingest.run(bench, fresh, config, SYNC)
     assert tree(run / "ingest") == tree(fresh / "ingest")
     assert not list((run / ".partial").iterdir())
 

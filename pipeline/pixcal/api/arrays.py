@@ -109,7 +109,7 @@ def calibrate(
     run.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix=".frames-", dir=run) as folder:
         _write(described, stacks, Path(folder))
-        commands.ingest(folder, run, runtime=runtime)
+        commands.ingest(folder, run, copy=True, runtime=runtime)
     commands.reduce(run, gain=gain, runtime=runtime)
     commands.fit(run, model=model, runtime=runtime)
     commands.allan(run, runtime=runtime)

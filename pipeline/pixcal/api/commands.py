@@ -35,6 +35,7 @@ def run(
     out: StrPath,
     *,
     overwrite: bool = False,
+    copy: bool = False,
     gain: Literal["declared", "measured"] = "declared",
     model: str = "auto",
     cubes: StrPath | None = None,
@@ -51,6 +52,8 @@ def run(
         The run directory; made if it is not there.
     overwrite : bool
         Replace what was ingested from another acquisition.
+    copy : bool
+        Copy the samples of all frames: later steps do without the files.
     gain : {"declared", "measured"}
         The gain that electrons are counted with: the owner's, or that of the flats.
     model : str
@@ -72,7 +75,7 @@ def run(
     InputError
         In one line, with the file, key or option that is wrong.
     """
-    ingest(acquisition, out, overwrite=overwrite, cubes=cubes, runtime=runtime)
+    ingest(acquisition, out, overwrite=overwrite, copy=copy, cubes=cubes, runtime=runtime)
     reduced = reduce(out, gain=gain, cubes=cubes, runtime=runtime)
     if reduced.acquisition.frames.fringes:
         fit(out, model=model, runtime=runtime)
@@ -105,10 +108,11 @@ def ingest(
     out: StrPath,
     *,
     overwrite: bool = False,
+    copy: bool = False,
     cubes: StrPath | None = None,
     runtime: Runtime | None = None,
 ) -> Run:
-    """Copy the frames of an acquisition into checksummed cubes.
+    """Check every frame of an acquisition, and catalogue it.
 
     Parameters
     ----------
@@ -118,6 +122,9 @@ def ingest(
         The run directory; made if it is not there.
     overwrite : bool
         Replace what was ingested from another acquisition.
+    copy : bool
+        Copy the samples of all frames, not of compressed ones only: later steps do without the
+        files.
     cubes : str or path, optional
         Folder or URL for the cubes.
     runtime : Runtime, optional
@@ -129,7 +136,7 @@ def ingest(
     """
     from pixcal.stages import ingest as stage
 
-    config = _config(stage.Config, "ingest", overwrite=overwrite, cubes=_text(cubes))
+    config = _config(stage.Config, "ingest", overwrite=overwrite, copy=copy, cubes=_text(cubes))
     stage.run(Path(acquisition), Path(out), config, runtime or Runtime())
     return open_run(out)
 

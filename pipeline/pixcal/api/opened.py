@@ -23,7 +23,7 @@ F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 
 FORMATS = {
-    "ingest": 1,
+    "ingest": 2,
     "reduce": 1,
     "fit": 1,
     "allan": 1,

@@ -130,7 +130,7 @@ def _fringes(
         time_s=times,
         exptime_s=np.nan if exposure is None else float(exposure),
         electrons=electrons,
-        adu=ArrayReader(ingested.raw / "fringes" / name).read((first, last), y, x),
+        adu=ingested.arrays[f"fringes/{name}"].read((first, last), y, x),
         g=g,
         dk=dk,
         free=free,

@@ -62,7 +62,7 @@ from pixcal.storage.folder import INDEX
 STAGE = "report"
 FORMAT = 1
 SHOWN_STAGES = {
-    "ingest": 1,
+    "ingest": 2,
     "reduce": 1,
     "sweep": 3,
     "fit": 1,

@@ -66,6 +66,8 @@ __all__ = [
 
 _KEY_IN_NAME = 16
 _FROM_FRINGES = ("sweep", "fit", "allan", "crests", "corrected", "astrometry")
+_EARLIER = {"ingest": (1,)}
+"""Formats that are read beside the one that is written."""
 
 
 def _command(run: Path, stage: str) -> str:
@@ -102,7 +104,7 @@ def require(run: Path, stage: str, format: int) -> Manifest:
         if stage in _FROM_FRINGES and _without_fringes(run):
             raise InputError(f"{run}: the acquisition lists no fringes, so there is no {stage}")
         raise InputError(f"{folder}: not there yet; run '{command}' first")
-    if manifest.stage != stage or manifest.format != format:
+    if manifest.stage != stage or manifest.format not in (format, *_EARLIER.get(stage, ())):
         raise InputError(
             f"{folder}: format {manifest.stage}/{manifest.format}, this pixcal reads "
             f"{stage}/{format}; run '{command}' again"
@@ -139,7 +141,6 @@ class Build:
     key: str
     resumed: bool
     summary: dict[str, Any] = field(default_factory=dict)
-    durable: bool = False
 
     @property
     def scratch(self) -> Path:
@@ -153,8 +154,8 @@ class Build:
     def journal(self) -> set[str]:
         """Steps noted as done by an earlier, interrupted build.
 
-        Unless the build is durable, only those of this run of the machine: after a power failure
-        nobody knows what reached the disk.
+        Only those of this run of the machine: after a power failure nobody knows what reached the
+        disk.
         """
         path = self.folder / JOURNAL
         if not path.exists():
@@ -164,7 +165,7 @@ class Build:
             # The last line may have been cut by a kill: what does not parse was not done.
             try:
                 step = json.loads(line)
-                if self.durable or step["boot"] == _boot():
+                if step["boot"] == _boot():
                     done.add(step["done"])
             except (ValueError, KeyError, TypeError):
                 continue
@@ -174,9 +175,6 @@ class Build:
         """Note a step as done. Call it when all that the step wrote is in place."""
         with (self.folder / JOURNAL).open("a", encoding="utf-8") as file:
             file.write("\n" + json.dumps({"done": step, "boot": _boot()}) + "\n")
-            if self.durable:
-                file.flush()
-                os.fsync(file.fileno())
 
 
 @cache
@@ -213,7 +211,6 @@ def build(
     config: dict[str, Any],
     inputs: dict[str, str],
     *,
-    durable: bool = False,
     cubes: Place | None = None,
 ) -> Iterator[Build]:
     """Build an artefact aside and put it in place when the block ends without an exception.
@@ -225,9 +222,6 @@ def build(
 
     Parameters
     ----------
-    durable : bool
-        What is noted as done has been flushed to the disk (arrays created ``durable``), and is
-        trusted even after a power failure.
     cubes : Path or UrlPath, optional
         Folder below which to make one for the cubes, instead of ``RUN/<stage>``; no part of the
         key. An unfinished build whose cubes lie under another is not resumed.
@@ -244,7 +238,7 @@ def build(
     resumed = folder.is_dir()
     folder.mkdir(parents=True, exist_ok=True)
     settle(folder, run, cubes)
-    made = Build(folder, cubes_of(folder), key, resumed, durable=durable)
+    made = Build(folder, cubes_of(folder), key, resumed)
     yield made
     # What is called complete must be on the disk, not on its way to it.
     os.sync()

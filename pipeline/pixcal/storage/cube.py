@@ -55,7 +55,6 @@ def create_array(
     chunks: Sequence[int] = CHUNK,
     fill_value: Any = 0,
     attrs: dict[str, Any] | None = None,
-    durable: bool = False,
 ) -> "ArrayWriter":
     """Create an array to be written chunk by chunk, or reopen one that was left unfinished.
 
@@ -69,16 +68,13 @@ def create_array(
         Of fixed size; stored little-endian.
     fill_value : scalar
         Value outside the array in edge chunks, and CF ``_FillValue`` where ``attrs`` says so.
-    durable : bool
-        Flush every chunk to the disk as it is written, so that work of hours also outlives a power
-        failure half-way. Otherwise the artefact is flushed once, when it is complete.
     """
     shape, chunks = tuple(map(int, shape)), tuple(map(int, chunks))
     dtype = np.dtype(dtype).newbyteorder("<")
     text = json.dumps(attrs or {})
     metadata = _array_metadata(shape, chunks, dtype.str, fill_value, tuple(dims), text)
     _write_metadata(path, metadata)
-    return ArrayWriter(path, shape, chunks, dtype, fill_value, metadata, durable)
+    return ArrayWriter(path, shape, chunks, dtype, fill_value, metadata)
 
 
 # Kept: arrays are many and alike, and zarr-python takes a millisecond for each.
@@ -177,7 +173,6 @@ class ArrayWriter:
     dtype: np.dtype[Any]
     fill_value: Any
     metadata: bytes
-    durable: bool = False
 
     def write(self, start: Sequence[int], data: NDArray[Any]) -> None:
         """Write a block that begins and ends on chunk borders (or at the array's end).
@@ -195,7 +190,7 @@ class ArrayWriter:
                 block_at = f"block {tuple(start)} + {data.shape}"
                 raise ValueError(f"{block_at} is not on chunks {self.chunks}")
             first.append(s // c)
-        open_folder(self.path).write(self._encode(first, data), durable=self.durable)
+        open_folder(self.path).write(self._encode(first, data))
 
     def _encode(self, first: Sequence[int], data: NDArray[Any]) -> Iterator[File]:
         """Name and content of the chunks of a block."""
@@ -258,7 +253,7 @@ class ArrayWriter:
         body = BytesIO()
         np.save(body, index)
         content = body.getvalue()
-        folder.write([(INDEX, (content, _seal(self.metadata, content)))], durable=self.durable)
+        folder.write([(INDEX, (content, _seal(self.metadata, content)))])
         return index
 
 

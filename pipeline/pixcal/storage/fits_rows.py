@@ -5,7 +5,6 @@ Only plain files can be read so. Compressed ones are first unpacked, once, by `u
 
 import gzip
 import io
-import sys
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -13,21 +12,31 @@ from itertools import product
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import google_crc32c
 import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
 from pixcal.model.errors import InputError
+from pixcal.storage.cube import CHUNK
 from pixcal.storage.fits_in import Coding, FrameFile, damaged_gzip
 from pixcal.storage.sources import SourceFile, unreadable
+
+BAND = CHUNK[1]
+"""Rows that have a checksum in common: those of a chunk."""
 
 _PIECE = 1 << 20
 _TILE_PIECE = 8 << 20
 
 
+def bands(rows: tuple[int, int]) -> list[tuple[int, int]]:
+    """Rows (first, one after the last) of each band; the last one may be lower."""
+    return [(y, min(y + BAND, rows[1])) for y in range(*rows, BAND)]
+
+
 def read_rows(
-    file: FrameFile, planes: Sequence[int], rows: tuple[int, int], out: NDArray[Any]
-) -> None:
+    file: FrameFile, planes: Sequence[int], rows: tuple[int, int], out: NDArray[Any] | None = None
+) -> NDArray[np.float64]:
     """Read rows of some planes of a plain file, each byte once.
 
     Parameters
@@ -37,10 +46,15 @@ def read_rows(
     planes : sequence of int
         Numbers of the planes.
     rows : tuple of int
-        First row, and the one after the last.
-    out : ndarray (plane, y, x)
+        First row, which begins a band, and the one after the last.
+    out : ndarray (plane, y, x), optional
         Filled with the values (ADU); each plane of it contiguous, of the file's type or one
         that holds it.
+
+    Returns
+    -------
+    (plane, band, 2) float64
+        Of each `BAND` rows: CRC-32C of the bytes in the file, and the largest sample (ADU).
 
     Raises
     ------
@@ -48,22 +62,35 @@ def read_rows(
         If the file was changed, or ends too early.
     """
     _, ny, nx = file.shape
-    coding = file.coding
-    direct = coding.exact and out.dtype == coding.dtype
-    stored = np.empty(out.shape[1:], coding.stored) if not direct else None
+    coding, within = file.coding, bands(rows)
+    stored = np.empty((min(BAND, rows[1] - rows[0]), nx), coding.stored)
+    found = np.empty((len(planes), len(within), 2))
+    direct = out is not None and coding.exact and out.dtype == coding.dtype
     with file.source.open() as handle:
-        for plane, target in zip(planes, out, strict=True):
-            raw = target.view(coding.stored) if stored is None else stored
-            start = file.offset + (plane * ny + rows[0]) * nx * coding.stored.itemsize
+        for (n, plane), (b, (y0, y1)) in product(enumerate(planes), enumerate(within)):
+            target = None if out is None else out[n, y0 - rows[0] : y1 - rows[0]]
+            raw = stored[: y1 - y0]
+            if direct and target is not None:
+                raw = target.view(coding.stored)
+            start = file.offset + (plane * ny + y0) * nx * coding.stored.itemsize
             _read_exactly(handle, start, raw, file.source.path)
-            if sys.byteorder == "little":
-                raw.byteswap(inplace=True)
-            if coding.exact:
-                _turn_sign(raw, coding)
-            if stored is not None:
-                target[...] = raw.view(coding.dtype) if coding.exact else _scale(raw, coding)
+            found[n, b, 0] = google_crc32c.value(raw.tobytes())
+            values = _values(raw, coding)
+            found[n, b, 1] = np.fmax.reduce(values, axis=None)
+            if target is not None and not direct:
+                target[...] = values
         # Written to since it was opened, it is partly another file.
         file.source.check_read(handle)
+    return found
+
+
+def _values(raw: NDArray[Any], coding: Coding) -> NDArray[Any]:
+    """Samples (ADU) of what a file holds, which is changed in place where that will do."""
+    # The BZERO that makes unsigned integers of signed ones (and the reverse) turns the sign bit.
+    turned = 1 << (8 * raw.itemsize - 1) if coding.exact and coding.bzero else 0
+    bits = raw.view(f"u{raw.itemsize}")
+    np.bitwise_xor(bits.view(bits.dtype.newbyteorder(">")), bits.dtype.type(turned), out=bits)
+    return raw.view(coding.dtype) if coding.exact else _scale(raw, coding)
 
 
 def _read_exactly(handle: io.FileIO, start: int, raw: NDArray[Any], path: Path) -> None:
@@ -78,13 +105,6 @@ def _read_exactly(handle: io.FileIO, start: int, raw: NDArray[Any], path: Path) 
             read += count
     except OSError as error:
         raise unreadable(path, error) from error
-
-
-def _turn_sign(raw: NDArray[Any], coding: Coding) -> None:
-    """Apply the BZERO that makes unsigned integers of signed ones (and the reverse), in place."""
-    if coding.bzero:
-        bits = raw.view(f"u{raw.itemsize}")
-        bits ^= bits.dtype.type(1 << (8 * raw.itemsize - 1))
 
 
 def _scale(raw: NDArray[Any], coding: Coding) -> NDArray[np.float32]:

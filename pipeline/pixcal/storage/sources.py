@@ -6,6 +6,7 @@ import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import ClassVar
 
 from pixcal.model.acquisition import Frames
 from pixcal.model.errors import InputError
@@ -27,6 +28,10 @@ class SourceFile:
     mtime_ns : int
         Time of the last change (ns since 1970).
     """
+
+    CHANGED: ClassVar[str] = (
+        "changed while it was being read; wait until the acquisition is complete and run again"
+    )
 
     path: Path
     name: str
@@ -65,10 +70,7 @@ class SourceFile:
 
     def _compare(self, now: os.stat_result) -> None:
         if (now.st_size, now.st_mtime_ns) != (self.size, self.mtime_ns):
-            raise InputError(
-                f"{self.path}: changed while it was being read; wait until the acquisition is "
-                "complete and run again"
-            )
+            raise InputError(f"{self.path}: {self.CHANGED}")
 
 
 def unreadable(path: Path, error: OSError) -> InputError:

@@ -94,7 +94,7 @@ def _fit_all(
     result = {
         "schema": "pixcal/fit/1",
         "pixcal": __version__,
-        "input": require(run_dir, "ingest", 1).key,
+        "input": require(run_dir, "ingest", 2).key,
         "model": config.model,
         "sets": {
             f.name: describe(f, totals.sets[f.name].masked, totals.sets[f.name].sigma_px)

@@ -1,5 +1,7 @@
 """The arrays of ``RUN/ingest``: made, closed, and taken over from an earlier ingest.
 
+Of every frame the catalogue is kept: checksums and largest samples. The samples themselves are
+copied where they could not be read again from where they are, or where that is asked for.
 An array whose files are all as they were is not read again: its chunks are linked from the earlier
 artefact, and what the headers said is taken from its tables. Its files are not even opened.
 """
@@ -7,30 +9,37 @@ artefact, and what the headers said is taken from its tables. Its files are not 
 import hashlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.errors import DamagedError
-from pixcal.storage.artefact import Manifest, damaged_files, file_digest, read_json
+from pixcal.storage.artefact import Build, Manifest, damaged_files, digest, file_digest, read_json
 from pixcal.storage.cube import ArrayWriter, create_array, create_group
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.fits_in import Coding, FrameFile
+from pixcal.storage.fits_rows import BAND
 from pixcal.storage.folder import DISK_FULL
+from pixcal.storage.frame_reader import Columns, described
 from pixcal.storage.frames import tabulate
 from pixcal.storage.place import Place
 from pixcal.storage.sources import SourceFile
 
+FRAMES_A_PIECE = 16
+"""Frames that one task catalogues: a chunk of the catalogue."""
+
 
 def create(cubes: Place, array: str, shape: Sequence[int], dtype: Any) -> ArrayWriter:
     """Create an array (time, y, x) among the cubes of an artefact, in ADU, or reopen it."""
-    create_group(cubes / "raw.zarr")
+    _create_groups(cubes / "raw.zarr", array)
+    return create_array(cubes / "raw.zarr" / array, shape, dtype, attrs={"units": "adu"})
+
+
+def _create_groups(store: Place, array: str) -> None:
+    create_group(store)
     if "/" in array:
-        create_group(cubes / "raw.zarr" / array.split("/")[0])
-    return create_array(
-        cubes / "raw.zarr" / array, shape, dtype, attrs={"units": "adu"}, durable=True
-    )
+        create_group(store / array.split("/")[0])
 
 
 def finish(writer: ArrayWriter) -> dict[str, Any]:
@@ -52,23 +61,73 @@ def finish(writer: ArrayWriter) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
+class Writers:
+    """What an array of frames is written to.
+
+    Attributes
+    ----------
+    catalogue : ArrayWriter
+        (time, band, 2): what `pixcal.storage.fits_rows.read_rows` returns.
+    samples : ArrayWriter or None
+        (time, y, x) in ADU, where they are copied.
+    shape, dtype
+        Of the frames.
+    """
+
+    catalogue: ArrayWriter
+    samples: ArrayWriter | None
+    shape: tuple[int, ...]
+    dtype: str
+
+    @classmethod
+    def create(
+        cls, made: Build, array: str, shape: Sequence[int], dtype: Any, *, copied: bool
+    ) -> "Writers":
+        """Create the arrays, or reopen them."""
+        store = made.folder / "catalogue.zarr"
+        _create_groups(store, array)
+        facts = (-(-shape[1] // BAND), 2)
+        catalogue = create_array(
+            store / array, (shape[0], *facts), "f8",
+            dims=("time", "band", "fact"), chunks=(FRAMES_A_PIECE, *facts),
+            attrs={"fact": ["CRC-32C of the bytes", "largest sample, adu"]},
+        )  # fmt: skip
+        samples = create(made.cubes, array, shape, dtype) if copied else None
+        return cls(catalogue, samples, tuple(shape), str(dtype))
+
+    def finish(self) -> dict[str, Any]:
+        """Close them: shape, type, whether samples were copied, and the digest of the content."""
+        parts = [writer for writer in (self.catalogue, self.samples) if writer is not None]
+        return {
+            "shape": list(self.shape),
+            "dtype": self.dtype,
+            "copied": self.samples is not None,
+            "digest": digest([finish(writer)["digest"] for writer in parts]),
+        }
+
+
+@dataclass(frozen=True)
 class Kept:
     """An array of an earlier ingest whose files are still the same.
 
     Attributes
     ----------
     array : str
-        Its name now; the earlier one may be another.
-    path : Path or UrlPath
-        Its folder among the cubes of the earlier artefact.
+        Its name now.
+    name : str
+        Its name then.
+    folder : Path
+        The earlier artefact.
     facts : mapping
-        What `finish` returned then.
+        What `Writers.finish` returned then.
     files : list of FrameFile
-        The files as their headers described them then. Where their samples are is not known.
+        The files as their headers described them then; where the samples of those that were copied
+        are is not known.
     """
 
     array: str
-    path: Place
+    name: str
+    folder: Path
     facts: Mapping[str, Any]
     files: list[FrameFile]
 
@@ -78,6 +137,8 @@ def find_kept(
     earlier: Manifest,
     same: Mapping[str, str],
     sources: Mapping[str, Sequence[SourceFile]],
+    *,
+    copy: bool,
 ) -> list[Kept]:
     """Arrays of an earlier ingest that can be taken over, if their chunks are whole.
 
@@ -91,6 +152,8 @@ def find_kept(
         Name now to earlier name, of the arrays made from the same files.
     sources : mapping
         Files of each array now.
+    copy : bool
+        Only those whose samples were copied.
 
     Returns
     -------
@@ -98,48 +161,55 @@ def find_kept(
         Without those that its tables do not describe, or that are damaged: they must be read
         again.
     """
-    tables_file = folder / "frames.json"
     try:
-        tables = read_json(tables_file)
+        tables, places = (_intact(folder, earlier, name) for name in ("frames.json", "files.json"))
     except DamagedError:
         return []
-    if earlier.files and file_digest(tables_file) != earlier.files.get(tables_file.name):
-        return []
-    damaged = damaged_files(folder)
+    damaged = tuple(damaged_files(folder))
     kept = []
     for array, name in same.items():
-        if any(file.startswith(f"raw.zarr/{name}/") for file in damaged):
+        parts = (f"raw.zarr/{name}/", f"catalogue.zarr/{name}/")
+        if any(file.startswith(parts) for file in damaged):
             continue
         try:
             facts = earlier.summary["arrays"][name]
-            files = _described(sources[array], facts["shape"], tables[name])
+            files = _described(sources[array], facts["shape"], tables[name], places[name])
         except (LookupError, TypeError):
             continue
-        if _order(files) == list(zip(tables[name]["file"], tables[name]["plane"], strict=True)):
-            kept.append(Kept(array, cubes_of(folder) / "raw.zarr" / name, facts, files))
+        as_listed = list(zip(tables[name]["file"], tables[name]["plane"], strict=True))
+        if _order(files) == as_listed and (facts["copied"] or not copy):
+            kept.append(Kept(array, name, folder, facts, files))
     return kept
 
 
+def _intact(folder: Path, earlier: Manifest, name: str) -> Any:
+    """Content of a file of an earlier artefact, held against its digest."""
+    content = read_json(folder / name)
+    if file_digest(folder / name) != earlier.files.get(name):
+        raise DamagedError(f"{folder / name}: altered since it was written", folder / name)
+    return content
+
+
 def _described(
-    sources: Sequence[SourceFile], shape: Sequence[int], table: Mapping[str, Sequence[Any]]
+    sources: Sequence[SourceFile],
+    shape: Sequence[int],
+    table: Mapping[str, Sequence[Any]],
+    places: Columns | None,
 ) -> list[FrameFile]:
-    """The files of an array from its columns in ``frames.json``."""
+    """The files of an array from its columns in ``frames.json`` and ``files.json``."""
     planes = Counter(table["file"])
     first = {table["file"][n]: n for n, plane in enumerate(table["plane"]) if plane == 0}
-    return [
-        FrameFile(
-            source,
-            "plain",
-            hdu=-1,
-            offset=-1,
-            shape=(planes[source.name], shape[1], shape[2]),
-            coding=Coding(8),
-            mjd=table["mjd"][first[source.name]],
-            exptime_s=table["exptime_s"][first[source.name]],
-            temperature_c=table["temperature_c"][first[source.name]],
-        )
-        for source in sources
-    ]
+    rows = {} if places is None else {name: n for n, name in enumerate(places["file"])}
+    found = []
+    for source in sources:
+        n = first[source.name]
+        frame = (planes[source.name], shape[1], shape[2])
+        file = FrameFile(source, "plain", -1, -1, frame, Coding(8))
+        if places is not None:
+            file = described(places, rows[source.name], source.path.parent, frame[1:])
+        headers = {name: table[name][n] for name in ("mjd", "exptime_s", "temperature_c")}
+        found.append(replace(file, source=source, **headers))
+    return found
 
 
 def _order(files: Sequence[FrameFile]) -> list[tuple[str, int]]:
@@ -148,27 +218,33 @@ def _order(files: Sequence[FrameFile]) -> list[tuple[str, int]]:
     return [(frame.file.source.name, frame.plane) for frame in frames]
 
 
-def take_over(cubes: Place, kept: Sequence[Kept], runtime: Runtime) -> dict[str, dict[str, Any]]:
+def take_over(made: Build, kept: Sequence[Kept], runtime: Runtime) -> dict[str, dict[str, Any]]:
     """Link the chunks of earlier arrays into a build (from one place to another they are copied),
     and hold them against their digests.
 
     Returns
     -------
     dict
-        What `finish` returns, by array, of those that are whole; the others must be read again.
+        What `Writers.finish` returns, by array, of those that are whole; the others must be read
+        again.
     """
     # Made here, one by one: they share groups, which two tasks must not make at once.
-    writers = [create(cubes, k.array, k.facts["shape"], k.facts["dtype"]) for k in kept]
+    writers = [
+        Writers.create(made, k.array, k.facts["shape"], k.facts["dtype"], copied=k.facts["copied"])
+        for k in kept
+    ]
     tasks = list(zip(kept, writers, strict=True))
     found = run_tasks(_take_over, tasks, runtime, label="unchanged")
     return {k.array: facts for k, facts in zip(kept, found, strict=True) if facts is not None}
 
 
-def _take_over(task: tuple[Kept, ArrayWriter]) -> dict[str, Any] | None:
-    kept, writer = task
+def _take_over(task: tuple[Kept, Writers]) -> dict[str, Any] | None:
+    kept, writers = task
     try:
-        writer.take(kept.path)
-        facts = finish(writer)
+        writers.catalogue.take(kept.folder / "catalogue.zarr" / kept.name)
+        if writers.samples is not None:
+            writers.samples.take(cubes_of(kept.folder) / "raw.zarr" / kept.name)
+        facts = writers.finish()
     except DamagedError:
         return None
     except OSError as error:

@@ -1,11 +1,13 @@
-"""Ingest: the FITS frames of an acquisition into checksummed cubes, each frame read once.
+"""Ingest: the FITS frames of an acquisition checked and catalogued, each frame read once.
 
-Everything that can be told from headers and file lengths is checked before any data are read. The
-frames then go through memory in blocks of 64 frames and bands of rows, which are whole chunks: no
-chunk is written twice, and a run that was cut short goes on with the blocks that are missing.
-Arrays whose files have not changed since an earlier ingest are taken over from it, unread.
+Everything that can be told from headers and file lengths is checked before any data are read. Every
+frame is then read for its checksums; from plain files nothing is copied, since `reduce` reads them
+where they are. Samples of compressed files, which cannot be read in bands of rows, go into cubes,
+and all do with ``copy``. A run that was cut short goes on with the blocks of frames that are
+missing. Arrays whose files have not changed since an earlier ingest are taken over, unread.
 """
 
+import os
 import shutil
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +25,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.config import quantity, to_plain
 from pixcal.model.errors import DamagedError, InputError, RemoteError
-from pixcal.stages.ingest.arrays import create, find_kept, finish, take_over
+from pixcal.stages.ingest.arrays import FRAMES_A_PIECE, Writers, find_kept, take_over
 from pixcal.storage.artefact import (
     Build,
     Manifest,
@@ -33,18 +35,20 @@ from pixcal.storage.artefact import (
     read_manifest,
     up_to_date,
     write_json,
+    write_manifest,
 )
-from pixcal.storage.cube import CHUNK, ArrayWriter
+from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.cube_place import base_of, chosen_base, cubes_of
 from pixcal.storage.fits_in import FrameFile, inspect
-from pixcal.storage.fits_rows import read_rows, unpack, unpack_bytes
+from pixcal.storage.fits_rows import BAND, read_rows, unpack, unpack_bytes
 from pixcal.storage.folder import transit_bytes
+from pixcal.storage.frame_reader import describe
 from pixcal.storage.frames import Frame, columns, tabulate
 from pixcal.storage.place import Place
 from pixcal.storage.sources import SourceFile, find_sources, fingerprint
 
 STAGE = "ingest"
-FORMAT = 1
+FORMAT = 2
 
 _BAND_ROWS = (512, 384, 256, 128)
 """Heights of a band, the first that fits the memory: whole chunks, and long reads."""
@@ -62,12 +66,15 @@ class Config:
     ----------
     overwrite : bool
         Replace what was ingested from another acquisition; no part of the result.
+    copy : bool
+        Copy the samples of all frames, so that later steps do without the files.
     cubes : str or None
         Folder or URL for the cubes, or RUN; None for where those of the earlier ingest are, or
         else RUN. No part of the result.
     """
 
     overwrite: bool = quantity(False, doc="replace an ingest of another acquisition")
+    copy: bool = quantity(False, doc="copy all samples into cubes")
     cubes: str | None = quantity(None, doc="folder or URL for the cubes")
 
 
@@ -107,21 +114,48 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
     with lock(out):
         base = chosen_base(config.cubes, out, out / STAGE)
         done = up_to_date(out, STAGE, artefact_key(STAGE, FORMAT, plain, inputs))
-        if done is not None and base_of(out / STAGE) == base:
-            return done
+        if done is not None and base_of(out / STAGE) == base and _has_copies(done, config.copy):
+            return _place(out, description.parent)
         earlier = _earlier(out)
         same = _same_files(earlier, inputs)
         if earlier is not None and not same and not config.overwrite:
             _refuse_other(out, earlier, plain, inputs)
-        kept = find_kept(out / STAGE, earlier, same, sources) if earlier is not None else []
-        with build(out, STAGE, FORMAT, plain, inputs, durable=True, cubes=base) as made:
-            facts = take_over(made.cubes, kept, runtime)
+        kept = []
+        if earlier is not None and earlier.format == FORMAT:
+            kept = find_kept(out / STAGE, earlier, same, sources, copy=config.copy)
+        with build(out, STAGE, FORMAT, plain, inputs, cubes=base) as made:
+            facts = take_over(made, kept, runtime)
             known = {k.array: k.files for k in kept if k.array in facts}
             tables, warnings = _check(described, sources, known, runtime)
-            _fill(made, {a: f for a, f in tables.items() if a not in known}, runtime)
-            _close(made, described, sources, tables, warnings, facts)
+            copied = {
+                array: facts[array]["copied"] if array in facts else _needs_copy(frames, config)
+                for array, frames in tables.items()
+            }
+            _fill(made, {a: f for a, f in tables.items() if a not in known}, copied, runtime)
+            _close(made, described, sources, tables, copied, facts)
+            made.summary["warnings"] = warnings
+        return _place(out, description.parent)
+
+
+def _has_copies(manifest: Manifest, copy: bool) -> bool:
+    return not copy or all(facts["copied"] for facts in manifest.summary["arrays"].values())
+
+
+def _needs_copy(frames: Sequence[Frame], config: Config) -> bool:
+    return config.copy or any(file.container != "plain" for file in _files(frames))
+
+
+def _place(out: Path, folder: Path) -> Manifest:
+    """Note in the manifest where the files are now; they may have been moved as they are."""
     manifest = read_manifest(out / STAGE)
     assert manifest is not None
+    where = {
+        "folder": str(folder.absolute()),
+        "from_run": os.path.relpath(folder.absolute(), out.absolute()),
+    }
+    if manifest.summary.get("acquisition") != where:
+        manifest.summary["acquisition"] = where
+        write_manifest(out / STAGE, manifest)
     return manifest
 
 
@@ -136,7 +170,7 @@ def _earlier(out: Path) -> Manifest | None:
 
 def _same_files(earlier: Manifest | None, inputs: Mapping[str, str]) -> dict[str, str]:
     """Arrays made from the same files as an earlier one, whose name is the value."""
-    if earlier is None or earlier.format != FORMAT:
+    if earlier is None:
         return {}
     names = {files: array for array, files in earlier.inputs.items()}
     return {array: names[files] for array, files in inputs.items() if files in names}
@@ -237,30 +271,35 @@ def _common_dtype(array: str, files: Sequence[FrameFile]) -> np.dtype[Any]:
 
 
 def _plan(
-    tables: Mapping[str, Sequence[Frame]], cubes: Place, runtime: Runtime
+    tables: Mapping[str, Sequence[Frame]],
+    copied: Mapping[str, bool],
+    cubes: Place,
+    runtime: Runtime,
 ) -> tuple[int, Plan]:
-    """Rows of a band, and the memory: rather lower bands than fewer workers."""
+    """Rows that are copied at once, and the memory: rather fewer rows than fewer workers."""
     shared = _BYTES_A_FRAME * sum(map(len, tables.values()))
     rows, need = 0, 0
     for rows in _BAND_ROWS:
-        tasks = (_task_bytes(array, frames, rows) for array, frames in tables.items())
+        tasks = (
+            _task_bytes(array, frames, rows, copied[array]) for array, frames in tables.items()
+        )
         need = max(tasks, default=0) + transit_bytes(cubes)
         if Plan(need, shared, runtime.n_workers).total <= runtime.memory:
             break
     return rows, make_plan("ingest", need, shared, runtime)
 
 
-def _task_bytes(array: str, frames: Sequence[Frame], rows: int) -> int:
-    """Peak of one task: the band, one frame's samples in conversion, chunks in compression."""
+def _task_bytes(array: str, frames: Sequence[Frame], rows: int, copied: bool) -> int:
+    """Peak of one task: the rows, a band of samples in conversion, chunks in compression."""
     files = _files(frames)
     _, ny, nx = files[0].shape
-    band = min(rows, ny) * nx
     dtype = _common_dtype(array, files)
-    converted = any(not f.coding.exact or f.coding.dtype != dtype for f in files)
-    conversion = band * (np.dtype("f8").itemsize + 3 * dtype.itemsize) if converted else 0
+    conversion = min(BAND, ny) * nx * (np.dtype("f8").itemsize + 3 * dtype.itemsize)
+    if not copied:
+        return conversion
     chunk = CHUNK[0] * CHUNK[1] * CHUNK[2] * dtype.itemsize
     reading = max(conversion, *(unpack_bytes(f) for f in files), 4 * chunk)
-    return min(CHUNK[0], len(frames)) * band * dtype.itemsize + reading
+    return min(CHUNK[0], len(frames)) * min(rows, ny) * nx * dtype.itemsize + reading
 
 
 def _files(frames: Sequence[Frame]) -> list[FrameFile]:
@@ -269,49 +308,48 @@ def _files(frames: Sequence[Frame]) -> list[FrameFile]:
 
 @dataclass(frozen=True)
 class _Piece:
-    """A task: some frames, from a border of chunks on, in bands of rows."""
+    """A task: some frames, from a border of chunks on; samples are copied in strips of rows."""
 
     step: str
-    writer: ArrayWriter
+    writers: Writers
     start: int
     frames: Sequence[Frame]
-    bands: Sequence[tuple[int, int]]
+    rows: int
     scratch: Path
 
 
 def _pieces(
-    array: str, frames: Sequence[Frame], writer: ArrayWriter, rows: int, scratch: Path
+    array: str, frames: Sequence[Frame], writers: Writers, rows: int, scratch: Path
 ) -> Iterator[_Piece]:
-    """Tasks of an array.
+    """Tasks of an array: a block of frames each.
 
-    Plain files: one block of 64 frames in one band each. Compressed files can only be read whole,
-    so that all bands of their block are one task, and blocks that share a file as well.
+    Compressed files can only be read whole: blocks that share one are one task.
     """
-    ny = frames[0].file.shape[1]
-    bands = [(y0, min(y0 + rows, ny)) for y0 in range(0, ny, rows)]
     borders = [0]
-    for t in range(CHUNK[0], len(frames), CHUNK[0]):
-        if frames[t].plane == 0 or frames[t].file.container == "plain":
+    for t in range(0, len(frames), CHUNK[0] if writers.samples else FRAMES_A_PIECE):
+        if t and (frames[t].plane == 0 or frames[t].file.container == "plain"):
             borders.append(t)
     for start, stop in zip(borders, [*borders[1:], len(frames)], strict=True):
-        part = frames[start:stop]
-        packed = any(frame.file.container != "plain" for frame in part)
-        for group in [bands] if packed else [[band] for band in bands]:
-            step = f"{array} {start}:{stop} {group[0][0]}:{group[-1][1]}"
-            yield _Piece(step, writer, start, part, group, scratch)
+        step = f"{array} {start}:{stop}"
+        yield _Piece(step, writers, start, frames[start:stop], rows, scratch)
 
 
-def _fill(made: Build, tables: Mapping[str, Sequence[Frame]], runtime: Runtime) -> None:
-    """Write all blocks that an earlier run has not written."""
-    rows, plan = _plan(tables, made.cubes, runtime)
+def _fill(
+    made: Build,
+    tables: Mapping[str, Sequence[Frame]],
+    copied: Mapping[str, bool],
+    runtime: Runtime,
+) -> None:
+    """Read and write all blocks that an earlier run has not written."""
+    rows, plan = _plan(tables, copied, made.cubes, runtime)
     scratch = made.scratch
     shutil.rmtree(scratch, ignore_errors=True)
     scratch.mkdir()
     journal = made.journal()
     todo: list[_Piece] = []
     for array, frames in tables.items():
-        writer = _create(made.cubes, array, frames)
-        pieces = _pieces(array, frames, writer, rows, scratch)
+        writers = _writers(made, array, frames, copied[array])
+        pieces = _pieces(array, frames, writers, rows, scratch)
         todo += [piece for piece in pieces if piece.step not in journal]
     run_tasks(
         _write_piece,
@@ -323,26 +361,32 @@ def _fill(made: Build, tables: Mapping[str, Sequence[Frame]], runtime: Runtime) 
     shutil.rmtree(scratch, ignore_errors=True)
 
 
-def _create(cubes: Place, array: str, frames: Sequence[Frame]) -> ArrayWriter:
+def _writers(made: Build, array: str, frames: Sequence[Frame], copied: bool) -> Writers:
     shape = (len(frames), *frames[0].file.shape[1:])
-    return create(cubes, array, shape, _common_dtype(array, _files(frames)))
+    return Writers.create(made, array, shape, _common_dtype(array, _files(frames)), copied=copied)
 
 
 def _write_piece(piece: _Piece) -> None:
-    """Read the frames of a task, block by block and band by band, and write their chunks."""
-    nx = piece.frames[0].file.shape[2]
-    rows = max(y1 - y0 for y0, y1 in piece.bands)
-    count = min(CHUNK[0], len(piece.frames))
-    buffer = np.empty((count, rows, nx), piece.writer.dtype)
+    """Read the frames of a task, block by block, and write their part of the catalogue."""
+    samples, (_, ny, nx) = piece.writers.samples, piece.frames[0].file.shape
+    strips = [(0, ny)]
+    if samples is not None:
+        strips = [(y, min(y + piece.rows, ny)) for y in range(0, ny, piece.rows)]
+        count = min(CHUNK[0], len(piece.frames))
+        buffer = np.empty((count, min(piece.rows, ny), nx), samples.dtype)
+    found = np.empty((len(piece.frames), *piece.writers.catalogue.shape[1:]))
     with TemporaryDirectory(dir=piece.scratch) as scratch:
         unpacked: dict[str, FrameFile] = {}
         for t in range(0, len(piece.frames), CHUNK[0]):
             block = piece.frames[t : t + CHUNK[0]]
             unpacked = _unpack_block(block, unpacked, Path(scratch, str(t)))
-            for y0, y1 in piece.bands:
-                out = buffer[: len(block), : y1 - y0]
-                _read_band(block, unpacked, (y0, y1), out)
-                piece.writer.write((piece.start + t, y0, 0), out)
+            for y0, y1 in strips:
+                out = None if samples is None else buffer[: len(block), : y1 - y0]
+                bands = slice(y0 // BAND, -(-y1 // BAND))
+                found[t : t + len(block), bands] = _read_block(block, unpacked, (y0, y1), out)
+                if samples is not None and out is not None:
+                    samples.write((piece.start + t, y0, 0), out)
+    piece.writers.catalogue.write((piece.start, 0, 0), found)
 
 
 def _unpack_block(
@@ -359,18 +403,19 @@ def _unpack_block(
     }
 
 
-def _read_band(
+def _read_block(
     block: Sequence[Frame],
     unpacked: Mapping[str, FrameFile],
     rows: tuple[int, int],
-    out: NDArray[Any],
-) -> None:
-    at = 0
+    out: NDArray[Any] | None,
+) -> NDArray[np.float64]:
+    found, at = [], 0
     for file, group in groupby(block, key=lambda frame: frame.file):
         planes = [frame.plane for frame in group]
-        source = unpacked.get(file.source.name, file)
-        read_rows(source, planes, rows, out[at : at + len(planes)])
+        target = None if out is None else out[at : at + len(planes)]
+        found.append(read_rows(unpacked.get(file.source.name, file), planes, rows, target))
         at += len(planes)
+    return np.concatenate(found)
 
 
 # The end
@@ -381,7 +426,7 @@ def _close(
     described: Acquisition,
     sources: Mapping[str, Sequence[SourceFile]],
     tables: Mapping[str, Sequence[Frame]],
-    warnings: list[str],
+    copied: Mapping[str, bool],
     facts: Mapping[str, dict[str, Any]],
 ) -> None:
     """Check that nothing is missing or was changed meanwhile, and write the tables.
@@ -393,7 +438,7 @@ def _close(
             for source in files:
                 source.check_unchanged()
         arrays = {
-            array: (facts.get(array) or finish(_create(made.cubes, array, frames)))
+            array: (facts.get(array) or _writers(made, array, frames, copied[array]).finish())
             | {"files": len(_files(frames))}
             for array, frames in tables.items()
         }
@@ -404,5 +449,14 @@ def _close(
         made.discard()
         raise
     write_json(made.folder / "acquisition.json", to_plain(described))
-    write_json(made.folder / "frames.json", {a: columns(f) for a, f in tables.items()})
-    made.summary.update(arrays=arrays, warnings=warnings)
+    listed, places = {}, {}
+    for array, frames in tables.items():
+        catalogue = ArrayReader(made.folder / "catalogue.zarr" / array).read()
+        largest = np.fmax.reduce(catalogue[..., 1], axis=1)
+        listed[array] = columns(frames) | {
+            "largest_adu": [float(v) if np.isfinite(v) else None for v in largest]
+        }
+        places[array] = None if copied[array] else describe(_files(frames))
+    write_json(made.folder / "frames.json", listed)
+    write_json(made.folder / "files.json", places)
+    made.summary["arrays"] = arrays

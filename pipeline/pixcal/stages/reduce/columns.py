@@ -1,12 +1,28 @@
-"""Columns of chunks, the unit of work: 128 by 128 pixels of all frames."""
+"""Columns of chunks, 128 by 128 pixels of all frames, and strips of neighbours, the unit of work.
 
-from collections.abc import Callable, Sequence
+FITS files hold rows: a strip as wide as memory allows is read in one go.
+"""
 
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.engine.plan import Plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.storage.artefact import Build
-from pixcal.storage.cube import CHUNK
+from pixcal.storage.cube import CHUNK, ArrayReader
+from pixcal.storage.frame_reader import Reader
+from pixcal.storage.place import UrlPath
 
 Index = tuple[int, int]
+Strip = tuple[Index, ...]
+
+SHARE = 0.8
+"""Of the memory allowed, that strips may be made wide for."""
+CAUTIOUS = 4
+"""Tasks that share as much memory as this process may use, on a cluster."""
 
 
 def grid(shape: tuple[int, int]) -> tuple[int, int]:
@@ -26,23 +42,75 @@ def extent(shape: tuple[int, int], index: Index) -> tuple[tuple[int, int], tuple
     return (i * cy, min((i + 1) * cy, ny)), (j * cx, min((j + 1) * cx, nx))
 
 
+def strips(todo: Sequence[Index], width: int) -> list[Strip]:
+    """Columns side by side, so many at most in a strip."""
+    found: list[list[Index]] = []
+    for i, j in todo:
+        if found and len(found[-1]) < width and found[-1][-1] == (i, j - 1):
+            found[-1].append((i, j))
+        else:
+            found.append([(i, j)])
+    return [tuple(strip) for strip in found]
+
+
+def strip_width(readers: Iterable[Reader], need: Callable[[int], int], runtime: Runtime) -> int:
+    """Columns of a strip: all, or as many as leave memory for all workers.
+
+    Parameters
+    ----------
+    readers : iterable of Reader
+        Of the frames. Cubes at URLs are read column by column, ahead of time.
+    need : callable
+        Bytes of a task, given the number of columns.
+    runtime : Runtime
+        How to run.
+    """
+    width = 1
+    for reader in readers:
+        if isinstance(reader, ArrayReader) and isinstance(reader.path, UrlPath):
+            return 1
+        width = grid((reader.shape[1], reader.shape[2]))[1]
+    # Nobody knows here what the workers of a cluster may use.
+    at_once = CAUTIOUS if runtime.remote else runtime.n_workers
+    while width > 1 and Plan(need(width), 0, at_once).total > SHARE * runtime.memory:
+        width = -(-width // 2)
+    return width
+
+
+def blocks(reader: Reader, strip: Strip) -> Iterator[tuple[int, Iterator[NDArray[Any]]]]:
+    """First frame and samples (t, y, x) of each column of a strip, 64 frames at a time."""
+    window = reader.shape[1], reader.shape[2]
+    (rows, (x0, _)), (_, (_, x1)) = extent(window, strip[0]), extent(window, strip[-1])
+    frames = reader.shape[0]
+    buffer = np.empty((min(CHUNK[0], frames), rows[1] - rows[0], x1 - x0), reader.dtype)
+    borders = range(CHUNK[2], x1 - x0, CHUNK[2])
+    for first in range(0, frames, CHUNK[0]):
+        last = min(first + CHUNK[0], frames)
+        block = reader.read((first, last), rows, (x0, x1), out=buffer[: last - first])
+        # Contiguous: kernels run along rows whose samples follow one another.
+        yield first, map(np.ascontiguousarray, np.split(block, borders, axis=2))
+
+
 def run_noted(
     made: Build,
-    task: Callable[[Index], None],
+    task: Callable[[Strip], None],
     todo: Sequence[Index],
+    width: int,
     runtime: Runtime,
     label: str,
 ) -> None:
-    """Run a task that writes whole chunks on columns, but for those that are noted as done.
+    """Run a task that writes whole chunks on strips of columns, but for those noted as done.
 
     Parameters
     ----------
     made : Build
         Whose journal to use.
     task : callable
-        All that it leaves is on the disk when it returns.
+        All that it leaves is written when it returns.
     todo : sequence of (int, int)
         Columns.
+    width : int
+        Columns of a strip at most.
     runtime : Runtime
         How to run.
     label : str
@@ -50,7 +118,10 @@ def run_noted(
     """
     journal = made.journal()
     steps = {index: f"{label} {index[0]} {index[1]}" for index in todo}
-    left = [index for index in todo if steps[index] not in journal]
-    run_tasks(
-        task, left, runtime, label=label, done=lambda number, _: made.note(steps[left[number]])
-    )
+    left = strips([index for index in todo if steps[index] not in journal], width)
+
+    def note(number: int, _: Any) -> None:
+        for index in left[number]:
+            made.note(steps[index])
+
+    run_tasks(task, left, runtime, label=label, done=note)

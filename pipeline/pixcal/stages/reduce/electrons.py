@@ -1,6 +1,5 @@
-"""Fringe frames in electrons: from ``raw.zarr`` to the datasets of ``reduced.zarr``."""
+"""Fringe frames in electrons: from FITS files, or ``raw.zarr``, to ``reduced.zarr``."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from pixcal.kernels.quantise import FILL, Scale, coefficients, encode, extremes
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.calibration import FLAG_ATTRS
-from pixcal.stages.reduce.columns import Index, extent, grid
+from pixcal.stages.reduce.columns import Index, Strip, blocks, extent, grid
 from pixcal.storage.cube import (
     CHUNK,
     ArrayReader,
@@ -20,12 +19,16 @@ from pixcal.storage.cube import (
     create_group,
     write_array,
 )
+from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import Place
 
 F32 = NDArray[np.float32]
 
-CONVERT_BYTES = 8 * 4 * CHUNK[0] * CHUNK[1] * CHUNK[2]
-"""Peak of `convert`: a raw chunk, its codes, both compressed, and maps."""
+
+def convert_bytes(itemsize: int, width: int) -> int:
+    """Peak of `convert`: a chunk, its codes, both compressed; of each column, a chunk and maps."""
+    tile = CHUNK[1] * CHUNK[2]
+    return 4 * 4 * CHUNK[0] * tile + width * tile * (CHUNK[0] * itemsize + 16 * 4)
 
 
 @dataclass(frozen=True)
@@ -36,8 +39,8 @@ class FringeSet:
     ----------
     name : str
         As in ``acquisition.yaml``.
-    raw : Path or UrlPath
-        Array of the frames.
+    raw : Reader
+        Of the frames.
     calibration : Path
         ``calibration.zarr``.
     exptime : (t,) float32
@@ -49,7 +52,7 @@ class FringeSet:
     """
 
     name: str
-    raw: Place
+    raw: Reader
     calibration: Path
     exptime: F32
     saturation: float
@@ -60,37 +63,35 @@ class FringeSet:
         """Number of frames."""
         return len(self.exptime)
 
-    def maps(self, shape: tuple[int, int], index: Index) -> dict[str, NDArray[Any]]:
+    def extent(self, index: Index) -> tuple[tuple[int, int], tuple[int, int]]:
+        """((y0, y1), (x0, x1)) of a column of chunks."""
+        return extent((self.raw.shape[1], self.raw.shape[2]), index)
+
+    def maps(self, index: Index) -> dict[str, NDArray[Any]]:
         """Calibration maps of a column of chunks."""
-        ranges = extent(shape, index)
+        ranges = self.extent(index)
         names = ("bias", "dark_rate", "flat", "read_noise", "mask")
         return {name: ArrayReader(self.calibration / name).read(*ranges) for name in names}
 
 
-def _window(raw: ArrayReader) -> tuple[int, int]:
-    return raw.shape[1], raw.shape[2]
+def signal_range(fringes: FringeSet, strip: Strip) -> tuple[float, float]:
+    """Least and largest electrons of the samples of good pixels in columns of chunks."""
+    every = [fringes.maps(index) for index in strip]
+    lowest = [np.full(maps["bias"].shape, np.inf, np.float32) for maps in every]
+    highest = [-low for low in lowest]
+    for _, parts in blocks(fringes.raw, strip):
+        for samples, low, high in zip(parts, lowest, highest, strict=True):
+            extremes(samples, np.float32(fringes.saturation), low, high)
+    found = [_range_e(fringes, *of) for of in zip(every, lowest, highest, strict=True)]
+    return min(low for low, _ in found), max(high for _, high in found)
 
 
-def _chunks(raw: ArrayReader, index: Index) -> Iterator[tuple[int, NDArray[Any]]]:
-    """First frame and samples (t, y, x) of the chunks of a column."""
-    chunk = np.empty(raw.chunks, raw.dtype)
-    (y0, y1), (x0, x1) = extent(_window(raw), index)
-    for first in range(0, raw.shape[0], CHUNK[0]):
-        raw.read_chunk((first // CHUNK[0], *index), chunk)
-        yield first, chunk[: min(CHUNK[0], raw.shape[0] - first), : y1 - y0, : x1 - x0]
-
-
-def signal_range(fringes: FringeSet, index: Index) -> tuple[float, float]:
-    """Least and largest electrons of the samples of good pixels in a column of chunks."""
-    raw = ArrayReader(fringes.raw)
-    maps = fringes.maps(_window(raw), index)
-    lowest = np.full(maps["bias"].shape, np.inf, np.float32)
-    highest = -lowest
-    for _, samples in _chunks(raw, index):
-        extremes(samples, np.float32(fringes.saturation), lowest, highest)
+def _range_e(
+    fringes: FringeSet, maps: dict[str, NDArray[Any]], low: F32, high: F32
+) -> tuple[float, float]:
     seconds = np.array([fringes.exptime.max(), fringes.exptime.min()], np.float32)
     dark = maps["dark_rate"] * seconds[:, None, None]
-    ends = (fringes.gain * (np.stack([lowest, highest]) - maps["bias"]) - dark) / maps["flat"]
+    ends = (fringes.gain * (np.stack([low, high]) - maps["bias"]) - dark) / maps["flat"]
     good = (maps["mask"] == 0) & np.isfinite(ends).all(axis=0)
     if not good.any():
         return np.inf, -np.inf
@@ -169,38 +170,58 @@ STRAY_SAMPLES = 2
 """Saturated samples that a pixel may have in a short run."""
 
 
-def convert(job: Converting, index: Index) -> None:
-    """Write a column of chunks in electrons, its maps, and its counts.
+class _Column:
+    """A column of chunks as it is converted."""
+
+    def __init__(self, job: Converting, index: Index) -> None:
+        self.job, self.index = job, index
+        self.maps = job.fringes.maps(index)
+        self.coefficients = coefficients(
+            job.scale, job.fringes.gain,
+            *(self.maps[name] for name in ("bias", "dark_rate", "flat")),
+        )  # fmt: skip
+        self.saturated = np.zeros(self.maps["flat"].shape, np.uint32)
+        self.lost = np.zeros_like(self.saturated)
+        self.total = self.largest = 0
+
+    def add(self, first: int, samples: NDArray[Any], codes: NDArray[np.uint16]) -> None:
+        """Write the chunk that begins at a frame."""
+        fringes = self.job.fringes
+        (y0, _), (x0, _) = fringes.extent(self.index)
+        self.total += encode(
+            samples, *self.coefficients, fringes.exptime[first : first + len(samples)],
+            np.float32(fringes.saturation), codes, self.saturated, self.lost,
+        )  # fmt: skip
+        self.job.writers["signal"].write((first, y0, x0), codes)
+        if samples.dtype.kind in "iu":
+            self.largest = max(self.largest, int(samples.max()))
+
+    def close(self) -> None:
+        """Write maps and counts."""
+        fringes, maps, writers = self.job.fringes, self.maps, self.job.writers
+        (y0, _), (x0, _) = fringes.extent(self.index)
+        flat, rate, seconds = maps["flat"], maps["dark_rate"], float(fringes.exptime.mean())
+        read = (maps["read_noise"] ** 2 + np.maximum(rate, 0) * seconds) / flat**2
+        read = read + self.job.scale.variance
+        often = self.saturated > max(STRAY_SHARE * fringes.frames, STRAY_SAMPLES)
+        mask = maps["mask"] | PixelFlag.SATURATED * often | PixelFlag.NO_DATA * (self.lost > 0)
+        for name, data in (("read_variance", read), ("shot_factor", 1 / flat), ("mask", mask)):
+            writers[name].write((y0, x0), data.astype(writers[name].dtype))
+        without = int(self.saturated.sum()), int(self.lost.sum())
+        weighted = flat.size * fringes.frames - sum(without)
+        counts = np.array([[[*without, weighted, self.total, self.largest]]])
+        writers["counts"].write((*self.index, 0), counts)
+
+
+def convert(job: Converting, strip: Strip) -> None:
+    """Write columns of chunks in electrons, their maps, and their counts.
 
     The counts are: samples that are saturated; others without weight; samples with weight; the sum
     of their codes; the largest sample (ADU; zero for real numbers).
     """
-    fringes, writers = job.fringes, job.writers
-    raw = ArrayReader(fringes.raw)
-    (y0, _), (x0, _) = extent(_window(raw), index)
-    maps = fringes.maps(_window(raw), index)
-    flat, rate = maps["flat"], maps["dark_rate"]
-    slope, start, dark = coefficients(job.scale, fringes.gain, maps["bias"], rate, flat)
-    saturated = np.zeros(flat.shape, np.uint32)
-    lost = np.zeros_like(saturated)
-    codes = np.empty((CHUNK[0], *flat.shape), np.uint16)
-    total = largest = 0
-    for first, samples in _chunks(raw, index):
-        out = codes[: len(samples)]
-        exptime = fringes.exptime[first : first + len(samples)]
-        total += encode(
-            samples, slope, start, dark, exptime, np.float32(fringes.saturation),
-            out, saturated, lost,
-        )  # fmt: skip
-        writers["signal"].write((first, y0, x0), out)
-        if raw.dtype.kind in "iu":
-            largest = max(largest, int(samples.max()))
-    seconds = float(fringes.exptime.mean())
-    read = (maps["read_noise"] ** 2 + np.maximum(rate, 0) * seconds) / flat**2 + job.scale.variance
-    often = saturated > max(STRAY_SHARE * fringes.frames, STRAY_SAMPLES)
-    mask = maps["mask"] | PixelFlag.SATURATED * often | PixelFlag.NO_DATA * (lost > 0)
-    for name, data in (("read_variance", read), ("shot_factor", 1 / flat), ("mask", mask)):
-        writers[name].write((y0, x0), data.astype(writers[name].dtype))
-    without = int(saturated.sum()), int(lost.sum())
-    weighted = flat.size * fringes.frames - sum(without)
-    writers["counts"].write((*index, 0), np.array([[[*without, weighted, total, largest]]]))
+    columns = [_Column(job, index) for index in strip]
+    for first, parts in blocks(job.fringes.raw, strip):
+        for column, samples in zip(columns, parts, strict=True):
+            column.add(first, samples, np.empty(samples.shape, np.uint16))
+    for column in columns:
+        column.close()

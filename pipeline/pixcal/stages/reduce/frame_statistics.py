@@ -1,13 +1,16 @@
 """What the calibration frames say, column of chunks by column; each frame is read once.
 
-A column's bias, dark and flat frames are combined into maps; its share of the photon transfer and
+Strips of neighbouring columns are read together. A column's bias, dark and flat frames are combined
+into maps; its share of the photon transfer and
 of the ladder of flats goes into small tables. All of it is left in a scratch store, so that a run
 that was cut short goes on with the columns that are missing.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,11 +27,11 @@ from pixcal.estimators.detector import (
 from pixcal.kernels.photon_transfer import N_BINS, bin_pairs, pair_statistics
 from pixcal.kernels.robust import BATCH, Combination, Combined
 from pixcal.model.flags import PixelFlag
-from pixcal.stages.reduce.columns import Index, extent, grid
+from pixcal.stages.reduce.columns import Index, Strip, extent, grid
 from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.ingested import MOST_ADU
-from pixcal.storage.cube import CHUNK, ArrayReader, ArrayWriter, create_array, create_group
-from pixcal.storage.place import Place
+from pixcal.storage.cube import CHUNK, ArrayWriter, create_array, create_group
+from pixcal.storage.frame_reader import Reader
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -70,8 +73,8 @@ class Measuring:
 
     Attributes
     ----------
-    raw : Path or UrlPath
-        ``raw.zarr`` of ``RUN/ingest``.
+    frames : mapping
+        A reader of each array.
     shape : (int, int)
         Of the detector's window (y, x).
     dark, flat : sequence of Group
@@ -92,7 +95,7 @@ class Measuring:
         Arrays for the results.
     """
 
-    raw: Place
+    frames: Mapping[str, Reader]
     shape: tuple[int, int]
     dark: Sequence[Group]
     flat: Sequence[Group]
@@ -122,37 +125,58 @@ def statistics_writers(folder: Path, shape: tuple[int, int], flats: int) -> dict
     return made
 
 
-def measure_bytes(dark: Sequence[Group], flat: Sequence[Group]) -> int:
-    """Peak of `measure`: a batch in copies, one chunk, maps of every group."""
+def measure_bytes(dark: Sequence[Group], flat: Sequence[Group], width: int) -> int:
+    """Peak of `measure`: a column's batch in copies; of each column, one chunk and maps."""
     chunk, tile = 4 * CHUNK[0] * CHUNK[1] * CHUNK[2], 8 * CHUNK[1] * CHUNK[2]
-    return 6 * chunk + tile * (60 + 8 * len(dark) + 16 * len(flat))
+    return 6 * chunk + width * (chunk + tile * (60 + 8 * len(dark) + 16 * len(flat)))
 
 
-def measure(job: Measuring, index: Index) -> None:
-    """Combine the calibration frames of a column of chunks and write their statistics."""
-    (y0, y1), (x0, x1) = extent(job.shape, index)
-    maps = {name: np.zeros((y1 - y0, x1 - x0)) for name in STATISTICS}
-    pairs = np.zeros((2, N_BINS, 3))
-    levels = np.zeros(job.writers["levels"].shape[2:])
-    line, noise = None, np.zeros((y1 - y0, x1 - x0))
-    if job.dark:
-        line, noise = _measure_dark(job, index, maps, pairs[0])
-    if job.flat:
-        levels[:] = _measure_flat(job, index, line, noise, maps, pairs[1])
-    block = np.stack([maps[name] for name in STATISTICS])
-    job.writers["maps"].write((0, y0, x0), block.astype(np.float32))
-    job.writers["pairs"].write((*index, 0, 0, 0), pairs[None, None])
-    job.writers["levels"].write((*index, 0, 0), levels[None, None])
+@dataclass
+class _Column:
+    """What becomes known of a column of chunks."""
+
+    index: Index
+    maps: dict[str, F64]
+    pairs: F64
+    levels: F64
+    noise: F64
+    """Variance of a sample that is usual here (ADU²)."""
+    line: DarkLine | None = None
+    rungs: list[Rung] = field(default_factory=list)
+
+    @classmethod
+    def begin(cls, job: Measuring, index: Index) -> "_Column":
+        (y0, y1), (x0, x1) = extent(job.shape, index)
+        maps = {name: np.zeros((y1 - y0, x1 - x0)) for name in STATISTICS}
+        levels = np.zeros(job.writers["levels"].shape[2:])
+        return cls(index, maps, np.zeros((2, N_BINS, 3)), levels, np.zeros((y1 - y0, x1 - x0)))
 
 
-def _measure_dark(
-    job: Measuring, index: Index, maps: dict[str, F64], pairs: F64
-) -> tuple[DarkLine, F64]:
-    """Bias and dark signal; also the variance of a sample that is usual in this column (ADU²)."""
-    combined = []
-    for group in job.dark:
-        wanted = pairs if group == job.read_series else None
-        combined.append(_combine(job, group, index, None, wanted))
+def measure(job: Measuring, strip: Strip) -> None:
+    """Combine the calibration frames of columns of chunks and write their statistics."""
+    columns = [_Column.begin(job, index) for index in strip]
+    combined = [_combine(job, group, columns) for group in job.dark]
+    for column, *found in zip(columns, *combined, strict=True) if combined else []:
+        _measure_dark(job, column, found)
+    del combined
+    for number, group in enumerate(job.flat):
+        for column, combination in zip(columns, _combine(job, group, columns), strict=True):
+            _measure_rung(job, column, number, combination)
+    for column in columns:
+        if job.flat:
+            maps, rungs = column.maps, column.rungs
+            maps["response"], maps["response_error"] = response_rate(rungs)
+            maps["flags"][nonlinear(rungs, job.limits.nonlinear)] += int(PixelFlag.NONLINEAR)
+        (y0, _), (x0, _) = extent(job.shape, column.index)
+        block = np.stack([column.maps[name] for name in STATISTICS])
+        job.writers["maps"].write((0, y0, x0), block.astype(np.float32))
+        job.writers["pairs"].write((*column.index, 0, 0, 0), column.pairs[None, None])
+        job.writers["levels"].write((*column.index, 0, 0), column.levels[None, None])
+
+
+def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined]) -> None:
+    """Bias and dark signal; also the variance of a sample that is usual in this column."""
+    maps = column.maps
     times = [group.exptime for group in job.dark]
     line = dark_line([c.mean for c in combined], [c.kept for c in combined], times)
     maps["bias"], maps["dark_rate"] = line.bias, line.rate
@@ -174,52 +198,46 @@ def _measure_dark(
     maps["flags"][line.bias >= job.full] += int(PixelFlag.HOT)
     usual = usual_variance(maps["dark_variance"], int(np.median(dof)))
     usual = job.read_noise**2 if np.isnan(usual) else usual
-    return line, np.maximum(maps["dark_variance"], usual)
+    column.line, column.noise = line, np.maximum(maps["dark_variance"], usual)
 
 
-def _measure_flat(
-    job: Measuring,
-    index: Index,
-    line: DarkLine | None,
-    noise: F64,
-    maps: dict[str, F64],
-    pairs: F64,
-) -> F64:
-    """Response, and for each rung: median level (ADU), pixels, samples without weight."""
-    rungs, levels = [], np.zeros((len(job.flat), 3))
-    for number, group in enumerate(job.flat):
-        exptime = group.exptime if job.flats_timed else 0.0
-        pedestal = None if line is None else line.signal(exptime).astype(np.float32)
-        found = _combine(job, group, index, pedestal, pairs)
-        signal = np.where(found.seen == len(group.frames), found.mean, np.nan)
-        level = median_and_sigma(signal)[0]
-        levels[number] = level, signal.size, (len(group.frames) - found.seen).sum()
-        # Few frames say little of one pixel's noise, and most pixels are like the others.
-        usual = usual_variance(found.variance, len(group.frames) - 1)
-        usual = max(level, 0) / job.gain + job.read_noise**2 if np.isnan(usual) else usual
-        brighter = np.fmax(signal / level, 1) if level > 0 else 1.0
-        variance = np.fmax(found.variance, usual * brighter) / len(group.frames)
-        if line is not None:
-            variance = variance + noise * line.variance(exptime)
-        rungs.append(Rung(group.exptime, len(group.frames), signal, variance))
-    maps["response"], maps["response_error"] = response_rate(rungs)
-    maps["flags"][nonlinear(rungs, job.limits.nonlinear)] += int(PixelFlag.NONLINEAR)
-    return levels
+def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined) -> None:
+    """A rung of the ladder of flats: median level (ADU), pixels, samples without weight."""
+    group, line = job.flat[number], column.line
+    exptime = group.exptime if job.flats_timed else 0.0
+    signal = np.where(found.seen == len(group.frames), found.mean, np.nan)
+    level = median_and_sigma(signal)[0]
+    column.levels[number] = level, signal.size, (len(group.frames) - found.seen).sum()
+    # Few frames say little of one pixel's noise, and most pixels are like the others.
+    usual = usual_variance(found.variance, len(group.frames) - 1)
+    usual = max(level, 0) / job.gain + job.read_noise**2 if np.isnan(usual) else usual
+    brighter = np.fmax(signal / level, 1) if level > 0 else 1.0
+    variance = np.fmax(found.variance, usual * brighter) / len(group.frames)
+    if line is not None:
+        variance = variance + column.noise * line.variance(exptime)
+    column.rungs.append(Rung(group.exptime, len(group.frames), signal, variance))
 
 
-def _combine(
-    job: Measuring, group: Group, index: Index, pedestal: F32 | None, pairs: F64 | None
-) -> Combined:
-    """Robust combination of a group; statistics of its pairs are added to ``pairs``."""
+def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[Combined]:
+    """Robust combination of a group in each column; statistics of its pairs are added there."""
     lamp = group.array == "flat"
-    combination = Combination(clip=job.limits.clip, lamp=lamp, quantum=job.quantum)
-    for frames in _batches(job, group, index):
-        if pedestal is not None:
-            frames -= pedestal
-        levels = combination.update(frames)
-        if pairs is not None:
-            pairs += _pair_sums(job, frames, levels, lamp)
-    return combination.result()
+    every = [Combination(clip=job.limits.clip, lamp=lamp, quantum=job.quantum) for _ in columns]
+    pedestals: list[F32 | None] = [None] * len(columns)
+    if lamp:
+        exptime = group.exptime if job.flats_timed else 0.0
+        lines = [column.line for column in columns]
+        pedestals = [None if x is None else x.signal(exptime).astype(np.float32) for x in lines]
+    for batch in _batches(job, group, tuple(column.index for column in columns)):
+        for column, combination, pedestal, samples in zip(
+            columns, every, pedestals, batch, strict=True
+        ):
+            frames = _usable(job, samples, lamp)
+            if pedestal is not None:
+                frames -= pedestal
+            levels = combination.update(frames)
+            if lamp or group == job.read_series:
+                column.pairs[int(lamp)] += _pair_sums(job, frames, levels, lamp)
+    return [combination.result() for combination in every]
 
 
 def _pair_sums(job: Measuring, frames: F32, levels: F32, lamp: bool) -> F64:
@@ -244,22 +262,26 @@ def _pair_sums(job: Measuring, frames: F32, levels: F32, lamp: bool) -> F64:
     return sums
 
 
-def _batches(job: Measuring, group: Group, index: Index) -> Iterator[F32]:
-    """Frames (t, y, x) of a group, `BATCH` at a time, NaN where a sample cannot be used."""
-    reader = ArrayReader(job.raw / group.array)
-    chunk = np.empty(reader.chunks, reader.dtype)
-    (y0, y1), (x0, x1) = extent(job.shape, index)
-    at = -1
+def _usable(job: Measuring, samples: NDArray[Any], lamp: bool) -> F32:
+    """Samples as real numbers, NaN where one cannot be used."""
+    frames = samples.astype(np.float32)
+    frames[~(np.abs(frames) <= MOST_ADU)] = np.nan
+    if lamp:
+        # Only there: a pixel that is saturated without light shall be seen as hot.
+        frames[frames >= job.saturation] = np.nan
+    return frames
+
+
+def _batches(job: Measuring, group: Group, strip: Strip) -> Iterator[list[NDArray[Any]]]:
+    """Frames (t, y, x) of a group in each column of a strip, `BATCH` at a time."""
+    reader = job.frames[group.array]
+    (rows, (x0, _)), (_, (_, x1)) = extent(job.shape, strip[0]), extent(job.shape, strip[-1])
     for first in range(0, len(group.frames), BATCH):
         numbers = group.frames[first : first + BATCH]
-        batch = np.empty((len(numbers), y1 - y0, x1 - x0), np.float32)
-        for n, frame in enumerate(numbers):
-            if frame // CHUNK[0] != at:
-                at = frame // CHUNK[0]
-                reader.read_chunk((at, *index), chunk)
-            batch[n] = chunk[frame % CHUNK[0], : y1 - y0, : x1 - x0]
-        batch[~(np.abs(batch) <= MOST_ADU)] = np.nan
-        if group.array == "flat":
-            # Only there: a pixel that is saturated without light shall be seen as hot.
-            batch[batch >= job.saturation] = np.nan
-        yield batch
+        batch = np.empty((len(numbers), rows[1] - rows[0], x1 - x0), reader.dtype)
+        for _, run in groupby(enumerate(numbers), key=lambda at: at[1] - at[0]):
+            # Frames that follow one another are read at once.
+            (n, frame), *more = run
+            last = n + 1 + len(more)
+            reader.read((frame, frame + last - n), rows, (x0, x1), out=batch[n:last])
+        yield np.split(batch, range(CHUNK[2], x1 - x0, CHUNK[2]), axis=2)

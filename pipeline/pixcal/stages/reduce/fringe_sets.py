@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels.quantise import Scale, choose_scale
-from pixcal.stages.reduce.columns import indices, run_noted
+from pixcal.stages.reduce.columns import indices, run_noted, strip_width, strips
 from pixcal.stages.reduce.electrons import (
     Converting,
     FringeSet,
     convert,
+    convert_bytes,
     set_writers,
     signal_range,
     write_coordinates,
@@ -89,13 +90,15 @@ def write_set(
     """
     fringes = FringeSet(
         name=name.partition("/")[2],
-        raw=source.raw / name,
+        raw=source.arrays[name],
         calibration=made.folder / "calibration.zarr",
         exptime=source.exposures.fringes[name],
         saturation=source.saturation(name),
         gain=gain,
     )
     todo = indices(source.shape)
+    need = partial(convert_bytes, fringes.raw.dtype.itemsize)
+    width = strip_width([fringes.raw], need, runtime)
     low, high = _possible_range(source, name, gain, bounds)
     origin = "saturation"
     scale = None
@@ -104,7 +107,9 @@ def write_set(
     if scale is None or scale.variance > share * bounds.smallest_variance:
         # Worth a look at the frames: they need not fill the range that the converter has.
         origin = "frames"
-        ends = run_tasks(partial(signal_range, fringes), todo, runtime, label=f"{name} range")
+        ends = run_tasks(
+            partial(signal_range, fringes), strips(todo, width), runtime, label=f"{name} range"
+        )
         # Samples far below the bias are no samples: they have no weight.
         low, high = max(low, min(e[0] for e in ends)), max(e[1] for e in ends)
         low, high = (low, high) if low <= high else (0.0, 1.0)
@@ -114,7 +119,7 @@ def write_set(
     job = Converting(
         fringes, scale, set_writers(folder, scratch, fringes.frames, source.shape, scale)
     )
-    run_noted(made, partial(convert, job), todo, runtime, name)
+    run_noted(made, partial(convert, job), todo, width, runtime, name)
     for writer in job.writers.values():
         writer.finish()
     write_coordinates(folder, source.tables[name]["time_s"], source.shape)

@@ -13,9 +13,10 @@ from pixcal.model.acquisition import Acquisition, Detector
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages.reduce.exposures import Exposures, group_exposures
-from pixcal.storage.artefact import read_json
+from pixcal.storage.artefact import read_json, read_manifest
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
+from pixcal.storage.frame_reader import FrameReader, Reader
 from pixcal.storage.place import Place
 
 MOST_ADU = 2.0**32
@@ -57,9 +58,41 @@ class Ingested:
         return group_exposures(self.tables)
 
     @cached_property
-    def arrays(self) -> Mapping[str, ArrayReader]:
-        """A reader of each array."""
-        return {name: ArrayReader(self.raw / name) for name in self.tables}
+    def arrays(self) -> Mapping[str, Reader]:
+        """A reader of each array: of its cube, or of the FITS files.
+
+        Raises
+        ------
+        InputError
+            If the files are not there any more.
+        """
+        manifest = read_manifest(self.folder)
+        if manifest is None or manifest.format == 1:
+            return {name: ArrayReader(self.raw / name) for name in self.tables}
+        readers: dict[str, Reader] = {}
+        places = read_json(self.folder / "files.json")
+        for name, table in self.tables.items():
+            if places[name] is None:
+                readers[name] = ArrayReader(self.raw / name)
+                continue
+            facts = manifest.summary["arrays"][name]
+            checksums = ArrayReader(self.folder / "catalogue.zarr" / name).read()[..., 0]
+            folder = self._files_folder(manifest.summary["acquisition"], places[name]["file"][0])
+            readers[name] = FrameReader(
+                folder, places[name], table, facts["shape"], facts["dtype"], checksums
+            )
+        return readers
+
+    def _files_folder(self, noted: Mapping[str, str], file: str) -> Path:
+        """The folder that holds the files: where it was, or as far from the run as it was."""
+        folder = Path(noted["folder"])
+        for found in (folder, self.folder.absolute().parent / noted["from_run"]):
+            if (found / file).exists():
+                return found
+        raise InputError(
+            f"{folder}: the frames of {self.folder} are not there any more; run 'pixcal ingest ACQ "
+            f"--out {self.folder.parent}' with ACQ where they are (and --copy, to remove them then)"
+        )
 
     @cached_property
     def shape(self) -> tuple[int, int]:

@@ -1,6 +1,7 @@
 """Reduce: from raw frames to electrons, with what is needed to weight every sample.
 
-Reads ``RUN/ingest`` only: when bias or flat frames change, no FITS file is read again.
+Reads the frames that ``RUN/ingest`` lists in strips of rows, from the FITS files where they were
+not copied, and holds them against their checksums.
 """
 
 import math
@@ -19,9 +20,9 @@ from pixcal.model.config import quantity, to_plain
 from pixcal.model.errors import InputError
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.calibration import Finishing, calibration_writers, finish
-from pixcal.stages.reduce.columns import extent, indices, run_noted
+from pixcal.stages.reduce.columns import extent, indices, run_noted, strip_width
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
-from pixcal.stages.reduce.electrons import CONVERT_BYTES
+from pixcal.stages.reduce.electrons import convert_bytes
 from pixcal.stages.reduce.frame_statistics import (
     Limits,
     Measuring,
@@ -51,7 +52,7 @@ STAGE = "reduce"
 FORMAT = 1
 SCHEMA = "pixcal/reduce/1"
 
-_INGEST_FORMAT = 1
+_INGEST_FORMAT = 2
 _MIN_READ_FRAMES = 8  # fewer do not tell the noise of each pixel
 _SHARED_BYTES = 64 << 20
 
@@ -139,12 +140,17 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
 def _reduce(made: Build, source: Ingested, config: Config, runtime: Runtime) -> None:
     exposures = source.exposures
-    need = max(measure_bytes(exposures.dark, exposures.flat), CONVERT_BYTES)
-    need += transit_bytes(source.raw, made.cubes)
-    runtime = runtime.with_workers(make_plan("reduce", need, _SHARED_BYTES, runtime).workers)
-    create_group(made.scratch)
+    transit = transit_bytes(source.raw, made.cubes)
+
+    def need(width: int) -> int:
+        return _SHARED_BYTES + transit + measure_bytes(exposures.dark, exposures.flat, width)
+
     job = _measuring(source, config, made.scratch / "statistics")
-    run_noted(made, partial(measure, job), indices(source.shape), runtime, "statistics")
+    width = strip_width(source.arrays.values(), need, runtime)
+    least = transit + max(measure_bytes(exposures.dark, exposures.flat, width), convert_bytes(4, 1))
+    runtime = runtime.with_workers(make_plan("reduce", least, _SHARED_BYTES, runtime).workers)
+    create_group(made.scratch)
+    run_noted(made, partial(measure, job), indices(source.shape), width, runtime, "statistics")
     for writer in job.writers.values():
         writer.finish()
     summary = summarise(job, made.scratch / "statistics", source.detector)
@@ -162,7 +168,9 @@ def _reduce(made: Build, source: Ingested, config: Config, runtime: Runtime) -> 
 def _measuring(source: Ingested, config: Config, folder: Path) -> Measuring:
     exposures, detector = source.exposures, source.detector
     return Measuring(
-        raw=source.raw,
+        frames={
+            name: source.arrays[name] for name in ("bias", "dark", "flat") if name in source.arrays
+        },
         shape=source.shape,
         dark=exposures.dark,
         flat=exposures.flat,

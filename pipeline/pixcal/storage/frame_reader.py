@@ -1,0 +1,132 @@
+"""Frames read from the FITS files they are in, as `pixcal.storage.cube` reads those of a cube.
+
+The files were described and read once by `ingest`. What is read of them now is held against what
+was found then: their sizes, times of change, and the checksum of every band of rows.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.model.errors import InputError
+from pixcal.storage.cube import ArrayReader
+from pixcal.storage.fits_in import Coding, FrameFile
+from pixcal.storage.fits_rows import BAND, read_rows
+from pixcal.storage.sources import SourceFile
+
+Columns = Mapping[str, Sequence[Any]]
+"""What ``files.json`` holds of the files of an array, in columns of equal length."""
+
+
+def describe(files: Sequence[FrameFile]) -> dict[str, list[Any]]:
+    """Where the samples of plain files are, in columns."""
+    return {
+        "file": [f.source.name for f in files],
+        "size": [f.source.size for f in files],
+        "mtime_ns": [f.source.mtime_ns for f in files],
+        "offset": [f.offset for f in files],
+        "planes": [f.shape[0] for f in files],
+        "bitpix": [f.coding.bitpix for f in files],
+        "bscale": [f.coding.bscale for f in files],
+        "bzero": [f.coding.bzero for f in files],
+        "blank": [f.coding.blank for f in files],
+    }
+
+
+@dataclass(frozen=True)
+class _Ingested(SourceFile):
+    """A file as it was when it was ingested."""
+
+    CHANGED: ClassVar[str] = "changed since it was ingested; run 'pixcal ingest' again"
+
+
+def described(columns: Columns, number: int, folder: Path, frame: Sequence[int]) -> FrameFile:
+    """One of the files that `describe` described, with frames (y, x) of a size."""
+    row = {name: column[number] for name, column in columns.items()}
+    source = _Ingested(folder / row["file"], row["file"], row["size"], row["mtime_ns"])
+    coding = Coding(row["bitpix"], row["bscale"], row["bzero"], row["blank"])
+    shape = (row["planes"], frame[0], frame[1])
+    return FrameFile(source, "plain", -1, row["offset"], shape, coding)
+
+
+class FrameReader:
+    """Reads blocks of an array (time, y, x) from FITS files, checking every band of rows.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the acquisition.
+    columns : mapping
+        What `describe` returned.
+    table : mapping
+        Columns ``file`` and ``plane`` of the frames, in their order.
+    shape, dtype
+        Of the array.
+    checksums : (time, band) ndarray
+        Of the bytes of each band.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        columns: Columns,
+        table: Columns,
+        shape: Sequence[int],
+        dtype: Any,
+        checksums: NDArray[Any],
+    ) -> None:
+        numbers = {name: number for number, name in enumerate(columns["file"])}
+        self.folder, self.columns = folder, columns
+        self.shape: tuple[int, ...] = tuple(shape)
+        self.dtype: np.dtype[Any] = np.dtype(dtype)
+        self._files = [numbers[name] for name in table["file"]]
+        self._planes = list(table["plane"])
+        self._checksums = checksums
+
+    def read(self, *ranges: tuple[int, int], out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """A block, as `ArrayReader.read` gives it; fastest in bands of 128 rows of all columns.
+
+        Raises
+        ------
+        InputError
+            Naming the file that is gone, or is not as it was ingested.
+        """
+        full = [(0, n) for n in self.shape]
+        full[: len(ranges)] = [(max(0, a), min(b, n)) for (a, b), n in zip(ranges, self.shape)]  # noqa: B905
+        (t0, t1), (y0, y1), (x0, x1) = full
+        shape = (t1 - t0, y1 - y0, x1 - x0)
+        block = np.empty(shape, self.dtype) if out is None else out
+        if 0 in shape:
+            return block
+        _, ny, nx = self.shape
+        rows = (y0 - y0 % BAND, min(-(-y1 // BAND) * BAND, ny))
+        whole = rows == (y0, y1) and x1 - x0 == nx and block.flags.c_contiguous
+        band = np.empty((1, rows[1] - rows[0], nx), self.dtype)
+        for number, frames in groupby(range(t0, t1), key=self._files.__getitem__):
+            file = described(self.columns, number, self.folder, (ny, nx))
+            for t in frames:
+                target = block[t - t0 : t - t0 + 1] if whole else band
+                self._read_frame(file, t, rows, target)
+                if not whole:
+                    block[t - t0] = band[0, y0 - rows[0] : y1 - rows[0], x0:x1]
+        return block
+
+    def _read_frame(
+        self, file: FrameFile, t: int, rows: tuple[int, int], out: NDArray[Any]
+    ) -> None:
+        found = read_rows(file, [self._planes[t]], rows, out)[0, :, 0]
+        first = rows[0] // BAND
+        if (found != self._checksums[t, first : first + len(found)]).any():
+            raise InputError(
+                f"{file.source.path}: its bytes are not those that were ingested (checksum), "
+                "though size and time are; restore it, or touch it and run 'pixcal ingest' again"
+            )
+
+
+Reader = ArrayReader | FrameReader
+"""What frames (time, y, x) are read with, wherever they are."""
