@@ -182,9 +182,9 @@ def _ingested(case: Case, spoil: Any) -> Answer:
 
 def _check(acq: Path, run: Path) -> None:
     """Hold the ingested frames against what astropy reads."""
-    from pixcal.storage.cube import ArrayReader
+    from pixcal.stages.reduce.ingested import Ingested
 
-    reader = ArrayReader(run / "ingest" / "raw.zarr" / "bias")
+    reader = Ingested(run / "ingest").arrays["bias"]
     table = json.loads((run / "ingest" / "frames.json").read_text())["bias"]
     for column in ("mjd", "exptime_s", "temperature_c", "time_s"):
         if not all(v is None or np.isfinite(v) for v in table[column]):

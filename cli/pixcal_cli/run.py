@@ -56,8 +56,8 @@ def run(
     from pixcal.stages import allan, correct, diagnose, fit, ingest, reduce, report
 
     with results.announce("ingest", run / "ingest"):
-        config = ingest.Config(overwrite=overwrite, copy=copy, cubes=cubes)
-        ingest.run(acquisition, run, config, runtime)
+        cataloguing = ingest.Config(overwrite=overwrite, copy=copy, cubes=cubes)
+        ingest.run(acquisition, run, cataloguing, runtime)
     with results.announce("reduce", run / "reduce"):
         reduce.run(run, reduce.Config(gain=gain, cubes=cubes), runtime)
     fringes = bool(load_acquisition(acquisition).frames.fringes)
