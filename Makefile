@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip --quiet install --no-compile
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: study-diagnose help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-full fuzz effect-pictures reproduce reproduce-full blind blind-full clean
+.PHONY: study-diagnose help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-full fuzz effect-pictures reproduce reproduce-full blind blind-second blind-full clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 17
@@ -97,6 +97,14 @@ blind: $(TOOLS) ## ten small cases whose effects are withheld, diagnosed and sco
 	  $(BIN)/pixcal blind make --cases 10 --seed 1001 --out work/blind --sealed work/blind-truth.json
 	$(BIN)/pixcal blind run work/blind
 	$(BIN)/pixcal blind score work/blind --sealed work/blind-truth.json
+
+blind-second: $(TOOLS) ## 100 cases of the second bench alone (hours, 7 GB of disk); goes on where it was
+	$(PIP) '.[second-bench]'
+	[ -e work/blind-second ] || \
+	  $(BIN)/pixcal blind make --cases 100 --seed $(SEED) --size standard --bench second \
+	  --out work/blind-second --sealed work/blind-second-truth.json
+	$(BIN)/pixcal blind run work/blind-second --cluster processes --memory 4GiB
+	$(BIN)/pixcal blind score work/blind-second --sealed work/blind-second-truth.json
 
 blind-full: $(TOOLS) ## 200 cases of 128 x 128 pixels (hours, 15 GB of disk); another SEED for another examination
 	[ -e work/blind-full ] || \

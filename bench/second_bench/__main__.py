@@ -1,11 +1,11 @@
 """``python -m second_bench CASE --seed N --out ACQ --truth FILE``."""
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
 import second_bench
-from second_bench.camera import record
 from second_bench.cases import CaseError, make_case
 from second_bench.effects import LAWS
 from second_bench.ordinary import VARIATIONS, Layout
@@ -20,7 +20,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("case", nargs="?", help="ordinary, an effect, or effects joined by '+'")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--out", type=Path, help="folder of the acquisition, which must not exist")
+    parser.add_argument("--out", type=Path, help="folder of the acquisition; none: truth alone")
     parser.add_argument("--truth", type=Path, help="file of the truth (JSON)")
     parser.add_argument("--strength", type=float, help="0 (barely visible) to 1 (strong)")
     parser.add_argument("--bench", choices=("ordinary", "plain"), default="ordinary")
@@ -32,7 +32,20 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--flats", type=int, default=40)
     parser.add_argument("--darks", type=int, default=0, help="of one second")
     parser.add_argument("--list", action="store_true", help="list the cases")
+    parser.add_argument("--json", action="store_true", help="list them for programs")
     return parser
+
+
+def _show_cases(as_json: bool) -> None:
+    facts = ("effect", "name", "weak", "strong", "unit", "known", "decidable", "needs")
+    laws = [{name: getattr(law, name) for name in facts} for law in LAWS]
+    if as_json:
+        print(json.dumps({"variations": VARIATIONS, "laws": laws}))
+        return
+    print(*(f"ordinary/{name}" for name in VARIATIONS), sep="\n")
+    for law in LAWS:
+        known = "" if law.known else " (not known to pixcal)"
+        print(f"{law.effect}/{law.name}: {law.weak:g} to {law.strong:g} {law.unit}{known}")
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -40,17 +53,13 @@ def main(arguments: list[str] | None = None) -> int:
     parser = _parser()
     asked = parser.parse_args(arguments)
     if asked.list:
-        print(*(f"ordinary/{name}" for name in VARIATIONS), sep="\n")
-        for law in LAWS:
-            known = "" if law.known else " (not known to pixcal)"
-            sizes = f"{law.weak:g} to {law.strong:g} {law.unit}"
-            print(f"{law.effect}/{law.name}: {sizes}{known}")
+        _show_cases(asked.json)
         return 0
-    if not (asked.case and asked.out and asked.truth):
-        parser.error("CASE, --out and --truth are needed")
-    if asked.out.exists():
+    if not (asked.case and asked.truth):
+        parser.error("CASE and --truth are needed")
+    if asked.out and asked.out.exists():
         parser.error(f"--out {asked.out}: exists already; choose another folder")
-    if asked.truth.resolve().is_relative_to(asked.out.resolve()):
+    if asked.out and asked.truth.resolve().is_relative_to(asked.out.resolve()):
         parser.error(f"--truth {asked.truth}: inside {asked.out}; keep the truth apart")
     layout = Layout(tuple(asked.size), asked.frames, asked.bias, asked.darks, asked.flats)
     plain = asked.bench == "plain"
@@ -60,7 +69,10 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(str(error))
     except ModuleNotFoundError as error:
         parser.error(f"{asked.case}: needs {error.name}; pip install 'pixcal[second-bench]'")
-    write_acquisition(bench, record(bench), asked.out)
+    if asked.out:
+        from second_bench.camera import record  # here: HCIPy takes seconds to import
+
+        write_acquisition(bench, record(bench), asked.out)
     write_truth(asked.truth, truth, bench)
     return 0
 

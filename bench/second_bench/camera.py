@@ -5,10 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from second_bench.model import F64, WARM_UP, Bench, Frame, Run, stream
+from second_bench.model import EXPTIME_S, F64, TOP_ADU, WARM_UP, Bench, Frame, Run, stream
 from second_bench.optics import Light, expose, light_of
-
-TOP_ADU = 65535
 
 
 def record(bench: Bench) -> Iterator[tuple[Run, NDArray[np.uint16]]]:
@@ -47,7 +45,3 @@ def mean_electrons(bench: Bench, lights: list[Light], run: Run, index: int) -> F
     if run.kind == "flat":
         return bench.flat_response * (bench.flat_e * float(run.power[index, 0])) + bench.dark_e
     return bench.response * expose(lights[run.number], run, index, bench.grid()) + bench.dark_e
-
-
-EXPTIME_S = 0.02
-"""Of fringes and flats."""

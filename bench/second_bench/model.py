@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 WARM_UP = 3
 """Frames of each run that are exposed before the first that is recorded."""
+EXPTIME_S = 0.02
+"""Of fringes and flats."""
+TOP_ADU = 65535
 
 
 def stream(seed: int, *names: str | int) -> np.random.Generator:

@@ -4,8 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from second_bench.camera import EXPTIME_S, TOP_ADU
-from second_bench.model import F64, Beam, Bench, FringeSet, Run, new_run, stream
+from second_bench.model import (
+    EXPTIME_S,
+    F64,
+    TOP_ADU,
+    Beam,
+    Bench,
+    FringeSet,
+    Run,
+    new_run,
+    stream,
+)
 
 VARIATIONS = (
     "aim", "centred", "radii", "powers", "read_noise", "dust", "phases", "amplifiers",

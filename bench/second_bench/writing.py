@@ -11,8 +11,7 @@ from astropy.io import fits
 from astropy.time import Time, TimeDelta
 from numpy.typing import NDArray
 
-from second_bench.camera import TOP_ADU
-from second_bench.model import WARM_UP, Bench, Run
+from second_bench.model import TOP_ADU, WARM_UP, Bench, Run
 
 NIGHT = Time("2026-03-01T20:00:00")
 PER_FILE = 200

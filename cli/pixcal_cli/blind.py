@@ -36,7 +36,7 @@ def blind() -> None:
 @blind.command(
     epilog=examples(
         "pixcal blind make --cases 10 --seed 1001 --out exam --sealed truth.json",
-        "pixcal blind make --cases 200 --seed 2001 --size standard --out exam --sealed truth.json",
+        "pixcal blind make --cases 100 --bench second --out exam --sealed truth.json",
     )
 )
 @click.option("--cases", type=click.IntRange(1, 9999), required=True, help="Number of cases.")
@@ -63,14 +63,28 @@ def blind() -> None:
     help="small: 61 x 67 pixels, 2 x 300 frames; standard: 128 x 128, 2 or 3 x 600; "
     "tiny: 33 x 35, 2 x 60, to try the commands.",
 )
+@click.option(
+    "--bench",
+    type=click.Choice(["both", "second", "own"]),
+    default="both",
+    show_default=True,
+    help="Cases of the second bench, which shares no code with pixcal, of pixcal's own simulator "
+    "(a self-check), or half of each.",
+)
 @runtime_options
 def make(
-    cases: int, seed: int | None, folder: Path, sealed: Path, size: str, runtime: "Runtime"
+    cases: int,
+    seed: int | None,
+    folder: Path,
+    sealed: Path,
+    size: str,
+    bench: str,
+    runtime: "Runtime",
 ) -> None:
     """Make cases, each with an effect, several, or none, and seal the truth."""
     from pixcal.stages import blind as stage  # here: for a fast `pixcal --help`
 
-    found = stage.make(folder, sealed, stage.MakeConfig(cases, seed, size), runtime)
+    found = stage.make(folder, sealed, stage.MakeConfig(cases, seed, size, bench), runtime)
     click.echo(f"cases in {folder}: {cases}; their truth in {sealed}")
     results.show_notes(found.notes)
 

@@ -13,7 +13,7 @@ def test_an_examination_from_beginning_to_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     exam, sealed = tmp_path / "exam", tmp_path / "truth.json"
-    size = ["--cases", "1", "--seed", "1", "--size", "tiny", "--quiet"]
+    size = ["--cases", "1", "--seed", "1", "--size", "tiny", "--bench", "own", "--quiet"]
     assert invoke(["blind", "make", *size, "--out", str(exam), "--sealed", str(sealed)]) == 0
     assert capsys.readouterr().out == f"cases in {exam}: 1; their truth in {sealed}\n"
     products = exam / "runs" / "case-0001" / "products"
@@ -40,7 +40,7 @@ def test_an_examination_from_beginning_to_end(
 def sat(folder: Path, seed: int, size: str, capsys: pytest.CaptureFixture[str]) -> list[str]:
     """An examination of one case, in which nothing was found: folder and truth."""
     exam, sealed = folder / f"exam-{seed}", folder / f"truth-{seed}.json"
-    drawn = ["--cases", "1", "--seed", str(seed), "--size", size, "--quiet"]
+    drawn = ["--cases", "1", "--seed", str(seed), "--size", size, "--bench", "own", "--quiet"]
     assert invoke(["blind", "make", *drawn, "--out", str(exam), "--sealed", str(sealed)]) == 0
     products = exam / "runs" / "case-0001" / "products"
     products.mkdir(parents=True)

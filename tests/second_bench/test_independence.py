@@ -36,7 +36,7 @@ def test_pixcal_imports_nothing_of_the_bench() -> None:
 
 
 def test_no_module_of_pixcal_is_loaded_with_the_bench() -> None:
-    told = "import sys, second_bench.__main__; print(*sorted(sys.modules))"
+    told = "import sys, second_bench.__main__, second_bench.camera; print(*sorted(sys.modules))"
     loaded = subprocess.run(
         [sys.executable, "-c", told], capture_output=True, text=True, check=True
     ).stdout.split()

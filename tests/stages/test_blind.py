@@ -1,5 +1,6 @@
 """The blind examination: what is drawn, what cannot leak, what is sealed, and how it is scored."""
 
+import importlib.util
 import json
 import shutil
 from collections import Counter
@@ -9,38 +10,42 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from astropy.io import fits
 
 from pixcal.effects import effects, parse_effects
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime
-from pixcal.kernels.crosstalk import Coupling, couple
+from pixcal.model.acquisition import load_acquisition
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError, PlanError
-from pixcal.simulation.recording import Recording, recordings
 from pixcal.stages import blind, correct, diagnose, ingest, reduce
-from pixcal.stages.blind.benches import LAYOUTS, draw_bench
+from pixcal.stages.blind.benches import LAYOUTS
 from pixcal.stages.blind.cases import write_examination
 from pixcal.stages.blind.draw import (
-    ELSEWHERE,
     LEFT_OUT,
     NOTHING,
     ONE,
+    SECOND,
+    SECOND_NOTHING,
+    SECOND_ONE,
+    SECOND_OTHER,
+    SECOND_PAIR,
     SEVERAL,
     Drawn,
     Examination,
     Truth,
     draw_examination,
 )
-from pixcal.stages.blind.elsewhere import FOREIGN, Elsewhere
 from pixcal.stages.blind.grade import grade
-from pixcal.stages.blind.marking import summary
 from pixcal.stages.blind.offsets import offset_errors
 from pixcal.stages.blind.paper import read_paper
 from pixcal.stages.blind.parameters import held
 from pixcal.stages.blind.seal import read_seal
+from pixcal.stages.blind.second import SecondCase, catalogue
 from pixcal.stages.blind.sitting import share
 from pixcal.stages.blind.strengths import STRONGEST, WAYS, Way
+from pixcal.stages.blind.summary import summary
 from pixcal.stages.blind.table import as_markdown, write_between
 from pixcal.stages.diagnose import look
 from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
@@ -55,7 +60,7 @@ BLOCK = 2880
 
 def test_every_effect_has_its_ways_and_its_turn() -> None:
     assert {way.effect for way in WAYS} == set(effects())
-    examination = draw_examination(3 * len(effects()), 17, "small")
+    examination = draw_examination(3 * len(effects()), 17, "small", "own")
     turns = Counter(t.names[0] for t in examination.truths if t.part == ONE)
     assert set(turns) == set(effects())
     assert max(turns.values()) - min(turns.values()) <= 1
@@ -71,32 +76,71 @@ def test_a_way_is_an_effect_at_any_strength(way: Way) -> None:
         json.dumps(way.make(strength, rng))
 
 
-def test_the_parts_of_an_examination() -> None:
-    examination = draw_examination(200, 5, "small")
+def test_the_parts_of_the_self_check() -> None:
+    examination = draw_examination(100, 5, "small", "own")
     assert Counter(t.part for t in examination.truths) == {
-        ONE: 80, NOTHING: 30, SEVERAL: 30, LEFT_OUT: 30, ELSEWHERE: 30,
+        ONE: 50, NOTHING: 16, SEVERAL: 17, LEFT_OUT: 17,
     }  # fmt: skip
     assert [t.part for t in examination.truths] != sorted(t.part for t in examination.truths)
     for truth in examination.truths:
         assert (truth.left_out in truth.names) == (truth.part == LEFT_OUT)
         least = 1.0 if truth.part == ONE else 2.0
-        assert all(least <= d.times <= STRONGEST for d in truth.drawn)
+        assert all(least <= (d.times or 0) <= STRONGEST for d in truth.drawn)
         assert len(set(truth.names)) == len(truth.names)
         assert len(truth.names) in {ONE: (1,), NOTHING: (0,), SEVERAL: (2, 3)}.get(truth.part, (1,))
-    assert draw_examination(200, 5, "small") == examination
-    assert draw_examination(200, 6, "small") != examination
+    assert draw_examination(100, 5, "small", "own") == examination
+    assert draw_examination(100, 6, "small", "own") != examination
 
 
-def test_without_galsim_there_is_no_part_5(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pixcal.stages.blind.draw.galsim_is_there", lambda: False)
-    examination = draw_examination(20, 5, "small")
-    assert ELSEWHERE not in {t.part for t in examination.truths}
-    assert len(examination.truths) == 20
-    assert "GalSim" in examination.notes[0]
+def test_half_of_the_cases_are_of_the_second_bench() -> None:
+    variations, laws, _ = catalogue()
+    examination = draw_examination(200, 5, "small")
+    second = [t for t in examination.truths if t.part in SECOND]
+    assert Counter(t.part for t in second) == {
+        SECOND_ONE: 55, SECOND_NOTHING: 25, SECOND_PAIR: 10, SECOND_OTHER: 10,
+    }  # fmt: skip
+    assert all((t.second is None) == (t.part not in SECOND) for t in examination.truths)
+    assert len({t.second.seed for t in second if t.second}) == 100
+    known = {law.effect for law in laws if law.known}
+    for truth in second:
+        assert truth.left_out in effects()
+        assert truth.left_out not in truth.names
+        assert (set(truth.names) <= known) == (truth.part != SECOND_OTHER)
+        assert len(truth.names) == {SECOND_NOTHING: 0, SECOND_PAIR: 2}.get(truth.part, 1)
+    one = Counter(t.names[0] for t in second if t.part == SECOND_ONE)
+    assert set(one) == known
+    assert max(one.values()) - min(one.values()) <= 1
+    plain = [t.second.case for t in second if t.second and t.part == SECOND_NOTHING]
+    assert plain.count("ordinary") == 13
+    assert {case.partition("/")[2] for case in plain if "/" in case} <= set(variations)
+    assert {t.part for t in draw_examination(30, 5, "small", "second").truths} == set(SECOND)
+
+
+def test_a_second_bench_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pixcal.stages.blind.second.NEEDED", ("galsim", "hcipy_of_old"))
+    catalogue.cache_clear()
+    with pytest.raises(InputError, match=r"hcipy_of_old; .*pixcal\[second-bench\].*--bench own"):
+        draw_examination(20, 5, "small")
+    assert len(draw_examination(20, 5, "small", "own").truths) == 20
+
+
+def test_laws_whose_package_is_missing_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = importlib.util.find_spec
+    monkeypatch.setattr(
+        "pixcal.stages.blind.second.importlib.util.find_spec",
+        lambda name: None if name == "pyxel" else real(name),
+    )
+    catalogue.cache_clear()
+    _, laws, absent = catalogue()
+    assert absent == ("pyxel",)
+    assert ("lag", "traps") not in {(law.effect, law.name) for law in laws}
+    assert "lag" in {law.effect for law in laws}
+    assert "pyxel" in draw_examination(20, 5, "small").notes[0]
+    catalogue.cache_clear()
 
 
 def test_some_standard_cases_have_a_second_baseline() -> None:
-    examination = draw_examination(40, 5, "standard")
+    examination = draw_examination(40, 5, "standard", "own")
     sets = Counter(len(examination.bench(n).frames.fringes) for n in range(40))
     assert set(sets) == {2, 3}
     for n in range(40):
@@ -153,7 +197,7 @@ def test_the_folder_holds_no_trace_of_the_truth(tmp_path: Path) -> None:
         one,
         truths=(
             Truth(LEFT_OUT, "lag", (drawn("lag", 0.02),)),
-            Truth(ELSEWHERE, "ipc", (Drawn("nonlinearity", "", 0.02, 3.0, {}),), elsewhere=True),
+            Truth(ONE, "ipc", (drawn("nonlinearity", 0.02),)),
             Truth(NOTHING, "lag"),
         ),
     )
@@ -173,8 +217,22 @@ def test_the_folder_holds_no_trace_of_the_truth(tmp_path: Path) -> None:
     assert '"seed"' not in text
 
 
+def test_cases_of_the_second_bench_differ_in_their_samples_alone(tmp_path: Path) -> None:
+    """What a case holds is not seen without looking at samples; whose bench it is may be."""
+    found = []
+    for name, case in (("one", "ordinary/dust"), ("other", "lag/linear+row_noise/rows")):
+        asked = SecondCase(case, 77, 0.5)
+        examination = Examination(12, "tiny", (Truth(SECOND_NOTHING, "ipc", second=asked),))
+        write_examination(tmp_path / name, tmp_path / f"{name}.json", examination, SYNC)
+        found.append(facts_of(tmp_path / name))
+    (yaml_one, yaml_other) = (f.pop("case-0001/acquisition.yaml")[-1] for f in found)
+    assert found[0] == found[1]
+    assert load_acquisition(tmp_path / "one" / "case-0001").optics.distance_mm == 400
+    assert set(yaml.safe_load(yaml_one)) == set(yaml.safe_load(yaml_other))
+
+
 def test_the_bench_does_not_depend_on_the_truth() -> None:
-    many, few = draw_examination(30, 8, "small"), draw_examination(7, 8, "small")
+    many, few = (draw_examination(n, 8, "small", "own") for n in (30, 7))
     assert many.truths[:7] != few.truths
     assert [many.bench(n) for n in range(7)] == [few.bench(n) for n in range(7)]
     assert len({many.bench(n).seed for n in range(30)}) == 30
@@ -184,7 +242,7 @@ def test_a_seed_that_is_not_given_cannot_be_guessed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("pixcal.stages.blind.cases.write_examination", lambda *_: None)
-    config = blind.MakeConfig(1)
+    config = blind.MakeConfig(1, bench="own")
     seeds = {blind.make(tmp_path / "e", tmp_path / "t", config, SYNC).seed for _ in range(8)}
     assert len(seeds) == 8
     assert all(seed >= 1000 for seed in seeds)
@@ -335,6 +393,11 @@ LAG = Truth(ONE, "ipc", (Drawn("lag", "share", 1e-3, 3.0, {"share": 1e-3}),))
 BOTH = replace(LAG, part=SEVERAL, drawn=(*LAG.drawn, Drawn("ipc", "", 0.1, 2.0, {})))
 MISSING = replace(LAG, part=LEFT_OUT, left_out="lag")
 EMPTY = Truth(NOTHING, "ipc")
+STRANGER = replace(LAG, part=SECOND_ONE, second=SecondCase("lag/linear", 3, 0.5))
+ORDINARY = Truth(SECOND_NOTHING, "ipc", second=SecondCase("ordinary", 3, 0.5))
+UNKNOWN = replace(
+    STRANGER, part=SECOND_OTHER, drawn=(Drawn("pickup", "tone, e- amplitude", 5.0, None, {}),)
+)
 
 
 @pytest.mark.parametrize(
@@ -354,6 +417,12 @@ EMPTY = Truth(NOTHING, "ipc")
         (MISSING, answer(["ipc"], 0.4, "partly explained"), True, ""),
         (MISSING, answer(["ipc"], 0.8, "partly explained"), False, "ipc blamed for 0.80"),
         (MISSING, answer([], 0.0), False, "verdict 'no gap'"),
+        (STRANGER, answer(["lag"], 0.9), True, ""),
+        (STRANGER, answer(["ipc", "lag"], 0.9), False, "named after ipc"),
+        (ORDINARY, answer([], 0.0), True, ""),
+        (ORDINARY, answer([], 0.0, "unexplained"), False, "verdict 'unexplained'"),
+        (UNKNOWN, answer([], 0.0, "unexplained"), True, ""),
+        (UNKNOWN, answer(["ipc"], 0.8), False, "ipc blamed for 0.80"),
     ],
 )
 def test_an_answer_is_marked(truth: Truth, diagnosis: Any, right: bool, why: str) -> None:
@@ -412,6 +481,8 @@ def test_a_score_counts_and_is_shown(tmp_path: Path) -> None:
         grade("case-0004", BOTH, answer(["ipc"], 0.7)),
         grade("case-0005", MISSING, answer([], 0.0, "unexplained")),
         grade("case-0006", EMPTY, None, "disk | full"),
+        grade("case-0009", STRANGER, answer(["lag", "ipc"], 0.9)),
+        grade("case-0010", UNKNOWN, answer([], 0.0, "unexplained")),
     ]
     found = summary(grades)
     pairs = found["parts"]["3"]["questions"]["pairs: both found"]
@@ -422,20 +493,25 @@ def test_a_score_counts_and_is_shown(tmp_path: Path) -> None:
     # Clopper and Pearson's limits of one in two: of the beta distribution.
     assert first["interval"] == pytest.approx([0.0126, 0.9874], abs=1e-4)
     assert found["confusion"] == {
-        "lag": {"ipc": 1, "lag": 1},
+        "lag": {"ipc": 1, "lag": 2},
         "nothing": {"failed": 1, "nothing": 1},
+        "pickup": {"unexplained": 1},
     }
+    stranger = found["parts"][str(SECOND_ONE)]["questions"]
+    assert [q["right"] for q in stranger.values()] == [1, 0, 1]
+    assert found["second"]["effects"]["lag"]["right"]["of"] == 1
     about = {
         "purpose": "development", "size": "small", "seed": 3, "notes": [],
-        "made": 8, "missing": ["case-0007", "case-0008"],
+        "made": 10, "missing": ["case-0007", "case-0008"],
         "sittings": {"codes": ["a", "b"], "median_seconds": {"diagnosis": 60.2, "maps": 1.9},
                      "without_maps": 0},
     }  # fmt: skip
     text = as_markdown(found | about)
-    assert "2 of 8 are not diagnosed yet" in text
+    assert text.index("The second bench") < text.index("Self-check")
+    assert "2 of 10 are not diagnosed yet" in text
     assert "2 versions of the program" in text
     assert "development seed" in text
-    assert "| lag | 2 | 1 | ipc 1 |" in text
+    assert "| lag | 3 | 2 | ipc 1 |" in text
     assert "disk / full" in text
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- blind:small -->\nold\n<!-- end -->\nafter\n")
@@ -443,7 +519,7 @@ def test_a_score_counts_and_is_shown(tmp_path: Path) -> None:
     once = page.read_text()
     write_between(page, "small", text)
     assert page.read_text() == once
-    assert once.startswith("before\n<!-- blind:small -->\n\n6 cases")
+    assert once.startswith("before\n<!-- blind:small -->\n\n8 cases")
     assert once.endswith("<!-- end -->\nafter\n")
     with pytest.raises(InputError, match="blind:standard"):
         write_between(page, "standard", text)
@@ -462,9 +538,9 @@ WANDERING = drawn("hyperbolic_fringes", 60.0)
         (Truth(ONE, "lag", (KERNEL,)), None, (1.5, 50.0)),
         (Truth(ONE, "lag", (WANDERING,)), WANDERING, (0.9, 50.0)),
         (Truth(NOTHING, "lag"), None, (0.9, 1.15)),
-        (Truth(NOTHING, "lag", elsewhere=True), None, (0.9, 1.15)),
+        (Truth(SECOND_NOTHING, "lag", second=SecondCase("ordinary/aim", 5, 0)), None, (0.9, 1.15)),
     ],
-    ids=["undone", "not named", "another shape", "nothing", "nothing, elsewhere"],
+    ids=["undone", "not named", "another shape", "nothing", "nothing, on the second bench"],
 )
 def test_offsets_are_held_against_the_truth_in_bounds(
     truth: Truth, named: Drawn | None, before: tuple[float, float], tmp_path: Path
@@ -481,7 +557,7 @@ def test_offsets_are_held_against_the_truth_in_bounds(
         write_json(made.folder / "diagnosis.json", {"verdict": "explained", "causes": causes})
     correct.run(run_dir, correct.Config(), SYNC)
     found = offset_errors(
-        run_dir / "products", folder / "case-0001", truth, examination.bench(0)
+        run_dir / "products", folder / "case-0001", truth, examination.bench(0), LAYOUTS["tiny"]
     )  # fmt: skip
     assert [one.axis for one in found] == ["x", "y"]
     worst = max(one.before for one in found)
@@ -492,91 +568,6 @@ def test_offsets_are_held_against_the_truth_in_bounds(
             assert one.after == one.before
         else:
             assert 0.9 < one.after < 1.15
-
-
-# Frames made elsewhere.
-
-
-@pytest.fixture(scope="module")
-def flat() -> Recording:
-    """Flats of a bench without noise of the pixels."""
-    layout = LAYOUTS["small"]
-    bench = draw_bench(layout, np.random.default_rng(2))
-    quiet = replace(bench.detector, prnu_rms=0.0, hot_fraction=0.0, read_noise_e=0.0)
-    bench = replace(bench, detector=replace(quiet, gain_e_per_adu=1.0, bias_pixel_rms_adu=0.0))
-    return next(r for r in recordings(bench) if r.kind == "flat" and r.number == 2)
-
-
-def exposed(made: Elsewhere, recording: Recording, count: int) -> Any:
-    shape = recording.bench.detector.shape
-    camera = made.camera(recording.bench, (0, shape[0]), ())
-    return np.stack([s for _, s in camera.expose(recording, range(count))]).astype(float)
-
-
-def test_frames_of_the_other_simulator_have_shot_noise_and_fringes(flat: Recording) -> None:
-    frames = exposed(Elsewhere(), flat, 20)
-    mean = flat.electrons
-    bias = frames.mean(axis=0) - mean
-    assert frames.var(axis=0, ddof=1).mean() == pytest.approx(mean, rel=0.02)
-    assert np.median(bias) == pytest.approx(flat.bench.detector.bias_adu, abs=3 * 12 + 12)
-    scan = next(r for r in recordings(flat.bench) if r.kind == "fringes")
-    one = exposed(Elsewhere(), scan, 1)[0]
-    power = np.abs(np.fft.fft(one - one.mean(), axis=1)).mean(axis=0)[1 : one.shape[1] // 2]
-    pitch = flat.bench.detector.pitch_um * 1e-3
-    spacing = 632.8e-6 * 400 / (scan.bench.frames.fringes[0].baseline_mm[0] * pitch)
-    assert one.shape[1] / (np.argmax(power) + 1) == pytest.approx(spacing, rel=0.1)
-
-
-def test_the_other_simulator_does_not_mind_how_rows_are_cut(flat: Recording) -> None:
-    made = Elsewhere("lag", 0.01)
-    whole = exposed(made, flat, 4)
-    for rows in ((0, 40), (40, 61)):
-        camera = made.camera(flat.bench, rows, ())
-        (own,) = [s for _, s in camera.expose(flat, range(3, 4))]
-        assert np.array_equal(own, whole[3, slice(*rows)])
-
-
-def test_what_galsim_does_is_what_the_library_means(flat: Recording) -> None:
-    """Sizes of GalSim's effects in the frames, against those of the library's own."""
-    plain = exposed(Elsewhere(), flat, 40)
-    light = flat.electrons
-    bent = exposed(Elsewhere("nonlinearity", 0.02), flat, 40)
-    assert (bent - plain).mean() == pytest.approx(-0.02 * light**2 / 50_000, rel=0.02)
-
-    late = exposed(Elsewhere("lag", 0.01), flat, 40)
-    assert (late - plain)[0].mean() == pytest.approx(-0.01 * light, rel=0.02)
-    assert (late - plain)[2:].mean() == pytest.approx(0, abs=2)
-
-    coarse = exposed(Elsewhere("quantisation", 3.0), flat, 2)
-    assert np.all(coarse % 4 == 0)
-
-    coupled = exposed(Elsewhere("ipc", 0.01), flat, 1)[0]
-    own = couple(
-        (exposed(Elsewhere(), flat, 1)[0] - _bias(flat)).astype(np.float32),
-        [Coupling(dy, 0, 0.01) for dy in (-1, 1)] + [Coupling(0, dx, 0.005) for dx in (-1, 1)],
-        (0, 0),
-    )
-    assert np.abs(coupled - _bias(flat) - own)[1:-1, 1:-1].max() < 2
-
-    moved = exposed(Elsewhere("brighter_fatter", 1e-6), flat, 40)
-    loss = plain.var(axis=0, ddof=1).mean() - moved.var(axis=0, ddof=1).mean()
-    # A pixel's four boundaries move by the charge on either side: 4 px/e- times the mean squared.
-    assert loss == pytest.approx(8 * 1e-6 * light**2, rel=0.25)
-
-
-def _bias(recording: Recording) -> Any:
-    camera = Elsewhere().camera(recording.bench, (0, recording.bench.detector.shape[0]), ())
-    return camera.pixels.bias
-
-
-def test_galsim_that_is_missing_is_named(flat: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
-    def missing(name: str) -> None:
-        raise ImportError(name)
-
-    monkeypatch.setattr("pixcal.stages.blind.elsewhere.importlib.import_module", missing)
-    for effect in FOREIGN:
-        with pytest.raises(InputError, match="pip install galsim"):
-            exposed(Elsewhere(effect, 0.01), flat, 2)
 
 
 # A whole examination, so that the diagnosis cannot rot.
@@ -590,7 +581,12 @@ def test_strong_effects_are_found_and_nothing_is_claimed(tmp_path: Path) -> None
         Truth(ONE, "lag", (KERNEL,)),
         Truth(NOTHING, "ipc"),
         Truth(LEFT_OUT, "row_noise", (rows,)),
-        Truth(ELSEWHERE, "ipc", (Drawn("lag", "", 0.01, 9.0, {}),), elsewhere=True),
+        Truth(
+            SECOND_ONE,
+            "ipc",
+            (Drawn("lag", "", 0.01, None, {}),),
+            second=SecondCase("lag/linear", 3, 0.85),
+        ),
     )
     folder, sealed = tmp_path / "exam", tmp_path / "truth.json"
     write_examination(folder, sealed, Examination(12, "tiny", truths), SYNC)

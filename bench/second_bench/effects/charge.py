@@ -103,7 +103,7 @@ def exponentials(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     return {"shares": [size * share, size * (1 - share)], "frames": frames.tolist()}
 
 
-@law("lag", "traps", 20, 800, "e- that traps hold", varied_phases=True)
+@law("lag", "traps", 20, 800, "e- that traps hold", varied_phases=True, needs="pyxel")
 def traps(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     """Traps that fill up, by Pyxel's model of persistence."""
     from pyxel.models.charge_collection.utils_persistence import (

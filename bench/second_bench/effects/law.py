@@ -31,6 +31,8 @@ class Law:
         Whether frames of the bench can show it at all.
     varied_phases : bool
         Whether it shows only where the phase step differs from frame to frame.
+    needs : str
+        Package that it needs beside HCIPy and GalSim.
     """
 
     effect: str
@@ -42,18 +44,19 @@ class Law:
     known: bool = True
     decidable: bool = True
     varied_phases: bool = False
+    needs: str = ""
 
 
 LAWS: list[Law] = []
 
 
 def law(
-    effect: str, name: str, weak: float, strong: float, unit: str, **flags: bool
+    effect: str, name: str, weak: float, strong: float, unit: str, **more: Any
 ) -> Callable[[Apply], Apply]:
     """Enter a law into `LAWS`."""
 
     def entered(apply: Apply) -> Apply:
-        LAWS.append(Law(effect, name, weak, strong, unit, apply, **flags))
+        LAWS.append(Law(effect, name, weak, strong, unit, apply, **more))
         return apply
 
     return entered

@@ -10,7 +10,10 @@ from second_bench.model import F64, Bench, Frame
 _Drawn = dict[str, Any]
 
 
-@law("charge_transfer", "traps", 150, 5000, "e- that the traps of a column hold", known=False)
+@law(
+    "charge_transfer", "traps", 150, 5000, "e- that the traps of a column hold",
+    known=False, needs="pyxel",
+)  # fmt: skip
 def charge_transfer(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     """Charge that traps take on its way to the output, and give back behind it.
 

@@ -23,9 +23,9 @@ from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import Camera
 from pixcal.stages.blind.benches import LAYOUTS
 from pixcal.stages.blind.draw import Examination, Truth, draw_examination
-from pixcal.stages.blind.elsewhere import Elsewhere
 from pixcal.stages.blind.paper import EXAMINATION, case_name, write_paper
 from pixcal.stages.blind.seal import write_seal
+from pixcal.stages.blind.second import record_second
 from pixcal.stages.simulate import acquire
 from pixcal.storage.artefact import digest, lock
 
@@ -45,11 +45,14 @@ class MakeConfig:
         Without one it is drawn, and nobody can guess it.
     size : str
         ``small`` or ``standard``.
+    bench : str
+        Whose cases: ``second``, ``own`` or ``both``.
     """
 
     cases: int
     seed: int | None = None
     size: str = "small"
+    bench: str = "both"
 
 
 def make(out: Path, sealed: Path, config: MakeConfig, runtime: Runtime) -> Examination:
@@ -71,7 +74,7 @@ def make(out: Path, sealed: Path, config: MakeConfig, runtime: Runtime) -> Exami
     """
     _check(out, sealed, config)
     seed = EXAMINATION + secrets.randbelow(MOST_SEED) if config.seed is None else config.seed
-    examination = draw_examination(config.cases, seed, config.size)
+    examination = draw_examination(config.cases, seed, config.size, config.bench)
     write_examination(out, sealed, examination, runtime)
     return examination
 
@@ -84,7 +87,7 @@ def write_examination(out: Path, sealed: Path, examination: Examination, runtime
     aside = out.with_name(partial_ones + key)
     with lock(aside):
         items = list(zip(range(len(benches)), benches, examination.truths, strict=True))
-        run_tasks(partial(_case, aside), items, runtime, label="cases")
+        run_tasks(partial(_case, aside, examination.size), items, runtime, label="cases")
         made = _copied(aside, [case_name(n) for n in range(len(benches))])
         write_paper(made, examination, write_seal(sealed, examination, benches))
         _same_times(made)
@@ -105,20 +108,19 @@ def _check(out: Path, sealed: Path, config: MakeConfig) -> None:
         raise InputError(f"--sealed {sealed}: inside {out}; keep the truth apart from the cases")
 
 
-def _case(folder: Path, item: tuple[int, Bench, Truth]) -> None:
+def _case(folder: Path, size: str, item: tuple[int, Bench, Truth]) -> None:
     number, bench, truth = item
     final = folder / case_name(number)
     if final.exists():
         return
     made = folder / f".{final.name}.aside"
     shutil.rmtree(made, ignore_errors=True)
-    made.mkdir(parents=True)
-    here = Runtime(cluster="sync")
-    if truth.elsewhere:
-        foreign = [Elsewhere(d.effect, d.strength) for d in truth.drawn] or [Elsewhere()]
-        acquire(bench, (), made, here, foreign[0].camera)
+    if truth.second is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        record_second(truth.second, LAYOUTS[size], made)
     else:
-        acquire(bench, effects_of(truth, bench), made, here, Camera)
+        made.mkdir(parents=True)
+        acquire(bench, effects_of(truth, bench), made, Runtime(cluster="sync"), Camera)
     made.rename(final)
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -10,23 +9,31 @@ import numpy as np
 from pixcal.effects import effects
 from pixcal.model.bench import Bench
 from pixcal.stages.blind.benches import LAYOUTS, draw_bench
-from pixcal.stages.blind.elsewhere import FOREIGN, galsim_is_there
+from pixcal.stages.blind.second import SecondCase, SecondLaw, catalogue
 from pixcal.stages.blind.strengths import STRONGEST, Way, ways_of
 
-ONE, NOTHING, SEVERAL, LEFT_OUT, ELSEWHERE = range(1, 6)
+ONE, NOTHING, SEVERAL, LEFT_OUT, SECOND_ONE, SECOND_NOTHING, SECOND_PAIR, SECOND_OTHER = range(1, 9)
 PARTS = {
-    ONE: "one effect",
-    NOTHING: "nothing",
-    SEVERAL: "two or three effects",
-    LEFT_OUT: "the effect is no candidate",
-    ELSEWHERE: "somebody else's effects",
+    SECOND_ONE: "second bench: one effect",
+    SECOND_NOTHING: "second bench: an ordinary bench",
+    SECOND_PAIR: "second bench: two effects",
+    SECOND_OTHER: "second bench: an effect that pixcal does not know",
+    ONE: "self-check: one effect",
+    NOTHING: "self-check: nothing",
+    SEVERAL: "self-check: two or three effects",
+    LEFT_OUT: "self-check: the effect is no candidate",
 }
-SHARES = {ONE: 0.4, NOTHING: 0.15, SEVERAL: 0.15, LEFT_OUT: 0.15, ELSEWHERE: 0.15}
-"""Of the cases."""
+"""In the order of the table."""
+SECOND = (SECOND_ONE, SECOND_NOTHING, SECOND_PAIR, SECOND_OTHER)
+SHARES = {
+    "second": {SECOND_ONE: 0.55, SECOND_NOTHING: 0.25, SECOND_PAIR: 0.1, SECOND_OTHER: 0.1},
+    "own": {ONE: 0.5, NOTHING: 0.16, SEVERAL: 0.17, LEFT_OUT: 0.17},
+}
+"""Of the cases of each bench; both have as many."""
+VISIBLE = 0.3
+"""Least strength of the second bench's effects; 0 is barely visible."""
 CLEAR = 2.0
 """Times the threshold that effects are at least, but for part 1, which begins at the threshold."""
-OTHERS_OF_NOTHING = 3
-"""Every third case without an effect is made by the other simulator."""
 
 _TRUTH, _BENCH = 1, 2
 
@@ -38,16 +45,17 @@ class Drawn:
     Attributes
     ----------
     effect, way : str
-    strength, times : float
-        And how many times the threshold that is.
+    strength : float
+    times : float or None
+        How many times the threshold that is; nobody knows that of the second bench.
     parameters : dict
-        Of the library's effect; of somebody else's those that mean the same.
+        Of the library's effect.
     """
 
     effect: str
     way: str
     strength: float
-    times: float
+    times: float | None
     parameters: dict[str, Any]
 
 
@@ -61,14 +69,14 @@ class Truth:
     left_out : str
         Effect that is no candidate.
     drawn : tuple of Drawn
-    elsewhere : bool
-        Whether the other simulator makes the frames.
+    second : SecondCase, optional
+        What the second bench is asked for, where it makes the frames.
     """
 
     part: int
     left_out: str
     drawn: tuple[Drawn, ...] = ()
-    elsewhere: bool = False
+    second: SecondCase | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -99,7 +107,7 @@ class Examination:
         return draw_bench(LAYOUTS[self.size], rng)
 
 
-def draw_examination(cases: int, seed: int, size: str) -> Examination:
+def draw_examination(cases: int, seed: int, size: str, bench: str = "both") -> Examination:
     """Draw the truth of all cases.
 
     Parameters
@@ -108,12 +116,26 @@ def draw_examination(cases: int, seed: int, size: str) -> Examination:
     seed : int
     size : str
         One of `LAYOUTS`.
+    bench : str
+        Whose cases: ``second``, ``own`` or ``both``.
+
+    Raises
+    ------
+    InputError
+        If the second bench is wanted and cannot be run.
     """
     rng = np.random.default_rng([seed, _TRUTH])
-    there = galsim_is_there()
-    notes = () if there else ("GalSim is not installed: part 5 is left out",)
-    counts = _counts(cases, {p: s for p, s in SHARES.items() if p != ELSEWHERE or there})
-    truths = [truth for part, count in counts.items() for truth in _part(part, count, size, rng)]
+    absent = catalogue()[2] if bench != "own" else ()
+    notes = tuple(f"{name} is not installed: laws that need it are left out" for name in absent)
+    shares: dict[int, float] = {}
+    for whose, own in SHARES.items():
+        if bench in (whose, "both"):
+            shares |= own
+    truths = [
+        truth
+        for part, count in _counts(cases, shares).items()
+        for truth in (_second if part in SECOND else _part)(part, count, size, rng)
+    ]
     order = rng.permutation(len(truths))
     return Examination(seed, size, tuple(truths[n] for n in order), notes)
 
@@ -130,22 +152,42 @@ def _counts(cases: int, shares: dict[int, float]) -> dict[int, int]:
 
 
 def _part(part: int, count: int, size: str, rng: np.random.Generator) -> Iterator[Truth]:
-    names = list(FOREIGN if part == ELSEWHERE else ways_of())
-    turns = _turns(names, rng)
+    turns = _turns(list(ways_of()), rng)
     for number in range(count):
         if part == NOTHING:
-            other = number % OTHERS_OF_NOTHING == OTHERS_OF_NOTHING - 1
-            yield Truth(part, _innocent((), rng), elsewhere=other)
+            yield Truth(part, _innocent((), rng))
             continue
         many = 1 if part != SEVERAL else 3 if number % 3 == 2 else 2
         chosen = _distinct(turns, many)
         least = 1.0 if part == ONE else CLEAR
-        if part == ELSEWHERE:
-            drawn = [_foreign(name, size, rng) for name in chosen]
-        else:
-            drawn = [_drawn(_any(ways_of()[name], rng), size, least, rng) for name in chosen]
+        drawn = [_drawn(_any(ways_of()[name], rng), size, least, rng) for name in chosen]
         left_out = chosen[0] if part == LEFT_OUT else _innocent(chosen, rng)
-        yield Truth(part, left_out, tuple(drawn), part == ELSEWHERE)
+        yield Truth(part, left_out, tuple(drawn))
+
+
+def _second(part: int, count: int, _size: str, rng: np.random.Generator) -> Iterator[Truth]:
+    """Cases of the second bench: effects in turn, and of each a law that frames can show."""
+    variations, laws, _ = catalogue()
+    of: dict[str, list[SecondLaw]] = {}
+    for law in laws:
+        if law.decidable and law.known == (part != SECOND_OTHER):
+            of.setdefault(law.effect, []).append(law)
+    turns, others = _turns(list(of), rng), _turns([f"ordinary/{v}" for v in variations], rng)
+    for number in range(count):
+        seed, strength = int(rng.integers(1 << 40)), float(rng.uniform(VISIBLE, 1))
+        if part == SECOND_NOTHING:
+            # Half of them differ in everything at once.
+            case = next(others) if number % 2 else "ordinary"
+            yield Truth(part, _innocent((), rng), second=SecondCase(case, seed, strength))
+            continue
+        chosen = _distinct(turns, 2 if part == SECOND_PAIR else 1)
+        own = [of[name][int(rng.integers(len(of[name])))] for name in chosen]
+        drawn = tuple(
+            Drawn(one.effect, f"{one.name}, {one.unit}", one.size(strength), None, {})
+            for one in own
+        )
+        case = "+".join(f"{one.effect}/{one.name}" for one in own)
+        yield Truth(part, _innocent(chosen, rng), drawn, SecondCase(case, seed, strength))
 
 
 def _turns(names: list[str], rng: np.random.Generator) -> Iterator[str]:
@@ -176,18 +218,3 @@ def _drawn(way: Way, size: str, least: float, rng: np.random.Generator) -> Drawn
     strength = times * way.threshold(size)
     made = way.make(strength, rng)
     return Drawn(way.effect, way.strength, strength, times, made)
-
-
-@cache
-def _foreign_ways() -> dict[str, Way]:
-    """The way of the library's own that each effect of GalSim is measured against."""
-    return {name: ways_of()[name][0] for name in FOREIGN}
-
-
-def _foreign(name: str, size: str, rng: np.random.Generator) -> Drawn:
-    way = _foreign_ways()[name]
-    times = float(np.exp(rng.uniform(np.log(CLEAR), np.log(STRONGEST))))
-    strength = times * way.threshold(size)
-    if name == "quantisation":
-        strength = float(np.ceil(strength))
-    return Drawn(name, f"GalSim {FOREIGN[name]}", strength, times, {})

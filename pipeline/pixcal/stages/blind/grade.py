@@ -5,7 +5,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from pixcal.effects import effects
-from pixcal.stages.blind.draw import ELSEWHERE, LEFT_OUT, NOTHING, ONE, SEVERAL, Truth
+from pixcal.stages.blind.draw import (
+    LEFT_OUT,
+    NOTHING,
+    ONE,
+    SECOND_NOTHING,
+    SECOND_ONE,
+    SECOND_OTHER,
+    SECOND_PAIR,
+    SEVERAL,
+    Truth,
+)
 from pixcal.stages.blind.offsets import AxisError
 from pixcal.stages.blind.parameters import held
 
@@ -80,11 +90,14 @@ class Grade:
 
 
 QUESTIONS = {
+    SECOND_ONE: ("named first", "nothing else named", "explained"),
+    SECOND_NOTHING: ("no gap", "no cause claimed"),
+    SECOND_PAIR: ("all found, none invented", "all found", "none invented"),
+    SECOND_OTHER: ("honest", "not called explained", "nobody blamed for most"),
     ONE: ("named first",),
     NOTHING: ("no cause claimed", "no gap"),
     SEVERAL: ("all found, none invented", "all found", "none invented"),
     LEFT_OUT: ("honest", "not called explained", "nobody blamed for most", "right domain"),
-    ELSEWHERE: ("named first",),
 }
 """Of each part; the first one decides."""
 
@@ -102,7 +115,7 @@ def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "")
         Why it could not.
     """
     way = ", ".join(f"{d.effect}: {d.way} {d.strength:.3g}" for d in truth.drawn)
-    times = min((d.times for d in truth.drawn), default=None)
+    times = min((d.times for d in truth.drawn if d.times is not None), default=None)
     about = (case, truth.part, truth.names, way, times, truth.left_out)
     if diagnosis is None:
         marks = dict.fromkeys(QUESTIONS[truth.part], False)
@@ -112,7 +125,7 @@ def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "")
     marks = dict(zip(QUESTIONS[truth.part], answers, strict=True))
     why = "" if answers[0] else _why(truth, diagnosis, named)
     closed = 1 - float(diagnosis["gap"]["after"]) if named else None
-    parameters = () if truth.elsewhere else tuple(_parameters(truth, diagnosis))
+    parameters = () if truth.second else tuple(_parameters(truth, diagnosis))
     return Grade(
         *about, diagnosis["verdict"], named, marks, why,
         claims=tuple(_claim(cause) for cause in diagnosis["causes"]),
@@ -130,16 +143,22 @@ def _place(one: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _answers(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> tuple[bool, ...]:
-    if truth.part in (ONE, ELSEWHERE):
+    verdict = diagnosis["verdict"]
+    if truth.part == ONE:
         return (named[:1] == truth.names,)
+    if truth.part == SECOND_ONE:
+        return named[:1] == truth.names, set(named) <= set(truth.names), verdict == "explained"
     if truth.part == NOTHING:
-        return not named, diagnosis["verdict"] == "no gap"
-    if truth.part == SEVERAL:
+        return not named, verdict == "no gap"
+    if truth.part == SECOND_NOTHING:
+        return verdict == "no gap", not named
+    if truth.part in (SEVERAL, SECOND_PAIR):
         found, invented = set(truth.names) <= set(named), set(named) - set(truth.names)
         return found and not invented, found, not invented
-    honest = diagnosis["verdict"] in ("unexplained", "partly explained")
+    honest = verdict in ("unexplained", "partly explained")
     blamed = any(cause["gap_closed"] > BLAMED for cause in diagnosis["causes"])
-    return honest and not blamed, honest, not blamed, _domain_seen(truth, diagnosis)
+    asked = honest and not blamed, honest, not blamed
+    return asked if truth.part == SECOND_OTHER else (*asked, _domain_seen(truth, diagnosis))
 
 
 def _domain_seen(truth: Truth, diagnosis: Diagnosis) -> bool:
@@ -174,12 +193,15 @@ def _parameters(truth: Truth, diagnosis: Diagnosis) -> list[dict[str, Any]]:
 def _why(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> str:
     """What a wrong answer comes from, as far as the diagnosis tells."""
     reasons = []
-    if truth.part == NOTHING:
-        return "; ".join(
-            f"{c['effect']} claimed (p = {c['p_value']:.1e}, closes {c['gap_closed']:.2f})"
-            for c in diagnosis["causes"]
+    if truth.part in (NOTHING, SECOND_NOTHING):
+        return (
+            "; ".join(
+                f"{c['effect']} claimed (p = {c['p_value']:.1e}, closes {c['gap_closed']:.2f})"
+                for c in diagnosis["causes"]
+            )
+            or f"verdict {diagnosis['verdict']!r}"
         )
-    if truth.part == LEFT_OUT:
+    if truth.part in (LEFT_OUT, SECOND_OTHER):
         blamed = [c for c in diagnosis["causes"] if c["gap_closed"] > BLAMED]
         reasons = [f"{c['effect']} blamed for {c['gap_closed']:.2f} of the gap" for c in blamed]
         return "; ".join(reasons) or f"verdict {diagnosis['verdict']!r}"

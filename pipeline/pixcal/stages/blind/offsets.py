@@ -16,9 +16,10 @@ from pixcal.estimators.gauge import fringe_modes
 from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import Camera
+from pixcal.stages.blind.benches import Layout
 from pixcal.stages.blind.cases import effects_of
 from pixcal.stages.blind.draw import Truth
-from pixcal.stages.blind.elsewhere import pixels_of
+from pixcal.stages.blind.second import second_offsets
 from pixcal.stages.compare.sides import PART_OF, fitted_shape
 from pixcal.storage.artefact import read_json
 from pixcal.storage.products import read_map
@@ -60,17 +61,16 @@ class AxisError:
         return self.before > BIASED
 
 
-def true_offsets(truth: Truth, bench: Bench) -> tuple[F64, F64]:
+def true_offsets(truth: Truth, bench: Bench, layout: Layout) -> tuple[F64, F64]:
     """True offsets (y, x) along x and y, px, of the simulator that made the case."""
-    if truth.elsewhere:
-        pixels = pixels_of(bench)
-        return pixels.delta_x, pixels.delta_y
+    if truth.second is not None:
+        return second_offsets(truth.second, layout)
     maps = Camera(bench, (0, bench.detector.shape[0]), effects_of(truth, bench)).maps
     return np.asarray(maps.delta_x, float), np.asarray(maps.delta_y, float)
 
 
 def offset_errors(
-    products: Path, acquisition: Path, truth: Truth, bench: Bench
+    products: Path, acquisition: Path, truth: Truth, bench: Bench, layout: Layout
 ) -> tuple[AxisError, ...]:
     """Errors of the maps of a case.
 
@@ -83,6 +83,8 @@ def offset_errors(
     truth : Truth
     bench : Bench
         Of the case.
+    layout : Layout
+        Of its examination.
 
     Raises
     ------
@@ -96,7 +98,7 @@ def offset_errors(
     described = load_acquisition(acquisition)
     corrected: Sets = {name: facts["fit"] for name, facts in correction["sets"].items()}
     found = []
-    for n, (axis, true) in enumerate(zip(AXES, true_offsets(truth, bench), strict=True)):
+    for n, (axis, true) in enumerate(zip(AXES, true_offsets(truth, bench, layout), strict=True)):
         product = products / f"delta_{axis}.fits"
         if not product.is_file():
             continue

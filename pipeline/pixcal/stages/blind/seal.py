@@ -17,7 +17,7 @@ from pixcal.model.errors import InputError
 from pixcal.stages.blind.draw import Examination
 from pixcal.storage.artefact import read_json, write_json
 
-SCHEMA = "pixcal/blind-truth/1"
+SCHEMA = "pixcal/blind-truth/2"
 
 
 @dataclass(frozen=True)

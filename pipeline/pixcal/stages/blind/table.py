@@ -5,19 +5,33 @@ from pathlib import Path
 from typing import Any
 
 from pixcal.model.errors import InputError
+from pixcal.stages.blind.draw import PARTS, SECOND
 
 Plain = Mapping[str, Any]
 
 
 def as_markdown(score: Plain) -> str:
-    """Tables of a score: parts, part 1 by effect, confusion, failures."""
+    """Tables of a score: the second bench, then pixcal's own draws, confusion, failures."""
     wrong = [case for case in score["cases"] if not case["right"]]
-    blocks = [
-        _about(score),
-        _parts(score["parts"]),
-        _medians(score["medians"]),
-        _maps(score["maps"]),
-        _effects(score["effects"]),
+    second = {p: facts for p, facts in score["parts"].items() if int(p) in SECOND}
+    own = {p: facts for p, facts in score["parts"].items() if int(p) not in SECOND}
+    blocks = [_about(score)]
+    if second:
+        blocks += [
+            "**The second bench**, which shares no code with pixcal:",
+            _parts(second),
+            _maps(score["second"]["maps"]),
+            _second_effects(score["second"]["effects"]),
+        ]
+    if own:
+        blocks += [
+            "**Self-check**: cases of pixcal's own simulator, which its diagnosis uses too:",
+            _parts(own),
+            _medians(score["medians"]),
+            _maps(score["maps"]),
+            _effects(score["effects"]),
+        ]
+    blocks += [
         "Named first, by what was in the data (alone in it, and a candidate):",
         _confusion(score["confusion"]),
         _failures(wrong) if wrong else "No case was answered wrong.",
@@ -48,9 +62,10 @@ def _about(score: Plain) -> str:
 
 def _parts(parts: Mapping[str, Plain]) -> str:
     rows = []
-    for part, facts in parts.items():
+    for facts in parts.values():
+        name = facts["title"].partition(": ")[2]
         for question, count in facts["questions"].items():
-            name, right = f"{part}: {facts['title']}", f"{count['right']} of {count['of']}"
+            right = f"{count['right']} of {count['of']}"
             rows.append((name, question, right, *_percent(count), *_target(count)))
     header = ("part", "question", "right", "share", "95 % interval", "target", "reached")
     return _table(header, rows)
@@ -75,14 +90,14 @@ def _target(count: Plain) -> tuple[str, str]:
 def _medians(medians: Mapping[str, float | None]) -> str:
     names = {"closed": "share of the gap closed", "oracle": "by the true effects"}
     known = [f"{names[n]} {v:.3g}" for n, v in medians.items() if v is not None]
-    return f"Medians of part 1: {', '.join(known)}." if known else ""
+    return f"Medians of the cases of one effect: {', '.join(known)}." if known else ""
 
 
 def _maps(maps: Plain) -> str:
     """Errors of the offsets, in Cramér-Rao bounds."""
     if not maps["all"]["maps"]:
         return ""
-    titles = {"all": "all of part 1", "biased": "those that the effect biases"}
+    titles = {"all": "all cases of one effect", "biased": "those that the effect biases"}
     rows = []
     for which, title in titles.items():
         own = maps[which]
@@ -116,8 +131,22 @@ def _effects(effects: Mapping[str, Plain]) -> str:
         closed = "" if own["closed"] is None else f"{own['closed']:.2f}"
         rows.append((name, *counts, closed, *(_before_after(o) for o in own["offsets"].values())))
     header = (
-        "part 1", "named first below twice the threshold", "from there", "gap closed, median",
+        "one effect", "named first below twice the threshold", "from there", "gap closed, median",
         "error along x, bounds", "along y",
+    )  # fmt: skip
+    return _table(header, rows)
+
+
+def _second_effects(effects: Mapping[str, Plain]) -> str:
+    if not effects:
+        return ""
+    rows = []
+    for name, own in effects.items():
+        right = f"{own['right']['right']} of {own['right']['of']}"
+        closed = "" if own["closed"] is None else f"{own['closed']:.2f}"
+        rows.append((name, right, closed, *(_before_after(o) for o in own["offsets"].values())))
+    header = (
+        "one effect", "named first", "gap closed, median", "error along x, bounds", "along y",
     )  # fmt: skip
     return _table(header, rows)
 
@@ -139,7 +168,7 @@ def _failures(wrong: Sequence[Plain]) -> str:
     rows = [
         (
             case["case"],
-            case["part"],
+            PARTS[case["part"]],
             case["way"] or "nothing",
             "" if case["times"] is None else f"{case['times']:.1f}",
             ", ".join(_claimed(one) for one in case["claims"]) or case["verdict"],

@@ -1,0 +1,135 @@
+"""Cases of the second bench, which shares no code with pixcal and runs as a program of its own."""
+
+import importlib.util
+import json
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.model.errors import InputError
+from pixcal.stages.blind.benches import Layout
+
+F64 = NDArray[np.float64]
+
+PROGRAM = "second_bench"
+NEEDED = ("hcipy", "galsim")
+BIAS, FLATS = 40, 40
+"""Frames of a case, but for the smallest sizes, which have fewer."""
+INSTALL = "install them with 'pip install pixcal[second-bench]'"
+
+
+@dataclass(frozen=True)
+class SecondLaw:
+    """A law of an effect, as the second bench lists it.
+
+    Attributes
+    ----------
+    effect, name, unit : str
+    weak, strong : float
+        Sizes at strengths 0 and 1.
+    known, decidable : bool
+        Whether pixcal has the effect, and whether frames can show it.
+    needs : str
+        A package.
+    """
+
+    effect: str
+    name: str
+    weak: float
+    strong: float
+    unit: str
+    known: bool
+    decidable: bool
+    needs: str
+
+    def size(self, strength: float) -> float:
+        """Size of the effect, in its unit."""
+        return float(self.weak * (self.strong / self.weak) ** strength)
+
+
+@dataclass(frozen=True)
+class SecondCase:
+    """What the second bench is asked for.
+
+    Attributes
+    ----------
+    case : str
+    seed : int
+    strength : float
+        From 0 to 1.
+    """
+
+    case: str
+    seed: int
+    strength: float
+
+
+def _there(package: str) -> bool:
+    return not package or importlib.util.find_spec(package) is not None
+
+
+def missing() -> list[str]:
+    """Packages that the second bench needs and that are not installed."""
+    return [name for name in (PROGRAM, *NEEDED) if not _there(name)]
+
+
+@cache
+def catalogue() -> tuple[tuple[str, ...], tuple[SecondLaw, ...], tuple[str, ...]]:
+    """Variations of ordinary benches, laws that can be made here, and packages that others need.
+
+    Raises
+    ------
+    InputError
+        If the second bench cannot be run.
+    """
+    if missing():
+        raise InputError(
+            f"the second bench needs {', '.join(missing())}; {INSTALL}, or say --bench own"
+        )
+    told = json.loads(_asked("--list", "--json"))
+    laws = [SecondLaw(**facts) for facts in told["laws"]]
+    absent = sorted({law.needs for law in laws if not _there(law.needs)})
+    return tuple(told["variations"]), tuple(n for n in laws if n.needs not in absent), tuple(absent)
+
+
+def _asked(*line: str | Path) -> str:
+    """What the program prints."""
+    command = [sys.executable, "-m", PROGRAM, *map(str, line)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        told = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise InputError(f"the second bench failed: {told}")
+    return done.stdout
+
+
+def _options(case: SecondCase, layout: Layout) -> Sequence[str]:
+    many = min(FLATS, layout.frames // 2)
+    return (
+        case.case, "--seed", str(case.seed), "--strength", str(case.strength),
+        "--size", str(layout.shape[0]), str(layout.shape[1]), "--frames", str(layout.frames),
+        "--bias", str(min(BIAS, many)), "--flats", str(many),
+    )  # fmt: skip
+
+
+def record_second(case: SecondCase, layout: Layout, out: Path) -> None:
+    """Record a case into a folder that is not there yet."""
+    with tempfile.TemporaryDirectory(prefix="pixcal-second-") as scratch:
+        truth = Path(scratch) / "truth.json"
+        _asked(*_options(case, layout), "--out", out, "--truth", truth)
+
+
+def second_offsets(case: SecondCase, layout: Layout) -> tuple[F64, F64]:
+    """True offsets (y, x) of a case along x and y, px."""
+    with tempfile.TemporaryDirectory(prefix="pixcal-second-") as scratch:
+        truth = Path(scratch) / "truth.json"
+        _asked(*_options(case, layout), "--truth", truth)
+        told: dict[str, Any] = json.loads(truth.read_text())
+    return np.asarray(told["delta_x"], float), np.asarray(told["delta_y"], float)
