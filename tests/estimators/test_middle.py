@@ -29,7 +29,7 @@ def evidence() -> Evidence:
     )  # fmt: skip
     stack = Stack("dark", 0.5, np.arange(4.0), RNG.random((4, NY, NX)).astype(np.float32))
     return Evidence(
-        {"set": fringes}, (stack,), 1.0, 16.0, plane, plane, plane, plane > 0.1, 65535.0, 4.4,
+        {"set": fringes}, (stack,), 1.0, 16.0, 16.0, plane, plane, plane, plane > 0.1, 65535.0, 4.4,
         632.8, 400.0, origin=(10, 20),
     )  # fmt: skip
 

@@ -173,7 +173,7 @@ def _of_flats(evidence: Evidence, level_e: float) -> tuple[F64, F64] | None:
             times.append(stack.exptime_s)
             means.append(levels.mean())
             errors.append(levels.std(ddof=1) / np.sqrt(len(levels)))
-    if len(times) < MIN_RUNGS or min(means) <= 0:
+    if len(times) < MIN_RUNGS or min(means) <= 0 or not evidence.dithered:
         return None
     time, mean = np.array(times), np.array(means)
     information = (mean / np.array(errors)) ** 2

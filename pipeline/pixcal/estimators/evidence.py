@@ -20,6 +20,8 @@ STRIPE = 4
 """Rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves."""
 SATURATED = 1e-3
 """Share of saturated samples from which flats tell nothing of levels and noise."""
+DITHER = 0.38
+"""Noise over a code from which means of rounded samples are right to 2 % of a code."""
 NO_SAMPLE = -(1 << 30)
 """Electrons that stand for a sample without weight."""
 
@@ -176,7 +178,9 @@ class Evidence:
     gain : float
         e-/ADU.
     read_noise : float
-        e- rms.
+        Of a sample, the rounding of the converter included; e- rms.
+    amplifier_noise : float
+        The same before rounding.
     bias, dark_rate, flat : (y, x) float64
         Calibration maps: ADU, e-/s, relative.
     good : (y, x) bool
@@ -196,6 +200,7 @@ class Evidence:
     stacks: tuple[Stack, ...]
     gain: float
     read_noise: float
+    amplifier_noise: float
     bias: F64
     dark_rate: F64
     flat: F64
@@ -239,6 +244,11 @@ class Evidence:
         sigma = np.sqrt(self.read_noise**2 + np.maximum(self.dark_rate, 0) * seconds)
         every = np.broadcast_to(sigma.astype(np.float32), rest.shape)
         return rest.astype(np.float32), every
+
+    @property
+    def dithered(self) -> bool:
+        """Whether the read noise spans so much of a code that means of dark samples are right."""
+        return self.amplifier_noise > DITHER * self.gain
 
     @property
     def ladder(self) -> tuple[Stack, ...]:

@@ -65,7 +65,9 @@ def _block_statistics(
                 mean = 0.5 * (first[y, x] + second[y, x])
                 sigma = math.sqrt(max(mean, 0.0) / gain + read_noise**2)
                 d = first[y, x] - second[y, x]
-                if abs(d - centre * sigma) <= clip * spread * sigma + quantum:
+                # The median deviation of whole numbers may be nothing.
+                limit = clip * math.sqrt((spread * sigma) ** 2 + quantum**2) + quantum
+                if abs(d - centre * sigma) <= limit:
                     n += 1
                     total += d
                     square += d * d

@@ -260,7 +260,8 @@ class Combination:
             sigma = np.full_like(sigma, self._sigma)
         sigma = np.maximum(sigma, np.float32(self._sigma))
         rounding = np.float32(self._quantum) + _ROUNDING * np.abs(self._reference)
-        self._limit = np.float32(self._clip) * sigma + rounding
+        # The median deviation of whole numbers may be nothing.
+        self._limit = np.float32(self._clip) * np.hypot(sigma, np.float32(self._quantum)) + rounding
         self._sums = np.zeros((6, *frames.shape[1:]))
 
     def _common(self, frames: F32) -> F32:

@@ -66,6 +66,7 @@ def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice
         stacks=_stacks(ingested, (y, x)),
         gain=float(used["gain_e_per_adu"]["used"]),
         read_noise=float(used["read_noise_e"]["used"]),
+        amplifier_noise=float(used["read_noise_e"]["before_rounding"]),
         bias=maps["bias"].astype(float),
         dark_rate=maps["dark_rate"].astype(float),
         flat=maps["flat"].astype(float),

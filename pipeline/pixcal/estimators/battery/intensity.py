@@ -59,9 +59,9 @@ def flat_ladder(evidence: Evidence) -> Curve | None:
         if np.isfinite(stack.exptime_s) and stack.exptime_s > 0:
             light = (stack.adu.mean(axis=0) - evidence.bias)[evidence.good] * evidence.gain
             dark = evidence.dark_rate[evidence.good] * stack.exptime_s
-            levels.append(float(np.median(light - dark)))
+            levels.append(float(np.mean(light - dark)))
             times.append(stack.exptime_s)
-    if len(levels) < 2:
+    if len(levels) < 2 or not evidence.dithered:
         return None
     rate = np.array(levels) / np.array(times)
     return Curve(np.array(times), rate / rate.mean() - 1)

@@ -111,7 +111,7 @@ def lines(look: Look) -> Curve:
 def _lines_of(kind: str) -> Statistic:
     def measured(evidence: Evidence) -> Curve | None:
         stacks = [s for s in evidence.of_kind(kind) if len(s.adu) >= 3]
-        if not stacks:
+        if not stacks or not evidence.dithered:
             return None
         values, weights = [], []
         for stack in stacks:
@@ -177,11 +177,11 @@ def pixel_peakedness(look: Look) -> Curve:
 def read_noise(evidence: Evidence) -> Curve | None:
     """Quantiles over all pixels of their variance over the read noise's."""
     stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= 8]
-    if not stacks:
+    if not stacks or not evidence.dithered:
         return None
-    frames = stacks[0].adu * np.float32(evidence.gain)
-    frames = frames - np.median(frames, axis=(1, 2), keepdims=True)
-    variance = np.var(frames, axis=0, ddof=1) / evidence.read_noise**2
+    # Of whole numbers a median jumps by a code.
+    frames = stacks[0].adu - stacks[0].adu[:, evidence.good].mean(axis=1)[:, None, None]
+    variance = np.var(frames, axis=0, ddof=1) * (evidence.gain / evidence.read_noise) ** 2
     return Curve(np.array(QUANTILES), np.quantile(variance, QUANTILES))
 
 

@@ -52,7 +52,7 @@ def bench_of(
             shape=(shape[0], shape[1]),
             pitch_um=d.pitch_um,
             gain_e_per_adu=evidence.gain,
-            read_noise_e=evidence.read_noise,
+            read_noise_e=evidence.amplifier_noise,
             name=d.name,
             chip=whole,
             origin_px=evidence.origin,
@@ -101,7 +101,7 @@ def recordings_of(
             exposure = float(exposures[numbers[0]])
             exposure = 0.0 if np.isnan(exposure) else exposure
             period = float(np.median(np.diff(times[numbers]))) if len(numbers) > 1 else exposure
-            electrons = 1.0
+            electrons = 1.0 if name in listed else 0.0
             if kind == "flat":
                 electrons = lamp * exposure if lamp and exposure else _level(evidence, exposure)
             recordings.append(
@@ -150,7 +150,7 @@ def _light(evidence: Evidence, stack: Stack) -> float:
     good = evidence.good & (evidence.flat > 0)
     light = (stack.adu.mean(axis=0) - evidence.bias)[good] * evidence.gain
     light = light - evidence.dark_rate[good] * np.nan_to_num(stack.exptime_s)
-    return float(np.median(light / evidence.flat[good]))
+    return float(light.mean() / evidence.flat[good].mean())
 
 
 def _top(

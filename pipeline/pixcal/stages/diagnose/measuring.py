@@ -12,6 +12,7 @@ from pixcal.estimators.evidence import Evidence, FringeEvidence
 from pixcal.estimators.pixel_read_noise import PixelNoise
 from pixcal.estimators.structure import smooth_surface
 from pixcal.kernels.processes import ramp_step
+from pixcal.kernels.rounding import level_before_rounding
 from pixcal.kernels.sample_sums import calm_residuals, pixel_moments
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.model.acquisition import Acquisition
@@ -43,6 +44,8 @@ NO_TEST = 10.0
 TWO_BEAMS = 2
 """Degree, over a window, of the logarithm of the contrast of two Gaussian beams (their intensities'
 ratio is the exponential of a quadratic form)."""
+CORE = 5.0
+"""Robust standard deviations within which the scatter of the dark signal may be noise."""
 
 
 def nominal_bench(
@@ -95,9 +98,9 @@ def nominal_bench(
         delta_x=np.zeros(good.shape, np.float32),
         delta_y=np.zeros(good.shape, np.float32),
         response=flat,
-        bias=_mean([e.bias for e in evidence]),
-        dark_rate=np.maximum(_mean([_uncoupled(e.dark_rate) for e in evidence]), 0),
-        read_noise=np.full(good.shape, one.read_noise, np.float32),
+        bias=_bias_before_rounding(evidence, dtypes),
+        dark_rate=_dark_rate(evidence, halves),
+        read_noise=np.full(good.shape, one.amplifier_noise, np.float32),
         gain=np.full(good.shape, one.gain, np.float32),
         mask=np.where(good, 0, 1).astype(np.uint8),
     )
@@ -112,7 +115,9 @@ def nominal_bench(
         dtypes,
         bench,
         Measured(maps, sets),
-        PixelNoise.of([s.adu for e in parts for s in e.of_kind("bias")], good),
+        PixelNoise.of([s.adu for e in parts for s in e.of_kind("bias")], good)
+        if one.dithered
+        else None,
         _gain(evidence, flat.astype(float), good, with_flats),
         fits,
         tuple(recordings),
@@ -129,6 +134,15 @@ def parted(name: str, halves: Sequence[Half]) -> bool:
 def _mean(maps: Sequence[F64]) -> F32:
     values = np.nan_to_num(np.mean(maps, axis=0), nan=1.0, posinf=1.0, neginf=1.0)
     return np.asarray(values, np.float32)
+
+
+def _bias_before_rounding(evidence: Sequence[Evidence], dtypes: Mapping[str, np.dtype[Any]]) -> F32:
+    """Bias (ADU) of the amplifier, whose rounded samples have the measured mean."""
+    mean = _mean([e.bias for e in evidence])
+    if any(dtype.kind == "f" for dtype in dtypes.values()):
+        return mean
+    noise = evidence[0].amplifier_noise / evidence[0].gain
+    return level_before_rounding(mean.astype(float), noise).astype(np.float32)
 
 
 def _response_of_fringes(evidence: Sequence[Evidence]) -> F32:
@@ -171,6 +185,32 @@ def _fitted(
         origin,
         flat,
     )
+
+
+def _dark_rate(evidence: Sequence[Evidence], halves: Sequence[Half]) -> F32:
+    """Dark signal, e-/s, whose scatter is lessened by what is noise; the simulation adds its own.
+
+    Of negative rates nothing would be left but a higher mean.
+    """
+    rate = _mean([_uncoupled(e.dark_rate) for e in evidence])
+    own = parted("bias", halves) and parted("dark", halves)
+    noise = _rate_variance(evidence[0]) / (len(evidence) if own else 1)
+    rest = rate - np.median(rate)
+    spread = 1.4826 * float(np.median(np.abs(rest)))
+    core = np.abs(rest) <= CORE * spread
+    true = np.sqrt(max(1 - noise / spread**2, 0.0)) if spread > 0 else 1.0
+    centre = rate[core].mean()
+    return np.maximum(np.where(core, centre + true * (rate - centre), rate), 0).astype(np.float32)
+
+
+def _rate_variance(evidence: Evidence) -> float:
+    """Variance of a pixel's dark signal by noise, (e-/s)²."""
+    stacks = [*evidence.of_kind("bias"), *evidence.of_kind("dark")]
+    times = np.array([np.nan_to_num(s.exptime_s) for s in stacks for _ in s.adu])
+    if not len(times) or np.ptp(times) == 0:
+        return 0.0
+    charge = float(np.median(np.maximum(evidence.dark_rate, 0))) * times.max()
+    return float((evidence.read_noise**2 + charge) / (len(times) * times.var()))
 
 
 def _uncoupled(dark: F64) -> F64:

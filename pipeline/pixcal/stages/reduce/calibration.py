@@ -4,7 +4,7 @@ First what is usual on the whole detector, then, column of chunks by column, the
 and the flags of the pixels that are not usual.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -68,8 +68,8 @@ class Usual:
     bias: float
 
 
-def usual(folder: Path, shape: tuple[int, int], gain: float) -> Usual:
-    """Medians of the maps that `measure` wrote, over at most a million pixels on a regular grid.
+def on_grid(folder: Path, shape: tuple[int, int], names: Sequence[str]) -> F64:
+    """Maps that `measure` wrote, (name, pixel), of at most a million pixels on a regular grid.
 
     Parameters
     ----------
@@ -77,23 +77,36 @@ def usual(folder: Path, shape: tuple[int, int], gain: float) -> Usual:
         Where the maps are.
     shape : (int, int)
         Of the detector's window (y, x).
-    gain : float
-        Rough guess (e-/ADU).
+    names : sequence of str
+        Of `STATISTICS`.
     """
     reader = ArrayReader(folder / "maps")
     stride = int(np.ceil(np.sqrt(shape[0] * shape[1] / _SAMPLES)))
-    names = (
-        "response", "response_error", "dark_rate", "dark_variance", "dark_charge", "dark_dof",
-        "bias",
-    )  # fmt: skip
     wanted = [STATISTICS.index(name) for name in names]
     parts = []
     for index in indices(shape):
         (y0, y1), (x0, x1) = extent(shape, index)
         block = reader.read((0, len(STATISTICS)), (y0, y1), (x0, x1))
-        on_grid = block[wanted, -y0 % stride :: stride, -x0 % stride :: stride]
-        parts.append(on_grid.reshape(len(wanted), -1))
-    response, error, rate, variance, charge, dof, bias = np.concatenate(parts, axis=1)
+        some = block[wanted, -y0 % stride :: stride, -x0 % stride :: stride]
+        parts.append(some.reshape(len(wanted), -1))
+    return np.concatenate(parts, axis=1).astype(float)
+
+
+def usual(folder: Path, shape: tuple[int, int], gain: float) -> Usual:
+    """Medians of the maps that `measure` wrote.
+
+    Parameters
+    ----------
+    folder, shape
+        As of `on_grid`.
+    gain : float
+        Rough guess (e-/ADU).
+    """
+    names = (
+        "response", "response_error", "dark_rate", "dark_variance", "dark_charge", "dark_dof",
+        "bias",
+    )  # fmt: skip
+    response, error, rate, variance, charge, dof, bias = on_grid(folder, shape, names)
     return Usual(
         median_and_sigma(response[response > 0])[0],
         median_and_sigma(error[error > 0])[0],

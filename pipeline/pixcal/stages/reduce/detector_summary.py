@@ -10,16 +10,17 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.detector import Linearity, linearity
 from pixcal.kernels.photon_transfer import GainFit, fit_gain
+from pixcal.kernels.rounding import SHEPPARD, UNTOLD, noise_before_rounding
 from pixcal.model.acquisition import Detector
 from pixcal.model.errors import InputError
-from pixcal.stages.reduce.calibration import Usual, usual
+from pixcal.stages.reduce.calibration import Usual, on_grid, usual
 from pixcal.stages.reduce.columns import grid
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.storage.cube import ArrayReader
 
 F64 = NDArray[np.float64]
 
-ROUNDING_ADU = 1 / math.sqrt(12)
+ROUNDING_ADU = math.sqrt(SHEPPARD)
 """Noise of a converter that rounds to whole ADU."""
 
 _LINEAR_SHARE = 0.7
@@ -41,7 +42,9 @@ class Summary:
     usual : Usual
         Medians of the maps.
     read_noise : (float, float) or None
-        From differences of successive frames, and its error (ADU).
+        Of a sample, rounding included, from differences of successive frames; its error (ADU).
+    before_rounding : (float, float) or None
+        The same without the rounding of the converter.
     gain : GainFit or None
         By photon transfer.
     levels : (rung,) float64
@@ -55,6 +58,7 @@ class Summary:
     declared: Detector
     usual: Usual
     read_noise: tuple[float, float] | None
+    before_rounding: tuple[float, float] | None
     gain: GainFit | None
     levels: F64
     usable: NDArray[np.bool_]
@@ -84,6 +88,17 @@ class Summary:
             noise = gain * self.read_noise[0]
         return max(noise, gain * ROUNDING_ADU)
 
+    def noise_before_rounding_e(self, gain: float) -> float:
+        """Read noise (e-) of the amplifier: measured, else declared.
+
+        Where samples of one code alone say that it is far below a step, no more than that.
+        """
+        if self.before_rounding is not None:
+            return gain * self.before_rounding[0]
+        if self.read_noise is None:
+            return self.declared.read_noise_e
+        return min(self.declared.read_noise_e, gain * UNTOLD)
+
     def warnings(self, gain: float) -> list[str]:
         """Sentences on what was declared otherwise than it was measured."""
         found = []
@@ -96,9 +111,9 @@ class Summary:
                     f"are {declared:g}: {gain:.4g} is used"
                 )
         noise = self.declared.read_noise_e
-        if self.read_noise is not None:
-            value, error = (gain * v for v in self.read_noise)
-            if abs(value - noise) > max(3 * error, 0.1 * noise, gain * ROUNDING_ADU):
+        if self.before_rounding is not None:
+            value, error = (gain * v for v in self.before_rounding)
+            if abs(value - noise) > max(3 * error, 0.1 * noise):
                 found.append(
                     f"the read noise measured is {value:.4g} ± {error:.2g} e-, declared are "
                     f"{noise:g}: the measured one is used"
@@ -141,12 +156,24 @@ def summarise(job: Measuring, folder: Path, declared: Detector) -> Summary:
     if job.flats_timed and job.flat:
         straight = linearity(np.array([group.exptime for group in job.flat]), levels, usable)
     read_variance = _read_variance(sums[0])
-    read_noise = None
+    read_noise = own = None
     if read_variance is not None:
         noise = math.sqrt(read_variance[0])
         read_noise = (noise, read_variance[1] / (2 * noise) if noise else 0.0)
-    gain = _gain(sums[1], read_variance, medians, job)
-    return Summary(declared, medians, read_noise, gain, levels, usable, straight)
+        own = _before_rounding(read_variance, folder, job) if job.quantum else read_noise
+    gain = _gain(sums[1], own, medians, job)
+    return Summary(declared, medians, read_noise, own, gain, levels, usable, straight)
+
+
+def _before_rounding(
+    variance: tuple[float, float], folder: Path, job: Measuring
+) -> tuple[float, float] | None:
+    """Noise of the amplifier and its error (ADU), by where the levels lie between codes."""
+    assert job.read_series is not None
+    bias, rate = on_grid(folder, job.shape, ("bias", "dark_rate"))
+    means = bias + rate * job.read_series.exptime
+    frames = len(job.read_series.frames)
+    return noise_before_rounding(*variance, means[np.isfinite(means)], frames)
 
 
 def _read_variance(sums: F64) -> tuple[float, float] | None:
@@ -156,15 +183,16 @@ def _read_variance(sums: F64) -> tuple[float, float] | None:
 
 
 def _gain(
-    sums: F64, read_variance: tuple[float, float] | None, medians: Usual, job: Measuring
+    sums: F64, read_noise: tuple[float, float] | None, medians: Usual, job: Measuring
 ) -> GainFit | None:
     """Photon transfer; None where the level above bias is unknown, or the error is too large."""
     if not (job.dark and job.flat):
         return None
-    guess = job.read_noise**2
-    variance, error = read_variance or (guess, 2 * _GUESS_ERROR * guess)
+    noise, error = read_noise or (job.read_noise, _GUESS_ERROR * job.read_noise)
+    # With light there is noise enough that rounding adds no more and no less than this.
+    variance = noise**2 + SHEPPARD * job.quantum**2
     top = _LINEAR_SHARE * (job.saturation - medians.bias)
-    fitted = fit_gain(sums, variance, error, top)
+    fitted = fit_gain(sums, variance, 2 * noise * error, top)
     return fitted if fitted is not None and fitted.error < _GAIN_ERROR * fitted.gain else None
 
 

@@ -267,7 +267,7 @@ def _report(
 def _report_noise(
     summary: Summary, config: Config, gain: float, bounds: Bounds
 ) -> dict[str, dict[str, Any]]:
-    fitted, noise = summary.gain, summary.read_noise
+    fitted, noise, total = summary.gain, summary.before_rounding, summary.read_noise
     return {
         "gain_e_per_adu": {
             "declared": summary.declared.gain_e_per_adu,
@@ -282,6 +282,8 @@ def _report_noise(
             "declared": summary.declared.read_noise_e,
             "measured": gain * noise[0] if noise else None,
             "error": gain * noise[1] if noise else None,
+            "with_rounding": gain * total[0] if total else None,
+            "before_rounding": summary.noise_before_rounding_e(gain),
             "used": bounds.read_noise,
         },
     }

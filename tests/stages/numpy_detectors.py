@@ -1,0 +1,123 @@
+"""Cameras of a few lines of NumPy, independent of pixcal's own simulation, and their null tests."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.battery import Key, measure
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.gap import Difference, Reference, compare, expect_nominal
+from pixcal.model.acquisition import SCHEMA, Acquisition
+from pixcal.model.config import parse
+from pixcal.stages import reduce
+from pixcal.stages.diagnose.measuring import nominal_bench
+from pixcal.stages.diagnose.nominal import NominalBench
+from pixcal.stages.diagnose.parts import Raw, evidence_of, select
+from pixcal.stages.diagnose.windows import Split, split, whole_of
+
+F64 = NDArray[np.float64]
+Frames = dict[str, NDArray[np.uint16]]
+Tables = dict[str, dict[str, list[Any]]]
+
+
+@dataclass(frozen=True)
+class Detector:
+    """A camera, and what is recorded with it: flats are (exposure s, frames, lamp)."""
+
+    gain: float = 2.0
+    noise: float = 10.0
+    bias: float = 100.4
+    scatter: float = 0.0
+    shape: tuple[int, int] = (96, 96)
+    top: int = 65535
+    dark: float = 5.0
+    rate: float = 2e4
+    prnu: float = 0.01
+    flats: Sequence[tuple[float, int, float]] = ((0.1, 10, 1), (0.3, 10, 1), (0.6, 10, 1))
+    response: Callable[[F64], F64] = lambda electrons: electrons
+
+    def frames(self, seed: int, bias: int = 20, dark: int = 8) -> tuple[Frames, Tables]:
+        """Bias, dark (1 s) and flat frames as a camera writes them."""
+        rng = np.random.default_rng(seed)
+        offset = self.bias + self.scatter * rng.standard_normal(self.shape)
+        pixels = 1 + self.prnu * rng.standard_normal(self.shape)
+
+        def frame(seconds: float, light: float) -> NDArray[np.uint16]:
+            charge = rng.poisson((self.dark + light * self.rate * pixels) * seconds).astype(float)
+            noise = self.noise * rng.standard_normal(self.shape)
+            codes = np.rint((self.response(charge) + noise) / self.gain + offset)
+            return np.clip(codes, 0, self.top).astype(np.uint16)
+
+        plan = {"bias": [(0.0, bias, 0.0)], "dark": [(1.0, dark, 0.0)], "flat": self.flats}
+        arrays, tables = {}, {}
+        for kind, steps in plan.items():
+            each = [(t, lamp) for t, count, lamp in steps for _ in range(count)]
+            if not each:
+                continue
+            arrays[kind] = np.stack([frame(*one) for one in each])
+            n = len(each)
+            tables[kind] = {
+                "file": [f"{kind}-{i}.fits" for i in range(n)], "plane": [0] * n,
+                "mjd": [None] * n, "exptime_s": [t for t, _ in each],
+                "temperature_c": [None] * n, "time_s": [float(i) for i in range(n)],
+                "time_source": ["number"] * n,
+            }  # fmt: skip
+        return arrays, tables
+
+    def described(self, **detector: float) -> Acquisition:
+        """What its owner says of it."""
+        plain = {
+            "schema": SCHEMA,
+            "detector": {"pitch_um": 5.0, "gain_e_per_adu": self.gain, "read_noise_e": self.noise}
+            | detector,
+            "optics": {"wavelength_nm": 632.8, "distance_mm": 400.0},
+            "frames": {
+                "bias": ["bias*"], "dark": ["dark*"], "flat": ["flat*"] if self.flats else [],
+                "fringes": [],
+            },
+        }  # fmt: skip
+        return parse(Acquisition, plain, "acquisition")
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """An acquisition, its nominal bench, and how far simulations of it are off."""
+
+    evidence: Evidence
+    bench: NominalBench
+    split: Split
+    differences: Mapping[Key, Difference]
+
+
+def held_against_nominal(detector: Detector, seed: int, folder: Path, count: int = 12) -> Nominal:
+    """Measure the nominal bench of a recording, and hold its second half against simulations."""
+    arrays, tables = detector.frames(seed)
+    acquisition, part = detector.described(), whole_of(detector.shape)
+    own, folders = split(tables, detector.shape[0] * detector.shape[1]), iter(range(1000))
+
+    def look(raw: Raw) -> Evidence:
+        return evidence_of(raw, folder / str(next(folders)), part, detector.shape)
+
+    halves = [
+        look(
+            Raw(
+                acquisition,
+                {name: array[half.frames[name]] for name, array in arrays.items()},
+                select(tables, half),
+                reduce.Config(),
+            )
+        )
+        for half in (own.learn, own.test)
+    ]
+    dtypes = {name: array.dtype for name, array in arrays.items()}
+    bench = nominal_bench(
+        acquisition, tables, halves, (own.learn, own.test), detector.shape, reduce.Config(), dtypes
+    )
+    made = [measure(look(bench.simulate(own.test, (), 1000 * seed + n))) for n in range(count)]
+    reference = Reference.of(made)
+    data = reference.on_scale(measure(halves[1]))
+    return Nominal(halves[0], bench, own, compare(data, expect_nominal(reference)))
