@@ -35,6 +35,8 @@ _NO_CHANGE = 1e-6
 _MISSED = 3.0
 _UNEVEN = 2e-3
 """Scatter of counts that light brings about: levels of pixels do not lie evenly on codes."""
+LEAST_NOISE = 1.4
+"""Codes of noise below which the peak of dark frames is too narrow for a local fit."""
 LOWEST_RIPPLE = 1 / 16
 """Turns a code."""
 
@@ -277,7 +279,7 @@ def code_widths(counts: F64, noise: float, first: float = 0.0) -> CodeWidths | N
         Code from which the noise is at least that.
     """
     half = int(np.clip(noise / 2, _LEAST_HALF, _MOST_HALF))
-    if noise < 1 or len(counts) < 2 * _CALM:
+    if noise < LEAST_NOISE or len(counts) < 2 * _CALM:
         return None
     length = 2 * half + 1
     expected = savgol_filter(counts, length, _ORDER)
@@ -290,7 +292,10 @@ def code_widths(counts: F64, noise: float, first: float = 0.0) -> CodeWidths | N
     kernel = -savgol_coeffs(length, _ORDER)
     kernel[half] += 1
     width = (counts - expected)[used] / calm[used]
-    # What another fit still changes is what the first one missed of narrow peaks.
-    missed = uniform_filter1d(np.abs(expected - savgol_filter(expected, length, _ORDER)), length)
-    variance = expected + (_MISSED * missed) ** 2 + (_UNEVEN * expected) ** 2
+    # What another fit still changes, beyond what uneven codes do to it, the first one missed.
+    again = np.convolve(kernel, savgol_coeffs(length, _ORDER))
+    share = 2 * float(again @ again) / float(kernel @ kernel)
+    change = uniform_filter1d((expected - savgol_filter(expected, length, _ORDER)) ** 2, length)
+    missed = np.maximum(change - share * uniform_filter1d((counts - expected) ** 2, length), 0)
+    variance = expected + _MISSED**2 * missed + (_UNEVEN * expected) ** 2
     return CodeWidths(np.flatnonzero(used), width, variance[used] / calm[used] ** 2, kernel)
