@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.code_density import (
+    LEAST_NOISE,
     CodeWidths,
     code_widths,
     converter_counts,
@@ -170,10 +171,11 @@ class Quantisation(Effect):
             return None
         step, step_error = step_of(counts)
         noise, first = evidence.read_noise / evidence.gain / step, 0.0
-        if noise < 1 and fringes:
+        if noise < LEAST_NOISE and fringes:
             counts = histogram(fringes, evidence.good)
-            first = float(np.median(evidence.bias)) / step + (1 - noise**2) * step * evidence.gain
-            noise = 1.0
+            shot = LEAST_NOISE**2 - noise**2
+            first = float(np.median(evidence.bias)) / step + shot * step * evidence.gain
+            noise = LEAST_NOISE
         widths = (
             None if counts is None else code_widths(converter_counts(counts, step), noise, first)
         )
