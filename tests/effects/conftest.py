@@ -1,6 +1,5 @@
 """Small acquisitions with effects, simulated, reduced and fitted, as evidence."""
 
-import shutil
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -83,7 +82,6 @@ def acquired(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Evidence
             ingest.run(folder / "acq", folder / "run", ingest.Config(), SYNC)
             reduce.run(folder / "run", reduce.Config(), SYNC)
             fit.run(folder / "run", fit.Config(), SYNC)
-            shutil.rmtree(folder / "acq")
             runs[text] = folder / "run"
         return evidence(runs[text])
 
