@@ -69,9 +69,21 @@ def show_reduce(run: Path) -> None:
         for label, key in (("gain e-/ADU", "gain_e_per_adu"), ("read noise e-", "read_noise_e"))
     ]
     show_table(("quantity", "declared", "measured", "used"), rows)
+    figures = facts.get("figures_of_merit", {})
+    shown = [
+        (f["title"], f"{_figure(f['value'], f['error'])} {f['unit']}".rstrip(), f["note"])
+        for key, f in figures.items()
+        if not key.endswith(_PARTS)
+    ]
+    if shown:
+        show_table(("figure of merit (measured gain)", "value", ""), shown)
     counts = ", ".join(f"{count} {flag}" for flag, count in facts["flags"].items() if count)
     click.echo(f"  pixels: {counts}")
     show_notes(facts["warnings"])
+
+
+_PARTS = ("_row", "_column", "_pixel")
+"""Parts of a figure of merit, which the JSON and the report have."""
 
 
 def show_fit(run: Path) -> None:
@@ -270,6 +282,11 @@ def _ratio(a: float | None, b: float | None) -> float | None:
 
 def _number(value: float | None, digits: int = 4) -> str:
     return "-" if value is None else f"{value:.{digits}g}"
+
+
+def _figure(value: float, error: float | None) -> str:
+    """As `with_error`; a large number without error not as a power of ten."""
+    return f"{value:.0f}" if error is None and value >= 1e4 else with_error(value, error)
 
 
 def with_error(value: float | None, error: float | None) -> str:

@@ -95,12 +95,15 @@ class Detector:
     ----------
     facts : dict
         ``reduce.json``; empty where there is none.
+    curves : dict
+        ``figures_of_merit.json``; empty where there is none.
     maps : dict
         ``bias`` (ADU), ``dark_rate`` (e-/s), ``flat``, ``read_noise`` (e-), those that exist.
     """
 
     facts: dict[str, Any] = field(default_factory=dict)
     maps: dict[str, MapSummary] = field(default_factory=dict)
+    curves: dict[str, Any] = field(default_factory=dict)
     flags: FlagSummary | None = None
 
 

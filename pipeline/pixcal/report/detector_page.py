@@ -1,9 +1,11 @@
 """The detector's chapter of the page."""
 
-from pixcal.report import detector_figures, map_figures
-from pixcal.report.blocks import Block, Section, plate
-from pixcal.report.contents import Contents
-from pixcal.report.tables import Table, is_table, reduction_tables
+from collections.abc import Iterator
+
+from pixcal.report import detector_figures, emva_figures, map_figures
+from pixcal.report.blocks import Block, Plate, Section, plate
+from pixcal.report.contents import Contents, Detector
+from pixcal.report.tables import Table, is_table, merit_table, reduction_tables
 from pixcal.report.text import number
 
 DETECTOR_MAPS = {
@@ -24,7 +26,7 @@ def detector(contents: Contents) -> Section:
         # A map of one value is what the reduction takes where there are no frames.
         if key in found.maps and found.maps[key].std > 0
     ]
-    blocks: list[Block] = []
+    blocks: list[Block] = [*merit_table(found.facts), *_merit_plates(found)]
     if panels:
         blocks.append(
             plate(
@@ -57,3 +59,35 @@ def detector(contents: Contents) -> Section:
     if not blocks:
         lead = "Not measured: the reduction left no calibration maps."
     return Section("detector", "Detector", lead, blocks)
+
+
+def _merit_plates(found: Detector) -> Iterator[Plate]:
+    """Photon transfer, and what is not uniform, in the dark and in light."""
+    figures, curves = found.facts.get("figures_of_merit") or {}, found.curves
+    transfer = curves.get("photon_transfer") or {}
+    if len(transfer.get("level", ())) > 1:
+        full = figures.get("saturation")
+        yield plate(
+            "Photon-transfer curve",
+            "Half the variance of the differences of pairs of flats against their level; right: "
+            "over the straight line that shot noise and read noise make. Good: points on the line "
+            "up to saturation. Bad: a slope or a curve (nonlinear response, neighbours that share "
+            "charge), or a fall (saturation) at a level that is still in use.",
+            emva_figures.photon_transfer(
+                transfer, full["value"] if full and full["error"] is not None else None
+            ),
+        )
+    for key, name, what in (
+        ("dsnu", "DSNU", "Without light"),
+        ("prnu", "PRNU", "Near half of the saturation, quadratic trend of the lamp removed"),
+    ):
+        if key in curves:
+            yield plate(
+                f"{name}: spectra and profiles",
+                f"{what}. Left: amplitude along the rows and along the columns, where white noise "
+                "is flat; the dashed line is the noise left in the averaged frames. Right: means "
+                "of rows and columns. Good: flat spectra, means without pattern. Bad: peaks "
+                "(periodic pattern: 0.5 cycles/px is a repeat of two), a rise to low frequencies "
+                "(gradients), steps between rows or columns (amplifiers).",
+                emva_figures.nonuniformity(curves[key], name),
+            )

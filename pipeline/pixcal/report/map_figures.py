@@ -291,16 +291,17 @@ def map_row(panels: Sequence[tuple[str, str, MapSummary]], *, symmetric: bool = 
     rows = -(-len(panels) // columns)
     tall = float(np.clip(3.4 * ny / nx, 1.2, 4.4))
     figure = new_figure(WIDE if columns == 2 else WIDE / 2 + 0.5, rows * (tall + 0.85))
-    grid = figure.subplots(rows, columns, squeeze=False)
+    # The layout does not count the labels of colour bars.
+    grid = figure.subplots(rows, columns, squeeze=False, gridspec_kw={"wspace": 0.12})
     for axes in grid.ravel()[len(panels) :]:
         axes.set_visible(False)
     for axes, (title, unit, summary) in zip(grid.ravel(), panels, strict=False):
         scale: ColourScale = (symmetric_scale if symmetric else span_scale)(summary.image)
         drawn = draw_map(axes, summary, scale)
         _square(axes, summary.shape)
-        axes.set_title(title, fontsize=11)
+        axes.set_title(", ".join(filter(None, (title, block_note(summary)))), fontsize=11)
         axes.set(xlabel="x (px)", ylabel="y (px)")
-        add_bar(figure, axes, drawn, _with_note(unit, summary), scale.beyond)
+        add_bar(figure, axes, drawn, unit, scale.beyond)
     return figure
 
 

@@ -30,7 +30,8 @@ FLAG_WORDS = {
 
 _GAIN_COLUMNS = ("declared", "measured", "error", "used")
 _REDUCTION_SHOWN = (
-    "schema", "warnings", "flags", "gain_e_per_adu", "read_noise_e", "linearity", "sets",
+    "schema", "warnings", "flags", "figures_of_merit", "gain_e_per_adu", "read_noise_e",
+    "linearity", "sets",
     "quantisation",
 )  # fmt: skip
 
@@ -113,6 +114,20 @@ def reduction_tables(facts: Mapping[str, Any]) -> Iterator[Table]:
     rest = {k: v for k, v in facts.items() if k not in _REDUCTION_SHOWN}
     if rest:
         yield Table("Other numbers of the reduction", ["quantity", "value"], flat_rows(rest))
+
+
+def merit_table(facts: Mapping[str, Any]) -> Iterator[Table]:
+    """What a data sheet of the detector would say."""
+    rows = [
+        [f["title"], with_error(f["value"], f["error"]), f["unit"].replace("e-", "e⁻"), f["note"]]
+        for f in (facts.get("figures_of_merit") or {}).values()
+    ]
+    if rows:
+        yield Table(
+            "Figures of merit (EMVA 1288), with the measured gain",
+            ["figure", "value", "unit", ""],
+            rows,
+        )
 
 
 def _columns_table(title: str, columns: Mapping[str, Mapping[str, Any]]) -> Table:

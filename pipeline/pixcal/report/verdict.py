@@ -59,10 +59,23 @@ def headline(contents: Contents) -> str:
 
 def detector_headline(facts: dict[str, Any]) -> str:
     """Gain and read noise in a sentence, measured where they could be."""
-    parts = []
+    figures = facts.get("figures_of_merit") or {}
+    parts = [
+        f"{name} {with_error(figures[key]['value'], figures[key]['error'])} {unit}"
+        for key, name, unit in (
+            ("conversion_gain", "gain", "e⁻/ADU"),
+            ("read_noise", "read noise", "e⁻"),
+            ("full_well", "full well", "e⁻"),
+        )
+        if key in figures and not figures[key]["note"]
+    ]
     for key, name, unit in (
-        ("gain_e_per_adu", "gain", "e⁻/ADU"),
-        ("read_noise_e", "read noise", "e⁻"),
+        (
+            ("gain_e_per_adu", "gain", "e⁻/ADU"),
+            ("read_noise_e", "read noise", "e⁻"),
+        )
+        if not parts
+        else ()
     ):
         entry = facts.get(key, {})
         if entry.get("measured") is not None:
@@ -98,10 +111,23 @@ def cards(contents: Contents) -> list[Card]:
         )
         if fringes.allan is not None and fringes.allan.get("slope") is not None:
             made.append(_allan_card(fringes.name, fringes.allan))
+    if not contents.has_fringes:
+        made += _detector_cards(contents.detector.facts)
     if contents.diagnosis is not None:
         made.append(_diagnosis_card(contents.diagnosis))
     made.append(_mask_card(contents))
     return made
+
+
+def _detector_cards(facts: dict[str, Any]) -> Iterator[Card]:
+    """What a data sheet begins with."""
+    found = facts.get("figures_of_merit") or {}
+    for key in ("conversion_gain", "read_noise", "full_well", "dynamic_range", "dsnu", "prnu",
+                "dark_current"):  # fmt: skip
+        if key in found:
+            f = found[key]
+            unit = f["unit"].replace("e-", "e⁻")
+            yield Card(f["title"], f"{with_error(f['value'], f['error'])} {unit}", f["note"], GOOD)
 
 
 def _diagnosis_card(diagnosis: Diagnosis) -> Card:

@@ -151,6 +151,7 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
                 for name in DETECTOR_MAPS
                 if f"detector/{name}" in results
             },
+            _optional_json(run_dir / "reduce" / "figures_of_merit.json"),
             results.get("flags/detector"),
         ),
         fit=fit,

@@ -23,6 +23,7 @@ from pixcal.stages.reduce.calibration import Finishing, calibration_writers, fin
 from pixcal.stages.reduce.columns import extent, indices, run_noted, strip_width
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
 from pixcal.stages.reduce.electrons import convert_bytes
+from pixcal.stages.reduce.figures_of_merit import characterise
 from pixcal.stages.reduce.frame_statistics import (
     Limits,
     Measuring,
@@ -162,7 +163,7 @@ def _reduce(made: Build, source: Ingested, config: Config, runtime: Runtime) -> 
             made, source, name,
             gain=gain, bounds=bounds, share=config.rounding_share, runtime=runtime,
         )  # fmt: skip
-    _report(made, source, config, job, summary, gain, bounds, sets)
+    _report(made, source, config, job, summary, gain, bounds, sets, runtime)
 
 
 def _measuring(source: Ingested, config: Config, folder: Path) -> Measuring:
@@ -244,6 +245,7 @@ def _report(
     gain: float,
     bounds: Bounds,
     sets: Mapping[str, dict[str, Any]],
+    runtime: Runtime,
 ) -> None:
     warnings = [*source.exposures.warnings, *summary.warnings(gain)]
     declared = source.detector.saturation_adu is not None
@@ -260,6 +262,7 @@ def _report(
         "sets": sets,
         "warnings": warnings,
     }
+    report["figures_of_merit"] = characterise(made, source, job, summary, report, runtime)
     write_json(made.folder / "reduce.json", report)
     made.summary.update({key: report[key] for key in ("gain_e_per_adu", "flags", "warnings")})
 

@@ -1,0 +1,250 @@
+"""Figures of merit of a detector after EMVA 1288 (release 4.0), in electrons.
+
+Spatial nonuniformity is measured from two averages of independent frames, such as the even and the
+odd ones: what both hold is the detector's, what differs is noise, and no model of the noise is
+asked for. It is split into rows, columns and pixels by an analysis of variance (Searle, Casella and
+McCulloch, *Variance Components*, 1992, section 4.3).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+Measure = tuple[float, float]
+"""A value and its 1-sigma error."""
+
+_FALL = 0.8
+"""Variance over its maximum below which samples saturate: noise alone does not fall so far."""
+
+
+@dataclass(frozen=True)
+class Nonuniformity:
+    """Standard deviations over the detector, each with its error.
+
+    Attributes
+    ----------
+    total, row, column, pixel : (float, float)
+        Of the map; of what all pixels of a row share, those of a column; of the rest. Zero where
+        the variance comes out below zero by chance, with the standard deviation that would show.
+    """
+
+    total: Measure
+    row: Measure
+    column: Measure
+    pixel: Measure
+
+
+def nonuniformity(first: F64, second: F64, good: NDArray[np.bool_]) -> Nonuniformity:
+    """Nonuniformity that two averages of independent frames have in common.
+
+    Parameters
+    ----------
+    first, second : (y, x) float64
+        Averages of as many frames, in any unit.
+    good : (y, x) bool
+        Pixels to use.
+    """
+    a, b = (_filled(values, good) for values in (first, second))
+    ny, nx = a.shape
+    lost = int((~good).sum())
+    dofs = np.array([ny - 1, nx - 1, max((ny - 1) * (nx - 1) - lost, 1)], float)
+    own = np.array([_squares(a, a), _squares(b, b)]) / dofs
+    shared = _squares(a, b) / dofs
+    # Variance of a sample covariance of normal variables.
+    spread = (shared**2 + own[0] * own[1]) / dofs
+    pixel = float(shared[2])
+    row, column = float(shared[0] - pixel) / nx, float(shared[1] - pixel) / ny
+    errors = np.sqrt([(spread[0] + spread[2]) / nx**2, (spread[1] + spread[2]) / ny**2, spread[2]])
+    total = row + column + pixel
+    total_error = math.sqrt(spread[0] / nx**2 + spread[1] / ny**2 + spread[2])
+    return Nonuniformity(
+        _root(total, total_error),
+        _root(row, errors[0]),
+        _root(column, errors[1]),
+        _root(pixel, errors[2]),
+    )
+
+
+def _filled(values: F64, good: NDArray[np.bool_]) -> F64:
+    """The map less its mean; a bad pixel is what its row and its column let expect."""
+    count = np.maximum(good.sum(axis=1), 1), np.maximum(good.sum(axis=0), 1)
+    values = np.where(good, values - values[good].mean(), 0.0)
+    rows = values.sum(axis=1) / count[0]
+    columns = (values - np.where(good, rows[:, None], 0.0)).sum(axis=0) / count[1]
+    return np.where(good, values, rows[:, None] + columns)
+
+
+def _squares(a: F64, b: F64) -> F64:
+    """Sums of products between rows, between columns, and of what is left."""
+    ny, nx = a.shape
+    a, b = a - a.mean(), b - b.mean()
+    row = nx * float(a.mean(axis=1) @ b.mean(axis=1))
+    column = ny * float(a.mean(axis=0) @ b.mean(axis=0))
+    return np.array([row, column, float((a * b).sum()) - row - column])
+
+
+def _root(variance: float, error: float) -> Measure:
+    value = math.sqrt(max(variance, 0.0))
+    return (value, error / (2 * value)) if variance > error else (value, math.sqrt(error))
+
+
+def without_trend(values: F64, good: NDArray[np.bool_]) -> F64:
+    """A flat field over its mean, less one, less the quadratic polynomial of an uneven lamp.
+
+    Parameters
+    ----------
+    values : (y, x) float64
+        Signal above bias and dark.
+    good : (y, x) bool
+        Pixels to use.
+    """
+    ny, nx = values.shape
+    y, x = np.linspace(-1, 1, ny)[:, None], np.linspace(-1, 1, nx)[None, :]
+    terms = [np.broadcast_to(t, values.shape) for t in (np.ones(()), x, y, x * x, x * y, y * y)]
+    relative = np.where(good, values / values[good].mean(), 0.0)
+    normal = np.array([[(good * s * t).sum() for t in terms] for s in terms])
+    right = np.array([(relative * t).sum() for t in terms])
+    trend: F64 = sum(
+        (c * t for c, t in zip(np.linalg.lstsq(normal, right)[0], terms, strict=True)),
+        start=np.zeros_like(values),
+    )
+    return relative - trend
+
+
+@dataclass(frozen=True)
+class Spectrogram:
+    """Spectrum of a map along its rows or its columns.
+
+    Attributes
+    ----------
+    frequency : (n,) float64
+        Cycles per pixel, zero left out.
+    amplitude : (n,) float64
+        Root of the mean power of all rows (columns); white noise of s has s everywhere.
+    noise : float
+        The same of the noise in the map.
+    """
+
+    frequency: F64
+    amplitude: F64
+    noise: float
+
+
+def spectrogram(first: F64, second: F64, good: NDArray[np.bool_], *, axis: int) -> Spectrogram:
+    """Spectrum of the mean of two averages along an axis (1: along the rows), and its noise.
+
+    Parameters
+    ----------
+    first, second : (y, x) float64
+        As for `nonuniformity`.
+    good : (y, x) bool
+        Pixels to use.
+    axis : {0, 1}
+        Along which the Fourier transform is taken.
+    """
+    a, b = (_filled(values, good) for values in (first, second))
+    n = a.shape[axis]
+    scale = 1 / math.sqrt(n)
+    power = np.abs(np.fft.rfft((a + b) / 2, axis=axis) * scale) ** 2
+    noise = np.abs(np.fft.rfft((a - b) / 2, axis=axis) * scale) ** 2
+    mean = power.mean(axis=1 - axis)[1:]
+    frequency: F64 = np.fft.rfftfreq(n)[1:].astype(float)
+    return Spectrogram(frequency, np.sqrt(mean), math.sqrt(noise.mean()))
+
+
+def transfer_points(sums: F64, most: int = 60) -> F64:
+    """Photon-transfer curve from sums over pairs of frames.
+
+    Parameters
+    ----------
+    sums : (bin, 3) float64
+        Degrees of freedom; the same times level; times variance: see `photon_transfer.bin_pairs`.
+    most : int
+        Most points: neighbouring bins are put together.
+
+    Returns
+    -------
+    (point, 3) float64
+        Level (ADU), variance of a sample (ADU²) and its error.
+    """
+    filled = sums[sums[:, 0] > 0]
+    if not len(filled):
+        return np.empty((0, 3))
+    size = -(-len(filled) // most)
+    dof, level, variance = np.add.reduceat(filled, np.arange(0, len(filled), size)).T
+    level, variance = level / dof, variance / dof
+    return np.stack([level, variance, variance * np.sqrt(2 / dof)], axis=1)
+
+
+def saturation(points: F64) -> Measure | None:
+    """Level (ADU) of the photon-transfer curve's maximum, if the variance falls beyond it.
+
+    Parameters
+    ----------
+    points : (point, 3) float64
+        Of `transfer_points`.
+
+    Returns
+    -------
+    (float, float) or None
+        With half of the way to the level where the variance has fallen as its error. None where
+        the curve rises to its end: saturation was not reached.
+    """
+    if len(points) < 2:
+        return None
+    # Of few pixels a variance may be high by chance.
+    peak = int((points[:, 1] - 2 * points[:, 2]).argmax())
+    fallen = points[peak + 1 :][points[peak + 1 :, 1] < _FALL * points[peak, 1], 0]
+    if not len(fallen):
+        return None
+    level = float(points[peak, 0])
+    return level, float(fallen[0] - level) / 2
+
+
+def dynamic_range(full_well: Measure, read_noise: Measure) -> tuple[float, float, float]:
+    """Saturation over the least signal that can be seen (signal-to-noise ratio of one).
+
+    Parameters
+    ----------
+    full_well, read_noise : (float, float)
+        With errors (e-).
+
+    Returns
+    -------
+    ratio, error, decibels : float
+    """
+    # Signal whose shot noise and read noise together equal it: n² = n + σ².
+    root = math.sqrt(read_noise[0] ** 2 + 0.25)
+    least, least_error = root + 0.5, read_noise[0] / root * read_noise[1]
+    ratio = full_well[0] / least
+    error = ratio * math.hypot(full_well[1] / full_well[0], least_error / least)
+    return ratio, error, 20 * math.log10(ratio)
+
+
+def dark_slope(times: F64, means: F64) -> Measure | None:
+    """Dark signal (per second) from the means of frames, with the scatter between them.
+
+    Parameters
+    ----------
+    times : (frame,) float64
+        Exposure times (s).
+    means : (frame,) float64
+        Mean signal of each frame.
+
+    Returns
+    -------
+    (float, float) or None
+        None with fewer than three frames or a single exposure time.
+    """
+    if len(times) < 3:
+        return None
+    lever = times - times.mean()
+    square = float(lever @ lever)
+    if square <= 0:
+        return None
+    slope = float(lever @ means) / square
+    rest = means - means.mean() - slope * lever
+    return slope, math.sqrt(float(rest @ rest) / (len(times) - 2) / square)

@@ -1,0 +1,246 @@
+"""Figures of merit after EMVA 1288: what a data sheet of the detector would say, with errors.
+
+Spatial nonuniformity comes from averages of the even and of the odd frames of a series, read once
+more in the middle of the detector (`SIDE` pixels at most); the rest from what was measured before.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.engine.run import Runtime
+from pixcal.estimators.emva import (
+    Measure,
+    Nonuniformity,
+    dark_slope,
+    dynamic_range,
+    nonuniformity,
+    saturation,
+    spectrogram,
+    transfer_points,
+    without_trend,
+)
+from pixcal.stages.reduce.detector_summary import Summary
+from pixcal.stages.reduce.frame_statistics import Measuring
+from pixcal.stages.reduce.halves import Window, frames_of, middle_of, read_halves
+from pixcal.stages.reduce.ingested import Ingested
+from pixcal.storage.artefact import Build, write_json
+from pixcal.storage.cube import CHUNK, ArrayReader
+
+F64 = NDArray[np.float64]
+Json = dict[str, Any]
+
+
+def characterise(
+    made: Build, source: Ingested, job: Measuring, summary: Summary, facts: Json, runtime: Runtime
+) -> Json:
+    """Figures of merit, by name; their curves go to ``figures_of_merit.json``.
+
+    Parameters
+    ----------
+    made : Build
+        With ``calibration.zarr`` and the statistics of the frames.
+    source : Ingested
+    job : Measuring
+    summary : Summary
+    facts : dict
+        What ``reduce.json`` says so far.
+    runtime : Runtime
+
+    Returns
+    -------
+    dict
+        For each figure ``title``, ``unit``, ``value``, ``error`` (null where unknown), ``note``.
+    """
+    gain = _gain(facts)
+    tables = ArrayReader(made.scratch / "statistics" / "pairs").read()
+    points = transfer_points(tables[:, :, 1].sum(axis=(0, 1)))
+    top, reached = _top(points, summary, job)
+    middle = middle_of(source.shape)
+    halves = read_halves(made, source, summary, top, middle, runtime)
+    found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, _gain_note(facts))}
+    noise = _read_noise(found, facts, gain[0])
+    _full_well(found, gain[0], top, reached, noise)
+    straight = facts["linearity"]
+    if straight is not None:
+        departure = straight["max_deviation_percent"], None
+        found["linearity_error"] = _figure("linearity error, largest", "%", departure)
+    curves: Json = {"photon_transfer": _listed(points.T, ("level", "variance", "error"))}
+    curves["photon_transfer"] |= {"gain": gain[0], "read_variance": (noise or (0.0,))[0] ** 2}
+    if halves.dark is not None:
+        electrons = halves.dark * gain[0]
+        _spread(found, curves, "dsnu", "e-", electrons, halves.good)
+    if halves.flat is not None:
+        percent = np.stack([100 * without_trend(half, halves.good) for half in halves.flat])
+        _spread(found, curves, "prnu", "%", percent, halves.good)
+    _dark_current(found, made, source, gain[0] / facts["gain_e_per_adu"]["used"], middle)
+    for figure in found.values():
+        if figure["unit"] in ("e-", "e-/s") and figure["error"] is not None:
+            of_gain = figure["value"] * (gain[1] or 0.0) / gain[0]
+            figure["error"] = math.hypot(figure["error"], of_gain)
+    write_json(made.folder / "figures_of_merit.json", curves)
+    return found
+
+
+def _figure(
+    title: str, unit: str, measure: tuple[float, float | None], note: str = ""
+) -> dict[str, Any]:
+    value, error = measure
+    return {"title": title, "unit": unit, "value": value, "error": error, "note": note}
+
+
+def _gain(facts: Json) -> tuple[float, float | None]:
+    entry = facts["gain_e_per_adu"]
+    if entry["measured"] is None:
+        return entry["used"], None
+    return entry["measured"], entry["error"]
+
+
+def _gain_note(facts: Json) -> str:
+    return "" if facts["gain_e_per_adu"]["measured"] is not None else "declared, not measured"
+
+
+def _read_noise(found: Json, facts: Json, gain: float) -> Measure | None:
+    """Read noise with and without rounding (e-); returned with rounding, in ADU."""
+    entry = facts["read_noise_e"]
+    scale = gain / facts["gain_e_per_adu"]["used"]
+    whole = entry.get("with_rounding", entry["measured"])
+    if whole is None:
+        return None
+    error, rounding = scale * (entry["error"] or 0.0), gain / math.sqrt(12)
+    whole *= scale
+    found["read_noise_with_rounding"] = _figure(
+        "read noise with rounding", "e-", (whole, error), f"rounding to ADU adds {rounding:.3g} e-"
+    )
+    if "with_rounding" in entry and entry["measured"] is not None:
+        own = scale * entry["measured"]
+    else:
+        own = math.sqrt(max(whole**2 - rounding**2, 0.0))
+    found["read_noise"] = _figure("read noise without rounding", "e-", (own, error))
+    return whole / gain, error / gain
+
+
+def _top(points: F64, summary: Summary, job: Measuring) -> tuple[Measure | None, bool]:
+    """Saturation above bias (ADU) with its error, or the highest level, and whether it is one."""
+    peak = saturation(points)
+    if peak is not None:
+        return peak, True
+    if not len(summary.levels) or not summary.usable.any():
+        return None, False
+    if not summary.usable.all() and math.isfinite(job.saturation):
+        return (job.saturation - summary.usual.bias, 0.5), True
+    return (float(summary.levels[summary.usable].max()), 0.0), False
+
+
+def _full_well(
+    found: Json,
+    gain: float,
+    top: Measure | None,
+    reached: bool,
+    noise: Measure | None,
+) -> None:
+    if top is None:
+        return
+    note = "" if reached else "lower limit: the flats do not saturate"
+
+    def figure(title: str, unit: str, measure: Measure, more: str = "") -> Json:
+        value, error = measure
+        said = "; ".join(filter(None, (more, note)))
+        return _figure(title, unit, (value, error if reached else None), said)
+
+    found["saturation"] = figure("saturation above bias", "ADU", top)
+    full = gain * top[0]
+    well = full, gain * top[1]
+    found["full_well"] = figure("full well", "e-", well)
+    peak = math.sqrt(full)
+    found["snr_max"] = figure("largest signal-to-noise ratio", "", (peak, well[1] / (2 * peak)))
+    if noise is not None:
+        electrons = noise[0] * gain, noise[1] * gain
+        ratio, error, decibels = dynamic_range(well, electrons)
+        found["dynamic_range"] = figure("dynamic range", "", (ratio, error), f"{decibels:.1f} dB")
+
+
+# Nonuniformity
+
+
+_TITLES = {"dsnu": "DSNU", "prnu": "PRNU"}
+
+
+def _spread(
+    found: Json, curves: Json, name: str, unit: str, halves: F64, good: NDArray[np.bool_]
+) -> None:
+    """Standard deviations, spectra and profiles of a pair of maps."""
+    spread: Nonuniformity = nonuniformity(halves[0], halves[1], good)
+    note = "quadratic trend of the lamp removed" if name == "prnu" else ""
+    found[name] = _figure(_TITLES[name], unit, spread.total, note)
+    for part in ("row", "column", "pixel"):
+        title = f"{_TITLES[name]} of {part}s"
+        found[f"{name}_{part}"] = _figure(title, unit, getattr(spread, part))
+    mean = np.where(good, halves.mean(axis=0), np.nan)
+    curves[name] = {"unit": unit}
+    for axis, along in ((1, "rows"), (0, "columns")):
+        seen = spectrogram(halves[0], halves[1], good, axis=axis)
+        curves[name][along] = _listed((seen.frequency, seen.amplitude), ("frequency", "amplitude"))
+        curves[name][along]["noise"] = seen.noise
+        count = good.sum(axis=axis)
+        filled = count > 0
+        means = np.nansum(mean, axis=axis)[filled] / count[filled]
+        curves[name][along] |= _listed(
+            (np.flatnonzero(filled), means - means.mean()), ("at", "profile")
+        )
+
+
+def _listed(columns: Any, names: tuple[str, ...]) -> Json:
+    """Columns of numbers of five digits."""
+    return {
+        name: [float(f"{v:.5g}") for v in column]
+        for name, column in zip(names, columns, strict=True)
+    }
+
+
+# Dark current
+
+
+def _dark_current(found: Json, made: Build, source: Ingested, scale: float, middle: Window) -> None:
+    """Mean dark signal of the good pixels; its error is that of frames, drift of bias included."""
+    if not source.exposures.has_rate:
+        return
+    folder = made.folder / "calibration.zarr"
+    good = ArrayReader(folder / "mask").read(*middle) == 0
+    if not good.any():
+        return
+    rate = ArrayReader(folder / "dark_rate").read(*middle)[good].mean(dtype=float)
+    gain = found["conversion_gain"]["value"]
+    slope = dark_slope(*_dark_means(source, middle, good))
+    error = gain * slope[1] if slope is not None else None
+    note = _temperature(source.tables)
+    found["dark_current"] = _figure("dark current", "e-/s", (scale * float(rate), error), note)
+
+
+def _dark_means(source: Ingested, middle: Window, good: NDArray[np.bool_]) -> tuple[F64, F64]:
+    """Exposure time (s) and mean (ADU) of each frame without light, over some rows."""
+    (y0, y1), columns = middle
+    rows = y0 + (y1 - y0) // CHUNK[1] // 2 * CHUNK[1]
+    window = (rows, min(rows + CHUNK[1], y1)), columns
+    pixels = good[window[0][0] - y0 : window[0][1] - y0]
+    times, means = [], []
+    for group in source.exposures.dark if pixels.any() else ():
+        for _, samples in frames_of(source, group.array, group.frames, window):
+            times.append(group.exptime)
+            means.append(float(samples[pixels].mean(dtype=float)))
+    return np.array(times), np.array(means)
+
+
+def _temperature(tables: Mapping[str, Mapping[str, Any]]) -> str:
+    """At what temperature the frames without light were taken, if their headers say."""
+    told = [
+        t for kind in ("dark", "bias") for t in tables.get(kind, {}).get("temperature_c", ())
+        if t is not None
+    ]  # fmt: skip
+    if not told:
+        return "temperature not in the headers"
+    low, high = min(told), max(told)
+    return f"at {low:.1f} °C" if high - low < 0.05 else f"at {low:.1f} to {high:.1f} °C"

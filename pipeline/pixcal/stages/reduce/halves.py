@@ -1,0 +1,122 @@
+"""Averages of the even and of the odd frames of a series: what they share is the detector's."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.emva import Measure
+from pixcal.model.flags import PixelFlag
+from pixcal.stages.reduce.detector_summary import Summary
+from pixcal.stages.reduce.exposures import Group
+from pixcal.stages.reduce.ingested import Ingested
+from pixcal.storage.artefact import Build
+from pixcal.storage.cube import CHUNK, ArrayReader
+
+F64 = NDArray[np.float64]
+Window = tuple[tuple[int, int], tuple[int, int]]
+"""First row and the one after the last; the same of columns."""
+
+SIDE = 1024
+"""Longest side of the middle of the detector whose nonuniformity is measured."""
+_LEAST_PIXELS = 16
+_FRAMES = 64
+"""Most frames of a series that are read for it."""
+
+
+@dataclass(frozen=True)
+class Halves:
+    """Averages of the even and of the odd frames over the middle of the detector (ADU).
+
+    Attributes
+    ----------
+    dark : (2, y, x) float64 or None
+        Without light, shortest exposure.
+    flat : (2, y, x) float64 or None
+        Near half of the saturation, the former subtracted.
+    good : (y, x) bool
+    """
+
+    dark: F64 | None
+    flat: F64 | None
+    good: NDArray[np.bool_]
+
+
+def middle_of(shape: tuple[int, int]) -> Window:
+    """Rows and columns of the middle of the detector, from a border of chunks on."""
+    ends = []
+    for n, chunk in zip(shape, CHUNK[1:], strict=True):
+        first = max(0, (n - SIDE) // 2 // chunk * chunk)
+        ends.append((first, min(first + SIDE, n)))
+    return ends[0], ends[1]
+
+
+def read_halves(
+    made: Build,
+    source: Ingested,
+    summary: Summary,
+    top: Measure | None,
+    middle: Window,
+    runtime: Runtime,
+) -> Halves:
+    """Read the bias frames and the flats near half of the saturation ``top`` (ADU above bias)."""
+    dark, flat = source.exposures.read_series, _half_full(source, summary, top)
+    mask = ArrayReader(made.folder / "calibration.zarr" / "mask").read(*middle)
+    # Which pixels are bent depends on their response: without them it would look more uniform.
+    good = mask & ~np.uint8(PixelFlag.NONLINEAR) == 0
+    series = [group for group in (dark, flat) if group is not None]
+    if not series or good.sum() < _LEAST_PIXELS or min(good.shape) < 2:
+        return Halves(None, None, good)
+    (y0, y1), columns = middle
+    bands = [((y, min(y + CHUNK[1], y1)), columns) for y in range(y0, y1, CHUNK[1])]
+    parts = run_tasks(
+        partial(_averages, source, tuple(series)), bands, runtime, label="nonuniformity"
+    )
+    whole = np.concatenate(parts, axis=1)
+    # A pixel that a frame lacks is not used.
+    good &= np.isfinite(whole).all(axis=0)
+    if good.sum() < _LEAST_PIXELS:
+        return Halves(None, None, good)
+    if dark is None:
+        return Halves(None, whole, good)
+    return Halves(whole[:2], whole[2:] - whole[:2] if flat is not None else None, good)
+
+
+def _half_full(source: Ingested, summary: Summary, top: Measure | None) -> Group | None:
+    """Flats whose level is nearest to half of the saturation."""
+    if top is None:
+        return None
+    offers = [
+        (abs(level - top[0] / 2), n)
+        for n, level in enumerate(summary.levels)
+        if summary.usable[n] and len(source.exposures.flat[n].frames) > 1
+    ]
+    return source.exposures.flat[min(offers)[1]] if offers else None
+
+
+def _averages(source: Ingested, series: tuple[Group, ...], window: Window) -> F64:
+    """Averages of the even and of the odd frames of each series, (2 series, y, x)."""
+    (y0, y1), (x0, x1) = window
+    made = np.zeros((2 * len(series), y1 - y0, x1 - x0))
+    for n, group in enumerate(series):
+        used = group.frames[: min(_FRAMES, len(group.frames)) // 2 * 2]
+        for number, (_, samples) in enumerate(frames_of(source, group.array, used, window)):
+            made[2 * n + number % 2] += samples
+        made[2 * n : 2 * n + 2] /= len(used) / 2
+    return made
+
+
+def frames_of(
+    source: Ingested, array: str, numbers: Sequence[int], window: Window
+) -> Iterator[tuple[int, NDArray[Any]]]:
+    """Number and samples (y, x) of some frames, read in the blocks that they are stored in."""
+    for block, held in groupby(numbers, key=lambda number: number // CHUNK[0]):
+        first = block * CHUNK[0]
+        samples = source.arrays[array].read((first, first + CHUNK[0]), *window)
+        for number in held:
+            yield number, samples[number - first]

@@ -1,0 +1,129 @@
+"""A simulated camera's data sheet comes out of its frames, without optics or fringes."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from astropy.io import fits
+from click.testing import CliRunner
+
+import pixcal
+from pixcal_cli.main import cli
+
+SHAPE = (140, 150)
+GAIN, READ, FULL, DARK = 2.5, 6.0, 9000.0, 3.0
+DSNU, COLUMN, PRNU = 4.0, 1.5, 1.2
+"""e- and e- of whole columns; per cent."""
+
+
+def write_camera(folder: Path, levels: tuple[float, ...], seed: int = 8) -> Path:
+    """A 12-bit camera: bias, two series of darks at -10 C, a ladder of flats."""
+    rng = np.random.default_rng(seed)
+    offset = 200.3 * GAIN + DSNU * rng.standard_normal(SHAPE)
+    offset += COLUMN * rng.standard_normal((1, SHAPE[1]))
+    response = 1 + PRNU / 100 * rng.standard_normal(SHAPE)
+
+    def expose(name: str, count: int, electrons: float, seconds: float) -> None:
+        charge = rng.poisson(electrons * response + DARK * seconds, (count, *SHAPE))
+        read = np.minimum(charge, FULL) + offset + READ * rng.standard_normal((count, *SHAPE))
+        samples = np.clip(np.rint(read / GAIN), 0, 4095).astype(np.uint16)
+        header = fits.Header({"EXPTIME": seconds, "CCD-TEMP": -10.0})
+        fits.writeto(folder / f"{name}.fits", samples, header)
+
+    folder.mkdir()
+    expose("bias", 40, 0, 0.0)
+    for n, seconds in enumerate((10.0, 40.0)):
+        expose(f"dark{n}", 10, 0, seconds)
+    for n, level in enumerate(levels):
+        expose(f"flat{n}", 8, level, level / 1e5)
+    listed = {
+        "schema": "pixcal/acquisition/1",
+        "detector": {"name": "CAM", "pitch_um": 5.5, "gain_e_per_adu": 2.5, "read_noise_e": 6.0},
+        "frames": {"bias": ["bias.fits"], "dark": ["dark*.fits"], "flat": ["flat*.fits"]},
+    }
+    (folder / "acquisition.yaml").write_text(yaml.safe_dump(listed))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> pixcal.Run:
+    folder = tmp_path_factory.mktemp("camera")
+    acquisition = write_camera(folder / "acq", (500, 1500, 3000, 4500, 6000))
+    return pixcal.run(acquisition, folder / "run", diagnosed=False)
+
+
+def test_every_figure_is_right_within_its_error(run: pixcal.Run) -> None:
+    found: dict[str, Any] = run.reduction["figures_of_merit"]
+    truth = {
+        "conversion_gain": GAIN,
+        "read_noise": READ,
+        "read_noise_with_rounding": np.hypot(READ, GAIN / np.sqrt(12)),
+        "dsnu": np.hypot(DSNU, COLUMN),
+        "dsnu_column": COLUMN,
+        "dsnu_pixel": DSNU,
+        "prnu": PRNU,
+        "dark_current": DARK,
+    }
+    for name, true in truth.items():
+        value, error = found[name]["value"], found[name]["error"]
+        # Eight draws: the chance that any leaves four errors is 5e-4.
+        assert abs(value - true) < 4 * error, name
+        assert error < 0.1 * true, name
+    assert found["dsnu_row"]["value"] < 4 * found["dsnu_row"]["error"]
+    assert found["dark_current"]["note"] == "at -10.0 °C"
+    assert "lower limit" in found["full_well"]["note"]
+    assert found["full_well"]["value"] == pytest.approx(6000, rel=0.02)
+    assert found["full_well"]["error"] is None
+
+
+def test_a_ladder_that_saturates_gives_the_full_well(tmp_path: Path) -> None:
+    ladder = (500, 2500, 4500, 6500, 8000, 8600, 9500, 11000)
+    acquisition = write_camera(tmp_path / "acq", ladder)
+    reduced = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run"))
+    found = reduced.reduction["figures_of_merit"]["saturation"]
+    assert found["note"] == ""
+    # The variance is largest at the last level whose brightest samples alone are cut.
+    assert found["value"] == pytest.approx(8600 / GAIN, rel=0.02)
+    assert abs(found["value"] - FULL / GAIN) < 3 * found["error"] < 0.15 * FULL / GAIN
+
+
+def test_the_same_whatever_the_workers(run: pixcal.Run, tmp_path: Path) -> None:
+    again = pixcal.ingest(run.path.parent / "acq", tmp_path / "run")
+    pixcal.reduce(again, runtime=pixcal.Runtime("sync"))
+    for name in ("reduce.json", "figures_of_merit.json"):
+        assert (again.path / "reduce" / name).read_bytes() == (
+            run.path / "reduce" / name
+        ).read_bytes()
+
+
+def test_terminal_and_report_show_them_and_speak_of_no_fibres(run: pixcal.Run) -> None:
+    said = CliRunner().invoke(cli, ["reduce", str(run.path), "--quiet"]).output
+    page = run.report.read_text(encoding="utf-8")
+    for figure in run.reduction["figures_of_merit"].values():
+        assert figure["title"] in page
+        part = figure["title"].endswith(("of rows", "of columns", "of pixels"))
+        assert (figure["title"] in said) != part
+    for title in ("Photon-transfer curve", "DSNU: spectra", "PRNU: spectra", "Linearity"):
+        assert title in page
+    for word in ("fibre", "fringe set", "Not measured: there is no"):
+        assert word not in said
+        assert word not in page.split("Provenance</h2>")[0].split("<body>")[1], word
+
+
+def test_without_flats_and_darks_the_rest_is_there(tmp_path: Path) -> None:
+    acquisition = write_camera(tmp_path / "acq", (500,))
+    listed = yaml.safe_load((acquisition / "acquisition.yaml").read_text())
+    listed["frames"] = {"bias": ["bias.fits"]}
+    (acquisition / "acquisition.yaml").write_text(yaml.safe_dump(listed))
+    made = pixcal.run(acquisition, tmp_path / "run", diagnosed=False)
+    found = made.reduction["figures_of_merit"]
+    assert set(found) == {
+        "conversion_gain", "read_noise_with_rounding", "read_noise", "dsnu", "dsnu_row",
+        "dsnu_column", "dsnu_pixel",
+    }  # fmt: skip
+    assert found["conversion_gain"]["note"] == "declared, not measured"
+    curves = json.loads((made.path / "reduce" / "figures_of_merit.json").read_text())
+    assert curves["dsnu"]["rows"]["frequency"][-1] == 0.5
