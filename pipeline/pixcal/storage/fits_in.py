@@ -26,7 +26,7 @@ from pixcal.storage.fits_facts import (
 )
 from pixcal.storage.sources import SourceFile, unreadable
 
-Container = Literal["plain", "gzip", "tiles"]
+Container = Literal["plain", "gzip", "tiles", "picture"]
 _Stream = io.BufferedReader | gzip.GzipFile
 
 _BLOCK = 2880
@@ -84,14 +84,14 @@ class Coding:
 
 @dataclass(frozen=True)
 class FrameFile:
-    """A FITS file with one frame or a cube of frames.
+    """A file with one frame or a cube of frames.
 
     Attributes
     ----------
     source : SourceFile
         The file.
-    container : {"plain", "gzip", "tiles"}
-        ``tiles``: an image compressed by tiles, in a binary table.
+    container : {"plain", "gzip", "tiles", "picture"}
+        ``tiles``: an image compressed by tiles, in a binary table. ``picture``: TIFF or PNG.
     hdu : int
         Number of the header and data unit that holds the image.
     offset : int
@@ -220,7 +220,9 @@ def _first_image(source: SourceFile, stream: _Stream) -> tuple[fits.Header, fits
     """
     primary = header = _read_header(stream, b"SIMPLE")
     if primary is None:
-        raise ValueError("not a FITS file; remove it, or narrow the glob that lists it")
+        raise ValueError(
+            "not a FITS, TIFF or PNG file; remove it, or narrow the glob that lists it"
+        )
     hdu = 0
     while header is not None:
         if _is_tiled(header) or _is_image(header):

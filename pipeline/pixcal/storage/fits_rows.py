@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from pixcal.model.errors import InputError
 from pixcal.storage.cube import CHUNK
 from pixcal.storage.fits_in import Coding, FrameFile, damaged_gzip
+from pixcal.storage.pictures import picture_bytes, unpack_picture
 from pixcal.storage.sources import SourceFile, unreadable
 
 BAND = CHUNK[1]
@@ -122,7 +123,7 @@ def unpack(file: FrameFile, target: Path) -> FrameFile:
     Parameters
     ----------
     file : FrameFile
-        A file in the container ``gzip`` or ``tiles``.
+        A file in any container but ``plain``.
     target : Path
         Scratch file to make.
 
@@ -137,7 +138,9 @@ def unpack(file: FrameFile, target: Path) -> FrameFile:
         Naming the compressed file when it is damaged, cut short, or was changed.
     """
     with file.source.open() as handle, target.open("wb") as out:
-        if file.container == "gzip":
+        if file.container == "picture":
+            unpack_picture(file, out)
+        elif file.container == "gzip":
             _unpack_gzip(file, handle, out)
         else:
             _unpack_tiles(file, out)
@@ -156,6 +159,8 @@ def unpack_bytes(file: FrameFile) -> int:
     """Memory that `unpack` takes for a file, in bytes (measured, see the tests)."""
     if file.container == "plain":
         return 0
+    if file.container == "picture":
+        return picture_bytes(file)
     if file.container == "gzip":
         return 4 * _PIECE
     # Decoders hold a whole tile several times; HCOMPRESS, the hungriest, 7 times.

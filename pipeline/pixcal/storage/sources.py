@@ -4,13 +4,14 @@ import io
 import os
 import stat
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import ClassVar
 
 from pixcal.model.acquisition import Frames
 from pixcal.model.errors import InputError
 from pixcal.storage.artefact import digest
+from pixcal.storage.header_table import Header, read_headers
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,8 @@ class SourceFile:
         Bytes.
     mtime_ns : int
         Time of the last change (ns since 1970).
+    header : tuple of (str, value)
+        What ``headers.csv`` says of it.
     """
 
     CHANGED: ClassVar[str] = (
@@ -37,6 +40,7 @@ class SourceFile:
     name: str
     size: int
     mtime_ns: int
+    header: Header = ()
 
     def open(self) -> io.FileIO:
         """Open the file for unbuffered reading, if it is still the one that was found.
@@ -80,8 +84,8 @@ def unreadable(path: Path, error: OSError) -> InputError:
 
 
 def fingerprint(sources: Sequence[SourceFile]) -> str:
-    """Digest of the names, sizes and times of change of a set of files."""
-    return digest([(s.name, s.size, s.mtime_ns) for s in sources])
+    """Digest of the names, sizes, times of change and listed headers of a set of files."""
+    return digest([(s.name, s.size, s.mtime_ns, *s.header) for s in sources])
 
 
 def find_sources(frames: Frames, description: Path) -> dict[str, tuple[SourceFile, ...]]:
@@ -114,7 +118,12 @@ def find_sources(frames: Frames, description: Path) -> dict[str, tuple[SourceFil
         for number, pattern in enumerate(globs):
             names |= _matches(pattern, description, f"{description}: {key}[{number}]")
         found[array] = tuple(_source(description.parent, name, key, seen) for name in sorted(names))
-    return found
+    listed = {source.name for sources in found.values() for source in sources}
+    headers = read_headers(description.parent, sorted(listed))
+    return {
+        array: tuple(replace(s, header=headers.get(s.name, ())) for s in sources)
+        for array, sources in found.items()
+    }
 
 
 def _globs(frames: Frames) -> list[tuple[str, str, tuple[str, ...]]]:

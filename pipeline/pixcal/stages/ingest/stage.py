@@ -39,9 +39,10 @@ from pixcal.storage.artefact import (
 )
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.cube_place import base_of, chosen_base, cubes_of
-from pixcal.storage.fits_in import FrameFile, inspect
+from pixcal.storage.fits_in import FrameFile
 from pixcal.storage.fits_rows import BAND, read_rows, unpack, unpack_bytes
 from pixcal.storage.folder import transit_bytes
+from pixcal.storage.frame_files import inspect
 from pixcal.storage.frame_reader import describe
 from pixcal.storage.frames import Frame, columns, tabulate
 from pixcal.storage.place import Place

@@ -1,0 +1,128 @@
+"""Frames in TIFF and PNG files, read by Pillow: greyscale, one frame a page.
+
+Such files have no FITS header. Exposure times are taken from ``headers.csv``
+(`pixcal.storage.header_table`), else from the EXIF tag ExposureTime.
+"""
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from astropy.io import fits
+from PIL import ExifTags, Image
+
+from pixcal.model.errors import InputError
+from pixcal.storage.fits_facts import exposure_s, temperature_c, time_stamp_mjd
+from pixcal.storage.fits_in import Coding, FrameFile
+from pixcal.storage.sources import SourceFile
+
+# PNG; TIFF and BigTIFF in both byte orders.
+_MAGIC = (b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+_CODINGS = {
+    "L": Coding(8),
+    "I;16": Coding(16, bzero=1 << 15),
+    "I;16L": Coding(16, bzero=1 << 15),
+    "I;16B": Coding(16, bzero=1 << 15),
+    "I": Coding(32),
+    "F": Coding(-32),
+}
+"""Modes of Pillow that hold one sample a pixel, and how `unpack_picture` writes them."""
+
+
+def is_picture(start: bytes) -> bool:
+    """Whether a file that begins so is TIFF or PNG."""
+    return start.startswith(_MAGIC)
+
+
+def inspect_picture(source: SourceFile) -> FrameFile:
+    """Frames of a TIFF or PNG file: a page each, all of one size.
+
+    Raises
+    ------
+    InputError
+        Naming the file: damaged, in colour, or of pages that differ.
+    """
+    with _opened(source.path) as picture:
+        pages = getattr(picture, "n_frames", 1)
+        kinds = set()
+        for page in range(pages):
+            picture.seek(page)
+            kinds.add((picture.size, picture.mode))
+        if len(kinds) > 1:
+            raise InputError(
+                f"{source.path}: pages of different sizes or types; a file holds frames of one "
+                "size, so remove previews and thumbnails"
+            )
+        (((nx, ny), mode),) = kinds
+        if mode not in _CODINGS:
+            raise InputError(
+                f"{source.path}: samples of Pillow's mode {mode}; frames are greyscale of 8, 16 or "
+                "32 bits: record raw frames, without colour or palette"
+            )
+        header = fits.Header(dict(source.header))
+        exif = _exposure_s(picture)
+    told = exposure_s((header,))
+    return FrameFile(
+        source,
+        "picture",
+        hdu=0,
+        offset=0,
+        shape=(pages, ny, nx),
+        coding=_CODINGS[mode],
+        mjd=time_stamp_mjd((header,)),
+        exptime_s=exif if told is None else told,
+        temperature_c=temperature_c((header,)),
+    )
+
+
+def unpack_picture(file: FrameFile, out: BinaryIO) -> None:
+    """Write the pages of a file as the big-endian samples of a FITS cube.
+
+    Raises
+    ------
+    InputError
+        Naming the file when it is damaged or cut short.
+    """
+    with _opened(file.source.path) as picture:
+        for page in range(file.shape[0]):
+            picture.seek(page)
+            samples = np.asarray(picture)
+            if samples.shape != file.shape[1:]:
+                raise InputError(f"{file.source.path}: changed while it was being read")
+            if file.coding.bzero:
+                samples = (samples ^ np.uint16(file.coding.bzero)).view(np.int16)
+            out.write(samples.astype(file.coding.stored.newbyteorder(">")).tobytes())
+
+
+def picture_bytes(file: FrameFile) -> int:
+    """Memory that `unpack_picture` takes: Pillow's page, and three copies of it."""
+    return (4 << 20) + 4 * file.data_bytes // file.shape[0]
+
+
+def _exposure_s(picture: Image.Image) -> float | None:
+    exif = picture.getexif()
+    own = exif.get_ifd(ExifTags.IFD.Exif)
+    value = own.get(ExifTags.Base.ExposureTime, exif.get(ExifTags.Base.ExposureTime))
+    try:
+        return None if value is None else float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Image.Image]:
+    """A file opened by Pillow; what its decoders raise becomes one line."""
+    try:
+        with Image.open(path, formats=("TIFF", "PNG")) as picture:
+            yield picture
+    except InputError:
+        raise
+    except Exception as error:  # the decoders raise a dozen kinds, all of which mean one thing
+        reason = " ".join(str(error).replace(os.fspath(path), "it").split())
+        raise InputError(
+            f"{path}: cannot be decoded ({reason or type(error).__name__}); copy it again, or "
+            "remove it"
+        ) from error
