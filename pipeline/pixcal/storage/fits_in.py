@@ -220,9 +220,7 @@ def _first_image(source: SourceFile, stream: _Stream) -> tuple[fits.Header, fits
     """
     primary = header = _read_header(stream, b"SIMPLE")
     if primary is None:
-        raise ValueError(
-            "not a FITS, TIFF or PNG file; remove it, or narrow the glob that lists it"
-        )
+        raise ValueError("not a FITS file (nor TIFF or PNG); remove it, or narrow its glob")
     hdu = 0
     while header is not None:
         if _is_tiled(header) or _is_image(header):
