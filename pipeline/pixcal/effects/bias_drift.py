@@ -2,12 +2,15 @@
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import idct
 
 from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.frame_light import OFFSETS, FrameLight, light_of
 from pixcal.estimators.frame_offset import (
     OffsetSeries,
     dark_offsets,
@@ -41,15 +44,30 @@ SETTLINGS = 8
 """Time constants tried, from some steps to the length of the run."""
 WORTH = 0.3
 """Fringes count where their mean offset is as well known as this, of a sample's read noise."""
-_KEY = 1000
-"""First key of the walk's random numbers: no recording has it."""
+PARTS = ("power", "power_walk", "contrast", "contrast_walk", *OFFSETS)
+"""What moves the light of the frames of a run."""
+KNOTS = 32
+"""Most points of a track."""
+_KEY, _RUN = 1000, 2000
+"""First keys of the walks' random numbers: no recording has them."""
+
+
+@dataclass(frozen=True)
+class Track:
+    """Offset of the frames of one run of fringes, as measured: straight between its points."""
+
+    set: str = quantity(doc="name of the fringe set")
+    time_s: tuple[float, ...] = quantity(unit="s", doc="after the first frame of the run, rising")
+    offset_e: tuple[float, ...] = quantity(unit="e-", low=-1e6, high=1e6, doc="at these times")
 
 
 @dataclass(frozen=True)
 class BiasDrift(Effect):
     """A constant added to all pixels of a frame; time runs from the acquisition's first frame.
 
-    Slow changes are those of the temperature: a ramp, a settling after power-on, a random walk.
+    Slow changes are those of the temperature: a ramp, a settling after power-on, a random walk that
+    goes on through all frames, or one that begins anew with each run of fringes, when the readout
+    settles to its pace. ``tracks`` are offsets as measured, with no law.
     The fit takes up by B, the intensity of a frame, as much of an offset as looks like light; the
     rest is pattern, where the light is uneven or samples were divided by a flat. Maps alone do not
     tell: the fit's mean intensity hides a constant offset, and nothing else is constant in time.
@@ -59,7 +77,7 @@ class BiasDrift(Effect):
     title = "offset of the whole frame, changing"
     stage = Stage.READOUT
     domains = ("time", "noise")
-    strengths = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e")
+    strengths = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e", "run_walk_e_h", "tracks")
     told_by = ("dark",)
     sources = (
         "Rauscher 2015, PASP 127, 1144: pedestal drift of 4 e- rms at 5 e- of read noise",
@@ -75,6 +93,25 @@ class BiasDrift(Effect):
         5.0, unit="e-", low=-1e5, high=1e5, doc="what decays from the first frame on"
     )
     settle_s: float = quantity(600.0, unit="s", above=0, high=1e7, doc="time constant of the decay")
+    run_walk_e_h: float = quantity(
+        0.0, unit="e-/h^0.5", low=0, high=1e6, doc="random walk that begins with each fringe run"
+    )
+    tracks: tuple[Track, ...] = quantity((), doc="offsets of fringe runs as measured")
+
+    def scaled(self, factor: float) -> Self:
+        """As in `Effect.scaled`."""
+        plain = replace(self, tracks=())
+        tracks = tuple(
+            replace(t, offset_e=tuple(factor * v for v in t.offset_e)) for t in self.tracks
+        )
+        changed = {n: factor * getattr(self, n) for n in plain.strengths if n != "tracks"}
+        return replace(plain, tracks=tracks, **changed)
+
+    @property
+    def is_null(self) -> bool:
+        """As in `Effect.is_null`."""
+        plain = any(getattr(self, n) for n in self.strengths if n != "tracks")
+        return not plain and not any(v for t in self.tracks for v in t.offset_e)
 
     def trend(self, time_s: F64) -> F64:
         """Offset (t,), e-, that is not random; of an acquisition's times."""
@@ -97,11 +134,66 @@ class BiasDrift(Effect):
     def readout(self, adu: F32, shot: Shot) -> F32:
         """As in `Effect.readout`."""
         offset = self.offset(shot.time_s, shot.bench.seed, shot.rng(self.name))
+        if shot.recording.kind == "fringes":
+            offset += self._in_run(shot)
         return adu + np.float32(offset / shot.bench.detector.gain_e_per_adu)
+
+    def _in_run(self, shot: Shot) -> float:
+        """Offset of a frame of fringes since its run began, e-."""
+        time = shot.frame * shot.recording.period_s
+        name = shot.bench.frames.fringes[shot.recording.number].name
+        offset = sum(float(np.interp(time, t.time_s, t.offset_e)) for t in self.tracks
+                     if t.set == name)  # fmt: skip
+        if self.run_walk_e_h:
+
+            def normal(level: int, place: int) -> float:
+                own = shot.recording.rng(self.name, _RUN + level, place)
+                return float(own.standard_normal())
+
+            offset += self.run_walk_e_h * brownian(time, normal) / np.sqrt(HOUR_S)
+        return offset
+
+    def replayed(self, evidence: Evidence) -> Self | None:
+        """As in `Effect.replayed`: the slow offset of every frame of fringes."""
+        light = light_of(evidence)
+        if light is None:
+            return None
+        return replace(self.scaled(0.0), jitter_rms=self.jitter_rms, tracks=_tracks(light))
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Levels of frames without light against time; of fringes what is not light.
+
+        What moves B and leaves A alone in fringes is an offset too; where frames without light do
+        not have as much of it, it is one of the runs of fringes.
+        """
+        through, in_runs = cls._through(evidence), cls._in_runs(evidence)
+        found = [e for e in (through, in_runs) if e is not None]
+        return max(found, key=lambda e: e.significance, default=None)
+
+    @classmethod
+    def _in_runs(cls, evidence: Evidence) -> Estimate | None:
+        """A walk of each run of fringes by itself, from B and A of its frames."""
+        light = light_of(evidence)
+        if light is None:
+            return None
+        light = replace(light, dark=())
+        there = light.components(PARTS)
+        none = light.components(PARTS, absent=OFFSETS)
+        walk, error = there.root(PARTS.index("offset_walk"))
+        chance = joint_log_chance(there, none, there.size[-2:])
+        per_hour = float(np.sqrt(HOUR_S))
+        return Estimate(
+            cls(0.0, 0.0, 0.0, 0.0, run_walk_e_h=min(walk * per_hour, 1e6)),
+            {"run_walk_e_h": error * per_hour},
+            sigmas(chance),
+            "the mean light of the frames changes and the fringe amplitude does not",
+            law="random walk of each run of fringes",
+        )
+
+    @classmethod
+    def _through(cls, evidence: Evidence) -> Estimate | None:
+        """What drifts through all frames, by one clock.
 
         A change of the dark current would look the same in one stack of darks; where there are bias
         frames, they hold it down. Of few frames a walk may look like a ramp: what both explain is
@@ -127,7 +219,11 @@ class BiasDrift(Effect):
             found, slope = level, 0.0
         (jitter, jitter_error), (walk, walk_error) = found.root(0), found.root(1)
         per_hour = float(np.sqrt(HOUR_S))
-        values = {"jitter_rms": jitter, "ramp_e_h": slope, "walk_e_h": walk * per_hour}
+        values: dict[str, Any] = {
+            "jitter_rms": jitter,
+            "ramp_e_h": slope,
+            "walk_e_h": walk * per_hour,
+        }
         errors = {
             "jitter_rms": jitter_error, "ramp_e_h": slope_error, "walk_e_h": walk_error * per_hour
         }  # fmt: skip
@@ -197,3 +293,26 @@ def _settling(
         error, width = width / np.sqrt(bend), width / 2
     time = float(np.exp(log_time))
     return (time, fit(time, MAX_STEPS), time * min(float(error), 3.0)), chance
+
+
+def _tracks(light: FrameLight) -> tuple[Track, ...]:
+    """Offsets of every set: the part of (B, log A/B) that moves the first and not A (Wiener)."""
+    light = replace(light, dark=())
+    found = []
+    for series in light.sets:
+        alone = replace(light, sets=(series,))
+        modes = alone.modes(PARTS)
+        size = np.maximum(estimate_components(modes).size, 0.0)
+        n = len(series) - 1
+        parts = size[:, None, None, None] * modes.parts[:, :n]
+        level = light.level[series.name]
+        # Of unit walk in e-, what (B, log A/B) share with it.
+        walk = parts[PARTS.index("offset_walk")]
+        with_offset = level * np.stack([walk[:, 0, 0], walk[:, 1, 0]], axis=1)
+        weight = np.linalg.solve(parts.sum(axis=0), with_offset[..., None])[..., 0]
+        smooth = np.einsum("nc,nc->n", weight, modes.values[:n])
+        offset = idct(np.concatenate([[0.0], smooth]), type=2, norm="ortho")
+        at = np.unique(np.linspace(0, n, min(KNOTS, n + 1)).astype(int))
+        times, values = series.time_s[at], np.clip(offset[at], -1e6, 1e6)
+        found.append(Track(series.name, tuple(map(float, times)), tuple(map(float, values))))
+    return tuple(found)

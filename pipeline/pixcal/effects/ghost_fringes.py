@@ -2,63 +2,73 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri_exp
 
-from pixcal.estimators.evidence import Evidence, FringeEvidence
-from pixcal.estimators.map_fit import (
-    MapFit,
-    MapPart,
-    centred,
-    fit_maps,
-    gauge_terms,
-    phase_map,
-    polynomial,
-    without,
-)
-from pixcal.estimators.structure import PERIODS
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.map_waves import WaveFit, find_waves
 from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows
-from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
 
-F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
-Mask = NDArray[np.bool_]
 
-NEAR = 1.5
-"""Periods in the window: no beat is looked for closer than that to what the fit leaves open."""
+PARENTS = ("modulated", "fixed", "both", "crossed")
+_TIED = 4.0
+"""Standard deviations beyond which an amplitude is not zero, or two are not alike."""
 
-HARMONICS = 4
-"""Of the fringes: a response that is not linear leaves waves there."""
 
-_MIN_PIXELS = 200
-_CLIP = 6.0
-_TURNS = 5
+@dataclass(frozen=True)
+class GhostWave:
+    """One ghost as it is measured in the maps of a fringe set, with no assumption on its origin."""
+
+    beat_rad_px: tuple[float, float] = quantity(
+        unit="rad/px", low=-np.pi, high=np.pi, doc="vector of the beat along x and y"
+    )
+    set: str = quantity("", doc="name of the fringe set; default: all")
+    static: tuple[float, float] = quantity(
+        (0.0, 0.0), low=-0.9, high=0.9, doc="cosine and sine of the pattern of the mean light"
+    )
+    forward: tuple[float, float] = quantity(
+        (0.0, 0.0), low=-0.9, high=0.9, doc="of the fringes at the fringe vector plus the beat"
+    )
+    backward: tuple[float, float] = quantity(
+        (0.0, 0.0), low=-0.9, high=0.9, doc="of the fringes at the fringe vector less the beat"
+    )
+
+    def scaled(self, factor: float) -> Self:
+        """The same wave, ``factor`` times as strong."""
+        (s, t), (f, g), (b, c) = self.static, self.forward, self.backward
+        return replace(
+            self,
+            static=(factor * s, factor * t),
+            forward=(factor * f, factor * g),
+            backward=(factor * b, factor * c),
+        )
 
 
 @dataclass(frozen=True)
 class GhostFringes(Effect):
-    """Light reflected twice in a plate interferes with the direct light.
+    """A weak beam, the reflection of a fibre in a plate, adds its field to the two direct ones.
 
-    Seen from the detector the reflection moves the fibres' images aside by the same way in all
-    sets, so every ghost beats with what it meets at the same fringe vector, ``beat_rad_px``. Direct
-    light of one fibre with the ghost of the other follows the modulator (``follows``): the fringe's
-    phasor is multiplied by ``1 + share exp(i (beat·r + phase_rad))``, which shifts the phase by up
-    to ``share`` rad, and changes the visibility by as much, a quarter of a period away. Direct
-    light with its own ghost stands still: the mean light is multiplied by ``1 + share cos(...)``,
-    and so are flats where their lamp is as coherent (``in_flats``).
+    Of amplitude ``share`` and at the angle of ``beat_rad_px`` to its parent's beam, it interferes
+    with both fibres. With its parent it makes a pattern that stands still: the mean light gains
+    ``2 share I cos(beat·r + phase_rad)``, I the parent's intensity. With the other fibre it makes
+    fringes that follow the modulator: the fringe's phasor is multiplied by
+    ``1 + share exp(±i (beat·r + phase_rad))``, plus for the modulated fibre, minus for the fixed
+    one. A ghost whose polarisation is crossed with the other fibre's makes the static pattern
+    alone. ``waves`` are ghosts as measured, set by set, with amplitudes that nothing ties.
     """
 
     name = "ghost_fringes"
     title = "ghost fringes of a parasitic reflection"
     stage = Stage.LIGHT
     domains = ("space",)
-    strengths = ("share",)
+    strengths = ("share", "waves")
     told_by = ("baseline", "axis")
     sources = (
         "a ghost of 0.5 % shifts by up to 0.005 / |K|: 4e-3 px at 5 px interfringe",
@@ -67,37 +77,70 @@ class GhostFringes(Effect):
         "wedge of angle w makes fringes of lambda / (2 n w)",
     )
 
-    share: float = quantity(
-        0.005, low=0, high=0.9, doc="amplitude of the ghost, of the fringe's or of the mean light"
-    )
+    share: float = quantity(0.005, low=0, high=0.9, doc="amplitude of the ghost over its parent's")
     beat_rad_px: tuple[float, float] = quantity(
         (0.35, 0.2), unit="rad/px", low=-np.pi, high=np.pi, doc="vector of the beat along x and y"
     )  # fmt: skip
     phase_rad: float = quantity(
         0.0, unit="rad", low=-1e3, high=1e3, doc="of the beat in the window's first pixel"
     )
-    follows: bool = quantity(True, doc="whether the ghost's phase follows the modulator")
-    in_flats: bool = quantity(False, doc="whether a ghost that stands still is in flats too")
+    parent: str = quantity("modulated", choices=PARENTS, doc="fibre that is reflected")
+    in_flats: bool = quantity(False, doc="whether flats have the static pattern too")
+    waves: tuple[GhostWave, ...] = quantity((), doc="ghosts as measured, beside the one above")
 
-    def beat(self, rows: Rows, columns: Rows) -> C128:
-        """``share exp(i (beat·r + phase))`` (y, x) on rows and columns of the window."""
+    def scaled(self, factor: float) -> Self:
+        """As in `Effect.scaled`."""
+        waves = tuple(wave.scaled(factor) for wave in self.waves)
+        return replace(self, share=self.share * factor, waves=waves)
+
+    @property
+    def is_null(self) -> bool:
+        """As in `Effect.is_null`."""
+        return not self.share and all(w == w.scaled(0.0) for w in self.waves)
+
+    def _waves(self, of: str) -> list[GhostWave]:
+        """All waves of a set."""
+        size, turn = self.share, self.phase_rad
+        one = (size * np.cos(turn), -size * np.sin(turn))
+        other = (size * np.cos(turn), size * np.sin(turn))
+        nothing = (0.0, 0.0)
+        twice = 2 if self.parent == "both" else 1
+        own = GhostWave(
+            self.beat_rad_px,
+            static=(twice * one[0], twice * one[1]),
+            forward=other if self.parent in ("modulated", "both") else nothing,
+            backward=one if self.parent in ("fixed", "both") else nothing,
+        )
+        return [w for w in (own, *self.waves) if w.set in ("", of)]
+
+    def _factors(self, of: str, rows: Rows, columns: Rows) -> tuple[F64, C128]:
+        """By what mean light and fringe phasor (y, x) are multiplied on rows and columns."""
         y, x = np.arange(*rows)[:, None], np.arange(*columns)
-        kx, ky = self.beat_rad_px
-        return np.asarray(self.share * np.exp(1j * (kx * x + ky * y + self.phase_rad)))
+        mean = np.ones((len(y), len(x)))
+        fringe = np.ones(mean.shape, complex)
+        for wave in self._waves(of):
+            e = np.exp(1j * (wave.beat_rad_px[0] * x + wave.beat_rad_px[1] * y))
+            mean += wave.static[0] * e.real + wave.static[1] * e.imag
+            fringe += complex(*wave.forward) * e + complex(*wave.backward) * e.conj()
+        return mean, fringe
 
     def light(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
     ) -> LightMaps:
         """As in `Effect.light`."""
-        beat = self.beat(rows, (0, light.iota.shape[1]))
-        if recording.kind == "fringes" and self.follows:
-            z = (light.alpha_cos + 1j * light.alpha_sin) * (1 + beat)
-            return replace(
-                light, alpha_sin=z.imag.astype(np.float32), alpha_cos=z.real.astype(np.float32)
-            )
-        if recording.kind == "fringes" or (self.in_flats and not self.follows):
-            return replace(light, iota=light.iota * (1 + beat.real).astype(np.float32))
-        return light
+        columns = (0, light.iota.shape[1])
+        if recording.kind == "flat" and self.in_flats:
+            mean, _ = self._factors("", rows, columns)
+            return replace(light, iota=light.iota * mean.astype(np.float32))
+        if recording.kind != "fringes":
+            return light
+        name = recording.bench.frames.fringes[recording.number].name
+        mean, fringe = self._factors(name, rows, columns)
+        z = (light.alpha_cos + 1j * light.alpha_sin) * fringe
+        return LightMaps(
+            light.iota * mean.astype(np.float32), z.imag.astype(np.float32),
+            z.real.astype(np.float32),
+        )  # fmt: skip
 
     def predict(self, maps: FringeMaps) -> FringeMaps:
         """As in `Effect.predict`."""
@@ -109,226 +152,88 @@ class GhostFringes(Effect):
 
     def _times(self, maps: FringeMaps, power: int) -> FringeMaps:
         (row, column), (ny, nx) = maps.origin, maps.theta.shape[1:]
-        beat = self.beat((row, row + ny), (column, column + nx))
+        mean, fringe = self._factors(maps.name, (row, row + ny), (column, column + nx))
         iota, sine, cosine = maps.theta
-        if self.follows:
-            z = (cosine + 1j * sine) * (1 + beat) ** power
-            return replace(maps, theta=np.stack([iota, z.imag, z.real]))
-        factor = (1 + beat.real) ** power
-        theta = np.stack([iota * factor, sine, cosine])
+        z = (cosine + 1j * sine) * fringe**power
+        theta = np.stack([iota * mean**power, z.imag, z.real])
         if not self.in_flats or maps.flat is None:
             return replace(maps, theta=theta)
-        return replace(maps, theta=theta / factor, flat=maps.flat * factor)
+        lamp = self._factors("", (row, row + ny), (column, column + nx))[0] ** power
+        return replace(maps, theta=theta / lamp, flat=maps.flat * lamp)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """One wave, the same in all sets, that phase and visibility share a quarter period apart.
+        """Waves that mean light and fringes share, set by set (`find_waves`).
 
-        A ghost that stands still is in the visibility, and against it in iota, or in the flat when
-        flats have it too. What true offsets, crosstalk or a flat do is in one of the maps alone, or
-        not in these relations, and is not claimed. The chance is that of the best of all waves that
-        the window can tell apart; those near the fringes, and near no wave at all, are left out.
+        What true offsets, crosstalk or a flat do is in one of the maps alone, and is not claimed.
         """
-        sets = [f for f in evidence.fringes.values() if np.count_nonzero(f.good) > _MIN_PIXELS]
-        if not sets:
+        found = find_waves(evidence)
+        if found is None:
             return None
-        flat = _Map(
-            np.log(np.maximum(evidence.flat, 1e-9)), polynomial(evidence.good.shape, 2),
-            evidence.good & (evidence.flat > 0), 1,
-        )  # fmt: skip
-        following = _Found.of(
-            [_visibility(f, 1) for f in sets], [_phase(f) for f in sets], (0, 1), sets
-        )
-        seen = [_visibility(f, -1) for f in sets]
-        still = [_Found.of(seen, other, (0,), sets) for other in ([_iota(f) for f in sets], [flat])]
-        found = max((following, *still), key=lambda s: s.significance)
         ny, nx = evidence.good.shape
-        y0, x0 = evidence.origin[0] + (ny - 1) / 2, evidence.origin[1] + (nx - 1) / 2
-        phase = np.angle(found.wave) - found.q @ np.array([x0, y0])
-        error = found.errors
-        follows = found is following
+        middle = (evidence.origin[1] + (nx - 1) / 2, evidence.origin[0] + (ny - 1) / 2)
+        waves: list[GhostWave] = []
+        errors: dict[str, float] = {}
+        for n, one in enumerate(found.waves):
+            waves.append(_wave(one, middle))
+            for key, error in (("static", one.errors[0]), ("forward", one.errors[1]),
+                               ("backward", one.errors[2])):  # fmt: skip
+                errors |= {f"waves[{n}].{key}[{part}]": error for part in (0, 1)}
+            errors |= {f"waves[{n}].beat_rad_px[{axis}]": one.errors[3 + axis] for axis in (0, 1)}
+        law, tied = _law(found.waves, middle)
         return Estimate(
-            cls(
-                float(min(abs(found.wave), 0.9)),
-                (float(found.q[0]), float(found.q[1])),
-                float(np.angle(np.exp(1j * phase))),
-                follows,
-                found is still[1],
-            ),
-            {
-                "share": error[0],
-                "phase_rad": float(np.hypot(error[1], np.hypot(error[2] * x0, error[3] * y0))),
-                "beat_rad_px[0]": error[2],
-                "beat_rad_px[1]": error[3],
-            },
+            cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=tuple(waves)),
+            errors,
             found.significance,
-            "a wave that visibility and phase share"
-            if follows
-            else "a wave in the visibility that the mean light explains",
-            {"of_following": following.significance, "of_still": [s.significance for s in still]},
+            "waves of one vector in " + " and ".join(found.seen_in),
+            {"sigmas_by_map": found.by_map},
+            law=law,
+            by_law=cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=tied),
         )
 
 
-@dataclass(frozen=True)
-class _Map:
-    """A map (y, x) in which a ghost G is seen as ``Re(part G)``; free terms (n, y, x)."""
-
-    data: F64
-    free: F64
-    good: Mask
-    part: complex
-
-    def rest(self) -> tuple[F64, float]:
-        """The map without its free terms, zero where masked, and its variance."""
-        left = without(self.data[self.good][:, None], self.free[:, self.good].T)[:, 0]
-        scatter = 1.4826 * float(np.median(np.abs(left - np.median(left))))
-        left = np.where(np.abs(left) > _CLIP * scatter, 0, left)
-        out = np.zeros(self.good.shape)
-        out[self.good] = left
-        return out, float((left @ left) / len(left)) or 1e-30
+def _wave(found: WaveFit, middle: tuple[float, float]) -> GhostWave:
+    """A wave counted from the window's first pixel instead of its middle."""
+    qx, qy = found.q
+    turn = np.exp(-1j * (qx * middle[0] + qy * middle[1]))
+    # Of the mean light Re(s e), of the fringes f e and b / e.
+    static, forward, backward = found.static * turn, found.forward * turn, found.backward / turn
+    return GhostWave(
+        (float(np.clip(qx, -np.pi, np.pi)), float(np.clip(qy, -np.pi, np.pi))),
+        found.set,
+        _pair(static.conjugate()), _pair(forward), _pair(backward),
+    )  # fmt: skip
 
 
-def _terms(found: FringeEvidence) -> F64:
-    return np.concatenate([polynomial(found.good.shape, 2), gauge_terms(found)])
+def _pair(value: complex) -> tuple[float, float]:
+    return float(np.clip(value.real, -0.9, 0.9)), float(np.clip(value.imag, -0.9, 0.9))
 
 
-def _log(found: FringeEvidence, value: F64) -> F64:
-    return np.asarray(np.log(np.where(found.good, np.maximum(value, 1e-9), 1.0)))
-
-
-def _alpha_of(found: FringeEvidence) -> F64:
-    return np.asarray(np.hypot(found.theta[1], found.theta[2]))
-
-
-def _visibility(found: FringeEvidence, part: complex) -> _Map:
-    visibility = _alpha_of(found) / np.maximum(found.theta[0], 1e-9)
-    return _Map(_log(found, visibility), _terms(found), found.good, part)
-
-
-def _phase(found: FringeEvidence) -> _Map:
-    return _Map(phase_map(found), _terms(found), found.good, -1j)
-
-
-def _iota(found: FringeEvidence) -> _Map:
-    return _Map(_log(found, found.theta[0]), _terms(found), found.good, 1)
-
-
-@dataclass(frozen=True)
-class _Found:
-    """The best wave of some maps.
-
-    Attributes
-    ----------
-    wave : complex
-        Share and phase at the middle of the part.
-    q : (2,) float64
-        Along x and y, rad/px.
-    errors : (4,) float
-        Of share, phase, and q.
-    significance : float
-    """
-
-    wave: complex
-    q: F64
-    errors: tuple[float, ...]
-    significance: float
-
-    @classmethod
-    def of(
-        cls,
-        one: Sequence[_Map],
-        other: Sequence[_Map],
-        searched: Sequence[int],
-        sets: Sequence[FringeEvidence],
-    ) -> "_Found":
-        """Of maps of two kinds: searched in those numbered, confirmed in both."""
-        kinds = [one, other]
-        search = [m for n in searched for m in kinds[n]]
-        q, trials = _best_wave(search, sets)
-        wave, q, fit = _fitted(search, q)
-        own = [_amplitude(kind, q) for kind in kinds]
-        apart = own[0].values - own[1].values
-        spread = own[0].covariance + own[1].covariance
-        scale = np.sqrt(max(1.0, float(apart @ np.linalg.solve(spread, apart)) / 2))
-        ways = [_best_of(_amplitude(search, q).gain, trials)]
-        ways += [sigmas_of_chi2(o.gain, 2) for o in own]
-        errors = np.sqrt(np.diag(fit.covariance))
-        # Share and phase: along the wave, and across it.
-        share = max(abs(wave), errors[0])
-        turned = (errors[0], min(errors[1] / share, np.pi), errors[2], errors[3])
-        return cls(wave, q, tuple(float(e) for e in turned), float(min(ways) / scale))
-
-
-def _best_wave(maps: Sequence[_Map], sets: Sequence[FringeEvidence]) -> tuple[F64, float]:
-    """Vector with the largest chi-square on a fine grid, and how many waves there were."""
-    shape = maps[0].good.shape
-    size = (2 * shape[0], 2 * shape[1])
-    seen = np.zeros(shape, complex)
-    for m in maps:
-        data, variance = m.rest()
-        seen += data / variance * np.conj(m.part)
-    power = np.abs(np.fft.fft2(seen, size)) ** 2
-    fy, fx = np.meshgrid(*(np.fft.fftfreq(n) for n in size), indexing="ij")
-    allowed = ~_of_lines(fx, fy, shape)
-    for f in sets:
-        for n in range(HARMONICS + 1):
-            for sign in (1, -1):
-                dx, dy = fx - sign * n * f.k[0] / 2 / np.pi, fy - sign * n * f.k[1] / 2 / np.pi
-                far = np.hypot((dx - np.rint(dx)) * shape[1], (dy - np.rint(dy)) * shape[0])
-                allowed &= far > NEAR
-    if np.isrealobj(seen) or not np.any(seen.imag):
-        allowed &= (fy > 0) | ((fy == 0) & (fx > 0))
-    at = int(np.argmax(np.where(allowed, power, -1)))
-    q = 2 * np.pi * np.array([fx.flat[at], fy.flat[at]])
-    # Between the waves of the window there are some that are alike but not the same.
-    return q, 3 * np.count_nonzero(allowed) / 4
-
-
-def _of_lines(fx: F64, fy: F64, shape: tuple[int, ...]) -> Mask:
-    """Frequencies (cycles/px) of rows or columns that repeat: those are circuits, and not glass."""
-    found = np.zeros(fx.shape, bool)
-    for across, along, n, m in ((fx, fy, shape[1], shape[0]), (fy, fx, shape[0], shape[1])):
-        level = np.abs(across) * n < NEAR
-        for period in PERIODS:
-            harmonic = np.abs(along * period - np.rint(along * period)) / period * m < NEAR
-            found |= level & harmonic & (np.abs(along) * m >= NEAR)
-    return found
-
-
-def _fitted(maps: Sequence[_Map], q: F64) -> tuple[complex, F64, MapFit]:
-    """Wave and vector by Gauss and Newton; covariance along and across the wave, and of q."""
-    first = _amplitude(maps, q).values
-    wave, limit = complex(first[0], first[1]), 2 * np.pi / np.array(maps[0].good.shape[::-1])
-    start = q
-    for _ in range(_TURNS):
-        parts = []
-        for m in maps:
-            y, x = centred(m.good.shape)
-            e = np.exp(1j * (q[0] * x + q[1] * y + np.angle(wave)))
-            slope = 1j * abs(wave) * e
-            signals = np.stack([(m.part * s).real for s in (e, 1j * e, x * slope, y * slope)])
-            model = (m.part * abs(wave) * e).real
-            parts.append(MapPart.of(signals, m.data - model, m.free, m.good))
-        fit = fit_maps(parts)
-        along, across, *turn = fit.values
-        wave = (abs(wave) + complex(along, across)) * np.exp(1j * np.angle(wave))
-        q = np.clip(q + np.array(turn), start - limit, start + limit)
-    return wave, q, fit
-
-
-def _amplitude(maps: Sequence[_Map], q: F64) -> MapFit:
-    """Real and imaginary part of the wave of a vector."""
-    parts = []
-    for m in maps:
-        y, x = centred(m.good.shape)
-        e = np.exp(1j * (q[0] * x + q[1] * y))
-        signals = np.stack([(m.part * e).real, (m.part * 1j * e).real])
-        parts.append(MapPart.of(signals, m.data, m.free, m.good))
-    return fit_maps(parts)
-
-
-def _best_of(gain: float, trials: float) -> float:
-    """Standard deviations as rare as the best chi-square of so many waves."""
-    log_rate = np.log(trials) - gain / 2
-    log_chance = log_rate if log_rate < -20 else np.log(-np.expm1(-np.exp(log_rate)))
-    return -float(ndtri_exp(min(float(log_chance), -1e-300)))
+def _law(
+    waves: Sequence[WaveFit], middle: tuple[float, float]
+) -> tuple[str, tuple[GhostWave, ...]]:
+    """What ties the amplitudes of the waves: the law, and the waves that follow it."""
+    laws = {
+        "static pattern alone: a ghost crossed in polarisation with the other fibre": (1, 0, 0),
+        "ghost of the modulated fibre: static pattern and fringes that follow": (1, 1, 0),
+        "ghost of the fixed fibre: static pattern and fringes that follow": (1, 0, 1),
+        "ghosts of both fibres": (2, 1, 1),
+    }
+    best = None
+    for law, (s, f, b) in laws.items():
+        misfit, tied = 0.0, []
+        for w in waves:
+            # One complex amplitude: static s·a, forward f·a, backward b·conj(a).
+            weights = [s**2 / w.errors[0] ** 2, f**2 / w.errors[1] ** 2, b**2 / w.errors[2] ** 2]
+            parts = [w.static / s, w.forward, w.backward.conjugate()]
+            amplitude = complex(np.average(parts, weights=weights))
+            own = (s * amplitude, f * amplitude, b * amplitude.conjugate())
+            for value, wanted, error in zip(
+                (w.static, w.forward, w.backward), own, w.errors, strict=False
+            ):
+                misfit += abs(value - wanted) ** 2 / error**2
+            tied.append(_wave(replace(w, static=own[0], forward=own[1], backward=own[2]), middle))
+        if best is None or misfit < best[0]:
+            best = misfit, law, tuple(tied)
+    assert best is not None
+    return best[1], best[2]

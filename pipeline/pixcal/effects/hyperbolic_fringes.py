@@ -27,17 +27,33 @@ from pixcal.simulation.recording import Recording
 
 F64 = NDArray[np.float64]
 
-_TURNS = 4
+_ITERATIONS = 4
+_APART = 25.0
+"""Chi-square by which positions of their own must fit the sets better than a common one."""
+
+
+@dataclass(frozen=True)
+class FibrePair:
+    """Where the fibre pair of one fringe set stands."""
+
+    set: str = quantity(doc="name of the fringe set")
+    foot_mm: tuple[float, float] = quantity(
+        unit="mm", low=-1e4, high=1e4, doc="foot of the fibres' centre from the chip's"
+    )
+    height_mm: float = quantity(
+        0.0, unit="mm", low=-100, high=100, doc="fibre B further from the detector than A"
+    )
 
 
 @dataclass(frozen=True)
 class HyperbolicFringes(Effect):
     """Exact phase of two fibre tips less its paraxial limit, added to the straight fringes.
 
-    To leading order the bending is ``-K·q q² / (2 D²)``, q from the foot of the fibres' centre:
+    To leading order the curvature is ``-K·q q² / (2 D²)``, q from the foot of the fibres' centre:
     in proportion to the fringe vector, so in pixels it does not depend on the baseline, and sets
-    of other interfringe do not tell it from true offsets. Its shape does: two numbers rule the
-    curvature of all sets.
+    of other fringe period do not tell it from true offsets. Its shape does: the foot and the
+    difference in height of the tips rule the curvature of a set. The arms of a mount do not move
+    together: ``pairs`` has the position of each set's fibres, where it is not that of all.
 
     The maps of a fit do not say where on the chip they lie, so `predict` cannot tell;
     `straightened` undoes it where the geometry is given, and ``fit --model hyperbolic`` fits it.
@@ -65,7 +81,8 @@ class HyperbolicFringes(Effect):
     distance_mm: float | None = quantity(
         None, unit="mm", above=0, high=1e7, doc="fibres to detector; default: that of the bench"
     )
-    share: float = quantity(1.0, low=-100, high=100, doc="of the bending: 1 exact, 0 straight")
+    share: float = quantity(1.0, low=-100, high=100, doc="of the curvature: 1 exact, 0 straight")
+    pairs: tuple[FibrePair, ...] = quantity((), doc="position of each set's fibre pair")
 
     def check(self, bench: Bench) -> None:
         """As in `Effect.check`."""
@@ -98,13 +115,16 @@ class HyperbolicFringes(Effect):
         centre = bench.detector.chip_centre_px
         distance = self.distance_mm or own.distance
         wider = distance / own.distance
+        name = bench.frames.fringes[number].name
+        pair = next((p for p in self.pairs if p.set == name), FibrePair(name, self.foot_mm))
         return replace(
             own,
-            centre_x=centre[0] * pitch + self.foot_mm[0],
-            centre_y=centre[1] * pitch + self.foot_mm[1],
+            centre_x=centre[0] * pitch + pair.foot_mm[0],
+            centre_y=centre[1] * pitch + pair.foot_mm[1],
             distance=distance,
             baseline_x=own.baseline_x * wider,
             baseline_y=own.baseline_y * wider,
+            baseline_z=pair.height_mm,
         )
 
     def straightened(self, theta: F64, where: Geometry) -> F64:
@@ -115,38 +135,41 @@ class HyperbolicFringes(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Foot of the fibres from the curvature of the phase maps, the distance being the nominal.
+        """Positions of the fibres from the curvature of the phase maps, at the nominal distance.
 
-        Free beside it are the plane and the fringe modes that the fit leaves open. A curvature that
-        two numbers do not explain in all sets widens the errors. The share, and the distance, would
-        need the third order, which a small window does not show; the foot is counted from the
-        middle of the window that was read.
+        Free beside it are the plane and the fringe modes that the fit leaves open. One foot for all
+        sets is preferred where it explains their curvature as well as positions of their own. The
+        share, and the distance, would need the third order, which a small window does not show; the
+        foot is counted from the middle of the window that was read.
         """
         sets = [f for f in evidence.fringes.values() if _enough(f)]
         if not sets:
             return None
-        foot, fit = _foot(evidence, sets)
-        bent = [_bending(evidence, f, foot)[None] for f in sets]
-        share = fit_maps([_part(evidence, f, b, None) for f, b in zip(sets, bent, strict=True)])
-        scale = max(1.0, _unexplained(evidence, sets, foot))
-        errors = np.sqrt(np.diag(fit.covariance) * scale)
-        details: dict[str, object] = {
-            "unexplained_chi2_per_term": scale,
-            "share_at_foot": float(share.values[0]),
-        }
-        for f in sets:
-            own, own_fit = _foot(evidence, [f])
-            details[f"foot_of_{f.name}_mm"] = [float(v) for v in own]
-            details[f"foot_of_{f.name}_errors_mm"] = np.sqrt(np.diag(own_fit.covariance)).tolist()
-        x, y = (float(np.clip(v, -1e4, 1e4)) for v in foot)
+        common, fit = _positions(evidence, sets, 2)
+        own = [_positions(evidence, [f], 3) for f in sets]
+        by_common = _gain(evidence, sets, [common] * len(sets))
+        by_own = _gain(evidence, sets, [values for values, _ in own])
+        details = {f"foot_of_{f.name}_mm": v.tolist() for f, (v, _) in zip(sets, own, strict=True)}
+        why = "curvature of the phase maps, of the shape that two fibres make"
+        foot = _foot(common)
+        if by_own - by_common < _APART:
+            errors = np.sqrt(np.diag(fit.covariance))
+            return Estimate(
+                cls(foot, evidence.distance_mm),
+                {f"foot_mm[{n}]": float(errors[n]) for n in (0, 1)},
+                sigmas_of_chi2(by_common, 2), why, details, law="one fibre position for all sets",
+            )  # fmt: skip
+        pairs, named = [], {}
+        for n, (f, (values, own_fit)) in enumerate(zip(sets, own, strict=True)):
+            pairs.append(FibrePair(f.name, _foot(values), float(np.clip(values[2], -100, 100))))
+            keys = ("foot_mm[0]", "foot_mm[1]", "height_mm")
+            for key, error in zip(keys, np.sqrt(np.diag(own_fit.covariance)), strict=True):
+                named[f"pairs[{n}].{key}"] = float(error)
         return Estimate(
-            cls((x, y), evidence.distance_mm),
-            {"foot_mm[0]": float(errors[0]), "foot_mm[1]": float(errors[1])},
-            # The foot has taken the share to one, if anything is bent this way at all.
-            sigmas_of_chi2(share.gain / scale, 2) if share.values[0] > 0 else 0.0,
-            "curvature of the phase maps, of the shape that two fibres make",
-            details,
-        )
+            cls(foot, evidence.distance_mm, pairs=tuple(pairs)),
+            named, sigmas_of_chi2(by_own, 3 * len(sets)), why, details,
+            law="a fibre position of its own in every set",
+        )  # fmt: skip
 
 
 def bending(x: F64, y: F64, where: Geometry) -> F64:
@@ -158,12 +181,19 @@ def _enough(found: FringeEvidence) -> bool:
     return bool(np.count_nonzero(found.good) > 200) and min(found.good.shape) > 8
 
 
-def _geometry(evidence: Evidence, found: FringeEvidence, foot: F64) -> Geometry:
-    """With the window's middle as the origin, and the measured fringe vector at the map's."""
+def _foot(values: F64) -> tuple[float, float]:
+    return float(np.clip(values[0], -1e4, 1e4)), float(np.clip(values[1], -1e4, 1e4))
+
+
+def _geometry(evidence: Evidence, found: FringeEvidence, position: F64) -> Geometry:
+    """With the window's middle as the origin, and the measured fringe vector at the map's.
+
+    The position: foot along x and y, and the difference in height if it is not zero (mm).
+    """
     pitch, wavelength = evidence.pitch_um * 1e-3, evidence.wavelength_nm * 1e-6
     per_k = wavelength * evidence.distance_mm / (2 * np.pi * pitch)
     paraxial = Geometry(
-        wavelength, pitch, float(foot[0]), float(foot[1]), evidence.distance_mm,
+        wavelength, pitch, float(position[0]), float(position[1]), evidence.distance_mm,
         float(np.hypot(*found.k)) * per_k, 0.0,
     )  # fmt: skip
     # Far from the foot fringes are wider than in the paraxial limit: the phase is as good as
@@ -176,7 +206,13 @@ def _geometry(evidence: Evidence, found: FringeEvidence, foot: F64) -> Geometry:
         for dx, dy in ((0.5, 0.0), (0.0, 0.5))
     ]
     baseline = size * np.linalg.solve(np.array(gradients, float), np.array(found.k))
-    return replace(paraxial, baseline_x=float(baseline[0]), baseline_y=float(baseline[1]))
+    height = float(position[2]) if len(position) > 2 else 0.0
+    return replace(
+        paraxial,
+        baseline_x=float(baseline[0]),
+        baseline_y=float(baseline[1]),
+        baseline_z=height,
+    )
 
 
 def _middle(found: FringeEvidence) -> tuple[float, float]:
@@ -188,40 +224,45 @@ def _middle(found: FringeEvidence) -> tuple[float, float]:
     )
 
 
-def _bending(evidence: Evidence, found: FringeEvidence, foot: F64) -> F64:
+def _bending(evidence: Evidence, found: FringeEvidence, position: F64) -> F64:
     y, x = centred(found.good.shape)
     y0, x0 = _middle(found)
-    return bending(x + x0, y + y0, _geometry(evidence, found, foot))
+    bent = bending(x + x0, y + y0, _geometry(evidence, found, position))
+    return np.asarray(bent - bent[bent.shape[0] // 2, bent.shape[1] // 2])
 
 
-def _part(evidence: Evidence, found: FringeEvidence, signals: F64, foot: F64 | None) -> MapPart:
-    """The phase map of a set about fringes bent by a foot, or straight ones."""
+def _part(evidence: Evidence, found: FringeEvidence, signals: F64, position: F64 | None) -> MapPart:
+    """The phase map of a set about fringes that are bent, or straight ones."""
     free = np.concatenate([polynomial(found.good.shape, 1), gauge_terms(found)])
     data = phase_map(found)
-    if foot is not None:
-        data = data - _bending(evidence, found, foot)
+    if position is not None:
+        data = data - _bending(evidence, found, position)
     return MapPart.of(signals, data, free, found.good)
 
 
-def _foot(evidence: Evidence, sets: list[FringeEvidence]) -> tuple[F64, MapFit]:
-    """Foot (x, y) in mm, by Gauss and Newton: the bending is nearly linear in it."""
-    foot, step = np.zeros(2), np.eye(2)
-    for _ in range(_TURNS):
+def _positions(evidence: Evidence, sets: list[FringeEvidence], size: int) -> tuple[F64, MapFit]:
+    """Foot (x, y), and with three numbers the height, in mm, by Gauss and Newton.
+
+    The curvature is nearly linear in them.
+    """
+    position, step = np.zeros(size), np.diag([1.0, 1.0, 0.01][:size])
+    for _ in range(_ITERATIONS):
         parts = []
         for f in sets:
-            here = _bending(evidence, f, foot)
-            signals = np.stack([_bending(evidence, f, foot + d) - here for d in step])
-            parts.append(_part(evidence, f, signals, foot))
+            here = _bending(evidence, f, position)
+            signals = np.stack([_bending(evidence, f, position + d) - here for d in step])
+            signals /= np.diag(step)[:, None, None]
+            parts.append(_part(evidence, f, signals, position))
         fit = fit_maps(parts)
-        foot = np.clip(foot + fit.values, -1e4, 1e4)
-    return foot, fit
+        position = np.clip(position + fit.values, -1e4, 1e4)
+    return position, fit
 
 
-def _unexplained(evidence: Evidence, sets: list[FringeEvidence], foot: F64) -> float:
-    """Chi-square a term of the curvature (second order) that the foot leaves."""
-    total, terms = 0.0, -2
-    for f in sets:
-        signals = polynomial(f.good.shape, 2)[3:]
-        total += fit_maps([_part(evidence, f, signals, foot)]).gain
-        terms += len(signals)
-    return total / terms
+def _gain(evidence: Evidence, sets: list[FringeEvidence], positions: list[F64]) -> float:
+    """Chi-square that the curvature of these positions takes from straight fringes."""
+    gain = 0.0
+    for f, position in zip(sets, positions, strict=True):
+        bent = _bending(evidence, f, position)[None]
+        fit = fit_maps([_part(evidence, f, bent, None)])
+        gain += fit.gain if fit.values[0] > 0 else 0.0
+    return gain

@@ -1,13 +1,14 @@
 """Light that does not interfere: laser light scattered in the bench, of a smooth pattern."""
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.evidence import Evidence, FringeEvidence
-from pixcal.estimators.map_fit import MapFit, MapPart, centred, fit_maps, gauge_terms
-from pixcal.estimators.row_ramp import RowRamp, enough_for_rows
+from pixcal.estimators.map_fit import MapFit, MapPart, fit_maps, gauge_terms, polynomial
+from pixcal.estimators.structure import legendre, legendre_at
 from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.config import quantity
@@ -17,10 +18,36 @@ from pixcal.simulation.recording import Recording
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+DEGREE = 8
+"""Of the polynomials that a measured pattern is made of."""
+BEAMS = 2
+"""Degree of what two Gaussian beams do to the logarithm of the visibility."""
+
 _MIN_PIXELS = 200
-_SURE = 5.0
-_CROSSED = 0.3
-"""Sine of the angle between two baselines that tell of both slopes."""
+
+
+@dataclass(frozen=True)
+class StrayPattern:
+    """Stray light as measured in one fringe set, on a part of the detector."""
+
+    set: str = quantity(doc="name of the fringe set")
+    rows: tuple[int, int] = quantity(doc="first row of the part, and the one after the last")
+    columns: tuple[int, int] = quantity(doc="first column, and the one after the last")
+    coefficients: tuple[float, ...] = quantity(
+        low=-20, high=20, doc="of Legendre products in log(1 + share), by total degree"
+    )
+
+    def share(self, rows: F64, columns: F64) -> F64:
+        """Share (y, x) of the fibres' light; beyond the part that of its edge. Never negative."""
+        (y0, y1), (x0, x1) = self.rows, self.columns
+        y = np.clip(2 * (rows - y0) / max(y1 - y0 - 1, 1) - 1, -1, 1)
+        x = np.clip(2 * (columns - x0) / max(x1 - x0 - 1, 1) - 1, -1, 1)
+        grid = np.linspace(-1, 1, 33)
+        inside, terms = (
+            np.tensordot(self.coefficients, legendre_at(*at, DEGREE)[: len(self.coefficients)], 1)
+            for at in ((grid, grid), (y, x))
+        )
+        return np.asarray(np.expm1(np.maximum(terms - inside.min(), 0.0)))
 
 
 @dataclass(frozen=True)
@@ -28,15 +55,17 @@ class Straylight(Effect):
     """Incoherent light in the fringe frames, in units of the fibres' own at the same place.
 
     It follows the laser's power. The mean light becomes ``1 + share + slope·r`` times what it was,
-    the fringe stays: the visibility falls, the offsets keep still. Flats, of another lamp, do not
-    have it. Where the pattern would be negative there is none.
+    and more where a bump or a measured pattern says so; the fringe stays: the visibility falls, the
+    offsets keep still. Flats, of another lamp, do not have it. Where the pattern would be negative
+    there is none. An even share, and one that varies as two unequal Gaussian beams make the
+    visibility vary over a window, cannot be told from those beams.
     """
 
     name = "straylight"
     title = "scattered light that does not interfere"
     stage = Stage.LIGHT
     domains = ("space",)
-    strengths = ("share", "slope_per_px")
+    strengths = ("share", "slope_per_px", "bump", "patterns")
     told_by = ("axis",)
     sources = (
         "Rousset et al., eq. 3: straylight is a part of the mean term B iota (design/paper.txt)",
@@ -50,11 +79,45 @@ class Straylight(Effect):
     slope_per_px: tuple[float, float] = quantity(
         (4e-5, -2e-5), unit="1/px", low=-1, high=1, doc="how the share grows along x and y"
     )
+    bump: float = quantity(0.0, low=0, high=10, doc="share on top of a round bump")
+    bump_centre_px: tuple[float, float] = quantity(
+        (0.0, 0.0), unit="px", low=-1e5, high=1e5, doc="column and row of the window"
+    )
+    bump_radius_px: float = quantity(
+        30.0, unit="px", above=0, high=1e5, doc="standard deviation of the bump"
+    )
+    patterns: tuple[StrayPattern, ...] = quantity((), doc="as measured, set by set")
 
-    def pattern(self, rows: Rows, columns: Rows) -> F64:
-        """Share (y, x) on some rows and columns of the window (first, one after the last)."""
-        y, x = np.arange(*rows)[:, None], np.arange(*columns)
-        share = self.share + self.slope_per_px[0] * x + self.slope_per_px[1] * y
+    def scaled(self, factor: float) -> Self:
+        """As in `Effect.scaled`."""
+        x, y = self.slope_per_px
+        return replace(
+            self,
+            share=factor * self.share,
+            slope_per_px=(factor * x, factor * y),
+            bump=factor * self.bump,
+            patterns=tuple(
+                replace(p, coefficients=tuple(factor * c for c in p.coefficients))
+                for p in self.patterns
+            ),
+        )
+
+    @property
+    def is_null(self) -> bool:
+        """As in `Effect.is_null`."""
+        plain = self.share or any(self.slope_per_px) or self.bump
+        return not plain and not any(c for p in self.patterns for c in p.coefficients)
+
+    def pattern(self, rows: Rows, columns: Rows, of: str = "") -> F64:
+        """Share (y, x) in a set on rows and columns of the window (first, one after the last)."""
+        y, x = np.arange(*rows, dtype=float), np.arange(*columns, dtype=float)
+        share = self.share + self.slope_per_px[0] * x + self.slope_per_px[1] * y[:, None]
+        if self.bump:
+            dx, dy = x - self.bump_centre_px[0], y[:, None] - self.bump_centre_px[1]
+            share = share + self.bump * np.exp(-(dx**2 + dy**2) / (2 * self.bump_radius_px**2))
+        for pattern in self.patterns:
+            if pattern.set == of:
+                share = share + pattern.share(y, x)
         return np.asarray(np.maximum(share, 0.0))
 
     def light(
@@ -63,7 +126,8 @@ class Straylight(Effect):
         """As in `Effect.light`."""
         if recording.kind != "fringes":
             return light
-        more = 1 + self.pattern(rows, (0, light.iota.shape[1]))
+        name = recording.bench.frames.fringes[recording.number].name
+        more = 1 + self.pattern(rows, (0, light.iota.shape[1]), name)
         return replace(light, iota=light.iota * more.astype(np.float32))
 
     def predict(self, maps: FringeMaps) -> FringeMaps:
@@ -76,95 +140,69 @@ class Straylight(Effect):
 
     def _more(self, maps: FringeMaps) -> F64:
         (row, column), (ny, nx) = maps.origin, maps.theta.shape[1:]
-        return 1 + self.pattern((row, row + ny), (column, column + nx))
+        return 1 + self.pattern((row, row + ny), (column, column + nx), maps.name)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Slopes of the pattern from the gradient of the visibility, if it is that of all sets.
+        """Pattern of each set from what its visibility has beyond that of two Gaussian beams.
 
-        Fibres of unequal light change the visibility along the baseline, or where their beams point
-        apart; that differs from set to set, and what differs widens the errors. What rows lose to
-        the next frame (`rolling_shutter`) is known from the residuals, and taken out. Where all
-        baselines are parallel only the slope across them counts, and beams that point apart look
-        alike. A share that is the same everywhere cannot be told from a lower visibility of the
-        laser: what is given is the least that the slopes allow, for light is never negative, with
-        an error that reaches to the most, where the laser's visibility is one.
+        Light that does not interfere raises the mean light where it lowers the visibility; a loss
+        of contrast leaves the mean light alone, and is not claimed.
         """
         sets = [f for f in evidence.fringes.values() if np.count_nonzero(f.good) > _MIN_PIXELS]
         if not sets:
             return None
-        axes, fit, scale = _slopes(sets)
-        most = max(1 / min(_visibility(f) for f in sets) - 1, 0.0)
-        # The logarithm of 1 + share + slope x grows by slope / (1 + share).
-        slope = np.clip(axes @ fit.values * (1 + most / 2), -1, 1)
-        errors = np.sqrt(np.diag(axes @ fit.covariance @ axes.T) * scale)
-        least, its_error = _least_share(evidence, slope, errors)
-        unknown = max(most - least, 0.0) / np.sqrt(12)
-        errors = np.hypot(errors * (1 + most / 2), np.abs(slope) * unknown)
-        named = {f"slope_per_px[{n}]": float(e) for n, e in enumerate(errors) if e > 0}
+        patterns, errors, shares = [], {}, []
+        gain, dof, skipped = 0.0, 0, len(polynomial((4, 4), BEAMS))
+        for n, f in enumerate(sets):
+            fit = _structure(f)
+            shares.append(_in_light(f, fit.values))
+            gain += fit.gain
+            dof += len(fit.values)
+            values = tuple(float(v) for v in np.clip(fit.values, -20, 20))
+            (y0, x0), (ny, nx) = f.origin, f.good.shape
+            patterns.append(
+                StrayPattern(f.name, (y0, y0 + ny), (x0, x0 + nx), (0.0,) * skipped + values)
+            )
+            for place, error in enumerate(np.sqrt(np.diag(fit.covariance)), start=skipped):
+                errors[f"patterns[{n}].coefficients[{place}]"] = float(error)
+        in_light = float(np.median(shares))
         return Estimate(
-            cls(least, (float(slope[0]), float(slope[1]))),
-            named | {"share": float(np.hypot(its_error, unknown))},
-            sigmas_of_chi2(fit.gain / scale, len(fit.values)),
-            "gradient of the visibility that is common to all sets",
-            {"share_at_most": most, "chi2_per_term_between_sets": scale},
+            cls(0.0, (0.0, 0.0), patterns=tuple(patterns)),
+            errors,
+            sigmas_of_chi2(gain, dof) if in_light > 0.5 else 0.0,
+            "the visibility has structure that two beams cannot make, and the mean light has it "
+            "too",
+            {"share_in_mean_light": in_light},
+            law="smooth pattern of any shape",
         )
 
 
-def _slopes(sets: list[FringeEvidence]) -> tuple[F64, MapFit, float]:
-    """Axes (2, n) of the slopes that can be told, their fit, and by how much its variances grow."""
-    k = np.array([f.k for f in sets])
-    k /= np.hypot(*k.T)[:, None]
-    if len(sets) == 1 or np.abs(k[1:, 0] * k[0, 1] - k[1:, 1] * k[0, 0]).max() < _CROSSED:
-        across = np.array([[-k[0, 1]], [k[0, 0]]])
-        return across, fit_maps([_part(f, across) for f in sets]), 1.0
-    parts = [_part(f, np.eye(2)) for f in sets]
-    fit = fit_maps(parts)
-    own = [fit_maps([p]) for p in parts]
-    apart = sum(
-        (o.values - fit.values) @ np.linalg.solve(o.covariance, o.values - fit.values) for o in own
-    )
-    return np.eye(2), fit, max(1.0, float(apart) / (2 * len(sets) - 2))
-
-
-def _visibility(found: FringeEvidence) -> float:
-    alpha = np.hypot(found.theta[1], found.theta[2])[found.good]
-    return float(np.median(alpha / found.theta[0][found.good]))
-
-
-def _lost_by_rows(found: FringeEvidence) -> F64:
-    """Share of the fringe (y, 1) that rows lose to the frame next to it, where that is sure."""
-    lost = np.zeros(found.good.shape[0])
-    if enough_for_rows(found):
-        ramps = [RowRamp.of([found], way) for way in (1, -1)]
-        for ramp in ramps:
-            if ramp.slope > _SURE * ramp.error:
-                lost += ramp.share(found)
-    return lost[:, None]
-
-
-def _part(found: FringeEvidence, axes: F64) -> MapPart:
-    """Logarithm of iota / alpha, with slopes along some axes (2, n) as its signals."""
+def _usable(found: FringeEvidence) -> NDArray[np.bool_]:
     alpha = np.hypot(found.theta[1], found.theta[2])
-    good = found.good & (alpha > 0) & (found.theta[0] > 0)
-    inverse = np.zeros(good.shape)
-    inverse[good] = np.log(found.theta[0][good] / alpha[good])
-    inverse -= _lost_by_rows(found)
-    y, x = np.broadcast_arrays(*centred(good.shape))
-    along = (found.k[0] * x + found.k[1] * y) / np.hypot(*found.k)
-    # Unequal fibres: 1 / cosh of a straight line along the baseline.
-    free = [np.ones(good.shape), along**2, *gauge_terms(found)]
-    if axes.shape[1] == 1:
-        free.append(along)
-    slopes = np.einsum("an,ayx->nyx", axes, np.stack([x, y]))
-    return MapPart.of(slopes, inverse, np.stack(free), good)
+    return np.asarray(found.good & (alpha > 0) & (found.theta[0] > 0))
 
 
-def _least_share(evidence: Evidence, slope: F64, errors: F64) -> tuple[float, float]:
-    """Share in the first pixel that keeps the pattern above zero all over the part."""
-    ny, nx = evidence.good.shape
-    row, column = evidence.origin
-    ends = np.array([[column + i * (nx - 1), row + j * (ny - 1)] for i in (0, 1) for j in (0, 1)])
-    lowest = ends[np.argmin(ends @ slope)]
-    share = abs(float(np.clip(-(lowest @ slope), 0.0, 10.0)))
-    return share, float(max(np.hypot(*(ends.max(axis=0) * errors)), 1e-12))
+def _free(found: FringeEvidence) -> F64:
+    return np.concatenate([polynomial(found.good.shape, BEAMS), gauge_terms(found)])
+
+
+def _terms(found: FringeEvidence) -> F64:
+    """Legendre products (term, y, x) beyond those of the beams."""
+    return legendre(found.good.shape, DEGREE)[len(polynomial((4, 4), BEAMS)) :]
+
+
+def _structure(found: FringeEvidence) -> MapFit:
+    """Coefficients of log(1 + share) in the logarithm of iota over alpha."""
+    good = _usable(found)
+    ratio = found.theta[0] / np.maximum(np.hypot(found.theta[1], found.theta[2]), 1e-9)
+    inverse = np.log(np.where(good, ratio, 1.0))
+    return fit_maps([MapPart.of(_terms(found), inverse, _free(found), good)])
+
+
+def _in_light(found: FringeEvidence, coefficients: F64) -> float:
+    """How much of the pattern, of one, the mean light has."""
+    good = _usable(found)
+    light = np.log(np.where(good, found.theta[0], 1.0))
+    pattern = np.tensordot(coefficients, _terms(found), 1)[None]
+    return float(fit_maps([MapPart.of(pattern, light, _free(found), good)]).values[0])

@@ -69,7 +69,9 @@ class MapPart:
         y, x = np.nonzero(use)
         width = -(-use.shape[1] // BLOCK)
         block = (y // BLOCK) * width + x // BLOCK
-        return cls(rest[:, :-1], rest[:, -1], block, len(y) - len(free))
+        return cls(
+            np.ascontiguousarray(rest[:, :-1]), rest[:, -1].copy(), block, len(y) - len(free)
+        )
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,12 @@ def clipped(values: F64) -> F64:
 
 def legendre(shape: tuple[int, ...], degree: int) -> F64:
     """Products of Legendre polynomials (term, y, x) up to a total degree, the constant first."""
-    ny, nx = shape
-    y = legvander(np.linspace(-1, 1, ny), degree)
-    x = legvander(np.linspace(-1, 1, nx), degree)
+    return legendre_at(np.linspace(-1, 1, shape[0]), np.linspace(-1, 1, shape[1]), degree)
+
+
+def legendre_at(rows: F64, columns: F64, degree: int) -> F64:
+    """The same at rows (y,) and columns (x,) from -1 to 1."""
+    y, x = legvander(rows, degree), legvander(columns, degree)
     orders = [(i, n - i) for n in range(degree + 1) for i in range(n + 1)]
     return np.stack([np.outer(y[:, i], x[:, j]) for i, j in orders])
 

@@ -73,12 +73,15 @@ class FringeMaps:
     flat : (y, x) float64, optional
         Relative response as flats show it, which samples were divided by; None without flats. An
         effect that acts on flats as well changes it.
+    name : str
+        Of the fringe set.
     """
 
     theta: F64
     k: tuple[float, float]
     origin: tuple[int, int] = (0, 0)
     flat: F64 | None = None
+    name: str = ""
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,10 @@ class Estimate:
     together : tuple of mapping
         Steps of several parameters at once, of independent errors of one sigma, where the errors
         hang together; otherwise each parameter has an error of its own.
+    law : str
+        The best of the mechanism's laws, in words; empty where the effect is its own law.
+    by_law : Effect, optional
+        The effect as that law has it.
     """
 
     effect: "Effect"
@@ -108,6 +115,8 @@ class Estimate:
     why: str
     details: Mapping[str, Any] = field(default_factory=dict)
     together: tuple[Mapping[str, float], ...] = ()
+    law: str = ""
+    by_law: "Effect | None" = None
 
     @property
     def sure(self) -> "Effect":
@@ -248,6 +257,13 @@ class Effect:
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Parameters and errors from an acquisition; None where it holds no evidence of it."""
         raise NotImplementedError(f"{cls.__name__} cannot be estimated")
+
+    def replayed(self, evidence: Evidence) -> Self | None:
+        """The same effect doing to each frame what it did to these, whatever its law.
+
+        None for effects whose law says all that there is to say of single frames.
+        """
+        return None
 
     def predict(self, maps: FringeMaps) -> FringeMaps | None:
         """Maps that a fit finds with the effect on; None where maps alone do not tell."""

@@ -6,6 +6,8 @@ window may be a part of a larger detector, whose pixels give to those at its bor
 the chip, where nothing comes from beyond: the maps tell, side by side.
 """
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -58,7 +60,7 @@ def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, scatter: float) -> 
         z = (maps.theta[2] + 1j * maps.theta[1]) * np.exp(1j * scatter * sign * beyond)
         z *= np.where(unknown, 1 + sign, 1.0)
         theta = np.stack([maps.theta[0], z.imag, z.real])
-        found.append(FringeMaps(theta, maps.k, maps.origin, maps.flat))
+        found.append(replace(maps, theta=theta))
     return found
 
 

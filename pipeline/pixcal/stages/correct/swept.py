@@ -126,7 +126,7 @@ def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
     flat = None
     if swept.flat is not None:
         flat = padded(ArrayReader(swept.flat).read(*there).astype(float), swept, part, 1.0)
-    maps = FringeMaps(theta, swept.k, (part[0][0], part[1][0]), flat)
+    maps = FringeMaps(theta, swept.k, (part[0][0], part[1][0]), flat, swept.folder.name)
     return maps, padded(good, swept, part, False), padded(known, swept, part, False)
 
 

@@ -9,6 +9,7 @@ chunks of the cube, so results depend neither on memory nor on workers.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -203,7 +204,7 @@ def _turned(maps: FringeMaps, phase: F64) -> FringeMaps:
     """Maps with their phase moved."""
     iota, sine, cosine = maps.theta
     z = (cosine + 1j * sine) * np.exp(1j * np.nan_to_num(phase))
-    return FringeMaps(np.stack([iota, z.imag, z.real]), maps.k, maps.origin, maps.flat)
+    return replace(maps, theta=np.stack([iota, z.imag, z.real]))
 
 
 def _noise_factors(swept: Swept, maps: FringeMaps) -> F64:

@@ -84,9 +84,11 @@ def inquire(
     candidates: dict[str, Candidate] = {}
     signatures: tuple[type[Effect], ...] = ()
 
-    def learnt(evidence: Evidence, few: Runtime) -> tuple[type[Effect], ...]:
+    def learnt(evidence: Evidence, unseen: Evidence, few: Runtime) -> tuple[type[Effect], ...]:
         nonlocal signatures
         candidates.update(_candidates(evidence, kinds, base, few))
+        for candidate in candidates.values():
+            candidate.replay = _replayed(candidate, unseen)
         signatures = weakly_seen(candidates, kinds)
         return signatures
 
@@ -166,6 +168,18 @@ def _candidates(
             reason = one or "the acquisition holds no frames that could tell"
             candidates[name] = Candidate(name, None, reason)
     return candidates
+
+
+def _replayed(candidate: Candidate, unseen: Evidence) -> Effect | None:
+    """The effect as the unseen frames have it one by one; None where its law says all."""
+    found = candidate.estimate
+    if found is None or found.significance < SURE:
+        return None
+    try:
+        replay = found.effect.replayed(unseen)
+    except (InputError, np.linalg.LinAlgError, ValueError, ArithmeticError):
+        return None
+    return None if replay is None or replay.is_null else replay
 
 
 def weakly_seen(

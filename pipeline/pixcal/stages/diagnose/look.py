@@ -75,7 +75,7 @@ def look_at(
     run_dir: Path,
     scratch: Path,
     runtime: Runtime,
-    learnt: Callable[[Evidence, Runtime], Sequence[type[Effect]]] = lambda *_: (),
+    learnt: Callable[[Evidence, Evidence, Runtime], Sequence[type[Effect]]] = lambda *_: (),
 ) -> Look:
     """Take the parts of a reduced run that are looked at, and measure their nominal bench.
 
@@ -84,8 +84,8 @@ def look_at(
     run_dir, scratch : Path
     runtime : Runtime
     learnt : callable
-        Is given the evidence that effects are fitted on, and how to run estimates in the memory
-        that there is; tells whose estimates are statistics too.
+        Is given the evidence that effects are fitted on and that they are tried on, and how to run
+        estimates in the memory that there is; tells whose estimates are statistics too.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def look_at(
         finally:
             del raws
         if not windows:
-            signatures = tuple(learnt(halves[0], few))
+            signatures = tuple(learnt(halves[0], halves[1], few))
         bench = nominal_bench(
             acquisition, ingested.tables, halves, (own.learn, own.test), shape, reduction, dtypes
         )

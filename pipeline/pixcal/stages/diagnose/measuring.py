@@ -24,6 +24,8 @@ from pixcal.stages.diagnose.nominal import (
     MeasuredGain,
     NominalBench,
     SetTruth,
+    contrast_surface,
+    light_surface,
 )
 from pixcal.stages.diagnose.parts import Half, Table
 
@@ -41,9 +43,6 @@ WILD = 8.0
 """Standard deviations beyond which a residual is left out."""
 NO_TEST = 10.0
 """Reduced chi-square of the photon transfer beyond which its gain is not believed."""
-TWO_BEAMS = 2
-"""Degree, over a window, of the logarithm of the contrast of two Gaussian beams (their intensities'
-ratio is the exponential of a quadratic form)."""
 CORE = 5.0
 """Robust standard deviations within which the scatter of the dark signal may be noise."""
 
@@ -184,6 +183,7 @@ def _fitted(
         one.k,
         origin,
         flat,
+        one.name,
     )
 
 
@@ -229,7 +229,7 @@ def _set_truth(
     one = found[0]
     good = np.all([f.good for f in found], axis=0)
     iota = np.mean([f.theta[0] * np.mean(f.g[:, 0]) for f in found], axis=0)
-    surface = smooth_surface(np.where(good, iota, np.nan), good)
+    surface = light_surface(iota[None], good)
     contrast = np.mean([_contrast(f, good) for f in found], axis=0)
     ny, nx = good.shape
     y, x = np.arange(ny)[:, None] - (ny - 1) / 2, np.arange(nx)[None, :] - (nx - 1) / 2
@@ -247,13 +247,10 @@ def _set_truth(
 
 
 def _contrast(found: FringeEvidence, good: NDArray[np.bool_]) -> F64:
-    """Contrast (y, x) as two Gaussian beams can make it, smooth over the window."""
-    alpha = np.hypot(*found.theta[1:])
-    used = good & (alpha > 0) & (found.theta[0] > 0)
-    log = np.where(used, np.log(np.where(used, alpha / found.theta[0], 1.0)), np.nan)
-    surface = smooth_surface(log, used, TWO_BEAMS)
+    """Contrast (y, x) of the frames, smooth over the window."""
+    surface = contrast_surface(found.theta, good)
     of_frames = np.median(np.hypot(found.g[:, 1], found.g[:, 2]) / found.g[:, 0])
-    return np.asarray(np.exp(surface) * of_frames)
+    return np.asarray(surface * of_frames)
 
 
 def _phases(found: Sequence[FringeEvidence], frames: Sequence[NDArray[np.intp]], count: int) -> F64:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.corrected import corrected_offsets, phase_change, straight_modes
 from pixcal.estimators.fringes import grid
 from pixcal.estimators.pixel_read_noise import PixelNoise
-from pixcal.estimators.structure import Offsets, true_offsets
+from pixcal.estimators.structure import Offsets, smooth_surface, true_offsets
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
 from pixcal.model.acquisition import Acquisition
@@ -35,6 +35,9 @@ from pixcal.stages.diagnose.undone import Undone
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+TWO_BEAMS = 2
+"""Degree, over a window, of the logarithm of the contrast of two Gaussian beams (their intensities'
+ratio is the exponential of a quadratic form)."""
 _GAIN, _NOISE = 101, 102
 """Keys of random numbers."""
 
@@ -123,6 +126,19 @@ class Measured(Effect):
         return FrameStates(phi, np.ones(count), np.ones(count), still, still)
 
 
+def light_surface(theta: F64, good: NDArray[np.bool_]) -> F64:
+    """Mean light (y, x) of a fit's maps, smooth over the window."""
+    return smooth_surface(np.where(good, theta[0], np.nan), good)
+
+
+def contrast_surface(theta: F64, good: NDArray[np.bool_]) -> F64:
+    """Contrast (y, x) of a fit's maps as two Gaussian beams can make it over a window."""
+    alpha = np.hypot(*theta[1:])
+    used = good & (alpha > 0) & (theta[0] > 0)
+    log = np.where(used, np.log(np.where(used, alpha / theta[0], 1.0)), np.nan)
+    return np.asarray(np.exp(smooth_surface(log, used, TWO_BEAMS)))
+
+
 @dataclass(frozen=True)
 class FittedSet:
     """What was fitted of a fringe set.
@@ -137,7 +153,9 @@ class FittedSet:
         rad/px.
     origin : (int, int)
     flat : (y, x) float64, optional
-    light, contrast : float
+    name : str
+        Of the set.
+    light, contrast : (y, x) float32 or float
         What mean and contrast of the fringes are times those that were measured.
     """
 
@@ -147,12 +165,15 @@ class FittedSet:
     k: tuple[float, float]
     origin: tuple[int, int]
     flat: F64 | None = None
-    light: float = 1.0
-    contrast: float = 1.0
+    name: str = ""
+    light: F32 | float = 1.0
+    contrast: F32 | float = 1.0
 
     def without(self, effects: Sequence[Effect]) -> "FittedSet":
         """The same with effects undone that act on maps: offsets as fitted with them known."""
-        maps = before = FringeMaps(filled(self.theta, self.k), self.k, self.origin, self.flat)
+        maps = before = FringeMaps(
+            filled(self.theta, self.k), self.k, self.origin, self.flat, self.name
+        )
         for effect in sorted(effects, key=lambda e: (e.stage, e.name), reverse=True):
             maps = effect.undo(maps) or maps
         if maps is before:
@@ -165,9 +186,16 @@ class FittedSet:
             straight_modes(before.theta, self.k),
             size,
         )
-        light = _middle(maps.theta[0] / before.theta[0])
-        fringe = _middle(np.hypot(*maps.theta[1:]) / np.hypot(*before.theta[1:]))
-        return replace(self, delta=delta, flat=maps.flat, light=light, contrast=fringe / light)
+        good = np.asarray(np.isfinite(self.theta).all(axis=0))
+        light = light_surface(maps.theta, good) / light_surface(before.theta, good)
+        contrast = contrast_surface(maps.theta, good) / contrast_surface(before.theta, good)
+        return replace(
+            self,
+            delta=delta,
+            flat=maps.flat,
+            light=light.astype(np.float32),
+            contrast=contrast.astype(np.float32),
+        )
 
     @cached_property
     def offsets(self) -> Offsets:
@@ -353,21 +381,15 @@ class NominalBench:
             light, contrast = undone.fringes(
                 float(np.median(own.light)), float(np.median(own.contrast))
             )
-            times = np.float32(fit.contrast * contrast)
+            times = np.float32(contrast) * fit.contrast
             sets.append(
                 replace(
                     own,
-                    light=own.light * np.float32(fit.light * light),
+                    light=own.light * np.float32(light) * fit.light,
                     contrast=np.minimum(own.contrast * times, np.float32(1)),
                 )
             )
         return replace(self.measured, maps=maps, sets=tuple(sets))
-
-
-def _middle(ratio: F64) -> float:
-    """Median of what is finite; 1 where nothing is."""
-    finite = ratio[np.isfinite(ratio)]
-    return float(np.median(finite)) if finite.size else 1.0
 
 
 def _runs(numbers: NDArray[np.intp]) -> list[tuple[int, int]]:

@@ -1,6 +1,7 @@
 """What each cause does to the map of offsets: how far it moves them, and what is to be done."""
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,7 @@ def _shapes(run_dir: Path) -> tuple[str, Mapping[str, str]]:
 def _change(effect: Effect, fit: FittedSet) -> F64:
     """Change (pixel,) of the offsets of good pixels by an effect, px; modes taken off."""
     good = np.isfinite(fit.theta).all(axis=0) & np.isfinite(fit.delta)
-    maps = FringeMaps(filled(fit.theta, fit.k), fit.k, fit.origin, fit.flat)
+    maps = FringeMaps(filled(fit.theta, fit.k), fit.k, fit.origin, fit.flat, fit.name)
     after = effect.undo(maps) or _undone_on_samples(effect, maps) or effect.predict(maps)
     if after is None or not good.any():
         return np.zeros(0)
@@ -83,7 +84,7 @@ def _undone_on_samples(effect: Effect, maps: FringeMaps) -> FringeMaps | None:
     normal = np.einsum("mt,nt,tyx->yxmn", frames, frames, weight)
     right = np.einsum("mt,tyx->yxm", frames, weight * undone)
     theta = np.moveaxis(np.linalg.solve(normal, right[..., None])[..., 0], -1, 0)
-    return FringeMaps(theta, maps.k, maps.origin, maps.flat)
+    return replace(maps, theta=theta)
 
 
 def _rounded(value: float) -> float:

@@ -146,6 +146,9 @@ def _cause(
     alone = shrinkage(data, found.nominal, candidate.alone or found.final, where)
     without = shrinkage(data, found.nominal, found.without[name], where)
     gain = found.final.log_likelihood - found.without[name].log_likelihood
+    by_law = alone
+    if name in found.by_law:
+        by_law = shrinkage(data, found.nominal, found.by_law[name], where)
     alike = found.alike.get(name, ())
     kinds = [type(e.effect) for n in (name, *alike) if (e := found.candidates[n].estimate)]
     # Two independent parts of the frames, joined by Fisher's rule. A likelihood ratio of e^gain has
@@ -162,8 +165,10 @@ def _cause(
         "title": effect.title,
         "parameters": to_plain(effect),
         "uncertainty": {k: float(v) for k, v in estimate.errors.items()},
-        "gap_closed": _rounded(1 - alone.gap.total),
-        "gap_closed_interval": [_rounded(1 - v) for v in reversed(alone.interval)],
+        "law": estimate.law,
+        "gap_closed": _closed(alone.gap.total),
+        "gap_closed_interval": [_closed(v) for v in reversed(alone.interval)],
+        "gap_closed_by_law": _closed(by_law.gap.total),
         "gain_over_rest": _rounded(without.gap.total - final.gap.total),
         "p_value": float(np.clip(chance, LEAST_CHANCE, 1.0)),
         "sigmas": _rounded(estimate.significance),
@@ -186,7 +191,7 @@ def _candidate(
 ) -> dict[str, Any]:
     closed = 0.0
     if candidate.alone is not None and where:
-        closed = 1 - shrinkage(data, found.nominal, candidate.alone, where).gap.total
+        closed = _closed(shrinkage(data, found.nominal, candidate.alone, where).gap.total)
     about: dict[str, Any] = {
         "effect": candidate.name,
         "gap_closed": _rounded(closed),
@@ -326,6 +331,11 @@ def _absolute(
             }
         )
     return rows
+
+
+def _closed(left: float) -> float:
+    """Share of the gap that is closed where so much is left; never less than none."""
+    return _rounded(max(1 - left, 0.0))
 
 
 def _rounded(value: float) -> float:

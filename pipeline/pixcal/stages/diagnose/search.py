@@ -7,7 +7,7 @@ candidate is allowed for: the same estimate is made on a simulation with the eff
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,10 @@ LITTLE = 0.1
 EXPLAINED = 0.7
 """Share of a candidate's significance that another effect may bring about."""
 
+LAW_ERROR = 0.25
+"""Share of what an effect does that the world may do otherwise: a second cause needs evidence that
+another law of the first one would not bring about."""
+
 Simulate = Callable[[Sequence[Effects], int, str, Sequence[str]], Sequence[list[Curves] | str]]
 Estimates = Callable[[Effects, Sequence[str]], Mapping[str, float]]
 
@@ -70,6 +74,8 @@ class Candidate:
         In how many ways it was tried, of which the likeliest was taken.
     share : float
         Of its significance, what the effects taken before it do not bring about.
+    replay : Effect, optional
+        The effect doing to each unseen frame what was measured there, whatever its law.
     """
 
     name: str
@@ -78,6 +84,14 @@ class Candidate:
     alone: Trial | None = None
     ways: int = 1
     share: float = 1.0
+    replay: Effect | None = None
+
+    def by_law(self, effect: Effect) -> Effect | None:
+        """The effect as the best of its laws has it; None where it is its own law."""
+        assert self.estimate is not None
+        if effect == self.replay:
+            return self.estimate.effect
+        return self.estimate.by_law
 
 
 @dataclass(frozen=True)
@@ -94,6 +108,9 @@ class Found:
     candidates : mapping
     alike : mapping
         Effects that do about as well as one that was taken, by its name.
+    by_law : mapping
+        With one of those taken as the best of its laws has it, by its name; of effects that are
+        their own law nothing.
     """
 
     nominal: Trial
@@ -102,6 +119,7 @@ class Found:
     without: Mapping[str, Trial]
     candidates: Mapping[str, Candidate]
     alike: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    by_law: Mapping[str, Trial] = field(default_factory=dict)
 
 
 def looks_like(name: str) -> str:
@@ -148,13 +166,14 @@ class Search:
             self._drop_unseen(open_ones, shares, current)
             if not open_ones:
                 break
-            trials = self._tried(effects, open_ones, shares)
+            trials = self._tried(effects, open_ones, shares, current)
             if not taken:
                 for name, (trial, _) in trials.items():
                     candidates[name].alone = trial
             # Held against as many simulations as the candidates have: chance is the same in both.
             start = self._start(tuple(effects.values()), SCREEN)
-            gains = {n: t.log_likelihood - start.log_likelihood for n, (t, _) in trials.items()}
+            least = self._tolerant(start, current).log_likelihood
+            gains = {n: t.log_likelihood - least for n, (t, _) in trials.items()}
             if not gains:
                 break
             own = {n: g for n, g in gains.items() if g >= self._least(candidates[n])}
@@ -239,11 +258,13 @@ class Search:
         effects: Mapping[str, Effect],
         open_ones: dict[str, Candidate],
         shares: Mapping[str, float],
+        current: Trial,
     ) -> dict[str, tuple[Trial, Effect]]:
         """Each candidate added to the effects taken, in its likeliest way.
 
         As estimated, and without strengths that may be zero; as strong as that, and as what is left
-        beside the effects taken.
+        beside the effects taken; and as its frames have it. Log-likelihoods allow for other laws of
+        the effects taken.
         """
         options: list[tuple[str, Effect]] = []
         for name, candidate in open_ones.items():
@@ -252,6 +273,8 @@ class Search:
             ways = [whole, *([sure] if sure != whole else [])]
             if shares.get(name, 1.0) < 0.9:
                 ways += [way.scaled(shares[name]) for way in ways]
+            if candidate.replay is not None:
+                ways.append(candidate.replay)
             candidate.ways = max(candidate.ways, len(ways))
             options += [(name, way) for way in ways]
         benches = [(*effects.values(), effect) for _, effect in options]
@@ -263,11 +286,21 @@ class Search:
                 refused[name] = f"cannot be simulated: {curves}"
                 continue
             trial = self._trial(bench, self._expected(curves, open_ones[name]))
+            trial = self._tolerant(trial, current)
             if name not in found or trial.log_likelihood > found[name][0].log_likelihood:
                 found[name] = trial, effect
         for name in refused.keys() - found.keys():
             open_ones.pop(name).reason = refused[name]
         return found
+
+    def _tolerant(self, trial: Trial, taken: Trial) -> Trial:
+        """A trial that allows for what other laws of the effects taken may do otherwise."""
+        if not taken.effects:
+            return trial
+        nominal, variance = self.nominal.expected.mean, dict(trial.expected.variance)
+        for key, mean in taken.expected.mean.items():
+            variance[key] = variance[key] + (LAW_ERROR * (mean - nominal[key])) ** 2
+        return self._trial(trial.effects, replace(trial.expected, variance=variance))
 
     def _expected(self, curves: list[Curves], candidate: Candidate | None = None) -> Expectation:
         error = 0.0
@@ -338,11 +371,27 @@ class Search:
         return Found(
             self.nominal, current, tuple(taken), without, candidates,
             {n: near for n in taken if (near := tuple(a for a in alike[n] if a not in taken))},
+            self._by_laws(effects, candidates),
         )  # fmt: skip
+
+    def _by_laws(
+        self, effects: Mapping[str, Effect], candidates: Mapping[str, Candidate]
+    ) -> dict[str, Trial]:
+        """Each effect alone as the best of its laws has it."""
+        found = {}
+        for name, effect in effects.items():
+            law = candidates[name].by_law(effect)
+            trial = None if law is None or law == effect else self._confirmed((law,), SCREEN)
+            if isinstance(trial, Trial):
+                found[name] = trial
+        return found
 
     def _worthless(self, current: Trial, without: Mapping[str, Trial]) -> tuple[str, str] | None:
         """An effect without which the data are about as likely, and what to say of it."""
-        worth = {n: current.log_likelihood - t.log_likelihood for n, t in without.items()}
+        worth = {
+            n: self._tolerant(current, t).log_likelihood - self._tolerant(t, t).log_likelihood
+            for n, t in without.items()
+        }
         least = min(worth, key=lambda n: worth[n], default=None)
         if least is None or worth[least] >= LEAST:
             return None
