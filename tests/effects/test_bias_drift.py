@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pixcal.effects.bias_drift import BiasDrift
+from pixcal.effects.bias_drift import BiasDrift, Track
 from pixcal.effects.row_noise import RowNoise
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.frame_offset import FEWEST, fringe_offsets
@@ -240,7 +240,7 @@ def test_fringes_hold_what_is_no_light(acquired: Callable[..., Evidence]) -> Non
 
 
 def test_fringes_of_even_light_alone_say_nothing(acquired: Callable[..., Evidence]) -> None:
-    assert BiasDrift.estimate(replace(acquired(), stacks=())) is None
+    assert BiasDrift._through(replace(acquired(), stacks=())) is None
 
 
 def test_evidence_tells_when_each_part_began(
@@ -254,3 +254,41 @@ def test_evidence_tells_when_each_part_began(
         if stack.kind != "flat":
             stem = {"bias": "bias", "dark": "dark-0"}[stack.kind]
             assert stack.start_s == pytest.approx(begun[stem], abs=2e-3)
+
+
+RUN = {"jitter_rms": 0.0, "ramp_e_h": 0.0, "walk_e_h": 0.0, "settle_e": 0.0}
+
+
+def test_a_walk_of_the_fringe_runs_alone_is_found(acquired: Callable[..., Evidence]) -> None:
+    """The mean light moves, the fringe amplitude does not, and bias frames know nothing of it."""
+    evidence = acquired(None, {"bias_drift": RUN | {"run_walk_e_h": 600.0}})
+    found = BiasDrift.estimate(evidence)
+    assert found is not None
+    assert isinstance(found.effect, BiasDrift)
+    assert found.significance > 8
+    # Of two runs a walk shows its size in few modes.
+    assert found.effect.run_walk_e_h == pytest.approx(600, rel=0.5)
+    assert found.effect.walk_e_h == 0
+    again = found.effect.replayed(evidence)
+    assert again is not None
+    assert {track.set for track in again.tracks} == set(evidence.fringes)
+
+
+@pytest.mark.parametrize("other", ["intensity_noise", "contrast_noise"])
+def test_light_that_changes_is_no_drift_of_the_runs(
+    acquired: Callable[..., Evidence], other: str
+) -> None:
+    found = BiasDrift._in_runs(acquired(None, {other: {}}))
+    assert found is not None
+    assert found.significance < 4
+
+
+def test_tracks_are_replayed(make_effect_bench: Callable[..., Bench]) -> None:
+    bench = make_effect_bench({"detector.shape": [20, 24]})
+    track = Track("vertical", (0.0, 20.0), (0.0, 100.0))
+    drift = BiasDrift(**RUN, tracks=(track,))
+    for r in recordings(bench):
+        plain, on = (frames_of(bench, r, e).mean(axis=(1, 2)) for e in ((), (drift,)))
+        time = r.period_s * np.arange(r.count)
+        wanted = np.interp(time, track.time_s, track.offset_e) * (r.folder == "vertical")
+        np.testing.assert_allclose(on - plain, wanted, atol=0.1)

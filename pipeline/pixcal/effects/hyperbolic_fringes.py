@@ -29,7 +29,9 @@ F64 = NDArray[np.float64]
 
 _ITERATIONS = 4
 _APART = 25.0
-"""Chi-square by which positions of their own must fit the sets better than a common one."""
+"""Chi-square by which positions of their own must fit the sets better than a common one,"""
+_MODEL = 0.02
+"""and the share of all of it."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ class HyperbolicFringes(Effect):
         details = {f"foot_of_{f.name}_mm": v.tolist() for f, (v, _) in zip(sets, own, strict=True)}
         why = "curvature of the phase maps, of the shape that two fibres make"
         foot = _foot(common)
-        if by_own - by_common < _APART:
+        if by_own - by_common < max(_APART, _MODEL * by_own):
             errors = np.sqrt(np.diag(fit.covariance))
             return Estimate(
                 cls(foot, evidence.distance_mm),

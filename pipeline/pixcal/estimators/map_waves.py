@@ -46,6 +46,7 @@ _ITERATIONS = 4
 _SMOOTH = 3
 """Degree of what beams and lamp do to the maps."""
 
+LIGHT = "the mean light"
 STATIC, FORWARD, BACKWARD = slice(0, 2), slice(2, 4), slice(4, 6)
 
 
@@ -82,7 +83,8 @@ class Waves:
     in_flats : bool
         Whether the flats have the static pattern, and not the light over the flat.
     significance : float
-        Of the map that shows the strongest wave second best, in standard deviations.
+        Of the map that shows the strongest wave second best, or of the mean light if that shows it
+        best; in standard deviations.
     seen_in : tuple of str
         Maps that show it.
     by_map : mapping
@@ -169,7 +171,7 @@ def _maps(found: FringeEvidence, evidence: Evidence, in_flats: bool) -> list[_Ma
     light = np.log(np.where(good, light, 1.0))
     free = polynomial(good.shape, _SMOOTH) if in_flats else terms
     return [
-        _Map("the flats" if in_flats else "the mean light", light, free, good, (1, 0, 0)),
+        _Map("the flats" if in_flats else LIGHT, light, free, good, (1, 0, 0)),
         _Map("the visibility", visibility, terms, good, (-1, 1, 1)),
         _Map("the phase", np.nan_to_num(phase_map(found)), terms, good, (0, -1j, -1j)),
     ]
@@ -211,8 +213,12 @@ def _strongest(maps: Maps, sets: Sequence[FringeEvidence], allowed: Mask, in_fla
     by_map = {kind: sigmas_of_chi2(gain, dof) for kind, gain in gains.items()}
     order = sorted(by_map, key=lambda kind: -by_map[kind])
     first = _best_of(gains[order[0]], trials * len(groups), dof)
+    significance = float(min(first, by_map[order[1]]))
+    if order[0] == LIGHT:
+        # Ghosts of both fibres alike move neither visibility nor phase.
+        significance = float(first)
     return Waves(
-        tuple(waves), in_flats, float(min(first, by_map[order[1]])),
+        tuple(waves), in_flats, significance,
         tuple(kind for kind in order if by_map[kind] > SIGNIFICANT) or tuple(order[:2]), by_map,
     )  # fmt: skip
 

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from pixcal.effects.ghost_fringes import PARENTS
+
 Plain = dict[str, Any]
 Make = Callable[[float, np.random.Generator], Plain]
 
@@ -79,7 +81,14 @@ def _jitter(s: float, rng: np.random.Generator) -> Plain:
 
 def _ghost(s: float, rng: np.random.Generator) -> Plain:
     beat = _around(rng.uniform(0.15, 1.0), rng)
-    return {"share": s, "beat_rad_px": beat, "phase_rad": float(rng.uniform(-np.pi, np.pi))}
+    turn, parent = float(rng.uniform(-np.pi, np.pi)), str(rng.choice(PARENTS))
+    return {"share": s, "beat_rad_px": beat, "phase_rad": turn, "parent": parent}
+
+
+def _bump(s: float, rng: np.random.Generator) -> Plain:
+    centre = [float(v) for v in rng.uniform(10, 110, 2)]
+    return {"share": 0.0, "slope_per_px": [0.0, 0.0], "bump": s, "bump_centre_px": centre,
+            "bump_radius_px": float(rng.uniform(15, 40))}  # fmt: skip
 
 
 def _nearest(s: float, rng: np.random.Generator) -> Plain:
@@ -145,8 +154,7 @@ WAYS = (
     Way("row_noise", "rows, e-", 0.75, 0.3, _only("row_rms", _ROWS)),
     Way("row_noise", "columns, e-", 0.7, 0.32, _only("column_rms", _ROWS)),
     Way("row_noise", "rows in turn, e-", 0.29, 0.12, _only("interlace_rms", _ROWS)),
-    Way("straylight", "slope, 1/px", 1.6e-6, 5.4e-7,
-        lambda s, rng: {"share": float(rng.uniform(0.01, 0.04)), "slope_per_px": _around(s, rng)}),
+    Way("straylight", "bump, of the light", 1.5e-3, 7e-4, _bump),
     Way("telegraph_noise", "amplitude, e-", 19, 10,
         lambda s, rng: {"amplitude_e": s, "share": float(rng.uniform(0.01, 0.05)),
                         "switching_s": _between(0.3, 3, rng)}),
