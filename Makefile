@@ -68,6 +68,7 @@ precision: $(INSTALLED) ## 12 000 simulated frames against their truth (half a m
 	$(BIN)/python benchmarks/precision.py
 
 bench: $(INSTALLED) ## speed against a bare scan, and beside other methods (6 minutes, 30 GB of disk)
+	$(BIN)/python benchmarks/chain.py
 	$(BIN)/python benchmarks/throughput.py
 	$(BIN)/python benchmarks/comparison.py
 

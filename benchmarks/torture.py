@@ -59,8 +59,10 @@ def trials(bench: Bench, share: float) -> dict[str, Trial]:
     found["products"] = partial(damage.products, bench, flip, n(6), SEED)
     found["processes"] = partial(processes.together, bench, n(12), SEED)
     for change in inputs.CHANGES:
-        name = f"inputs {change.__name__}"
-        found[name] = partial(inputs.change, bench, change, n(6), SEED)
+        for stage in ("ingest", "reduce"):
+            name = f"inputs {change.__name__} {stage}"
+            found[name] = partial(inputs.change, bench, change, n(6), SEED, stage)
+    found["inputs rot"] = partial(inputs.rot, bench, n(20), SEED)
     for jump in clocks.JUMPS:
         found[f"clock {jump.__name__}"] = partial(clocks.jump, bench, jump)
     found["read-only"] = partial(places.read_only, bench)

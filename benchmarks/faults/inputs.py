@@ -46,31 +46,70 @@ CHANGES = {
 }
 
 
-def change(bench: Bench, how: Change, times: int, seed: int) -> Outcome:
-    """Change a file of the acquisition at a random moment of ingest, then put it back."""
-    outcome = Outcome(f"an input file {CHANGES[how]} while `ingest` runs")
-    rng = random.Random(f"{how.__name__} {seed}")
-    acquisition = bench.folder / "changing"
-    files = [f.relative_to(bench.acquisition) for f in sorted(bench.acquisition.rglob("*.fits"))]
+def change(bench: Bench, how: Change, times: int, seed: int, stage: str = "ingest") -> Outcome:
+    """Change a file of the acquisition at a random moment of a stage, then put it back."""
+    outcome = Outcome(f"an input file {CHANGES[how]} while `{stage}` runs")
+    rng = random.Random(f"{how.__name__} {stage} {seed}")
     while outcome.tried < times:
-        shutil.rmtree(acquisition, ignore_errors=True)
-        shutil.copytree(bench.acquisition, acquisition)  # with the times of the files
-        run = bench.copy("changed")
-        name = rng.choice(files)
-        command = Command(line("ingest", acquisition, run))
+        acquisition, run = _fresh(bench, stage)
+        name = rng.choice(_files(bench))
+        command = Command(line(stage, acquisition, run))
         while command.process.is_alive() and not (run / ".lock").exists():
             time.sleep(0.001)  # until it knows its files
-        time.sleep(rng.uniform(0, bench.seconds["ingest"] / 2))
+        time.sleep(rng.uniform(0, bench.seconds[stage] / 2))
         how(acquisition / name, rng)
         ended = command.end()
         if ended.code:
             ended.refused(2, f"{acquisition / name}: ")
-            assert not (run / "ingest").exists()
+            assert not (run / stage).exists()
             outcome.ends["named, exit 2; with the file restored resumed, bit-identical"] += 1
         else:
             outcome.ends["after all was read: bit-identical"] += 1
-            bench.assert_same(run, "ingest")
+            bench.assert_same(run, stage)
         shutil.copy2(bench.acquisition / name, acquisition / name)
-        pixcal(*line("ingest", acquisition, run)).succeeded()
-        bench.assert_same(run, "ingest")
+        pixcal(*line(stage, acquisition, run)).succeeded()
+        bench.assert_same(run, stage)
     return outcome
+
+
+def rot(bench: Bench, times: int, seed: int) -> Outcome:
+    """Flip a bit of a frame after it was ingested; its size and time stay."""
+    outcome = Outcome(
+        "a bit of a FITS file flips between `ingest` and `reduce`, its time as it was"
+    )
+    rng = random.Random(f"rot {seed}")
+    while outcome.tried < times:
+        acquisition, run = _fresh(bench, "reduce")
+        name = rng.choice(_files(bench))
+        file, facts = acquisition / name, (acquisition / name).stat()
+        body = bytearray(file.read_bytes())
+        at = rng.randrange(8 * len(body))
+        body[at >> 3] ^= 1 << (at & 7)
+        file.write_bytes(body)
+        os.utime(file, ns=(facts.st_atime_ns, facts.st_mtime_ns))
+        ended = pixcal(*line("reduce", acquisition, run))
+        if ended.code:
+            ended.refused(2, f"{file}: its bytes are not those that were ingested")
+            outcome.ends["named, exit 2; with the file restored bit-identical"] += 1
+            shutil.copy2(bench.acquisition / name, file)
+            pixcal(*line("reduce", acquisition, run)).succeeded()
+        else:
+            outcome.ends["in no sample: bit-identical"] += 1
+        bench.assert_same(run, "reduce")
+    return outcome
+
+
+def _files(bench: Bench) -> list[Path]:
+    return [f.relative_to(bench.acquisition) for f in sorted(bench.acquisition.rglob("*.fits"))]
+
+
+def _fresh(bench: Bench, stage: str) -> tuple[Path, Path]:
+    """An acquisition of the same frames, and a run up to a stage of it."""
+    acquisition = bench.folder / "changing"
+    shutil.rmtree(acquisition, ignore_errors=True)
+    shutil.copytree(bench.acquisition, acquisition)  # with the times of the files
+    run = bench.copy("changed")
+    if stage == "reduce":
+        pixcal(*line("ingest", acquisition, run)).succeeded()
+        (run / ".lock").unlink()
+    return acquisition, run

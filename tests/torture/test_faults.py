@@ -62,9 +62,14 @@ def test_several_processes_on_one_run(bench: Bench) -> None:
     assert processes.together(bench, 2, SEED).tried == 6
 
 
+@pytest.mark.parametrize("stage", ["ingest", "reduce"])
 @pytest.mark.parametrize("how", inputs.CHANGES)
-def test_a_file_that_changes_while_it_is_read(bench: Bench, how: inputs.Change) -> None:
-    assert inputs.change(bench, how, 1, SEED).tried == 1
+def test_a_file_that_changes_while_it_is_read(bench: Bench, how: inputs.Change, stage: str) -> None:
+    assert inputs.change(bench, how, 1, SEED, stage).tried == 1
+
+
+def test_a_frame_that_rots_after_it_was_ingested(bench: Bench) -> None:
+    assert inputs.rot(bench, 2, SEED).tried == 2
 
 
 def test_a_clock_that_jumps(bench: Bench) -> None:

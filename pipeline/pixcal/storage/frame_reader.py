@@ -6,7 +6,6 @@ was found then: their sizes, times of change, and the checksum of every band of 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -80,13 +79,18 @@ class FrameReader:
         dtype: Any,
         checksums: NDArray[Any],
     ) -> None:
-        numbers = {name: number for number, name in enumerate(columns["file"])}
-        self.folder, self.columns = folder, columns
+        self._made_of = folder, columns, table, shape, dtype, checksums
         self.shape: tuple[int, ...] = tuple(shape)
         self.dtype: np.dtype[Any] = np.dtype(dtype)
-        self._files = [numbers[name] for name in table["file"]]
+        names = enumerate(columns["file"])
+        files = {name: described(columns, n, folder, self.shape[1:]) for n, name in names}
+        self._files = [files[name] for name in table["file"]]
         self._planes = list(table["plane"])
         self._checksums = checksums
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Without all the paths: another process checks each that it is sent.
+        return FrameReader, self._made_of
 
     def read(self, *ranges: tuple[int, int], out: NDArray[Any] | None = None) -> NDArray[Any]:
         """A block, as `ArrayReader.read` gives it; fastest in bands of 128 rows of all columns.
@@ -107,18 +111,14 @@ class FrameReader:
         rows = (y0 - y0 % BAND, min(-(-y1 // BAND) * BAND, ny))
         whole = rows == (y0, y1) and x1 - x0 == nx and block.flags.c_contiguous
         band = np.empty((1, rows[1] - rows[0], nx), self.dtype)
-        for number, frames in groupby(range(t0, t1), key=self._files.__getitem__):
-            file = described(self.columns, number, self.folder, (ny, nx))
-            for t in frames:
-                target = block[t - t0 : t - t0 + 1] if whole else band
-                self._read_frame(file, t, rows, target)
-                if not whole:
-                    block[t - t0] = band[0, y0 - rows[0] : y1 - rows[0], x0:x1]
+        for t in range(t0, t1):
+            self._read_frame(t, rows, block[t - t0 : t - t0 + 1] if whole else band)
+            if not whole:
+                block[t - t0] = band[0, y0 - rows[0] : y1 - rows[0], x0:x1]
         return block
 
-    def _read_frame(
-        self, file: FrameFile, t: int, rows: tuple[int, int], out: NDArray[Any]
-    ) -> None:
+    def _read_frame(self, t: int, rows: tuple[int, int], out: NDArray[Any]) -> None:
+        file = self._files[t]
         found = read_rows(file, [self._planes[t]], rows, out)[0, :, 0]
         first = rows[0] // BAND
         if (found != self._checksums[t, first : first + len(found)]).any():

@@ -1,0 +1,107 @@
+"""From FITS files to maps and report, against a plain read and a plain write: ``make bench``.
+
+The limits are measured in the same run as the stages: every FITS file read once, and the samples of
+the reduced cubes written once more by the same writer and flushed to the disk.
+"""
+
+import argparse
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from pixcal.engine.run import Runtime
+from pixcal.stages import allan, fit, ingest, reduce, report
+from pixcal.storage.cube import ArrayReader, create_array
+from workload import Workload, seconds
+
+THREADS = 2
+
+
+def main() -> None:
+    """Run and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", type=int, default=1024, help="pixels along each side")
+    parser.add_argument("--frames", type=int, default=1000)
+    parser.add_argument("--folder", type=Path, help="where the data go; default: a temporary one")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=options.folder) as scratch:
+        work = Workload(Path(scratch, "chain"), (options.size, options.size), options.frames, 2)
+        work.simulate()
+        compare(work)
+
+
+def compare(work: Workload) -> None:
+    """Times of the stages on one thread and on two, and of the limits."""
+    gb = work.gigabytes
+    files = sorted((work.folder / "acq").rglob("*.fits"))
+    every_stage(work, THREADS)  # kernels compiled, files in memory
+    one, read = every_stage(work, 1), seconds(lambda: share_out(read_file, files))
+    two, write = every_stage(work, THREADS), write_again(work)
+    print(f"{gb:.2f} GB of raw samples, {work.shape[1]} x {work.shape[0]} px x {work.frames} x 2")
+    print(f"plain read {read:.1f} s, plain write {write:.1f} s")
+    print("stage     1 thread  2 threads  ratio  share")
+    whole = sum(two.values())
+    for stage, took in two.items():
+        gain, share = one[stage] / took, took / whole
+        print(f"{stage:8} {one[stage]:8.1f} s {took:8.1f} s {gain:6.2f} {share:6.0%}")
+    ratio = whole / (read + write)
+    print(f"whole: {whole:.1f} s, {gb / whole:.2f} GB/s, {ratio:.1f} times plain read and write")
+    beside = size(work.run) / size(work.folder / "acq")
+    print(f"on disk beside the FITS files: {beside:.2f} times as much as they")
+
+
+def every_stage(work: Workload, threads: int) -> dict[str, float]:
+    """Seconds of each stage from the start."""
+    shutil.rmtree(work.run, ignore_errors=True)
+    os.sync()
+    here, acquisition = Runtime(workers=threads), work.folder / "acq"
+    found = {
+        "ingest": seconds(lambda: ingest.run(acquisition, work.run, ingest.Config(), here)),
+    }
+    for name, module in (("reduce", reduce), ("fit", fit), ("allan", allan), ("report", report)):
+        found[name] = seconds(lambda module=module: module.run(work.run, module.Config(), here))  # type: ignore[misc]
+    return found
+
+
+def read_file(file: Path) -> None:
+    """Read a file."""
+    buffer = bytearray(4 << 20)
+    with file.open("rb", buffering=0) as handle:
+        while handle.readinto(buffer):
+            pass
+
+
+def write_again(work: Workload) -> float:
+    """Seconds to write the samples of the reduced cubes by the same writer; they are in memory."""
+    took = 0.0
+    for number, source in enumerate(work.sources):
+        reader = ArrayReader(source.folder / "signal")
+        columns = list(reader.tiles())
+        target = work.folder / f"again-{number}"
+        writer = create_array(target, reader.shape, reader.dtype)
+        for n in range(0, len(columns), 16):
+            blocks = [((0, y[0], x[0]), reader.read((0, reader.shape[0]), y, x))
+                      for y, x in columns[n : n + 16]]  # fmt: skip
+            took += seconds(lambda: share_out(lambda at: writer.write(*at), blocks))  # noqa: B023
+        took += seconds(os.sync)
+        shutil.rmtree(target)
+    return took
+
+
+def share_out(work: Callable[[Any], None], items: Sequence[Any]) -> None:
+    """Do something with every item, in threads."""
+    with ThreadPoolExecutor(THREADS) as pool:
+        list(pool.map(work, items))
+
+
+def size(folder: Path) -> int:
+    """Bytes of the files below a folder."""
+    return sum(file.stat().st_size for file in folder.rglob("*") if file.is_file())
+
+
+if __name__ == "__main__":
+    main()
