@@ -18,6 +18,7 @@ from pixcal.stages.diagnose.measuring import nominal_bench
 from pixcal.stages.diagnose.nominal import NominalBench
 from pixcal.stages.diagnose.parts import Raw, evidence_of, select
 from pixcal.stages.diagnose.windows import Split, split, whole_of
+from pixcal.storage.artefact import read_json
 
 F64 = NDArray[np.float64]
 Frames = dict[str, NDArray[np.uint16]]
@@ -81,6 +82,15 @@ class Detector:
             },
         }  # fmt: skip
         return parse(Acquisition, plain, "acquisition")
+
+
+def reduced(detector: Detector, seed: int, folder: Path) -> tuple[Evidence, dict[str, Any]]:
+    """Evidence of a recording, and its ``reduce.json``."""
+    arrays, tables = detector.frames(seed)
+    raw = Raw(detector.described(), arrays, tables, reduce.Config())
+    evidence = evidence_of(raw, folder, whole_of(detector.shape), detector.shape)
+    report: dict[str, Any] = read_json(folder / "reduce" / "reduce.json")
+    return evidence, report
 
 
 @dataclass(frozen=True)

@@ -164,6 +164,8 @@ def _full_scale(evidence: Evidence, usual: float) -> float:
 def _of_flats(evidence: Evidence, level_e: float) -> tuple[F64, F64] | None:
     """(quadratic, cubic) and their covariance from a ladder; None with too few levels."""
     times, means, errors = [], [], []
+    if not evidence.steady_lamp:
+        return None
     for stack in evidence.of_kind("flat"):
         lost = (stack.adu[:, evidence.good] >= evidence.saturation_adu).mean()
         if stack.exptime_s > 0 and lost < _SATURATED and len(stack.adu) > 1:

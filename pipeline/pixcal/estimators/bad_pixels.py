@@ -25,6 +25,13 @@ _MIN_OUTLIERS = 3
 _OUTLIER_SHARE = 0.02
 _KURTOSIS_SIGMAS = 4.0
 _KURTOSIS_SAMPLES = 32
+_CURVES = 2
+_DEGREE = 3
+_FARTHEST = 4.0
+_CLIPPINGS = 4
+_CLIP = 4.0
+_FEWEST = 64
+_SAMPLE = 4096
 
 
 def hot(rate: F64, error: F64, median: float, sigma: float, limit: float) -> Mask:
@@ -118,7 +125,9 @@ def nonlinear(rungs: Sequence[Rung], limit: float) -> Mask:
     """Signal that does not follow that of the other pixels over a ladder of flats.
 
     The pixel's share of the median level of the rungs (of the same tile, so that the lamp's own
-    drift and the detector's common curve drop out) is constant for a good pixel.
+    drift drops out) is constant for a good pixel on a linear detector. Where the response of all
+    pixels is curved, brighter pixels are further along the curve: what pixels of one brightness
+    have in common is the detector's response, and no defect.
 
     Parameters
     ----------
@@ -138,6 +147,9 @@ def nonlinear(rungs: Sequence[Rung], limit: float) -> Mask:
         error = np.sqrt(variance) / levels
         weight = np.where(np.isfinite(share) & (error > 0) & (levels > 0), error**-2, 0.0)
         share = np.where(weight > 0, share, 0.0)
+        for _ in range(_CURVES):
+            mean = (weight * share).sum(axis=0) / weight.sum(axis=0)
+            share = share - mean * _common(share / mean - 1, mean, weight > 0)
         total = weight.sum(axis=0)
         mean = (weight * share).sum(axis=0) / total
         # A rung is part of the mean, so their difference varies less than the rung alone.
@@ -146,3 +158,27 @@ def nonlinear(rungs: Sequence[Rung], limit: float) -> Mask:
         beyond = (off > limit * np.abs(mean)) & (off > _MANY_SIGNIFICANT * spread) & (weight > 0)
     enough = (weight > 0).sum(axis=0) >= MIN_RUNGS
     return np.asarray(beyond.any(axis=0) & enough)
+
+
+def _common(off: F64, brightness: F64, used: Mask) -> F64:
+    """What pixels of one brightness (y, x) have in common of their departures (rung, y, x)."""
+    usual, scale = median_and_sigma(brightness)
+    x = (
+        np.clip((brightness - usual) / scale, -_FARTHEST, _FARTHEST)
+        if scale > 0
+        else 0 * brightness
+    )
+    x = np.nan_to_num(x)
+    some = np.zeros(x.shape, np.bool_)
+    some.flat[:: max(x.size // _SAMPLE, 1) | 1] = True
+    found = np.zeros_like(off)
+    for rest, out, own in zip(off, found, used & np.isfinite(off), strict=True):
+        kept = own & some
+        for _ in range(_CLIPPINGS):
+            if kept.sum() < _FEWEST:
+                break
+            terms = np.polynomial.polynomial.polyfit(x[kept], rest[kept], _DEGREE)
+            out[:] = np.polynomial.polynomial.polyval(x, terms)
+            left = rest - out
+            kept = own & some & (np.abs(left) < _CLIP * max(median_and_sigma(left[kept])[1], 1e-12))
+    return np.nan_to_num(found)

@@ -20,6 +20,8 @@ STRIPE = 4
 """Rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves."""
 SATURATED = 1e-3
 """Share of saturated samples from which flats tell nothing of levels and noise."""
+STEADY = 0.3
+"""Relative change of the light a second of flats beyond which it is the lamp that was changed."""
 DITHER = 0.38
 """Noise over a code from which means of rounded samples are right to 2 % of a code."""
 NO_SAMPLE = -(1 << 30)
@@ -156,6 +158,8 @@ class Stack:
     adu : (t, y, x) float32
     start_s : float
         Time of the first of its kind after the first frame of the acquisition; nan when unknown.
+    step : int
+        Of the lamp, among flats of one exposure time; 0 is the dimmest.
     """
 
     kind: str
@@ -163,6 +167,7 @@ class Stack:
     time_s: F64
     adu: F32
     start_s: float = np.nan
+    step: int = 0
 
 
 @dataclass(frozen=True)
@@ -251,6 +256,18 @@ class Evidence:
         return self.amplifier_noise > DITHER * self.gain
 
     @property
+    def steady_lamp(self) -> bool:
+        """Whether flats of different exposure times can be of one lamp."""
+        times = [s.exptime_s for s in self.ladder]
+        if not times or not min(times) > 0 or len(set(times)) < len(times):
+            return False
+        good = self.good
+        rates = [
+            float((s.adu.mean(axis=0) - self.bias)[good].mean()) / s.exptime_s for s in self.ladder
+        ]
+        return min(rates) > 0 and max(rates) < (1 + STEADY) * min(rates)
+
+    @property
     def ladder(self) -> tuple[Stack, ...]:
         """Flats by exposure time, without those that are saturated in part."""
         return tuple(s for s in self.of_kind("flat") if self._saturated(s) < SATURATED)
@@ -261,7 +278,9 @@ class Evidence:
 
     def of_kind(self, kind: str) -> tuple[Stack, ...]:
         """Stacks of a kind, by exposure time."""
-        return tuple(sorted((s for s in self.stacks if s.kind == kind), key=lambda s: s.exptime_s))
+        return tuple(
+            sorted((s for s in self.stacks if s.kind == kind), key=lambda s: (s.exptime_s, s.step))
+        )
 
 
 def stripes(shape: tuple[int, ...]) -> NDArray[np.bool_]:

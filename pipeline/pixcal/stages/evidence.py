@@ -169,10 +169,13 @@ def _stacks(ingested: Ingested, part: Part) -> tuple[Stack, ...]:
         exposures = np.array([np.nan if t is None else t for t in table["exptime_s"]], float)
         frames = ingested.arrays[kind].read((0, len(exposures)), *part)
         times = np.asarray(table["time_s"], float)
+        steps = np.array(table.get("step") or np.zeros(len(exposures)), int)
         for exposure in np.unique(exposures):
-            own = (exposures == exposure) | (np.isnan(exposures) & np.isnan(exposure))
-            adu, start = frames[own].astype(np.float32), _start(ingested, kind)
-            found.append(Stack(kind, float(exposure), times[own], adu, start))
+            same = (exposures == exposure) | (np.isnan(exposures) & np.isnan(exposure))
+            for step in np.unique(steps[same]):
+                own = same & (steps == step)
+                adu, start = frames[own].astype(np.float32), _start(ingested, kind)
+                found.append(Stack(kind, float(exposure), times[own], adu, start, int(step)))
     return tuple(found)
 
 

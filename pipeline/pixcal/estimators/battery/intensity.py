@@ -61,7 +61,7 @@ def flat_ladder(evidence: Evidence) -> Curve | None:
             dark = evidence.dark_rate[evidence.good] * stack.exptime_s
             levels.append(float(np.mean(light - dark)))
             times.append(stack.exptime_s)
-    if len(levels) < 2 or not evidence.dithered:
+    if len(levels) < 2 or not evidence.dithered or not evidence.steady_lamp:
         return None
     rate = np.array(levels) / np.array(times)
     return Curve(np.array(times), rate / rate.mean() - 1)

@@ -96,14 +96,15 @@ def recordings_of(
         exposures = np.array([np.nan if t is None else t for t in table["exptime_s"]], float)
         times = np.array(table["time_s"], float)
         kind = name.split("/")[0]
-        own = [np.arange(len(times))] if name in listed else groups(exposures)
+        own = [np.arange(len(times))] if name in listed else groups(table)
         for n, numbers in enumerate(own):
             exposure = float(exposures[numbers[0]])
             exposure = 0.0 if np.isnan(exposure) else exposure
             period = float(np.median(np.diff(times[numbers]))) if len(numbers) > 1 else exposure
             electrons = 1.0 if name in listed else 0.0
             if kind == "flat":
-                electrons = lamp * exposure if lamp and exposure else _level(evidence, exposure)
+                step = int(table["step"][numbers[0]]) if "step" in table else 0
+                electrons = lamp * exposure if lamp else _level(evidence, exposure, step)
             recordings.append(
                 Recording(
                     bench, kind, listed.get(name, n), name, name, len(numbers), exposure,
@@ -130,15 +131,20 @@ def _start(tables: Mapping[str, Table]) -> dict[str, float]:
 def _lamp(evidence: Evidence) -> float:
     """Electrons a second of the flats, for unit response: a linear detector shows one rate.
 
-    Zero without flats of a known exposure time that are not saturated.
+    Zero where the lamp was changed between flats, or none of a known exposure time is there that is
+    not saturated.
     """
+    if not evidence.steady_lamp:
+        return 0.0
     rates = [_light(evidence, s) / s.exptime_s for s in evidence.ladder if s.exptime_s > 0]
     return max(float(np.mean(rates)), 0.0) if rates else 0.0
 
 
-def _level(evidence: Evidence, exposure: float) -> float:
-    """Electrons of the flats of an exposure time, for unit response."""
+def _level(evidence: Evidence, exposure: float, step: int) -> float:
+    """Electrons of the flats of an exposure time and a lamp, for unit response."""
     for stack in evidence.of_kind("flat"):
+        if stack.step != step:
+            continue
         known = np.isfinite(stack.exptime_s)
         if (not known and exposure == 0) or (known and np.isclose(stack.exptime_s, exposure)):
             return _light(evidence, stack)

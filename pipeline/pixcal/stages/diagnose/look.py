@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -95,6 +95,11 @@ def look_at(
     ingested = Ingested(run_dir / "ingest")
     file = run_dir / "ingest" / "acquisition.json"
     acquisition = parse(Acquisition, read_json(file), str(file))
+    # Every window is to be looked at with the saturation of the whole detector.
+    saturation = acquisition.detector.saturation_adu or ingested.saturation_found
+    acquisition = replace(
+        acquisition, detector=replace(acquisition.detector, saturation_adu=saturation)
+    )
     reduction = _reduction(run_dir)
     shape = ingested.shape
     first, parts = chosen_windows(shape)

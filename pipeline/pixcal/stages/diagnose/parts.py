@@ -69,11 +69,12 @@ class Raw:
         return found
 
 
-def groups(exposures: NDArray[np.float64]) -> list[NDArray[np.intp]]:
-    """Numbers of the frames of each exposure time, in ascending order; unknown ones together."""
-    known = [np.flatnonzero(exposures == t) for t in np.unique(exposures[~np.isnan(exposures)])]
-    unknown = np.flatnonzero(np.isnan(exposures))
-    return known + ([unknown] if len(unknown) else [])
+def groups(table: Table) -> list[NDArray[np.intp]]:
+    """Numbers of the frames of each exposure time and lamp, in ascending order; unknown last."""
+    exposures = np.array([np.inf if t is None else t for t in table["exptime_s"]], float)
+    steps = np.array(table.get("step") or np.zeros(len(exposures)), int)
+    pairs = sorted(set(zip(exposures.tolist(), steps.tolist(), strict=True)))
+    return [np.flatnonzero((exposures == t) & (steps == step)) for t, step in pairs]
 
 
 def take(

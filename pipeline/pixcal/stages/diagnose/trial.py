@@ -262,7 +262,9 @@ def estimate(evidence: Evidence, kind: type[Effect]) -> Estimate | str | None:
         found = kind.estimate(evidence)
     except NotImplementedError:
         return "its file does not say how to estimate it"
-    except (InputError, np.linalg.LinAlgError, ValueError, ArithmeticError) as error:
+    except np.linalg.LinAlgError:
+        return "cannot be estimated here: these frames do not determine its parameters"
+    except (InputError, ValueError, ArithmeticError) as error:
         return " ".join(f"cannot be estimated here: {error}".split())[:300]
     if found is not None and not np.isfinite(found.significance):
         return "cannot be estimated here: no finite significance"

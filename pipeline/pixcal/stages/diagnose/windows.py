@@ -77,7 +77,7 @@ def split(tables: Mapping[str, Table], pixels: int) -> Split:
         exposures = np.array([np.nan if t is None else t for t in table["exptime_s"]], float)
         fringes = "/" in name
         early, late = [], []
-        for own in [np.arange(len(exposures))] if fringes else groups(exposures):
+        for own in [np.arange(len(exposures))] if fringes else groups(table):
             one, other = _halves(own, SAMPLES // pixels)
             early.append(one)
             late.append(other)

@@ -27,6 +27,11 @@ _LINEAR_SHARE = 0.7
 _SATURATED_RUNG = 1e-2
 _GAIN_ERROR = 0.2
 _GUESS_ERROR = 0.1
+_NO_LINE = 10.0
+"""Reduced chi-square of a photon-transfer curve that is no line."""
+_LINEARITY = 0.02
+_LAMP = 0.3
+"""Relative change of light a second between flats that are not of one lamp."""
 _LIT = 5.0
 """Least response of the usual pixel over its error: below it the flat would be noise."""
 
@@ -99,9 +104,35 @@ class Summary:
             return self.declared.read_noise_e
         return min(self.declared.read_noise_e, gain * UNTOLD)
 
-    def warnings(self, gain: float) -> list[str]:
-        """Sentences on what was declared otherwise than it was measured."""
+    def warnings(self, gain: float, saturation: float | None) -> list[str]:
+        """Sentences on what is not as it should be, or was declared otherwise than measured.
+
+        Parameters
+        ----------
+        gain : float
+            That is used (e-/ADU).
+        saturation : float or None
+            Where flats were found to saturate (ADU), if it was not declared.
+        """
         found = []
+        if saturation is not None:
+            found.append(
+                f"flats saturate at {saturation:.0f} ADU, where their samples pile up: "
+                f"{(~self.usable).sum()} of {len(self.usable)} levels are left out of gain and "
+                "linearity; declare detector.saturation_adu if it is another level"
+            )
+        if self.gain is not None and self.gain.chi2_reduced > _NO_LINE:
+            found.append(
+                "the photon-transfer curve is no straight line (reduced chi-square "
+                f"{self.gain.chi2_reduced:.3g}): do not rely on the gain measured; causes are a "
+                "nonlinear response, a lamp that flickers, or charge shared by neighbours"
+            )
+        if self.linearity is not None and self.linearity.max_deviation > _LINEARITY:
+            found.append(
+                f"the levels of the flats are up to {100 * self.linearity.max_deviation:.2g} % off "
+                "a straight line over exposure time: the response of all pixels, or the lamp, is "
+                "not linear; no pixel is flagged for it"
+            )
         declared = self.declared.gain_e_per_adu
         if self.gain is not None:
             value, error = self.gain.gain, self.gain.error
@@ -153,8 +184,9 @@ def summarise(job: Measuring, folder: Path, declared: Detector) -> Summary:
         sums += tables.read((i, i + 1), (j, j + 1))[0, 0]
     levels, usable = _rungs(ArrayReader(folder / "levels").read(), job)
     straight = None
-    if job.flats_timed and job.flat:
-        straight = linearity(np.array([group.exptime for group in job.flat]), levels, usable)
+    times = np.array([group.exptime for group in job.flat])
+    if job.flats_timed and job.flat and _one_lamp(times[usable], levels[usable]):
+        straight = linearity(times, levels, usable)
     read_variance = _read_variance(sums[0])
     read_noise = own = None
     if read_variance is not None:
@@ -208,6 +240,12 @@ def _rungs(tables: F64, job: Measuring) -> tuple[F64, NDArray[np.bool_]]:
     total = (weight * np.nan_to_num(level)).sum(axis=0)
     seen = weight.sum(axis=0)
     return np.divide(total, seen, out=np.zeros_like(total), where=seen > 0), usable
+
+
+def _one_lamp(times: F64, levels: F64) -> bool:
+    """Whether flats (s, ADU) can be of one lamp: of several at one exposure time they are not."""
+    rates = levels / times
+    return len(np.unique(times)) == len(times) > 0 and bool(rates.max() < (1 + _LAMP) * rates.min())
 
 
 def linearity_report(summary: Summary, job: Measuring, gain: float) -> dict[str, Any] | None:

@@ -90,15 +90,23 @@ def group_exposures(tables: Mapping[str, Mapping[str, Sequence[Any]]]) -> Exposu
             f"no frame has EXPTIME: darks are taken to be exposed as long as the others{unit}"
         )
     _group_darks(found, times)
-    _group_flats(found, times.get("flat", []))
+    _group_flats(found, times.get("flat", []), tables.get("flat", {}).get("step"))
     for name in lit:
         if name != "flat":
             _time_fringes(found, name, times[name])
     return found
 
 
-def _groups(array: str, times: Sequence[float | None]) -> list[Group]:
-    """Frames with a known time, in groups of the same, sorted by time."""
+def _groups(
+    array: str, times: Sequence[float | None], steps: Sequence[int] | None = None
+) -> list[Group]:
+    """Frames with a known time, in groups of the same time and step, sorted by both."""
+    if steps is not None and any(steps):
+        parts = []
+        for step in sorted(set(steps)):
+            own = [t if s == step else None for t, s in zip(times, steps, strict=True)]
+            parts += _groups(array, own)
+        return sorted(parts, key=lambda group: group.exptime)
     order = sorted((t, n) for n, t in enumerate(times) if t is not None)
     groups: list[list[tuple[float, int]]] = []
     for t, n in order:
@@ -132,20 +140,27 @@ def _group_darks(found: Exposures, times: Mapping[str, list[float | None]]) -> N
         )
 
 
-def _group_flats(found: Exposures, times: list[float | None]) -> None:
+def _group_flats(found: Exposures, times: list[float | None], steps: Sequence[int] | None) -> None:
     if not times:
         found.warnings.append("no flat frames: the flat is 1, the gain is not measured")
         return
+    # Without exposure nothing tells the rate of the light.
     usable = [t if t else None for t in times]
-    found.flat = _groups("flat", usable)
-    unknown = sum(t is None for t in usable)
+    found.flat = _groups("flat", usable, steps)
+    unknown, unexposed = sum(t is None for t in times), sum(t == 0 for t in times)
     if not found.flat:
         found.known = False
-        found.flat = [Group("flat", 1.0, tuple(range(len(times))))]
+        found.flat = _groups("flat", [1.0] * len(times), steps)
         if found.has_rate:
-            found.warnings.append("flat frames have no EXPTIME: their dark signal is not removed")
+            lacking = "an EXPTIME of 0" if unexposed else "no EXPTIME"
+            found.warnings.append(f"flat frames have {lacking}: their dark signal is not removed")
     elif unknown:
         found.warnings.append(f"{unknown} of {len(times)} flat frames have no EXPTIME: not used")
+    elif unexposed:
+        found.warnings.append(
+            f"{unexposed} of {len(times)} flat frames have an exposure time of 0 s: not used; list "
+            "them under frames.bias if they hold no light"
+        )
 
 
 def _time_fringes(found: Exposures, name: str, times: list[float | None]) -> None:

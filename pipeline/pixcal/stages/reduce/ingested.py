@@ -13,6 +13,7 @@ from pixcal.model.acquisition import Acquisition, Detector
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages.reduce.exposures import Exposures, group_exposures
+from pixcal.stages.reduce.flat_survey import FlatSurvey
 from pixcal.storage.artefact import read_json, read_manifest
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
@@ -47,10 +48,22 @@ class Ingested:
         return parse(Acquisition, read_json(described), str(described)).detector
 
     @cached_property
+    def _listed(self) -> dict[str, dict[str, list[Any]]]:
+        listed: dict[str, dict[str, list[Any]]] = read_json(self.folder / "frames.json")
+        return listed
+
+    @cached_property
     def tables(self) -> dict[str, dict[str, list[Any]]]:
-        """Columns of facts on the frames of each array."""
-        tables: dict[str, dict[str, list[Any]]] = read_json(self.folder / "frames.json")
-        return tables
+        """Columns of facts on the frames of each array; of flats also the ``step`` of the lamp."""
+        flat = self._listed.get("flat")
+        if self.survey is None or flat is None or "step" in flat:
+            return self._listed
+        return self._listed | {"flat": flat | {"step": self.survey.steps(flat["exptime_s"])}}
+
+    @cached_property
+    def survey(self) -> FlatSurvey | None:
+        """What flats show at first sight; None without flats."""
+        return FlatSurvey.of(self.arrays) if "flat" in self._listed else None
 
     @cached_property
     def exposures(self) -> Exposures:
@@ -68,10 +81,10 @@ class Ingested:
         """
         manifest = read_manifest(self.folder)
         if manifest is None or manifest.format == 1:
-            return {name: ArrayReader(self.raw / name) for name in self.tables}
+            return {name: ArrayReader(self.raw / name) for name in self._listed}
         readers: dict[str, Reader] = {}
         places = read_json(self.folder / "files.json")
-        for name, table in self.tables.items():
+        for name, table in self._listed.items():
             if places[name] is None:
                 readers[name] = ArrayReader(self.raw / name)
                 continue
@@ -120,11 +133,19 @@ class Ingested:
         return float(all(self._is_integer(group.array) for group in groups))
 
     def saturation(self, name: str) -> float:
-        """Level (ADU) from which on samples of an array are saturated: declared, or its type's."""
+        """Level (ADU) from which on samples of an array are saturated.
+
+        As declared, else where flats pile up, else the end of its type.
+        """
         end = MOST_ADU
         if self._is_integer(name):
             end = float(np.iinfo(self.arrays[name].dtype).max)
-        return min(self.detector.saturation_adu or end, end)
+        return min(self.detector.saturation_adu or self.saturation_found or end, end)
+
+    @property
+    def saturation_found(self) -> float | None:
+        """Level (ADU) at which flats pile up; None where they do not."""
+        return None if self.survey is None else self.survey.saturation
 
     def lowest(self, name: str) -> float:
         """Least sample (ADU) that an array can hold."""

@@ -247,7 +247,8 @@ def _report(
     sets: Mapping[str, dict[str, Any]],
     runtime: Runtime,
 ) -> None:
-    warnings = [*source.exposures.warnings, *summary.warnings(gain)]
+    piled = source.saturation_found if source.detector.saturation_adu is None else None
+    warnings = [*source.exposures.warnings, *summary.warnings(gain, piled)]
     declared = source.detector.saturation_adu is not None
     for name, found in sets.items():
         warnings += set_warnings(name, found, declared, config.rounding_share)
@@ -257,6 +258,12 @@ def _report(
         "schema": SCHEMA,
         **_report_noise(summary, config, gain, bounds),
         "linearity": linearity_report(summary, job, gain),
+        "saturation_adu": {
+            "declared": source.detector.saturation_adu,
+            "found": source.saturation_found,
+            "used": job.saturation if math.isfinite(job.saturation) else None,
+            "levels_left_out": int((~summary.usable).sum()),
+        },
         "flags": _count_flags(made.folder / "calibration.zarr" / "mask", source.shape),
         "quantisation": {name: found.pop("quantisation") for name, found in sets.items()},
         "sets": sets,

@@ -1,0 +1,91 @@
+"""What flats show at first sight: how bright each frame is, and where samples saturate.
+
+Frames of one exposure time may be of several levels, where the lamp was changed. Where a converter
+or a well ends, samples pile up at their highest code.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.storage.frame_reader import Reader
+
+F64 = NDArray[np.float64]
+
+ROWS = 64
+"""Rows that are looked at, in the middle of the frames."""
+APART = 0.05
+"""Relative distance of two levels that are not one lamp's flicker."""
+LEAST_SHARE = 1e-3
+"""Of the samples of a frame that lie at the highest code at least."""
+LEAST_SAMPLES = 50
+NEIGHBOURS = 16
+"""Codes below the highest that are held against it."""
+PILED = 4
+"""How many times as many samples as at any of these are a pile."""
+
+
+@dataclass(frozen=True)
+class FlatSurvey:
+    """Flats at first sight.
+
+    Attributes
+    ----------
+    levels : (t,) float64
+        Mean of each frame above the bias (ADU).
+    saturation : float or None
+        Code (ADU) at which samples pile up; None where none do, or samples are real numbers.
+    """
+
+    levels: F64
+    saturation: float | None
+
+    @classmethod
+    def of(cls, arrays: Mapping[str, Reader]) -> "FlatSurvey":
+        """Look at the middle rows of all flats, and of a frame without light."""
+        dark = next((arrays[name] for name in ("bias", "dark") if name in arrays), None)
+        pedestal = 0.0 if dark is None else float(np.nanmean(_rows(dark, 0)))
+        flats = arrays["flat"]
+        whole = flats.dtype.kind in "iu"
+        levels, tops = [], []
+        for number in range(flats.shape[0]):
+            samples = _rows(flats, number)
+            levels.append(float(np.nanmean(samples)) - pedestal)
+            if whole:
+                top = int(samples.max())
+                below = top - samples[samples >= top - NEIGHBOURS].astype(np.int64)
+                counts = np.bincount(below.ravel(), minlength=NEIGHBOURS + 1)
+                tops.append((top, counts, float(counts[0] / samples.size)))
+        return cls(np.array(levels), _pile(tops))
+
+    def steps(self, exposures: Sequence[float | None]) -> list[int]:
+        """Number of the level of each frame among those of the same exposure time, from 0."""
+        found = np.zeros(len(exposures), int)
+        times = np.array([np.nan if t is None else t for t in exposures], float)
+        for time in np.unique(times):
+            own = np.flatnonzero((times == time) | (np.isnan(times) & np.isnan(time)))
+            order = own[np.argsort(self.levels[own], kind="stable")]
+            levels = self.levels[order]
+            found[order[1:]] = np.cumsum(np.diff(levels) > APART * np.maximum(levels[1:], 1.0))
+        return [int(step) for step in found]
+
+
+def _rows(frames: Reader, number: int) -> NDArray[Any]:
+    _, ny, nx = frames.shape
+    first = max((ny - ROWS) // 2, 0)
+    read: NDArray[Any] = frames.read((number, number + 1), (first, min(first + ROWS, ny)), (0, nx))
+    return read
+
+
+def _pile(tops: Sequence[tuple[int, NDArray[np.int64], float]]) -> float | None:
+    """Highest code, if there are far more samples than just below it."""
+    if not tops:
+        return None
+    highest = max(top for top, _, _ in tops)
+    own = [(counts, share) for top, counts, share in tops if top == highest]
+    counts = np.sum([c for c, _ in own], axis=0)
+    piled = counts[0] >= LEAST_SAMPLES and counts[0] > PILED * counts[1:].max()
+    return float(highest) if piled and max(s for _, s in own) >= LEAST_SHARE else None
