@@ -104,7 +104,10 @@ def test_noise_is_drawn_once_for_a_frame_wherever_one_begins(
     assert sorted(drawn) == [(frame, 0) for frame in range(20 - lag.frames_back, 35)]
 
 
-@pytest.mark.parametrize("lag", [Lag(0.02, 0.0, 0.0), Lag(0.05, 1.5, 0.0)])
+FULL = Lag(0.03, 0.0, 0.0, (2.0, 1.2, 0.8, 0.3), 40_000.0, (0.6, 0.3, 0.1))
+
+
+@pytest.mark.parametrize("lag", [Lag(0.02, 0.0, 0.0), Lag(0.05, 1.5, 0.0), FULL])
 def test_frames_are_restored(make_effect_bench: Callable[..., Bench], lag: Lag) -> None:
     bench = quiet(make_effect_bench(SMALL))
     fringes = of_kind(bench, "fringes")
@@ -175,3 +178,25 @@ def test_a_bent_response_is_not_taken_for_it(acquired: Callable[..., Evidence]) 
         found = Lag.estimate(replace(evidence, fringes=sets))
         assert found is not None
         assert found.significance < 4
+
+
+def test_traps_that_fill_up_are_measured_without_their_law(
+    acquired: Callable[..., Evidence],
+) -> None:
+    parts, later = (2.5, 1.8, 1.1, 0.4), (0.6, 0.2, 0.1, 0.06, 0.04)
+    given = {
+        "share": 0.01, "spread": 0.0, "bands": list(parts), "level_e": 45_000.0,
+        "later": list(later),
+    }  # fmt: skip
+    found = Lag.estimate(acquired(None, {"lag": given}))
+    assert found is not None
+    lag = found.effect
+    assert isinstance(lag, Lag)
+    assert lag.releases[:5] == pytest.approx(later, abs=0.03)
+    charge = np.array([3e3, 1e4, 2e4, 4e4], np.float32)
+    truth = Lag(0.01, 0.0, 0.0, parts, 45_000.0, later)
+    np.testing.assert_allclose(lag._left(charge), truth._left(charge), rtol=0.05)
+    even = Lag.estimate(acquired(None, {"lag": {"share": 0.01}}))
+    assert even is not None
+    assert isinstance(even.effect, Lag)
+    assert even.effect.bands == even.effect.later == ()

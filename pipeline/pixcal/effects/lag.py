@@ -10,6 +10,7 @@ from scipy.optimize import minimize_scalar
 
 from pixcal.estimators.distortions import Freedom
 from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.levels_of_lag import BANDS, in_bands, shares_by_level
 from pixcal.estimators.middle import middle
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
@@ -40,6 +41,10 @@ _MIN_FRAMES = 20
 _MIN_FLATS = 8
 _ROUNDS = 2
 _CLEAR = 4.0
+_NOT_EXPONENTIAL, _NOT_EVEN = 40.0, 25.0
+"""Chi-squares from which releases, or the level, are taken as they come."""
+_TURNS = 3
+"""Of the inverse: each gains a factor of the share."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +52,8 @@ class Lag(Effect):
     """Incomplete transfer: each electron stays behind with a chance of ``share``.
 
     It comes out with the next frame, or over several. No charge is lost, and before the first frame
-    of a recording the pixels were dark and empty.
+    of a recording the pixels were dark and empty. Traps that fill up take another share of each
+    band of the level.
 
     A fit of the fringes takes up what all pixels have in common: the frame before is a sum of the
     same maps, so every frame only gets another amplitude and phase. So maps show nothing of it;
@@ -82,9 +88,21 @@ class Lag(Effect):
         0.1, low=0, high=1, doc="of the share from pixel to pixel, relative (rms)"
     )
 
+    bands: tuple[float, ...] = quantity(
+        (), low=0, high=100, doc="share of the charge in bands of its level that begin at 0, 1/8, "
+        "1/4 and 1/2 of level_e, over `share`; empty: the same in all"
+    )  # fmt: skip
+    level_e: float = quantity(50_000.0, unit="e-", above=0, high=1e7, doc="full scale of the bands")
+    later: tuple[float, ...] = quantity(
+        (), low=0, high=1, doc="parts of what stayed behind that come out 1, 2, ... frames later; "
+        "empty: as decay_frames says"
+    )  # fmt: skip
+
     @property
     def releases(self) -> F64:
         """Share of what stayed behind that comes out 1, 2, ... frames later; their sum is one."""
+        if sum(self.later) > 0:
+            return np.array(self.later) / sum(self.later)
         if not self.decay_frames:
             return np.ones(1)
         keep = np.exp(-1 / self.decay_frames)
@@ -112,8 +130,19 @@ class Lag(Effect):
         share = _shares(self, shot.bench.detector, shot.rows)
         left = np.empty_like(charge)
         noise = shot.normals(self.name, frame) if shot.bench.shot_noise else np.zeros_like(charge)
-        left_behind(charge, share, noise, left)
+        begins, weights = _bands(self)
+        left_behind(charge, share, begins, weights, noise, left)
         return left
+
+    def _left(self, charge: F32) -> F32:
+        """Mean of what stays of a charge, e-."""
+        share = np.float32(self.share)
+        if not self.bands:
+            return share * charge
+        parts = in_bands(charge, self.level_e)
+        return np.asarray(
+            share * sum(np.float32(w) * p for w, p in zip(self.bands, parts, strict=True))
+        )
 
     def restored(self, frames: F32) -> F32:
         """Frames without lag, from those with it.
@@ -132,8 +161,11 @@ class Lag(Effect):
         for n, frame in enumerate(frames):
             late = np.zeros_like(frame)
             for back, release in enumerate(self.releases[:n], start=1):
-                late += np.float32(self.share * release) * found[n - back]
-            found[n] = (frame - late) / np.float32(1 - self.share)
+                late += np.float32(release) * self._left(found[n - back])
+            share = np.float32(self.share)
+            found[n] = (frame - late) / (1 - share)
+            for _ in range(_TURNS if self.bands else 0):
+                found[n] = (frame - late + self._left(found[n]) - share * found[n]) / (1 - share)
         return found
 
     @classmethod
@@ -156,7 +188,9 @@ class Lag(Effect):
                 return None
             share, keep, share_error, keep_error, sigmas = _decay(steps)
             found = cls(float(np.clip(share, 0, 0.5)), -1 / np.log(keep) if keep else 0.0)
+        share, share_error, later = _freely(steps, keep, share, share_error)
         part = middle(evidence)
+        level_e = max(float(np.nanquantile(f.electrons[::7], 0.99)) for f in fringes)
         uneven, uneven_error = _mean(
             [p for f in part.fringes.values() if (p := uneven_pixels(f)) is not None]
         )
@@ -170,20 +204,32 @@ class Lag(Effect):
             size = max(rms, np.sqrt(uneven_error) / (1 - keep))
             spread_error = uneven_error / (1 - keep) ** 2 / (2 * size)
             spread_error = float(np.hypot(spread_error, spread * share_error) / share)
+        bands, of_bands = _by_level(
+            part, cls(share, found.decay_frames, later=later, level_e=level_e), sigmas
+        )
         decay = -1 / np.log(keep) if keep else 0.0
         decay_error = keep_error * decay**2 / keep if keep else -1 / np.log(min(keep_error, 0.9))
         return Estimate(
-            cls(share, min(float(decay), _MAX_DECAY), min(spread, 1.0)),
+            cls(share, min(float(decay), _MAX_DECAY), min(spread, 1.0), bands, level_e, later),
             {
                 "share": share_error,
                 "decay_frames": float(decay_error),
                 "spread": min(spread_error, 1.0),
-            },
+            }
+            | of_bands,
             sigmas_of_best(sigmas, uneven / uneven_error),
             "the contrast falls with the step of the phase since the frame before"
             + (", and pixels keep it unevenly" if uneven > _CLEAR * uneven_error else ""),
             {"by_contrast_sigmas": sigmas, "by_pixels_sigmas": uneven / uneven_error},
         )
+
+
+@lru_cache(maxsize=4)
+def _bands(lag: Lag) -> tuple[F32, F32]:
+    """Where bands of the charge begin, e-, and the share in each over the mean one."""
+    weights = lag.bands or (1.0,)
+    begins = np.array(BANDS[: len(weights)], np.float32) * np.float32(lag.level_e)
+    return begins, np.array(weights, np.float32)
 
 
 @lru_cache(maxsize=4)
@@ -271,6 +317,40 @@ def _decay(steps: list[tuple[F64, F64]]) -> tuple[float, float, float, float, fl
     if not best:
         errors[0] = 1 / np.sqrt(u @ information @ u)
     return share, best, float(errors[0]), float(errors[1]), gain(best)
+
+
+def _freely(
+    steps: list[tuple[F64, F64]], keep: float, share: float, error: float
+) -> tuple[float, float, tuple[float, ...]]:
+    """Share, its error and what comes out in each frame, where an exponential does not describe it.
+
+    Else share and error as given, and nothing.
+    """
+    information = np.sum([n for _, n in steps], axis=0)
+    free = np.linalg.solve(information, np.sum([n @ w for w, n in steps], axis=0))
+    away = free - share * (1 - keep) * keep ** np.arange(LAGS)
+    if float(away @ information @ away) < _NOT_EXPONENTIAL or share < _CLEAR * error:
+        return share, error, ()
+    covariance = np.linalg.inv(information)
+    kept = np.maximum(free, 0)
+    total = float(kept.sum())
+    return total, float(np.sqrt(covariance.sum())), tuple(map(float, kept / total))
+
+
+def _by_level(
+    evidence: Evidence, lag: Lag, sigmas: float
+) -> tuple[tuple[float, ...], dict[str, float]]:
+    """Share in bands of the level over the mean one, with errors, where it is not the same."""
+    if sigmas < _CLEAR:
+        return (), {}
+    shares, covariance, against = shares_by_level(
+        evidence, lag.share, lag.releases[:LAGS], lag.level_e
+    )
+    if against < _NOT_EVEN:
+        return (), {}
+    errors = np.sqrt(np.diag(covariance)) / lag.share
+    bands = tuple(float(v) for v in np.clip(shares / lag.share, 0, 100))
+    return bands, {f"bands[{n}]": float(e) for n, e in enumerate(errors)}
 
 
 def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:

@@ -37,8 +37,9 @@ class TelegraphNoise(Effect):
     """A trap near the source follower of some pixels that is full or empty.
 
     Both states are equally likely; the level lies half an amplitude above or below its mean.
-    Amplitudes have an exponential distribution. Nothing of it is constant in time, so maps of the
-    fit neither show it nor can be mended; the pixels are those that `reduce` flags as noisy.
+    Amplitudes have a gamma distribution, by default an exponential one. Nothing of it is constant
+    in time, so maps of the fit neither show it nor can be mended; the pixels are those that
+    `reduce` flags as noisy.
     """
 
     name = "telegraph_noise"
@@ -63,6 +64,10 @@ class TelegraphNoise(Effect):
     switching_s: float = quantity(
         0.5, unit="s", low=0, high=1e6, doc="mean stay in a level; 0: another draw in every frame"
     )
+    amplitude_shape: float = quantity(
+        1.0, low=0.01, high=100, doc="of the gamma distribution of amplitudes: 1 is exponential, "
+        "large: all are alike"
+    )  # fmt: skip
 
     def readout(self, adu: F32, shot: Shot) -> F32:
         """As in `Effect.readout`."""
@@ -71,7 +76,7 @@ class TelegraphNoise(Effect):
         keep = float(np.exp(-2 * recording.period_s / self.switching_s)) if self.switching_s else 0
         first, last = shot.rows
         for block in range(first // BLOCK_ROWS, -(-last // BLOCK_ROWS)):
-            rows, columns, amplitudes = _pixels(detector, block, self.share)
+            rows, columns, amplitudes = _pixels(detector, block, self.share, self.amplitude_shape)
             if not len(rows):
                 continue
             seed = int(recording.pixel_rng(self.name, block).integers(1 << 62))
@@ -104,12 +109,13 @@ class TelegraphNoise(Effect):
 
 def _estimate(cls: type[TelegraphNoise], found: Telegraph) -> Estimate:
     return Estimate(
-        cls(found.share, found.amplitude, found.switching_s),
+        cls(found.share, found.amplitude, found.switching_s, found.shape),
         {
             "share": found.share_error,
             "amplitude_e": found.amplitude_error,
             "switching_s": found.switching_error,
-        },
+        }
+        | ({"amplitude_shape": found.shape_error} if found.shape_error else {}),
         found.significance,
         "noisy pixels have two levels or stay in one from frame to frame",
         {"flat_top_sigmas": found.flat_top, "staying_sigmas": found.staying, "noisy": found.noisy},
@@ -118,13 +124,15 @@ def _estimate(cls: type[TelegraphNoise], found: Telegraph) -> Estimate:
 
 @lru_cache(maxsize=4)
 def _pixels(
-    detector: SimulatedDetector, block: int, share: float
+    detector: SimulatedDetector, block: int, share: float, shape: float
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], F32]:
     """Rows and columns of the pixels of a block that have it, and amplitudes of mean one."""
     rows = block * BLOCK_ROWS, min((block + 1) * BLOCK_ROWS, detector.shape[0])
 
     def draw(rng: np.random.Generator) -> F64:
-        chance, amplitude = rng.random(TILE), rng.standard_exponential(TILE)
+        chance = rng.random(TILE)
+        alike = rng.standard_gamma(shape, TILE) / shape if shape != 1 else None
+        amplitude = rng.standard_exponential(TILE) if alike is None else alike
         return np.where(chance < share, amplitude, 0)
 
     amplitudes = chip_map(detector, rows, TelegraphNoise.name, draw)

@@ -8,7 +8,7 @@ F32 = NDArray[np.float32]
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def left_behind(charge: F32, share: F32, normal: F32, out: F32) -> None:
+def left_behind(charge: F32, share: F32, begins: F32, weights: F32, normal: F32, out: F32) -> None:
     """Electrons that stay in each pixel, each by its own chance: binomial, as a normal variate.
 
     Parameters
@@ -16,7 +16,9 @@ def left_behind(charge: F32, share: F32, normal: F32, out: F32) -> None:
     charge : (y, x) float32
         e-.
     share : (y, x) float32
-        Chance of an electron.
+        Chance of an electron, on the mean.
+    begins, weights : (band,) float32
+        Where bands of the charge begin (e-), and the chance in each over the mean one.
     normal : (y, x) float32
         Standard normals; zero for the mean.
     out : (y, x) float32
@@ -25,6 +27,13 @@ def left_behind(charge: F32, share: F32, normal: F32, out: F32) -> None:
     zero, one = np.float32(0), np.float32(1)
     for y in range(charge.shape[0]):
         for x in range(charge.shape[1]):
-            mean = share[y, x] * charge[y, x]
+            told = zero
+            for band in range(begins.size):
+                if charge[y, x] > begins[band] or band == 0:
+                    part = charge[y, x]
+                    if band + 1 < begins.size:
+                        part = min(part, begins[band + 1])
+                    told += weights[band] * (part - begins[band])
+            mean = share[y, x] * told
             scatter = np.sqrt(max(mean * (one - share[y, x]), zero))
             out[y, x] = min(max(mean + scatter * normal[y, x], zero), max(charge[y, x], zero))

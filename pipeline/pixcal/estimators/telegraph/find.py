@@ -20,9 +20,10 @@ class Telegraph:
 
     Attributes
     ----------
-    share, amplitude, switching_s : float
-        Of the pixels; mean, e-; mean stay in a level, s (0: no longer than a frame).
-    share_error, amplitude_error, switching_error : float
+    share, amplitude, shape, switching_s : float
+        Of the pixels; mean, e-; of the amplitudes' gamma distribution; mean stay in a level, s
+        (0: no longer than a frame).
+    share_error, amplitude_error, shape_error, switching_error : float
     significance : float
         That noisy pixels jump.
     flat_top, staying : float
@@ -33,9 +34,11 @@ class Telegraph:
 
     share: float
     amplitude: float
+    shape: float
     switching_s: float
     share_error: float
     amplitude_error: float
+    shape_error: float
     switching_error: float
     significance: float
     flat_top: float
@@ -62,6 +65,7 @@ def find_telegraph(series: Sequence[Series]) -> Telegraph | None:
         if abs(switching - before) < SETTLED * switching_error:
             break
     return Telegraph(
-        found.share, found.amplitude, switching, found.share_error, found.amplitude_error,
-        switching_error, sigmas_of_best(flat_top, staying), flat_top, staying, noisy,
+        found.share, found.amplitude, found.shape, switching,
+        found.share_error, found.amplitude_error, found.shape_error, switching_error,
+        sigmas_of_best(flat_top, staying), flat_top, staying, noisy,
     )  # fmt: skip
