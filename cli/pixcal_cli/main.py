@@ -16,6 +16,7 @@ from pixcal_cli.allan import allan
 from pixcal_cli.astrometry import astrometry
 from pixcal_cli.blind import blind
 from pixcal_cli.budget import budget
+from pixcal_cli.centroids import centroids, wcs
 from pixcal_cli.compare import compare
 from pixcal_cli.crests import crests
 from pixcal_cli.diagnose import diagnose
@@ -50,6 +51,8 @@ class InOrder(click.Group):
         crests,
         diagnose,
         astrometry,
+        centroids,
+        wcs,
         report,
         compare,
         simulate,

@@ -12,8 +12,10 @@ from pixcal.api import astrometry as astrometry
 from pixcal.api import budget as budget
 from pixcal.api import calibrate as calibrate
 from pixcal.api import compare as compare
+from pixcal.api import correct_centroids as correct_centroids
 from pixcal.api import crests as crests
 from pixcal.api import diagnose as diagnose
+from pixcal.api import distortion_wcs as distortion_wcs
 from pixcal.api import fit as fit
 from pixcal.api import ingest as ingest
 from pixcal.api import open_run as open_run

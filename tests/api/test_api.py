@@ -96,7 +96,9 @@ def test_no_name_is_hidden_by_a_folder_of_the_package() -> None:
 
 def test_every_command_is_a_function() -> None:
     stages = {name for name, one in cli.commands.items() if not isinstance(one, click.Group)}
-    assert (stages - {"report"}) | {"write_report"} <= set(api.__all__)
+    # A noun is no name for a function.
+    names = {"report": "write_report", "centroids": "correct_centroids", "wcs": "distortion_wcs"}
+    assert {names.get(stage, stage) for stage in stages} <= set(api.__all__)
 
 
 @pytest.mark.parametrize("name", STAGES)

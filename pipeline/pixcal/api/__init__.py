@@ -4,6 +4,7 @@ All of these names can be had from `pixcal` itself.
 """
 
 from pixcal.api.arrays import calibrate
+from pixcal.api.centroids import correct_centroids, distortion_wcs
 from pixcal.api.commands import (
     allan,
     astrometry,
@@ -39,8 +40,10 @@ __all__ = [
     "budget",
     "calibrate",
     "compare",
+    "correct_centroids",
     "crests",
     "diagnose",
+    "distortion_wcs",
     "fit",
     "ingest",
     "open_run",

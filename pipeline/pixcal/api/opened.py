@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ from pixcal.model.errors import InputError
 from pixcal.storage.artefact import damage_noted, read_json, require
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.products import read_map
+
+if TYPE_CHECKING:
+    from astropy.nddata import CCDData
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -63,6 +66,19 @@ class OffsetMap:
     def good(self) -> NDArray[np.bool_]:
         """(y, x): pixels that have an offset."""
         return np.equal(self.mask, 0)
+
+    def ccddata(self) -> "CCDData":
+        """The map as astropy's ``CCDData``: with its errors, mask, flags and header."""
+        from astropy.nddata import CCDData, StdDevUncertainty  # here: slow to import
+
+        return CCDData(
+            self.delta,
+            unit="pixel",
+            uncertainty=StdDevUncertainty(self.sigma),
+            mask=~self.good,
+            flags=self.mask,
+            meta=dict(self.header),
+        )
 
     def picture(self) -> Picture:
         """The map with the means of its columns and rows, as the report shows it."""

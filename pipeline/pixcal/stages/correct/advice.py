@@ -55,11 +55,25 @@ def advice(run_dir: Path) -> Advice | None:
     correction = _correction(run_dir)
     causes = diagnosis["causes"] if diagnosis else ()
     rows = tuple(_row(cause, correction) for cause in causes)
-    made = correction is not None and correction["outputs"]
-    source: Json = correction if made and correction is not None else fit
-    names = [f"{name}{SUFFIX if made else ''}.fits" for name in source["outputs"]]
+    names = [path.name for path in maps_to_use(run_dir).values()]
     use = f"Use {' and '.join(names)}: {_about(diagnosis, correction)}."
     return Advice((use, _limit(fit, diagnosis, correction)), rows)
+
+
+def maps_to_use(run_dir: Path) -> dict[str, Path]:
+    """The products to use, by the names of their maps: corrected ones where there are any.
+
+    Raises
+    ------
+    InputError
+        If the run was not fitted.
+    """
+    require(run_dir, "fit", 1)
+    source: Json = read_json(run_dir / "fit" / "fit.json")
+    correction, suffix = _correction(run_dir), ""
+    if correction is not None and correction["outputs"]:
+        source, suffix = correction, SUFFIX
+    return {name: run_dir / "products" / f"{name}{suffix}.fits" for name in source["outputs"]}
 
 
 def _diagnosis(run_dir: Path) -> Json | None:

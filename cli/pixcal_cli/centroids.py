@@ -1,0 +1,96 @@
+"""``pixcal centroids`` and ``pixcal wcs``: what the maps do to the places of stars."""
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from pixcal.model.errors import InputError
+from pixcal_cli.options import examples, run_argument
+
+PATH = click.Path(path_type=Path)
+
+
+@click.command(
+    epilog=examples(
+        "pixcal centroids demo stars.csv --out corrected.csv --fwhm 2.5",
+        "pixcal centroids demo sex.fits --x X_IMAGE --y Y_IMAGE --origin 1 --fwhm 3 --out out.fits",
+    )
+)
+@run_argument
+@click.argument("table", metavar="TABLE", type=PATH)
+@click.option("--out", metavar="FILE", required=True, type=PATH, help="CSV, ECSV, FITS or VOTable.")
+@click.option("--fwhm", metavar="PX", required=True, type=float, help="Width of the stars, px.")
+@click.option("--x", default="x", show_default=True, metavar="NAME", help="Column of x, px.")
+@click.option("--y", default="y", show_default=True, metavar="NAME", help="Column of y, px.")
+@click.option(
+    "--origin",
+    type=click.Choice(["0", "1"]),
+    default="0",
+    show_default=True,
+    help="Coordinate of the centre of the first pixel; SExtractor and FITS count from 1.",
+)
+@click.option(
+    "--electrons",
+    type=float,
+    metavar="N",
+    show_default="all pixels count alike",
+    help="Of a star, if the centroids were fitted with weights of its photon noise.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace FILE.")
+def centroids(
+    run: Path,
+    table: Path,
+    out: Path,
+    fwhm: float,
+    x: str,
+    y: str,
+    origin: str,
+    electrons: float | None,
+    overwrite: bool,
+) -> None:
+    """Correct a table of centroids with the maps of RUN.
+
+    TABLE holds centroids measured as if the pixels were a perfect grid. Columns are added: the
+    corrected places, and what the errors of the maps leave in them.
+    """
+    from pixcal.stages import centroids as stage  # here: for a fast `pixcal --help`
+
+    job = stage.TableJob(table, out, x, y, int(origin), overwrite)
+    found = stage.correct_table(run, job, fwhm_px=fwhm, electrons=electrons)
+    good = np.isfinite(found.place[:, 0])
+    click.echo(f"{out}: {int(good.sum())} of {len(good)} centroids corrected")
+    if good.any():
+        left = np.sqrt((found.error[good] ** 2).mean(axis=0))
+        click.echo(f"  errors of the maps leave {left[0]:.2g} px in x, {left[1]:.2g} px in y")
+    if not good.all():
+        click.echo("  note: the others lie off the detector, or too near to masked pixels: NaN")
+
+
+@click.command(
+    epilog=examples(
+        "pixcal wcs demo --out distortion.fits", "pixcal wcs demo --out stars.fits --fwhm 2.5"
+    )
+)
+@run_argument
+@click.option("--out", metavar="FILE", required=True, type=PATH, help="FITS file to write.")
+@click.option(
+    "--fwhm",
+    metavar="PX",
+    type=float,
+    show_default="the pixels themselves",
+    help="Distortion of stars of this width in the middle of pixels.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace FILE.")
+def wcs(run: Path, out: Path, fwhm: float | None, overwrite: bool) -> None:
+    """Write the maps of RUN as a WCS distortion.
+
+    Lookup tables (D2IMARR) that astropy and others apply to pixel coordinates before everything
+    else of a WCS.
+    """
+    from pixcal.stages import centroids as stage  # here: for a fast `pixcal --help`
+
+    if out.exists() and not overwrite:
+        raise InputError(f"{out}: is there already; choose another --out, or add --overwrite")
+    stage.write_wcs(run, out, fwhm_px=fwhm)
+    click.echo(f"{out}: written")

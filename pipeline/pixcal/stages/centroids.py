@@ -1,0 +1,148 @@
+"""What the maps of a run do to centroids: tables corrected, and a WCS that corrects."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from astropy.wcs import WCS
+from numpy.typing import NDArray
+
+from pixcal.estimators.centroid_correction import (
+    Corrected,
+    correct_centroids,
+    correction_map,
+    gaussian_star,
+)
+from pixcal.estimators.centroids import Star
+from pixcal.model.errors import InputError
+from pixcal.stages.correct.advice import maps_to_use
+from pixcal.storage.artefact import read_json
+from pixcal.storage.distortion import distortion, write_distortion
+from pixcal.storage.products import read_map
+from pixcal.storage.tables import column, read_table, write_table
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+FWHMS = (0.5, 50.0)
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """Offsets of the pixels along x and y, and their errors, (2, y, x), px; NaN where unknown.
+
+    Attributes
+    ----------
+    files : tuple of str
+        The products that they come from.
+    read_noise : float
+        e-, as declared.
+    """
+
+    delta: F32
+    sigma: F32
+    files: tuple[str, ...]
+    read_noise: float
+
+
+def read_offsets(run_dir: Path) -> Offsets:
+    """The maps of a run that are to be used: corrected ones where there are any.
+
+    With a single fringe axis the offsets along it; those across it are taken as zero.
+
+    Raises
+    ------
+    InputError
+        If the run was not fitted.
+    """
+    files = maps_to_use(run_dir)
+    maps = {name: read_map(path)[:2] for name, path in files.items()}
+    if not maps:
+        raise InputError(f"{run_dir}: the fit left no map of offsets")
+    if "delta_fringe" in maps:
+        facts = read_json(run_dir / "fit" / "fit.json")["sets"]
+        axis = np.array(next(iter(facts.values()))["axis"], np.float32)[:, None, None]
+        delta, sigma = (axis * values for values in maps["delta_fringe"])
+        sigma = np.abs(sigma)
+    else:
+        pairs = zip(*(maps[name] for name in ("delta_x", "delta_y")), strict=True)
+        delta, sigma = (np.stack(pair) for pair in pairs)
+    detector = read_json(run_dir / "ingest" / "acquisition.json")["detector"]
+    names = tuple(path.name for path in files.values())
+    return Offsets(delta, sigma, names, float(detector["read_noise_e"]))
+
+
+def star_of(offsets: Offsets, fwhm_px: float, electrons: float | None) -> Star:
+    """A star of some width.
+
+    Raises
+    ------
+    InputError
+        If the width is out of range.
+    """
+    low, high = FWHMS
+    if not low <= fwhm_px <= high:
+        raise InputError(f"--fwhm: {fwhm_px:g} px; give a width from {low:g} to {high:g} px")
+    if electrons is not None and not 0 < electrons < np.inf:
+        raise InputError(f"--electrons: {electrons:g}; give a number above zero")
+    return gaussian_star(fwhm_px, electrons, offsets.read_noise)
+
+
+def correct(run_dir: Path, place: F64, *, fwhm_px: float, electrons: float | None) -> Corrected:
+    """Correct centroids (n, 2), px from the centre of the first pixel."""
+    offsets = read_offsets(run_dir)
+    star = star_of(offsets, fwhm_px, electrons)
+    return correct_centroids(place, offsets.delta, offsets.sigma, star)
+
+
+@dataclass(frozen=True)
+class TableJob:
+    """Which columns of which table to correct.
+
+    Attributes
+    ----------
+    table, out : Path
+    x, y : str
+        Names of the columns.
+    origin : int
+        Coordinate of the centre of the first pixel: 0 or 1.
+    overwrite : bool
+        Whether ``out`` may be replaced.
+    """
+
+    table: Path
+    out: Path
+    x: str = "x"
+    y: str = "y"
+    origin: int = 0
+    overwrite: bool = False
+
+
+def correct_table(
+    run_dir: Path, job: TableJob, *, fwhm_px: float, electrons: float | None
+) -> Corrected:
+    """Write a table with columns added: ``<x>_corrected``, ``<x>_map_error``; the same of y."""
+    table = read_table(job.table)
+    names = (job.x, job.y)
+    measured = np.stack(
+        [column(table, n, job.table, f"--{o}") for n, o in zip(names, "xy", strict=True)], axis=1
+    )
+    found = correct(run_dir, measured - job.origin, fwhm_px=fwhm_px, electrons=electrons)
+    for n, name in enumerate(names):
+        table[f"{name}_corrected"] = found.place[:, n] + job.origin
+        table[f"{name}_map_error"] = found.error[:, n]
+    write_table(table, job.out, overwrite=job.overwrite)
+    return found
+
+
+def wcs_of(run_dir: Path, *, fwhm_px: float | None) -> WCS:
+    """The maps as a distortion: of the pixels themselves, or of stars of some width."""
+    offsets = read_offsets(run_dir)
+    star = None if fwhm_px is None else star_of(offsets, fwhm_px, None)
+    return distortion(correction_map(offsets.delta, star))
+
+
+def write_wcs(run_dir: Path, out: Path, *, fwhm_px: float | None) -> None:
+    """Write `wcs_of` to a FITS file."""
+    names = " and ".join(path.name for path in maps_to_use(run_dir).values())
+    of = "pixels" if fwhm_px is None else f"stars of FWHM {fwhm_px:g} px"
+    write_distortion(wcs_of(run_dir, fwhm_px=fwhm_px), out, f"offsets of {of}, from {names}")
