@@ -12,10 +12,13 @@ from pixcal.estimators.corrected import (
     phase_sums,
     straight_modes,
 )
+from pixcal.estimators.crosstalk.covariance import NORMAL, NORMALS, TERMS, Products
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels
+from pixcal.estimators.crosstalk.information import Measured
 from pixcal.estimators.crosstalk.links import Classes, class_sums, links, periods, sums_of
-from pixcal.estimators.crosstalk.support import Choice
+from pixcal.estimators.crosstalk.support import Choice, choose
 from pixcal.estimators.modes import solve_modes
+from pixcal.model.errors import InputError
 
 
 def test_every_pair_of_pixels_within_reach_is_one_link():
@@ -57,7 +60,7 @@ def test_significance_is_that_of_the_best_of_many_looks():
     """The largest of N squares of normals; a million draws against the formula's quantiles."""
 
     def of(best, looks):
-        return Choice((), (), Classes(1, 1, (0, 0)), best, looks).significance
+        return Choice((), Classes(1, 1, (0, 0)), best, looks).significance
 
     rng = np.random.default_rng(2)
     looks, drawn = 1000, []
@@ -69,6 +72,27 @@ def test_significance_is_that_of_the_best_of_many_looks():
     assert of(40.0**2, 10**5) == pytest.approx(39.8, abs=0.1)
     ladder = [of(x**2, 10**5) for x in np.linspace(3, 60, 400)]
     assert np.all(np.diff(ladder) > 0)
+
+
+def noise_shared(steps, alike):
+    """Products of residuals in which pixels some steps apart share noise, by the hundredth."""
+    shape = (24, 24)
+    normal = np.zeros((len(steps), NORMALS, *shape))
+    normal[:, NORMAL[0, 0]] = normal[:, NORMAL[1, 1]] = 1e4
+    right = np.zeros((len(steps), TERMS, *shape))
+    for n, step in enumerate(steps):
+        right[n, :2] = 1e2 if step in alike else 0.0
+    return Measured(Products(right, normal, 1.0, 1e-3, 0.02), None, steps, shape, (0, 0))
+
+
+def test_noise_that_far_pixels_share_is_refused_at_once():
+    steps = links((24, 24))
+    near = [s for s in steps if max(map(abs, s)) < 3]
+    found = choose(noise_shared(steps, near))
+    assert [steps[n] for n in found.links] == near
+    assert found.classes.count == 1
+    with pytest.raises(InputError, match=r"^not decided: .* 48 of them more than 2 pixels apart"):
+        choose(noise_shared(steps, steps))
 
 
 def hot(value, charge=None, sigma=2e-4):

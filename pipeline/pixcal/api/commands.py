@@ -42,7 +42,7 @@ def run(
     diagnosed: bool = True,
     runtime: Runtime | None = None,
 ) -> Run:
-    """Do all steps, from an acquisition to the report, as ``pixcal run``.
+    """Do all steps, from an acquisition to corrected maps and the report, as ``pixcal run``.
 
     Parameters
     ----------

@@ -1,6 +1,7 @@
 """The coupling between pixels, measured three ways and joined.
 
-`hot_pixels` (darks), `covariance` (noise of flats and of fringe residuals) and `maps` (visibility,
-and offsets at several baselines) each give least-squares sums over the same unknown shares;
-`support` finds which couplings there are, and `joined` what they are worth together.
+`support` finds whether there are couplings, and of what period, in the noise that neighbours share
+(`covariance`) and around `hot_pixels`. For that period `dense` measures all couplings within two
+pixels, from these and the `pattern` of the maps (visibility and offsets of all sets), each shrunk
+by its error (`shrinkage`); `joined` tells which are there.
 """

@@ -1,41 +1,31 @@
 """The kernel: what darks, noise and maps say together, and each by itself."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
+from scipy.stats import chi2
 
-from pixcal.estimators.crosstalk.covariance import Products, products
-from pixcal.estimators.crosstalk.hot_pixels import HotPixels, hot_pixels
-from pixcal.estimators.crosstalk.information import Measured
-from pixcal.estimators.crosstalk.links import Place, links
-from pixcal.estimators.crosstalk.maps import map_information
-from pixcal.estimators.crosstalk.second_order import to_first_order
-from pixcal.estimators.crosstalk.support import Choice, Pick, again, choose
+from pixcal.estimators.crosstalk.dense import Dense, Frames, frames_of, within
+from pixcal.estimators.crosstalk.links import links
+from pixcal.estimators.crosstalk.support import Choice, choose
 from pixcal.estimators.evidence import Evidence
-from pixcal.kernels.crosstalk import Coupling, outflow
+from pixcal.kernels.crosstalk import Coupling
+from pixcal.model.errors import InputError
 
 F64 = NDArray[np.float64]
-Sums = tuple[F64, F64]
 
-ROUNDS = 4
-"""Times that the couplings are found at most; each knows the second order of those before."""
 LEVEL_STEPS = 10
 """Steps of a level dependence."""
-MAP_STEPS = 3
-"""Steps of the shares with the maps."""
-SAME = 1e-5
-"""Change of a share that is none."""
 LARGEST = 0.1
 """How large a share may well be."""
-ALIKE, DIFFERENT = 0.02, 0.3
-"""How much shares that one number serves differ, relatively, where they are nearly alike or not."""
-LEAST = 3e-4
-"""Share below which that is taken of this."""
 CERTAIN = 5.0
 """Sigmas beyond which a level dependence is taken."""
+THERE = 3.5
+"""Sigmas beyond which a coupling is told of: of a hundred that are none, one in twenty kernels."""
+ALIKE = 0.05
+"""Chance from which shares of all classes are taken to be one."""
 
 
 @dataclass(frozen=True)
@@ -68,183 +58,117 @@ class Kernel:
 
 
 def measure(evidence: Evidence) -> Kernel | None:
-    """Couplings of an acquisition; None where it has neither light nor dark signal to tell."""
-    search = _Search.of(evidence)
-    if search is None:
+    """Couplings of an acquisition; None where it has neither light nor dark signal to tell.
+
+    Those that stand out say whether there are any, and of what period; then all within two pixels
+    are measured together, and those that are there are told.
+
+    Raises
+    ------
+    InputError
+        If so many stand out that it is no kernel.
+    """
+    shape = (evidence.good.shape[0], evidence.good.shape[1])
+    every = links(shape)
+    frames = frames_of([evidence], every) if every else None
+    if frames is None:
         return None
-    found, known = search.couplings((), 0.0)
-    pixels = 0 if search.hot is None else len(search.hot.y)
-    per_ke, per_ke_error = 0.0, np.inf
-    if known:
-        known, per_ke, per_ke_error = search.level(known)
-        # Once more, with the charge as it was collected, and all hot pixels.
-        search = _Search.of(evidence, known) or search
-        found, known = search.couplings(known, per_ke)
-    if not known:
-        return Kernel((), np.zeros((0, 0)), found.significance, {}, pixels, 0.0, np.inf)
-    ways = _ways(found.picks, search.noise, known)
-    for _ in range(MAP_STEPS):
-        # The maps are those of one level, and linear only about shares that are nearly right.
-        maps = None if per_ke else map_information(evidence, known)
-        if maps is not None:
-            ways["maps"] = maps
-        about = _together(ways, found.picks)
-        shares, covariance = _solve(ways, *about)
-        known = _with_shares(found.picks, shares, per_ke)
-    alone = {way: _solve({way: sums}, *about) for way, sums in ways.items()}
-    by = {way: (own, np.sqrt(np.diag(c))) for way, (own, c) in alone.items()}
-    return Kernel(known, covariance, found.significance, by, pixels, per_ke, per_ke_error)
+    found = choose(frames.measured(()))
+    pixels = 0 if frames.hot is None else len(frames.hot.y)
+    none = Kernel((), np.zeros((0, 0)), found.significance, {}, pixels, 0.0, np.inf)
+    if not found.links:
+        return none
+    near = within(shape, {every[n] for n in found.links})
+    del frames
+    known: tuple[Coupling, ...] = ()
+    per_ke, error = 0.0, np.inf
+    for _ in range(2):
+        # The second time with the charge as it was collected, and all hot pixels.
+        own = frames_of([evidence], near, known)
+        dense = None if own is None else own.kernel(found.classes, known, per_ke)
+        if own is None or dense is None:
+            raise InputError(
+                "not decided: a kernel of that period has more couplings than can be measured"
+            )
+        if not known:
+            per_ke, error = _level(own, dense, found)
+            dense = own.kernel(found.classes, dense.couplings, per_ke) if per_ke else dense
+        known = tuple(c for c in dense.couplings) if dense else ()
+    assert dense is not None
+    return _told(dense, replace(none, per_ke=per_ke, per_ke_error=error))
 
 
-def _shape(evidence: Evidence) -> Place:
-    return evidence.good.shape[0], evidence.good.shape[1]
+def _level(frames: Frames, dense: Dense, found: Choice) -> tuple[float, float]:
+    """By how much (1/ke-) shares fall with the signal, zero if they may not, and its error.
+
+    Shares that rise may be brighter-fatter; those that fall cannot.
+    """
+    per_ke, error = 0.0, np.inf
+    if frames.hot is None:
+        return per_ke, error
+    now: Dense | None = dense
+    for _ in range(LEVEL_STEPS):
+        if now is None:
+            break
+        there = np.abs(now.shares) > THERE * np.sqrt(np.diag(now.covariance))
+        known = [c for c, sure in zip(now.couplings, there, strict=True) if sure]
+        hot = frames.measured(now.couplings, per_ke).hot
+        assert hot is not None
+        more, error = hot.level_dependence(known, frames.steps, frames.evidence.origin)
+        if per_ke + more > -CERTAIN * error:
+            return 0.0, error
+        if abs(more) < 0.1 * error:
+            break
+        per_ke += more
+        now = frames.kernel(found.classes, now.couplings, per_ke)
+    return per_ke, error
 
 
-@dataclass(frozen=True)
-class _Search:
-    """The noise and the hot pixels of an acquisition, in which couplings are looked for."""
-
-    noise: Products | None
-    hot: HotPixels | None
-    steps: tuple[Place, ...]
-    shape: Place
-    first: Place
-
-    @classmethod
-    def of(cls, evidence: Evidence, known: Sequence[Coupling] = ()) -> "_Search | None":
-        shape = _shape(evidence)
-        steps = links(shape)
-        if not steps:
-            return None
-        noise, hot = products(evidence, steps, known), hot_pixels(evidence, steps, known)
-        if noise is None and hot is None:
-            return None
-        return cls(noise, hot, steps, shape, evidence.origin)
-
-    def couplings(
-        self, known: tuple[Coupling, ...], per_ke: float
-    ) -> tuple[Choice, tuple[Coupling, ...]]:
-        """Couplings by noise and hot pixels; those known before give the second order."""
-        found = choose(self._measured(known, per_ke))
-        for _ in range(ROUNDS):
-            if not found.picks:
-                return found, ()
-            ways = _ways(found.picks, self.noise, known)
-            shares, _ = _solve(ways, *_together(ways, found.picks))
-            before, known = known, _with_shares(found.picks, shares, per_ke)
-            if _same(before, known):
-                break
-            found = again(found, self._measured(known, per_ke))
-        return found, known
-
-    def _measured(self, known: Sequence[Coupling], per_ke: float) -> Measured:
-        noise, hot = self.noise, self.hot
-        if noise is not None:
-            noise = to_first_order(noise, known, self.steps, self.first)
-        if hot is not None:
-            hot = hot.corrected(outflow(known, self.shape, self.first), per_ke)
-        return Measured(noise, hot, self.steps, self.shape, self.first)
-
-    def level(self, known: tuple[Coupling, ...]) -> tuple[tuple[Coupling, ...], float, float]:
-        """Couplings whose shares may fall with the signal, by how much (1/ke-), and its error.
-
-        Shares that rise may be brighter-fatter; those that fall cannot.
-        """
-        per_ke, error = 0.0, np.inf
-        if self.hot is None:
-            return known, per_ke, error
-        for _ in range(LEVEL_STEPS):
-            hot = self.hot.corrected(outflow(known, self.shape, self.first), per_ke)
-            more, error = hot.level_dependence(known, self.steps, self.first)
-            if per_ke + more > -CERTAIN * error:
-                return known, 0.0, error
-            if abs(more) < 0.1 * error:
-                break
-            per_ke += more
-            _, known = self.couplings(known, per_ke)
-        return known, per_ke, error
-
-
-def _couplings(picks: Sequence[Pick]) -> tuple[Coupling, ...]:
-    return tuple(c for pick in picks for c in pick.couplings)
-
-
-def _with_shares(picks: Sequence[Pick], shares: F64, per_ke: float) -> tuple[Coupling, ...]:
-    pairs = zip(_couplings(picks), shares, strict=True)
-    return tuple(replace(c, share=float(k), per_ke=per_ke) for c, k in pairs)
-
-
-def _same(before: Sequence[Coupling], now: Sequence[Coupling]) -> bool:
-    return len(before) == len(now) and all(
-        replace(a, share=b.share) == b and abs(a.share - b.share) < SAME
-        for a, b in zip(before, now, strict=True)
+def _told(dense: Dense, about: Kernel) -> Kernel:
+    """The couplings that are there, those that all classes have alike as one."""
+    basis, couplings = _plain(dense)
+    if not couplings:
+        return about
+    precision = np.linalg.inv(dense.covariance)
+    covariance = np.asarray(np.linalg.inv(basis.T @ precision @ basis), float)
+    shares = covariance @ basis.T @ precision @ dense.shares
+    # Of several shares that may well be one, each has the error that it has by itself.
+    for n, (column, own) in enumerate(zip(basis.T > 0, np.diag(covariance), strict=True)):
+        each = float(np.diag(dense.covariance)[column].mean())
+        covariance[n, n] = max(own, each) if column.sum() > 1 else own
+    by = {}
+    for way, (normal, right) in dense.ways.items():
+        own = np.linalg.inv(basis.T @ normal @ basis + np.eye(len(couplings)) / LARGEST**2)
+        by[way] = (own @ basis.T @ right, np.sqrt(np.diag(own)))
+    return replace(
+        about,
+        couplings=tuple(replace(c, share=float(k)) for c, k in zip(couplings, shares, strict=True)),
+        covariance=covariance,
+        by=by,
     )
 
 
-def _ways(
-    picks: Sequence[Pick], noise: Products | None, known: Sequence[Coupling]
-) -> dict[str, Sums]:
-    """Sums of all shares taken, by way of measuring."""
-    names = {way for pick in picks for way in pick.information.normal}
-    ways = {}
-    for way in sorted(names):
-        normal = block_diag(*(pick.information.normal[way] for pick in picks))
-        right = np.concatenate([pick.information.right[way] for pick in picks])
-        ways[way] = (normal, right)
-    if noise is not None and "covariance" in ways:
-        before = {replace(c, share=0.0, per_ke=0.0): c.share for c in known}
-        shares = np.array([before.get(c, 0.0) for c in _couplings(picks)])
-        ways["covariance"] = any_gain(ways["covariance"], noise, shares)
-    return ways
-
-
-def any_gain(sums: Sums, noise: Products, shares: F64) -> Sums:
-    """Sums where all shares may be wrong by the error of the shot noise they are measured in."""
-    normal, right = sums
-    slope = normal @ shares
-    inner = shares @ slope + (noise.shot / noise.shot_error) ** 2
-    return normal - np.outer(slope, slope) / inner, right - slope * (shares @ right) / inner
-
-
-def _together(ways: Mapping[str, Sums], picks: Sequence[Pick]) -> tuple[F64, F64]:
-    """Basis (share, number) of all shares taken, and the shares if it held exactly."""
-    basis = block_diag(*(pick.basis for pick in picks))
-    normal, right = (sum(part) for part in zip(*ways.values(), strict=True))
-    small = np.eye(len(basis)) / LARGEST**2
-    return basis, basis @ np.linalg.solve(basis.T @ (normal + small) @ basis, basis.T @ right)
-
-
-def _solve(ways: Mapping[str, Sums], basis: F64, together: F64) -> Sums:
-    """Shares and their covariance.
-
-    Shares that one number serves are alike, but how much? All nearly, or all but one, or each a
-    little different: these count by how well they explain what is measured. So a share of which
-    little is known has the error of one that may differ, whatever the others are.
-    """
-    normal, right = (sum(part) for part in zip(*ways.values(), strict=True))
-    size = np.maximum(np.abs(together), LEAST)
-    one = ALIKE * size
-    guesses = [one, DIFFERENT * size] + [
-        np.where(row, DIFFERENT * size, one) for row in np.eye(len(size))
-    ]
-    shares, covariances, weights = [], [], []
-    for spread in guesses:
-        precision, log_size = _about(basis, spread)
-        whole = normal + precision + np.eye(len(right)) / LARGEST**2
-        covariances.append(np.linalg.inv(whole))
-        shares.append(covariances[-1] @ right)
-        fit = float(right @ shares[-1])
-        weights.append((fit + log_size - float(np.linalg.slogdet(whole)[1])) / 2)
-    weight = np.exp(np.array(weights) - max(weights))
-    weight /= weight.sum()
-    mean = weight @ np.array(shares)
-    apart = np.array(shares) - mean
-    return mean, np.tensordot(weight, covariances, 1) + (weight * apart.T) @ apart
-
-
-def _about(basis: F64, spread: F64) -> tuple[F64, float]:
-    """Precision of shares that scatter about a basis, all of which is free; log of its size."""
-    precision = np.diag(spread**-2)
-    inner = basis.T @ precision @ basis
-    common = precision @ basis @ np.linalg.solve(inner, basis.T @ precision)
-    return precision - common, -2 * float(np.log(spread).sum()) - float(np.linalg.slogdet(inner)[1])
+def _plain(dense: Dense) -> tuple[F64, list[Coupling]]:
+    """Basis (share, number) of what is told of a kernel, and the couplings."""
+    sigma = np.sqrt(np.diag(dense.covariance))
+    steps = dict.fromkeys((c.dy, c.dx) for c in dense.couplings)
+    columns, couplings = [], []
+    for step in steps:
+        at = np.array([n for n, c in enumerate(dense.couplings) if (c.dy, c.dx) == step])
+        precision = np.linalg.inv(dense.covariance[np.ix_(at, at)])
+        shares, weight = dense.shares[at], float(precision.sum())
+        mean = float(precision.sum(0) @ shares) / weight
+        apart = shares - mean
+        alike = chi2.sf(float(apart @ precision @ apart), len(at) - 1) > ALIKE
+        if len(at) > 1 and alike:
+            if abs(mean) > THERE * weight**-0.5:
+                columns.append(np.isin(np.arange(len(sigma)), at).astype(float))
+                one = dense.couplings[at[0]]
+                couplings.append(
+                    replace(one, every_rows=1, row=0, every_columns=1, column=0, share=mean)
+                )
+            continue
+        for n in at[np.abs(shares) > THERE * sigma[at]]:
+            columns.append(np.eye(len(sigma))[n])
+            couplings.append(dense.couplings[n])
+    return np.array(columns).T, couplings

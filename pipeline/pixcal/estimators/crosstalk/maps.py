@@ -15,13 +15,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.corrected import phase_change
 from pixcal.estimators.crosstalk.links import MAX_PERIOD, MIN_REPEATS, REACH, Classes
-from pixcal.estimators.detector import median_and_sigma
 from pixcal.estimators.evidence import Evidence, FringeEvidence
 from pixcal.estimators.fringes import grid, polynomial_basis
 from pixcal.estimators.gauge import fringe_modes
-from pixcal.kernels.crosstalk import Coupling, filled, outflow, uncouple_fringes
+from pixcal.kernels.crosstalk import Coupling, outflow
 
 F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
@@ -34,49 +32,6 @@ DEGREE = 3
 MIN_PIXELS = 100
 ALIGNED = 0.05
 """Fringe vectors that differ in direction by less (rad/px) lie on one axis."""
-
-
-def map_information(evidence: Evidence, couplings: Sequence[Coupling]) -> tuple[F64, F64] | None:
-    """Least-squares sums (n, n), (n,) of the shares, about those given; None without fringes."""
-    sets = list(evidence.fringes.values())
-    good = good_in_all(evidence)
-    if not couplings or good.sum() < MIN_PIXELS:
-        return None
-    size = len(couplings)
-    normal, right = np.zeros((size, size)), np.zeros(size)
-    shifts, slopes = [], []
-    smooth = smooth_modes(sets, good)
-    for found in sets:
-        theta = _undone(found, couplings)
-        slope = _slope(found, couplings, good)
-        y = without(log_visibility(theta, good), smooth)
-        widths = without(_widths(found, couplings, good), smooth)
-        own = _visibility(y, without(slope.real, smooth), widths)
-        normal, right = normal + own[0], right + own[1]
-        k = float(np.hypot(*found.k))
-        change = phase_change(found.theta, theta)[good]
-        shifts.append(without(found.delta[good] + change / k, smooth))
-        slopes.append(without(slope.imag / k, smooth))
-    weight = _apart_from_displacement(sets, good)
-    y, j = np.stack(shifts), np.stack(slopes)
-    weight /= max(1.0, _excess(y, weight, sets))
-    normal += np.einsum("anp,ab,bmp->nm", j, weight, j, optimize=True)
-    right += np.einsum("anp,ab,bp->n", j, weight, y, optimize=True)
-    return normal, right + normal @ np.array([c.share for c in couplings])
-
-
-def _excess(y: F64, weight: F64, sets: Sequence[FringeEvidence]) -> float:
-    """Scatter (set, pixel) over that of the noise, as a reduced chi-square."""
-    axes = np.array([s.k for s in sets])
-    freedom = (len(sets) - int(np.linalg.matrix_rank(axes, tol=ALIGNED))) * y.shape[1]
-    square = float(np.einsum("ap,ab,bp->", y, weight, y, optimize=True))
-    return square / freedom if freedom else 1.0
-
-
-def _undone(found: FringeEvidence, couplings: Sequence[Coupling]) -> F64:
-    """The three maps without the couplings, as they were before they were divided by the flat."""
-    theta = np.where(found.good, found.theta, np.nan) / found.shot_factor
-    return uncouple_fringes(filled(theta, found.k), couplings, found.origin)
 
 
 def good_in_all(evidence: Evidence) -> Mask:
@@ -121,11 +76,6 @@ def without(values: F64, modes: F64) -> F64:
     return np.asarray(values - (values @ modes.T) @ modes)
 
 
-def _slope(found: FringeEvidence, couplings: Sequence[Coupling], good: Mask) -> C128:
-    """Derivative (n, pixel) of the log of what couplings multiply the fringe by."""
-    return _slope_at(found.k, couplings, good, found.origin)
-
-
 def _slope_at(
     k: tuple[float, float], couplings: Sequence[Coupling], good: Mask, first: tuple[int, int]
 ) -> C128:
@@ -164,38 +114,6 @@ def response_slopes(
     inside = np.zeros(shape, bool)
     inside[rows : rows + classes.rows, columns : columns + classes.columns] = True
     return _slope_at(k, couplings, inside, (0, 0))
-
-
-def _widths(found: FringeEvidence, couplings: Sequence[Coupling], good: Mask) -> F64:
-    """Change of the log visibility where the receivers of a class are wider by 1 px."""
-    k2 = found.k[0] ** 2 + found.k[1] ** 2
-    patterns: dict[bytes, F64] = {}
-    for c in couplings:
-        pattern = np.zeros(good.shape)
-        pattern[c.places((good.shape[0], good.shape[1]), found.origin)[1]] = k2 / 12
-        patterns[pattern.tobytes()] = pattern[good]
-    return np.stack(list(patterns.values()))
-
-
-def _visibility(y: F64, slope: F64, widths: F64) -> tuple[F64, F64]:
-    """Sums of the shares from the log visibility, the widths being free up to `WIDTH`."""
-    weight = 1 / median_and_sigma(y)[1] ** 2
-    inner = weight * widths @ widths.T + np.eye(len(widths)) / WIDTH**2
-    cross = weight * slope @ widths.T
-    taken = np.linalg.solve(inner, cross.T).T
-    normal = weight * slope @ slope.T - taken @ cross.T
-    return normal, weight * (slope @ y - taken @ (widths @ y))
-
-
-def _apart_from_displacement(sets: Sequence[FringeEvidence], good: Mask) -> F64:
-    """Weights (set, set) of offsets, px⁻², when a displacement of each pixel is free."""
-    k = np.array([s.k for s in sets])
-    axes = k / np.hypot(*k.T)[:, None]
-    sigma = [np.median(s.sigma[good]) / np.hypot(*s.k) for s in sets]
-    own = np.diag(np.array(sigma) ** -2)
-    weight = own - own @ axes @ np.linalg.pinv(axes.T @ own @ axes, rcond=1e-6) @ axes.T @ own
-    # Orthogonal axes leave rounding alone.
-    return np.where(np.abs(weight) > 1e-9 * own.max(), weight, 0.0)
 
 
 def map_periods(evidence: Evidence) -> dict[str, dict[str, tuple[int, int]]]:

@@ -6,16 +6,17 @@ one acquisition of a hundred. A capacitance couples both ways alike, and a kerne
 there and back, and of many classes, are one number until the data tell them apart.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri_exp
 from scipy.stats import norm
 
-from pixcal.estimators.crosstalk.information import Information, Measured
+from pixcal.estimators.crosstalk.information import Measured
 from pixcal.estimators.crosstalk.links import Classes, Place, periods
 from pixcal.kernels.crosstalk import Coupling
+from pixcal.model.errors import InputError
 
 F64 = NDArray[np.float64]
 
@@ -26,33 +27,10 @@ INDEPENDENT = 0.35
 makes the median significance of acquisitions without couplings about zero."""
 WORTH = 16.0
 """Fall in chi-square for which another share is taken, once a link is known to couple."""
-APART = 5.0
-"""Fall in chi-square for which shares are told apart, once the period is known."""
-ZERO = 2.0
-"""Sigmas below which a share is none."""
-TOLD = 6.0
-"""Errors of a share in the largest of its link, from which on it may be none."""
+NEAR, MOST_FAR = 2, 12
+"""Of a kernel few couplings reach over more pixels than that."""
 NOTHING = 1e-6
 """Weight of a share below which it is not measured at all."""
-
-
-@dataclass(frozen=True)
-class Pick:
-    """Couplings of a link that are taken, and what is known of their shares.
-
-    Attributes
-    ----------
-    couplings : tuple of Coupling
-        Without shares.
-    basis : (coupling, number) float64
-        Shares are about this times numbers that are free: some are alike.
-    information : Information
-        Of these couplings only.
-    """
-
-    couplings: tuple[Coupling, ...]
-    basis: F64
-    information: Information
 
 
 @dataclass(frozen=True)
@@ -61,7 +39,6 @@ class Choice:
 
     Attributes
     ----------
-    picks : tuple of Pick
     links : tuple of int
         That stand out.
     classes : Classes
@@ -72,7 +49,6 @@ class Choice:
         Numbers that were tried.
     """
 
-    picks: tuple[Pick, ...]
     links: tuple[int, ...]
     classes: Classes
     best: float
@@ -99,31 +75,27 @@ def choose(measured: Measured) -> Choice:
     """Take what stands out.
 
     First the links that do, at any period; then the one period that serves all of them best, the
-    shortest that is good enough; then, for that period, which classes differ.
+    shortest that is good enough.
+
+    Raises
+    ------
+    InputError
+        If so many of them are far apart that it is no kernel.
     """
     looks = len(measured.links) * sum(3 * n * m for n, m in periods(measured.shape))
     critical = _critical(looks)
     gains = np.stack([_best_gains(*i.total) for _, i in measured.every_period()])
     there = tuple(int(n) for n in np.nonzero(gains.max(axis=0) > critical)[0])
+    far = sum(max(map(abs, measured.links[n])) > NEAR for n in there)
+    if far > MOST_FAR:
+        raise InputError(
+            f"not decided: noise is shared by {len(there)} kinds of pairs of pixels, {far} of them "
+            f"more than {NEAR} pixels apart (at most {MOST_FAR} are measured): it is not that of a "
+            "kernel"
+        )
     none = Classes(1, 1, measured.first)
     classes = _period(measured.of(there), critical) if there else none
-    return again(Choice((), there, classes, max(float(gains.max()), 1e-9), looks), measured)
-
-
-def again(choice: Choice, measured: Measured) -> Choice:
-    """The same links and period, with shares of what is measured now."""
-    if not choice.links:
-        return choice
-    present = measured.of(choice.links)
-    information, directions = present.of_period(choice.classes), _directions(choice.classes)
-    picks = []
-    for n, step in enumerate(present.links):
-        own = information.of(n)
-        basis, gain = _greedy(*own.total, directions, APART)
-        if gain > choice.critical:
-            basis = _without_zeros(*own.total, basis, gain)
-            picks.append(_pick(own, choice.classes, step, basis))
-    return replace(choice, picks=tuple(picks))
+    return Choice(there, classes, max(float(gains.max()), 1e-9), looks)
 
 
 def _critical(looks: int) -> float:
@@ -137,7 +109,7 @@ def _period(present: Measured, critical: float) -> Classes:
         directions = _directions(classes)
         score = 0.0
         for n in range(len(present.links)):
-            basis, gain = _greedy(*information.of(n).total, directions, WORTH)
+            basis, gain = _greedy(*information.of(n).total, directions)
             score += gain - WORTH * basis.shape[1]
         scores.append((score, classes))
     enough = max(score for score, _ in scores) - critical
@@ -171,15 +143,13 @@ def _fall(value: F64, weight: F64) -> F64:
     return np.where(weight > NOTHING, value**2 / np.maximum(weight, NOTHING), 0.0)
 
 
-def _greedy(normal: F64, right: F64, directions: F64, apart: float) -> tuple[F64, float]:
+def _greedy(normal: F64, right: F64, directions: F64) -> tuple[F64, float]:
     """Directions that are worth it (u, number), the strongest first, and the fall in chi-square.
 
     Parameters
     ----------
     normal, right : (u, u), (u,) float64
     directions : (u, direction) float64
-    apart : float
-        Least fall for telling shares apart that are there; one that is not yet needs `WORTH`.
     """
     weight = np.einsum("ud,ud->d", directions, normal @ directions)
     # Of equals the plainest: many shares alike, both ways.
@@ -187,50 +157,20 @@ def _greedy(normal: F64, right: F64, directions: F64, apart: float) -> tuple[F64
     basis = np.zeros((len(right), 0))
     gain, rest = 0.0, right
     while basis.shape[1] < len(right):
-        absent = ~np.any(basis, axis=1)
-        least = np.where(np.any(directions[absent], axis=0), WORTH, apart)
-        each = _fall(rest @ directions, weight) - least
+        each = _fall(rest @ directions, weight)
         n = int(np.argmax(each + plain))
         wider = np.column_stack([basis, directions[:, n]])
         inner = wider.T @ normal @ wider
         solved = np.linalg.lstsq(inner, wider.T @ right, rcond=1e-9)[0]
         now = float(solved @ wider.T @ right)
-        if each[n] < 0 or now - gain < least[n]:
+        if min(each[n], now - gain) < WORTH:
             break
         basis, gain, rest = wider, now, right - normal @ wider @ solved
     return basis, gain
 
 
-def _without_zeros(normal: F64, right: F64, basis: F64, gain: float) -> F64:
-    """A basis without the shares that are none, as far as the data can tell them from others.
-
-    Those have a number of their own that is small beside its error, and the error is small beside
-    the largest share.
-    """
-    solved = np.linalg.lstsq(basis.T @ normal @ basis, basis.T @ right, rcond=1e-9)[0]
-    largest = float(np.max(np.abs(basis @ solved)))
-    told = np.diag(normal) > (TOLD / largest) ** 2
-    for u in np.nonzero(np.any(basis, axis=1) & told)[0]:
-        fewer = basis.copy()
-        fewer[u] = 0.0
-        numbers = np.linalg.matrix_rank(basis) - np.linalg.matrix_rank(fewer)
-        if not numbers:
-            continue
-        fewer = fewer[:, np.any(fewer, axis=0)]
-        solved = np.linalg.lstsq(fewer.T @ normal @ fewer, fewer.T @ right, rcond=1e-9)[0]
-        now = float(solved @ fewer.T @ right)
-        if now > gain - numbers * ZERO**2:
-            basis, gain = fewer, now
-    return basis
-
-
-def _pick(information: Information, classes: Classes, step: Place, basis: F64) -> Pick:
-    used = np.nonzero(np.any(basis, axis=1))[0]
-    couplings = (coupling_of(classes, *divmod(int(u), 2), step) for u in used)
-    return Pick(tuple(couplings), basis[used], information.only(used))
-
-
 def coupling_of(classes: Classes, number: int, back: int, step: Place) -> Coupling:
+    """What a class gives over a step, or gets back; without its share."""
     if not back:
         return classes.coupling(number, step, 0.0)
     return classes.coupling(classes.shifted(number, step), (-step[0], -step[1]), 0.0)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from pixcal.stages.correct.surroundings import DEPTH, Sides, border_misfit, decided
-from pixcal.stages.correct.swept import Swept, maps_of, undone
+from pixcal.stages.correct.swept import Swept, free_of_samples, undone
 
 ALONG = 1024
 """Pixels along a side that tell whether it is open."""
@@ -16,7 +16,7 @@ def sides_of(sets: Sequence[Swept]) -> Sides:
     """Where the detector goes on beyond the window, as the maps of all sets tell."""
     misfits = np.zeros((4, 2))
     for swept in sets:
-        if any(effect.undo_halo for effect in swept.effects):
+        if swept.passes_borders:
             for side in range(4):
                 misfits[side] += [_misfit(swept, side, is_open) for is_open in (False, True)]
     return decided(misfits)
@@ -38,7 +38,7 @@ def _misfit(swept: Swept, side: int, is_open: bool) -> float:
     sides[side] = is_open
     one = replace(swept, open_sides=(sides[0], sides[1], sides[2], sides[3]))
     part, inside = one.around(y, x), one.inside(y, x)
-    maps, good, _ = maps_of(one, part)
+    maps, good = free_of_samples(one, part)
     theta, good = undone(maps, swept.effects)[0].theta[(slice(None), *inside)], good[inside]
     kx, ky = swept.k
     if axis:

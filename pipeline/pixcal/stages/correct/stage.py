@@ -7,7 +7,6 @@ what remains, and sets combined, by the code of the fit.
 
 import hashlib
 import json
-import math
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -178,9 +177,7 @@ def _corrected_maps(
     sides = sides_of(own_sets)
     for name, closed in zip(names, own_sets, strict=True):
         own = replace(closed, open_sides=sides)
-        left[name] = parameter_errors(own, plan.errors, runtime, plan.covariances)
-        left_px = math.hypot(*(error for error in left[name].values() if error is not None))
-        own = replace(own, left=left_px * math.hypot(*own.k))
+        left[name] = parameter_errors(own, runtime)
         target = made.scratch / "undone" / name
         undo_on_maps(own, target, runtime, name)
         halves[name] = own.has_halves
@@ -248,6 +245,10 @@ def _swept_set(
         (float(facts["kx"]), float(facts["ky"])),
         flat if acquisition.frames.flat else None,
         float(used["read_noise_e"]["used"]),
+        plan.on_samples,
+        run_dir / "sweep" / "sweep.zarr" / name,
+        plan.errors,
+        plan.covariances,
     )
 
 

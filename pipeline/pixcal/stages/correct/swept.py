@@ -1,7 +1,7 @@
 """A set as it was swept, and what its maps are to be freed of."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from pixcal.kernels.crosstalk import FILL_REACH, filled
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.correct.surroundings import BEYOND, CLOSED, Sides, usable
+from pixcal.stages.diagnose.on_map import undone_on_samples
 from pixcal.stages.evidence import Part, fitted_theta
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json
@@ -44,8 +45,14 @@ class Swept:
         Map that samples were divided by.
     read_noise : float
         e-.
-    left : float
-        Rms of the error of the phase that the errors of the effects' parameters leave, rad.
+    samples : tuple of Effect
+        That were undone on samples, as if nothing were beyond the window.
+    raw : Path, optional
+        The sweep before that.
+    errors : mapping
+        Of the parameters of each effect, 1-sigma: by effect, then by parameter.
+    covariances : mapping
+        By effect: of all its parameters, where they were measured together.
     open_sides : (bool, bool, bool, bool)
         Where the detector goes on beyond the window: top, bottom, left, right.
     """
@@ -56,7 +63,10 @@ class Swept:
     k: tuple[float, float]
     flat: Path | None
     read_noise: float
-    left: float = 0.0
+    samples: tuple[Effect, ...] = ()
+    raw: Path | None = None
+    errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    covariances: Mapping[str, F64] = field(default_factory=dict)
     open_sides: Sides = CLOSED
 
     @property
@@ -86,7 +96,17 @@ class Swept:
     @property
     def halo(self) -> int:
         """Pixels around a tile that are read with it."""
-        return FILL_REACH + sum(effect.undo_halo for effect in self.effects)
+        return FILL_REACH + sum(effect.undo_halo for effect in (*self.effects, *self.samples))
+
+    @property
+    def passes_borders(self) -> bool:
+        """Whether what is undone moves charge, so that pixels beyond the window matter."""
+        return any(effect.undo_halo for effect in (*self.effects, *self.samples))
+
+    @property
+    def as_read(self) -> "Swept":
+        """The set with effects on samples still there."""
+        return self if self.raw is None else replace(self, folder=self.raw)
 
     def around(self, y: tuple[int, int], x: tuple[int, int]) -> Part:
         """A tile with its halo, as far as the detector goes: beyond the window at open sides."""
@@ -128,6 +148,33 @@ def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
         flat = padded(ArrayReader(swept.flat).read(*there).astype(float), swept, part, 1.0)
     maps = FringeMaps(theta, swept.k, (part[0][0], part[1][0]), flat, swept.folder.name)
     return maps, padded(good, swept, part, False), padded(known, swept, part, False)
+
+
+def free_of_samples(swept: Swept, part: Part) -> tuple[FringeMaps, Mask]:
+    """What a fit would find on a part if effects on samples were undone with what lies beyond.
+
+    Returns
+    -------
+    maps : FringeMaps
+    good : (y, x) bool
+        Pixels that have an offset.
+    """
+    maps, good, _ = maps_of(swept.as_read, part)
+    for effect in swept.samples:
+        maps = undone_on_samples(effect, maps) or maps
+    return maps, good
+
+
+def border_change(swept: Swept, part: Part) -> F64:
+    """Change (y, x) of the phase at open sides: charge that comes from beyond, rad."""
+    there = swept.within(part)
+    if there == part or not any(effect.undo_halo for effect in swept.samples):
+        return np.zeros([b - a for a, b in part])
+    y0, x0 = (t[0] - p[0] for t, p in zip(there, part, strict=True))
+    closed = free_of_samples(replace(swept, open_sides=CLOSED), there)[0].theta
+    at = np.s_[:, y0 : y0 + closed.shape[1], x0 : x0 + closed.shape[2]]
+    change = phase_change(closed, free_of_samples(swept, part)[0].theta[at])
+    return np.asarray(padded(change, swept, part, 0.0))
 
 
 def padded(values: NDArray[Any], swept: Swept, part: Part, fill: float = np.nan) -> NDArray[Any]:

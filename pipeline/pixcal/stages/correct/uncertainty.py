@@ -15,13 +15,19 @@ from pixcal.estimators.corrected import phase_change, straight_modes
 from pixcal.estimators.modes import solve_modes
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Effect
+from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.correct.swept import Swept, maps_of, undone
-from pixcal.stages.correct.undoing import PIXEL_BYTES
 from pixcal.stages.fit.scouting import scout_tiles
 
 F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
+PIXEL_BYTES = 500
+"""Peak of a tile's task for each of its pixels, those around it included (measured),"""
+EFFECT_BYTES = 40
+"""for each effect,"""
+SLOPE_BYTES = 24
+"""and for each parameter whose slope is taken."""
 TILES = 9
 """Tiles, spread over the window, that tell for all: errors of parameters repeat over it."""
 
@@ -58,76 +64,90 @@ def _add(plain: Any, path: Sequence[str], step: float) -> None:
         plain[key] += step
 
 
-def parameter_errors(
-    swept: Swept,
-    errors: Mapping[str, Mapping[str, float]],
-    runtime: Runtime,
-    covariances: Mapping[str, F64] = {},
-) -> dict[str, float | None]:
+def parameter_errors(swept: Swept, runtime: Runtime) -> dict[str, float | None]:
     """Rms (px) of what the errors of each effect's parameters leave in the offsets of a set.
-
-    Where their covariance is known and the effect tells what each does (`Effect.phase_slopes`), all
-    together; else parameters are moved one by one, and what each does is added in squares.
 
     Parameters
     ----------
     swept : Swept
-    errors : mapping
-        By effect, then by parameter.
     runtime : Runtime
-    covariances : mapping
-        By effect: of all parameters that have slopes.
 
     Returns
     -------
     dict
         By effect; None where no errors are given.
     """
-    others = {e.name: moved(e, errors.get(e.name, {})) for e in swept.effects}
     tiles = scout_tiles(swept.source.grid, TILES)
-    cy, cx = swept.source.signal.chunks[1:]
-    need = (cy + 2 * swept.halo) * (cx + 2 * swept.halo) * PIXEL_BYTES
-    plan = make_plan("errors of the parameters", need, 0, runtime)
+    plan = make_plan("errors of the parameters", task_bytes(swept), 0, runtime)
     told = run_tasks(
-        partial(_tile, swept, others, covariances),
-        tiles,
-        runtime.with_workers(plan.workers),
-        label="parameters",
+        partial(_tile, swept), tiles, runtime.with_workers(plan.workers), label="parameters"
     )
     total = np.sum(told, axis=0)
     return {
-        name: float(np.sqrt(square / max(count, 1))) if others[name] else None
-        for name, (square, count) in zip(others, total, strict=True)
+        effect.name: float(np.sqrt(square / max(count, 1)))
+        if swept.errors.get(effect.name)
+        else None
+        for effect, (square, count) in zip(swept.effects, total, strict=True)
     }
 
 
-def _tile(
-    swept: Swept,
-    others: Mapping[str, Sequence[Effect]],
-    covariances: Mapping[str, F64],
-    at: tuple[int, int],
-) -> list[tuple[float, int]]:
+def task_bytes(swept: Swept) -> int:
+    """Peak of a tile's task that undoes its effects and takes the slopes of their parameters."""
+    slopes = max((len(c) for c in swept.covariances.values()), default=0)
+    cy, cx = swept.source.signal.chunks[1:]
+    pixel = PIXEL_BYTES + EFFECT_BYTES * len(swept.effects) + SLOPE_BYTES * slopes
+    return (cy + 2 * swept.halo) * (cx + 2 * swept.halo) * pixel
+
+
+def _tile(swept: Swept, at: tuple[int, int]) -> list[tuple[float, int]]:
     """Sum of squares (px²) and pixels, for each effect."""
     y, x = swept.source.ranges(at)
-    part = swept.around(y, x)
     inside = swept.inside(y, x)
-    maps, good, _ = maps_of(swept, part)
+    maps, good, _ = maps_of(swept, swept.around(y, x))
     size = float(np.hypot(*swept.k))
+    some = good[inside]
+    return [
+        (float(variance[some].sum()) / size**2, int(some.sum()))
+        for variance in left_over(swept, maps, good, inside)
+    ]
+
+
+def left_over(swept: Swept, maps: FringeMaps, good: Mask, inside: tuple[slice, slice]) -> list[F64]:
+    """Variance of the phase (y, x), rad², that the errors of each effect's parameters leave.
+
+    Where their covariance is known and the effect tells what each does (`Effect.phase_slopes`), all
+    together; else parameters are moved one by one, and what each does is added in squares. Modes
+    that the fit removes are taken off, tile by tile.
+
+    Parameters
+    ----------
+    swept : Swept
+    maps : FringeMaps
+        Of a tile and its surroundings, with the effects.
+    good : (y, x) bool
+        Pixels that have an offset.
+    inside : (slice, slice)
+        The tile.
+    """
     found = []
     for effect in swept.effects:
         after, _ = undone(maps, (effect,))
-        modes = straight_modes(after.theta[(slice(None), *inside)], swept.k)[:, good[inside]]
-        covariance = covariances.get(effect.name)
+        theta = after.theta[(slice(None), *inside)]
+        covariance = swept.covariances.get(effect.name)
         slopes = None if covariance is None else effect.phase_slopes(after)
         if covariance is None or slopes is None:
-            steps = [o for other in others[effect.name] if (o := other.undo(maps)) is not None]
+            others = moved(effect, swept.errors.get(effect.name, {}))
+            steps = [o for other in others if (o := other.undo(maps)) is not None]
             slopes = np.array([phase_change(after.theta, o.theta) for o in steps])
             covariance = np.eye(len(steps))
-        square = 0.0
+        variance = np.zeros(theta.shape[1:])
         if len(slopes):
-            change = slopes[(slice(None), *inside)][:, good[inside]] / size
-            change -= solve_modes(modes @ modes.T, modes @ change.T).T @ modes
-            square = float(np.einsum("np,np->", covariance @ change, change))
-        found.append((square, int(good[inside].sum())))
+            modes = straight_modes(theta, swept.k).reshape(-1, variance.size)
+            change = slopes[(slice(None), *inside)].reshape(len(slopes), -1)
+            own = modes[:, good[inside].ravel()]
+            taken = solve_modes(own @ own.T, own @ change[:, good[inside].ravel()].T)
+            change = change - taken.T @ modes
+            variance = np.einsum("np,np->p", covariance @ change, change).reshape(variance.shape)
+        found.append(variance)
         maps = after
     return found

@@ -24,7 +24,8 @@ from pixcal.estimators.geometry import tile_plane
 from pixcal.estimators.tile_sums import TileSums, sum_row
 from pixcal.simulation.effect import FringeMaps
 from pixcal.stages.correct.surroundings import disturbed, scatter_of
-from pixcal.stages.correct.swept import HALVES, Swept, maps_of, padded, undone
+from pixcal.stages.correct.swept import HALVES, Swept, border_change, maps_of, padded, undone
+from pixcal.stages.correct.uncertainty import left_over, task_bytes
 from pixcal.stages.evidence import Part
 from pixcal.stages.fit.sweep import BATCH_MAPS
 from pixcal.storage.artefact import read_json, write_json
@@ -35,10 +36,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-PIXEL_BYTES = 500
-"""Peak of a tile's task for each of its pixels, those around it included (measured),"""
-EFFECT_BYTES = 40
-"""and for each effect."""
 SAME = ("chi2", "mask", "g", "dk", "time")
 """Arrays of a sweep that stay."""
 
@@ -71,7 +68,6 @@ def undo_on_maps(swept: Swept, target: Path, runtime: Runtime, name: str) -> Non
     write_array(target / "batch_count", variants, dims=("batch",))
     write_array(target / "batch_time", np.zeros(len(variants)), dims=("batch",))
     cy, cx = swept.source.signal.chunks[1:]
-    around = (cy + 2 * swept.halo) * (cx + 2 * swept.halo)
     tiles = swept.source.tiles()
     if swept.has_halves:
         halves = _create(target, swept, ("half_phase", "half_sigma"), HALVES)
@@ -88,8 +84,7 @@ def undo_on_maps(swept: Swept, target: Path, runtime: Runtime, name: str) -> Non
         target / "sums", (*swept.source.grid, width), "<f8", dims=("row", "column", "fact"),
         chunks=(1, 1, width), fill_value=np.nan,
     )  # fmt: skip
-    need = around * (PIXEL_BYTES + EFFECT_BYTES * len(swept.effects))
-    plan = make_plan(f"undoing effects of {name}", need, 0, runtime)
+    plan = make_plan(f"undoing effects of {name}", task_bytes(swept), 0, runtime)
     run_tasks(
         partial(_undo_tile, swept, target, writers), tiles, runtime.with_workers(plan.workers),
         label=f"undo {name}",
@@ -151,15 +146,19 @@ def _undo_tile(
     part = swept.around(y, x)
     inside = swept.inside(y, x)
     maps, good, known = maps_of(swept, part)
+    border = border_change(swept, part)
+    maps = _turned(maps, border)
     after, steps = undone(maps, swept.effects)
     change = np.sum(steps, axis=0) if steps else np.zeros(maps.theta.shape[1:])
     phase = wrapped(
-        ArrayReader(swept.folder / "phase").read(y, x) + change[inside].astype(np.float32)
+        ArrayReader(swept.folder / "phase").read(y, x)
+        + (change + border)[inside].astype(np.float32)
     )
     factor = np.prod(_noise_factors(swept, maps), axis=0)[inside]
     own_error = ArrayReader(swept.folder / "sigma").read(y, x) * factor
     beside = _of_neighbours(swept, maps, after, known, part)[inside]
-    sigma = np.sqrt(own_error**2 + beside**2 + swept.left**2).astype(np.float32)
+    left = np.sum(left_over(swept, maps, good, inside), axis=0)
+    sigma = np.sqrt(own_error**2 + beside**2 + left).astype(np.float32)
     iota, alpha = after.theta[0][inside], np.hypot(after.theta[1], after.theta[2])[inside]
     variants: list[F64] = []
     errors: list[F64] = []

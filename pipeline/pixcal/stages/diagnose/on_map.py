@@ -62,7 +62,7 @@ def _change(effect: Effect, fit: FittedSet) -> F64:
     """Change (pixel,) of the offsets of good pixels by an effect, px; modes taken off."""
     good = np.isfinite(fit.theta).all(axis=0) & np.isfinite(fit.delta)
     maps = FringeMaps(filled(fit.theta, fit.k), fit.k, fit.origin, fit.flat, fit.name)
-    after = effect.undo(maps) or _undone_on_samples(effect, maps) or effect.predict(maps)
+    after = effect.undo(maps) or undone_on_samples(effect, maps) or effect.predict(maps)
     if after is None or not good.any():
         return np.zeros(0)
     change = -phase_change(maps.theta, after.theta)[good]
@@ -71,8 +71,11 @@ def _change(effect: Effect, fit: FittedSet) -> F64:
     return np.asarray((change - taken @ modes) / np.hypot(*fit.k))
 
 
-def _undone_on_samples(effect: Effect, maps: FringeMaps) -> FringeMaps | None:
-    """Maps that a fit finds in frames without noise that an effect was undone on."""
+def undone_on_samples(effect: Effect, maps: FringeMaps) -> FringeMaps | None:
+    """Maps that a fit finds in frames without noise that an effect was undone on.
+
+    None where the effect is not one of samples.
+    """
     phi = 2 * np.pi * np.arange(PHASES) / PHASES
     frames = np.stack([np.ones(PHASES), np.cos(phi), np.sin(phi)])
     flat = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat

@@ -265,7 +265,9 @@ def estimate(evidence: Evidence, kind: type[Effect]) -> Estimate | str | None:
     except np.linalg.LinAlgError:
         return "cannot be estimated here: these frames do not determine its parameters"
     except (InputError, ValueError, ArithmeticError) as error:
-        return " ".join(f"cannot be estimated here: {error}".split())[:300]
+        told = str(error)
+        reason = told if told.startswith("not decided") else f"cannot be estimated here: {told}"
+        return " ".join(reason.split())[:300]
     if found is not None and not np.isfinite(found.significance):
         return "cannot be estimated here: no finite significance"
     return found
