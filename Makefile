@@ -100,7 +100,7 @@ blind: $(TOOLS) ## ten small cases whose effects are withheld, diagnosed and sco
 	$(BIN)/pixcal blind score work/blind --sealed work/blind-truth.json
 
 blind-second: $(TOOLS) ## 100 cases of the second bench alone (hours, 7 GB of disk); goes on where it was
-	$(PIP) '.[second-bench]'
+	$(PIP) --editable '.[second-bench]'
 	[ -e work/blind-second ] || \
 	  $(BIN)/pixcal blind make --cases 100 --seed $(SEED) --size standard --bench second \
 	  --out work/blind-second --sealed work/blind-second-truth.json

@@ -27,7 +27,7 @@ def _exams() -> tuple[Path, Path]:
     made = []
     for seed in (1, 2):
         exam, truth = folder / f"{seed}" / "exam", folder / f"{seed}" / "truth.json"
-        line = ["--cases", str(CASES), "--seed", str(seed), "--size", "tiny"]
+        line = ["--cases", str(CASES), "--seed", str(seed), "--size", "tiny", "--bench", "own"]
         assert pixcal("blind", "make", *line, "--out", exam, "--sealed", truth, *RUNTIME) == 0
         for number in range(1, CASES + 1):
             run = exam / "runs" / f"case-{number:04d}"

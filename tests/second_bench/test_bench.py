@@ -123,6 +123,15 @@ def test_crosstalk_moves_charge_and_makes_none(case: str) -> None:
         assert after[row, 20] < 1e4
 
 
+def test_the_kernel_of_the_truth_is_what_becomes_of_a_spot() -> None:
+    bench, truth = make_case("ipc/asymmetric", 5, SMALL, plain=True)
+    spot = np.zeros(bench.shape)
+    spot[11, 20] = 1.0
+    after = bench.signal[0](spot, Frame(bench.runs[0], 0, stream(1)))
+    kernel = truth["effects"][0]["parameters"]["kernel"]
+    np.testing.assert_allclose(after[10:13, 19:22], kernel, atol=1e-12)
+
+
 @pytest.mark.parametrize("case", ["brighter_fatter/power_law", "brighter_fatter/table"])
 def test_moving_borders_make_no_charge_and_widen_a_bright_spot(case: str) -> None:
     bench = made(case, strength=1.0)

@@ -12,10 +12,18 @@ _Drawn = dict[str, Any]
 
 
 def coupled(e: F64, kernel: F64) -> F64:
-    """Voltages after capacitive coupling by a 3 x 3 kernel (y, x), by GalSim."""
+    """Voltages after capacitive coupling by a 3 x 3 kernel (y, x), by GalSim.
+
+    An entry is the share that a pixel takes from its neighbour on that side.
+    """
     image = galsim.ImageD(np.ascontiguousarray(e))
     image.applyIPC(galsim.ImageD(np.ascontiguousarray(kernel)), edge_treatment="extend")
     return np.asarray(image.array)
+
+
+def _given(kernel: F64) -> _Drawn:
+    """Shares that a pixel gives to its neighbours (y, x), of a kernel of those that it takes."""
+    return {"kernel": kernel[::-1, ::-1].tolist()}
 
 
 def _kernel(sides: F64, corners: F64) -> F64:
@@ -33,7 +41,7 @@ def symmetric(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     """Capacitances between neighbours, and a tenth of them between diagonal ones."""
     kernel = _kernel(np.full(4, size), np.full(4, size * rng.uniform(0.05, 0.15)))
     bench.signal.append(lambda e, _: coupled(e, kernel))
-    return {"kernel": kernel.tolist()}
+    return _given(kernel)
 
 
 @law("ipc", "asymmetric", 1.5e-3, 0.02, "to the next pixel, the largest")
@@ -43,7 +51,7 @@ def asymmetric(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     sides *= size / sides.max()
     kernel = _kernel(sides, size * rng.uniform(0.02, 0.2, 4))
     bench.signal.append(lambda e, _: coupled(e, kernel))
-    return {"kernel": kernel.tolist()}
+    return _given(kernel)
 
 
 @law("ipc", "four_rows", 3e-3, 0.03, "to the next row, the largest")
