@@ -42,7 +42,7 @@ from pixcal.stages.blind.offsets import offset_errors
 from pixcal.stages.blind.paper import read_paper
 from pixcal.stages.blind.parameters import held
 from pixcal.stages.blind.seal import read_seal
-from pixcal.stages.blind.second import SecondCase, catalogue
+from pixcal.stages.blind.second import SecondCase, catalogue, second_offsets
 from pixcal.stages.blind.sitting import share
 from pixcal.stages.blind.strengths import STRONGEST, WAYS, Way
 from pixcal.stages.blind.summary import summary
@@ -122,6 +122,15 @@ def test_a_second_bench_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch
     with pytest.raises(InputError, match=r"hcipy_of_old; .*pixcal\[second-bench\].*--bench own"):
         draw_examination(20, 5, "small")
     assert len(draw_examination(20, 5, "small", "own").truths) == 20
+
+
+@pytest.mark.parametrize("case", ["--list", "--out=/tmp/elsewhere", "ipc/", "", "lag; ls", "a b"])
+def test_what_is_no_case_is_not_told_to_the_second_bench(
+    case: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pixcal.stages.blind.second._asked", pytest.fail)
+    with pytest.raises(InputError, match="not a case of the second bench"):
+        second_offsets(SecondCase(case, 1, 0.5), LAYOUTS["tiny"])
 
 
 def test_laws_whose_package_is_missing_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -111,6 +112,9 @@ def _asked(*line: str | Path) -> str:
 
 
 def _options(case: SecondCase, layout: Layout) -> Sequence[str]:
+    # It may come from a file, and must not pass for an option.
+    if not re.fullmatch(r"[a-z0-9_]+(/[a-z0-9_]+)?(\+[a-z0-9_]+(/[a-z0-9_]+)?)*", case.case):
+        raise InputError(f"{case.case!r}: not a case of the second bench; give another sealed file")
     many = min(FLATS, layout.frames // 2)
     return (
         case.case, "--seed", str(case.seed), "--strength", str(case.strength),
