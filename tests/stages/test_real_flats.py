@@ -1,11 +1,20 @@
 """Ladders of flats as cameras record them: saturated, curved, of one exposure time or several."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy_detectors import Detector, reduced
+
+from pixcal.effects.gain_error import GainError
+from pixcal.effects.nonlinearity import Nonlinearity
+from pixcal.estimators.battery import DETECTOR, measure
+from pixcal.estimators.battery.look import STEPS
+from pixcal.stages import reduce
+from pixcal.stages.diagnose.parts import Raw, evidence_of
+from pixcal.stages.diagnose.windows import whole_of
 
 LEVELS = tuple(np.linspace(0.05, 1.0, 12))
 CAMERA = {"gain": 2.3, "noise": 8.0, "bias": 200.4, "scatter": 2.0, "top": 4095, "rate": 8000.0}
@@ -67,3 +76,49 @@ def test_a_curve_that_all_pixels_share_is_no_defect(tmp_path: Path) -> None:
     assert report["linearity"]["max_deviation_percent"] > 3
     assert any("no straight line" in warning for warning in report["warnings"])
     assert any("straight line over exposure time" in warning for warning in report["warnings"])
+
+
+@pytest.mark.parametrize("gain", [1.0, 1.06])
+@pytest.mark.parametrize("quadratic", [0.0, -0.02])
+def test_gain_is_told_by_noise_and_response_by_levels(
+    gain: float, quadratic: float, tmp_path: Path
+) -> None:
+    camera = Detector(
+        **(CAMERA | {"gain": 2.3 * gain, "shape": (128, 128)}),
+        flats=[*ladder([(t, 1) for t in LEVELS], 6), (0.52, 60, 1)],
+        response=lambda e: e * (1 + quadratic * e / 8000),
+    )
+    arrays, tables = camera.frames(7)
+    declared = replace(camera, gain=2.3).described()
+    raw = Raw(declared, arrays, tables, reduce.Config())
+    evidence = evidence_of(raw, tmp_path, whole_of(camera.shape), camera.shape)
+    of_gain, response = GainError.estimate(evidence), Nonlinearity.estimate(evidence)
+    assert of_gain is not None
+    assert response is not None
+    error = of_gain.errors["relative"]
+    assert error < 0.008
+    assert of_gain.effect.relative == pytest.approx(gain - 1, abs=4 * error)
+    assert (response.significance > 10) == (quadratic != 0)
+    assert isinstance(response.effect, Nonlinearity)
+    at_top = response.effect.response(np.array([8000.0], np.float32))[0] / 8000 - 1
+    assert at_top == pytest.approx(quadratic, abs=2e-3)
+
+
+def test_row_noise_with_a_repeat_shows_at_its_distance(tmp_path: Path) -> None:
+    evidence, _ = reduced(Detector(**CAMERA), 8, tmp_path)
+    rng = np.random.default_rng(1)
+    stacks = []
+    for stack in evidence.stacks:
+        shared = 4 * rng.standard_normal((len(stack.adu), 24, 1, 2, 1))
+        rows = np.broadcast_to(shared, (len(stack.adu), 24, 2, 2, 1)).reshape(-1, 96, 1)
+        stacks.append(replace(stack, adu=(stack.adu + rows).astype(np.float32)))
+    before, after = measure(evidence), measure(replace(evidence, stacks=tuple(stacks)))
+    for kind in ("bias", "dark"):
+        # Rows, one to four apart: every second one is alike in half of the pairs.
+        plain, repeated = (m[f"{kind}_line_repeats", DETECTOR].value for m in (before, after))
+        assert np.abs(plain).max() < 0.4
+        assert repeated[1] > 10
+        assert np.abs(repeated[[0, 2, 4, 5, 6, 7]]).max() < 0.3 * repeated[1]
+        correlation = after[f"{kind}_neighbours", DETECTOR].value
+        assert correlation[STEPS.index((2, 0))] > 0.1
+        assert correlation[STEPS.index((0, 1))] > 0.2

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.flat_ladder import ladder_response
 from pixcal.kernels.noise_sums import product_sums
 from pixcal.kernels.scene import DetectorMaps, Rows
 from pixcal.model.bench import Bench
@@ -27,6 +28,9 @@ _CLIP = 6.0
 _DISAGREE = 4.0
 _MIN_PIXELS = 200
 _MIN_FRAMES = 8
+_MIN_LEVELS = 3
+_CURVED = 3.0
+_ALIKE = 1e4
 _READ_KNOWN = 0.3
 """Relative error of the read noise's variance as it was used."""
 
@@ -88,7 +92,7 @@ class GainError(Effect):
             "fringes": _shot_share(
                 s for f in evidence.fringes.values() if (s := _of_fringes(f)) is not None
             ),
-            "flats": _shot_share(_of_stacks(evidence)),
+            "flats": shot_share_of_flats(evidence),
         }
         found = {name: way for name, way in ways.items() if way is not None}
         if not found:
@@ -105,6 +109,91 @@ class GainError(Effect):
             f"{share:.3f} times that of the gain used",
             details,
         )
+
+
+def shot_share_of_flats(evidence: Evidence) -> tuple[float, float] | None:
+    """Noise that grows with the level in flats over that expected; None without samples.
+
+    A response that is not linear changes the noise in proportion to the level, and a wrong gain
+    changes it by one factor: the former is taken out as the levels show it or, where the lamp was
+    changed between them, by the noise at level zero.
+    """
+    pooled = _shot_share(_of_stacks(evidence))
+    curve = transfer_curve(evidence)
+    if pooled is None or curve is None:
+        return pooled
+    response = ladder_response(evidence, curve.top)
+    if response is None:
+        curved = abs(curve.slope) > _CURVED * curve.slope_error
+        return (curve.share, curve.error) if curved else pooled
+    (quadratic, cubic), _ = response
+    u = curve.levels / curve.top
+    rise = 1 + u * (2 * quadratic + 3 * u * cubic)
+    weight = curve.errors**-2
+    straight = curve.shares * (1 + u * (quadratic + u * cubic)) / rise**2
+    return float(np.average(straight, weights=weight)), float(weight.sum() ** -0.5)
+
+
+@dataclass(frozen=True)
+class TransferCurve:
+    """Photon transfer of flats over that of the gain used, as a line over the level.
+
+    Attributes
+    ----------
+    share, error : float
+        At level zero.
+    slope, slope_error : float
+        Change up to the top.
+    top : float
+        Highest level, e-.
+    levels, shares, errors : (n,) float64
+        Of each level (e-).
+    """
+
+    share: float
+    error: float
+    slope: float
+    slope_error: float
+    top: float
+    levels: F64
+    shares: F64
+    errors: F64
+
+
+def transfer_curve(evidence: Evidence) -> TransferCurve | None:
+    """Photon transfer of each level of flats; None with fewer than three levels.
+
+    Noise that neighbours share counts with that of the pixels themselves, as in `GainError`.
+    """
+    return evidence.once("transfer curve", make=lambda: _transfer_curve(evidence))
+
+
+def _transfer_curve(evidence: Evidence) -> TransferCurve | None:
+    darks = [
+        s for stack in evidence.stacks
+        if stack.kind != "flat" and _is_enough(stack)
+        and (s := _of_stack(stack, evidence)) is not None
+    ]  # fmt: skip
+    points = []
+    for stack in filter(_is_enough, evidence.ladder):
+        sums = _of_stack(stack, evidence)
+        share = None if sums is None else _shot_share([sums, *darks])
+        level = float((stack.adu.mean(axis=0) - evidence.bias)[evidence.good].mean())
+        if share is not None and level > 0:
+            points.append((level * evidence.gain, *share))
+    if len(points) < _MIN_LEVELS:
+        return None
+    level, share, error = np.array(points).T
+    top = float(level.max())
+    design = np.stack([np.ones_like(level), level / top]) / error
+    normal = design @ design.T
+    if np.linalg.cond(normal) > _ALIKE:
+        return None
+    covariance = np.linalg.inv(normal)
+    found = covariance @ (design @ (share / error))
+    errors = np.sqrt(np.diag(covariance))
+    at_zero, rise = zip(found.tolist(), errors.tolist(), strict=True)
+    return TransferCurve(*at_zero, *rise, top, level, share, error)
 
 
 def _joined(found: dict[str, tuple[float, float]]) -> tuple[float, float]:

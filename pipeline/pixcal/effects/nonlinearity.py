@@ -5,7 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from pixcal.effects.gain_error import transfer_curve
 from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.flat_ladder import ladder_response
 from pixcal.estimators.middle import middle
 from pixcal.estimators.neighbours import shared_charge
 from pixcal.estimators.response import fit_response
@@ -23,11 +25,8 @@ F64 = NDArray[np.float64]
 FALLOFF_PX = 0.5
 """Of the shift of boundaries by the brighter-fatter effect beside the response."""
 
-MIN_RUNGS = 3
-"""Fewest levels of flats that tell a curve from a line through nothing."""
-
 _TURNS = 30
-_SATURATED = 1e-3
+_NOT_TOLD = 1e-3
 _OTHER_ORDER = 4
 
 
@@ -122,7 +121,7 @@ class Nonlinearity(Effect):
         says how much of them there is, where all fringes have the same spacing.
         """
         level = _full_scale(evidence, cls().level_e)
-        ladder = _of_flats(evidence, level)
+        ladder, curve = ladder_response(evidence, level), _of_noise(evidence, level)
         if evidence.fringes:
             shifts = boundary_shifts(FALLOFF_PX)
             part = middle(evidence)
@@ -133,9 +132,14 @@ class Nonlinearity(Effect):
         elif ladder is not None:
             sizes, covariance = ladder
             why = "levels of flats that are not in proportion to their exposure times"
+        elif curve is not None:
+            sizes, covariance = curve
+            why = "noise of flats that is not in proportion to their level"
         else:
             return None
         details: dict[str, object] = {}
+        if curve is not None:
+            details["of_noise"], details["of_noise_error"] = curve[0][0], curve[1][0, 0] ** 0.5
         if ladder is not None:
             errors = np.sqrt(np.diag(ladder[1]))
             details["of_flats"] = [float(v) for v in ladder[0]]
@@ -161,34 +165,14 @@ def _full_scale(evidence: Evidence, usual: float) -> float:
     return usual if usual / _OTHER_ORDER < top < usual * _OTHER_ORDER else float(f"{top:.1g}")
 
 
-def _of_flats(evidence: Evidence, level_e: float) -> tuple[F64, F64] | None:
-    """(quadratic, cubic) and their covariance from a ladder; None with too few levels."""
-    times, means, errors = [], [], []
-    if not evidence.steady_lamp:
+def _of_noise(evidence: Evidence, level_e: float) -> tuple[F64, F64] | None:
+    """(quadratic, 0) and covariance from photon transfer; None with too few levels.
+
+    A signal ``S (1 + q u)`` has the variance ``S (1 + 2 q u)²``: over the signal it rises by 3 q u.
+    """
+    curve = transfer_curve(evidence)
+    if curve is None:
         return None
-    for stack in evidence.of_kind("flat"):
-        lost = (stack.adu[:, evidence.good] >= evidence.saturation_adu).mean()
-        if stack.exptime_s > 0 and lost < _SATURATED and len(stack.adu) > 1:
-            light = (stack.adu - evidence.bias) * evidence.gain
-            light -= evidence.dark_rate * stack.exptime_s
-            levels = light[:, evidence.good].mean(axis=1)
-            times.append(stack.exptime_s)
-            means.append(levels.mean())
-            errors.append(levels.std(ddof=1) / np.sqrt(len(levels)))
-    if len(times) < MIN_RUNGS or min(means) <= 0 or not evidence.dithered:
-        return None
-    time, mean = np.array(times), np.array(means)
-    information = (mean / np.array(errors)) ** 2
-    # Where the flat varies, bright pixels bend more than the mean does.
-    flat = evidence.flat[evidence.good] / evidence.flat[evidence.good].mean()
-    square, cube = (flat**2).mean() / level_e, (flat**3).mean() / level_e**2
-    rate, sizes = float((mean / time).mean()), np.zeros(2)
-    for _ in range(_TURNS):
-        linear = rate * time
-        terms = np.stack([linear * square, linear**2 * cube])
-        bent = 1 + sizes @ terms
-        design = np.stack([np.ones_like(time), *(terms / bent)])
-        covariance = np.linalg.inv((design * information) @ design.T)
-        step = covariance @ (design @ (information * (mean / (linear * bent) - 1)))
-        rate, sizes = rate * (1 + step[0]), sizes + step[1:]
-    return sizes, covariance[1:, 1:]
+    scale = level_e / (3 * curve.top * curve.share)
+    error = scale * curve.slope_error
+    return np.array([scale * curve.slope, 0.0]), np.diag([error**2, _NOT_TOLD**2])

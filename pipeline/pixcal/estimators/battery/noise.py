@@ -185,21 +185,6 @@ def read_noise(evidence: Evidence) -> Curve | None:
     return Curve(np.array(QUANTILES), np.quantile(variance, QUANTILES))
 
 
-@statistic("noise", "correlation of neighbours in flats", x="neighbour, by level", sets=False)
-def flat_neighbours(evidence: Evidence) -> Curve | None:
-    """Correlation of differences of flats."""
-    value: list[float] = []
-    for stack in evidence.ladder:
-        if len(stack.adu) >= 4:
-            light = (stack.adu - evidence.bias.astype(np.float32)) * evidence.good
-            light = light / light.sum(axis=(1, 2), keepdims=True) * light[0].sum()
-            steps = _calm(np.asarray(light[1::2] - light[:-1:2], np.float32), evidence.good)
-            square = float((steps[:, evidence.good] ** 2).mean())
-            sums = neighbour_sums(steps, evidence.good, STEPS[:4])
-            value += list(_mean_product(*sums) / square)
-    return Curve(np.arange(len(value), dtype=float), np.array(value)) if value else None
-
-
 @statistic("noise", "neighbours of hot pixels", x="left, right, above, below", sets=False)
 def hot_neighbours(evidence: Evidence) -> Curve | None:
     """Dark current beside hot pixels over theirs."""

@@ -17,6 +17,8 @@ F64 = NDArray[np.float64]
 
 ROWS = 64
 """Rows that are looked at, in the middle of the frames."""
+TOGETHER = 64
+"""Frames that are read at once: those of a chunk of a cube."""
 APART = 0.05
 """Relative distance of two levels that are not one lamp's flicker."""
 LEAST_SHARE = 1e-3
@@ -47,12 +49,14 @@ class FlatSurvey:
     def of(cls, arrays: Mapping[str, Reader]) -> "FlatSurvey":
         """Look at the middle rows of all flats, and of a frame without light."""
         dark = next((arrays[name] for name in ("bias", "dark") if name in arrays), None)
-        pedestal = 0.0 if dark is None else float(np.nanmean(_rows(dark, 0)))
+        pedestal = 0.0 if dark is None else float(np.nanmean(_rows(dark, 0, 1)))
         flats = arrays["flat"]
         whole = flats.dtype.kind in "iu"
         levels, tops = [], []
         for number in range(flats.shape[0]):
-            samples = _rows(flats, number)
+            if number % TOGETHER == 0:
+                several = _rows(flats, number, number + TOGETHER)
+            samples = several[number % TOGETHER]
             levels.append(float(np.nanmean(samples)) - pedestal)
             if whole:
                 top = int(samples.max())
@@ -73,10 +77,12 @@ class FlatSurvey:
         return [int(step) for step in found]
 
 
-def _rows(frames: Reader, number: int) -> NDArray[Any]:
-    _, ny, nx = frames.shape
+def _rows(frames: Reader, begin: int, end: int) -> NDArray[Any]:
+    count, ny, nx = frames.shape
     first = max((ny - ROWS) // 2, 0)
-    read: NDArray[Any] = frames.read((number, number + 1), (first, min(first + ROWS, ny)), (0, nx))
+    read: NDArray[Any] = frames.read(
+        (begin, min(end, count)), (first, min(first + ROWS, ny)), (0, nx)
+    )
     return read
 
 
