@@ -83,6 +83,9 @@ def test_a_ladder_that_saturates_gives_the_full_well(tmp_path: Path) -> None:
     ladder = (500, 2500, 4500, 6500, 8000, 8600, 9500, 11000)
     acquisition = write_camera(tmp_path / "acq", ladder)
     reduced = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run"))
+    gain = reduced.reduction["figures_of_merit"]["conversion_gain"]
+    assert abs(gain["value"] - GAIN) < 4 * gain["error"] < 0.04 * GAIN
+    assert reduced.reduction["linearity"]["max_deviation_percent"] < 0.5
     found = reduced.reduction["figures_of_merit"]["saturation"]
     assert found["note"] == ""
     # The variance is largest at the last level whose brightest samples alone are cut.

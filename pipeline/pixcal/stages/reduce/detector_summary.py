@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.detector import Linearity, linearity
+from pixcal.estimators.emva import saturation, transfer_points
 from pixcal.kernels.photon_transfer import GainFit, fit_gain
 from pixcal.kernels.rounding import SHEPPARD, UNTOLD, noise_before_rounding
 from pixcal.model.acquisition import Detector
@@ -183,6 +184,10 @@ def summarise(job: Measuring, folder: Path, declared: Detector) -> Summary:
     for i, j in np.ndindex(grid(job.shape)):
         sums += tables.read((i, i + 1), (j, j + 1))[0, 0]
     levels, usable = _rungs(ArrayReader(folder / "levels").read(), job)
+    # Pixels that are full saturate the flats though no sample of the converter does.
+    full = saturation(transfer_points(sums[1]))
+    top = float(np.fmin(job.saturation - medians.bias, full[0] if full else math.inf))
+    usable &= levels <= top
     straight = None
     times = np.array([group.exptime for group in job.flat])
     if job.flats_timed and job.flat and _one_lamp(times[usable], levels[usable]):
@@ -193,7 +198,7 @@ def summarise(job: Measuring, folder: Path, declared: Detector) -> Summary:
         noise = math.sqrt(read_variance[0])
         read_noise = (noise, read_variance[1] / (2 * noise) if noise else 0.0)
         own = _before_rounding(read_variance, folder, job) if job.quantum else read_noise
-    gain = _gain(sums[1], own, medians, job)
+    gain = _gain(sums[1], own, top, job)
     return Summary(declared, medians, read_noise, own, gain, levels, usable, straight)
 
 
@@ -215,16 +220,18 @@ def _read_variance(sums: F64) -> tuple[float, float] | None:
 
 
 def _gain(
-    sums: F64, read_noise: tuple[float, float] | None, medians: Usual, job: Measuring
+    sums: F64, read_noise: tuple[float, float] | None, top: float, job: Measuring
 ) -> GainFit | None:
-    """Photon transfer; None where the level above bias is unknown, or the error is too large."""
+    """Photon transfer below the level ``top`` (ADU above bias) of saturation.
+
+    None where the level above bias is unknown, or the error is too large.
+    """
     if not (job.dark and job.flat):
         return None
     noise, error = read_noise or (job.read_noise, _GUESS_ERROR * job.read_noise)
     # With light there is noise enough that rounding adds no more and no less than this.
     variance = noise**2 + SHEPPARD * job.quantum**2
-    top = _LINEAR_SHARE * (job.saturation - medians.bias)
-    fitted = fit_gain(sums, variance, 2 * noise * error, top)
+    fitted = fit_gain(sums, variance, 2 * noise * error, _LINEAR_SHARE * top)
     return fitted if fitted is not None and fitted.error < _GAIN_ERROR * fitted.gain else None
 
 
