@@ -193,3 +193,17 @@ def test_beside_a_bent_response_it_is_not_taken_to_be_alone(
     assert found.effect.falloff_px == 0.5
     assert "falloff_px" not in found.errors
     assert abs(found.effect.shift_px_per_e - 2e-7) < 4 * found.errors["shift_px_per_e"]
+
+
+def test_boundaries_that_move_otherwise_between_rows_are_found(
+    acquired: Callable[..., Evidence],
+) -> None:
+    given = {"shift_px_per_e": 3e-7, "falloff_px": 0.7, "along_y": 0.8}
+    found = BrighterFatter.estimate(acquired(None, {"brighter_fatter": given}))
+    assert found is not None
+    assert isinstance(found.effect, BrighterFatter)
+    assert abs(found.effect.along_y - 0.8) < 4 * found.errors["along_y"] < 0.1
+    even = BrighterFatter.estimate(acquired(None, {"brighter_fatter": {"shift_px_per_e": 3e-7}}))
+    assert even is not None
+    assert isinstance(even.effect, BrighterFatter)
+    assert abs(even.effect.along_y - 1) <= 4 * even.errors.get("along_y", 0.0)

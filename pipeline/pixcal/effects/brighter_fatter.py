@@ -64,6 +64,9 @@ class BrighterFatter(Effect):
     falloff_px: float = quantity(
         0.5, unit="px", above=0, high=10, doc="distance over which the shift falls by a factor e"
     )
+    along_y: float = quantity(
+        1.0, low=0, high=10, doc="shift of boundaries between rows over that between columns"
+    )
 
     @property
     def halo(self) -> int:
@@ -76,7 +79,7 @@ class BrighterFatter(Effect):
 
     def charge(self, charge: F32, shot: Shot) -> F32:
         """As in `Effect.charge`."""
-        return charge + moved_charge(charge, self._shifts)
+        return charge + moved_charge(charge, self._shifts, self.along_y)
 
     def restored(self, charge: F32) -> F32:
         """Charge as it would be with boundaries that stay.
@@ -93,7 +96,7 @@ class BrighterFatter(Effect):
         """
         found = charge
         for _ in range(_TURNS):
-            found = charge - moved_charge(found, self._shifts)
+            found = charge - moved_charge(found, self._shifts, self.along_y)
         return found
 
     def undo_samples(self, charge: F32) -> F32:
@@ -113,7 +116,8 @@ class BrighterFatter(Effect):
         crosstalk between pixels it differs because it rises with the square of the level. In the
         fringes it makes a second harmonic that depends on their spacing, which a response cannot;
         that is far more precise, and is used as long as it does not contradict the noise. Where it
-        is there and explains all harmonics with some falloff, no response is taken to be beside it.
+        is there and explains all harmonics with some falloff, and as much along y as along x or
+        another part of it, no response is taken to be beside it.
         """
         evidence = middle(evidence)
         falloff = cls().falloff_px
@@ -136,13 +140,14 @@ class BrighterFatter(Effect):
         significance = float(size / error)
         errors: dict[str, float] = {"shift_px_per_e": error}
         together: tuple[dict[str, float], ...] = ()
+        along_y = 1.0
         alone = _alone(evidence, falloff) if significance > _THERE and evidence.fringes else None
         if alone is not None:
-            falloff, size = alone.falloff_px, alone.shift
+            falloff, size, along_y = alone.falloff_px, alone.shift, alone.along_y
             errors, together = _errors(alone)
             why += "; no bent response is needed beside it"
         details["a_00"] = size * float(area_changes(falloff)[REACH, REACH])
-        effect = cls(float(np.clip(size, 0, 1e-5)), falloff)
+        effect = cls(float(np.clip(size, 0, 1e-5)), falloff, along_y)
         return Estimate(effect, errors, significance, why, details, together)
 
 
@@ -153,18 +158,22 @@ def _alone(evidence: Evidence, falloff: float) -> Boundaries | None:
     either seems to be needed.
     """
     found = boundaries_alone(evidence, LEVEL, POWERS, falloff)
+    if found.against > _NEEDED:
+        found = boundaries_alone(evidence, LEVEL, POWERS, falloff, by_axis=True)
     noise = shared_charge(evidence, boundary_shifts(found.falloff_px))
     if noise is None or found.against > _NEEDED:
         return None
-    apart = abs(found.shift - noise.size)
+    apart = abs(found.shift * (1 + found.along_y) / 2 - noise.size)
     return found if apart < _DISAGREE * np.hypot(found.shift_error, noise.variance**0.5) else None
 
 
 def _errors(found: Boundaries) -> tuple[dict[str, float], tuple[dict[str, float], ...]]:
     """Of both parameters, and how they hang together."""
     own = {"shift_px_per_e": found.shift_error}
+    ratio = {"along_y": found.along_y_error} if found.along_y_error else {}
+    together = (own, ratio) if ratio else (own,)
     if not np.isfinite(found.falloff_error):
-        return own, (own,)
+        return own | ratio, together
     both = {"shift_px_per_e": found.with_falloff, "falloff_px": found.falloff_error}
     whole = float(np.hypot(found.shift_error, found.with_falloff))
-    return both | {"shift_px_per_e": whole}, (own, both)
+    return both | {"shift_px_per_e": whole} | ratio, (*together, both)

@@ -6,7 +6,7 @@ on the fringes' spacing.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,6 +108,9 @@ class Boundaries:
         By how much the shift changes with the falloff's error, px.
     against : float
         Chi-square by which a bent response beside them would fit better.
+    along_y, along_y_error : float
+        Shift of boundaries between rows over that between columns; the error is zero where it was
+        held.
     """
 
     falloff_px: float
@@ -116,10 +119,12 @@ class Boundaries:
     shift_error: float
     with_falloff: float
     against: float
+    along_y: float = 1.0
+    along_y_error: float = 0.0
 
 
 def boundaries_alone(
-    evidence: Evidence, level_e: float, powers: int, otherwise_px: float
+    evidence: Evidence, level_e: float, powers: int, otherwise_px: float, *, by_axis: bool = False
 ) -> Boundaries:
     """Boundaries that explain the harmonics by themselves, with the falloff that does it best.
 
@@ -131,7 +136,25 @@ def boundaries_alone(
         Of the response that may be beside them, as of `fit_response`.
     otherwise_px : float
         Falloff where the harmonics do not tell it; one of `FALLOFFS_PX`.
+    by_axis : bool
+        Boundaries between rows may move by another shift than those between columns: fringes across
+        each tell of it.
     """
+    sums = evidence.once(
+        "boundaries", level_e, powers, make=lambda: _boundary_sums(evidence, level_e, powers)
+    )
+    if len(sums) < 2 or not by_axis:
+        sums = [(sum(n for n, _ in sums), sum(r for _, r in sums))]  # type: ignore[list-item]
+    found = [_alone(sums, powers, powers + n) for n in range(len(FALLOFFS_PX))]
+    one = _best_falloff([f[:4] for f in found], FALLOFFS_PX.index(otherwise_px))
+    if len(sums) < 2:
+        return one
+    near = int(np.argmin(np.abs(np.log(np.array(FALLOFFS_PX) / one.falloff_px))))
+    return replace(one, along_y=found[near][4], along_y_error=found[near][5])
+
+
+def _boundary_sums(evidence: Evidence, level_e: float, powers: int) -> list[tuple[F64, F64]]:
+    """Sums of `distortion_sums` for powers and falloffs, of fringes across columns and rows."""
     every = [UNIT * boundary_shifts(falloff) for falloff in FALLOFFS_PX]
 
     def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> tuple[F32, Iterable[F32]]:
@@ -149,23 +172,40 @@ def boundaries_alone(
 
         return np.zeros_like(signal), slopes()
 
-    normal, right = distortion_sums(
-        tuple(evidence.fringes.values()), distortion, powers + len(every), margin=REACH
-    )
-    found = [_alone(normal, right, powers, powers + n) for n in range(len(every))]
-    return _best_falloff(found, FALLOFFS_PX.index(otherwise_px))
+    sets = evidence.fringes.values()
+    across = [
+        tuple(f for f in sets if (abs(f.k[0]) >= abs(f.k[1])) == of_columns)
+        for of_columns in (True, False)
+    ]
+    return [
+        distortion_sums(own, distortion, powers + len(every), margin=REACH) for own in across if own
+    ]
 
 
-def _alone(normal: F64, right: F64, powers: int, at: int) -> tuple[float, float, float, float]:
-    """Shift, its variance, the chi-square it explains, and what a bent response would beside it."""
-    size, variance = right[at] / normal[at, at], 1 / normal[at, at]
-    both = [*range(powers), at]
-    scale = 1 / np.sqrt(np.diag(normal)[both])
-    own = normal[np.ix_(both, both)] * np.outer(scale, scale)
-    scaled = right[both] * scale
-    gain = size * right[at]
-    beside = float(scaled @ np.linalg.pinv(own, rcond=1e-9, hermitian=True) @ scaled) - gain
-    return UNIT * float(size), UNIT**2 * float(variance), float(gain), beside
+def _alone(
+    sums: Sequence[tuple[F64, F64]], powers: int, at: int
+) -> tuple[float, float, float, float, float, float]:
+    """Shift, its variance, the chi-square explained, and what a bent response would beside it;
+    shift along y over that along x, and its error, of two sums."""
+    information = np.array([normal[at, at] for normal, _ in sums])
+    rights = np.array([right[at] for _, right in sums])
+    sizes = rights / information
+    gain = float(sizes @ rights)
+    # The powers are common to all, each sum has a shift of its own.
+    n = powers + len(sums)
+    own, both = np.zeros((n, n)), np.zeros(n)
+    for number, (normal, right) in enumerate(sums):
+        places, taken = [*range(powers), powers + number], [*range(powers), at]
+        own[np.ix_(places, places)] += normal[np.ix_(taken, taken)]
+        both[places] += right[taken]
+    scale = 1 / np.sqrt(np.diag(own))
+    scaled = both * scale
+    inverse = np.linalg.pinv(own * np.outer(scale, scale), rcond=1e-9, hermitian=True)
+    beside = float(scaled @ inverse @ scaled) - gain
+    ratio = float(sizes[-1] / sizes[0])
+    relative = 1 / np.sqrt(information) / sizes
+    error = abs(ratio) * float(np.linalg.norm(relative)) if len(sums) > 1 else 0.0
+    return UNIT * float(sizes[0]), UNIT**2 / float(information[0]), gain, beside, ratio, error
 
 
 def _best_falloff(found: Sequence[tuple[float, float, float, float]], otherwise: int) -> Boundaries:

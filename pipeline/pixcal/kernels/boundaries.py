@@ -117,7 +117,7 @@ def _pushes(charge: F32, shifts: F64) -> tuple[F32, F32]:
     return push_x, push_y
 
 
-def moved_charge(charge: F32, shifts: F64) -> F32:
+def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0) -> F32:
     """What each pixel gains.
 
     Parameters
@@ -127,6 +127,8 @@ def moved_charge(charge: F32, shifts: F64) -> F32:
         at them; through the edges nothing moves.
     shifts : (2 REACH + 1, 2 REACH) float64
         From `boundary_shifts`, times the shift by an electron (px).
+    along_y : float
+        Shift of the boundaries between rows over that of those between columns.
 
     Returns
     -------
@@ -137,7 +139,7 @@ def moved_charge(charge: F32, shifts: F64) -> F32:
     charge = np.ascontiguousarray(charge, np.float32)
     push_x, push_y = _pushes(charge, shifts)
     out = np.empty_like(charge)
-    _move(charge, push_x, push_y, out)
+    _move(charge, push_x, push_y * np.float32(along_y), out)
     return out
 
 
