@@ -484,7 +484,8 @@ def bench_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_run_prints_where_and_what(bench_run: Path) -> None:
     lines = (bench_run / "run.out").read_text().splitlines()
-    assert lines[: len(STAGES)] == [f"{stage}: RUN/{stage} (written)" for stage in STAGES]
+    made = [*STAGES[:5], "corrected", STAGES[5]]
+    assert lines[: len(made)] == [f"{stage}: RUN/{stage} (written)" for stage in made]
     for name in ("vertical", "horizontal"):
         assert len([line for line in lines if line.split()[:1] == [name]]) >= 2
     for name in ("delta_x.fits", "delta_y.fits", "fit.json", "allan.json", "report.html"):
