@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import click
-import numpy as np
 
 from pixcal.model.errors import InputError
 from pixcal_cli.options import examples, run_argument
@@ -54,7 +53,9 @@ def centroids(
     TABLE holds centroids measured as if the pixels were a perfect grid. Columns are added: the
     corrected places, and what the errors of the maps leave in them.
     """
-    from pixcal.stages import centroids as stage  # here: for a fast `pixcal --help`
+    import numpy as np  # here: for a fast `pixcal --help`
+
+    from pixcal.stages import centroids as stage
 
     job = stage.TableJob(table, out, x, y, int(origin), overwrite)
     found = stage.correct_table(run, job, fwhm_px=fwhm, electrons=electrons)

@@ -35,8 +35,8 @@ STAGES = ["ingest", "reduce", "fit", "allan", "diagnose", "report"]
 SHOWN = {"diagnose": "diagnosis"}
 """Stages whose results have another name."""
 COMMANDS = [
-    "run", *STAGES[:4], "crests", "diagnose", "astrometry", "report", "compare", "simulate",
-    "budget", "blind",
+    "run", *STAGES[:4], "crests", "diagnose", "astrometry", "centroids", "wcs", "report",
+    "compare", "simulate", "budget", "blind",
 ]  # fmt: skip
 
 
