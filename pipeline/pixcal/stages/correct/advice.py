@@ -179,6 +179,12 @@ def _reason(cause: Json) -> str:
     return treatment_of(effect, "auto", {}).why
 
 
+def _share(part: Json) -> float:
+    """Of a coupling, or of the wave of a ghost, which has a complex amplitude for each term."""
+    waves = (part[key] for key in ("static", "forward", "backward") if key in part)
+    return float(max([abs(part.get("share", 0.0)), *(math.hypot(*wave) for wave in waves)]))
+
+
 def size_of(cause: Json) -> str:
     """The strengths of an effect in a few words."""
     kind = known_effects().get(cause["effect"])
@@ -189,8 +195,9 @@ def size_of(cause: Json) -> str:
     for name in kind.strengths:
         value = cause["parameters"].get(name)
         if isinstance(value, Sequence) and value and isinstance(value[0], Mapping):
-            largest = max((abs(one.get("share", 0.0)) for one in value), default=0.0)
-            parts.append(f"{len(value)} {name}, largest {100 * largest:.2g} %")
+            largest = max(map(_share, value))
+            told = f", largest {100 * largest:.2g} %" if largest else ""
+            parts.append(f"{len(value)} {name}{told}")
         elif isinstance(value, int | float) and value:
             parts.append(f"{name} {value:.3g} {units[name]}".strip())
         elif isinstance(value, Sequence) and value:
