@@ -39,7 +39,12 @@ def legendre_at(rows: F64, columns: F64, degree: int) -> F64:
 def fit_terms(values: F64, terms: F64) -> F64:
     """Least-squares coefficients (term,) of maps (term, y, x) in a map with NaN."""
     good = np.isfinite(values)
-    return np.asarray(np.linalg.lstsq(terms[:, good].T, values[good], rcond=1e-10)[0])
+    design = terms[:, good]
+    size = np.sqrt((design**2).sum(axis=1))
+    design = design / np.where(size > 0, size, 1.0)[:, None]
+    # Few terms of many pixels: the normal equations take a hundredth of the time of an SVD.
+    inverse = np.linalg.pinv(design @ design.T, rcond=1e-12, hermitian=True)
+    return np.asarray(inverse @ (design @ values[good]) / np.where(size > 0, size, 1.0))
 
 
 def smooth_surface(values: F64, good: Mask, degree: int = DEGREE) -> F64:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.battery.look import Look
+from pixcal.estimators.battery.look import looks_of
 from pixcal.estimators.evidence import Evidence
 
 F64 = NDArray[np.float64]
@@ -109,7 +109,7 @@ def battery() -> Mapping[str, Statistic]:
 def measure(evidence: Evidence) -> dict[Key, Curve]:
     """Every statistic of an acquisition that it has the frames for."""
     found: dict[Key, Curve] = {}
-    looks = {name: Look(fringes, evidence) for name, fringes in evidence.fringes.items()}
+    looks = looks_of(evidence)
     for name, one in battery().items():
         for of, what in looks.items() if one.of_set else ((DETECTOR, evidence),):
             curve = one.measure(what)

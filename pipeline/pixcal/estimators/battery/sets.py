@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 
 from pixcal.estimators.battery import Curve, statistic
-from pixcal.estimators.battery.look import F64, Look
+from pixcal.estimators.battery.look import F64, looks_of
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.structure import flattened
 
@@ -16,7 +16,7 @@ SAME = 0.98
 @statistic("space", "maps of two sets alike", x="contrast, light of each pair", sets=False)
 def alike(evidence: Evidence) -> Curve | None:
     """Correlation of the maps of each pair of sets."""
-    looks = [Look(f, evidence) for f in evidence.fringes.values()]
+    looks = looks_of(evidence).values()
     values = [
         _correlation(flattened(one.maps[name]), flattened(other.maps[name]))
         for one, other in combinations(looks, 2)
@@ -33,7 +33,7 @@ def _correlation(one: F64, other: F64) -> float:
 @statistic("space", "offsets of two sets apart", unit="px", x="pair", power=True, sets=False)
 def apart(evidence: Evidence) -> Curve | None:
     """Mean square of the difference of the offsets along one axis, by two baselines."""
-    looks = [Look(f, evidence) for f in evidence.fringes.values()]
+    looks = looks_of(evidence).values()
     values = []
     for one, other in combinations(looks, 2):
         a, b = np.array(one.found.k), np.array(other.found.k)
