@@ -12,6 +12,7 @@ from pixcal.estimators.structure import (
     repeats,
     smooth_surface,
     true_offsets,
+    without_outliers,
 )
 
 SHAPE = (61, 67)
@@ -90,3 +91,16 @@ def test_bad_pixels_do_not_matter() -> None:
     found = true_offsets(holes, np.zeros(SHAPE), plane())
     assert np.isfinite(found.kept).all()
     assert not found.kept[::7, ::5].any()
+
+
+def test_outliers_are_told_from_a_strong_pattern() -> None:
+    y, x = np.mgrid[:61, :70]
+    rng = np.random.default_rng(4)
+    bump = 50 * np.exp(-((x - 30) ** 2 + (y - 20) ** 2) / 200)
+    values = bump + rng.standard_normal(bump.shape)
+    values[7, 9] += 15
+    values[40, 3] = np.nan
+    left = without_outliers(values)
+    assert np.isnan(left[7, 9])
+    assert np.isnan(left[40, 3])
+    assert np.isfinite(left).sum() >= values.size - 4

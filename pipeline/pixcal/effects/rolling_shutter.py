@@ -5,8 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.row_ramp import RowRamp, enough_for_rows
+from pixcal.estimators.evidence import Evidence, FringeEvidence
+from pixcal.estimators.row_ramp import RowRamp, enough_for_rows, enough_frames
+from pixcal.estimators.row_settling import find_settling, profile, steps_of
+from pixcal.kernels.synthesis import illuminate
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
@@ -16,6 +18,8 @@ from pixcal.simulation.shot import Shot
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+FEWEST = 4
+"""Rows at which a profile of the settling is given."""
 _MODEL = 0.01
 """Relative error of the slope: what the frames' own parameters absorb is known to about that."""
 
@@ -27,15 +31,17 @@ class RollingShutter(Effect):
     The modulator goes to the next phase ``delay_us`` after the first row's exposure ends: rows that
     are still exposed hold a share of the next frame's light, which grows with the row. A delay of
     nearly a frame is a step that comes late: then the first rows hold a share of the last frame's.
-    It depends on the order of the phases, so maps alone do not tell; of random phases the fit loses
-    a little contrast in these rows, and the rest is left in the residuals.
+    A modulator that settles while rows are read turns the phase of each row by a share of its step
+    instead (``settling``). Both depend on the order of the phases, so maps alone do not tell; of
+    random phases the fit loses a little contrast in these rows, and the rest is left in the
+    residuals.
     """
 
     name = "rolling_shutter"
     title = "rows exposed while the phase steps"
     stage = Stage.LIGHT
     domains = ("time", "space")
-    strengths = ("line_time_us",)
+    strengths = ("line_time_us", "settling")
     told_by = ("random",)
     sources = (
         "Pyxalis GIGAPYX-4600 as in Rousset et al.: 5456 rows at 152 frames/s are 1.2 us a row; at "
@@ -51,8 +57,23 @@ class RollingShutter(Effect):
         0.0, unit="us", low=0, high=1e10, doc="from the end of the first row's exposure to the step"
     )
 
+    settling: tuple[float, ...] = quantity(
+        (), low=-1, high=1, doc="share of the step by which the phase is off, at rows at equal "
+        "distances from the window's first to its last (none, or four and more)"
+    )  # fmt: skip
+    of_step: str = quantity("last", choices=("last", "next"), doc="step that ``settling`` is of")
+    origin_rad: float | None = quantity(
+        None, unit="rad", low=-10, high=10, doc="where the modulator's range of one turn begins; "
+        "default: it goes the shorter way around"
+    )  # fmt: skip
+
     def check(self, bench: Bench) -> None:
         """As in `Effect.check`."""
+        if 0 < len(self.settling) < FEWEST:
+            raise InputError(
+                f"effects.rolling_shutter: settling: {len(self.settling)} values; give none, or "
+                f"at least {FEWEST}"
+            )
         frames = bench.frames
         last = self.line_time_us * (bench.detector.shape[0] - 1) * 1e-6
         if last > frames.period_s:
@@ -88,7 +109,25 @@ class RollingShutter(Effect):
             # Before the first frame and after the last one the modulator stands still.
             if other is not None:
                 mixed = mixed + share.astype(np.float32)[:, None] * (other - mean)
-        return mixed
+        return mixed + self._settled(shot) if any(self.settling) else mixed
+
+    def _settled(self, shot: Shot) -> F32:
+        """What the phases of the rows being off adds to the mean of a frame, e-."""
+        states, light, shape = shot.states, shot.light, shot.bench.detector.shape
+        step = steps_of(states.phi, -1 if self.of_step == "last" else 1, self.origin_rad)
+        rows = np.arange(*shot.rows) / max(shape[0] - 1, 1)
+        turn = step[shot.frame] * profile(self.settling, rows)
+        columns, lines = states.turns(shot.frame, shape, shot.rows)
+        cos, sin = np.cos(turn).astype(np.float32), np.sin(turn).astype(np.float32)
+        later = np.stack([lines[0] * cos - lines[1] * sin, lines[1] * cos + lines[0] * sin])
+        found = []
+        for of_rows in (lines, later):
+            found.append(np.empty_like(light.iota))
+            illuminate(
+                light.iota, light.alpha_sin, light.alpha_cos, states.level[shot.frame],
+                states.amplitude[shot.frame], columns, of_rows, found[-1],
+            )  # fmt: skip
+        return found[1] - found[0]
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
@@ -99,8 +138,28 @@ class RollingShutter(Effect):
         steps tell nothing: there the next frame is what the fit takes for the pixel's own phase.
         """
         sets = [f for f in evidence.fringes.values() if enough_for_rows(f)]
-        if not sets:
+        many = [f for f in evidence.fringes.values() if enough_frames(f)]
+        if not many:
             return None
+        settled = find_settling(many)
+        which = "from the last" if settled.way < 0 else "to the next"
+        law = "phase of the rows off by a share of the step, of any profile"
+        settling = Estimate(
+            cls(
+                0.0, settling=tuple(float(v) for v in np.clip(settled.share, -1, 1)),
+                of_step="last" if settled.way < 0 else "next", origin_rad=settled.origin_rad,
+            ),
+            {f"settling[{n}]": float(e) for n, e in enumerate(settled.error)},
+            settled.significance,
+            f"the phase of the rows follows the step {which} frame",
+            law=law,
+        )  # fmt: skip
+        mixed = cls._mixed(sets) if sets else settling
+        return max(mixed, settling, key=lambda e: e.significance)
+
+    @classmethod
+    def _mixed(cls, sets: list[FringeEvidence]) -> Estimate:
+        """Light of two frames in the exposure of a row."""
         sums = [RowRamp.of(sets, way) for way in (1, -1)]
         following, last = (s.slope / s.error for s in sums)
         ramp, found = sums[int(last > max(following, 4.0))], sets[0]
@@ -122,4 +181,5 @@ class RollingShutter(Effect):
                 "share_per_row_of_last": sums[1].slope,
                 "errors": [float(s.error) for s in sums],
             },
+            law="rows exposed while the phase steps",
         )

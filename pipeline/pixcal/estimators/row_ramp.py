@@ -94,9 +94,12 @@ def _slope(sets: Sequence[tuple[F64, F64, F64]], terms: Sequence[F64]) -> tuple[
 
 def enough_for_rows(found: FringeEvidence) -> bool:
     """Whether a set has the frames and pixels, and the times, to tell of rows."""
-    timed = found.exptime_s > 0  # not so where it is unknown (nan)
-    many = np.count_nonzero(found.good) > _MIN_PIXELS
-    return bool(timed and many and len(found.g) >= _MIN_FRAMES)
+    return enough_frames(found) and bool(found.exptime_s > 0)  # not so where unknown (nan)
+
+
+def enough_frames(found: FringeEvidence) -> bool:
+    """Whether a set has the frames and pixels."""
+    return bool(np.count_nonzero(found.good) > _MIN_PIXELS and len(found.g) >= _MIN_FRAMES)
 
 
 def _apart_in_time(g: F64, share: float, way: int) -> F64:
@@ -115,14 +118,36 @@ def _rows(found: FringeEvidence, way: int, share: F64) -> tuple[F64, F64, F64]:
     shares given (row), the frames' parameters hold the mean already, and the fringe's amplitude in
     the maps has lost the rest.
     """
-    inside = slice(1, len(found.g) - 1)
-    theta = np.where(found.good, found.theta, 0)
+    own, mean = _apart_in_time(found.g, float(share.mean()), way), _maps(found)
+    mean[1:] /= 1 - (share - share.mean())[:, None]
+    other = own[1 + way : len(own) - 1 + way] - own[INSIDE]
+    return rows_of(found, other, mean)
+
+
+INSIDE = slice(1, -1)
+"""Frames that have one before and one after."""
+
+
+def _maps(found: FringeEvidence) -> F64:
+    return np.asarray(np.where(found.good, found.theta, 0))
+
+
+def rows_of(found: FringeEvidence, other: F64, mean: F64 | None = None) -> tuple[F64, F64, F64]:
+    """Rows of the window, and normal matrix and right-hand side of a light's share in each row.
+
+    Parameters
+    ----------
+    found : FringeEvidence
+    other : (t - 2, 3) float64
+        Parameters of the light in every frame but the first and the last, as in `FringeEvidence.g`.
+    mean : (3, y, x) float64, optional
+        Maps of the light; default: those of the fit.
+    """
+    inside, theta = INSIDE, _maps(found)
+    mean = theta if mean is None else mean
     rest, variance = found.residual[inside], found.variance[inside]
     used = np.isfinite(rest) & found.good
     weight = np.divide(np.float32(1), variance, out=np.zeros_like(rest), where=used)
-    own, mean = _apart_in_time(found.g, float(share.mean()), way), theta.copy()
-    mean[1:] /= 1 - (share - share.mean())[:, None]
-    other = own[1 + way : len(own) - 1 + way] - own[inside]
     light = _apart(other, mean, found.g[inside], weight)
     y, x = (place.ravel().astype(np.float32) for place in centred(found.good.shape))
     inner, of_rest, across, sums = row_sums(

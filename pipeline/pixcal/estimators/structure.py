@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
@@ -14,6 +15,8 @@ DEGREE = 3
 """Of a smooth surface."""
 PERIODS = (2, 3, 4, 5, 6, 8)
 """Of rows and columns: those of readout circuits."""
+AROUND = 5
+"""Pixels along the side of a pixel's surroundings."""
 _CLIP = 6.0
 
 
@@ -22,6 +25,17 @@ def clipped(values: F64) -> F64:
     rest = values - np.nanmedian(values)
     spread = 1.4826 * float(np.nanmedian(np.abs(rest)))
     return np.where(np.abs(rest) <= _CLIP * max(spread, 1e-300), rest, np.nan)
+
+
+def without_outliers(values: F64) -> F64:
+    """A map about its median, pixels left out (NaN) that differ from those around them.
+
+    By six robust standard deviations of such differences: a smooth pattern, however strong, neither
+    hides a defective pixel nor is taken for one.
+    """
+    rest = values - np.nanmedian(values)
+    around = median_filter(np.where(np.isfinite(rest), rest, 0.0), AROUND, mode="reflect")
+    return np.where(np.isfinite(clipped(rest - around)), rest, np.nan)
 
 
 def legendre(shape: tuple[int, ...], degree: int) -> F64:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.evidence import Evidence, FringeEvidence
-from pixcal.estimators.structure import clipped, flattened, smooth_surface
+from pixcal.estimators.structure import flattened, smooth_surface, without_outliers
 from pixcal.kernels.sample_sums import (
     calm_residuals,
     level_sums,
@@ -117,9 +117,9 @@ class Look:
         contrast = np.where(good, np.hypot(theta[1], theta[2]), np.nan) / iota
         light = iota / smooth_surface(iota, good)
         return {
-            "offset": clipped(np.where(good, self.found.delta, np.nan)),
-            "contrast": clipped(contrast / np.nanmedian(contrast) - 1),
-            "light": clipped(light - 1),
+            "offset": without_outliers(np.where(good, self.found.delta, np.nan)),
+            "contrast": without_outliers(contrast / np.nanmedian(contrast) - 1),
+            "light": without_outliers(light - 1),
         }
 
     @cached_property

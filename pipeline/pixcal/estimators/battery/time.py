@@ -18,6 +18,9 @@ SERIES = {
 }
 LAGS = (1, 2, 3, -1, -2)
 BATCHES = 8
+DISTINCT = 0.05
+"""Smallest singular value, of the largest, of shapes that a sequence of phases can tell apart: a
+ramp of equal steps, or four of them, cannot tell all."""
 
 
 def _spectrum(name: str) -> Statistic:
@@ -74,7 +77,7 @@ def contrast_by_step(look: Look) -> Curve:
     for lag in LAGS[:3]:
         step = np.cos(phi[lag:] - phi[:-lag])
         terms = np.column_stack([slow[lag:], step])
-        values.append(float(np.linalg.lstsq(terms, contrast[lag:], rcond=1e-9)[0][-1]))
+        values.append(float(np.linalg.lstsq(terms, contrast[lag:], rcond=DISTINCT)[0][-1]))
     return Curve(np.array(LAGS[:3], float), np.array(values))
 
 
@@ -85,7 +88,7 @@ def frames_by_phase(look: Look) -> Curve:
     turns = [f(n * phi) for n in (1, 2, 3) for f in (np.cos, np.sin)]
     terms = np.stack([np.ones(len(phi)), *turns], axis=1)
     values = [
-        np.linalg.lstsq(terms, look.frames[name], rcond=1e-9)[0][1:]
+        np.linalg.lstsq(terms, look.frames[name], rcond=DISTINCT)[0][1:]
         for name in ("contrast", "intensity")
     ]
     value = np.concatenate(values)
