@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pixcal.effects.bias_drift import BiasDrift, Track
+from pixcal.effects.bias_drift import BiasDrift
 from pixcal.effects.row_noise import RowNoise
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.frame_offset import FEWEST, fringe_offsets
@@ -15,6 +15,7 @@ from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
+from pixcal.simulation.track import Track
 
 Offset = Callable[[np.ndarray], np.ndarray]
 
@@ -290,5 +291,5 @@ def test_tracks_are_replayed(make_effect_bench: Callable[..., Bench]) -> None:
     for r in recordings(bench):
         plain, on = (frames_of(bench, r, e).mean(axis=(1, 2)) for e in ((), (drift,)))
         time = r.period_s * np.arange(r.count)
-        wanted = np.interp(time, track.time_s, track.offset_e) * (r.folder == "vertical")
+        wanted = np.interp(time, track.time_s, track.value, right=0.0) * (r.folder == "vertical")
         np.testing.assert_allclose(on - plain, wanted, atol=0.1)

@@ -31,6 +31,7 @@ from pixcal.kernels.synthesis import Stream, generator
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
+from pixcal.simulation.track import Track, at
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -50,15 +51,6 @@ KNOTS = 32
 """Most points of a track."""
 _KEY, _RUN = 1000, 2000
 """First keys of the walks' random numbers: no recording has them."""
-
-
-@dataclass(frozen=True)
-class Track:
-    """Offset of the frames of one run of fringes, as measured: straight between its points."""
-
-    set: str = quantity(doc="name of the fringe set")
-    time_s: tuple[float, ...] = quantity(unit="s", doc="after the first frame of the run, rising")
-    offset_e: tuple[float, ...] = quantity(unit="e-", low=-1e6, high=1e6, doc="at these times")
 
 
 @dataclass(frozen=True)
@@ -96,14 +88,12 @@ class BiasDrift(Effect):
     run_walk_e_h: float = quantity(
         0.0, unit="e-/h^0.5", low=0, high=1e6, doc="random walk that begins with each fringe run"
     )
-    tracks: tuple[Track, ...] = quantity((), doc="offsets of fringe runs as measured")
+    tracks: tuple[Track, ...] = quantity((), doc="offsets of fringe runs as measured, e-")
 
     def scaled(self, factor: float) -> Self:
         """As in `Effect.scaled`."""
         plain = replace(self, tracks=())
-        tracks = tuple(
-            replace(t, offset_e=tuple(factor * v for v in t.offset_e)) for t in self.tracks
-        )
+        tracks = tuple(track.scaled(factor) for track in self.tracks)
         changed = {n: factor * getattr(self, n) for n in plain.strengths if n != "tracks"}
         return replace(plain, tracks=tracks, **changed)
 
@@ -111,7 +101,7 @@ class BiasDrift(Effect):
     def is_null(self) -> bool:
         """As in `Effect.is_null`."""
         plain = any(getattr(self, n) for n in self.strengths if n != "tracks")
-        return not plain and not any(v for t in self.tracks for v in t.offset_e)
+        return not plain and not any(v for t in self.tracks for v in t.value)
 
     def trend(self, time_s: F64) -> F64:
         """Offset (t,), e-, that is not random; of an acquisition's times."""
@@ -142,8 +132,7 @@ class BiasDrift(Effect):
         """Offset of a frame of fringes since its run began, e-."""
         time = shot.frame * shot.recording.period_s
         name = shot.bench.frames.fringes[shot.recording.number].name
-        offset = sum(float(np.interp(time, t.time_s, t.offset_e)) for t in self.tracks
-                     if t.set == name)  # fmt: skip
+        offset = float(at(self.tracks, name, time))
         if self.run_walk_e_h:
 
             def normal(level: int, place: int) -> float:
@@ -312,7 +301,6 @@ def _tracks(light: FrameLight) -> tuple[Track, ...]:
         weight = np.linalg.solve(parts.sum(axis=0), with_offset[..., None])[..., 0]
         smooth = np.einsum("nc,nc->n", weight, modes.values[:n])
         offset = idct(np.concatenate([[0.0], smooth]), type=2, norm="ortho")
-        at = np.unique(np.linspace(0, n, min(KNOTS, n + 1)).astype(int))
-        times, values = series.time_s[at], np.clip(offset[at], -1e6, 1e6)
-        found.append(Track(series.name, tuple(map(float, times)), tuple(map(float, values))))
+        some = np.unique(np.linspace(0, n, min(KNOTS, n + 1)).astype(int))
+        found.append(Track.of(series.name, series.time_s[some], offset[some]))
     return tuple(found)

@@ -1,12 +1,13 @@
 """Fringes that wash out, a little, differently in every frame."""
 
 from dataclasses import dataclass, replace
+from typing import Any, Self, cast
 
 import numpy as np
 
 from pixcal.estimators.damping import Damping, best_damping
 from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.frame_light import OFFSETS, FrameLight, light_of
+from pixcal.estimators.frame_light import OFFSETS, FrameLight, light_courses, light_of
 from pixcal.estimators.variance_components import (
     Components,
     joint_log_chance,
@@ -18,6 +19,7 @@ from pixcal.kernels.scene import FrameStates
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
+from pixcal.simulation.track import Track, at
 
 SURE = 4.0
 """Standard deviations from which a slow change is told from a white one."""
@@ -42,7 +44,7 @@ class ContrastNoise(Effect):
     title = "visibility changing from frame to frame"
     stage = Stage.LIGHT
     domains = ("time",)
-    strengths = ("vibration_rad", "polarisation")
+    strengths = ("vibration_rad", "polarisation", "tracks")
     told_by = ()
     sources = (
         "Rousset et al., section 4.2: micro-vibrations within a frame are still to be looked at",
@@ -59,6 +61,22 @@ class ContrastNoise(Effect):
     polarisation_s: float = quantity(
         600.0, unit="s", low=0, high=1e6, doc="time over which it changes; 0: white"
     )
+    tracks: tuple[Track, ...] = quantity((), doc="relative changes as measured, set by set")
+
+    def scaled(self, factor: float) -> Self:
+        """As in `Effect.scaled`."""
+        return replace(
+            self,
+            vibration_rad=factor * self.vibration_rad,
+            polarisation=factor * self.polarisation,
+            tracks=tuple(track.scaled(factor) for track in self.tracks),
+        )
+
+    @property
+    def is_null(self) -> bool:
+        """As in `Effect.is_null`."""
+        plain = self.vibration_rad or self.polarisation
+        return not plain and not any(v for t in self.tracks for v in t.value)
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         """As in `Effect.states`."""
@@ -67,8 +85,17 @@ class ContrastNoise(Effect):
         keep = np.exp(-recording.period_s / self.polarisation_s) if self.polarisation_s else 0.0
         factor = np.exp(-energy * self.vibration_rad**2 / 2)
         factor *= np.maximum(1 + self.polarisation * damped_walk(drawn, keep), 0.0)
+        time = np.arange(recording.count, dtype=float) * recording.period_s
+        name = recording.bench.frames.fringes[recording.number].name
+        factor *= np.maximum(1 + at(self.tracks, name, time), 0.0)
         most = states.level / recording.bench.optics.visibility
         return replace(states, amplitude=np.minimum(states.amplitude * factor, most))
+
+    def replayed(self, evidence: Evidence) -> Self | None:
+        """As in `Effect.replayed`."""
+        courses = light_courses(evidence)
+        tracks = tuple(Track.of(name, time, change) for name, time, _, change in courses)
+        return replace(self, vibration_rad=0.0, polarisation=0.0, tracks=tracks)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
@@ -89,7 +116,7 @@ class ContrastNoise(Effect):
             drift = _drifting(damping, float(np.mean([s.step_s for s in light.sets])))
             values, errors = values | drift[0], errors | drift[1]
         return Estimate(
-            cls(**({"polarisation": 0.0} | values)),
+            cls(**cast("Any", {"polarisation": 0.0} | values)),
             errors,
             sigmas(joint_log_chance(there, none, there.size[:2])),
             "scatter of the fringe amplitudes over the intensities of all frames, beyond the noise "

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,13 @@ from scipy.optimize import minimize_scalar
 
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.frame_series import FrameSeries
-from pixcal.estimators.fringe_motion import Motion, motion_of, ramps, ramps_and_colour
+from pixcal.estimators.fringe_motion import (
+    Motion,
+    motion_of,
+    ramps,
+    ramps_and_colour,
+    slow_vectors,
+)
 from pixcal.estimators.spectral_line import Line
 from pixcal.estimators.variance_components import (
     MAX_STEPS,
@@ -26,6 +32,7 @@ from pixcal.kernels.scene import FrameStates
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
+from pixcal.simulation.track import Track, at
 
 F64 = NDArray[np.float64]
 
@@ -36,6 +43,9 @@ SETTLINGS = 10
 """Time constants tried at first, from `QUICKEST` frames to the length of the run."""
 QUICKEST = 3.0
 PARTS = ("jitter_x", "jitter_y", "walk_x", "walk_y")
+
+
+TRACKS = ("along_x", "along_y")
 
 
 @dataclass(frozen=True)
@@ -53,7 +63,7 @@ class FringeDrift(Effect):
     title = "fringe vector changing slowly, or swinging"
     stage = Stage.LIGHT
     domains = ("time", "space")
-    strengths = ("ramp", "settle", "walk", "vibration")
+    strengths = ("ramp", "settle", "walk", "vibration", *TRACKS)
     told_by = ()
     sources = (
         "Rousset et al., sections 4.2, 4.3 and 5.2: thermal deformations and low-frequency "
@@ -82,6 +92,26 @@ class FringeDrift(Effect):
         20.3, unit="Hz", low=0, high=1e4, doc="its frequency; frames see it folded below half "
         "their rate"
     )  # fmt: skip
+    along_x: tuple[Track, ...] = quantity((), doc="slow change of kx as measured, rad/px")
+    along_y: tuple[Track, ...] = quantity((), doc="slow change of ky as measured, rad/px")
+
+    def scaled(self, factor: float) -> Self:
+        """As in `Effect.scaled`."""
+        tracks = {
+            name: tuple(track.scaled(factor) for track in getattr(self, name)) for name in TRACKS
+        }
+        plain = {
+            name: tuple(factor * v for v in getattr(self, name))
+            for name in self.strengths
+            if name not in TRACKS
+        }
+        return replace(self, **cast("Any", plain | tracks))
+
+    @property
+    def is_null(self) -> bool:
+        """As in `Effect.is_null`."""
+        plain = any(any(getattr(self, n)) for n in self.strengths if n not in TRACKS)
+        return not plain and not any(v for n in TRACKS for t in getattr(self, n) for v in t.value)
 
     def vector_change(self, time_s: F64) -> F64:
         """Change of the fringe vector (t, 2), rad/px, that is not random; from its first frame.
@@ -102,7 +132,19 @@ class FringeDrift(Effect):
         phase = 2 * np.pi * recording.rng(self.name, 1).random()
         swung = swing(time, self.vibration_hz, phase, recording.exptime_s)
         change = self.vector_change(time) + walk * self.walk + np.outer(swung, self.vibration)
+        name = recording.bench.frames.fringes[recording.number].name
+        change += np.stack([at(self.along_x, name, time), at(self.along_y, name, time)], axis=1)
         return replace(states, dkx=states.dkx + change[:, 0], dky=states.dky + change[:, 1])
+
+    def replayed(self, evidence: Evidence) -> Self | None:
+        """As in `Effect.replayed`: the slow part of each frame's own fringe vector."""
+        courses = slow_vectors(evidence)
+        x, y = (
+            tuple(Track.of(name, time, vector[:, axis]) for name, time, vector in courses)
+            for axis in (0, 1)
+        )
+        calm = replace(self.scaled(0.0), vibration=self.vibration)
+        return replace(calm, along_x=x, along_y=y)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:

@@ -1,12 +1,13 @@
 """Power of the laser, or of its coupling into the fibres, changing from frame to frame."""
 
 from dataclasses import dataclass, replace
+from typing import Any, Self, cast
 
 import numpy as np
 
 from pixcal.estimators.damping import Damping, best_damping
 from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.frame_light import OFFSETS, FrameLight, light_of
+from pixcal.estimators.frame_light import OFFSETS, FrameLight, light_courses, light_of
 from pixcal.estimators.spectral_line import Line
 from pixcal.estimators.variance_components import (
     Components,
@@ -20,6 +21,7 @@ from pixcal.kernels.scene import FrameStates
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
+from pixcal.simulation.track import Track, at
 
 SURE = 4.0
 """Standard deviations from which a change is taken for correlated in time."""
@@ -41,7 +43,7 @@ class IntensityNoise(Effect):
     title = "intensity changing from frame to frame"
     stage = Stage.LIGHT
     domains = ("time",)
-    strengths = ("rms", "line")
+    strengths = ("rms", "line", "tracks")
     told_by = ()
     sources = (
         "Rousset et al., section on simulations: 2 % fluctuations of the laser (design/paper.txt)",
@@ -56,6 +58,17 @@ class IntensityNoise(Effect):
         100.0, unit="Hz", low=0, high=1e4, doc="its frequency; an exposure of whole periods does "
         "not see it"
     )  # fmt: skip
+    tracks: tuple[Track, ...] = quantity((), doc="relative changes as measured, set by set")
+
+    def scaled(self, factor: float) -> Self:
+        """As in `Effect.scaled`."""
+        tracks = tuple(track.scaled(factor) for track in self.tracks)
+        return replace(self, rms=factor * self.rms, line=factor * self.line, tracks=tracks)
+
+    @property
+    def is_null(self) -> bool:
+        """As in `Effect.is_null`."""
+        return not self.rms and not self.line and not any(v for t in self.tracks for v in t.value)
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         """As in `Effect.states`."""
@@ -65,8 +78,15 @@ class IntensityNoise(Effect):
         phase = 2 * np.pi * recording.rng(self.name, 1).random()
         change = self.rms * damped_walk(drawn, keep)
         change += self.line * swing(time, self.line_hz, phase, recording.exptime_s)
-        factor = np.maximum(1 + change, 0.0)
+        name = recording.bench.frames.fringes[recording.number].name
+        factor = np.maximum(1 + change + at(self.tracks, name, time), 0.0)
         return replace(states, level=states.level * factor, amplitude=states.amplitude * factor)
+
+    def replayed(self, evidence: Evidence) -> Self | None:
+        """As in `Effect.replayed`."""
+        courses = light_courses(evidence)
+        tracks = tuple(Track.of(name, time, level) for name, time, level, _ in courses)
+        return replace(self, rms=0.0, line=0.0, tracks=tracks)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
@@ -88,7 +108,7 @@ class IntensityNoise(Effect):
         if light.line is not None and light.line.sure:
             values, errors = _with_line(values, errors, light.line, light.sets[0].exptime_s)
         return Estimate(
-            cls(**values),
+            cls(**cast("Any", values)),
             errors,
             sigmas(log_chance_of_any([changes, line])),
             "what intensity and fringe amplitude of the frames do together, beyond the noise that "

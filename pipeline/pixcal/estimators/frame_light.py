@@ -106,6 +106,25 @@ class FrameLight:
         return np.asarray(power[:, None, None] * pattern)
 
 
+def light_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
+    """Of every set: name, times (t,), and changes (t,) of intensity and contrast of its frames.
+
+    Relative, and smaller than they were seen by the share of their scatter that is noise.
+    """
+    found = []
+    for f in evidence.fringes.values():
+        series = light_series(f)
+        if series is None:
+            continue
+        b, a = f.free[:, 0], np.hypot(f.free[:, 1], f.free[:, 2])
+        changes = []
+        for channel, values in enumerate((b / b.mean(), a / b / np.median(a / b))):
+            noise, seen = float(series.noise[channel, channel]), float(np.var(values))
+            changes.append((values - 1) * np.sqrt(max(1 - noise / max(seen, 1e-300), 0.0)))
+        found.append((f.name, f.time_s, changes[0], changes[1]))
+    return found
+
+
 def light_of(evidence: Evidence) -> FrameLight | None:
     """Light of all sets with frames enough; None without any."""
     found = {f.name: light_series(f) for f in evidence.fringes.values()}

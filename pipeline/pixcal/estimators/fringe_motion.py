@@ -10,13 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import idct
 
 from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.frame_series import FrameSeries, assemble, motion_series
+from pixcal.estimators.frame_series import MEDIAN, SLOW, FrameSeries, assemble, motion_series
 from pixcal.estimators.spectral_line import Line, find_line, without_line
 from pixcal.estimators.variance_components import (
     MAX_STEPS,
     Components,
+    cosine_modes,
     estimate_components,
     walk_power,
 )
@@ -132,6 +134,25 @@ def motion_of(evidence: Evidence) -> Motion | None:
         line=line,
         crossed=_crossed(found),
     )
+
+
+def slow_vectors(evidence: Evidence) -> list[tuple[str, F64, F64]]:
+    """Of every set: name, times (t,), and slow change (t, 2) of the fringe vector, rad/px.
+
+    The first cosine modes, each smaller than it was seen by the share that is noise (Wiener).
+    """
+    found = []
+    for fringes in evidence.fringes.values():
+        series = motion_series(fringes)
+        if series is None:
+            continue
+        modes = cosine_modes(series.values)
+        noise = np.median(modes[SLOW:] ** 2, axis=0) / MEDIAN
+        kept = modes[:SLOW] * np.maximum(1 - noise / np.maximum(modes[:SLOW] ** 2, 1e-300), 0)
+        every = np.zeros_like(series.values)
+        every[1 : len(kept) + 1] = kept
+        found.append((series.name, series.time_s, idct(every, type=2, norm="ortho", axis=0)))
+    return found
 
 
 def ramps(series: FrameSeries) -> F64:

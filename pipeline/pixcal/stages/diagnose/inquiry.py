@@ -104,8 +104,10 @@ def inquire(
 
     def asked_again(on: Effects, names: Sequence[str], few: Runtime) -> dict[str, float]:
         window = look.first
+        laws = {c.replay: c.estimate.effect for c in candidates.values() if c.replay and c.estimate}
         try:
-            evidence = window.evidence(window.learn, (*base, *on), LEARN_SEED, scratch)
+            by_law = tuple(laws.get(effect, effect) for effect in on)
+            evidence = window.evidence(window.learn, (*base, *by_law), LEARN_SEED, scratch)
         except InputError:
             return {}  # These frames do not tell what the effects look like.
         found = _estimates(evidence, {n: kinds[n] for n in names}, few, "estimate again")

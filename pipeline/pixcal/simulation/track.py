@@ -1,0 +1,40 @@
+"""What was measured of single frames of a fringe set, for simulations that repeat just that."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.model.config import quantity
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Track:
+    """A quantity of the frames of one fringe set, straight between its points, zero beyond them."""
+
+    set: str = quantity(doc="name of the fringe set")
+    time_s: tuple[float, ...] = quantity(unit="s", doc="after the set's first frame, rising")
+    value: tuple[float, ...] = quantity(low=-1e6, high=1e6, doc="at these times")
+
+    @classmethod
+    def of(cls, name: str, time_s: F64, value: F64) -> Self:
+        """From arrays (t,)."""
+        values = np.clip(value, -1e6, 1e6)
+        return cls(name, tuple(map(float, time_s)), tuple(map(float, values)))
+
+    def scaled(self, factor: float) -> Self:
+        """The same course, ``factor`` times as large."""
+        return replace(self, value=tuple(factor * v for v in self.value))
+
+
+def at(tracks: Iterable[Track], name: str, time_s: F64 | float) -> F64:
+    """Sum of the tracks of a set at some times."""
+    found = np.zeros(np.shape(time_s))
+    for track in tracks:
+        if track.set == name and track.time_s:
+            found = found + np.interp(time_s, track.time_s, track.value, left=0.0, right=0.0)
+    return found
