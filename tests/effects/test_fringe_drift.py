@@ -131,3 +131,20 @@ def test_with_one_direction_of_fringes_it_says_what_it_cannot_tell(acquired: Acq
     assert abs(found.effect.ramp[0] - 3e-3) < 4 * found.errors["ramp[0]"]
     assert found.significance > 6
     assert "wavelength" in found.why
+
+
+def test_what_frames_did_is_replayed(acquired: Callable[..., Evidence]) -> None:
+    """The slow vectors of the frames, whatever their law; what is white is left out."""
+    on = {"ramp": [0.02, 0.0], "settle": [0.0, 0.0], "walk": [0.0, 0.0], "vibration": [0.0, 0.0]}
+    evidence = acquired(None, {"fringe_drift": on})
+    again = FringeDrift().replayed(evidence)
+    assert again is not None
+    assert {t.set for t in again.along_x} == set(evidence.fringes)
+    for track in again.along_x:
+        time, value = np.array(track.time_s), np.array(track.value)
+        slope = np.polyfit(time / 3600, value, 1)[0]
+        assert slope == pytest.approx(0.02, rel=0.15)
+    for track in again.along_y:
+        assert np.ptp(track.value) < 0.2 * np.ptp(again.along_x[0].value)
+    assert not again.is_null
+    assert again.scaled(0.0).is_null

@@ -6,9 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pixcal.effects.contrast_noise import ContrastNoise
 from pixcal.effects.intensity_noise import IntensityNoise
 from pixcal.estimators.evidence import Evidence
+from pixcal.kernels.scene import frame_states
 from pixcal.model.bench import Bench
+from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import states_of
 from pixcal.simulation.recording import recordings
 
@@ -102,3 +105,33 @@ def test_what_looks_like_it_is_not_taken_for_it(
     found = IntensityNoise.estimate(acquired(None, alike))
     assert found is not None
     assert found.significance < 4
+
+
+@pytest.mark.parametrize(
+    ("kind", "on"),
+    [
+        (IntensityNoise, {"rms": 0.02, "line": 0.0}),
+        (ContrastNoise, {"vibration_rad": 0.3, "polarisation": 0.0}),
+    ],
+)
+def test_what_frames_did_is_replayed(
+    acquired: Callable[..., Evidence],
+    make_effect_bench: Callable[..., Bench],
+    kind: type[Effect],
+    on: dict[str, float],
+) -> None:
+    """Frame by frame: the states of the bench with the effect, from its tracks alone."""
+    evidence = acquired(None, {kind.name: on})
+    again = kind().replayed(evidence)
+    assert again is not None
+    bench = make_effect_bench()
+    true = kind(**on)
+    for recording in recordings(bench):
+        if recording.kind == "fringes":
+            plain = frame_states(bench, recording.number)
+            one, other = (e.states(plain, recording) for e in (true, again))
+            for name in ("level", "amplitude"):
+                wanted, found = getattr(one, name), getattr(other, name)
+                np.testing.assert_allclose(
+                    found / np.median(found), wanted / np.median(wanted), atol=0.004
+                )
