@@ -1,11 +1,14 @@
 """The statistics: each sees what it is for, in its own unit, and nothing else."""
 
 import dataclasses
+import gc
+import weakref
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
+from pixcal.effects import effects
 from pixcal.estimators.battery import DETECTOR, battery, measure
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.gap import Reference
@@ -98,3 +101,18 @@ def test_a_reference_needs_what_all_simulations_have(plain: Evidence) -> None:
     known = Reference.of([whole, part])
     assert set(known.usual) == set(part)
     assert set(known.on_scale(whole)) == set(part)
+
+
+def test_frames_that_were_looked_at_are_freed(acquired: Callable[..., Evidence]) -> None:
+    """At once, not by the garbage collector: a diagnosis looks at hundreds of them."""
+    evidence = dataclasses.replace(acquired())
+    alive = weakref.ref(evidence)
+    gc.disable()
+    try:
+        measure(evidence)
+        for kind in effects().values():
+            kind.estimate(evidence)
+        del evidence
+        assert alive() is None
+    finally:
+        gc.enable()

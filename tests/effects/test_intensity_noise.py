@@ -9,6 +9,7 @@ import pytest
 from pixcal.effects.contrast_noise import ContrastNoise
 from pixcal.effects.intensity_noise import IntensityNoise
 from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.frame_light import ambient_shares
 from pixcal.kernels.scene import frame_states
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
@@ -135,3 +136,17 @@ def test_what_frames_did_is_replayed(
                 np.testing.assert_allclose(
                     found / np.median(found), wanted / np.median(wanted), atol=0.004
                 )
+
+
+@pytest.mark.parametrize("shares", [(0.0, 0.0), (0.05, 0.01)])
+def test_ambient_light_is_told_from_a_change_of_contrast(
+    acquired: Callable[..., Evidence], shares: tuple[float, float]
+) -> None:
+    on = {"rms": 0.02, "line": 0.0, "ambient": list(shares)}
+    evidence = acquired(None, {"intensity_noise": on})
+    for (value, error), true in zip(ambient_shares(evidence), shares, strict=True):
+        assert abs(value - true) < 4 * error < 0.02
+    found = IntensityNoise.estimate(evidence)
+    assert found is not None
+    assert isinstance(found.effect, IntensityNoise)
+    assert any(found.effect.ambient) == any(shares)

@@ -7,7 +7,13 @@ import numpy as np
 
 from pixcal.estimators.damping import Damping, best_damping
 from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.frame_light import OFFSETS, FrameLight, light_courses, light_of
+from pixcal.estimators.frame_light import (
+    OFFSETS,
+    FrameLight,
+    ambient_shares,
+    light_courses,
+    light_of,
+)
 from pixcal.estimators.spectral_line import Line
 from pixcal.estimators.variance_components import (
     Components,
@@ -25,6 +31,8 @@ from pixcal.simulation.track import Track, at
 
 SURE = 4.0
 """Standard deviations from which a change is taken for correlated in time."""
+MOST_AMBIENT = 0.3
+"""Share of light that does not follow the laser beyond which contrast noise is likelier."""
 PARTS = ("power", "power_walk", "contrast", "contrast_walk", *OFFSETS)
 DAMPED = ("power_damped", "contrast", "contrast_walk", *OFFSETS)
 
@@ -58,6 +66,9 @@ class IntensityNoise(Effect):
         100.0, unit="Hz", low=0, high=1e4, doc="its frequency; an exposure of whole periods does "
         "not see it"
     )  # fmt: skip
+    ambient: tuple[float, ...] = quantity(
+        (), low=0, high=0.9, doc="share of each set's mean light that does not follow the laser"
+    )
     tracks: tuple[Track, ...] = quantity((), doc="relative changes as measured, set by set")
 
     def scaled(self, factor: float) -> Self:
@@ -79,14 +90,23 @@ class IntensityNoise(Effect):
         change = self.rms * damped_walk(drawn, keep)
         change += self.line * swing(time, self.line_hz, phase, recording.exptime_s)
         name = recording.bench.frames.fringes[recording.number].name
-        factor = np.maximum(1 + change + at(self.tracks, name, time), 0.0)
-        return replace(states, level=states.level * factor, amplitude=states.amplitude * factor)
+        change += at(self.tracks, name, time)
+        level = np.maximum(1 + (1 - self._ambient(recording.number)) * change, 0.0)
+        fringe = np.maximum(1 + change, 0.0)
+        return replace(states, level=states.level * level, amplitude=states.amplitude * fringe)
 
     def replayed(self, evidence: Evidence) -> Self | None:
         """As in `Effect.replayed`."""
         courses = light_courses(evidence)
-        tracks = tuple(Track.of(name, time, level) for name, time, level, _ in courses)
+        share = {name: self._ambient(n) for n, name in enumerate(evidence.fringes)}
+        tracks = tuple(
+            Track.of(name, time, level / (1 - share[name])) for name, time, level, _ in courses
+        )
         return replace(self, rms=0.0, line=0.0, tracks=tracks)
+
+    def _ambient(self, number: int) -> float:
+        """Share of a set; zero where none is given."""
+        return self.ambient[number] if number < len(self.ambient) else 0.0
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
@@ -107,8 +127,11 @@ class IntensityNoise(Effect):
         values, errors = _change(damping, step)
         if light.line is not None and light.line.sure:
             values, errors = _with_line(values, errors, light.line, light.sets[0].exptime_s)
+        shares = ambient_shares(evidence)
+        clear = any(SURE * error < share < MOST_AMBIENT for share, error in shares)
+        ambient = tuple(float(np.clip(share, 0, MOST_AMBIENT)) for share, _ in shares)
         return Estimate(
-            cls(**cast("Any", values)),
+            cls(**cast("Any", values), ambient=ambient if clear else ()),
             errors,
             sigmas(log_chance_of_any([changes, line])),
             "what intensity and fringe amplitude of the frames do together, beyond the noise that "

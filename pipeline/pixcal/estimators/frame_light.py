@@ -125,6 +125,22 @@ def light_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
     return found
 
 
+def ambient_shares(evidence: Evidence) -> list[tuple[float, float]]:
+    """Share of each set's mean light that does not follow the laser, and its error.
+
+    A change x of the laser's power changes the mean by (1 - share) x and the contrast by share x.
+    """
+    found = dict.fromkeys(evidence.fringes, (0.0, 1.0))
+    for name, _, level, contrast in light_courses(evidence):
+        square = float(level @ level)
+        if square > 0:
+            slope = float(level @ contrast) / square
+            rest = contrast - slope * level
+            error = np.sqrt(float(rest @ rest) / max(len(rest) - 1, 1) / square)
+            found[name] = slope / (1 + slope), float(error) / (1 + slope) ** 2
+    return list(found.values())
+
+
 def light_of(evidence: Evidence) -> FrameLight | None:
     """Light of all sets with frames enough; None without any."""
     found = {f.name: light_series(f) for f in evidence.fringes.values()}

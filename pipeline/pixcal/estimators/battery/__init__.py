@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.battery.look import looks_of
+from pixcal.estimators.battery.look import Look
 from pixcal.estimators.evidence import Evidence
 
 F64 = NDArray[np.float64]
@@ -56,11 +56,14 @@ class Statistic:
     kind : str
         ``linear``, or ``power``: mean squares, which are compared by their logarithms.
     of_set : bool
-        Looks at one fringe set; else at all of the evidence.
+        Looks at one fringe set; else at all of the evidence,
+    of_all : bool
+        or at all fringe sets together.
     floor : float
         Least standard deviation that chance has, where simulations may all be alike.
     measure : callable
-        From a `Look` (of a set) or `Evidence`; None where there is nothing to look at.
+        From a `Look` (of a set), those of all sets, or `Evidence`; None where there is nothing to
+        look at.
     """
 
     name: str
@@ -70,6 +73,7 @@ class Statistic:
     x_label: str
     kind: str
     of_set: bool
+    of_all: bool
     floor: float
     measure: Callable[[Any], Curve | None]
 
@@ -82,13 +86,17 @@ def statistic(
     x: str = "",
     power: bool = False,
     sets: bool = True,
+    together: bool = False,
     floor: float = 0.0,
 ) -> Callable[[Callable[[Any], Curve | None]], Statistic]:
     """Mark a function as a statistic; its name becomes that of the statistic."""
 
     def mark(measure: Callable[[Any], Curve | None]) -> Statistic:
         kind = "power" if power else "linear"
-        return Statistic(measure.__name__, title, domain, unit, x, kind, sets, floor, measure)
+        of_set = sets and not together
+        return Statistic(
+            measure.__name__, title, domain, unit, x, kind, of_set, together, floor, measure
+        )
 
     return mark
 
@@ -109,9 +117,11 @@ def battery() -> Mapping[str, Statistic]:
 def measure(evidence: Evidence) -> dict[Key, Curve]:
     """Every statistic of an acquisition that it has the frames for."""
     found: dict[Key, Curve] = {}
-    looks = looks_of(evidence)
+    looks = {name: Look(fringes, evidence) for name, fringes in evidence.fringes.items()}
+    every: tuple[tuple[str, Any], ...] = ((DETECTOR, tuple(looks.values())),)
     for name, one in battery().items():
-        for of, what in looks.items() if one.of_set else ((DETECTOR, evidence),):
+        whole = every if one.of_all else ((DETECTOR, evidence),)
+        for of, what in looks.items() if one.of_set else whole:
             curve = one.measure(what)
             if curve is not None and len(curve.value) and np.isfinite(curve.value).all():
                 found[name, of] = curve

@@ -145,13 +145,6 @@ class Look:
         }
 
 
-def looks_of(evidence: Evidence) -> dict[str, Look]:
-    """A look at every fringe set, the same whoever asks."""
-    return evidence.once(
-        "looks", make=lambda: {name: Look(f, evidence) for name, f in evidence.fringes.items()}
-    )
-
-
 LEVELS = 8
 """Bins of level."""
 CODES = 64

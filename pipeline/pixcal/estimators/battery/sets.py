@@ -1,22 +1,21 @@
 """Statistics across configurations: do fringe sets agree on what the detector has of its own?"""
 
+from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
 
 from pixcal.estimators.battery import Curve, statistic
-from pixcal.estimators.battery.look import F64, looks_of
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.battery.look import F64, Look
 from pixcal.estimators.structure import flattened
 
 SAME = 0.98
 """Cosine of the angle below which two sets measure along the same axis."""
 
 
-@statistic("space", "maps of two sets alike", x="contrast, light of each pair", sets=False)
-def alike(evidence: Evidence) -> Curve | None:
+@statistic("space", "maps of two sets alike", x="contrast, light of each pair", together=True)
+def alike(looks: Sequence[Look]) -> Curve | None:
     """Correlation of the maps of each pair of sets."""
-    looks = looks_of(evidence).values()
     values = [
         _correlation(flattened(one.maps[name]), flattened(other.maps[name]))
         for one, other in combinations(looks, 2)
@@ -30,10 +29,9 @@ def _correlation(one: F64, other: F64) -> float:
     return float(np.corrcoef(one[good], other[good])[0, 1])
 
 
-@statistic("space", "offsets of two sets apart", unit="px", x="pair", power=True, sets=False)
-def apart(evidence: Evidence) -> Curve | None:
+@statistic("space", "offsets of two sets apart", unit="px", x="pair", power=True, together=True)
+def apart(looks: Sequence[Look]) -> Curve | None:
     """Mean square of the difference of the offsets along one axis, by two baselines."""
-    looks = looks_of(evidence).values()
     values = []
     for one, other in combinations(looks, 2):
         a, b = np.array(one.found.k), np.array(other.found.k)

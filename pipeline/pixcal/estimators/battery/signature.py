@@ -37,7 +37,7 @@ def statistic_named(name: str) -> Statistic:
     def nothing(_: object) -> None:
         return None
 
-    return Statistic(name, title, domain, "σ", "", "linear", False, FLOOR, nothing)
+    return Statistic(name, title, domain, "σ", "", "linear", False, False, FLOOR, nothing)
 
 
 FLOOR = 0.7
