@@ -151,7 +151,7 @@ def test_samples_are_rounded_and_clipped() -> None:
     adu = np.empty_like(electrons)
     read = rng.uniform(3, 7, SHAPE).astype(np.float32)
     gain = rng.uniform(2, 3, SHAPE).astype(np.float32)
-    synthesis.amplify(electrons, bias, noise, read, gain, adu)
+    synthesis.amplify(electrons, bias, noise, read, 1 / gain, adu)
     synthesis.convert(adu, 200, out)
     exact = (electrons + read * noise.astype(np.float64)) / gain + bias
     assert np.abs(out - np.clip(exact, 0, 200)).max() <= 0.5 + 1e-4

@@ -35,8 +35,8 @@ class DetectorMaps:
     """e-/s."""
     read_noise: Float32
     """e- rms."""
-    gain: Float32
-    """e-/ADU."""
+    adu_per_e: Float32
+    """The inverse of the gain, ADU/e-."""
     mask: NDArray[np.uint8]
     """`PixelFlag.HOT` and `PixelFlag.DEAD`."""
 
@@ -133,7 +133,7 @@ def _chip_tile(d: SimulatedDetector, ty: int, tx: int) -> DetectorMaps:
         bias=normal(Stream.BIAS, d.bias_pixel_rms_adu) + column_bias,
         dark_rate=dark,
         read_noise=np.full(TILE, d.read_noise_e, np.float32),
-        gain=np.full(TILE, d.gain_e_per_adu, np.float32),
+        adu_per_e=np.full(TILE, 1.0 / d.gain_e_per_adu, np.float32),
         mask=np.where(dead, PixelFlag.DEAD, np.where(hot, PixelFlag.HOT, 0)).astype(np.uint8),
     )
 

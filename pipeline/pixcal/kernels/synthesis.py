@@ -177,7 +177,7 @@ def amplify(
     bias: Float32,
     normal: Float32,
     read_noise: Float32,
-    gain: Float32,
+    adu_per_e: Float32,
     out: Float32,
 ) -> None:
     """Electrons in ADU, with read noise and bias.
@@ -190,15 +190,15 @@ def amplify(
         ADU.
     normal : ndarray of float32, shape (y, x)
         Standard normals.
-    read_noise, gain : ndarray of float32, shape (y, x)
-        e- rms and e-/ADU.
+    read_noise, adu_per_e : ndarray of float32, shape (y, x)
+        e- rms, and the inverse of the gain.
     out : ndarray of float32, shape (y, x)
         ADU.
     """
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             electrons = signal[i, j] + read_noise[i, j] * normal[i, j]
-            out[i, j] = electrons / gain[i, j] + bias[i, j]
+            out[i, j] = electrons * adu_per_e[i, j] + bias[i, j]
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

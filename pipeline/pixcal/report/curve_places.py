@@ -20,7 +20,6 @@ class _Axis:
 
 _AXES = {
     "neighbour": _Axis("neighbour", "neighbour {}", _STEPS),
-    "neighbour, by level": _Axis("neighbour, level by level", "neighbour {}", _STEPS[:4] * 8),
     "row of four, down then right": _Axis(
         "neighbour, row modulo 4",
         "neighbour {}",

@@ -237,7 +237,7 @@ class _Chain:
         adu = np.empty_like(signal)
         read = self._normals(frame)[1]
         maps = self.camera.maps
-        synthesis.amplify(signal, maps.bias, read, maps.read_noise, maps.gain, adu)
+        synthesis.amplify(signal, maps.bias, read, maps.read_noise, maps.adu_per_e, adu)
         for at, effect in enumerate(self.effects):
             adu = effect.readout(adu, _Shot(self, frame, at))
         synthesis.convert(adu, d.top_adu, self._samples)

@@ -46,6 +46,8 @@ from pixcal.storage.fits_map import content_digest
 from pixcal.storage.fits_out import COMPRESSED, FrameWriter
 
 STAGE = "simulate"
+TRUTH_MAPS = tuple(f for f in fields(DetectorMaps) if f.name not in ("read_noise", "adu_per_e"))
+"""Maps that are told; read noise and gain of a simulated detector are the same in all pixels."""
 TRUTH = "simulate-truth"
 FORMAT = 1
 TRUTH_SCHEMA = "pixcal/truth/1"
@@ -413,7 +415,7 @@ def _write_truth(
             "uint8" if field.name == "mask" else "float32",
             {"BUNIT": units[field.name]} if field.name in units else None,
         )
-        for field in fields(DetectorMaps)
+        for field in TRUTH_MAPS
     ]
     run_tasks(partial(_write_maps, bench, effects, maps), _blocks(bench), runtime, label="truth")
     for writer in maps:
@@ -426,7 +428,7 @@ def _write_maps(bench: Bench, effects: Effects, writers: list[FrameWriter], rows
     camera = Camera(bench, rows, effects)
     skip = rows[0] - camera.rows[0]
     keep = slice(skip, skip + rows[1] - rows[0])
-    for field, writer in zip(fields(DetectorMaps), writers, strict=True):
+    for field, writer in zip(TRUTH_MAPS, writers, strict=True):
         writer.write_rows(rows[0], getattr(camera.maps, field.name)[keep])
 
 

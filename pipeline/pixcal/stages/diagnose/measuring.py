@@ -100,7 +100,7 @@ def nominal_bench(
         bias=_bias_before_rounding(evidence, dtypes),
         dark_rate=_dark_rate(evidence, halves),
         read_noise=np.full(good.shape, one.amplifier_noise, np.float32),
-        gain=np.full(good.shape, one.gain, np.float32),
+        adu_per_e=np.full(good.shape, 1 / one.gain, np.float32),
         mask=np.where(good, 0, 1).astype(np.uint8),
     )
     # Where frames are too few to part, every part holds the same ones.

@@ -98,7 +98,7 @@ class Measured(Effect):
         m, own = self.maps, slice(*rows)
         return DetectorMaps(
             m.delta_x[own], m.delta_y[own], m.response[own], m.bias[own], m.dark_rate[own],
-            m.read_noise[own], m.gain[own], m.mask[own],
+            m.read_noise[own], m.adu_per_e[own], m.mask[own],
         )  # fmt: skip
 
     def light(
@@ -356,7 +356,7 @@ class NominalBench:
             response=m.response * gain,
             dark_rate=m.dark_rate * gain,
             read_noise=noise,
-            gain=m.gain * gain,
+            adu_per_e=m.adu_per_e / gain,
         )
         return replace(measured, maps=maps)
 
