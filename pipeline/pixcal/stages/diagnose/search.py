@@ -43,7 +43,7 @@ SCREEN = 3
 CONFIRM = 8
 MOST = 5
 """Effects that are taken."""
-OPEN = 0.5
+OPEN = 0.15
 """Share of the gap that is left where the cause is taken for unknown; then an effect that closes"""
 LITTLE = 0.1
 """less than this share is not claimed."""
@@ -166,7 +166,7 @@ class Search:
             self._drop_unseen(open_ones, shares, current)
             if not open_ones:
                 break
-            trials = self._tried(effects, open_ones, shares, current)
+            trials, replays = self._tried(effects, open_ones, shares, current)
             if not taken:
                 for name, (trial, _) in trials.items():
                     candidates[name].alone = trial
@@ -177,11 +177,20 @@ class Search:
             if not gains:
                 break
             own = {n: g for n, g in gains.items() if g >= self._least(candidates[n])}
+            if not own:
+                # No law of any effect does; one of them may yet have acted by another law.
+                again = {n: t.log_likelihood - least for n, (t, _) in replays.items()}
+                own = {n: g for n, g in again.items() if g >= LEAST_OF_HINTED}
+                gains |= own
+                trials |= {n: replays[n] for n in own}
             for name in gains.keys() - own.keys():
                 candidates[name].reason = self._too_little(gains[name])
             if not own:
                 break
             best = max(own, key=lambda n: own[n])
+            replay = replays.get(best)
+            if replay and replay[0].log_likelihood > trials[best][0].log_likelihood:
+                trials[best] = replay
             del open_ones[best]
             confirmed = self._confirmed((*effects.values(), trials[best][1]), asked=[*open_ones])
             if isinstance(confirmed, str):
@@ -259,12 +268,12 @@ class Search:
         open_ones: dict[str, Candidate],
         shares: Mapping[str, float],
         current: Trial,
-    ) -> dict[str, tuple[Trial, Effect]]:
-        """Each candidate added to the effects taken, in its likeliest way.
+    ) -> tuple[dict[str, tuple[Trial, Effect]], dict[str, tuple[Trial, Effect]]]:
+        """Each candidate added to the effects taken, in its likeliest way; and as replayed.
 
         As estimated, and without strengths that may be zero; as strong as that, and as what is left
-        beside the effects taken; and as its frames have it. Log-likelihoods allow for other laws of
-        the effects taken.
+        beside the effects taken. Log-likelihoods allow for other laws of the effects taken. A
+        replay of single frames may imitate what another effect does by its law: it is apart.
         """
         options: list[tuple[str, Effect]] = []
         for name, candidate in open_ones.items():
@@ -280,6 +289,7 @@ class Search:
         benches = [(*effects.values(), effect) for _, effect in options]
         simulated = self._simulate(benches, SCREEN, f"candidates, round {len(effects) + 1}", ())
         found: dict[str, tuple[Trial, Effect]] = {}
+        replays: dict[str, tuple[Trial, Effect]] = {}
         refused: dict[str, str] = {}
         for (name, effect), bench, curves in zip(options, benches, simulated, strict=True):
             if isinstance(curves, str):
@@ -287,11 +297,12 @@ class Search:
                 continue
             trial = self._trial(bench, self._expected(curves, open_ones[name]))
             trial = self._tolerant(trial, current)
-            if name not in found or trial.log_likelihood > found[name][0].log_likelihood:
-                found[name] = trial, effect
+            into = replays if effect == open_ones[name].replay else found
+            if name not in into or trial.log_likelihood > into[name][0].log_likelihood:
+                into[name] = trial, effect
         for name in refused.keys() - found.keys():
             open_ones.pop(name).reason = refused[name]
-        return found
+        return found, replays
 
     def _tolerant(self, trial: Trial, taken: Trial) -> Trial:
         """A trial that allows for what other laws of the effects taken may do otherwise."""
