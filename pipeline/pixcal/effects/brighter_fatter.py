@@ -46,6 +46,7 @@ class BrighterFatter(Effect):
     strengths = ("shift_px_per_e",)
     told_by = ("ladder", "baseline")
     quick = False
+    quick = False
     sources = (
         "Antilogus et al. 2014, JINST 9, C03048: spots grow by up to 2 % over the full range; "
         "thinned sensors have it too",

@@ -48,6 +48,7 @@ class TelegraphNoise(Effect):
     domains = ("noise",)
     strengths = ("amplitude_e",)
     told_by = ("dark",)
+    quick = False
     sources = (
         "Ozdogru et al. 2025, Proc. SPIE 13527, 135270V (arXiv:2505.24540): telegraph noise in 1 "
         "to 5 % of the pixels of two scientific CMOS cameras",
