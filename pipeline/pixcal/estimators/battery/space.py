@@ -18,6 +18,8 @@ from pixcal.estimators.structure import (
 UNITS = {"offset": "px", "contrast": "", "light": ""}
 LINES = {0: "rows", 1: "columns"}
 BINS = 6
+FLOOR = 0.3
+"""Least standard deviation of a term over the one that the map's own scatter gives."""
 
 
 def _repeats(name: str, axis: int) -> Statistic:
@@ -68,7 +70,8 @@ def _low_orders(name: str) -> Statistic:
 
     measured.__name__ = f"{name}_bending"
     title = f"{name}: bending over the window"
-    return statistic("space", title, unit="sigma", x="Legendre term")(measured)
+    # Of light, whose surface is taken off, nothing is left but what outliers do to it.
+    return statistic("space", title, unit="sigma", x="Legendre term", floor=FLOOR)(measured)
 
 
 def _scales(name: str) -> Statistic:
