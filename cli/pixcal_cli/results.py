@@ -40,7 +40,7 @@ def show_simulate(acquisition: Path) -> None:
 
 
 def show_ingest(run: Path) -> None:
-    """Print one row for each array of frames, and what looked odd."""
+    """Print one row for each array of frames, and the warnings."""
     summary = read_json(run / "ingest" / MANIFEST)["summary"]
     rows = [
         (
@@ -119,31 +119,40 @@ def show_fit(run: Path) -> None:
 
 
 def show_correction(run: Path) -> None:
-    """Print what was done about each effect of a diagnosis, and what the maps gained."""
+    """Print how each effect of a diagnosis was treated, and how the maps changed."""
     found = read_json(run / "corrected" / "correction.json")
     if not found["effects"]:
-        click.echo(
-            f"  {found['verdict']}: the diagnosis found no effect; the maps of the fit stand"
-        )
+        click.echo(f"  {found['verdict']}: the diagnosis found no effect; use the maps of the fit")
         return
     rows = [(e["effect"], e["treatment"], e["why"]) for e in found["effects"]]
     show_table(("effect", "treatment", "why"), rows)
     if not found["outputs"]:
-        click.echo("  nothing to undo: the maps of the fit stand")
+        click.echo("  nothing to correct: use the maps of the fit")
         return
-    header = ("set", "moved px", "at most", "left px", "sigma px", "chi2", "every 4 rows px")
+    header = (
+        "set",
+        "change px rms",
+        "maximum",
+        "residual px",
+        "sigma px",
+        "chi2",
+        "4-row period px",
+    )
     show_table(header, [_gain_row(name, own) for name, own in found["sets"].items()])
-    show_notes(["'left': what the errors of the effects' parameters leave in the offsets"])
+    show_notes(
+        ["residual px: error of the offsets from the uncertainty of the effects' parameters"]
+    )
     for pair in found["pairs"]:
         expected = _number(pair["after_expected_px"], 3)
         apart = _before_after(pair["before_px"], pair["after_px"])
-        click.echo(f"  {' and '.join(pair['sets'])} apart: {apart} px (noise {expected} px)")
+        sets = " and ".join(pair["sets"])
+        click.echo(f"  difference between {sets}: {apart} px ({expected} px expected from noise)")
     if not found["pairs"]:
-        show_notes(["one set along each axis: a second baseline would measure the gain"])
+        show_notes(["one set along each axis: a second baseline would verify the correction"])
 
 
 def _gain_row(name: str, own: Mapping[str, Any]) -> tuple[str, ...]:
-    """What moved in a set, and what was before and after."""
+    """Change of the offsets of a set, and its figures before and after."""
     left = [error for error in own["parameter_error_px"].values() if error is not None]
     rows = own["rows"]
     return (
@@ -187,31 +196,31 @@ def _allan_row(curve: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def show_diagnosis(run: Path) -> None:
-    """Print the verdict, the causes, where the gap is, worst first, and frames that tell more."""
+    """Print the verdict, the causes, the largest differences and the recommended frames."""
     found = read_json(run / "diagnose" / "diagnosis.json")
     gap = found["gap"]
-    low, high = gap["interval"]
+    low, high = (100 * end for end in gap["interval"])
     click.echo(
-        f"  {found['verdict']}: of the gap {gap['after']:.2f} [{low:.2f}, {high:.2f}] is left"
+        f"  {found['verdict']}; residual gap: {100 * gap['after']:.0f} % "
+        f"(90 % interval {low:.0f} to {high:.0f} %)"
     )
     causes = [
         (
             cause["effect"],
-            "{:.3f} [{:.3f}, {:.3f}]".format(cause["gap_closed"], *cause["gap_closed_interval"]),
-            f"{cause['gain_over_rest']:.3f}",
+            "{:.1f} % ({:.1f} to {:.1f} %)".format(
+                *(100 * v for v in (cause["gap_closed"], *cause["gap_closed_interval"]))
+            ),
+            f"{100 * cause['gain_over_rest']:.1f} %",
             _chance(cause["p_value"]),
             ", ".join(cause["not_told_apart_from"]) or "-",
         )
         for cause in found["causes"]
     ]
     if causes:
-        show_table(("cause", "gap closed", "over the rest", "p", "or else"), causes)
+        header = ("cause", "gap closed", "unique share", "p-value", "indistinguishable from")
+        show_table(header, causes)
     for cause in found["causes"]:
-        if cause["would_decide"]:
-            others = " or ".join(cause["not_told_apart_from"])
-            click.echo(
-                f"  to tell {cause['effect']} from {others}: {'; '.join(cause['would_decide'])}"
-            )
+        _show_cause(cause)
     rows = [
         (
             f"{entry['domain']}: {entry['title']}",
@@ -224,17 +233,31 @@ def show_diagnosis(run: Path) -> None:
         for entry in gap["where"][:MOST_ROWS]
     ]
     if rows:
-        show_table(("where", "place", "measured", "nominal", "with causes", "sigma"), rows)
+        show_table(("statistic", "where", "measured", "nominal", "with causes", "sigma"), rows)
         if len(gap["where"]) > MOST_ROWS:
             click.echo(f"  and {len(gap['where']) - MOST_ROWS} more in diagnosis.json")
     if found["more_would_tell"]:
-        click.echo(f"  to tell more: {'; '.join(found['more_would_tell'])}")
+        click.echo(f"  recommended frames: {'; '.join(found['more_would_tell'])}")
+
+
+def _show_cause(cause: Mapping[str, Any]) -> None:
+    """Print the law of a cause, and the frames that would distinguish it from others."""
+    if law := cause.get("law"):
+        by_law, whole = (100 * cause[key] for key in ("gap_closed_by_law", "gap_closed"))
+        alone = (
+            f"; the law alone closes {by_law:.1f} %" if f"{by_law:.1f}" != f"{whole:.1f}" else ""
+        )
+        click.echo(f"  {cause['effect']}: {law}{alone}")
+    if cause["would_decide"]:
+        others = " or ".join(cause["not_told_apart_from"])
+        frames = "; ".join(cause["would_decide"])
+        click.echo(f"  recommended frames to distinguish {cause['effect']} from {others}: {frames}")
 
 
 MOST_ROWS = 8
-"""Differences that are printed."""
+"""Largest number of differences that are printed."""
 LEAST_CHANCE = 1e-12
-"""Smallest p-value that means something."""
+"""Smallest p-value that is printed as a number."""
 
 
 def _chance(p: float) -> str:

@@ -414,8 +414,11 @@ def test_a_diagnosis_names_frames_that_would_decide(
         "p_value": 1e-12,
         "not_told_apart_from": ["ipc", "glow"],
         "would_decide": ["dark frames", "a second baseline along x and y"],
+        "law": "charge of the last frame",
+        "gap_closed_by_law": 0.7,
     }
     sure = cause | {
+        "law": "white", "gap_closed_by_law": 0.9,
         "effect": "row_noise", "p_value": 1.1e-12, "not_told_apart_from": [], "would_decide": [],
     }  # fmt: skip
     found = {
@@ -428,16 +431,20 @@ def test_a_diagnosis_names_frames_that_would_decide(
     file = tmp_path / "diagnose/diagnosis.json"
     file.write_text(json.dumps(found))
     results.show_diagnosis(tmp_path)
-    _, _, lag, row_noise, *frames = (" ".join(row) for row in cells(capsys.readouterr().out))
-    assert lag == "lag 0.900 [0.800, 0.950] 0.900 < 1e-12 ipc, glow"
-    assert row_noise == "row_noise 0.900 [0.800, 0.950] 0.900 1.1e-12 -"
+    verdict, _, lag, row_noise, *frames = (" ".join(row) for row in cells(capsys.readouterr().out))
+    assert verdict == "partly explained; residual gap: 50 % (90 % interval 40 to 60 %)"
+    assert lag == "lag 90.0 % (80.0 to 95.0 %) 90.0 % < 1e-12 ipc, glow"
+    assert row_noise == "row_noise 90.0 % (80.0 to 95.0 %) 90.0 % 1.1e-12 -"
     assert frames == [
-        "to tell lag from ipc or glow: dark frames; a second baseline along x and y",
-        "to tell more: flat frames; a fringe set along another axis",
+        "lag: charge of the last frame; the law alone closes 70.0 %",
+        "recommended frames to distinguish lag from ipc or glow: "
+        "dark frames; a second baseline along x and y",
+        "row_noise: white",
+        "recommended frames: flat frames; a fringe set along another axis",
     ]
     file.write_text(json.dumps(found | {"causes": [sure], "more_would_tell": []}))
     results.show_diagnosis(tmp_path)
-    assert "to tell" not in capsys.readouterr().out
+    assert "recommended" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("names", ["", " , ", ","])

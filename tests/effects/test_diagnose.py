@@ -338,7 +338,9 @@ def test_an_effect_of_the_users_own_may_be_in_the_nominal_bench(
     found = json.loads((with_lag / "products" / "diagnosis.json").read_text())
     # Frames that do not flicker differ from a bench that does.
     assert found["verdict"] == "unexplained"
-    assert "intensity of the frames" in {entry["title"] for entry in found["gap"]["where"]}
+    assert "intensity: spectrum over the frames" in {
+        entry["title"] for entry in found["gap"]["where"]
+    }
 
 
 @pytest.mark.parametrize(

@@ -157,9 +157,9 @@ def answer(section: Section) -> Words:
 
 def test_a_run_that_was_not_diagnosed_says_what_to_run() -> None:
     section = diagnosis(contents(None))
-    assert section.lead.startswith("Not measured: run 'pixcal diagnose RUN'")
+    assert section.lead.startswith("Not run: run 'pixcal diagnose RUN'")
     assert not section.blocks
-    assert not any("simulation" in card.title for card in cards(contents(None)))
+    assert not any("diagnosis" in card.title for card in cards(contents(None)))
 
 
 @pytest.mark.usefixtures("without_figures")
@@ -170,10 +170,10 @@ def test_no_gap_is_said_at_once_and_what_came_nearest_is_shown() -> None:
     assert answer(section).level == "good"
     assert answer(section).text.startswith("No gap")
     assert "none of 102 statistics" in answer(section).text
-    nearest = table(section, "The largest deviations, all within chance")
+    nearest = table(section, "Largest deviations, none of them significant")
     assert [row[1] for row in nearest.rows] == ["title of b", "title of a"]
     assert "with causes" not in text_of(section)
-    (card,) = (c for c in cards(contents(found)) if c.title == "data against simulation")
+    (card,) = (c for c in cards(contents(found)) if c.title == "diagnosis")
     assert (card.value, card.level) == ("no gap", "good")
 
 
@@ -182,7 +182,7 @@ def test_unexplained_says_where_and_what_could_tell_more() -> None:
     found = a_diagnosis("unexplained", after=1.0, interval=[0.9, 1.1])
     section = diagnosis(contents(found))
     assert answer(section).level == "bad"
-    assert "in 2 of 102 statistics, mostly in noise, and none of the 2 effects" in (
+    assert "in 2 of 102 statistics, mostly in noise. None of the 2 effects" in (
         answer(section).text
     )
     advice = [b.text for b in section.blocks if isinstance(b, Words) and b.role == "advice"]
@@ -200,25 +200,25 @@ def test_causes_come_with_their_numbers() -> None:
     assert answer(section).text.startswith(
         "Explained: what lag is (lag) and what mine is (mine) account for"
     )
-    assert "3.0\u00a0% [1.0, 6.0] of the gap is left" in answer(section).text
+    assert "residual gap: 3.0\u00a0% (90\u00a0% interval 1.0 to 6.0\u00a0%)" in answer(section).text
     assert [row[:4] for row in table(section, "Causes").rows] == [
         ["1. what lag is (lag)", "80\u00a0% [75, 83]", "61\u00a0%", "< 10⁻¹²"],
         ["2. what mine is (mine)", "20\u00a0% [75, 83]", "5.0\u00a0%", "3.0 × 10⁻⁴"],
     ]
-    assert "Charge stays. What gave it away: frames follow others." in text_of(section)
+    assert "Charge stays. Evidence: frames follow others." in text_of(section)
     assert list(table(section, "Parameters of lag").rows) == [
         ["share", "0.002000 ± 0.000020", "e⁻/µm", "left behind"]
     ]
-    units = table(section, "In units of the bench (intervals: one sigma)")
+    units = table(section, "Differences in physical units (1σ intervals)")
     assert units.header[2:] == ["measured", "nominal", "with causes", "lag only", "mine only"]
     assert list(units.rows[0])[2:] == [
         "0.00200", "3.00 × 10⁻⁵ [2.00 × 10⁻⁵, 4.00 × 10⁻⁵]", "0.00190 [0.00180, 0.00210]",
         "0.00170", "4.00 × 10⁻⁵",
     ]  # fmt: skip
     assert [b.title for b in section.blocks if isinstance(b, Plate)] == [
-        "The gap", "What gave away what lag is (lag)", "What gave away what mine is (mine)",
+        "The gap", "Evidence for what lag is (lag)", "Evidence for what mine is (mine)",
     ]  # fmt: skip
-    assert "No statistic differs by more than chance any more." in text_of(section)
+    assert "No statistic differs significantly any more." in text_of(section)
 
 
 @pytest.mark.usefixtures("without_figures")
@@ -252,7 +252,7 @@ def test_every_difference_is_listed_once_the_worst_of_each_domain_first() -> Non
         for n in range(count)
     )
     section = diagnosis(contents(a_diagnosis(curves=(*curves, a_curve("quiet", sigma=1.0)))))
-    first, rest = table(section, "Statistics that differ"), table(section, "The others")
+    first, rest = table(section, "Statistics that differ"), table(section, "Other statistics")
     assert len(first.rows) == 12
     assert {row[0] for row in first.rows} == set(domains)
     for rows in (first.rows, rest.rows):
@@ -287,20 +287,20 @@ def test_what_remains_is_named_and_what_is_new_is_a_warning() -> None:
     )  # fmt: skip
     section = diagnosis(contents(found))
     assert "69\u00a0% of the gap" in answer(section).text
-    assert "31\u00a0% [25, 36] is left, mostly in time." in answer(section).text
+    assert "31\u00a0% (90\u00a0% interval 25 to 36\u00a0%), mostly in time." in answer(section).text
     rest = table(section, "Statistics that still differ")
     assert [row[1] for row in rest.rows] == ["title of stays", "title of new"]
     assert rest.rows[0][-2:] == ["+8.0", "79\u00a0%"]
     assert rest.rows[1][-2:] == ["−6.0", "new"]
-    assert "Of them, 1 did not differ before" in text_of(section)
+    assert "Of these, 1 did not differ before" in text_of(section)
 
 
 @pytest.mark.usefixtures("without_figures")
 def test_what_was_considered_and_looked_at_is_folded() -> None:
     section = diagnosis(contents(a_diagnosis()))
     folds = {b.title: b for b in section.blocks if isinstance(b, Fold)}
-    tried = table(section, "Not taken")
-    assert tried in folds["2 other effects were considered and not taken"].blocks
+    tried = table(section, "Rejected effects")
+    assert tried in folds["2 other effects were considered and rejected"].blocks
     assert list(tried.rows) == [
         ["mine", "+5.0", "11\u00a0%", "no likelier with it"],
         ["crosstalk (ipc)", "+0.4", "–", "not seen (0.4 sigma)"],
@@ -315,9 +315,19 @@ def test_what_was_considered_and_looked_at_is_folded() -> None:
 
 
 @pytest.mark.usefixtures("without_figures")
+def test_a_cause_names_its_law_and_what_that_closes_where_it_differs() -> None:
+    law = "rows exposed while the phase steps"
+    for by_law, shown in ((0.5, "; the law alone closes 50\u00a0% of the gap."), (0.8, ".")):
+        cause = a_cause(law=law, gap_closed_by_law=by_law)
+        section = diagnosis(contents(a_diagnosis(causes=(cause,))))
+        assert f"Law: {law}{shown}" in text_of(section)
+    assert "Law:" not in text_of(diagnosis(contents(a_diagnosis())))
+
+
+@pytest.mark.usefixtures("without_figures")
 def test_a_richer_nominal_bench_is_named() -> None:
     stage = StageRecord("diagnose", "k", 2, "0", {"nominal": {"ipc": {}, "lag": {}}}, {})
-    assert "to it were added ipc and lag" in (
+    assert "Included from the start: ipc and lag." in (
         diagnosis(dataclasses.replace(contents(a_diagnosis()), stages=(stage,))).lead
     )
     assert "straight fringes" not in diagnosis(contents(a_diagnosis(), frames={"fringes": []})).lead
@@ -329,8 +339,8 @@ def test_effects_that_are_not_told_apart_are_named_with_what_would_decide() -> N
     section = diagnosis(contents(a_diagnosis(causes=(cause,))))
     assert table(section, "Causes").rows[0][-1] == "ipc or mine"
     words = (
-        "The data do not tell it apart from crosstalk (ipc) or mine. "
-        "What would decide: dark frames and flats."
+        "The data cannot distinguish it from crosstalk (ipc) or mine. "
+        "Recommended frames: dark frames and flats."
     )
     assert words in text_of(section)
 
@@ -488,7 +498,7 @@ def test_hostile_text_is_shown_as_it_is_and_does_nothing() -> None:
     assert "<script" not in page
     shown = html.unescape(re.sub(r"<[^>]*>", " ", page))
     assert shown.count("<script>alert('") > 8
-    assert 'alt="What gave away &lt;script&gt;' in page
+    assert 'alt="Evidence for &lt;script&gt;' in page
 
 
 def test_shares_have_no_digits_that_mean_nothing() -> None:

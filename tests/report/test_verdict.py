@@ -81,7 +81,7 @@ def test_scaled_errors_are_not_pointed_out_without_need() -> None:
 @pytest.mark.parametrize(
     ("changes", "level", "words"),
     [
-        ({}, "good", "square root of the frames"),
+        ({}, "good", "square root of the number of frames"),
         ({"slope": -0.4}, "check", "slope −0.4000 ± 0.0040, not −0.5"),
         ({"knee_frames": 13_000.0}, "check", "beyond 13\u202f000 frames"),
     ],
@@ -103,13 +103,13 @@ def test_masked_pixels(masked: int, level: str) -> None:
 @pytest.mark.parametrize(
     ("facts", "words"),
     [
-        ({"fringe_vector_moves": True}, "fringe vector moves"),
+        ({"fringe_vector_moves": True}, "fringe vector varies"),
         (
             {
                 "model": "hyperbolic",
                 "geometry": {"centre_x_mm": 79.0, "centre_x_nominal_mm": 0.0},
             },
-            "79.0 mm from their nominal place along x",
+            "79.0 mm from their nominal position along x",
         ),
     ],
 )
@@ -124,8 +124,10 @@ def test_sets_that_do_not_agree(chi2: float, level: str) -> None:
 
 def test_the_way_to_the_precision_wanted() -> None:
     # (2e-4 / 5e-5)² = 16 times 600 frames of 0.14 s.
-    assert level_of(contents(), "would take 9\u202f600 frames (22.4 min") == "good"
-    assert level_of(contents({"sigma_median_px": 4e-5}), "better than the 5 × 10⁻⁵ px") == "good"
+    assert level_of(contents(), "needs 9\u202f600 frames (22.4 min") == "good"
+    assert (
+        level_of(contents({"sigma_median_px": 4e-5}), "reaches the target of 5 × 10⁻⁵ px") == "good"
+    )
 
 
 def test_warnings_are_sentences_and_worries_come_first() -> None:

@@ -342,7 +342,7 @@ def test_a_new_fit_makes_a_new_page_and_an_old_allan_is_pointed_out(tmp_path: Pa
 @pytest.mark.usefixtures("without_figures")
 def test_another_diagnosis_makes_another_page(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", (23, 29), ("one",), stages=("ingest", "reduce"))
-    assert "Not measured: run 'pixcal diagnose RUN'" in words(section(page_of(run), "diagnosis"))
+    assert "Not run: run 'pixcal diagnose RUN'" in words(section(page_of(run), "diagnosis"))
     write_diagnose(run)
     found = words(section(page_of(run), "diagnosis"))
     assert "left behind (lag) accounts for" in found

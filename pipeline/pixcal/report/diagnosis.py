@@ -1,4 +1,4 @@
-"""The chapter on the gap between data and simulation: what it is, what causes it, what remains."""
+"""The section on the diagnosis: the gap between data and simulation, its causes, the residual."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,6 +17,7 @@ from pixcal.report.diagnosis_words import (
     level,
     listed,
     percent,
+    residual_gap,
     unit,
     with_interval,
     worst,
@@ -30,20 +31,20 @@ SHOWN = 12
 """Rows of a table that are not folded."""
 PLOTS = 3
 """Statistics that are drawn for each cause, and of what remains."""
-NEW = "new with the causes"
+NEW = "introduced by the causes"
 
 _READ = (
-    "Above: dots are the data, squares or lines the simulations with ±1σ of chance and of their "
-    "own error. Below: how far the data are from each simulation; the band is ±2σ. "
+    "Top: data (dots) and simulations (squares or lines); error bars are ±1σ of the simulations. "
+    "Bottom: residual of the data from each simulation; the band is ±2σ. "
 )
 
 
 def diagnosis(contents: Contents) -> Section:
     """All that ``pixcal diagnose`` found; one line where it was not run."""
     found = contents.diagnosis
-    title = "Diagnosis: data against simulation"
+    title = "Diagnosis: data compared with simulation"
     if found is None:
-        lead = "Not measured: run 'pixcal diagnose RUN' and make the report again."
+        lead = "Not run: run 'pixcal diagnose RUN' and then 'pixcal report RUN'."
         return Section("diagnosis", title, lead, [])
     verdict = found.facts["verdict"]
     blocks: list[Block] = [Words(answer(found), "answer", level(verdict))]
@@ -66,11 +67,11 @@ def _lead(contents: Contents) -> str:
     fringes = contents.acquisition.get("frames", {}).get("fringes")
     bench = "straight fringes, constant light, " if fringes else ""
     given = [s.config.get("nominal") for s in contents.stages if s.name == "diagnose"]
-    more = f"; to it were added {listed(given[0])}" if given and given[0] else ""
+    more = f" Included from the start: {listed(given[0])}." if given and given[0] else ""
     return (
         f"The same frames were simulated with the nominal bench: {bench}a linear detector without "
-        f"memory or crosstalk, and its noise{more}. The gap is all that differs from the data by "
-        "more than chance; effects were fitted on one part of the frames and judged on the other."
+        f"lag or crosstalk, and its noise.{more} The gap is the sum of all significant differences "
+        "from the data. Effects were fitted on one half of the frames and tested on the other."
     )
 
 
@@ -78,7 +79,7 @@ def _heading(text: str) -> Words:
     return Words(text, "heading")
 
 
-# What it is, in a minute
+# Overview
 
 
 def _overview(found: Diagnosis) -> Iterator[Block]:
@@ -93,13 +94,13 @@ def _overview(found: Diagnosis) -> Iterator[Block]:
         for c in causes
     ]
     caption = (
-        "Every statistic that differs counts by the square of its significance; the nominal "
-        "simulation's whole gap is 100\u00a0%. "
+        "Each statistic that differs is weighted by the square of its significance; the gap of the "
+        "nominal simulation is 100\u00a0%. "
     )
     if causes:
         caption += (
-            "Thin lines are intervals of 90\u00a0%. A cause that closes much alone and is missed "
-            "little does what another cause does too."
+            "Thin lines are 90\u00a0% intervals. A cause that closes a large share alone but "
+            "reopens little when removed overlaps with another cause."
         )
     yield plate("The gap", caption, figures.gap_figure(_bars(gap, bool(causes)), closed))
     if causes:
@@ -134,9 +135,9 @@ def _causes_table(found: Diagnosis) -> Table:
     header = [
         "cause",
         "gap closed by it alone",
-        "lost without it",
+        "gap reopened when removed",
         "p-value",
-        "not told apart from",
+        "indistinguishable from",
     ]
     return Table("Causes", header, rows)
 
@@ -148,30 +149,40 @@ def _cause(rank: int, cause: Facts, found: Diagnosis) -> Iterator[Block]:
     name = cause["effect"]
     words = found.effects.get(name, EffectWords(""))
     yield _heading(f"Cause {rank}: {effect_title(found, name)}")
-    told = f"What gave it away: {cause['why'].rstrip('.')}." if cause.get("why") else ""
+    told = f"Evidence: {cause['why'].rstrip('.')}." if cause.get("why") else ""
     size = cause.get("sigmas")
-    sure = f"In the frames it was fitted to it is seen at {number(size, 2)}σ." if size else ""
-    yield Words(" ".join(filter(None, (words.about, told, sure))))
+    sure = f"Detection significance in the fitted frames: {number(size, 2)}σ." if size else ""
+    yield Words(" ".join(filter(None, (words.about, told, sure, _law(cause)))))
     alike = cause["not_told_apart_from"]
     if alike:
         others = listed((effect_title(found, other) for other in alike), "or")
         yield Words(
-            f"The data do not tell it apart from {others}."
-            + _advice("What would decide", cause.get("would_decide")),
+            f"The data cannot distinguish it from {others}."
+            + _advice("Recommended frames", cause.get("would_decide")),
             "advice",
         )
     shown = _named(found, cause.get("given_away_by", ()))
     if shown:
         yield plate(
-            f"What gave away {effect_title(found, name)}",
-            _READ + "The statistics are those that become likeliest by this cause.",
+            f"Evidence for {effect_title(found, name)}",
+            _READ + "These are the statistics whose likelihood improves most with this cause.",
             figures.curves_figure(shown),
         )
     yield from _parameters(cause, words)
 
 
+def _law(cause: Facts) -> str:
+    """The law of a cause, and what it closes by itself where that differs."""
+    law = cause.get("law")
+    if not law:
+        return ""
+    by_law, whole = (percent(cause[key]) for key in ("gap_closed_by_law", "gap_closed"))
+    alone = "" if by_law == whole else f"; the law alone closes {by_law} of the gap"
+    return f"Law: {law}{alone}."
+
+
 def _advice(words: str, frames: Sequence[str] | None) -> str:
-    """A sentence on frames to take; nothing of a diagnosis that does not tell them."""
+    """A sentence on the frames to take; empty where none are known."""
     return f" {words}: {listed(frames)}." if frames else ""
 
 
@@ -248,13 +259,13 @@ def _where(found: Diagnosis) -> Iterator[Block]:
     if len(rest) <= 2:
         first, rest = _by_domain(curves), []
     header = _header(causes)
-    title = "Statistics that differ, by domain, the worst first"
+    title = "Statistics that differ, by domain, the most significant first"
     yield Table(title, header, [_row(c, causes) for c in first])
     if rest:
         rows = [_row(c, causes) for c in _by_domain(rest)]
         yield Fold(
             f"{len(rest)} more statistics that differ",
-            [Table("The others, likewise", header, rows)],
+            [Table("Other statistics that differ", header, rows)],
         )
     yield from _maps(found)
     if not causes:
@@ -272,16 +283,15 @@ def _maps(found: Diagnosis) -> Iterator[Block]:
     panels = maps.panels(shape, places, found.curves) if shape else []
     if not panels:
         where = "window" if places else "cell of the window"
-        yield Words(f"No {where} is off by more than {maps.ASIDE:g} σ by itself.")
+        yield Words(f"No single {where} deviates by more than {maps.ASIDE:g} σ.")
     else:
         what = (
-            "Windows that were looked at (drawn larger than they are), and the statistic that is "
-            "furthest off in each, by domain"
+            "Windows tested (drawn larger than they are), with the largest deviation in each domain"
             if places
             else "Cells of the window, by statistic"
         )
         figure = maps.where_figure(shape, panels, with_after=bool(found.facts["causes"]))
-        yield plate("Where on the detector", f"{what}; numbers are deviations in σ.", figure)
+        yield plate("Where on the detector", f"{what}. Numbers are deviations in σ.", figure)
 
 
 def _by_domain(curves: Sequence[Facts]) -> list[Facts]:
@@ -304,7 +314,7 @@ def _rank_in_domain(curve: Facts, curves: Sequence[Facts]) -> int:
 
 
 def _header(causes: bool) -> list[str]:
-    after = ["with causes", "σ", "left"] if causes else []
+    after = ["with causes", "σ", "residual"] if causes else []
     return ["domain", "statistic", "where", "measured", "nominal", "σ", *after]
 
 
@@ -357,15 +367,15 @@ def _absolute(found: Diagnosis) -> Iterator[Block]:
     if rows:
         after = ["with causes", *(f"{name} only" for name in each)] if causes else []
         header = ["quantity", "unit", "measured", "nominal", *after]
-        title = "In units of the bench (intervals: one sigma)"
+        title = "Differences in physical units (1σ intervals)"
         yield from folded(Table(title, header, rows), SHOWN, "quantities")
 
 
-# What remains
+# Residual
 
 
 def _remainder(found: Diagnosis) -> Iterator[Block]:
-    if more := _advice("What could tell more", found.facts.get("more_would_tell")):
+    if more := _advice("Recommended frames", found.facts.get("more_would_tell")):
         yield Words(more.strip(), "advice")
     if not found.facts["causes"]:
         return
@@ -374,32 +384,33 @@ def _remainder(found: Diagnosis) -> Iterator[Block]:
         (c for c in found.curves if c["significance_after"] > found.noticed),
         key=lambda c: -c["significance_after"],
     )
-    yield _heading("What remains")
+    yield _heading("Residual gap")
     parts = [
         f"{percent(after)} in {domain}"
         for domain, (_, after) in sorted(gap.get("domains", {}).items(), key=lambda d: -d[1][1])
         if after >= 5e-4
     ]
     shares = f": {listed(parts)}" if parts else ""
-    sentence = f"{with_interval(gap['after'], gap['interval'])} of the gap is left{shares}. "
+    text = residual_gap(gap)
+    sentence = f"{text[:1].upper()}{text[1:]}{shares}. "
     if not left:
-        yield Words(sentence + "No statistic differs by more than chance any more.")
+        yield Words(sentence + "No statistic differs significantly any more.")
         return
     one = len(left) == 1
     yield Words(
         sentence + f"{len(left)} statistic{'' if one else 's'} still "
-        f"differ{'s' if one else ''} by more than chance."
+        f"differ{'s' if one else ''} significantly."
     )
     new = [c for c in left if not c["in_gap"]]
     if new:
         yield Words(
-            f"Of them, {len(new)} did not differ before: there a cause does what the data do not "
-            "show, so it may not be the right one.",
+            f"Of these, {len(new)} did not differ before: a cause predicts something that the data "
+            "do not show, so it may be the wrong one.",
             "advice",
         )
     table = Table("Statistics that still differ", _header(True), [_row(c, True) for c in left])
     yield from folded(table, SHOWN, "statistics that still differ")
-    yield plate("The largest of what remains", _READ, figures.curves_figure(left[:PLOTS]))
+    yield plate("Largest residual differences", _READ, figures.curves_figure(left[:PLOTS]))
 
 
 def _largest(found: Diagnosis) -> Iterator[Block]:
@@ -408,7 +419,7 @@ def _largest(found: Diagnosis) -> Iterator[Block]:
     if not curves:
         return
     yield Table(
-        "The largest deviations, all within chance",
+        "Largest deviations, none of them significant",
         _header(False),
         [_row(c, False) for c in curves],
     )
@@ -416,7 +427,7 @@ def _largest(found: Diagnosis) -> Iterator[Block]:
     yield from _absolute(found)
 
 
-# What was tried
+# Candidates
 
 
 def _candidates(found: Diagnosis) -> Iterator[Block]:
@@ -436,14 +447,14 @@ def _candidates(found: Diagnosis) -> Iterator[Block]:
         ]
         for c in tried
     ]
-    header = ["effect", "seen at (σ)", "closed alone", "why not"]
+    header = ["effect", "significance (σ)", "gap closed alone", "reason"]
     other = " other" if found.facts["causes"] else ""
-    title = f"{len(tried)}{other} effects were considered and not taken"
-    yield Fold(title, [Table("Not taken", header, rows)])
+    title = f"{len(tried)}{other} effects were considered and rejected"
+    yield Fold(title, [Table("Rejected effects", header, rows)])
 
 
 def _looked_at(found: Diagnosis) -> Iterator[Block]:
-    """Which frames and windows."""
+    """Frames and windows that were fitted and held out."""
     facts = found.facts.get("looked_at")
     if not facts:
         return
@@ -451,21 +462,19 @@ def _looked_at(found: Diagnosis) -> Iterator[Block]:
     rows = [["window", _window(one["window"]), "; ".join(map(_window, other["windows"]))]]
     names = dict.fromkeys([*one["frames"], *other["frames"]])
     rows += [[n, _frames(one["frames"].get(n)), _frames(other["frames"].get(n))] for n in names]
-    blocks: list[Table | Words] = [
-        Table("Frames and windows", ["", "effects fitted on", "effects judged on"], rows)
-    ]
+    blocks: list[Table | Words] = [Table("Frames and windows", ["", "fitted", "held out"], rows)]
     if facts.get("shared"):
         blocks.append(
             Words(
-                f"Too short to part: {listed(facts['shared'])}; what these frames tell of an "
-                "effect was judged on the same frames."
+                f"Too few frames to split: {listed(facts['shared'])}. Effects were fitted and "
+                "tested on the same frames there."
             )
         )
     blocks += [
         Words(f"Left out: {_window(one['window'])}. {one['reason']}")
         for one in facts.get("left_out", ())
     ]
-    yield Fold("Which frames were looked at", blocks)
+    yield Fold("Frames and windows used", blocks)
 
 
 def _window(ends: Sequence[Sequence[int]]) -> str:

@@ -25,13 +25,19 @@ def percent(value: float) -> str:
 
 
 def with_interval(value: float, ends: Sequence[float]) -> str:
-    """A share and its interval, in per cent."""
+    """A share and its 90 % interval, in per cent."""
     low, high = (number(round(100 * float(v), 2), 2) for v in ends)
     return f"{percent(value)} [{low}, {high}]"
 
 
+def residual_gap(gap: Mapping[str, Any]) -> str:
+    """Share of the gap that remains, with its interval."""
+    low, high = (number(round(100 * float(v), 2), 2) for v in gap["interval"])
+    return f"residual gap: {percent(gap['after'])} (90\u00a0% interval {low} to {high}\u00a0%)"
+
+
 def chance(p: float) -> str:
-    """A p-value; below any size that means something, a limit."""
+    """A p-value, or its upper limit where it is very small."""
     return "< 10⁻¹²" if p <= 1e-12 else number(float(p), 2)
 
 
@@ -62,29 +68,29 @@ def answer(diagnosis: Diagnosis) -> str:
     count = differing(diagnosis)
     if verdict == "no gap":
         return (
-            f"No gap: on frames that no effect was fitted on, none of {looked} statistics differs "
-            "from the nominal simulation by more than chance."
+            f"No gap: on held-out frames, none of {looked} statistics differs significantly from "
+            "the nominal simulation."
         )
     where = main_domains(gap)
     if verdict == "unexplained":
         return (
             f"Unexplained: the data differ from the nominal simulation in {count} of {looked} "
-            f"statistics{where}, and none of the {len(facts['candidates'])} effects that were "
-            "considered closes the gap."
+            f"statistics{where}. None of the {len(facts['candidates'])} effects considered "
+            "closes the gap."
         )
     causes = listed(effect_title(diagnosis, c["effect"]) for c in facts["causes"])
     one = len(facts["causes"]) == 1
-    left = with_interval(gap["after"], gap["interval"])
+    left = residual_gap(gap)
     if verdict == "explained":
         return (
-            f"Explained: {causes} account{'s' if one else ''} for how the data differ from the "
-            f"nominal simulation, in {count} of {looked} statistics; on frames kept out of the "
-            f"fit, {left} of the gap is left."
+            f"Explained: {causes} account{'s' if one else ''} for the differences between the "
+            f"data and the nominal simulation, found in {count} of {looked} statistics. On "
+            f"held-out frames, {left}."
         )
     return (
         f"{verdict[:1].upper()}{verdict[1:]}: {causes} close{'s' if one else ''} "
-        f"{percent(1 - gap['after'])} of the gap between the data and the nominal simulation, on "
-        f"frames kept out of the fit; {left} is left{where_left(gap)}."
+        f"{percent(1 - gap['after'])} of the gap between the data and the nominal simulation. On "
+        f"held-out frames, {left}{where_left(gap)}."
     )
 
 

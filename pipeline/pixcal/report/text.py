@@ -12,24 +12,24 @@ NAMES = {"delta_x": "δx", "delta_y": "δy", "delta_fringe": "δ along the fring
 SYMBOLS = {"delta_x": "δx", "delta_y": "δy", "delta_fringe": "δ"}
 
 _MODES = {
-    "1": "the mean of the map (piston): where the fringes' phase is zero is not known",
-    "x": "a slope along x: it is a small change of the fringe vector",
-    "y": "a slope along y: it is a small change of the fringe vector",
-    "cos(psi)*iota/alpha": "fringes of the set's own period (cosine): left open by an intensity "
-    "that is free in each frame",
+    "1": "the mean of the map (piston): degenerate with the origin of the fringe phase",
+    "x": "a slope along x: degenerate with a small change of the fringe vector",
+    "y": "a slope along y: degenerate with a small change of the fringe vector",
+    "cos(psi)*iota/alpha": "fringes of the set's own period (cosine): degenerate with a free "
+    "intensity in each frame",
     "sin(psi)*iota/alpha": "fringes of the set's own period (sine): likewise",
-    "cos(2*psi)": "fringes of half that period (cosine): left open by an amplitude that is free "
-    "in each frame",
+    "cos(2*psi)": "fringes of half that period (cosine): degenerate with a free amplitude in each "
+    "frame",
     "sin(2*psi)": "fringes of half that period (sine): likewise",
 }
 
 _FIBRES = {
-    "centre_x": "the place of the fibres along x",
-    "centre_y": "the place of the fibres along y",
+    "centre_x": "the position of the fibres along x",
+    "centre_y": "the position of the fibres along y",
     "distance": "the distance of the fibres",
     "baseline_x": "the separation of the fibres along x",
     "baseline_y": "the separation of the fibres along y",
-    "baseline_z": "one fibre being nearer than the other",
+    "baseline_z": "the separation of the fibres along the optical axis",
 }
 
 
@@ -38,7 +38,7 @@ def mode_in_words(name: str) -> str:
     if name.startswith("d psi / d "):
         moved = name.removeprefix("d psi / d ")
         return f"how the fringes change with {_FIBRES.get(moved, moved)}"
-    return _MODES.get(name, "a smooth mode of the fringes' shape")
+    return _MODES.get(name, "a smooth mode of the fringe geometry")
 
 
 def flag_name(flag: PixelFlag) -> str:

@@ -1,4 +1,4 @@
-"""The run in a few sentences: what was reached, and what a reader must look at."""
+"""Summary of the run: the precision reached, and the warnings."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from pixcal.report.contents import Contents, Diagnosis, FringeSet
-from pixcal.report.diagnosis_words import level, with_interval
+from pixcal.report.diagnosis_words import level, residual_gap
 from pixcal.report.text import NAMES, duration, number, share, with_error
 
 TARGET_PX = 5e-5
-"""Precision wanted of a calibration (paper, section 4.2)."""
+"""Target precision of a calibration (paper, section 4.2)."""
 
 FAR_MM = 40.0
 """A place of the fibres that a laboratory would notice: twice its 2 cm (paper, section 5.2)."""
@@ -43,8 +43,8 @@ def headline(contents: Contents) -> str:
         if not contents.has_fringes:
             return detector_headline(contents.detector.facts)
         return (
-            "No offsets were measured: the fit has not been run. This page holds what the detector "
-            "frames show."
+            "No offsets were measured: the fit has not been run. This page shows the results of "
+            "the detector frames."
         )
     parts = []
     for offset in contents.offsets:
@@ -95,7 +95,7 @@ def cards(contents: Contents) -> list[Card]:
             Card(
                 f"median σ of {NAMES[offset.name]}",
                 f"{number(sigma, 3)} px",
-                f"{number(nm, 3)} nm; offsets themselves: {number(found.robust_std, 3)} px rms",
+                f"{number(nm, 3)} nm; rms of the offsets: {number(found.robust_std, 3)} px",
                 GOOD if np.isfinite(sigma) else BAD,
             )
         )
@@ -103,9 +103,9 @@ def cards(contents: Contents) -> list[Card]:
         ratio = _ratio(fringes.facts.get("sigma_median_px"), fringes.facts.get("crb_median_px"))
         made.append(
             Card(
-                f"σ over the bound, {fringes.name}",
+                f"σ / Cramér–Rao bound, {fringes.name}",
                 number(ratio, 4),
-                "1 is the best any estimator can do (Cramér–Rao)",
+                "1 is the best that an unbiased estimator can reach",
                 _level(ratio, 1.1, 1.5),
             )
         )
@@ -133,10 +133,9 @@ def _detector_cards(facts: dict[str, Any]) -> Iterator[Card]:
 def _diagnosis_card(diagnosis: Diagnosis) -> Card:
     verdict, gap = diagnosis.facts["verdict"], diagnosis.facts["gap"]
     causes = ", ".join(c["effect"] for c in diagnosis.facts["causes"])
-    left = f"{with_interval(gap['after'], gap['interval'])} of the gap is left"
-    detail = "nothing differs by more than chance" if verdict == "no gap" else left
+    detail = "no significant difference" if verdict == "no gap" else residual_gap(gap)
     return Card(
-        "data against simulation",
+        "diagnosis",
         verdict,
         f"{causes}: {detail}" if causes else detail,
         level(verdict),
@@ -174,7 +173,7 @@ def _mask_card(contents: Contents) -> Card:
 
 
 def findings(contents: Contents) -> list[Finding]:
-    """Sentences in the order of how much they should worry."""
+    """Findings, the most serious first."""
     made = [Finding(CHECK, _sentence(text)) for text in contents.warnings]
     if not contents.acquisition.get("frames", {}).get("flat"):
         made.append(Finding(CHECK, "There are no flat frames: the flat is taken as 1 everywhere."))
@@ -189,9 +188,8 @@ def findings(contents: Contents) -> list[Finding]:
             Finding(
                 GOOD if agree else BAD,
                 f"Fringe sets that measure the same offsets "
-                f"{'agree' if agree else 'do not agree'}: reduced χ² {number(consistency)} "
-                "between them."
-                + ("" if agree else " An effect that depends on the fringe vector is at work."),
+                f"{'agree' if agree else 'do not agree'}: reduced χ² {number(consistency)}."
+                + ("" if agree else " An effect that depends on the fringe vector is present."),
             )
         )
     order = {BAD: 0, CHECK: 1, GOOD: 2}
@@ -217,14 +215,15 @@ def _of_set(fringes: FringeSet) -> Iterator[Finding]:
         yield Finding(
             _level(abs(scale - 1), 0.02, 0.3),
             f"{name}: residuals are {number(scale**2, 4)} times the declared noise in variance, "
-            f"so all errors were multiplied by {number(scale, 4)}. Gain or read noise may be off, "
-            "or the model misses something.",
+            f"so all errors were multiplied by {number(scale, 4)}. The gain or the read noise may "
+            "be wrong, or the model incomplete.",
         )
     if facts.get("period_note"):
         yield Finding(CHECK, _sentence(f"{name}: {facts['period_note']}"))
     if facts.get("fringe_vector_moves"):
         yield Finding(
-            CHECK, f"{name}: the fringe vector moves from frame to frame and was fitted in each."
+            CHECK,
+            f"{name}: the fringe vector varies from frame to frame; it was fitted in each frame.",
         )
     yield from _of_shape(name, facts)
     if facts.get("batch_note") and fringes.allan is None:
@@ -234,7 +233,7 @@ def _of_set(fringes: FringeSet) -> Iterator[Finding]:
 
 
 def _of_shape(name: str, facts: dict[str, Any]) -> Iterator[Finding]:
-    """Which shape the fringes were fitted with, and whether the bench is where it should be."""
+    """Model of the fringes, and whether the fitted bench geometry is plausible."""
     if facts.get("model") != "hyperbolic":
         return
     why = f" ({facts['evidence']})" if facts.get("evidence") else ""
@@ -248,9 +247,9 @@ def _of_shape(name: str, facts: dict[str, Any]) -> Iterator[Finding]:
         yield Finding(
             CHECK,
             f"{name}: the fit places the fibres {number(abs(centre - nominal))} mm from their "
-            f"nominal place along {axis}. If the bench is not that far off, smooth structure of "
-            "the detector (steps between stitched blocks) was taken for curved fringes: fit with "
-            "--model paraxial and compare.",
+            f"nominal position along {axis}. If the bench is better aligned than that, smooth "
+            "structure of the detector (steps between stitched blocks) was fitted as curvature of "
+            "the fringes: fit with --model paraxial and compare.",
         )
 
 
@@ -267,14 +266,15 @@ def _of_allan(fringes: FringeSet) -> Iterator[Finding]:
     if knee is not None:
         yield Finding(
             CHECK,
-            f"Set {fringes.name}: beyond {number(round(knee))} frames more averaging does not "
-            "help as the square-root law says: something drifts.",
+            f"Set {fringes.name}: beyond {number(round(knee))} frames the Allan deviation no "
+            "longer falls with the square root of the number of frames: the bench or the detector "
+            "drifts.",
         )
     elif _slope_is_white(measured):
         yield Finding(
             GOOD,
-            f"Set {fringes.name}: the Allan deviation falls with the square root of the frames, "
-            "over all lengths measured.",
+            f"Set {fringes.name}: the Allan deviation falls with the square root of the number of "
+            "frames, over all averaging lengths.",
         )
     else:
         yield Finding(
@@ -285,22 +285,20 @@ def _of_allan(fringes: FringeSet) -> Iterator[Finding]:
 
 
 def _of_target(fringes: FringeSet) -> Iterator[Finding]:
-    """How far it is to the precision wanted, if nothing but photons counts."""
+    """Frames needed for the target precision, if photon noise is the limit."""
     sigma, frames = fringes.facts.get("sigma_median_px"), fringes.facts.get("frames")
     if not sigma or not frames:
         return
     if sigma <= TARGET_PX:
-        yield Finding(
-            GOOD, f"Set {fringes.name}: better than the {number(TARGET_PX, 1)} px wanted."
-        )
+        yield Finding(GOOD, f"Set {fringes.name}: reaches the target of {number(TARGET_PX, 1)} px.")
         return
     needed = frames * (sigma / TARGET_PX) ** 2
     pace = fringes.facts.get("batch_period_s")
     time = f" ({duration(needed * pace)} at this rate)" if pace else ""
     yield Finding(
         GOOD,
-        f"Set {fringes.name}: {number(TARGET_PX, 1)} px would take {number(needed, 2)} frames"
-        f"{time}, if the square-root law holds so long.",
+        f"Set {fringes.name}: the target of {number(TARGET_PX, 1)} px needs {number(needed, 2)} "
+        f"frames{time}, if the square-root law holds that long.",
     )
 
 

@@ -78,7 +78,7 @@ def _lines_of(kind: str) -> Statistic:
         return Curve(np.arange(float(len(value))), np.array(value))
 
     measured.__name__ = f"{kind}_line_repeats"
-    title = f"rows and columns that share noise in {kind} frames"
+    title = f"correlated row and column noise in {kind} frames"
     return statistic("noise", title, x="distance: rows, then columns", sets=False)(measured)
 
 
@@ -90,7 +90,7 @@ def _repeats(rest: F32, good: Mask, axis: int) -> F64:
 
 
 @statistic(
-    "noise", "correlation of neighbours in flats, bright less dim", x="neighbour", sets=False
+    "noise", "correlation of neighbours in flats, bright minus dim", x="neighbour", sets=False
 )
 def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
     """Of the brighter half of the levels less that of the others."""
@@ -108,7 +108,7 @@ def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
 
 
 @statistic(
-    "time", "bias that changes, by its spectrum", x="band, then two rows, two columns",
+    "time", "change of the bias: spatial spectrum", x="band, then two rows, two columns",
     power=True, sets=False,
 )  # fmt: skip
 def bias_change(evidence: Evidence) -> Curve | None:

@@ -28,13 +28,19 @@ def harmonics(look: Look) -> Curve:
     return Curve(np.array(places), np.array(values))
 
 
-@statistic("intensity", "residual by level", unit="e-", x="bin of level")
+@statistic("intensity", "mean residual against signal", unit="e-", x="bin of level")
 def residual_by_level(look: Look) -> Curve:
     """Mean residual in bins of the level."""
     return Curve(np.arange(LEVELS, dtype=float), look.by_level[0])
 
 
-@statistic("intensity", "variance of flats by level", x="flat", power=True, sets=False)
+@statistic(
+    "intensity",
+    "photon transfer: variance of flats against signal",
+    x="flat",
+    power=True,
+    sets=False,
+)
 def photon_transfer(evidence: Evidence) -> Curve | None:
     """Variance of differences of flats over what shot and read noise give, for each level."""
     values = []
@@ -51,7 +57,7 @@ def photon_transfer(evidence: Evidence) -> Curve | None:
     return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None
 
 
-@statistic("intensity", "brightness of flats by exposure time", x="flat", sets=False)
+@statistic("intensity", "linearity: signal of flats against exposure time", x="flat", sets=False)
 def flat_ladder(evidence: Evidence) -> Curve | None:
     """Electrons a second of each level, over their mean."""
     levels, times = [], []
@@ -67,7 +73,7 @@ def flat_ladder(evidence: Evidence) -> Curve | None:
     return Curve(np.array(times), rate / rate.mean() - 1)
 
 
-@statistic("intensity", "bits of the samples", x="bit")
+@statistic("intensity", "frequency of each bit in the samples", x="bit")
 def bits(look: Look) -> Curve | None:
     """How much more often than every second time each of the lowest bits is set."""
     count = look.remainders
@@ -78,7 +84,7 @@ def bits(look: Look) -> Curve | None:
     return Curve(bit.astype(float), is_set @ count / count.sum() - 0.5)
 
 
-@statistic("intensity", "evenness of codes", x="codes a class", power=True)
+@statistic("intensity", "uniformity of ADC codes", x="codes a class", power=True)
 def code_classes(look: Look) -> Curve | None:
     """Scatter of how often codes come up, by their remainders on division by powers of two."""
     count = look.remainders

@@ -23,27 +23,27 @@ LEAST_DARKS = 5
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
 
 
-@statistic("noise", "variance of the residuals by level", x="bin of level", power=True)
+@statistic("noise", "residual variance against signal", x="bin of level", power=True)
 def variance_by_level(look: Look) -> Curve:
     """Mean square of residuals over their noise, in bins of the level."""
     return Curve(np.arange(LEVELS, dtype=float), look.by_level[1])
 
 
-@statistic("noise", "noise of the residuals", unit="e-", x="", power=True)
+@statistic("noise", "residual noise", unit="e-", x="", power=True)
 def residual_noise(look: Look) -> Curve:
     """Mean square of the residuals."""
     squares = np.einsum("tp,tp->p", look.electrons, look.electrons) / len(look.electrons)
     return Curve(np.zeros(1), np.array([float(squares[look.good.ravel()].mean())]))
 
 
-@statistic("noise", "variance of the residuals by place", x="cell of 4 × 4", power=True)
+@statistic("noise", "residual variance by position", x="cell of 4 × 4", power=True)
 def variance_by_place(look: Look) -> Curve | None:
     """Mean square of residuals over their noise, in cells of the window, row by row."""
     cells = by_cell(look.moments[0], look.good)
     return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
 
 
-@statistic("noise", "variance of the residuals by time", x="eighth of the frames", power=True)
+@statistic("noise", "residual variance against time", x="eighth of the frames", power=True)
 def variance_by_time(look: Look) -> Curve:
     """Mean square of residuals over their noise, in eighths of the frames."""
     squares = np.einsum("tyx,tyx->t", look.residual, look.residual) / look.good.sum()
@@ -58,7 +58,7 @@ def neighbours(look: Look) -> Curve:
     return Curve(np.arange(len(STEPS), dtype=float), _mean_product(sums, count))
 
 
-@statistic("noise", "correlation of neighbours by row", x="row of four, down then right")
+@statistic("noise", "correlation of neighbours by row, modulo 4", x="row of four, down then right")
 def neighbours_by_row(look: Look) -> Curve:
     """Correlation with the pixel below and to the right, for each row of four."""
     sums, count = (of[[STEPS.index((1, 0)), STEPS.index((0, 1))]] for of in look.neighbours)
@@ -69,7 +69,7 @@ def neighbours_by_row(look: Look) -> Curve:
     return Curve(np.arange(8.0), (value - value.mean(axis=1, keepdims=True)).ravel())
 
 
-@statistic("noise", "correlation of neighbours, bright less dark", x="neighbour")
+@statistic("noise", "correlation of neighbours, bright minus dark", x="neighbour")
 def neighbours_by_level(look: Look) -> Curve:
     """Covariance over shot noise in bright samples less that in dark ones."""
     keep = slice(None, None, look.thinned)
@@ -102,7 +102,7 @@ def _line_power(rest: F32, good: Mask) -> F64:
     return np.array(out)
 
 
-@statistic("noise", "noise of rows and columns", x="rows, columns", power=True)
+@statistic("noise", "row and column noise", x="rows, columns", power=True)
 def lines(look: Look) -> Curve:
     """Of the fringe frames' residuals."""
     return Curve(np.arange(2.0), _line_power(look.residual, look.good))
@@ -121,7 +121,7 @@ def _lines_of(kind: str) -> Statistic:
         return Curve(np.arange(2.0), np.average(values, axis=0, weights=weights))
 
     measured.__name__ = f"lines_of_{kind}"
-    title = f"noise of rows and columns in {kind} frames"
+    title = f"row and column noise in {kind} frames"
     return statistic("noise", title, x="rows, columns", power=True, sets=False)(measured)
 
 
@@ -144,7 +144,12 @@ def outliers(look: Look) -> Curve:
 
 
 @statistic(
-    "noise", "outliers in darks", x="sigma, low then high", unit="2 √count", sets=False, floor=1.0
+    "noise",
+    "outliers in dark frames",
+    x="sigma, low then high",
+    unit="2 √count",
+    sets=False,
+    floor=1.0,
 )
 def dark_outliers(evidence: Evidence) -> Curve | None:
     """The same of samples of darks, which last longer and have less noise."""
@@ -160,20 +165,26 @@ def dark_outliers(evidence: Evidence) -> Curve | None:
     return Curve(np.concatenate([-limits, limits]), value) if stacks else None
 
 
-@statistic("noise", "noise of the pixels", x="quantile", power=True)
+@statistic("noise", "noise distribution of the pixels", x="quantile", power=True)
 def pixel_noise(look: Look) -> Curve:
     """Quantiles over the pixels of the mean square of their residuals."""
     return Curve(np.array(QUANTILES), np.quantile(look.moments[0][look.good], QUANTILES))
 
 
-@statistic("noise", "fourth moments of the pixels", x="quantile")
+@statistic("noise", "kurtosis of the pixels' residuals", x="quantile")
 def pixel_peakedness(look: Look) -> Curve:
     """Quantiles over the pixels of the kurtosis of their residuals."""
     second, fourth = (moment[look.good] for moment in look.moments)
     return Curve(np.array(QUANTILES), np.quantile(fourth / second**2, QUANTILES))
 
 
-@statistic("noise", "noise of the pixels in bias frames", x="quantile", power=True, sets=False)
+@statistic(
+    "noise",
+    "read noise distribution of the pixels (bias frames)",
+    x="quantile",
+    power=True,
+    sets=False,
+)
 def read_noise(evidence: Evidence) -> Curve | None:
     """Quantiles over all pixels of their variance over the read noise's."""
     stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= 8]

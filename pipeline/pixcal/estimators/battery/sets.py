@@ -13,7 +13,9 @@ SAME = 0.98
 """Cosine of the angle below which two sets measure along the same axis."""
 
 
-@statistic("space", "maps of two sets alike", x="contrast, light of each pair", together=True)
+@statistic(
+    "space", "correlation of maps between sets", x="contrast, light of each pair", together=True
+)
 def alike(looks: Sequence[Look]) -> Curve | None:
     """Correlation of the maps of each pair of sets."""
     values = [
@@ -29,7 +31,9 @@ def _correlation(one: F64, other: F64) -> float:
     return float(np.corrcoef(one[good], other[good])[0, 1])
 
 
-@statistic("space", "offsets of two sets apart", unit="px", x="pair", power=True, together=True)
+@statistic(
+    "space", "difference of offsets between sets", unit="px", x="pair", power=True, together=True
+)
 def apart(looks: Sequence[Look]) -> Curve | None:
     """Mean square of the difference of the offsets along one axis, by two baselines."""
     values = []

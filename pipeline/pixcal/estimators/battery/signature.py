@@ -1,4 +1,4 @@
-"""What the estimate of an effect sees, as one more statistic.
+"""Detection significance of an effect as one more statistic.
 
 The battery looks at everything and so at nothing as sharply as an effect's own estimator does. For
 candidates that are seen weakly on the frames they are fitted on, the estimate's significance on the
@@ -32,7 +32,7 @@ def statistic_named(name: str) -> Statistic:
     if name in battery():
         return battery()[name]
     effect, _, domain = name.removeprefix(_PREFIX).rpartition(_INFIX)
-    title = f"what the estimate of {effect} sees"
+    title = f"detection significance of {effect}"
 
     def nothing(_: object) -> None:
         return None

@@ -17,6 +17,11 @@ from pixcal.estimators.structure import (
 
 UNITS = {"offset": "px", "contrast": "", "light": ""}
 LINES = {0: "rows", 1: "columns"}
+VARIATION = {
+    "offset": "curvature",
+    "contrast": "large-scale variation",
+    "light": "large-scale variation",
+}
 BINS = 6
 FLOOR = 0.3
 """Least standard deviation of a term over the one that the map's own scatter gives."""
@@ -28,7 +33,7 @@ def _repeats(name: str, axis: int) -> Statistic:
         return Curve(np.array(PERIODS, float), size)
 
     measured.__name__ = f"{name}_{LINES[axis]}_repeat"
-    title = f"{name}: {LINES[axis]} that repeat"
+    title = f"{name}: periodic pattern of {LINES[axis]}"
     return statistic("space", title, unit=UNITS[name], x=f"period, {LINES[axis]}")(measured)
 
 
@@ -50,7 +55,7 @@ def _fringes(name: str) -> Statistic:
         return Curve(np.array([1.0, 1.25, 2.0, 2.25]), fit_terms(values, terms))
 
     measured.__name__ = f"{name}_fringes"
-    title = f"{name}: fringes left, once and twice the frequency"
+    title = f"{name}: residual fringes, first and second harmonic"
     return statistic("space", title, unit=UNITS[name], x="harmonic (cosine, sine)")(measured)
 
 
@@ -69,7 +74,7 @@ def _low_orders(name: str) -> Statistic:
         return Curve(np.arange(first, len(terms), dtype=float), (size / error)[first:])
 
     measured.__name__ = f"{name}_bending"
-    title = f"{name}: bending over the window"
+    title = f"{name}: {VARIATION[name]}"
     # Of light, whose surface is taken off, nothing is left but what outliers do to it.
     return statistic("space", title, unit="sigma", x="Legendre term", floor=FLOOR)(measured)
 
@@ -86,7 +91,7 @@ def _scales(name: str) -> Statistic:
         return _binned(radius[apart], power[apart] * values.size, 0.5)
 
     measured.__name__ = f"{name}_scales"
-    title = f"{name}: power by scale"
+    title = f"{name}: power by spatial frequency"
     return statistic("space", title, unit=UNITS[name], x="cycles a pixel", power=True)(measured)
 
 
@@ -102,7 +107,7 @@ def _peak(name: str) -> Statistic:
         return Curve(np.array([float(np.hypot(fy[at[0], 0], fx[0, at[1]]))]), np.array([highest]))
 
     measured.__name__ = f"{name}_peak"
-    title = f"{name}: strongest period of its own"
+    title = f"{name}: strongest isolated spatial frequency"
     return statistic("space", title, unit=UNITS[name], x="cycles a pixel", power=True)(measured)
 
 
@@ -113,7 +118,7 @@ def _by_place(name: str) -> Statistic:
         return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
 
     measured.__name__ = f"{name}_by_place"
-    title = f"{name}: power by place"
+    title = f"{name}: power by position"
     return statistic("space", title, unit=UNITS[name], x="cell of 4 × 4", power=True)(measured)
 
 

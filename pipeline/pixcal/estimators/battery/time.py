@@ -30,9 +30,9 @@ def _spectrum(name: str) -> Statistic:
         return power_of(look.frames[name])
 
     measured.__name__ = f"{name}_of_frames"
-    return statistic("time", f"{title} of the frames", unit=unit, x="cycles a frame", power=True)(
-        measured
-    )
+    return statistic(
+        "time", f"{title}: spectrum over the frames", unit=unit, x="cycles a frame", power=True
+    )(measured)
 
 
 def power_of(series: F64) -> Curve:
@@ -48,7 +48,7 @@ def power_of(series: F64) -> Curve:
     return Curve(np.array(middle), np.array(value))
 
 
-@statistic("time", "what other frames left in this one", x="frames before")
+@statistic("time", "signal carried over from other frames", x="frames before")
 def frames_before(look: Look) -> Curve:
     """Share of another frame's fringes in the residuals.
 
@@ -68,7 +68,7 @@ def frames_before(look: Look) -> Curve:
     return Curve(np.array(LAGS, float), np.array(values))
 
 
-@statistic("time", "contrast by the step of the phase since frames before", x="frames before")
+@statistic("time", "contrast against the phase step from earlier frames", x="frames before")
 def contrast_by_step(look: Look) -> Curve:
     """Slope of the contrast against the cosine of the step."""
     contrast, phi = look.frames["contrast"], look.found.phi
@@ -81,7 +81,7 @@ def contrast_by_step(look: Look) -> Curve:
     return Curve(np.array(LAGS[:3], float), np.array(values))
 
 
-@statistic("time", "contrast and intensity by the phase", x="term")
+@statistic("time", "contrast and intensity against phase", x="term")
 def frames_by_phase(look: Look) -> Curve:
     """Amplitudes of contrast and intensity at one, two and three times the frame's phase."""
     phi = look.found.phi
@@ -95,7 +95,13 @@ def frames_by_phase(look: Look) -> Curve:
     return Curve(np.arange(len(value), dtype=float), value)
 
 
-@statistic("time", "offsets from batch to batch", unit="px", x="batches averaged", power=True)
+@statistic(
+    "time",
+    "Allan deviation of the offsets over batches",
+    unit="px",
+    x="batches averaged",
+    power=True,
+)
 def allan_of_batches(look: Look) -> Curve | None:
     """Allan variance of the pixels' offsets, over lengths of one, two and four batches."""
     found = look.found
@@ -138,7 +144,7 @@ def _of_stacks(kind: str) -> Statistic:
 
     measured.__name__ = f"{kind}_of_frames"
     return statistic(
-        "time", f"mean of {kind} frames", unit="" if kind == "flat" else "e-",
+        "time", f"mean of {kind} frames: spectrum", unit="" if kind == "flat" else "e-",
         x="bin of frequency", power=True, sets=False,
     )(measured)  # fmt: skip
 
@@ -148,7 +154,7 @@ SPECTRA = tuple(_spectrum(name) for name in SERIES)
 STACKS = tuple(_of_stacks(kind) for kind in ("bias", "dark", "flat"))
 
 
-@statistic("time", "level of bias frames, first to last", unit="e-", x="", sets=False)
+@statistic("time", "trend of the bias level", unit="e-", x="", sets=False)
 def bias_trend(evidence: Evidence) -> Curve | None:
     """Slope of the mean of bias and dark frames over their run, last less first."""
     values = []

@@ -15,6 +15,7 @@ from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.gap import Reference, compare, expect_nominal, expect_with
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate
+from pixcal.stages.diagnose.deciding import MORE
 from pixcal.stages.diagnose.look import Look, look_at, plain_part
 from pixcal.stages.diagnose.result import by_domain
 from pixcal.stages.diagnose.search import CONFIRM, SCREEN, SURE, Candidate, Found, Search
@@ -93,6 +94,9 @@ def inquire(
         return signatures
 
     look = look_at(run_dir, scratch, runtime, learnt)
+    for name, candidate in candidates.items():
+        if candidate.estimate is None and not candidate.reason:
+            candidate.reason = _needs(kinds[name], look.facts)
     estimates = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
     trials = Trials(look.windows, scratch, look.runtime, signatures, estimates, SCREEN)
     (nominal,) = trials.curves([base], REFERENCES, "nominal bench")
@@ -157,7 +161,10 @@ def places(made: Inquiry) -> list[dict[str, Any]]:
 
 
 def _candidates(
-    evidence: Evidence, kinds: Mapping[str, type[Effect]], base: Effects, runtime: Runtime
+    evidence: Evidence,
+    kinds: Mapping[str, type[Effect]],
+    base: Effects,
+    runtime: Runtime,
 ) -> dict[str, Candidate]:
     there = {effect.name for effect in base}
     tried = {name: kind for name, kind in kinds.items() if name not in there}
@@ -167,9 +174,16 @@ def _candidates(
         if isinstance(one, Estimate):
             candidates[name] = Candidate(name, one)
         else:
-            reason = one or "the acquisition holds no frames that could tell"
-            candidates[name] = Candidate(name, None, reason)
+            candidates[name] = Candidate(name, None, one or "")
     return candidates
+
+
+def _needs(kind: type[Effect], facts: Mapping[str, Any]) -> str:
+    """Frames without which an effect cannot be estimated."""
+    frames = [words for name, words in facts["missing_frames"].items() if name in kind.told_by]
+    if not frames:
+        frames = [MORE if facts["sets"] else "fringes"]
+    return f"needs frames that this acquisition lacks: {' or '.join(frames)}"
 
 
 def _replayed(candidate: Candidate, unseen: Evidence) -> Effect | None:
