@@ -4,9 +4,11 @@ import errno
 import os
 import signal
 import sys
+import threading
 import traceback
 import warnings
 from collections.abc import Sequence
+from types import FrameType
 
 import click
 
@@ -113,6 +115,14 @@ def one_line(message: str) -> str:
     return " ".join(w if len(w) < LONG_WORD else f"{w[:150]}…{w[-150:]}" for w in words)
 
 
+_interrupted = threading.Event()
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    _interrupted.set()
+    signal.default_int_handler(number, frame)
+
+
 def invoke(args: Sequence[str]) -> int:
     """Run one command line.
 
@@ -126,7 +136,10 @@ def invoke(args: Sequence[str]) -> int:
             cli.main(args, prog_name="pixcal", standalone_mode=False)
         code = _run(args)
         sys.stdout.flush()
-    except (Exception, KeyboardInterrupt) as error:
+    except (Exception, KeyboardInterrupt) as raised:
+        # Libraries that are interrupted while they load tell of it as they like.
+        lost = isinstance(raised, ImportError) and _interrupted.is_set()
+        error = KeyboardInterrupt() if lost else raised
         if os.environ.get("PIXCAL_DEBUG"):
             traceback.print_exc()
         code, message = explain(error)
@@ -150,6 +163,8 @@ def main() -> None:
     if not sys.warnoptions and not os.environ.get("PIXCAL_DEBUG"):
         # Libraries warn of what pixcal checks itself; what a user must know is in the results.
         warnings.simplefilter("ignore")
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     code = invoke(sys.argv[1:])
     # Nothing is left to be interrupted, and the interpreter would complain as it goes.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
