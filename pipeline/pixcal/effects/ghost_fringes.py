@@ -18,8 +18,6 @@ F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
 
 PARENTS = ("modulated", "fixed", "both", "crossed")
-_TIED = 4.0
-"""Standard deviations beyond which an amplitude is not zero, or two are not alike."""
 
 
 @dataclass(frozen=True)

@@ -60,7 +60,7 @@ def relative_gain(flat: F64, noise: F64, good: Mask) -> F64:
 
 
 def _profile(values: F64, axis: int) -> F64:
-    """Median of each row (axis 0) or column (1); of empty ones that of all."""
+    """Mean of each row (axis 0) or column (1); of empty ones the median of all."""
     count = np.isfinite(values).sum(axis=1 - axis)
     found = np.full(values.shape[axis], np.nanmedian(values))
     kept = np.compress(count > 0, values, axis=axis)
