@@ -242,18 +242,19 @@ def show_diagnosis(run: Path) -> None:
 
 def _show_cause(cause: Mapping[str, Any]) -> None:
     """Print the law of a cause, and the frames that would distinguish it from others."""
-    if law := cause.get("law"):
-        by_law, whole = (100 * cause[key] for key in ("gap_closed_by_law", "gap_closed"))
-        alone = (
-            f"; the law alone closes {by_law:.1f} %" if f"{by_law:.1f}" != f"{whole:.1f}" else ""
-        )
-        click.echo(f"  {cause['effect']}: {law}{alone}")
+    law, by_law = cause.get("law", ""), cause.get("gap_closed_by_law", cause["gap_closed"])
+    differs = abs(by_law - cause["gap_closed"]) > LAW_DIFFERS
+    alone = f"the law alone closes {100 * by_law:.1f} %" if differs else ""
+    if law or alone:
+        click.echo(f"  {cause['effect']}: {'; '.join(filter(None, (law, alone)))}")
     if cause["would_decide"]:
         others = " or ".join(cause["not_told_apart_from"])
         frames = "; ".join(cause["would_decide"])
         click.echo(f"  recommended frames to distinguish {cause['effect']} from {others}: {frames}")
 
 
+LAW_DIFFERS = 0.02
+"""Difference of the shares closed by a cause and by its law alone that is printed."""
 MOST_ROWS = 8
 """Largest number of differences that are printed."""
 LEAST_CHANCE = 1e-12

@@ -112,7 +112,7 @@ def test_what_is_there_is_taken_and_what_is_not_is_left() -> None:
     found, left = search({"left": 0.03}, [candidate("left", 0.0301), candidate("right", 0.03)])
     assert found.taken == ("left",)
     assert left < 0.05
-    assert found.candidates["right"].reason == "the unseen frames get no likelier with it"
+    assert found.candidates["right"].reason == "the held-out frames are not fitted better"
 
 
 def test_two_effects_are_both_found_in_any_order() -> None:
@@ -130,7 +130,7 @@ def test_of_two_that_are_alike_the_one_that_opens_no_gap_is_taken() -> None:
         {"left": 0.03}, [candidate("mimic", 0.03), candidate("left", 0.03)], {"mimic": 49.0}
     )
     assert found.taken == ("left",)
-    assert found.candidates["mimic"].reason == "what left does looks like it"
+    assert found.candidates["mimic"].reason == "explained by left, which has a similar signature"
 
 
 def test_effects_that_no_unseen_frame_tells_apart_are_named_together() -> None:
@@ -198,7 +198,7 @@ def test_once_nothing_differs_only_what_is_sure_is_tried() -> None:
         found = sought(sigmas, mimicked)
         assert found.taken == ("left",)
         assert frozenset({"left", "right"}) not in tried
-        assert "3.0 sigma beside left" in found.candidates["right"].reason
+        assert "3.0 sigma in addition to left" in found.candidates["right"].reason
 
 
 def test_what_will_be_estimated_again_is_asked_for_when_a_bench_is_confirmed() -> None:
@@ -250,7 +250,7 @@ def test_a_cause_beyond_the_most_is_told_that_no_more_were_sought() -> None:
     found, _ = search(truth, [candidate(label, 0.03) for label in SINGLE])
     (left_out,) = set(SINGLE) - set(found.taken)
     assert len(found.taken) == MOST
-    assert "no more are sought" in found.candidates[left_out].reason
+    assert "the search stops after" in found.candidates[left_out].reason
 
 
 def test_an_effect_that_was_hinted_at_and_not_taken_is_told_so() -> None:
@@ -261,10 +261,10 @@ def test_an_effect_that_was_hinted_at_and_not_taken_is_told_so() -> None:
             candidate("left", 0.03), candidate("little", 0.0035, sigmas=3.0),
         ], None, seed)  # fmt: skip
         reasons[seed] = found.candidates["little"].reason
-    told = [r for r in reasons.values() if "only hint at" in r]
+    told = [r for r in reasons.values() if "rises by only" in r]
     assert told
     for reason in told:
-        gain = float(reason.split("by ")[1].split(" in")[0])
+        gain = float(reason.split("by only ")[1].split(";")[0])
         assert LEAST <= gain < LEAST_OF_HINTED
 
 

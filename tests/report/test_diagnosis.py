@@ -317,11 +317,15 @@ def test_what_was_considered_and_looked_at_is_folded() -> None:
 @pytest.mark.usefixtures("without_figures")
 def test_a_cause_names_its_law_and_what_that_closes_where_it_differs() -> None:
     law = "rows exposed while the phase steps"
-    for by_law, shown in ((0.5, "; the law alone closes 50\u00a0% of the gap."), (0.8, ".")):
+    for by_law, shown in ((0.5, ". The law alone closes 50\u00a0% of the gap."), (0.79, ".")):
         cause = a_cause(law=law, gap_closed_by_law=by_law)
         section = diagnosis(contents(a_diagnosis(causes=(cause,))))
         assert f"Law: {law}{shown}" in text_of(section)
     assert "Law:" not in text_of(diagnosis(contents(a_diagnosis())))
+    cause = a_cause(law="", gap_closed_by_law=0.5)
+    shown = text_of(diagnosis(contents(a_diagnosis(causes=(cause,)))))
+    assert "The law alone closes 50" in shown
+    assert "Law:" not in shown
 
 
 @pytest.mark.usefixtures("without_figures")

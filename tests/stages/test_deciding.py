@@ -59,10 +59,10 @@ def missing(
         (missing(((6, 0), (9, 0)), LADDER), ("ghost_fringes",),
          ["a fringe set along another axis"]),
         (missing(FOUR, LADDER[:1]), ("nonlinearity",),
-         ["a ladder of flats (at least 3 exposure times)"]),
+         ["flats at 3 or more exposure times"]),
         (missing(FOUR, LADDER[:1]), ("row_noise",), [MORE]),
         (missing(FOUR, ()), ("mine",),
-         ["flat frames", "a ladder of flats (at least 3 exposure times)"]),
+         ["flat frames", "flats at 3 or more exposure times"]),
     ],
 )  # fmt: skip
 def test_frames_that_would_decide_are_those_that_are_missing(

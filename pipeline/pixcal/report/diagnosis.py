@@ -32,6 +32,8 @@ SHOWN = 12
 PLOTS = 3
 """Statistics that are drawn for each cause, and of what remains."""
 NEW = "introduced by the causes"
+LAW_DIFFERS = 0.02
+"""Difference of the shares closed by a cause and by its law alone that is shown."""
 
 _READ = (
     "Top: data (dots) and simulations (squares or lines); error bars are ±1σ of the simulations. "
@@ -173,12 +175,11 @@ def _cause(rank: int, cause: Facts, found: Diagnosis) -> Iterator[Block]:
 
 def _law(cause: Facts) -> str:
     """The law of a cause, and what it closes by itself where that differs."""
-    law = cause.get("law")
-    if not law:
-        return ""
-    by_law, whole = (percent(cause[key]) for key in ("gap_closed_by_law", "gap_closed"))
-    alone = "" if by_law == whole else f"; the law alone closes {by_law} of the gap"
-    return f"Law: {law}{alone}."
+    law, by_law = cause.get("law", ""), cause.get("gap_closed_by_law", cause["gap_closed"])
+    alone = ""
+    if abs(by_law - cause["gap_closed"]) > LAW_DIFFERS:
+        alone = f"The law alone closes {percent(by_law)} of the gap."
+    return " ".join(filter(None, (f"Law: {law}." if law else "", alone)))
 
 
 def _advice(words: str, frames: Sequence[str] | None) -> str:

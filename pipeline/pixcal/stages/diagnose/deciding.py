@@ -46,7 +46,7 @@ def missing_frames(
             missing[kind] = f"{kind} frames"
     exposures = {t for t in tables.get("flat", {}).get("exptime_s", ()) if t is not None}
     if len(exposures) < LADDER:
-        missing["ladder"] = f"a ladder of flats (at least {LADDER} exposure times)"
+        missing["ladder"] = f"flats at {LADDER} or more exposure times"
     if steps and all(steps):
         missing["random"] = RANDOM
     return missing

@@ -193,7 +193,7 @@ def _evidence(
     except InputError as error:
         which = ("first", "second")[number]
         reason = str(error).replace(f"{folder}: ", "")
-        raise InputError(f"{run_dir}: the {which} half of its frames: {reason}") from error
+        raise InputError(f"{run_dir}: in the {which} half of the frames, {reason}") from error
     finally:
         # Stages would take what is left of one window for up to date in the next.
         shutil.rmtree(folder, ignore_errors=True)

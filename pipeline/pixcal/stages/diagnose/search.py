@@ -124,7 +124,7 @@ class Found:
 
 def looks_like(name: str) -> str:
     """Why an effect is not sought any more beside another that was taken."""
-    return f"what {name} does looks like it"
+    return f"explained by {name}, which has a similar signature"
 
 
 class Search:
@@ -210,7 +210,7 @@ class Search:
                 del open_ones[name], shares[name]
         if len(taken) == MOST:
             for candidate in open_ones.values():
-                candidate.reason = f"{MOST} causes were found before it, and no more are sought"
+                candidate.reason = f"not tested: the search stops after {MOST} causes"
         return self._ablated(taken, effects, current, candidates, alike)
 
     def _drop_unseen(
@@ -232,10 +232,9 @@ class Search:
             candidate = open_ones[name]
             assert candidate.estimate is not None
             if size < least or candidate.estimate.effect.is_null:
-                beside = f" beside {' and '.join(e.name for e in current.effects)}"
+                beside = f" in addition to {' and '.join(e.name for e in current.effects)}"
                 candidate.reason = (
-                    f"not seen in the frames it was fitted on ({size:.1f} sigma"
-                    f"{beside if current.effects else ''})"
+                    f"not significant ({size:.1f} sigma{beside if current.effects else ''})"
                 )
                 del open_ones[name]
 
@@ -243,10 +242,10 @@ class Search:
     def _too_little(gain: float) -> str:
         """Why an effect that was tried is not taken."""
         if gain < LEAST:
-            return "the unseen frames get no likelier with it"
+            return "the held-out frames are not fitted better"
         return (
-            f"the unseen frames get likelier with it (by {gain:.1f} in the logarithm), but less "
-            f"than the {LEAST_OF_HINTED:g} asked of what the first frames only hint at"
+            f"the log-likelihood of the held-out frames rises by only {gain:.1f}; an effect of "
+            f"weak significance needs {LEAST_OF_HINTED:g}"
         )
 
     @staticmethod
@@ -370,7 +369,7 @@ class Search:
             candidates[least].reason = reason
             for candidate in candidates.values():
                 if candidate.reason == looks_like(least):
-                    candidate.reason = f"what {least} does looks like it, and {least}: {reason}"
+                    candidate.reason = f"similar to {least}, which was rejected: {reason}"
             taken.remove(least)
             del effects[least]
             current = fewer
@@ -406,7 +405,7 @@ class Search:
         least = min(worth, key=lambda n: worth[n], default=None)
         if least is None or worth[least] >= LEAST:
             return None
-        return least, "the other effects do without it"
+        return least, "the other causes explain the data as well without it"
 
     def _doubtful(self, current: Trial, without: Mapping[str, Trial]) -> tuple[str, str] | None:
         """An effect that closes little of a gap that stays open: it may stand in for another."""
@@ -424,8 +423,8 @@ class Search:
         if least is None or gains[least] >= LITTLE:
             return None
         return least, (
-            f"closes {max(gains[least], 0):.1%} of a gap of which {open_still:.0%} stays "
-            "unexplained: too little to be told from the unknown cause"
+            f"closes only {max(gains[least], 0):.1%} of the gap while {open_still:.0%} stays "
+            "unexplained; it may stand in for an unknown cause"
         )
 
     def _each_left_out(
@@ -436,5 +435,5 @@ class Search:
             for name in (taken if len(taken) > 1 else ())
         }
         # All at once, side by side; below they are at hand.
-        self._simulate(list(benches.values()), CONFIRM, "one left out", ())
+        self._simulate(list(benches.values()), CONFIRM, "each cause left out", ())
         return {name: self._start(benches.get(name, ())) for name in taken}

@@ -261,7 +261,7 @@ def estimate(evidence: Evidence, kind: type[Effect]) -> Estimate | str | None:
     try:
         found = kind.estimate(evidence)
     except NotImplementedError:
-        return "its file does not say how to estimate it"
+        return "its file defines no estimate"
     except np.linalg.LinAlgError:
         return "cannot be estimated here: these frames do not determine its parameters"
     except (InputError, ValueError, ArithmeticError) as error:
