@@ -1,5 +1,7 @@
 """Write again what is generated in docs/: help texts, files, layers, the tutorial's pictures.
 
+And ``pixcal/__init__.pyi``, from the options of the commands.
+
 A page names what follows: ``<!-- commands -->`` the help of all commands, to its end;
 ``<!-- file: examples/glow.py -->`` a fenced block; ``<!-- keys: SimulatedOptics -->`` a table.
 """
@@ -14,6 +16,7 @@ from click.testing import CliRunner
 
 import pixcal
 from documentation.layers import picture
+from documentation.stub import STUB, stub
 from pixcal.model import acquisition, bench
 from pixcal_cli.main import cli
 
@@ -108,6 +111,7 @@ def main() -> None:
     """Write everything."""
     LAYERS.parent.mkdir(exist_ok=True)
     LAYERS.write_text(picture(), encoding="utf-8")
+    STUB.write_text(stub(), encoding="utf-8")
     for page in sorted(DOCS.rglob("*.md")):
         before = page.read_text(encoding="utf-8")
         if (after := filled(before)) != before:

@@ -7,7 +7,8 @@ from typing import Any
 
 import click
 
-from pixcal_cli.options import examples
+from pixcal.model.options import Budget
+from pixcal_cli.options import PATH, bench_argument, config_options, examples
 from pixcal_cli.results import show_notes, show_table
 
 LIMITS = {
@@ -25,33 +26,13 @@ LIMITS = {
         "pixcal budget configs/paper.yaml --precision 5e-4 --frames 10000 --out budget",
     )
 )
-@click.argument("bench", metavar="BENCH.yaml", type=click.Path(path_type=Path))
+@bench_argument
+@config_options(Budget)
 @click.option(
-    "--precision",
-    type=click.FloatRange(1e-9, 1),
-    default=None,
-    show_default="5e-5 without --frames",
-    metavar="PX",
-    help="Wanted 1-sigma error of a pixel's offset on each axis.",
-)
-@click.option(
-    "--frames",
-    type=click.IntRange(1),
-    default=None,
-    metavar="N",
-    help="Frames of each fringe set: tells the precision that they reach.",
-)
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=None,
-    metavar="DIR",
-    help="Write budget.json and the picture budget.png there.",
+    "--out", type=PATH, metavar="DIR", help="Write budget.json and the picture budget.png there."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the contents of budget.json.")
-def budget(
-    bench: Path, precision: float | None, frames: int | None, out: Path | None, as_json: bool
-) -> None:
+def budget(bench: Path, config: Budget, out: Path | None, as_json: bool) -> None:
     """Tell frames and hours that a precision takes, before any are taken.
 
     BENCH.yaml describes a bench as for `pixcal simulate`. The numbers are the Cramér-Rao bound:
@@ -59,7 +40,7 @@ def budget(
     """
     from pixcal.stages import budget as stage  # here: for a fast `pixcal --help`
 
-    found = stage.run(bench, stage.Config(precision, frames), out)
+    found = stage.run(bench, config, out)
     if as_json:
         click.echo(json.dumps(found, indent=2))
         return

@@ -5,9 +5,7 @@ from pathlib import Path
 import click
 
 from pixcal.model.errors import InputError
-from pixcal_cli.options import examples, run_argument
-
-PATH = click.Path(path_type=Path)
+from pixcal_cli.options import PATH, examples, run_argument
 
 
 @click.command(

@@ -6,50 +6,36 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pixcal.model.options import Compare
 from pixcal.storage.artefact import read_json
 from pixcal_cli import results
-from pixcal_cli.options import examples, runtime_options
+from pixcal_cli.options import PATH, Command, command
 
 if TYPE_CHECKING:
     from pixcal.engine.run import Runtime
 
 
-@click.command(
-    epilog=examples(
-        "pixcal compare demo",
-        "pixcal compare monday tuesday --out repeatability",
+def runs_and_out(body: Command) -> Command:
+    """The runs, and where the result goes."""
+    out = click.option(
+        "--out",
+        type=PATH,
+        default=Path("compare"),
+        show_default=True,
+        metavar="DIR",
+        help="Directory of compare.json and compare.png.",
     )
+    runs = click.argument("runs", metavar="RUN [RUN]...", type=PATH, nargs=-1, required=True)
+    return runs(out(body))
+
+
+@command(
+    Compare,
+    "pixcal compare demo",
+    "pixcal compare monday tuesday --out repeatability",
+    argument=runs_and_out,
 )
-@click.argument(
-    "runs", metavar="RUN [RUN]...", type=click.Path(path_type=Path), nargs=-1, required=True
-)
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    default=Path("compare"),
-    show_default=True,
-    metavar="DIR",
-    help="Directory of compare.json and compare.png.",
-)
-@click.option(
-    "--split",
-    type=click.Choice(["halves", "odd-even"]),
-    default="halves",
-    show_default=True,
-    help="Parts of a single run: its first and second half, or every other batch of frames.",
-)
-@click.option(
-    "--sigma-accuracy",
-    type=click.FloatRange(0, 0.5),
-    default=0.02,
-    show_default=True,
-    metavar="SHARE",
-    help="Relative error of the maps' SIGMA that is no difference yet.",
-)
-@runtime_options
-def compare(
-    runs: tuple[Path, ...], out: Path, split: str, sigma_accuracy: float, runtime: "Runtime"
-) -> None:
+def compare(runs: tuple[Path, ...], out: Path, config: Compare, runtime: "Runtime") -> None:
     """Tell what maps of the same pixels have in common, and what not, scale by scale.
 
     Two fitted runs or more of windows of the same shape, or one run against itself.
@@ -57,7 +43,7 @@ def compare(
     from pixcal.stages import compare as stage  # here: for a fast `pixcal --help`
 
     with results.announce("compare", out):
-        stage.run(runs, out, stage.Config(split, sigma_accuracy), runtime)
+        stage.run(runs, out, config, runtime)
     _show(read_json(out / "compare.json"))
     for file in sorted(out.glob("compare*.*")):
         click.echo(f"  {file}")

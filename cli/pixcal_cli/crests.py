@@ -5,49 +5,22 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from pixcal.model.options import Crests
 from pixcal.storage.artefact import read_json
 from pixcal_cli import results
-from pixcal_cli.options import examples, run_argument, runtime_options
+from pixcal_cli.options import command
 
 if TYPE_CHECKING:
     from pixcal.engine.run import Runtime
 
 
-@click.command(epilog=examples("pixcal crests demo", "pixcal crests demo --frames 1 --paths 4"))
-@run_argument
-@click.option(
-    "--frames",
-    type=click.IntRange(1),
-    default=8,
-    show_default=True,
-    metavar="N",
-    help="Frames to use, spread over the run.",
-)
-@click.option(
-    "--paths",
-    type=click.IntRange(2),
-    default=None,
-    show_default="all",
-    metavar="N",
-    help="Crests and valleys to use of each end, the outermost.",
-)
-@click.option(
-    "--segment",
-    type=click.IntRange(4),
-    default=None,
-    show_default="an eighth of the window, 8 to 128",
-    metavar="PX",
-    help="Length along a fringe that gives one point.",
-)
-@runtime_options
-def crests(
-    run: Path, frames: int, paths: int | None, segment: int | None, runtime: "Runtime"
-) -> None:
+@command(Crests, "pixcal crests demo", "pixcal crests demo --frames 1 --paths 4")
+def crests(run: Path, config: Crests, runtime: "Runtime") -> None:
     """Find the fibres from crests and valleys, a check of the fit."""
     from pixcal.stages import crests as stage  # here: for a fast `pixcal --help`
 
     with results.announce("crests", run / "crests"):
-        stage.run(run, stage.Config(frames, paths, segment), runtime)
+        stage.run(run, config, runtime)
     for name, found in read_json(run / "crests" / "crests.json")["sets"].items():
         _show(name, found)
         click.echo(f"  {run / 'products' / f'crests-{name}.png'}")

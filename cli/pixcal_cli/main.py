@@ -14,21 +14,14 @@ import click
 
 from pixcal import __version__
 from pixcal.model.errors import ClusterError, PixcalError
-from pixcal_cli.allan import allan
 from pixcal_cli.astrometry import astrometry
 from pixcal_cli.blind import blind
 from pixcal_cli.budget import budget
 from pixcal_cli.centroids import centroids, wcs
 from pixcal_cli.compare import compare
 from pixcal_cli.crests import crests
-from pixcal_cli.diagnose import diagnose
-from pixcal_cli.fit import fit
-from pixcal_cli.ingest import ingest
 from pixcal_cli.options import examples
-from pixcal_cli.reduce import reduce
-from pixcal_cli.report import report
-from pixcal_cli.run import run
-from pixcal_cli.simulate import simulate
+from pixcal_cli.steps import allan, diagnose, fit, ingest, reduce, report, run, simulate
 
 LONG_WORD = 600
 """Characters of a word, such as a value that makes no sense, that are not shown in full."""

@@ -1,12 +1,17 @@
-"""Arguments and options that several commands share, and the types of their values."""
+"""Options of the commands from the dataclasses of `pixcal.model.options`; arguments they share."""
 
 import functools
+import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, Field, fields
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import click
+
+from pixcal.model.options import Region
 
 Command = Callable[..., Any]
 
@@ -24,7 +29,7 @@ def memory_size(text: str) -> int:
     return size
 
 
-def region(text: str) -> tuple[int, int, int, int]:
+def region(text: str) -> Region:
     """Limits (y0, y1, x0, x1) of a rectangle written ``y0:y1,x0:x1``, ends excluded."""
     found = re.fullmatch(r"(\d{1,6}):(\d{1,6}),(\d{1,6}):(\d{1,6})", text.strip())
     if found is None:
@@ -41,44 +46,92 @@ def examples(*lines: str) -> str:
     return "\n".join(["\b", title, *(f"  {line}" for line in lines)])
 
 
-acquisition_argument = click.argument("acquisition", metavar="ACQ", type=click.Path(path_type=Path))
-run_argument = click.argument("run", metavar="RUN", type=click.Path(path_type=Path))
+PATH = click.Path(path_type=Path)
+acquisition_argument = click.argument("acquisition", metavar="ACQ", type=PATH)
+run_argument = click.argument("run", metavar="RUN", type=PATH)
+bench_argument = click.argument("bench", metavar="BENCH.yaml", type=PATH)
 out_run_option = click.option(
     "--out",
     "run",
     metavar="RUN",
     required=True,
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="Directory of the results; made if it is not there.",
 )
-overwrite_option = click.option(
-    "--overwrite", is_flag=True, help="Replace what was ingested from another acquisition."
-)
-copy_option = click.option(
-    "--copy",
-    is_flag=True,
-    help="Copy the samples of all frames: later steps do without the files of ACQ.",
-)
-cubes_option = click.option(
-    "--cubes",
-    metavar="PLACE",
-    help="Folder or URL (s3://bucket/prefix) for the large cubes; RUN to keep them there. "
-    "[default: as before, or as in ingest; else RUN]",
-)
-gain_option = click.option(
-    "--gain",
-    type=click.Choice(["declared", "measured"]),
-    default="declared",
-    show_default=True,
-    help="The gain that electrons are counted with: the owner's, or that of the flats.",
-)
-model_option = click.option(
-    "--model",
-    type=click.Choice(["paraxial", "hyperbolic", "auto"]),
-    default="auto",
-    show_default=True,
-    help="Shape of the fringes: straight, hyperbolic, or whichever the phases call for.",
-)
+
+
+class Finite(click.FloatRange):
+    """A number in a range; ``nan`` is in none."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """The number of a text."""
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a number.", param, ctx)
+        return number
+
+
+def config_options(kind: type) -> Callable[[Command], Command]:
+    """Add the options of a dataclass; the command receives an instance of it as ``config``."""
+    hints = get_type_hints(kind)
+    offered = [f for f in fields(kind) if not f.metadata.get("python_only")]
+
+    def decorate(command: Command) -> Command:
+        @functools.wraps(command)
+        def with_config(*args: Any, **values: Any) -> Any:
+            config = kind(**{f.name: values.pop(f.name) for f in offered})
+            return command(*args, config=config, **values)
+
+        found: Command = with_config
+        for field in reversed(offered):
+            found = _option(field, hints[field.name])(found)
+        return found
+
+    return decorate
+
+
+def _option(field: Field[Any], hint: Any) -> Callable[[Command], Command]:
+    meta, default = field.metadata, field.default
+    flag = meta.get("flag")
+    unit = meta["unit"].rstrip("-")
+    plain = field.name.removesuffix(f"_{unit}").replace("_", "-")
+    if get_origin(hint) is UnionType:
+        hint = get_args(hint)[0]
+    multiple = get_origin(hint) is tuple and get_args(hint)[-1] is Ellipsis
+    if multiple:
+        hint = get_args(hint)[0]
+    told = not (default in (None, (), MISSING) or (hint is bool and not flag))
+    number = (unit.upper() or "N") if hint in (int, float) else None
+    return click.option(
+        flag or f"--{plain}",
+        field.name,
+        type=_type(hint, meta),
+        multiple=multiple,
+        is_flag=hint is bool,
+        required=default is MISSING,
+        default=None if default is MISSING or multiple else default,
+        show_default=meta.get("shown") or told,
+        metavar=meta.get("metavar", number),
+        help=meta["doc"],
+    )
+
+
+def _type(hint: Any, meta: Mapping[str, Any]) -> Any:
+    """How click reads a value of some type."""
+    low, high, above = meta["low"], meta["high"], meta["above"]
+    if choices := get_args(hint) if get_origin(hint) is Literal else meta["choices"]:
+        return click.Choice(choices)
+    if hint == Region:
+        return region
+    if get_origin(hint) is tuple:
+        return tuple(_type(one, meta) for one in get_args(hint))
+    if hint is int:
+        return click.IntRange(low, high)
+    if hint is float:
+        return Finite(low if above is None else above, high, min_open=above is not None)
+    return PATH if hint is Path else hint
 
 
 def runtime_options(command: Command) -> Command:
@@ -119,3 +172,25 @@ def runtime_options(command: Command) -> Command:
         return command(*args, runtime=runtime, **options)
 
     return with_runtime
+
+
+def command(
+    kind: type, *lines: str, argument: Callable[[Command], Command] = run_argument
+) -> Callable[[Command], click.Command]:
+    """A command of RUN (or another argument) with the options of a dataclass and of how to run.
+
+    Parameters
+    ----------
+    kind : type
+        The body receives an instance as ``config``, and a `Runtime` as ``runtime``.
+    *lines : str
+        Examples for its help.
+    argument : callable
+        What stands before the options.
+    """
+
+    def decorate(body: Command) -> click.Command:
+        body = argument(config_options(kind)(runtime_options(body)))
+        return click.command(epilog=examples(*lines))(body)
+
+    return decorate

@@ -1,7 +1,7 @@
 """Maps of pixel response offsets from Young's fringes.
 
-What a notebook or a program needs is here, from `pixcal.api`: the commands as functions, runs
-opened as arrays, and `calibrate`, from arrays to maps.
+What a notebook or a program needs is here: the commands as functions, runs opened as arrays, and
+`calibrate`, from arrays to maps.
 """
 
 from importlib import import_module
@@ -10,40 +10,32 @@ from typing import Any
 
 __version__ = version("pixcal")
 
-__all__ = [
-    "FringeSet",
-    "InputError",
-    "OffsetMap",
-    "Picture",
-    "PixcalError",
-    "PixelFlag",
-    "Run",
-    "Runtime",
-    "__version__",
-    "allan",
-    "astrometry",
-    "budget",
-    "calibrate",
-    "compare",
-    "correct_centroids",
-    "crests",
-    "diagnose",
-    "distortion_wcs",
-    "fit",
-    "ingest",
-    "open_run",
-    "reduce",
-    "run",
-    "sample_acquisition",
-    "simulate",
-    "write_report",
-]
+_HOMES = {
+    "api.arrays": ("calibrate",),
+    "api.centroids": ("correct_centroids", "distortion_wcs"),
+    "api.commands": (
+        *("run", "ingest", "reduce", "fit", "allan", "crests", "diagnose", "astrometry"),
+        *("write_report", "compare", "simulate", "budget"),
+    ),
+    "api.opened": ("FringeSet", "OffsetMap", "Run", "open_run"),
+    "api.picture": ("Picture",),
+    "api.sample": ("sample_acquisition",),
+    "engine.run": ("Runtime",),
+    "model.errors": ("InputError", "PixcalError"),
+    "model.flags": ("PixelFlag",),
+}
+"""The public names by the module that holds them, which is loaded with their first use.
+
+``__init__.pyi`` is written from it, for type checkers and editors, by ``make doc-pages``.
+"""
+
+__all__ = sorted(["__version__", *(name for names in _HOMES.values() for name in names)])
 
 
 def __getattr__(name: str) -> Any:
-    # Loaded with its first use: `import pixcal` and the command line stay quick.
-    if name in __all__:
-        return getattr(import_module("pixcal.api"), name)
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f"pixcal.{home}"), name)
     raise AttributeError(f"module 'pixcal' has no attribute {name!r}")
 
 

@@ -1,28 +1,496 @@
-# What `pixcal/__init__.py` gives when it is asked, for type checkers and editors.
-from pixcal.api import FringeSet as FringeSet
-from pixcal.api import InputError as InputError
-from pixcal.api import OffsetMap as OffsetMap
-from pixcal.api import Picture as Picture
-from pixcal.api import PixcalError as PixcalError
-from pixcal.api import PixelFlag as PixelFlag
-from pixcal.api import Run as Run
-from pixcal.api import Runtime as Runtime
-from pixcal.api import allan as allan
-from pixcal.api import astrometry as astrometry
-from pixcal.api import budget as budget
-from pixcal.api import calibrate as calibrate
-from pixcal.api import compare as compare
-from pixcal.api import correct_centroids as correct_centroids
-from pixcal.api import crests as crests
-from pixcal.api import diagnose as diagnose
-from pixcal.api import distortion_wcs as distortion_wcs
-from pixcal.api import fit as fit
-from pixcal.api import ingest as ingest
-from pixcal.api import open_run as open_run
-from pixcal.api import reduce as reduce
-from pixcal.api import run as run
-from pixcal.api import sample_acquisition as sample_acquisition
-from pixcal.api import simulate as simulate
-from pixcal.api import write_report as write_report
+# What `pixcal` gives, for type checkers and editors: written by `make doc-pages`.
+import collections.abc
+import os
+import pathlib
+import typing
+from typing import Literal
+
+import pixcal.api.opened
+import pixcal.engine.run
+from pixcal.api.arrays import calibrate as calibrate
+from pixcal.api.centroids import correct_centroids as correct_centroids
+from pixcal.api.centroids import distortion_wcs as distortion_wcs
+from pixcal.api.opened import FringeSet as FringeSet
+from pixcal.api.opened import OffsetMap as OffsetMap
+from pixcal.api.opened import Run as Run
+from pixcal.api.opened import open_run as open_run
+from pixcal.api.picture import Picture as Picture
+from pixcal.api.sample import sample_acquisition as sample_acquisition
+from pixcal.engine.run import Runtime as Runtime
+from pixcal.model.errors import InputError as InputError
+from pixcal.model.errors import PixcalError as PixcalError
+from pixcal.model.flags import PixelFlag as PixelFlag
 
 __version__: str
+__all__ = [
+    "FringeSet",
+    "InputError",
+    "OffsetMap",
+    "Picture",
+    "PixcalError",
+    "PixelFlag",
+    "Run",
+    "Runtime",
+    "__version__",
+    "allan",
+    "astrometry",
+    "budget",
+    "calibrate",
+    "compare",
+    "correct_centroids",
+    "crests",
+    "diagnose",
+    "distortion_wcs",
+    "fit",
+    "ingest",
+    "open_run",
+    "reduce",
+    "run",
+    "sample_acquisition",
+    "simulate",
+    "write_report",
+]
+
+def allan(
+    run: str | os.PathLike[str],
+    *,
+    region: tuple[int, int, int, int] | None = None,
+    regions: collections.abc.Sequence[tuple[int, int, int, int]] = (),
+    runtime: pixcal.engine.run.Runtime | None = None,
+) -> pixcal.api.opened.Run:
+    """Measure how the error falls with the number of frames (paper, section 4.3).
+
+    Parameters
+    ----------
+    run : Run, str or path
+        A run directory.
+    region : tuple[int, int, int, int], optional
+        Limits (y0, y1, x0, x1) of the main curve, ends excluded.
+    regions : Sequence[tuple[int, int, int, int]]
+        Pixels for a curve of their own, ends excluded; may be given several times.
+    runtime : Runtime, optional
+        Where and with how much memory tasks run.
+
+    Raises
+    ------
+    InputError
+        If the run was not fitted, or a region is not inside its window.
+    """
+
+def astrometry(
+    run: str | os.PathLike[str],
+    *,
+    truth: str | os.PathLike[str] | None = None,
+    diameter_m: float = 7.0,
+    focal_length_m: float = 130.0,
+    wavelength_nm: float = 600.0,
+    obscuration: float = 0.0,
+    electrons: float = 100000000.0,
+    background_e: float = 0.0,
+    window: int | None = None,
+    stars: int = 1000,
+    positions: int = 16,
+    dither_px: float = 32.0,
+    seed: int = 0,
+    runtime: pixcal.engine.run.Runtime | None = None,
+) -> dict[str, typing.Any]:
+    """Tell what the maps bring for the centroids of stars (paper, section 2).
+
+    Parameters
+    ----------
+    run : Run, str or path
+        A run directory.
+    truth : str or path, optional
+        True offsets of a simulated detector (ACQ-truth): where its pixels lie.
+    diameter_m : float
+        Diameter of the telescope, m.
+    focal_length_m : float
+        Focal length of the telescope, m.
+    wavelength_nm : float
+        Wavelength of the stars' light, nm.
+    obscuration : float
+        Central obscuration, share of the diameter.
+    electrons : float
+        Photo-electrons of a star at each position, all exposures together.
+    background_e : float
+        Background of a pixel at each position, electrons.
+    window : int, optional
+        Side of the window that is fitted, an odd number.
+    stars : int
+        Stars, at random places of the detector.
+    positions : int
+        Positions of each star, whose mean is taken.
+    dither_px : float
+        Largest distance of a position from the first, along x and y.
+    seed : int
+        Seed of the random numbers.
+    runtime : Runtime, optional
+        Where and with how much memory tasks run.
+
+    Returns
+    -------
+    dict
+        Contents of ``astrometry.json``.
+
+    Raises
+    ------
+    InputError
+        If the run was not fitted, or the truth is not that of this detector.
+    """
+
+def budget(
+    bench: str | os.PathLike[str],
+    *,
+    precision_px: float | None = None,
+    frames: int | None = None,
+    out: str | os.PathLike[str] | None = None,
+) -> dict[str, typing.Any]:
+    """Plan frames and hours for a given precision, before any are taken: the Cramér-Rao bound.
+
+    Parameters
+    ----------
+    bench : str or path
+        Bench file (schema ``pixcal/bench/1``).
+    precision_px : float, optional
+        Wanted 1-sigma error of a pixel's offset on each axis.
+    frames : int, optional
+        Frames of each fringe set: the precision that they reach.
+    out : str or path
+        Where the result goes; made if it is not there.
+
+    Returns
+    -------
+    dict
+        Contents of ``budget.json``, which goes into ``out`` (if given) with ``budget.png``.
+
+    Raises
+    ------
+    InputError
+        If the bench cannot be read, or its frames determine nothing.
+    """
+
+def compare(
+    runs: collections.abc.Sequence[str | os.PathLike[str]],
+    out: str | os.PathLike[str],
+    *,
+    split: Literal['halves', 'odd-even'] = 'halves',
+    sigma_accuracy: float = 0.02,
+    runtime: pixcal.engine.run.Runtime | None = None,
+) -> dict[str, typing.Any]:
+    """Tell what maps of the same pixels have in common and what not, scale by scale.
+
+    Parameters
+    ----------
+    runs : sequence of Run, str or path
+        Fitted runs; one alone is compared with itself.
+    out : str or path
+        Where the result goes; made if it is not there.
+    split : {"halves", "odd-even"}
+        Parts of a single run: its first and second half, or every other batch of frames.
+    sigma_accuracy : float
+        Relative error of SIGMA that is no difference yet.
+    runtime : Runtime, optional
+        Where and with how much memory tasks run.
+
+    Returns
+    -------
+    dict
+        Contents of ``compare.json``; beside it in ``out`` lie pictures.
+
+    Raises
+    ------
+    InputError
+        If a run was not fitted, or the windows differ.
+    """
+
+def crests(
+    run: str | os.PathLike[str],
+    *,
+    frames: int = 8,
+    paths: int | None = None,
+    segment: int | None = None,
+    runtime: pixcal.engine.run.Runtime | None = None,
+) -> dict[str, typing.Any]:
+    """Find the fibres from crests and valleys, a check of the fit (paper, equation 7).
+
+    Parameters
+    ----------
+    run : Run, str or path
+        A run directory.
+    frames : int
+        Frames to use, spread over the run.
+    paths : int, optional
+        Crests and valleys to use of each end, the outermost.
+    segment : int, optional
+        Length along a fringe that gives one point.
+    runtime : Runtime, optional
+        Where and with how much memory tasks run.
+
+    Returns
+    -------
+    dict
+        Contents of ``crests.json``.
+
+    Raises
+    ------
+    InputError
+        If the run was not reduced, or a set has too few fringes.
+    """
+
+def diagnose(
+    run: str | os.PathLike[str],
+    *,
+    only: collections.abc.Sequence[str] = (),
+    without: collections.abc.Sequence[str] = (),
+    own: collections.abc.Sequence[str | os.PathLike[str]] = (),
+    nominal: str | os.PathLike[str] | None = None,
+    runtime: pixcal.engine.run.Runtime | None = None,
+) -> dict[str, typing.Any]:
+    """Tell where data and simulation differ, which effect causes it, and what remains.
+
+    Parameters
+    ----------
+    run : Run, str or path
+        A run directory.
+    only : Sequence[str]
+        The only candidates.
+    without : Sequence[str]
+        Effects that are no candidates.
+    own : Sequence[str | os.PathLike[str]]
+        Python file that holds an effect of your own; may be given several times.
+    nominal : str or path, optional
+        Bench file whose effects the nominal bench has from the start.
+    runtime : Runtime, optional
+        Where and with how much memory tasks run.
+
+    Returns
+    -------
+    dict
+        Contents of ``diagnosis.json``.
+
+    Raises
+    ------
+    InputError
+        If the run was not reduced, or an effect is not known.
+    """
+
+def fit(
+    run: str | os.PathLike[str],
+    *,
+    batch_frames: int | None = None,
+    chi2_limit: float = 1.5,
+    model: str = 'auto',
+    with_diagnosis: bool = False,
+    own: collections.abc.Sequence[str | os.PathLike[str]] = (),
+    runtime: pixcal.engine.run.Runtime | None = None,
+) -> pixcal.api.opened.Run:
+    """Fit the fringes and write the maps of the offsets.
+
+    Parameters
+    ----------
+    run : Run, str or path
+        A run directory.
+    batch_frames : int, optional
+        Frames of an Allan batch; 500, or fewer in a short run.
+    chi2_limit : float
+        Reduced chi-square above which a pixel is ``BAD_FIT``.
+    model : str
+        Shape of the fringes: straight, hyperbolic, or whichever the phases call for.
+    with_diagnosis : bool
+        Also write maps without the effects that 'pixcal diagnose' found, and what they gained.
+    own : Sequence[str | os.PathLike[str]]
+        Python file with an effect of your own that the diagnosis found; may be given several times.
+    runtime : Runtime, optional
+        Where and with how much memory tasks run.
+
+    Raises
+    ------
+    InputError
+        If the run was not reduced, or holds no fringes that can be fitted; with a diagnosis, if
+        there is none.
+    """
+
+def ingest(
+    acquisition: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    copy: bool = False,
+    cubes: str | os.PathLike[str] | None = None,
+    runtime: pixcal.engine.run.Runtime | None = None,
+) -> pixcal.api.opened.Run:
+    """Check every frame of an acquisition, and catalogue it.
+
+    Parameters
+    ----------
+    acquisition : str or path
+        Directory with ``acquisition.yaml``.
+    out : str or path
+        Where the result goes; made if it is not there.
+    overwrite : bool
+        Replace what was ingested from another acquisition.
+    copy : bool
+        Copy the samples of all frames: later steps do without the files of ACQ.
+    cubes : str or path, optional
+        Folder or URL (s3://bucket/prefix) for the large cubes; RUN to keep them there. [default: as before, or as in ingest; else RUN]
+    runtime : Runtime, optional
+        Where and with how much memory tasks run.
+
+    Raises
+    ------
+    InputError
+        If a file, key or option is wrong.
+    """
+
+def reduce(
+    run: str | os.PathLike[str],
+    *,
+    gain: Literal['declared', 'measured'] = 'declared',
+    clip_sigma: float = 4.0,
+    hot_sigma: float = 10.0,
+    dead_below: float = 0.5,
+    dead_above: float = 2.0,
+    noisy_factor: float = 1.5,
+    nonlinear_share: float = 0.03,
+    rounding_share: float = 0.001,
+    cubes: str | os.PathLike[str] | None = None,
+    runtime: pixcal.engine.run.Runtime | None = None,
+) -> pixcal.api.opened.Run:
+    """Measure the detector and write the fringes in electrons.
+
+    Parameters
+    ----------
+    run : Run, str or path
+        A run directory.
+    gain : {"declared", "measured"}
+        Gain to use: declared in acquisition.yaml, or measured from the flats.
+    clip_sigma : float
+        Clipping of calibration frames, robust sigmas.
+    hot_sigma : float
+        Dark signal of ``HOT`` pixels, robust sigmas above the median.
+    dead_below : float
+        Response over the neighbours' below which a pixel is ``DEAD``.
+    dead_above : float
+        Response over the neighbours' above which a pixel is ``DEAD``.
+    noisy_factor : float
+        Noise over the usual noise above which a pixel is ``NOISY``.
+    nonlinear_share : float
+        Departure from a line above which it is ``NONLINEAR``.
+    rounding_share : float
+        Share of the variance that rounding may add.
+    cubes : str or path, optional
+        Folder or URL (s3://bucket/prefix) for the large cubes; RUN to keep them there. [default: as before, or as in ingest; else RUN]
+    runtime : Runtime, optional
+        Where and with how much memory tasks run.
+
+    Raises
+    ------
+    InputError
+        If the run was not ingested, or its gain is to be measured and cannot be.
+    """
+
+def run(
+    acquisition: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    copy: bool = False,
+    gain: Literal['declared', 'measured'] = 'declared',
+    model: str = 'auto',
+    cubes: str | os.PathLike[str] | None = None,
+    diagnosed: bool = True,
+    runtime: pixcal.engine.run.Runtime | None = None,
+) -> pixcal.api.opened.Run:
+    """Do all steps, from an acquisition to corrected maps and the report, as ``pixcal run``.
+
+    Parameters
+    ----------
+    acquisition : str or path
+        Directory with ``acquisition.yaml``.
+    out : str or path
+        Where the result goes; made if it is not there.
+    overwrite : bool
+        Replace what was ingested from another acquisition.
+    copy : bool
+        Copy the samples of all frames: later steps do without the files of ACQ.
+    gain : {"declared", "measured"}
+        Gain to use: declared in acquisition.yaml, or measured from the flats.
+    model : str
+        Shape of the fringes: straight, hyperbolic, or whichever the phases call for.
+    cubes : str or path, optional
+        Folder or URL (s3://bucket/prefix) for the large cubes; RUN to keep them there. [default: as before, or as in ingest; else RUN]
+    diagnosed : bool
+        Tell where the frames differ from a simulation of the bench, and why: takes the longest.
+    runtime : Runtime, optional
+        Where and with how much memory tasks run.
+
+    Returns
+    -------
+    Run
+        Without fringes in the acquisition, only the detector's side of it is there.
+
+    Raises
+    ------
+    InputError
+        In one line, with the file, key or option that is wrong. What is not possible beside the
+        maps (a diagnosis, a correction) is a warning.
+    """
+
+def simulate(
+    bench: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    *,
+    truth: str | os.PathLike[str] | None = None,
+    own: collections.abc.Sequence[str | os.PathLike[str]] = (),
+    runtime: pixcal.engine.run.Runtime | None = None,
+) -> pathlib.Path:
+    """Simulate a bench and write an acquisition, and its truth apart from it.
+
+    Parameters
+    ----------
+    bench : str or path
+        Bench file (schema ``pixcal/bench/1``).
+    out : str or path
+        Where the result goes; made if it is not there.
+    truth : str or path, optional
+        Directory of the truth, apart from the acquisition.
+    own : Sequence[str | os.PathLike[str]]
+        Python file with an effect of your own, for BENCH.yaml; may be given several times.
+    runtime : Runtime, optional
+        Where and with how much memory tasks run.
+
+    Returns
+    -------
+    Path
+        The acquisition.
+
+    Raises
+    ------
+    InputError
+        If the bench is wrong, or a directory holds what simulate did not put there.
+    """
+
+def write_report(
+    run: str | os.PathLike[str],
+    *,
+    runtime: pixcal.engine.run.Runtime | None = None,
+) -> pixcal.api.opened.Run:
+    """Write the self-contained HTML page on a run, as ``pixcal report``.
+
+    Parameters
+    ----------
+    run : Run, str or path
+        A run directory.
+    runtime : Runtime, optional
+        Where and with how much memory tasks run.
+
+    Returns
+    -------
+    Run
+        Its ``report`` is the page.
+
+    Raises
+    ------
+    InputError
+        If the run was not reduced.
+    """

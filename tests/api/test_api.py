@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 import pixcal
 from pixcal import api
+from pixcal.estimators.models import fringe_models
 from pixcal.stages import (
     allan,
     astrometry,
@@ -33,6 +34,7 @@ from pixcal.storage.products import read_map
 from pixcal_cli.main import cli
 
 SYNC = pixcal.Runtime(cluster="sync")
+PUBLIC = [name for name in pixcal.__all__ if name != "__version__"]
 STAGES = {
     "allan": allan, "astrometry": astrometry, "budget": budget, "compare": compare,
     "crests": crests, "diagnose": diagnose, "fit": fit, "ingest": ingest, "reduce": reduce,
@@ -76,13 +78,9 @@ def test_importing_pixcal_is_cheap() -> None:
     assert not {"numpy", "numba", "zarr", "pixcal.api"} & set(found.stdout.split())
 
 
-def test_the_names_are_those_of_the_api() -> None:
-    """At run time, and for type checkers."""
-    assert set(pixcal.__all__) == {*api.__all__, "__version__"}
-    stub = Path(pixcal.__file__).with_suffix(".pyi").read_text(encoding="utf-8")
-    told = {f"from pixcal.api import {name} as {name}" for name in api.__all__}
-    assert {line for line in stub.splitlines() if line.startswith("from")} == told
-    for name in api.__all__:
+def test_every_public_name_is_there() -> None:
+    """Also of `pixcal.api`."""
+    for name in PUBLIC:
         assert getattr(pixcal, name) is getattr(api, name)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         pixcal.nothing  # noqa: B018
@@ -91,14 +89,14 @@ def test_the_names_are_those_of_the_api() -> None:
 
 def test_no_name_is_hidden_by_a_folder_of_the_package() -> None:
     folders = {path.parent.name for path in Path(pixcal.__file__).parent.glob("*/__init__.py")}
-    assert not folders & set(api.__all__)
+    assert not folders & set(PUBLIC)
 
 
 def test_every_command_is_a_function() -> None:
     stages = {name for name, one in cli.commands.items() if not isinstance(one, click.Group)}
     # A noun is no name for a function.
     names = {"report": "write_report", "centroids": "correct_centroids", "wcs": "distortion_wcs"}
-    assert {names.get(stage, stage) for stage in stages} <= set(api.__all__)
+    assert {names.get(stage, stage) for stage in stages} <= set(PUBLIC)
 
 
 @pytest.mark.parametrize("name", STAGES)
@@ -111,13 +109,23 @@ def test_a_function_has_the_options_of_its_stage(name: str) -> None:
         assert given.default == field.default, field.name
 
 
-@pytest.mark.parametrize("name", [n for n in api.__all__ if inspect.isfunction(getattr(api, n))])
+@pytest.mark.parametrize("name", [n for n in PUBLIC if inspect.isfunction(getattr(pixcal, n))])
 def test_a_docstring_tells_every_parameter(name: str) -> None:
     function = getattr(pixcal, name)
     text = inspect.getdoc(function) or ""
     for parameter in inspect.signature(function).parameters:
         assert parameter in text, f"{name}: {parameter} is not told"
     assert "Raises" in text
+
+
+def test_an_option_that_there_is_not_is_refused() -> None:
+    with pytest.raises(TypeError, match="unexpected keyword argument 'modle'"):
+        pixcal.fit("run", modle="paraxial")
+
+
+def test_the_shapes_of_fringes_are_the_choices_of_the_fit() -> None:
+    (model,) = (f for f in dataclasses.fields(fit.Config) if f.name == "model")
+    assert set(model.metadata["choices"]) == {"auto", *fringe_models()}
 
 
 def test_maps_are_those_of_the_products(acquired: Any) -> None:

@@ -12,7 +12,7 @@ import sys
 from contextlib import redirect_stderr, redirect_stdout
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import click
 import numpy as np
@@ -536,5 +536,6 @@ def test_the_choices_are_those_of_the_stage(command: str, name: str, config: typ
     (option,) = (p for p in cli.commands[command].params if p.name == name)
     (field,) = (f for f in dataclasses.fields(config) if f.name == name)
     assert isinstance(option.type, click.Choice)
-    assert set(option.type.choices) == set(field.metadata["choices"])
+    choices = get_args(get_type_hints(config)[name]) or field.metadata["choices"]
+    assert set(option.type.choices) == set(choices)
     assert option.default == field.default

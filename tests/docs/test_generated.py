@@ -8,6 +8,7 @@ import yaml
 
 from doc_pages import DOCS, FILES, LAYERS, TABLES, commands_of, filled
 from documentation.layers import PACKAGES, picture
+from documentation.stub import STUB, stub
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted(DOCS.rglob("*.md"))
@@ -30,6 +31,10 @@ def test_the_page_of_commands_shows_all_of_them() -> None:
 
 def test_the_picture_of_the_layers_is_up_to_date() -> None:
     assert LAYERS.read_text(encoding="utf-8") == picture(), "run 'make doc-pages'"
+
+
+def test_type_checkers_are_told_the_options_that_there_are() -> None:
+    assert STUB.read_text(encoding="utf-8") == stub(), "run 'make doc-pages'"
 
 
 def closure(edges: set[tuple[str, str]]) -> set[tuple[str, str]]:

@@ -10,10 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from pixcal.api import commands
 from pixcal.api.opened import Run
-from pixcal.api.paths import StrPath
 from pixcal.engine.run import Runtime
 from pixcal.model.acquisition import SCHEMA, Acquisition
-from pixcal.model.config import parse, to_yaml
+from pixcal.model.config import StrPath, parse, to_yaml
 from pixcal.model.errors import InputError
 from pixcal.storage.fits_out import FrameWriter
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pixcal.api.paths import StrPath
+from pixcal.model.config import StrPath
 from pixcal.model.errors import InputError
 
 if TYPE_CHECKING:

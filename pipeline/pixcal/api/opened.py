@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.api.paths import StrPath
 from pixcal.api.picture import Picture
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.config import parse
+from pixcal.model.config import StrPath, parse
 from pixcal.model.errors import InputError
 from pixcal.storage.artefact import damage_noted, read_json, require
 from pixcal.storage.cube import ArrayReader

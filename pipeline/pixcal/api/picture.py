@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pixcal.api.paths import StrPath
+from pixcal.model.config import StrPath
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,18 @@ import math
 import re
 import types
 import typing
+from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import yaml
 
 from pixcal.model.errors import InputError
 
 T = TypeVar("T")
+
+StrPath = str | PathLike[str]
+"""A path in any form; an opened `pixcal.Run` is one as well."""
 
 MAX_CONFIG_BYTES = 1_000_000
 
@@ -31,6 +35,7 @@ def quantity(
     above: float | None = None,
     choices: tuple[str, ...] | None = None,
     doc: str = "",
+    **more: Any,
 ) -> Any:
     """Declare a configuration field with its unit and range.
 
@@ -48,8 +53,10 @@ def quantity(
         The only words allowed.
     doc : str
         One line on the meaning.
+    **more
+        Of options, as `pixcal.model.options` says.
     """
-    meta = {
+    meta = more | {
         "unit": unit,
         "low": low,
         "high": high,
@@ -195,9 +202,23 @@ def to_plain(config: Any) -> Any:
         return [to_plain(v) for v in config]
     if isinstance(config, dict):
         return {name: to_plain(value) for name, value in config.items()}
-    if isinstance(config, Path):
-        return str(config)
-    return config
+    return fspath(config) if isinstance(config, PathLike) else config
+
+
+def result_options(config: Any, kind: type | None = None) -> dict[str, Any]:
+    """Plain data of the options that a result depends on.
+
+    Parameters
+    ----------
+    config : dataclass
+    kind : type, optional
+        A dataclass that the configuration inherits from, to look at its options alone.
+    """
+    return {
+        f.name: to_plain(getattr(config, f.name))
+        for f in dataclasses.fields(kind or config)
+        if f.metadata.get("in_key", True)
+    }
 
 
 def to_yaml(config: Any) -> str:
@@ -221,10 +242,12 @@ def _value(hint: Any, value: Any, where: str, key: str, meta: Any) -> Any:
     place = f"{where}: {key}"
     origin = get_origin(hint)
     if origin in (typing.Union, types.UnionType):
-        options = [a for a in get_args(hint) if a is not type(None)]
-        if value is None and type(None) in get_args(hint):
+        kinds = get_args(hint)
+        if value is None and type(None) in kinds:
             return None
-        return _value(options[0], value, where, key, meta)
+        if isinstance(value, PathLike) and any(get_origin(k) is PathLike for k in kinds):
+            return fspath(value)
+        return _value(next(k for k in kinds if k is not type(None)), value, where, key, meta)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return parse(hint, value, where, key=key)
     if origin is dict:
@@ -250,10 +273,12 @@ def _value(hint: Any, value: Any, where: str, key: str, meta: Any) -> Any:
         if not isinstance(value, bool):
             raise InputError(f"{place}: expected true or false, found {_kind(value)}")
         return value
-    if hint is str:
+    if hint is Path and isinstance(value, (str, PathLike)):
+        return Path(value)
+    if hint in (str, Path) or origin is Literal:
         if not isinstance(value, str):
             raise InputError(f"{place}: expected text, found {_kind(value)}")
-        choices = meta.get("choices")
+        choices = get_args(hint) or meta.get("choices")
         if choices and value not in choices:
             raise InputError(f"{place}: {value!r:.80} is not one of {', '.join(choices)}")
         return value

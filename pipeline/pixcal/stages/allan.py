@@ -11,7 +11,7 @@ name ``y0:y1,x0:x1``.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -33,8 +33,9 @@ from pixcal.estimators.stability import (
     white_population,
 )
 from pixcal.kernels.allan import allan_deviation, averaging_lengths, disjoint_differences
-from pixcal.model.config import quantity
+from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
+from pixcal.model.options import Allan, Region
 from pixcal.storage.artefact import (
     Build,
     Manifest,
@@ -60,21 +61,11 @@ NOISE_LEVELS = (np.arange(64) + 0.5) / 64
 
 Range = tuple[int, int]
 Tile = tuple[Range, Range]
-Region = tuple[int, int, int, int]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Config:
-    """Options of the stability stage."""
-
-    region: Region | None = quantity(
-        None, unit="px", low=0, doc="(y0, y1, x0, x1), ends excluded, of the main curve"
-    )
-    regions: tuple[Region, ...] = quantity(
-        (), doc="further rectangles with a curve of their own; a single pixel is one of 1 x 1"
-    )
+Config = Allan
 
 
 @dataclass(frozen=True)
@@ -141,9 +132,10 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         for batches in sets.values():
             for region in (config.region, *config.regions):
                 _check_region(region, batches.window)
-        key = artefact_key("allan", FORMAT, asdict(config), inputs)
+        plain = result_options(config)
+        key = artefact_key("allan", FORMAT, plain, inputs)
         if up_to_date(run_dir, "allan", key) is None:
-            with build(run_dir, "allan", FORMAT, asdict(config), inputs) as made:
+            with build(run_dir, "allan", FORMAT, plain, inputs) as made:
                 create_group(made.folder / "allan.zarr")
                 result = {
                     name: _measure_set(made, name, batches, config, runtime)

@@ -11,7 +11,7 @@ its frames are those of all sets, shared as the bench plans. ``levers`` are chan
 the most helpful first; ``left_out`` and ``warnings`` are sentences.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -35,8 +35,9 @@ from pixcal.estimators.budget import (
 )
 from pixcal.estimators.fringes import HONEST_FRINGES
 from pixcal.model.bench import Bench, load_bench
-from pixcal.model.config import quantity, to_plain
+from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
+from pixcal.model.options import Budget
 from pixcal.report.budget_figures import BudgetView, Line, budget_figure
 from pixcal.report.drawing import png
 from pixcal.storage.artefact import digest, write_json
@@ -54,14 +55,7 @@ DOMINANT = 1.5
 F64 = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Config:
-    """What is asked for; without either, `PRECISION_PX`."""
-
-    precision_px: float | None = quantity(
-        None, unit="px", low=1e-9, high=1.0, doc="wanted on each axis"
-    )
-    frames: int | None = quantity(None, low=1, high=10**12, doc="of each fringe set")
+Config = Budget
 
 
 def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, Any]:
@@ -99,8 +93,6 @@ def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, 
                 "offset, level and contrast; at least three different ones are needed"
             )
     precision = config.precision_px
-    if precision is not None and not 1e-9 <= precision <= 1:
-        raise InputError(f"--precision {precision}: not between 1e-9 and 1 px; choose another")
     if precision is None and config.frames is None:
         precision = PRECISION_PX
     result = _budget(bench, bound, precision, config.frames)

@@ -13,7 +13,7 @@ in both. ``warnings`` are sentences. ``crests.zarr/<set name>`` holds the points
 
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -45,8 +45,9 @@ from pixcal.estimators.crests import (
 from pixcal.kernels.demodulation import N_SUMS
 from pixcal.kernels.optics import PARAMETERS, Geometry, phase, phase_jacobian
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.config import quantity
+from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
+from pixcal.model.options import Crests
 from pixcal.report.crest_figures import CrestView, Extract, crest_figure, outermost
 from pixcal.report.drawing import png
 from pixcal.stages.fit.sweep import load_run, nominal_vector
@@ -82,17 +83,7 @@ F32 = NDArray[np.float32]
 Range = tuple[int, int]
 
 
-@dataclass(frozen=True)
-class Config:
-    """Options of the crests."""
-
-    frames: int = quantity(8, low=1, unit="frames", doc="frames to use, spread over the run")
-    paths: int | None = quantity(
-        None, low=2, doc="crests and valleys to use of each end, the outermost (all of them)"
-    )
-    segment: int | None = quantity(
-        None, low=4, unit="px", doc="length along a fringe that gives one point (an eighth, 8-128)"
-    )
+Config = Crests
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -117,9 +108,10 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         if (run_dir / "fit" / MANIFEST).exists():
             inputs["fit"] = require(run_dir, "fit", 1).key
             facts = read_json(run_dir / "fit" / "fit.json")["sets"]
-        key = artefact_key(STAGE, FORMAT, asdict(config), inputs)
+        plain = result_options(config)
+        key = artefact_key(STAGE, FORMAT, plain, inputs)
         if up_to_date(run_dir, STAGE, key) is None:
-            with build(run_dir, STAGE, FORMAT, asdict(config), inputs) as made:
+            with build(run_dir, STAGE, FORMAT, plain, inputs) as made:
                 create_group(made.folder / "crests.zarr")
                 sets = {
                     s.name: _measure(run_dir, made, acquisition, s.name, facts, config, runtime)

@@ -4,7 +4,7 @@ import inspect
 import os
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from pixcal.effects import effects
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.gap import CHANCE, sigmas_of
+from pixcal.model.config import result_options
+from pixcal.model.options import Report
 from pixcal.report.contents import (
     ArrayRecord,
     Contents,
@@ -77,9 +79,7 @@ FIGURE_BYTES = 192 << 20
 """Matplotlib, one figure and the page."""
 
 
-@dataclass(frozen=True)
-class Config:
-    """A report has no options."""
+Config = Report
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -96,11 +96,11 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     with lock(run_dir):
         manifests = _manifests(run_dir)
         inputs = {stage: manifest.key for stage, manifest in manifests.items()}
-        key = artefact_key(STAGE, FORMAT, asdict(config), inputs)
+        key = artefact_key(STAGE, FORMAT, result_options(config), inputs)
         made = up_to_date(run_dir, STAGE, key)
         if made is None:
             contents = _collect(run_dir, manifests, runtime)
-            with build(run_dir, STAGE, FORMAT, asdict(config), inputs) as report:
+            with build(run_dir, STAGE, FORMAT, result_options(config), inputs) as report:
                 page = render(contents)
                 (report.folder / "report.html").write_text(page, encoding="utf-8")
                 report.summary = {"bytes": len(page.encode()), "sections": page.count("<section")}

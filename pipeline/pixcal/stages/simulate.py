@@ -11,7 +11,7 @@ and its frames (``B``, ``A``, ``phi``, ``dkx``, ``dky``); and the bench file.
 
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from datetime import datetime, timedelta
 from functools import partial
 from itertools import product
@@ -30,6 +30,7 @@ from pixcal.model import acquisition as described
 from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import to_plain, to_yaml
 from pixcal.model.errors import InputError
+from pixcal.model.options import Simulate
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import Camera, states_of
 from pixcal.simulation.recording import Recording, recordings
@@ -67,20 +68,7 @@ _BYTES_PER_COMPRESSED_SAMPLE = 10
 _MJD_EPOCH = datetime(1858, 11, 17)
 
 
-@dataclass(frozen=True)
-class Config:
-    """Options of the command.
-
-    Attributes
-    ----------
-    truth : Path, optional
-        Where the truth goes; default: beside the acquisition, ``<out>-truth``.
-    own : tuple of Path
-        Python files with effects of the user's own, which the bench file may name.
-    """
-
-    truth: Path | None = None
-    own: tuple[Path, ...] = ()
+Config = Simulate
 
 
 Effects = tuple[Effect, ...]

@@ -9,10 +9,12 @@ import json
 import logging
 import secrets
 from collections.abc import Mapping
+from os import fspath
 from pathlib import Path
 from typing import Any
 
 from pixcal import __version__
+from pixcal.model.config import StrPath
 from pixcal.model.errors import DamagedError, InputError, RemoteError
 from pixcal.storage.folder import open_folder
 from pixcal.storage.place import Place, parse_place
@@ -42,12 +44,12 @@ def base_of(artefact: Path) -> Place | None:
     return None if pointer is None else parse_place(pointer["base"])
 
 
-def chosen_base(text: str | None, run: Path, like: Path) -> Place | None:
+def chosen_base(named: StrPath | None, run: Path, like: Path) -> Place | None:
     """The folder for all cubes that the user wants.
 
     Parameters
     ----------
-    text : str or None
+    named : str or path or None
         A path or URL; the run directory itself to keep cubes in the artefacts; None for the same
         as another artefact.
     run : Path
@@ -60,9 +62,9 @@ def chosen_base(text: str | None, run: Path, like: Path) -> Place | None:
     Path or UrlPath or None
         None to keep cubes in the artefacts.
     """
-    if text is None:
+    if named is None:
         return base_of(like)
-    place = parse_place(text)
+    place = parse_place(fspath(named))
     return None if place == parse_place(str(run)) else place
 
 

@@ -18,7 +18,7 @@ What is not seen above the maps' own errors is null. ``astrometry.zarr`` holds t
 
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, astuple, dataclass
+from dataclasses import astuple
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,9 @@ from pixcal.engine.run import Runtime
 from pixcal.estimators.centroids import Star
 from pixcal.kernels.psf import Psf
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.config import parse, quantity
+from pixcal.model.config import parse, result_options
 from pixcal.model.errors import InputError
+from pixcal.model.options import Astrometry
 from pixcal.report.astrometry_figures import AstrometryView, astrometry_figure
 from pixcal.report.drawing import png
 from pixcal.stages.astrometry.detector import Component, Detector, generator, open_components
@@ -59,8 +60,6 @@ STAGE = "astrometry"
 FORMAT = 1
 SCHEMA = "pixcal/astrometry/1"
 
-MOST_ELECTRONS = 1e15
-"""The Poisson generator counts so far."""
 CURVE = np.geomspace(1e4, 1e12, 49)
 """Electrons of the curve of errors."""
 DETAIL = 128
@@ -79,31 +78,7 @@ _BYTES_PER_WINDOW_PIXEL = 200
 F64 = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Config:
-    """Truth, telescope and stars; the telescope is by default that of the paper, section 2."""
-
-    truth: Path | None = None
-    diameter_m: float = quantity(7.0, unit="m", above=0, doc="entrance pupil")
-    focal_length_m: float = quantity(130.0, unit="m", above=0, doc="focal length")
-    wavelength_nm: float = quantity(600.0, unit="nm", above=0, doc="of the stars' light")
-    obscuration: float = quantity(0.0, low=0, high=0.9, doc="in the middle, of the diameter")
-    electrons: float = quantity(1e8, unit="e-", above=0, doc="of a star at each position")
-    background_e: float = quantity(0.0, unit="e-", low=0, doc="of each pixel at each position")
-    window: int | None = quantity(None, unit="px", low=3, doc="side of the fit's window, odd")
-    stars: int = quantity(1000, low=2, doc="stars, all over the detector")
-    positions: int = quantity(16, low=1, doc="positions of each star")
-    dither_px: float = quantity(32.0, unit="px", low=0, doc="distance of positions from the first")
-    seed: int = quantity(0, low=0, doc="of the random numbers")
-
-    def __post_init__(self) -> None:
-        if self.window is not None and self.window % 2 == 0:
-            raise InputError(f"--window {self.window}: even; a window has a middle pixel")
-        if self.electrons + self.background_e > MOST_ELECTRONS:
-            raise InputError(
-                f"--electrons, --background: more than {MOST_ELECTRONS:g} e- cannot be counted; "
-                "give less"
-            )
+Config = Astrometry
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -133,7 +108,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             inputs[component.delta.path.name] = content_digest(component.delta.path)
             for _, image in component.truth:
                 inputs[f"truth/{image.path.name}"] = content_digest(image.path)
-        plain = asdict(config) | {"truth": None}
+        plain = result_options(config) | {"truth": None}
         key = artefact_key(STAGE, FORMAT, plain, inputs)
         if up_to_date(run_dir, STAGE, key) is None:
             with build(run_dir, STAGE, FORMAT, plain, inputs) as made:

@@ -1,7 +1,8 @@
 """``pixcal blind``: an examination of the diagnosis, on data whose effects are withheld."""
 
-from pixcal.stages.blind.cases import MakeConfig, make
-from pixcal.stages.blind.marking import ScoreConfig, score
-from pixcal.stages.blind.sitting import RunConfig, run
+from pixcal.model.blind_options import MakeConfig, RunConfig, ScoreConfig
+from pixcal.stages.blind.cases import make
+from pixcal.stages.blind.marking import score
+from pixcal.stages.blind.sitting import run
 
 __all__ = ["MakeConfig", "RunConfig", "ScoreConfig", "make", "run", "score"]

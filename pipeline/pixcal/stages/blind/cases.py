@@ -10,7 +10,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from pathlib import Path
 from pixcal.effects import parse_effects
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.bench import Bench
+from pixcal.model.blind_options import MakeConfig
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import Camera
@@ -32,27 +33,6 @@ from pixcal.storage.artefact import digest, lock
 MOMENT = datetime(2026, 1, 1, tzinfo=UTC).timestamp()
 """Time of every file."""
 MOST_SEED = 10**17
-
-
-@dataclass(frozen=True)
-class MakeConfig:
-    """Options of the command.
-
-    Attributes
-    ----------
-    cases : int
-    seed : int, optional
-        Without one it is drawn, and nobody can guess it.
-    size : str
-        ``small`` or ``standard``.
-    bench : str
-        Whose cases: ``second``, ``own`` or ``both``.
-    """
-
-    cases: int
-    seed: int | None = None
-    size: str = "small"
-    bench: str = "both"
 
 
 def make(out: Path, sealed: Path, config: MakeConfig, runtime: Runtime) -> Examination:

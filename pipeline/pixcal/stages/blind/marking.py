@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.model.blind_options import ScoreConfig
 from pixcal.model.errors import DamagedError, InputError, PixcalError, PlanError
 from pixcal.stages.blind.benches import LAYOUTS
 from pixcal.stages.blind.draw import LEFT_OUT, ONE
@@ -25,26 +26,6 @@ SCHEMA = "pixcal/blind-score/3"
 PRODUCT = "score.json"
 TABLE = "score.md"
 _TIMED = ("diagnosis", "maps")
-
-
-@dataclass(frozen=True)
-class ScoreConfig:
-    """Options of the command.
-
-    Attributes
-    ----------
-    oracle : int
-        Cases of parts 1 and 4, the first of them, whose true effects are simulated as well; of each
-        examination.
-    write : Path, optional
-        Page that the table goes to, between the marks of the examination's size.
-    also : tuple of (Path, Path)
-        Further examinations of the same size that are scored together with it: folder and truth.
-    """
-
-    oracle: int = 0
-    write: Path | None = None
-    also: tuple[tuple[Path, Path], ...] = ()
 
 
 def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> dict[str, Any]:

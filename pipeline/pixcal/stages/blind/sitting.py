@@ -10,13 +10,14 @@ import shutil
 import time
 import traceback
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import pixcal
 from pixcal.engine.plan import BASE_BYTES, make_plan
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.model.blind_options import RunConfig
 from pixcal.model.errors import ClusterError, DamagedError, PlanError
 from pixcal.stages import correct, diagnose, ingest, reduce
 from pixcal.stages.blind.benches import LAYOUTS, MOST_SETS
@@ -35,25 +36,6 @@ LEAST_BYTES = 1 << 30
 """Of a case on a cluster, whose workers have limits of their own."""
 LARGE = ("ingest", "reduce", "sweep", "fit", "corrected")
 """Artefacts that are removed once a case is diagnosed."""
-
-
-@dataclass(frozen=True)
-class RunConfig:
-    """Options of the command.
-
-    Attributes
-    ----------
-    again : bool
-        Diagnose anew what was diagnosed.
-    keep : bool
-        Keep the runs whole, not the products alone.
-    limit : int, optional
-        Cases that are diagnosed at most, in order; their order is random.
-    """
-
-    again: bool = False
-    keep: bool = False
-    limit: int | None = None
 
 
 def run(folder: Path, config: RunConfig, runtime: Runtime) -> tuple[int, int]:

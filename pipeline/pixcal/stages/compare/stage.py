@@ -9,7 +9,6 @@ holds all larger ones). The sizes of the scales add up in squares. With three si
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -19,9 +18,10 @@ from scipy.stats import norm
 
 from pixcal import __version__
 from pixcal.engine.run import Runtime
-from pixcal.estimators.agreement import SIGMA_ACCURACY, Estimate, three_cornered_hat
-from pixcal.model.config import quantity
+from pixcal.estimators.agreement import Estimate, three_cornered_hat
+from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
+from pixcal.model.options import Compare
 from pixcal.report.compare_figures import ComponentView, PairView, compare_figure
 from pixcal.report.drawing import png
 from pixcal.stages.compare.facts import describe, estimate_facts
@@ -61,18 +61,7 @@ NOTED_DEG = 0.5
 """From here on it is said that the axes differ."""
 
 
-@dataclass(frozen=True)
-class Config:
-    """Options of the comparison."""
-
-    split: str = quantity(
-        "halves",
-        choices=("halves", "odd-even"),
-        doc="of one run: its first and second half, or every other batch",
-    )
-    sigma_accuracy: float = quantity(
-        SIGMA_ACCURACY, low=0, high=0.5, doc="relative error of SIGMA that is no difference yet"
-    )
+Config = Compare
 
 
 def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -93,11 +82,6 @@ def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Ma
         If a run has not been fitted, the windows differ, the runs have no component in common, or
         the directory is not one that a comparison may write to.
     """
-    if not 0 <= config.sigma_accuracy <= 0.5:
-        raise InputError(
-            f"--sigma-accuracy {config.sigma_accuracy}: not between 0 and 0.5; "
-            "choose for example 0.02"
-        )
     _check_out(out)
     with damage_noted(*runs):
         sides = _sides(runs, config)
@@ -107,7 +91,8 @@ def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Ma
 def _run(sides: Sequence[Side], out: Path, config: Config, runtime: Runtime) -> Manifest:
     components = _components(sides)
     inputs = {f"{n} {side.run}": side.key for n, side in enumerate(sides)}
-    key = artefact_key(STAGE, FORMAT, asdict(config), inputs)
+    plain = result_options(config)
+    key = artefact_key(STAGE, FORMAT, plain, inputs)
     with lock(out):
         ready = read_manifest(out)
         if ready is not None and ready.key == key and (out / RESULT).exists():
@@ -121,7 +106,7 @@ def _run(sides: Sequence[Side], out: Path, config: Config, runtime: Runtime) -> 
             aside.write_bytes(png(compare_figure(view)))
             aside.replace(out / name)
         write_json(out / RESULT, result)
-        manifest = Manifest(STAGE, FORMAT, key, asdict(config), inputs)
+        manifest = Manifest(STAGE, FORMAT, key, plain, inputs)
         write_manifest(out, manifest)
         return manifest
 

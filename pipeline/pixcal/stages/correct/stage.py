@@ -9,7 +9,7 @@ import hashlib
 import json
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from pixcal import __version__
 from pixcal.engine.run import Runtime
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.errors import DamagedError, InputError
+from pixcal.model.options import Fit
 from pixcal.stages import fit
 from pixcal.stages.correct.again import measured_again
 from pixcal.stages.correct.gain import Maps, measure_gain
@@ -26,7 +27,6 @@ from pixcal.stages.correct.swept import Swept
 from pixcal.stages.correct.uncertainty import parameter_errors
 from pixcal.stages.correct.undoing import undo_on_maps
 from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
-from pixcal.stages.fit import Config as FitConfig
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
 from pixcal.stages.fit.maps import Totals, write_maps
 from pixcal.stages.fit.products import header_of, plan_products, publish_maps
@@ -57,20 +57,7 @@ SUFFIX = "_corrected"
 Json = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Config:
-    """Options of the fit with a diagnosis.
-
-    Attributes
-    ----------
-    own : tuple of Path
-        Files of effects of the user's own that the diagnosis found.
-    fit : fit.Config
-        Of the ordinary fit.
-    """
-
-    own: tuple[Path, ...] = ()
-    fit: FitConfig = field(default_factory=FitConfig)
+Config = Fit
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -92,11 +79,11 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             f"{run_dir / 'diagnose'}: of frames that were reduced otherwise; run "
             f"'pixcal diagnose {run_dir}' again"
         )
-    fitted = fit.run(run_dir, config.fit, runtime)
+    fitted = fit.run(run_dir, config, runtime)
     plan = treatments(
         read_json(run_dir / "diagnose" / "diagnosis.json")["causes"],
         diagnosed.config["nominal"],
-        config.fit.model,
+        config.model,
         {name: facts["model"] for name, facts in fitted.summary["sets"].items()},
         config.own,
         run_dir / "diagnose",

@@ -7,14 +7,14 @@ data and every simulation of them are reduced and fitted by the same stages.
 import hashlib
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from pixcal.effects import known_effects, parse_effects
 from pixcal.engine.run import Runtime
 from pixcal.model.bench import load_bench
-from pixcal.model.config import quantity, to_plain
+from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
+from pixcal.model.options import Diagnose
 from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.inquiry import inquire, places
 from pixcal.stages.diagnose.on_map import on_map
@@ -34,24 +34,7 @@ from pixcal.storage.artefact import (
 FORMAT = 5
 
 
-@dataclass(frozen=True)
-class Config:
-    """Options of the diagnosis.
-
-    Attributes
-    ----------
-    only, without : tuple of str
-        Candidates: these alone, or all but these.
-    own : tuple of Path
-        Files that each hold an effect of the user's own.
-    nominal : Path, optional
-        Bench file whose effects the nominal bench has from the start.
-    """
-
-    only: tuple[str, ...] = quantity((), doc="candidates")
-    without: tuple[str, ...] = quantity((), doc="not candidates")
-    own: tuple[Path, ...] = ()
-    nominal: Path | None = None
+Config = Diagnose
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:

@@ -1,13 +1,12 @@
 """Offsets from the sweep's phases: a shape for each set, modes removed, sets joined, products."""
 
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from pixcal import __version__
 from pixcal.engine.run import Runtime
-from pixcal.estimators.models import fringe_models
-from pixcal.model.config import quantity
+from pixcal.model.config import result_options
+from pixcal.model.options import Fit
 from pixcal.stages.fit import sweep
 from pixcal.stages.fit.fringe_set import describe, fit_set
 from pixcal.stages.fit.maps import write_maps
@@ -28,19 +27,7 @@ from pixcal.storage.artefact import (
 FORMAT = 1
 
 
-@dataclass(frozen=True)
-class Config:
-    """Options of the fit."""
-
-    model: str = quantity(
-        "auto", choices=("auto", *fringe_models()), doc="shape of the fringes; auto: by evidence"
-    )
-    batch_frames: int | None = quantity(
-        None, low=4, unit="frames", doc="frames of an Allan batch (500, or fewer in a short run)"
-    )
-    chi2_limit: float = quantity(
-        1.5, above=1.0, doc="pixels with a reduced chi-square above are flagged BAD_FIT"
-    )
+Config = Fit
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime, *, products: bool = True) -> Manifest:
@@ -61,14 +48,15 @@ def run(run_dir: Path, config: Config, runtime: Runtime, *, products: bool = Tru
     if products and sets:
         plan_products(run_dir, sets, runtime)
     with lock(run_dir):
-        swept = sweep.run(run_dir, sweep.Config(config.batch_frames, config.chi2_limit), runtime)
+        swept = sweep.run(run_dir, config, runtime)
         inputs = {"sweep": swept.key}
-        key = artefact_key("fit", FORMAT, asdict(config), inputs)
+        plain = result_options(config)
+        key = artefact_key("fit", FORMAT, plain, inputs)
         if (ready := up_to_date(run_dir, "fit", key)) is not None:
             if products and not published(run_dir):
                 publish(run_dir)
             return ready
-        with build(run_dir, "fit", FORMAT, asdict(config), inputs) as made:
+        with build(run_dir, "fit", FORMAT, plain, inputs) as made:
             made.summary = _fit_all(run_dir, made, swept, config, runtime)
         if products:
             publish(run_dir)

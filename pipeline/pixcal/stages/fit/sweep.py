@@ -4,7 +4,7 @@ What it leaves, ``RUN/sweep``, holds for every model of the fringes' geometry, w
 the phases afterwards: trying another model does not read the cube again.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,9 @@ from pixcal.estimators.sweep import BOUND_PIXELS, TileMaps, frames_to_prime, swe
 from pixcal.estimators.tile import Tile
 from pixcal.estimators.tile_sums import Carrier, TileSums, sum_row
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.config import parse, quantity
+from pixcal.model.config import parse, result_options
 from pixcal.model.errors import DamagedError, InputError
+from pixcal.model.options import Sweep
 from pixcal.stages.fit.scouting import CACHE_BYTES, read_frames, scout_set
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import (
@@ -49,12 +50,7 @@ BATCH_DTYPE = "<f2"
 """Half precision rounds them by a few thousandths of their noise, and halves the time they take."""
 
 
-@dataclass(frozen=True)
-class Config:
-    """Options of the sweep."""
-
-    batch_frames: int | None = quantity(None, low=4, doc="frames of an Allan batch (500, or fewer)")
-    chi2_limit: float = quantity(1.5, above=1.0, doc="reduced chi-square above: BAD_FIT")
+Config = Sweep
 
 
 def nominal_vector(acquisition: Acquisition, name: str) -> tuple[float, float]:
@@ -89,10 +85,11 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             f"{run_dir}: the acquisition lists no fringes; a fit needs some, in frames.fringes"
         )
     inputs = {"reduce": reduced.key}
-    key = artefact_key("sweep", FORMAT, asdict(config), inputs)
+    plain = result_options(config, Config)
+    key = artefact_key("sweep", FORMAT, plain, inputs)
     if (ready := up_to_date(run_dir, "sweep", key)) is not None:
         return ready
-    with build(run_dir, "sweep", FORMAT, asdict(config), inputs) as made:
+    with build(run_dir, "sweep", FORMAT, plain, inputs) as made:
         create_group(made.folder / "sweep.zarr")
         sets = {}
         for fringe_set in acquisition.frames.fringes:

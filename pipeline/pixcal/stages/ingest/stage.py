@@ -23,8 +23,9 @@ from numpy.typing import NDArray
 from pixcal.engine.plan import Plan, make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.acquisition import Acquisition, load_acquisition
-from pixcal.model.config import quantity, to_plain
+from pixcal.model.config import to_plain
 from pixcal.model.errors import DamagedError, InputError, RemoteError
+from pixcal.model.options import Ingest
 from pixcal.stages.ingest.arrays import FRAMES_A_PIECE, Writers, find_kept, take_over
 from pixcal.storage.artefact import (
     Build,
@@ -59,24 +60,7 @@ _FILES_A_TASK = 32
 _BYTES_A_FRAME = 4096
 
 
-@dataclass(frozen=True)
-class Config:
-    """How to ingest.
-
-    Attributes
-    ----------
-    overwrite : bool
-        Replace what was ingested from another acquisition; no part of the result.
-    copy : bool
-        Copy the samples of all frames, so that later steps do without the files.
-    cubes : str or None
-        Folder or URL for the cubes, or RUN; None for where those of the earlier ingest are, or
-        else RUN. No part of the result.
-    """
-
-    overwrite: bool = quantity(False, doc="replace an ingest of another acquisition")
-    copy: bool = quantity(False, doc="copy all samples into cubes")
-    cubes: str | None = quantity(None, doc="folder or URL for the cubes")
+Config = Ingest
 
 
 def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:

@@ -7,7 +7,6 @@ not copied, and holds them against their checksums.
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,9 +15,10 @@ import numpy as np
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.model.config import quantity, to_plain
+from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
 from pixcal.model.flags import PixelFlag
+from pixcal.model.options import Reduce
 from pixcal.stages.reduce.calibration import Finishing, calibration_writers, finish
 from pixcal.stages.reduce.columns import extent, indices, run_noted, strip_width
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
@@ -58,40 +58,7 @@ _MIN_READ_FRAMES = 8  # fewer do not tell the noise of each pixel
 _SHARED_BYTES = 64 << 20
 
 
-@dataclass(frozen=True)
-class Config:
-    """How to reduce.
-
-    Attributes
-    ----------
-    gain : str
-        ``declared``: electrons mean what the owner says; ``measured``: by photon transfer.
-    clip_sigma : float
-        Samples of bias, dark and flat frames further from the rest are left out.
-    hot_sigma : float
-        Dark signal above the median by so many robust sigmas of the detector is ``hot``.
-    dead_below, dead_above : float
-        Response over that of the neighbours out of these limits is ``dead``.
-    noisy_factor : float
-        Noise above the usual noise by this factor is ``noisy``.
-    nonlinear_share : float
-        Relative departure from the other pixels over a ladder of flats that is ``nonlinear``.
-    rounding_share : float
-        Share of the variance that the stored precision may cost.
-    cubes : str or None
-        Folder or URL for the cubes, or RUN; None for where those of ingest are. No part of the
-        result.
-    """
-
-    gain: str = quantity("declared", choices=("declared", "measured"), doc="which gain to use")
-    clip_sigma: float = quantity(4.0, low=4, high=100, doc="outliers in calibration frames")
-    hot_sigma: float = quantity(10.0, low=5, high=1e6, doc="dark signal of hot pixels")
-    dead_below: float = quantity(0.5, low=0, high=1, doc="response over that of the neighbours")
-    dead_above: float = quantity(2.0, low=1, high=1e6, doc="response over that of the neighbours")
-    noisy_factor: float = quantity(1.5, low=1, high=1e6, doc="noise over the usual noise")
-    nonlinear_share: float = quantity(0.03, above=0, high=1e6, doc="departure over a ladder")
-    rounding_share: float = quantity(1e-3, above=0, high=1, doc="of the variance, for storing")
-    cubes: str | None = quantity(None, doc="folder or URL for the cubes")
+Config = Reduce
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -117,8 +84,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         If the frames have not been ingested, or the gain is to be measured and cannot be.
     """
     require(run_dir, "ingest", _INGEST_FORMAT)
-    plain = to_plain(config)
-    del plain["cubes"]
+    plain = result_options(config)
     with lock(run_dir):
         # Again: another process may have replaced it until then.
         inputs = {"ingest": require(run_dir, "ingest", _INGEST_FORMAT).key}

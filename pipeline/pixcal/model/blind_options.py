@@ -1,0 +1,63 @@
+"""The options of the blind examination, as `pixcal.model.options` has those of the others."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pixcal.model.config import quantity
+
+
+@dataclass(frozen=True)
+class MakeConfig:
+    """Options of ``blind make``."""
+
+    cases: int = quantity(low=1, high=9999, metavar="N", doc="Number of cases.")
+    seed: int | None = quantity(
+        None,
+        low=0,
+        high=10**18,
+        doc="Seed of all that is drawn; below 1000 for development, from there on for "
+        "examinations. [default: one that only FILE knows]",
+    )
+    size: Literal["tiny", "small", "standard"] = quantity(
+        "small",
+        doc="small: 61 x 67 pixels, 2 x 300 frames; standard: 128 x 128, 2 or 3 x 600; "
+        "tiny: 33 x 35, 2 x 60, to try the commands.",
+    )
+    bench: Literal["both", "second", "own"] = quantity(
+        "both",
+        doc="Cases of the second bench, which shares no code with pixcal, of pixcal's own "
+        "simulator (a self-check), or half of each.",
+    )
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Options of ``blind run``."""
+
+    again: bool = quantity(False, doc="Diagnose anew what was diagnosed.")
+    keep: bool = quantity(False, doc="Keep the runs whole, not their products alone.")
+    limit: int | None = quantity(
+        None, low=1, doc="Diagnose at most N cases now, in order; their order is random."
+    )
+
+
+@dataclass(frozen=True)
+class ScoreConfig:
+    """Options of ``blind score``."""
+
+    oracle: int = quantity(
+        0,
+        low=0,
+        doc="Simulate the true effects of the first N cases of parts 1 and 4 as well: what could "
+        "be closed.",
+    )
+    write: Path | None = quantity(
+        None, metavar="PAGE", doc="Markdown page that the table goes to, between its marks."
+    )
+    also: tuple[tuple[Path, Path], ...] = quantity(
+        (),
+        metavar="DIR FILE",
+        doc="Another examination of the same size, and its truth, to be scored together; "
+        "may be given several times.",
+    )

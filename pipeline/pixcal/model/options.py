@@ -1,0 +1,305 @@
+"""The options of every command, each said once: type, range, default, unit and meaning.
+
+The command line, the functions of `pixcal.api` and the stages take them from here. An option is
+called as its field; the command line leaves out the unit (``--diameter`` is ``diameter_m``).
+Beside those of `pixcal.model.config.quantity`, a field may say
+
+- ``in_key``: false where the result does not depend on it;
+- ``python_only``: true where the command line does not offer it;
+- ``metavar``, ``flag``, ``shown``: how help shows its value, its name, and a default of None.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pixcal.model.config import StrPath, quantity
+from pixcal.model.errors import InputError
+
+Region = tuple[int, int, int, int]
+"""Limits (y0, y1, x0, x1) of a rectangle of pixels, ends excluded."""
+
+MOST_ELECTRONS = 1e15
+"""The Poisson generator counts so far."""
+
+
+def _overwrite() -> Any:
+    return quantity(False, doc="Replace what was ingested from another acquisition.", in_key=False)
+
+
+def _copy() -> Any:
+    doc = "Copy the samples of all frames: later steps do without the files of ACQ."
+    return quantity(False, doc=doc, in_key=False)
+
+
+def _cubes() -> Any:
+    doc = (
+        "Folder or URL (s3://bucket/prefix) for the large cubes; RUN to keep them there. "
+        "[default: as before, or as in ingest; else RUN]"
+    )
+    return quantity(None, doc=doc, metavar="PLACE", in_key=False)
+
+
+def _gain() -> Any:
+    doc = "Gain to use: declared in acquisition.yaml, or measured from the flats."
+    return quantity("declared", doc=doc)
+
+
+def _model() -> Any:
+    # The shapes of `pixcal.estimators.models`.
+    doc = "Shape of the fringes: straight, hyperbolic, or whichever the phases call for."
+    return quantity("auto", choices=("auto", "hyperbolic", "paraxial"), doc=doc)
+
+
+def _python(default: Any, **meaning: Any) -> Any:
+    """An option of the Python function that the command line does not offer."""
+    return quantity(default, python_only=True, **meaning)
+
+
+def _own(doc: str, *, in_key: bool = True) -> Any:
+    return quantity((), doc=f"{doc}; may be given several times.", metavar="FILE", in_key=in_key)
+
+
+@dataclass(frozen=True)
+class Ingest:
+    """Options of ``ingest``."""
+
+    overwrite: bool = _overwrite()
+    copy: bool = _copy()
+    cubes: StrPath | None = _cubes()
+
+
+@dataclass(frozen=True)
+class Reduce:
+    """Options of ``reduce``."""
+
+    gain: Literal["declared", "measured"] = _gain()
+    clip_sigma: float = _python(
+        4.0, low=4, high=100, doc="Clipping of calibration frames, robust sigmas."
+    )
+    hot_sigma: float = _python(
+        10.0, low=5, high=1e6, doc="Dark signal of ``HOT`` pixels, robust sigmas above the median."
+    )
+    dead_below: float = _python(
+        0.5, low=0, high=1, doc="Response over the neighbours' below which a pixel is ``DEAD``."
+    )
+    dead_above: float = _python(
+        2.0, low=1, high=1e6, doc="Response over the neighbours' above which a pixel is ``DEAD``."
+    )
+    noisy_factor: float = _python(
+        1.5, low=1, high=1e6, doc="Noise over the usual noise above which a pixel is ``NOISY``."
+    )
+    nonlinear_share: float = _python(
+        0.03, above=0, high=1e6, doc="Departure from a line above which it is ``NONLINEAR``."
+    )
+    rounding_share: float = _python(
+        1e-3, above=0, high=1, doc="Share of the variance that rounding may add."
+    )
+    cubes: StrPath | None = _cubes()
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Options of the pass over the cube, a part of ``fit``."""
+
+    batch_frames: int | None = _python(
+        None, low=4, unit="frames", doc="Frames of an Allan batch; 500, or fewer in a short run."
+    )
+    chi2_limit: float = _python(
+        1.5, above=1.0, doc="Reduced chi-square above which a pixel is ``BAD_FIT``."
+    )
+
+
+@dataclass(frozen=True)
+class Fit(Sweep):
+    """Options of ``fit``."""
+
+    model: str = _model()
+    with_diagnosis: bool = quantity(
+        False,
+        in_key=False,
+        doc="Also write maps without the effects that 'pixcal diagnose' found, and what they "
+        "gained.",
+    )
+    own: tuple[Path, ...] = _own(
+        "Python file with an effect of your own that the diagnosis found", in_key=False
+    )
+
+
+@dataclass(frozen=True)
+class Allan:
+    """Options of ``allan``."""
+
+    region: Region | None = _python(
+        None, unit="px", low=0, doc="Limits (y0, y1, x0, x1) of the main curve, ends excluded."
+    )
+    regions: tuple[Region, ...] = quantity(
+        (),
+        unit="px",
+        low=0,
+        flag="--region",
+        metavar="y0:y1,x0:x1",
+        doc="Pixels for a curve of their own, ends excluded; may be given several times.",
+    )
+
+
+@dataclass(frozen=True)
+class Crests:
+    """Options of ``crests``."""
+
+    frames: int = quantity(8, low=1, metavar="N", doc="Frames to use, spread over the run.")
+    paths: int | None = quantity(
+        None, low=2, shown="all", doc="Crests and valleys to use of each end, the outermost."
+    )
+    segment: int | None = quantity(
+        None,
+        low=4,
+        unit="px",
+        shown="an eighth of the window, 8 to 128",
+        doc="Length along a fringe that gives one point.",
+    )
+
+
+@dataclass(frozen=True)
+class Diagnose:
+    """Options of ``diagnose``."""
+
+    only: tuple[str, ...] = _python((), doc="The only candidates.")
+    without: tuple[str, ...] = _python((), doc="Effects that are no candidates.")
+    own: tuple[Path, ...] = _own("Python file that holds an effect of your own")
+    nominal: Path | None = quantity(
+        None,
+        metavar="BENCH.yaml",
+        doc="Bench file whose effects the nominal bench has from the start.",
+    )
+
+
+@dataclass(frozen=True)
+class Astrometry:
+    """Options of ``astrometry``; the telescope is by default that of the paper, section 2."""
+
+    truth: Path | None = quantity(
+        None,
+        metavar="DIR",
+        shown="the maps and a draw of their errors",
+        doc="True offsets of a simulated detector (ACQ-truth): where its pixels lie.",
+    )
+    diameter_m: float = quantity(7.0, unit="m", above=0, doc="Diameter of the telescope, m.")
+    focal_length_m: float = quantity(
+        130.0, unit="m", above=0, doc="Focal length of the telescope, m."
+    )
+    wavelength_nm: float = quantity(
+        600.0, unit="nm", above=0, doc="Wavelength of the stars' light, nm."
+    )
+    obscuration: float = quantity(
+        0.0, low=0, high=0.9, metavar="E", doc="Central obscuration, share of the diameter."
+    )
+    electrons: float = quantity(
+        1e8,
+        unit="e-",
+        above=0,
+        metavar="N",
+        shown="1e8",
+        doc="Photo-electrons of a star at each position, all exposures together.",
+    )
+    background_e: float = quantity(
+        0.0, unit="e-", low=0, metavar="N", doc="Background of a pixel at each position, electrons."
+    )
+    window: int | None = quantity(
+        None,
+        unit="px",
+        low=3,
+        high=255,
+        shown="8 λ/D",
+        doc="Side of the window that is fitted, an odd number.",
+    )
+    stars: int = quantity(1000, low=2, high=100_000, doc="Stars, at random places of the detector.")
+    positions: int = quantity(
+        16, low=1, high=1024, doc="Positions of each star, whose mean is taken."
+    )
+    dither_px: float = quantity(
+        32.0,
+        unit="px",
+        low=0,
+        high=512,
+        doc="Largest distance of a position from the first, along x and y.",
+    )
+    seed: int = quantity(0, low=0, doc="Seed of the random numbers.")
+
+    def __post_init__(self) -> None:
+        if self.window is not None and self.window % 2 == 0:
+            raise InputError(f"--window {self.window}: even; a window has a middle pixel")
+        if self.electrons + self.background_e > MOST_ELECTRONS:
+            raise InputError(
+                f"--electrons, --background: more than {MOST_ELECTRONS:g} e- cannot be counted; "
+                "give less"
+            )
+
+
+@dataclass(frozen=True)
+class Compare:
+    """Options of ``compare``."""
+
+    split: Literal["halves", "odd-even"] = quantity(
+        "halves",
+        doc="Parts of a single run: its first and second half, or every other batch of frames.",
+    )
+    sigma_accuracy: float = quantity(
+        0.02,
+        low=0,
+        high=0.5,
+        metavar="SHARE",
+        doc="Relative error of SIGMA that is no difference yet.",
+    )
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Options of ``budget``; without either it is for 5e-5 px, as the paper asks (section 1)."""
+
+    precision_px: float | None = quantity(
+        None,
+        unit="px",
+        low=1e-9,
+        high=1,
+        shown="5e-5 without --frames",
+        doc="Wanted 1-sigma error of a pixel's offset on each axis.",
+    )
+    frames: int | None = quantity(
+        None, low=1, high=10**12, doc="Frames of each fringe set: the precision that they reach."
+    )
+
+
+@dataclass(frozen=True)
+class Simulate:
+    """Options of ``simulate``."""
+
+    truth: Path | None = quantity(
+        None,
+        metavar="DIR",
+        shown="ACQ-truth",
+        doc="Directory of the truth, apart from the acquisition.",
+    )
+    own: tuple[Path, ...] = _own("Python file with an effect of your own, for BENCH.yaml")
+
+
+@dataclass(frozen=True)
+class Run:
+    """Options of ``run``, those of its steps among them."""
+
+    overwrite: bool = _overwrite()
+    copy: bool = _copy()
+    gain: Literal["declared", "measured"] = _gain()
+    model: str = _model()
+    cubes: StrPath | None = _cubes()
+    diagnosed: bool = quantity(
+        True,
+        flag="--diagnose/--no-diagnose",
+        doc="Tell where the frames differ from a simulation of the bench, and why: takes the "
+        "longest.",
+    )
+
+
+@dataclass(frozen=True)
+class Report:
+    """``report`` has no options."""

@@ -1,0 +1,84 @@
+"""``pixcal run``: all steps that an acquisition allows, from its frames to the report."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+from pixcal.engine.run import Runtime
+from pixcal.model import options
+from pixcal.model.acquisition import load_acquisition
+from pixcal.model.errors import InputError
+from pixcal.stages import allan, correct, diagnose, fit, ingest, reduce, report
+
+Config = options.Run
+Step = Callable[[str, Path], AbstractContextManager[None]]
+"""Called with a step's name and its folder; the step runs inside the context."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """Which steps were possible."""
+
+    fitted: bool
+    diagnosed: bool
+
+
+def _silent(_name: str, _folder: Path) -> AbstractContextManager[None]:
+    return nullcontext()
+
+
+def run(
+    acquisition: Path,
+    out: Path,
+    config: Config,
+    runtime: Runtime,
+    step: Step = _silent,
+    note: Callable[[str], object] = lambda _text: None,
+) -> Done:
+    """Do all steps; the maps are good without a diagnosis or a correction of them.
+
+    Parameters
+    ----------
+    acquisition, out : Path
+        As of ingest.
+    config : Config
+    runtime : Runtime
+    step : callable
+        Each step runs inside its context.
+    note : callable
+        Is told what was not possible, in a sentence.
+
+    Raises
+    ------
+    InputError
+        Naming the file, key or option that is wrong.
+    """
+    of_fit = fit.Config(model=config.model)
+    with step("ingest", out / "ingest"):
+        of_ingest = ingest.Config(config.overwrite, config.copy, config.cubes)
+        ingest.run(acquisition, out, of_ingest, runtime)
+    with step("reduce", out / "reduce"):
+        reduce.run(out, reduce.Config(gain=config.gain, cubes=config.cubes), runtime)
+    fringes = bool(load_acquisition(acquisition).frames.fringes)
+    if fringes:
+        with step("fit", out / "fit"):
+            fit.run(out, of_fit, runtime)
+        with step("allan", out / "allan"):
+            allan.run(out, allan.Config(), runtime)
+    diagnosed = config.diagnosed
+    if diagnosed:
+        try:
+            with step("diagnose", out / "diagnose"):
+                diagnose.run(out, diagnose.Config(), runtime)
+        except InputError as error:
+            note(f"diagnose: not possible: {error}")
+            diagnosed = False
+    if diagnosed and fringes:
+        with step("corrected", out / "corrected"):
+            refused = correct.attempt(out, of_fit, runtime)
+        if refused is not None:
+            note(f"corrected: not possible, the fitted maps stand: {refused}")
+    with step("report", out / "report"):
+        report.run(out, report.Config(), runtime)
+    return Done(fringes, diagnosed)
