@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 TOOLS := $(VENV)/.installed-tools
 DOCS := $(VENV)/.installed-docs
-# Of the whole blind examination; each is used once (docs/blind.md).
+# Of the whole blind examination; each is used once (docs/appendix/blind.md).
 SEED ?= 2004
 # Compiled on first use: most of what is installed is never imported.
 PIP := $(BIN)/python -m pip --quiet install --no-compile
@@ -75,19 +75,19 @@ bench: $(INSTALLED) ## speed against a bare scan, and beside other methods (6 mi
 bench-full: $(INSTALLED) ## the same for 46 Mpix: time and memory (20 minutes, 60 GB of disk)
 	$(BIN)/python benchmarks/throughput.py --full
 
-fuzz: $(INSTALLED) ## bad input in thousands of cases, for docs/fuzz.md (under ten minutes on two cores)
+fuzz: $(INSTALLED) ## bad input in thousands of cases, for docs/appendix/fuzz.md (under ten minutes on two cores)
 	$(BIN)/python benchmarks/fuzz.py --write
 
-torture: $(TOOLS) ## faults of all kinds done on purpose, for docs/torture.md (12 minutes)
+torture: $(TOOLS) ## faults of all kinds done on purpose, for docs/appendix/torture.md (12 minutes)
 	$(BIN)/python benchmarks/torture.py
 
 study-diagnose: $(INSTALLED) ## what the diagnosis claims by chance, and from which strength on it finds each effect (hours)
 	$(BIN)/python benchmarks/study_diagnose.py
 
-effect-pictures: $(INSTALLED) ## what every effect does to the offsets, for docs/effects (two minutes)
+effect-pictures: $(INSTALLED) ## what every effect does to the offsets, for docs/reference/effects (two minutes)
 	$(BIN)/python benchmarks/effect_pictures.py
 
-reproduce: $(INSTALLED) ## the paper's figures into docs/reproduction (minutes, 4 GB of disk)
+reproduce: $(INSTALLED) ## the paper's figures into docs/appendix/reproduction (minutes, 4 GB of disk)
 	$(BIN)/python benchmarks/reproduce.py
 
 reproduce-full: $(INSTALLED) ## the same in the paper's own sizes (much longer, 12 GB of disk)

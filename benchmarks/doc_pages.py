@@ -26,16 +26,17 @@ COMMANDS = re.compile(r"(<!-- commands -->\n).*\Z", re.DOTALL)
 FILES = re.compile(r"(<!-- file: (.+?) -->\n\n```[^\n]*\n).*?(```\n)", re.DOTALL)
 TABLES = re.compile(r"(<!-- keys: (\w+) -->\n\n)(?:\|.*\n)*")
 SEE = {
-    "pixcal run": "Step by step: [From FITS to the maps](tutorial.md).",
-    "pixcal ingest": "Frames: [Your own camera](own-camera.md). Keys of `acquisition.yaml`: "
-    "[Files](files.md).",
-    "pixcal fit": "What it computes: [Mathematics](mathematics.md).",
-    "pixcal astrometry": "How it is measured: [What the maps bring for stars](astrometry.md).",
-    "pixcal compare": "How to read it: [The same pixels twice](compare.md).",
-    "pixcal simulate": "Keys of the bench file: [Files](files.md#bench-files). Your own effects: "
-    "[one Python file](own-effect.md).",
-    "pixcal budget": "What is counted: [Frames before any are taken](budget.md).",
-    "pixcal blind": "What is asked and how it is marked: [The blind examination](blind.md).",
+    "pixcal run": "Tutorial: [From FITS to maps](../tutorials/first-maps.md).",
+    "pixcal ingest": "How to: [Your own camera](../how-to/own-camera.md). Keys of "
+    "`acquisition.yaml`: [Files](files.md).",
+    "pixcal fit": "What it computes: [Mathematics](../explanation/mathematics.md).",
+    "pixcal diagnose": "How to: [Diagnose a bench](../how-to/diagnose.md).",
+    "pixcal astrometry": "How to: [Star centroids](../how-to/astrometry.md).",
+    "pixcal compare": "How to: [Repeatability](../how-to/compare.md).",
+    "pixcal simulate": "Keys of the bench file: [Files](files.md#bench-files). How to: [Add your "
+    "own effect](../how-to/own-effect.md).",
+    "pixcal budget": "How to: [Plan an exposure](../how-to/budget.md).",
+    "pixcal blind": "Rules and results: [Blind examination](../appendix/blind.md).",
 }
 """Pages that say more."""
 

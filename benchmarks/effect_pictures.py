@@ -26,7 +26,7 @@ from pixcal.stages import fit, ingest, reduce, simulate
 from pixcal.storage.products import read_map
 
 ROOT = Path(__file__).parents[1]
-PAGES = ROOT / "docs" / "effects"
+PAGES = ROOT / "docs" / "reference" / "effects"
 AXES = ("delta_x", "delta_y")
 STRONGER = {"cosmic_hits": 3e4}
 """Times the strength of the defaults at which an effect is drawn, where these show nothing."""

@@ -1,4 +1,4 @@
-"""Bad input in thousands of cases: ``python benchmarks/fuzz.py`` writes the table of docs/fuzz.md.
+"""Bad input in thousands of cases, and the table of docs/appendix/fuzz.md.
 
 ``--kind NAME --case N`` repeats one case, ``--messages`` prints every refusal.
 """
@@ -19,7 +19,7 @@ from pathlib import Path
 from fuzzing.kinds import KINDS
 from fuzzing.laws import SECONDS, Kind, judged
 
-PAGE = Path(__file__).parents[1] / "docs" / "fuzz.md"
+PAGE = Path(__file__).parents[1] / "docs" / "appendix" / "fuzz.md"
 PART = 20
 """Cases that a process tries at a time."""
 ADDRESS_SPACE = 16 << 30
@@ -118,7 +118,7 @@ def main() -> int:
     jobs = len(os.sched_getaffinity(0))
     parser.add_argument("--jobs", type=int, default=jobs, help="processes [default: all cores]")
     parser.add_argument("--messages", action="store_true", help="print the refusals")
-    parser.add_argument("--write", action="store_true", help="write the table of docs/fuzz.md")
+    parser.add_argument("--write", action="store_true", help="write docs/appendix/fuzz.md")
     asked = parser.parse_args()
     numbers = {name: range(asked.cases or KINDS[name].cases) for name in asked.kind or KINDS}
     if asked.case is not None:

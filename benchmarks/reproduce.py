@@ -59,11 +59,11 @@ def main() -> None:
     parser.add_argument("--full", action="store_true", help="the paper's own sizes: about an hour")
     parser.add_argument("--figure", action="append", choices=FIGURES, help="only this one; again")
     parser.add_argument("--work", type=Path, default=ROOT / "work" / "reproduction")
-    parser.add_argument("--out", type=Path, help="of the page; default: docs/reproduction")
+    parser.add_argument("--out", type=Path, help="of the page; default: docs/appendix/reproduction")
     parser.add_argument("--quiet", action="store_true", help="no progress")
     options = parser.parse_args()
     work = options.work / ("full" if options.full else "quick")
-    default = ROOT / "docs" / "reproduction"
+    default = ROOT / "docs" / "appendix" / "reproduction"
     out = options.out or (default / "full" if options.full else default)
     lab = Lab(work, Runtime(quiet=options.quiet), options.full)
     outcomes = []

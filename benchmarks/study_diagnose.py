@@ -2,7 +2,7 @@
 
 Every acquisition is of another detector, with nothing in it or one effect of some strength, and is
 recorded, reduced and diagnosed as a user's would be. What is played goes to
-``docs/diagnose/study.jsonl``, where an interrupted study goes on, as long as the code is the same;
+``docs/appendix/diagnose/study.jsonl``, where an interrupted study resumes with the same code;
 tables and picture into the page.
 """
 
@@ -41,7 +41,7 @@ from pixcal.stages.diagnose.shrinkage import differing, shrinkage
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-OUT = Path(__file__).parents[1] / "docs" / "diagnose"
+OUT = Path(__file__).parents[1] / "docs" / "appendix" / "diagnose"
 HERE, PROCESSES = Runtime(cluster="sync"), Runtime(cluster="processes", quiet=False)
 STRENGTHS = (0.3, 1.0, 3.0, 10.0)
 """Times the threshold (`pixcal.stages.blind.strengths`), of each way in turn."""
@@ -459,7 +459,7 @@ def publish(played: Sequence[dict[str, Any]], out: Path) -> None:
             "wrong": wrong_table(something),
         }
         draw(something, out / "power.png")
-    page = OUT.parent / "diagnose.md"
+    page = OUT.parent / "diagnose-study.md"
     text = page.read_text(encoding="utf-8")
     for name, table in tables.items():
         start, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"

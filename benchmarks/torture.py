@@ -1,4 +1,4 @@
-"""Faults survived: ``make torture`` does them all and writes the table of docs/torture.md.
+"""Faults survived: ``make torture`` does them all and writes docs/appendix/torture.md.
 
 ``--only kill`` takes those whose name the expression finds, ``--share 0.1`` a tenth of each; the
 table is written when nothing was left out. The last line is "all survived", or what was not.
@@ -20,7 +20,7 @@ from pathlib import Path
 from faults import Outcome, clocks, damage, full_disk, inputs, kills, places, processes, workers
 from faults.bench import STAGES, Bench, make_bench
 
-PAGE = Path(__file__).parents[1] / "docs" / "torture.md"
+PAGE = Path(__file__).parents[1] / "docs" / "appendix" / "torture.md"
 BEGIN, END = "<!-- torture: begin -->", "<!-- torture: end -->"
 HEAD = "| what was done | times | how it ended |\n|---|---|---|"
 SEED = 20261121

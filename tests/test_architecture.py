@@ -1,4 +1,4 @@
-"""The code's real imports, held against the table in docs/architecture.md."""
+"""The code's real imports, held against the table in docs/explanation/architecture.md."""
 
 import ast
 import graphlib
@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = {"pixcal": ROOT / "pipeline/pixcal", "pixcal_cli": ROOT / "cli/pixcal_cli"}
 NEW_RANDOM = {"Generator", "default_rng", "SeedSequence", "BitGenerator", "PCG64", "Philox"}
-PAGE = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
 
 
 def table() -> dict[str, tuple[str, str]]:

@@ -70,7 +70,7 @@ def run(folder: Path, config: RunConfig, runtime: "Runtime") -> None:
 @command(
     ScoreConfig,
     "pixcal blind score exam --sealed truth.json",
-    "pixcal blind score exam --sealed truth.json --oracle 20 --write docs/blind.md",
+    "pixcal blind score exam --sealed truth.json --oracle 20 --write docs/appendix/blind.md",
     "pixcal blind score exam --sealed truth.json --also exam-2 truth-2.json",
     argument=lambda body: cases_argument(sealed_option(body)),
 )

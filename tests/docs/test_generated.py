@@ -24,7 +24,7 @@ def test_generated_blocks_are_up_to_date(page: Path) -> None:
 
 
 def test_the_page_of_commands_shows_all_of_them() -> None:
-    text = (DOCS / "commands.md").read_text(encoding="utf-8")
+    text = (DOCS / "reference" / "commands.md").read_text(encoding="utf-8")
     assert re.findall(r"^## (pixcal .+)$", text, re.MULTILINE) == commands_of()
     assert "Usage: pixcal run [OPTIONS] ACQ" in text
 

@@ -15,7 +15,8 @@ from astropy.io import fits
 import pixcal
 from pixcal.model.flags import PixelFlag
 
-PAGE = (Path(__file__).parents[2] / "docs" / "products.md").read_text(encoding="utf-8")
+DOCS = Path(__file__).parents[2] / "docs"
+PAGE = (DOCS / "reference" / "products.md").read_text(encoding="utf-8")
 STRUCTURE = {
     "SIMPLE", "BITPIX", "NAXIS", "NAXIS1", "NAXIS2", "EXTEND", "XTENSION", "PCOUNT", "GCOUNT",
     "EXTNAME",

@@ -28,13 +28,13 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_formulas_are_drawn_by_the_browser(site: Path) -> None:
-    text = (site / "mathematics.html").read_text(encoding="utf-8")
+    text = (site / "explanation/mathematics.html").read_text(encoding="utf-8")
     assert text.count("<math") > 20
     assert "arithmatex" not in text
 
 
 def test_the_reference_holds_the_docstrings(site: Path) -> None:
-    text = (site / "reference.html").read_text(encoding="utf-8")
+    text = (site / "reference/python.html").read_text(encoding="utf-8")
     for name in ("calibrate", "open_run", "delta_x", "baselines_mm", "sample_acquisition"):
         assert name in text
 

@@ -161,7 +161,7 @@ def test_what_is_undone_is_what_was_done(cls: type[Effect]) -> None:
 @EVERY_OF_PIXCAL
 def test_it_has_its_page(cls: type[Effect]) -> None:
     assert cls.name == cls.__module__.rpartition(".")[2]
-    page = ROOT / "docs" / "effects" / f"{cls.name}.md"
+    page = ROOT / "docs" / "reference" / "effects" / f"{cls.name}.md"
     assert page.is_file(), "what it is, source, parameters, the picture of what it does to delta"
     text = page.read_text(encoding="utf-8")
     for field in dataclasses.fields(cls):

@@ -1,4 +1,4 @@
-"""Some cases of every kind of bad input, and the laws that judge them (docs/fuzz.md)."""
+"""Some cases of every kind of bad input, and the laws that judge them (docs/appendix/fuzz.md)."""
 
 import os
 import time
@@ -17,7 +17,7 @@ from fuzzing.night import Night, _check_flags
 from pixcal.model.errors import InputError
 from pixcal_cli.main import cli
 
-PAGE = Path(__file__).parents[2] / "docs" / "fuzz.md"
+PAGE = Path(__file__).parents[2] / "docs" / "appendix" / "fuzz.md"
 CASES = {"markup": 2, "own-effects": 30}
 """Cases of a kind in the short version, where not a fortieth of those of the long one."""
 

@@ -1,4 +1,4 @@
-"""Every fault of docs/torture.md a few times; ``make torture`` does them many times.
+"""Every fault of docs/appendix/torture.md a few times; ``make torture`` does them many times.
 
 Each function asserts by itself that nothing is lost, that what is said is one line that names the
 place, and that in the end all bytes are those of an undisturbed run.

@@ -36,7 +36,7 @@ def checked(effect: type[Effect], file: Path) -> type[Effect]:
             # mypy: a class may be given another method
             effect.estimate = _estimate(vars(effect)["estimate"], file)  # type: ignore[method-assign]
     except (Exception, SystemExit) as error:
-        raise InputError(f"{file}: {_reason(error)}; see docs/own-effect.md") from error
+        raise InputError(f"{file}: {_reason(error)}; see docs/how-to/own-effect.md") from error
     return effect
 
 

@@ -15,7 +15,7 @@ def keep_freed_memory() -> None:
 
     The nanny sets MALLOC_TRIM_THRESHOLD_, and any such setting stops malloc from adapting itself:
     each buffer of a chunk comes as fresh pages from the kernel and goes back at once, which
-    multiplies the time of a sweep by 3 to 4 (docs/clusters.md). The limits set here are those that
+    multiplies the time of a sweep by 3 to 4. The limits set here are those that
     malloc would adapt to. What the owner of the worker has chosen stays as it is.
     """
     if os.environ.get("MALLOC_TRIM_THRESHOLD_") != OF_THE_NANNY:

@@ -32,7 +32,7 @@ ABSORBED = {
     "the share moves phases, by hundredths of the bound",
     "wavelength_drift": "every frame of the fit has a phase and, where it moves, a fringe vector",
 }
-"""Effects that the free parameters of the fit take up, and how (measured: docs/correct.md)."""
+"""Effects that the free parameters of the fit take up, and how (docs/how-to/correct.md)."""
 
 LEFT = {
     "cosmic_hits": "few samples are hit; most of those the reduction has left out",
@@ -44,7 +44,7 @@ LEFT = {
     "row_noise": "noise of every frame of its own: nothing of it stays in the maps",
     "telegraph_noise": "pixels that jump have larger errors, which the fit finds",
 }
-"""Effects that are noise, or too small to be worth undoing (measured: docs/correct.md)."""
+"""Effects that are noise, or too small to be worth undoing (docs/how-to/correct.md)."""
 
 
 @dataclass(frozen=True)
