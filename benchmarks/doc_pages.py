@@ -1,4 +1,4 @@
-"""Write again what is generated in docs/: help texts, files, layers, the tutorial's pictures.
+"""Write again what is generated in docs/: help texts, files, layers, pictures of the sample.
 
 And ``pixcal/__init__.pyi``, from the options of the commands.
 
@@ -15,6 +15,7 @@ import click
 from click.testing import CliRunner
 
 import pixcal
+from documentation import readme_picture
 from documentation.layers import picture
 from documentation.stub import STUB, stub
 from pixcal.model import acquisition, bench
@@ -100,10 +101,11 @@ def _content(name: str) -> str:
     return (DOCS / name).read_text(encoding="utf-8").rstrip() + "\n"
 
 
-def draw_tutorial(folder: Path) -> None:
-    """Pictures of the sample acquisition, as the report has them."""
+def draw_sample(folder: Path) -> None:
+    """Pictures of the sample acquisition: of the README, and two of the report."""
     with tempfile.TemporaryDirectory() as scratch:
-        run = pixcal.run(pixcal.sample_acquisition(), Path(scratch) / "demo", diagnosed=False)
+        run = pixcal.run(pixcal.sample_acquisition(), Path(scratch) / "demo")
+        readme_picture.draw(run, folder / "readme.png")
         run.delta_x.picture().save(folder / "demo-delta_x.png")
         run.sets["vertical"].allan_picture().save(folder / "demo-allan.png")
 
@@ -118,7 +120,7 @@ def main() -> None:
         if (after := filled(before)) != before:
             page.write_text(after, encoding="utf-8")
             print(page)
-    draw_tutorial(LAYERS.parent)
+    draw_sample(LAYERS.parent)
 
 
 if __name__ == "__main__":

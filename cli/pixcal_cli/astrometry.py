@@ -22,10 +22,10 @@ if TYPE_CHECKING:
     "pixcal astrometry demo --diameter 2.4 --focal-length 57.6 --electrons 1e6",
 )
 def astrometry(run: Path, config: Astrometry, runtime: "Runtime") -> None:
-    """Simulate stars and tell what the maps bring for their centroids.
+    """Estimate how much the maps improve star centroids.
 
-    Stars are fitted once taking pixels for a perfect grid and once where the measured maps say. The
-    telescope is by default that of the habitable worlds mission, 7 m and 130 m.
+    Simulated stars are fitted twice: on a perfect grid and with the measured maps. The default
+    telescope is that of the habitable worlds mission, 7 m and 130 m.
     """
     from pixcal.stages import astrometry as stage  # here: for a fast `pixcal --help`
 

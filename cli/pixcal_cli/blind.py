@@ -19,7 +19,7 @@ sealed_option = click.option(
     metavar="FILE",
     required=True,
     type=PATH,
-    help="File of the truth; apart from DIR.",
+    help="File of the truth; not inside DIR.",
 )
 out_option = click.option(
     "--out", "folder", metavar="DIR", required=True, type=PATH, help="Directory of the cases."
@@ -34,7 +34,7 @@ out_option = click.option(
     )
 )
 def blind() -> None:
-    """Examine the diagnosis on data whose effects are withheld."""
+    """Test the diagnosis on simulated benches whose effects are withheld."""
 
 
 @command(
@@ -44,7 +44,7 @@ def blind() -> None:
     argument=lambda body: out_option(sealed_option(body)),
 )
 def make(folder: Path, sealed: Path, config: MakeConfig, runtime: "Runtime") -> None:
-    """Make cases, each with an effect, several, or none, and seal the truth."""
+    """Simulate cases with no, one or several effects, and seal the truth."""
     from pixcal.stages import blind as stage  # here: for a fast `pixcal --help`
 
     found = stage.make(folder, sealed, config, runtime)
@@ -59,7 +59,7 @@ def make(folder: Path, sealed: Path, config: MakeConfig, runtime: "Runtime") -> 
     argument=cases_argument,
 )
 def run(folder: Path, config: RunConfig, runtime: "Runtime") -> None:
-    """Diagnose every case of DIR; those that are done are skipped."""
+    """Diagnose every case of DIR that is not done yet."""
     from pixcal.stages import blind as stage  # here: for a fast `pixcal --help`
 
     done, failed = stage.run(folder, config, runtime)
@@ -75,7 +75,7 @@ def run(folder: Path, config: RunConfig, runtime: "Runtime") -> None:
     argument=lambda body: cases_argument(sealed_option(body)),
 )
 def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: "Runtime") -> None:
-    """Open the seal and hold every diagnosis against its truth."""
+    """Compare every diagnosis with its truth."""
     from pixcal.stages import blind as stage  # here: for a fast `pixcal --help`
 
     found = stage.score(folder, sealed, config, runtime)

@@ -33,10 +33,10 @@ LIMITS = {
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the contents of budget.json.")
 def budget(bench: Path, config: Budget, out: Path | None, as_json: bool) -> None:
-    """Tell frames and hours that a precision takes, before any are taken.
+    """Plan an exposure: frames and hours needed for a given precision.
 
-    BENCH.yaml describes a bench as for `pixcal simulate`. The numbers are the Cramér-Rao bound:
-    no unbiased estimate needs fewer frames, and the fit comes within a few percent.
+    BENCH.yaml describes a bench as for `pixcal simulate`. The numbers are the Cramér-Rao bound: no
+    unbiased estimate needs fewer frames. The fit comes within a few percent of it.
     """
     from pixcal.stages import budget as stage  # here: for a fast `pixcal --help`
 

@@ -16,8 +16,20 @@ from pixcal_cli.options import PATH, examples, run_argument
 )
 @run_argument
 @click.argument("table", metavar="TABLE", type=PATH)
-@click.option("--out", metavar="FILE", required=True, type=PATH, help="CSV, ECSV, FITS or VOTable.")
-@click.option("--fwhm", metavar="PX", required=True, type=float, help="Width of the stars, px.")
+@click.option(
+    "--out",
+    metavar="FILE",
+    required=True,
+    type=PATH,
+    help="Table to write: CSV, ECSV, FITS or VOTable.",
+)
+@click.option(
+    "--fwhm",
+    metavar="PX",
+    required=True,
+    type=float,
+    help="Full width of the stars at half maximum, px.",
+)
 @click.option("--x", default="x", show_default=True, metavar="NAME", help="Column of x, px.")
 @click.option("--y", default="y", show_default=True, metavar="NAME", help="Column of y, px.")
 @click.option(
@@ -25,14 +37,14 @@ from pixcal_cli.options import PATH, examples, run_argument
     type=click.Choice(["0", "1"]),
     default="0",
     show_default=True,
-    help="Coordinate of the centre of the first pixel; SExtractor and FITS count from 1.",
+    help="Coordinate of the centre of the first pixel (1 for SExtractor and FITS).",
 )
 @click.option(
     "--electrons",
     type=float,
     metavar="N",
-    show_default="all pixels count alike",
-    help="Of a star, if the centroids were fitted with weights of its photon noise.",
+    show_default="equal weights",
+    help="Electrons per star, if the centroids were fitted with photon-noise weights.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace FILE.")
 def centroids(
@@ -48,8 +60,8 @@ def centroids(
 ) -> None:
     """Correct a table of centroids with the maps of RUN.
 
-    TABLE holds centroids measured as if the pixels were a perfect grid. Columns are added: the
-    corrected places, and what the errors of the maps leave in them.
+    TABLE holds centroids measured on a perfect grid. Columns are added for the corrected positions
+    and their errors from the maps.
     """
     import numpy as np  # here: for a fast `pixcal --help`
 
@@ -77,19 +89,19 @@ def centroids(
     "--fwhm",
     metavar="PX",
     type=float,
-    show_default="the pixels themselves",
-    help="Distortion of stars of this width in the middle of pixels.",
+    show_default="no star: the pixel offsets",
+    help="Distortion for stars of this width, centred on pixels.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace FILE.")
 def wcs(run: Path, out: Path, fwhm: float | None, overwrite: bool) -> None:
     """Write the maps of RUN as a WCS distortion.
 
-    Lookup tables (D2IMARR) that astropy and others apply to pixel coordinates before everything
-    else of a WCS.
+    astropy and others apply these lookup tables (D2IMARR) to pixel coordinates before the rest of a
+    WCS.
     """
     from pixcal.stages import centroids as stage  # here: for a fast `pixcal --help`
 
     if out.exists() and not overwrite:
-        raise InputError(f"{out}: is there already; choose another --out, or add --overwrite")
+        raise InputError(f"{out}: exists; choose another --out or add --overwrite")
     stage.write_wcs(run, out, fwhm_px=fwhm)
     click.echo(f"{out}: written")

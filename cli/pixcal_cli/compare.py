@@ -36,9 +36,9 @@ def runs_and_out(body: Command) -> Command:
     argument=runs_and_out,
 )
 def compare(runs: tuple[Path, ...], out: Path, config: Compare, runtime: "Runtime") -> None:
-    """Tell what maps of the same pixels have in common, and what not, scale by scale.
+    """Compare maps of the same pixels, scale by scale.
 
-    Two fitted runs or more of windows of the same shape, or one run against itself.
+    Give two or more fitted runs of the same window, or one run to compare with itself.
     """
     from pixcal.stages import compare as stage  # here: for a fast `pixcal --help`
 

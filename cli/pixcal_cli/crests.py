@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @command(Crests, "pixcal crests demo", "pixcal crests demo --frames 1 --paths 4")
 def crests(run: Path, config: Crests, runtime: "Runtime") -> None:
-    """Find the fibres from crests and valleys, a check of the fit."""
+    """Locate the fibres from the paths of crests and valleys, to check the fit."""
     from pixcal.stages import crests as stage  # here: for a fast `pixcal --help`
 
     with results.announce("crests", run / "crests"):
@@ -29,7 +29,7 @@ def crests(run: Path, config: Crests, runtime: "Runtime") -> None:
 def _show(name: str, found: dict[str, Any]) -> None:
     """The points, the fibres, and the difference to the fit's."""
     click.echo(
-        f"  {name}: {found['points_used']} of {found['points']} points, each good to "
+        f"  {name}: {found['points_used']} of {found['points']} points, error per point "
         f"{found['point_sigma_median_px']:.2g} px, chi2 {found['chi2_reduced']:.3g}"
     )
     geometry, agreement = found["geometry"], found["agreement"]

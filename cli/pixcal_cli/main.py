@@ -63,8 +63,8 @@ class InOrder(click.Group):
 def cli(ctx: click.Context) -> None:
     """Maps of pixel response offsets from Young's fringes.
 
-    `pixcal run` does everything; the other commands are its steps. Each step writes a folder under
-    RUN, skips what is up to date, and resumes what was cut short.
+    `pixcal run` does everything; ingest to report are its steps. Each step writes a folder in RUN,
+    skips what is up to date, and resumes after an interruption.
     """
     if ctx.invoked_subcommand is None:
         click.echo(ctx.get_help())

@@ -56,7 +56,7 @@ out_run_option = click.option(
     metavar="RUN",
     required=True,
     type=PATH,
-    help="Directory of the results; made if it is not there.",
+    help="Directory of the results; created if missing.",
 )
 
 
@@ -143,7 +143,7 @@ def runtime_options(command: Command) -> Command:
         default="threads",
         show_default=True,
         metavar="threads|processes|sync|tcp://…",
-        help="Where tasks run: here, or on a Dask cluster at this address.",
+        help="Run tasks here, or on the Dask cluster at this address.",
     )
     @click.option(
         "--workers",
@@ -151,7 +151,7 @@ def runtime_options(command: Command) -> Command:
         default=0,
         show_default="all cores",
         metavar="N",
-        help="Tasks at the same time.",
+        help="Number of parallel tasks.",
     )
     @click.option(
         "--memory",
@@ -159,7 +159,7 @@ def runtime_options(command: Command) -> Command:
         default="2GiB",
         show_default=True,
         metavar="SIZE",
-        help="Memory that may be used; work that needs more is refused.",
+        help="Memory limit; work that needs more is refused.",
     )
     @functools.wraps(command)
     def with_runtime(

@@ -42,14 +42,14 @@ def out_acquisition_option(body: Command) -> Command:
         metavar="ACQ",
         required=True,
         type=PATH,
-        help="Directory of the acquisition; made if it is not there.",
+        help="Directory of the acquisition; created if missing.",
     )
     return bench_argument(out(body))
 
 
 @command(options.Run, "pixcal run data_samples/demo --out demo", argument=from_acquisition)
 def run(acquisition: Path, run: Path, config: options.Run, runtime: "Runtime") -> None:
-    """Do all steps, from the acquisition ACQ to the report under RUN."""
+    """Run all steps, from the acquisition ACQ to the report in RUN."""
     from pixcal.stages import chain
 
     done = chain.run(acquisition, run, config, runtime, results.announce, click.echo)
@@ -63,7 +63,7 @@ def run(acquisition: Path, run: Path, config: options.Run, runtime: "Runtime") -
     argument=from_acquisition,
 )
 def ingest(acquisition: Path, run: Path, config: options.Ingest, runtime: "Runtime") -> None:
-    """Check every frame of the acquisition ACQ, and catalogue it.
+    """Check and catalogue every frame of the acquisition ACQ.
 
     ACQ is a directory with acquisition.yaml and FITS files. Later steps read these files where they
     are; only compressed ones are copied into cubes.
@@ -96,7 +96,7 @@ def reduce(run: Path, config: options.Reduce, runtime: "Runtime") -> None:
     "pixcal fit demo --with-diagnosis",
 )
 def fit(run: Path, config: options.Fit, runtime: "Runtime") -> None:
-    """Fit the fringes and write the maps of the pixels' offsets."""
+    """Fit the fringes and write the maps of pixel offsets."""
     from pixcal.stages import correct
     from pixcal.stages import fit as stage
 
@@ -108,7 +108,7 @@ def fit(run: Path, config: options.Fit, runtime: "Runtime") -> None:
             correct.run(run, config, runtime)
     else:
         if config.own:
-            raise click.UsageError("--own is of use with --with-diagnosis only; give that as well")
+            raise click.UsageError("--own needs --with-diagnosis; give both")
         with results.announce("fit", run / "fit"):
             stage.run(run, config, runtime)
     results.show_fit(run)
@@ -118,7 +118,7 @@ def fit(run: Path, config: options.Fit, runtime: "Runtime") -> None:
 
 @command(options.Allan, "pixcal allan demo", "pixcal allan demo --region 0:64,0:64")
 def allan(run: Path, config: options.Allan, runtime: "Runtime") -> None:
-    """Measure how the error falls with the number of frames."""
+    """Measure how the error falls with the number of frames (Allan deviation)."""
     from pixcal.stages import allan as stage
 
     with results.announce("allan", run / "allan"):
@@ -156,14 +156,14 @@ def effect_list(text: str) -> tuple[str, ...]:
     "chosen",
     type=effect_list,
     metavar="NAMES",
-    help="Candidates, divided by commas; a name after '-' is left out. [default: all]",
+    help="Candidate effects, comma-separated; -NAME leaves one out. [default: all]",
 )
 @config_options(options.Diagnose)
 @runtime_options
 def diagnose(
     run: Path, chosen: tuple[str, ...] | None, config: options.Diagnose, runtime: "Runtime"
 ) -> None:
-    """Tell where data and simulation differ, which effect causes it, and what remains."""
+    """Find where data and simulation differ, which effect causes it, and the residual gap."""
     from pixcal.stages import diagnose as stage
 
     only = tuple(name for name in chosen or () if not name.startswith("-"))
@@ -175,7 +175,7 @@ def diagnose(
 
 @command(options.Report, "pixcal report demo")
 def report(run: Path, config: options.Report, runtime: "Runtime") -> None:
-    """Write a self-contained HTML page on the whole run."""
+    """Write the report of a run, one self-contained HTML page."""
     from pixcal.stages import report as stage
 
     with results.announce("report", run / "report"):
@@ -192,8 +192,8 @@ def report(run: Path, config: options.Report, runtime: "Runtime") -> None:
 def simulate(bench: Path, acquisition: Path, config: options.Simulate, runtime: "Runtime") -> None:
     """Simulate a bench and write an acquisition.
 
-    BENCH.yaml describes detector, optics and frames; ACQ receives the FITS files that the bench's
-    camera would have written.
+    BENCH.yaml describes detector, optics and frames. ACQ receives the FITS files that the camera of
+    the bench would have written.
     """
     from pixcal.stages import simulate as stage
 

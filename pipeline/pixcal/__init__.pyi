@@ -67,7 +67,7 @@ def allan(
     region : tuple[int, int, int, int], optional
         Limits (y0, y1, x0, x1) of the main curve, ends excluded.
     regions : Sequence[tuple[int, int, int, int]]
-        Pixels for a curve of their own, ends excluded; may be given several times.
+        Rectangle with its own Allan curve, ends excluded; repeatable.
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -94,36 +94,36 @@ def astrometry(
     seed: int = 0,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> dict[str, typing.Any]:
-    """Tell what the maps bring for the centroids of stars (paper, section 2).
+    """Estimate how much the maps improve star centroids (paper, section 2).
 
     Parameters
     ----------
     run : Run, str or path
         A run directory.
     truth : str or path, optional
-        True offsets of a simulated detector (ACQ-truth): where its pixels lie.
+        True offsets of a simulated detector (ACQ-truth).
     diameter_m : float
         Diameter of the telescope, m.
     focal_length_m : float
         Focal length of the telescope, m.
     wavelength_nm : float
-        Wavelength of the stars' light, nm.
+        Wavelength of the star light, nm.
     obscuration : float
-        Central obscuration, share of the diameter.
+        Central obscuration as a fraction of the diameter.
     electrons : float
-        Photo-electrons of a star at each position, all exposures together.
+        Photo-electrons of a star at each position, over all exposures.
     background_e : float
-        Background of a pixel at each position, electrons.
+        Background per pixel and position, electrons.
     window : int, optional
-        Side of the window that is fitted, an odd number.
+        Side of the fit window, an odd number.
     stars : int
-        Stars, at random places of the detector.
+        Number of stars, at random places on the detector.
     positions : int
-        Positions of each star, whose mean is taken.
+        Positions of each star to average.
     dither_px : float
         Largest distance of a position from the first, along x and y.
     seed : int
-        Seed of the random numbers.
+        Random seed.
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -145,16 +145,16 @@ def budget(
     frames: int | None = None,
     out: str | os.PathLike[str] | None = None,
 ) -> dict[str, typing.Any]:
-    """Plan frames and hours for a given precision, before any are taken: the Cramér-Rao bound.
+    """Plan an exposure: frames and hours for a given precision (Cramér-Rao bound).
 
     Parameters
     ----------
     bench : str or path
         Bench file (schema ``pixcal/bench/1``).
     precision_px : float, optional
-        Wanted 1-sigma error of a pixel's offset on each axis.
+        Wanted 1-sigma error of the offsets on each axis.
     frames : int, optional
-        Frames of each fringe set: the precision that they reach.
+        Frames of each fringe set; prints the precision that they reach.
     out : str or path
         Where the result goes; made if it is not there.
 
@@ -177,7 +177,7 @@ def compare(
     sigma_accuracy: float = 0.02,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> dict[str, typing.Any]:
-    """Tell what maps of the same pixels have in common and what not, scale by scale.
+    """Compare maps of the same pixels, scale by scale.
 
     Parameters
     ----------
@@ -186,9 +186,9 @@ def compare(
     out : str or path
         Where the result goes; made if it is not there.
     split : {"halves", "odd-even"}
-        Parts of a single run: its first and second half, or every other batch of frames.
+        How to split a single run: first and second half, or alternating batches.
     sigma_accuracy : float
-        Relative error of SIGMA that is no difference yet.
+        Relative error of SIGMA to tolerate.
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -211,18 +211,18 @@ def crests(
     segment: int | None = None,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> dict[str, typing.Any]:
-    """Find the fibres from crests and valleys, a check of the fit (paper, equation 7).
+    """Locate the fibres from the paths of crests and valleys (paper, equation 7).
 
     Parameters
     ----------
     run : Run, str or path
         A run directory.
     frames : int
-        Frames to use, spread over the run.
+        Number of frames to use, spread over the run.
     paths : int, optional
-        Crests and valleys to use of each end, the outermost.
+        Outermost crests and valleys to use at each end.
     segment : int, optional
-        Length along a fringe that gives one point.
+        Length along a fringe for one point.
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -246,7 +246,7 @@ def diagnose(
     nominal: str | os.PathLike[str] | None = None,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> dict[str, typing.Any]:
-    """Tell where data and simulation differ, which effect causes it, and what remains.
+    """Find where data and simulation differ, which effect causes it, and the residual gap.
 
     Parameters
     ----------
@@ -255,11 +255,11 @@ def diagnose(
     only : Sequence[str]
         The only candidates.
     without : Sequence[str]
-        Effects that are no candidates.
+        Effects to leave out.
     own : Sequence[str | os.PathLike[str]]
-        Python file that holds an effect of your own; may be given several times.
+        Python file with an own effect; repeatable.
     nominal : str or path, optional
-        Bench file whose effects the nominal bench has from the start.
+        Bench file whose effects belong to the nominal simulation.
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -295,11 +295,11 @@ def fit(
     chi2_limit : float
         Reduced chi-square above which a pixel is ``BAD_FIT``.
     model : str
-        Shape of the fringes: straight, hyperbolic, or whichever the phases call for.
+        Shape of the fringes: hyperbolic, straight (paraxial), or chosen from the data.
     with_diagnosis : bool
-        Also write maps without the effects that 'pixcal diagnose' found, and what they gained.
+        Also write maps corrected for the effects that 'pixcal diagnose' found.
     own : Sequence[str | os.PathLike[str]]
-        Python file with an effect of your own that the diagnosis found; may be given several times.
+        Python file of an own effect that the diagnosis found; repeatable.
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -319,7 +319,7 @@ def ingest(
     cubes: str | os.PathLike[str] | None = None,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> pixcal.api.opened.Run:
-    """Check every frame of an acquisition, and catalogue it.
+    """Check and catalogue every frame of an acquisition.
 
     Parameters
     ----------
@@ -328,11 +328,11 @@ def ingest(
     out : str or path
         Where the result goes; made if it is not there.
     overwrite : bool
-        Replace what was ingested from another acquisition.
+        Replace the ingested frames of another acquisition.
     copy : bool
-        Copy the samples of all frames: later steps do without the files of ACQ.
+        Copy all samples into RUN, so that later steps do not need ACQ.
     cubes : str or path, optional
-        Folder or URL (s3://bucket/prefix) for the large cubes; RUN to keep them there. [default: as before, or as in ingest; else RUN]
+        Folder or URL (s3://bucket/prefix) for the large cubes, or RUN. [default: the place used before, else RUN]
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -363,7 +363,7 @@ def reduce(
     run : Run, str or path
         A run directory.
     gain : {"declared", "measured"}
-        Gain to use: declared in acquisition.yaml, or measured from the flats.
+        Gain to use: declared in acquisition.yaml or measured from the flats.
     clip_sigma : float
         Clipping of calibration frames, robust sigmas.
     hot_sigma : float
@@ -379,7 +379,7 @@ def reduce(
     rounding_share : float
         Share of the variance that rounding may add.
     cubes : str or path, optional
-        Folder or URL (s3://bucket/prefix) for the large cubes; RUN to keep them there. [default: as before, or as in ingest; else RUN]
+        Folder or URL (s3://bucket/prefix) for the large cubes, or RUN. [default: the place used before, else RUN]
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -401,7 +401,7 @@ def run(
     diagnosed: bool = True,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> pixcal.api.opened.Run:
-    """Do all steps, from an acquisition to corrected maps and the report, as ``pixcal run``.
+    """Run all steps, from an acquisition to corrected maps and the report, as ``pixcal run``.
 
     Parameters
     ----------
@@ -410,17 +410,17 @@ def run(
     out : str or path
         Where the result goes; made if it is not there.
     overwrite : bool
-        Replace what was ingested from another acquisition.
+        Replace the ingested frames of another acquisition.
     copy : bool
-        Copy the samples of all frames: later steps do without the files of ACQ.
+        Copy all samples into RUN, so that later steps do not need ACQ.
     gain : {"declared", "measured"}
-        Gain to use: declared in acquisition.yaml, or measured from the flats.
+        Gain to use: declared in acquisition.yaml or measured from the flats.
     model : str
-        Shape of the fringes: straight, hyperbolic, or whichever the phases call for.
+        Shape of the fringes: hyperbolic, straight (paraxial), or chosen from the data.
     cubes : str or path, optional
-        Folder or URL (s3://bucket/prefix) for the large cubes; RUN to keep them there. [default: as before, or as in ingest; else RUN]
+        Folder or URL (s3://bucket/prefix) for the large cubes, or RUN. [default: the place used before, else RUN]
     diagnosed : bool
-        Tell where the frames differ from a simulation of the bench, and why: takes the longest.
+        Find the effects that make the frames differ from a simulation (the longest step).
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -453,9 +453,9 @@ def simulate(
     out : str or path
         Where the result goes; made if it is not there.
     truth : str or path, optional
-        Directory of the truth, apart from the acquisition.
+        Directory of the truth.
     own : Sequence[str | os.PathLike[str]]
-        Python file with an effect of your own, for BENCH.yaml; may be given several times.
+        Python file with an own effect that BENCH.yaml names; repeatable.
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -475,7 +475,7 @@ def write_report(
     *,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> pixcal.api.opened.Run:
-    """Write the self-contained HTML page on a run, as ``pixcal report``.
+    """Write the report of a run, one self-contained HTML page, as ``pixcal report``.
 
     Parameters
     ----------

@@ -200,7 +200,9 @@ def test_causes_come_with_their_numbers() -> None:
     assert answer(section).text.startswith(
         "Explained: what lag is (lag) and what mine is (mine) account for"
     )
-    assert "residual gap: 3.0\u00a0% (90\u00a0% interval 1.0 to 6.0\u00a0%)" in answer(section).text
+    assert (
+        "residual gap is 3.0\u00a0% (90\u00a0% interval 1.0 to 6.0\u00a0%)" in answer(section).text
+    )
     assert [row[:4] for row in table(section, "Causes").rows] == [
         ["1. what lag is (lag)", "80\u00a0% [75, 83]", "61\u00a0%", "< 10⁻¹²"],
         ["2. what mine is (mine)", "20\u00a0% [75, 83]", "5.0\u00a0%", "3.0 × 10⁻⁴"],
@@ -287,7 +289,10 @@ def test_what_remains_is_named_and_what_is_new_is_a_warning() -> None:
     )  # fmt: skip
     section = diagnosis(contents(found))
     assert "69\u00a0% of the gap" in answer(section).text
-    assert "31\u00a0% (90\u00a0% interval 25 to 36\u00a0%), mostly in time." in answer(section).text
+    assert (
+        "31\u00a0% (90\u00a0% interval 25 to 36\u00a0%), mostly in time, measured on held-out frames."
+        in answer(section).text
+    )
     rest = table(section, "Statistics that still differ")
     assert [row[1] for row in rest.rows] == ["title of stays", "title of new"]
     assert rest.rows[0][-2:] == ["+8.0", "79\u00a0%"]

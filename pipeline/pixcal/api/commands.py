@@ -122,7 +122,7 @@ def _words(parameter: inspect.Parameter) -> str:
 def run(
     acquisition: StrPath, out: StrPath, options: of.Run, *, runtime: Runtime | None = None
 ) -> Run:
-    """Do all steps, from an acquisition to corrected maps and the report, as ``pixcal run``.
+    """Run all steps, from an acquisition to corrected maps and the report, as ``pixcal run``.
 
     Returns
     -------
@@ -148,7 +148,7 @@ def run(
 def ingest(
     acquisition: StrPath, out: StrPath, options: of.Ingest, *, runtime: Runtime | None = None
 ) -> Run:
-    """Check every frame of an acquisition, and catalogue it.
+    """Check and catalogue every frame of an acquisition.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def allan(run: StrPath, options: of.Allan, *, runtime: Runtime | None = None) ->
 
 @function_of(of.Report)
 def write_report(run: StrPath, options: of.Report, *, runtime: Runtime | None = None) -> Run:
-    """Write the self-contained HTML page on a run, as ``pixcal report``.
+    """Write the report of a run, one self-contained HTML page, as ``pixcal report``.
 
     Returns
     -------
@@ -233,7 +233,7 @@ def write_report(run: StrPath, options: of.Report, *, runtime: Runtime | None = 
 
 @function_of(of.Crests)
 def crests(run: StrPath, options: of.Crests, *, runtime: Runtime | None = None) -> Json:
-    """Find the fibres from crests and valleys, a check of the fit (paper, equation 7).
+    """Locate the fibres from the paths of crests and valleys (paper, equation 7).
 
     Returns
     -------
@@ -254,7 +254,7 @@ def crests(run: StrPath, options: of.Crests, *, runtime: Runtime | None = None) 
 
 @function_of(of.Diagnose)
 def diagnose(run: StrPath, options: of.Diagnose, *, runtime: Runtime | None = None) -> Json:
-    """Tell where data and simulation differ, which effect causes it, and what remains.
+    """Find where data and simulation differ, which effect causes it, and the residual gap.
 
     Returns
     -------
@@ -275,7 +275,7 @@ def diagnose(run: StrPath, options: of.Diagnose, *, runtime: Runtime | None = No
 
 @function_of(of.Astrometry)
 def astrometry(run: StrPath, options: of.Astrometry, *, runtime: Runtime | None = None) -> Json:
-    """Tell what the maps bring for the centroids of stars (paper, section 2).
+    """Estimate how much the maps improve star centroids (paper, section 2).
 
     Returns
     -------
@@ -298,7 +298,7 @@ def astrometry(run: StrPath, options: of.Astrometry, *, runtime: Runtime | None 
 def compare(
     runs: Sequence[StrPath], out: StrPath, options: of.Compare, *, runtime: Runtime | None = None
 ) -> Json:
-    """Tell what maps of the same pixels have in common and what not, scale by scale.
+    """Compare maps of the same pixels, scale by scale.
 
     Returns
     -------
@@ -319,7 +319,7 @@ def compare(
 
 @function_of(of.Budget)
 def budget(bench: StrPath, options: of.Budget, *, out: StrPath | None = None) -> Json:
-    """Plan frames and hours for a given precision, before any are taken: the Cramér-Rao bound.
+    """Plan an exposure: frames and hours for a given precision (Cramér-Rao bound).
 
     Returns
     -------

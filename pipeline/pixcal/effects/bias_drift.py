@@ -176,7 +176,7 @@ class BiasDrift(Effect):
             cls(0.0, 0.0, 0.0, 0.0, run_walk_e_h=min(walk * per_hour, 1e6)),
             {"run_walk_e_h": error * per_hour},
             sigmas(chance),
-            "the mean light of the frames changes and the fringe amplitude does not",
+            "the mean level changes from frame to frame while the fringe amplitude does not",
             law="random walk of each run of fringes",
         )
 

@@ -128,7 +128,7 @@ class BrighterFatter(Effect):
             return None
         size, variance = noise.size, noise.variance
         details = {"of_noise": size, "of_noise_error": float(np.sqrt(variance))}
-        why = "noise that neighbours share rises with the square of the level"
+        why = "covariance of neighbours that rises with the square of the level"
         if evidence.fringes:
             sizes, covariance = fit_response(evidence, LEVEL, POWERS, shifts)
             harmonic, spread = float(sizes[-1]), float(covariance[-1, -1])

@@ -119,8 +119,8 @@ class ContrastNoise(Effect):
             cls(**cast("Any", {"polarisation": 0.0} | values)),
             errors,
             sigmas(joint_log_chance(there, none, there.size[:2])),
-            "scatter of the fringe amplitudes over the intensities of all frames, beyond the noise "
-            "that two halves of the pixels do not share",
+            "scatter of the fringe amplitude relative to the intensity, correlated between two "
+            "halves of the pixels",
             {"slow_sigmas": slow, "skewness": _skewness(light, values["vibration_rad"])},
         )
 

@@ -144,7 +144,7 @@ class CosmicHits(Effect):
             cls(max(count - chance, 0.0) / seen, default * scale),
             errors,
             sigmas_of_count(count, chance),
-            "samples of single frames far above what the pixel has in all others",
+            "samples in single frames far above the pixel's other frames",
             {"hits": count, "expected_by_chance": chance, "seen_cm2_s": seen},
         )
 

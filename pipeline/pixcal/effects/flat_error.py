@@ -132,7 +132,7 @@ class FlatError(Effect):
             {"pixel_rms": float(errors[0]), "smooth_rms": float(errors[1])}
             | ({"scale_px": ring.scale_error} if waves else {}),
             float(all_of_it.mean() / all_of_it.std() * np.sqrt(weight)),
-            "structure that mean light and fringe amplitude share after division by the flat",
+            "structure common to mean light and fringe amplitude after division by the flat",
             {"variance": float(all_of_it.mean())},
         )
 

@@ -169,8 +169,10 @@ class FringeDrift(Effect):
             replace(cls().scaled(0.0), **values),
             errors,
             sigmas(log_chance_of_any([walks, ramped, line])),
-            "slow part of the fringe vectors of all frames, beside their white part"
-            + ("" if motion.crossed else "; along the fringe axis the wavelength could do it too"),
+            "slow change of the fringe vector beyond its white noise"
+            + (
+                "" if motion.crossed else "; along the fringe axis, wavelength drift looks the same"
+            ),
             {
                 "walk_sigmas": sigmas(walks),
                 "ramp_sigmas": sigmas(ramped),

@@ -63,7 +63,7 @@ class FringeJitter(Effect):
             cls((min(x, 0.1), min(y, 0.1))),
             {"rms[0]": x_error, "rms[1]": y_error},
             sigmas(joint_log_chance(full, less, full.size[:2])),
-            "scatter of the fringe vectors from frame to frame, beyond the noise that two halves "
-            "of the pixels do not share, and beside drift",
+            "scatter of the fringe vector from frame to frame beyond drift, correlated between two "
+            "halves of the pixels",
             {"frames": sum(map(len, motion.series))},
         )

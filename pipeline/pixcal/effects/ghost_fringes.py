@@ -183,7 +183,7 @@ class GhostFringes(Effect):
             cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=tuple(waves)),
             errors,
             found.significance,
-            "waves of one vector in " + " and ".join(found.seen_in),
+            "fringes of a common vector in " + " and ".join(found.seen_in),
             {"sigmas_by_map": found.by_map},
             law=law,
             by_law=cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=tied),

@@ -152,7 +152,7 @@ class HyperbolicFringes(Effect):
         by_common = _gain(evidence, sets, [common] * len(sets))
         by_own = _gain(evidence, sets, [values for values, _ in own])
         details = {f"foot_of_{f.name}_mm": v.tolist() for f, (v, _) in zip(sets, own, strict=True)}
-        why = "curvature of the phase maps, of the shape that two fibres make"
+        why = "curvature of the phase maps of the shape that two fibres give"
         foot = _foot(common)
         if by_own - by_common < max(_APART, _MODEL * by_own):
             errors = np.sqrt(np.diag(fit.covariance))
@@ -170,7 +170,7 @@ class HyperbolicFringes(Effect):
         return Estimate(
             cls(foot, evidence.distance_mm, pairs=tuple(pairs)),
             named, sigmas_of_chi2(by_own, 3 * len(sets)), why, details,
-            law="a fibre position of its own in every set",
+            law="a separate fibre position for each set",
         )  # fmt: skip
 
 

@@ -134,8 +134,8 @@ class IntensityNoise(Effect):
             cls(**cast("Any", values), ambient=ambient if clear else ()),
             errors,
             sigmas(log_chance_of_any([changes, line])),
-            "what intensity and fringe amplitude of the frames do together, beyond the noise that "
-            "two halves of the pixels do not share",
+            "common change of intensity and fringe amplitude, correlated between two halves of the "
+            "pixels",
             {"change_sigmas": sigmas(changes), "line_sigmas": sigmas(line)},
         )
 

@@ -454,7 +454,7 @@ def _of_flats(evidence: Evidence) -> Estimate | None:
         Lag(float(np.clip(share, 0, 0.5)), 0.0, 0.0),
         {"share": share_error},
         share / share_error,
-        "the first frame of flats after darkness lacks a share of the light",
+        "the first flat after darkness is fainter",
         {"share": share},
     )
 

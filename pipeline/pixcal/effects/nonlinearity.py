@@ -128,13 +128,13 @@ class Nonlinearity(Effect):
             noise = shared_charge(part, shifts)
             known = None if noise is None else (noise.size, noise.variance)
             sizes, covariance = fit_response(part, level, 2, shifts, known)
-            why = "second and third harmonic of the fringes' phase in the residuals"
+            why = "second and third harmonic of the fringes in the residuals"
         elif ladder is not None:
             sizes, covariance = ladder
-            why = "levels of flats that are not in proportion to their exposure times"
+            why = "flat levels that are not proportional to the exposure time"
         elif curve is not None:
             sizes, covariance = curve
-            why = "noise of flats that is not in proportion to their level"
+            why = "flat noise that is not proportional to the level"
         else:
             return None
         details: dict[str, object] = {}

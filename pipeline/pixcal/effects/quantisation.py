@@ -192,7 +192,7 @@ class Quantisation(Effect):
             cls(**values),
             errors,
             sigmas_of_best(*found),
-            "codes that never come, and counts of codes against those around",
+            "missing codes, and code counts compared with neighbouring codes",
             {"sigmas": found, "codes": 0 if widths is None else len(widths.number)},
         )
 

@@ -171,8 +171,7 @@ class Straylight(Effect):
             cls(0.0, (0.0, 0.0), patterns=tuple(patterns)),
             errors,
             sigmas_of_chi2(gain, dof) if in_light > 0.5 else 0.0,
-            "the visibility has structure that two beams cannot make, and the mean light has it "
-            "too",
+            "structure of the visibility that two beams cannot make, also seen in the mean light",
             {"share_in_mean_light": in_light},
             law="smooth pattern of any shape",
         )

@@ -116,8 +116,8 @@ class WavelengthDrift(Effect):
             cls(**({"hop": 0.0} | values)),
             errors,
             float(max(sigmas(chance), sharpest)),
-            "slow part of the fringe vectors of all frames along those of their sets"
-            + ("" if motion.crossed else "; a motion of the fibres along the axis could do it too"),
+            "slow change of the length of the fringe vector"
+            + ("" if motion.crossed else "; motion of the fibres along the axis looks the same"),
             {"walk_sigmas": drifts, "ramp_sigmas": ramps, "hops": len(jumps)},
         )
 

@@ -16,18 +16,18 @@ class MakeConfig:
         None,
         low=0,
         high=10**18,
-        doc="Seed of all that is drawn; below 1000 for development, from there on for "
-        "examinations. [default: one that only FILE knows]",
+        doc="Random seed: below 1000 for development, 1000 and above for examinations. "
+        "[default: a secret one, written to FILE]",
     )
     size: Literal["tiny", "small", "standard"] = quantity(
         "small",
         doc="small: 61 x 67 pixels, 2 x 300 frames; standard: 128 x 128, 2 or 3 x 600; "
-        "tiny: 33 x 35, 2 x 60, to try the commands.",
+        "tiny: 33 x 35, 2 x 60, to test the commands.",
     )
     bench: Literal["both", "second", "own"] = quantity(
         "both",
-        doc="Cases of the second bench, which shares no code with pixcal, of pixcal's own "
-        "simulator (a self-check), or half of each.",
+        doc="Simulator of the cases: the second bench, which shares no code with pixcal; "
+        "pixcal's own (a self-check); or half of each.",
     )
 
 
@@ -35,11 +35,9 @@ class MakeConfig:
 class RunConfig:
     """Options of ``blind run``."""
 
-    again: bool = quantity(False, doc="Diagnose anew what was diagnosed.")
-    keep: bool = quantity(False, doc="Keep the runs whole, not their products alone.")
-    limit: int | None = quantity(
-        None, low=1, doc="Diagnose at most N cases now, in order; their order is random."
-    )
+    again: bool = quantity(False, doc="Repeat cases that are done.")
+    keep: bool = quantity(False, doc="Keep the whole runs, not only their products.")
+    limit: int | None = quantity(None, low=1, doc="Diagnose at most N cases now.")
 
 
 @dataclass(frozen=True)
@@ -49,15 +47,14 @@ class ScoreConfig:
     oracle: int = quantity(
         0,
         low=0,
-        doc="Simulate the true effects of the first N cases of parts 1 and 4 as well: what could "
-        "be closed.",
+        doc="Also simulate the true effects of the first N cases of parts 1 and 4, for the share "
+        "of the gap that could be closed.",
     )
     write: Path | None = quantity(
-        None, metavar="PAGE", doc="Markdown page that the table goes to, between its marks."
+        None, metavar="PAGE", doc="Markdown page to write the tables into, between its marks."
     )
     also: tuple[tuple[Path, Path], ...] = quantity(
         (),
         metavar="DIR FILE",
-        doc="Another examination of the same size, and its truth, to be scored together; "
-        "may be given several times.",
+        doc="Another examination of the same size and its truth, to score together; repeatable.",
     )

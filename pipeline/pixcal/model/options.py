@@ -24,30 +24,30 @@ MOST_ELECTRONS = 1e15
 
 
 def _overwrite() -> Any:
-    return quantity(False, doc="Replace what was ingested from another acquisition.", in_key=False)
+    return quantity(False, doc="Replace the ingested frames of another acquisition.", in_key=False)
 
 
 def _copy() -> Any:
-    doc = "Copy the samples of all frames: later steps do without the files of ACQ."
+    doc = "Copy all samples into RUN, so that later steps do not need ACQ."
     return quantity(False, doc=doc, in_key=False)
 
 
 def _cubes() -> Any:
     doc = (
-        "Folder or URL (s3://bucket/prefix) for the large cubes; RUN to keep them there. "
-        "[default: as before, or as in ingest; else RUN]"
+        "Folder or URL (s3://bucket/prefix) for the large cubes, or RUN. "
+        "[default: the place used before, else RUN]"
     )
     return quantity(None, doc=doc, metavar="PLACE", in_key=False)
 
 
 def _gain() -> Any:
-    doc = "Gain to use: declared in acquisition.yaml, or measured from the flats."
+    doc = "Gain to use: declared in acquisition.yaml or measured from the flats."
     return quantity("declared", doc=doc)
 
 
 def _model() -> Any:
     # The shapes of `pixcal.estimators.models`.
-    doc = "Shape of the fringes: straight, hyperbolic, or whichever the phases call for."
+    doc = "Shape of the fringes: hyperbolic, straight (paraxial), or chosen from the data."
     return quantity("auto", choices=("auto", "hyperbolic", "paraxial"), doc=doc)
 
 
@@ -57,7 +57,7 @@ def _python(default: Any, **meaning: Any) -> Any:
 
 
 def _own(doc: str, *, in_key: bool = True) -> Any:
-    return quantity((), doc=f"{doc}; may be given several times.", metavar="FILE", in_key=in_key)
+    return quantity((), doc=f"{doc}; repeatable.", metavar="FILE", in_key=in_key)
 
 
 @dataclass(frozen=True)
@@ -118,11 +118,10 @@ class Fit(Sweep):
     with_diagnosis: bool = quantity(
         False,
         in_key=False,
-        doc="Also write maps without the effects that 'pixcal diagnose' found, and what they "
-        "gained.",
+        doc="Also write maps corrected for the effects that 'pixcal diagnose' found.",
     )
     own: tuple[Path, ...] = _own(
-        "Python file with an effect of your own that the diagnosis found", in_key=False
+        "Python file of an own effect that the diagnosis found", in_key=False
     )
 
 
@@ -139,7 +138,7 @@ class Allan:
         low=0,
         flag="--region",
         metavar="y0:y1,x0:x1",
-        doc="Pixels for a curve of their own, ends excluded; may be given several times.",
+        doc="Rectangle with its own Allan curve, ends excluded; repeatable.",
     )
 
 
@@ -147,16 +146,18 @@ class Allan:
 class Crests:
     """Options of ``crests``."""
 
-    frames: int = quantity(8, low=1, metavar="N", doc="Frames to use, spread over the run.")
+    frames: int = quantity(
+        8, low=1, metavar="N", doc="Number of frames to use, spread over the run."
+    )
     paths: int | None = quantity(
-        None, low=2, shown="all", doc="Crests and valleys to use of each end, the outermost."
+        None, low=2, shown="all", doc="Outermost crests and valleys to use at each end."
     )
     segment: int | None = quantity(
         None,
         low=4,
         unit="px",
         shown="an eighth of the window, 8 to 128",
-        doc="Length along a fringe that gives one point.",
+        doc="Length along a fringe for one point.",
     )
 
 
@@ -165,12 +166,12 @@ class Diagnose:
     """Options of ``diagnose``."""
 
     only: tuple[str, ...] = _python((), doc="The only candidates.")
-    without: tuple[str, ...] = _python((), doc="Effects that are no candidates.")
-    own: tuple[Path, ...] = _own("Python file that holds an effect of your own")
+    without: tuple[str, ...] = _python((), doc="Effects to leave out.")
+    own: tuple[Path, ...] = _own("Python file with an own effect")
     nominal: Path | None = quantity(
         None,
         metavar="BENCH.yaml",
-        doc="Bench file whose effects the nominal bench has from the start.",
+        doc="Bench file whose effects belong to the nominal simulation.",
     )
 
 
@@ -181,18 +182,18 @@ class Astrometry:
     truth: Path | None = quantity(
         None,
         metavar="DIR",
-        shown="the maps and a draw of their errors",
-        doc="True offsets of a simulated detector (ACQ-truth): where its pixels lie.",
+        shown="the maps plus random errors of size SIGMA",
+        doc="True offsets of a simulated detector (ACQ-truth).",
     )
     diameter_m: float = quantity(7.0, unit="m", above=0, doc="Diameter of the telescope, m.")
     focal_length_m: float = quantity(
         130.0, unit="m", above=0, doc="Focal length of the telescope, m."
     )
     wavelength_nm: float = quantity(
-        600.0, unit="nm", above=0, doc="Wavelength of the stars' light, nm."
+        600.0, unit="nm", above=0, doc="Wavelength of the star light, nm."
     )
     obscuration: float = quantity(
-        0.0, low=0, high=0.9, metavar="E", doc="Central obscuration, share of the diameter."
+        0.0, low=0, high=0.9, metavar="E", doc="Central obscuration as a fraction of the diameter."
     )
     electrons: float = quantity(
         1e8,
@@ -200,10 +201,10 @@ class Astrometry:
         above=0,
         metavar="N",
         shown="1e8",
-        doc="Photo-electrons of a star at each position, all exposures together.",
+        doc="Photo-electrons of a star at each position, over all exposures.",
     )
     background_e: float = quantity(
-        0.0, unit="e-", low=0, metavar="N", doc="Background of a pixel at each position, electrons."
+        0.0, unit="e-", low=0, metavar="N", doc="Background per pixel and position, electrons."
     )
     window: int | None = quantity(
         None,
@@ -211,12 +212,12 @@ class Astrometry:
         low=3,
         high=255,
         shown="8 λ/D",
-        doc="Side of the window that is fitted, an odd number.",
+        doc="Side of the fit window, an odd number.",
     )
-    stars: int = quantity(1000, low=2, high=100_000, doc="Stars, at random places of the detector.")
-    positions: int = quantity(
-        16, low=1, high=1024, doc="Positions of each star, whose mean is taken."
+    stars: int = quantity(
+        1000, low=2, high=100_000, doc="Number of stars, at random places on the detector."
     )
+    positions: int = quantity(16, low=1, high=1024, doc="Positions of each star to average.")
     dither_px: float = quantity(
         32.0,
         unit="px",
@@ -224,11 +225,11 @@ class Astrometry:
         high=512,
         doc="Largest distance of a position from the first, along x and y.",
     )
-    seed: int = quantity(0, low=0, doc="Seed of the random numbers.")
+    seed: int = quantity(0, low=0, doc="Random seed.")
 
     def __post_init__(self) -> None:
         if self.window is not None and self.window % 2 == 0:
-            raise InputError(f"--window {self.window}: even; a window has a middle pixel")
+            raise InputError(f"--window {self.window}: even; give an odd number")
         if self.electrons + self.background_e > MOST_ELECTRONS:
             raise InputError(
                 f"--electrons, --background: more than {MOST_ELECTRONS:g} e- cannot be counted; "
@@ -242,14 +243,14 @@ class Compare:
 
     split: Literal["halves", "odd-even"] = quantity(
         "halves",
-        doc="Parts of a single run: its first and second half, or every other batch of frames.",
+        doc="How to split a single run: first and second half, or alternating batches.",
     )
     sigma_accuracy: float = quantity(
         0.02,
         low=0,
         high=0.5,
         metavar="SHARE",
-        doc="Relative error of SIGMA that is no difference yet.",
+        doc="Relative error of SIGMA to tolerate.",
     )
 
 
@@ -263,10 +264,13 @@ class Budget:
         low=1e-9,
         high=1,
         shown="5e-5 without --frames",
-        doc="Wanted 1-sigma error of a pixel's offset on each axis.",
+        doc="Wanted 1-sigma error of the offsets on each axis.",
     )
     frames: int | None = quantity(
-        None, low=1, high=10**12, doc="Frames of each fringe set: the precision that they reach."
+        None,
+        low=1,
+        high=10**12,
+        doc="Frames of each fringe set; prints the precision that they reach.",
     )
 
 
@@ -278,9 +282,9 @@ class Simulate:
         None,
         metavar="DIR",
         shown="ACQ-truth",
-        doc="Directory of the truth, apart from the acquisition.",
+        doc="Directory of the truth.",
     )
-    own: tuple[Path, ...] = _own("Python file with an effect of your own, for BENCH.yaml")
+    own: tuple[Path, ...] = _own("Python file with an own effect that BENCH.yaml names")
 
 
 @dataclass(frozen=True)
@@ -295,8 +299,7 @@ class Run:
     diagnosed: bool = quantity(
         True,
         flag="--diagnose/--no-diagnose",
-        doc="Tell where the frames differ from a simulation of the bench, and why: takes the "
-        "longest.",
+        doc="Find the effects that make the frames differ from a simulation (the longest step).",
     )
 
 

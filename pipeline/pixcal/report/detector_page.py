@@ -55,7 +55,7 @@ def detector(contents: Contents) -> Section:
             )
         )
     blocks += reduction_tables(found.facts)
-    lead = "Bias, dark current, flat and read noise, and what the ladder of flats says."
+    lead = "Bias, dark current, flat, read noise and linearity."
     if not blocks:
         lead = "Not measured: the reduction left no calibration maps."
     return Section("detector", "Detector", lead, blocks)

@@ -31,6 +31,8 @@ SHOWN = 12
 """Rows of a table that are not folded."""
 PLOTS = 3
 """Statistics that are drawn for each cause, and of what remains."""
+LISTED = 8
+"""Numbers of a list that are shown one by one."""
 NEW = "introduced by the causes"
 LAW_DIFFERS = 0.02
 """Difference of the shares closed by a cause and by its law alone that is shown."""
@@ -136,7 +138,7 @@ def _causes_table(found: Diagnosis) -> Table:
         )
     header = [
         "cause",
-        "gap closed by it alone",
+        "gap closed alone",
         "gap reopened when removed",
         "p-value",
         "indistinguishable from",
@@ -216,6 +218,8 @@ def _parameters(cause: Facts, words: EffectWords) -> Iterator[Block]:
 
 def _fitted(name: str, value: Any, errors: Facts) -> str:
     if isinstance(value, list):
+        if _is_long(value):
+            return _in_short(value)
         return ", ".join(_fitted(f"{name}[{n}]", v, errors) for n, v in enumerate(value)) or "–"
     if name in errors and isinstance(value, (int, float)):
         return with_error(float(value), errors[name])
@@ -238,13 +242,29 @@ def _list_of(name: str, entries: Sequence[Facts], errors: Facts) -> tuple[Table,
     rows = [
         [
             with_error(entry.get(k), errors.get(f"{name}[{n}].{k}")) if k in fitted
-            else "–" if entry.get(k) is None else exact(entry[k])
+            else "–" if entry.get(k) is None else _in_short(entry[k])
             for k in columns
         ]
         for n, entry in enumerate(entries)
     ]  # fmt: skip
-    notes = [f"{k} {exact(entries[0][k])}" for k in same]
+    notes = [f"{k} {_in_short(entries[0][k])}" for k in same]
     return Table(name, columns, rows), ", ".join(notes)
+
+
+def _is_long(value: Any) -> bool:
+    return (
+        isinstance(value, list)
+        and len(value) > LISTED
+        and all(isinstance(one, (int, float)) for one in value)
+    )
+
+
+def _in_short(value: Any) -> str:
+    """A value in full; of a long list of numbers how many there are, their range and rms."""
+    if not _is_long(value):
+        return exact(value)
+    rms = math.sqrt(sum(one * one for one in value) / len(value))
+    return f"{len(value)} values, {number(min(value))} to {number(max(value))} (rms {number(rms)})"
 
 
 # Where
@@ -391,9 +411,9 @@ def _remainder(found: Diagnosis) -> Iterator[Block]:
         for domain, (_, after) in sorted(gap.get("domains", {}).items(), key=lambda d: -d[1][1])
         if after >= 5e-4
     ]
-    shares = f": {listed(parts)}" if parts else ""
+    shares = f", {listed(parts)}" if parts else ""
     text = residual_gap(gap)
-    sentence = f"{text[:1].upper()}{text[1:]}{shares}. "
+    sentence = f"The {text}{shares}. "
     if not left:
         yield Words(sentence + "No statistic differs significantly any more.")
         return

@@ -103,11 +103,11 @@ def _causes(axes: Axes, causes: Sequence[Closed]) -> None:
         axes.plot([low, high], [y, y], color=BLUE, linewidth=3, solid_capstyle="butt")
         axes.plot(
             100 * cause.alone, y, "o", color=BLUE, markersize=8,
-            label="closed by it alone" if first else None,
+            label="closed by the cause alone" if first else None,
         )  # fmt: skip
         axes.plot(
             100 * cause.over_rest, y, "D", color=INK, markersize=7, fillstyle="none",
-            label="lost when it is left out" if first else None,
+            label="reopened when removed" if first else None,
         )  # fmt: skip
     names = ["\n".join(textwrap.wrap(_plain(c.name, 60), 22)[:3]) for c in causes]
     axes.set_yticks(range(len(causes)), names)

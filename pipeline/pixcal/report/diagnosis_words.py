@@ -33,7 +33,7 @@ def with_interval(value: float, ends: Sequence[float]) -> str:
 def residual_gap(gap: Mapping[str, Any]) -> str:
     """Share of the gap that remains, with its interval."""
     low, high = (number(round(100 * float(v), 2), 2) for v in gap["interval"])
-    return f"residual gap: {percent(gap['after'])} (90\u00a0% interval {low} to {high}\u00a0%)"
+    return f"residual gap is {percent(gap['after'])} (90\u00a0% interval {low} to {high}\u00a0%)"
 
 
 def chance(p: float) -> str:
@@ -84,13 +84,13 @@ def answer(diagnosis: Diagnosis) -> str:
     if verdict == "explained":
         return (
             f"Explained: {causes} account{'s' if one else ''} for the differences between the "
-            f"data and the nominal simulation, found in {count} of {looked} statistics. On "
-            f"held-out frames, {left}."
+            f"data and the nominal simulation, found in {count} of {looked} statistics. The "
+            f"{left}, measured on held-out frames."
         )
     return (
         f"{verdict[:1].upper()}{verdict[1:]}: {causes} close{'s' if one else ''} "
-        f"{percent(1 - gap['after'])} of the gap between the data and the nominal simulation. On "
-        f"held-out frames, {left}{where_left(gap)}."
+        f"{percent(1 - gap['after'])} of the gap between the data and the nominal simulation. The "
+        f"{left}{where_left(gap)}, measured on held-out frames."
     )
 
 

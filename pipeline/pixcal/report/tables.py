@@ -22,7 +22,7 @@ FLAG_WORDS = {
     PixelFlag.DEAD: "response far from that of the neighbours",
     PixelFlag.NOISY: "noise far above the read noise, telegraph noise included",
     PixelFlag.SATURATED: "some fringe samples are saturated and carry no weight",
-    PixelFlag.NONLINEAR: "departs from the straight line over the ladder of flats",
+    PixelFlag.NONLINEAR: "departs from linearity over the exposure-time steps",
     PixelFlag.NO_DATA: "samples are missing or not finite",
     PixelFlag.BAD_FIT: "the fringe model does not describe the pixel",
 }

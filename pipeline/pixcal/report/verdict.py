@@ -133,11 +133,11 @@ def _detector_cards(facts: dict[str, Any]) -> Iterator[Card]:
 def _diagnosis_card(diagnosis: Diagnosis) -> Card:
     verdict, gap = diagnosis.facts["verdict"], diagnosis.facts["gap"]
     causes = ", ".join(c["effect"] for c in diagnosis.facts["causes"])
-    detail = "no significant difference" if verdict == "no gap" else residual_gap(gap)
+    detail = "no significant difference" if verdict == "no gap" else f"The {residual_gap(gap)}"
     return Card(
         "diagnosis",
         verdict,
-        f"{causes}: {detail}" if causes else detail,
+        f"{causes}. {detail}" if causes else detail,
         level(verdict),
     )
 

@@ -22,27 +22,25 @@ IN_CORRECTED = "in the corrected fit"
 CORRECTED = ("undone on maps", "undone on samples", IN_CORRECTED)
 """Treatments after which the corrected maps are free of an effect."""
 ABSORBED = {
-    "bias_drift": "a level that all pixels share moves the free intensity of a frame",
-    "contrast_noise": "every frame of the fit has an amplitude of its own",
-    "flat_error": "it scales a pixel's mean light and fringe alike: the phase stays",
-    "fringe_drift": "every frame of the fit has a fringe vector of its own where it moves",
-    "fringe_jitter": "every frame of the fit has a fringe vector of its own where it moves",
-    "intensity_noise": "every frame of the fit has an intensity of its own",
-    "lag": "the frame before is a sum of the same maps: the fit takes it up; only the scatter of "
-    "the share moves phases, by hundredths of the bound",
-    "wavelength_drift": "every frame of the fit has a phase and, where it moves, a fringe vector",
+    "bias_drift": "the free intensity of each frame absorbs a level common to all pixels",
+    "contrast_noise": "the fit has a free fringe amplitude in each frame",
+    "flat_error": "it scales level and fringes of a pixel equally and leaves the phase",
+    "fringe_drift": "the fit has a free fringe vector in each frame where it moves",
+    "fringe_jitter": "the fit has a free fringe vector in each frame where it moves",
+    "intensity_noise": "the fit has a free intensity in each frame",
+    "lag": "the fit absorbs a uniform lag; its variation moves phases by hundredths of the bound",
+    "wavelength_drift": "the fit has a free phase and fringe vector in each frame",
 }
 """Effects that the free parameters of the fit take up, and how (docs/how-to/correct.md)."""
 
 LEFT = {
-    "cosmic_hits": "few samples are hit; most of those the reduction has left out",
-    "gain_error": "offsets stay and SIGMA is wrong: mend gain_e_per_adu in acquisition.yaml, or "
-    "'pixcal reduce --gain measured', and fit again",
-    "quantisation": "rounding is noise of the samples, and costs offsets hundredths of the bound",
-    "rolling_shutter": "rows hold light of two frames; what the fit does not take up is a tenth of "
-    "the bound of 300 frames",
-    "row_noise": "noise of every frame of its own: nothing of it stays in the maps",
-    "telegraph_noise": "pixels that jump have larger errors, which the fit finds",
+    "cosmic_hits": "few samples are hit, and most of them are masked",
+    "gain_error": "only SIGMA is wrong: correct gain_e_per_adu in acquisition.yaml, or "
+    "use 'pixcal reduce --gain measured', and fit again",
+    "quantisation": "rounding adds noise of some hundredths of the bound",
+    "rolling_shutter": "the part that the fit leaves is a tenth of the bound of 300 frames",
+    "row_noise": "noise that is independent in each frame averages out",
+    "telegraph_noise": "such pixels have larger errors, and SIGMA shows them",
 }
 """Effects that are noise, or too small to be worth undoing (docs/how-to/correct.md)."""
 

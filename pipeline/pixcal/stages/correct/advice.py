@@ -15,7 +15,7 @@ from pixcal.storage.artefact import MANIFEST, read_json, require
 
 Json = Mapping[str, Any]
 
-HEADER = ("effect", "size", "on the map (rms, maximum)", "what is done about it")
+HEADER = ("effect", "size", "on the map (rms, maximum)", "action")
 NOT_MEASURED = {"rms_px": 0.0, "max_px": 0.0, "action": "not measured"}
 """In the place of ``on_map`` where a diagnosis has none."""
 MATTERS = 0.3
@@ -56,7 +56,7 @@ def advice(run_dir: Path) -> Advice | None:
     causes = diagnosis["causes"] if diagnosis else ()
     rows = tuple(_row(cause, correction) for cause in causes)
     names = [path.name for path in maps_to_use(run_dir).values()]
-    use = f"Use {' and '.join(names)}: {_about(diagnosis, correction)}."
+    use = f"Use {' and '.join(names)}{_about(diagnosis, correction)}."
     return Advice((use, _limit(fit, diagnosis, correction)), rows)
 
 
@@ -103,13 +103,13 @@ def _on_map(cause: Json) -> Json:
 
 def _about(diagnosis: Json | None, correction: Json | None) -> str:
     if diagnosis is None:
-        return "as fitted; no diagnosis was made, so effects that bias them are not known"
+        return " as fitted. No diagnosis was made, so biases are unknown"
     if correction is not None and correction["outputs"]:
         freed = [e["effect"] for e in correction["effects"] if _corrects(e["treatment"])]
-        return f"the offsets as fitted, corrected for {' and '.join(freed)}"
+        return f", corrected for {' and '.join(freed)}"
     if any(_on_map(c)["action"] == "corrected" for c in diagnosis["causes"]):
-        return "as fitted, NOT corrected for the effects below that could be"
-    return "as fitted; nothing that the diagnosis found needs a correction"
+        return " as fitted, NOT corrected for the effects below"
+    return " as fitted. They need no correction"
 
 
 def _corrects(how: str) -> bool:
@@ -138,8 +138,7 @@ def _limit(fit: Json, diagnosis: Json | None, correction: Json | None) -> str:
         )
     if diagnosis is not None and diagnosis["verdict"] in ("unexplained", "partly explained"):
         return (
-            f"The noise is {told}, but the diagnosis leaves a part of the gap without a cause: "
-            "a bias of the maps cannot be excluded."
+            f"The noise is {told}. Part of the gap has no known cause, so the maps may be biased."
         )
     kept = [
         e for facts in (made["sets"].values() if made else ())
@@ -150,7 +149,7 @@ def _limit(fit: Json, diagnosis: Json | None, correction: Json | None) -> str:
             f"Limited by noise, {told}, which includes the error of the correction, up to "
             f"{max(kept):.2g} px rms."
         )
-    return f"Limited by photon and read noise: {told}; more frames make it smaller."
+    return f"Limited by photon and read noise: {told}. More frames reduce it."
 
 
 def _row(cause: Json, correction: Json | None) -> tuple[str, str, str, str]:
@@ -185,6 +184,17 @@ def _share(part: Json) -> float:
     return float(max([abs(part.get("share", 0.0)), *(math.hypot(*wave) for wave in waves)]))
 
 
+def _size_of_parts(name: str, parts: Sequence[Json], unit: str) -> str:
+    """Of a list of like parts; of a replay, which has a value for each frame, the rms."""
+    if "value" in parts[0]:
+        values = [float(v) for part in parts for v in part["value"]]
+        rms = math.hypot(*values) / math.sqrt(max(len(values), 1))
+        return f"{rms:.2g} {unit} rms, frame by frame".replace("  ", " ")
+    largest = max(map(_share, parts))
+    told = f", largest {100 * largest:.2g} %" if largest else ""
+    return f"{len(parts)} {name}{told}"
+
+
 def size_of(cause: Json) -> str:
     """The strengths of an effect in a few words."""
     kind = known_effects().get(cause["effect"])
@@ -195,9 +205,7 @@ def size_of(cause: Json) -> str:
     for name in kind.strengths:
         value = cause["parameters"].get(name)
         if isinstance(value, Sequence) and value and isinstance(value[0], Mapping):
-            largest = max(map(_share, value))
-            told = f", largest {100 * largest:.2g} %" if largest else ""
-            parts.append(f"{len(value)} {name}{told}")
+            parts.append(_size_of_parts(name, value, units[name]))
         elif isinstance(value, int | float) and value:
             parts.append(f"{name} {value:.3g} {units[name]}".strip())
         elif isinstance(value, Sequence) and value:
