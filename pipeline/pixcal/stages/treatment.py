@@ -31,7 +31,7 @@ ABSORBED = {
     "lag": "the fit absorbs a uniform lag; its variation moves phases by hundredths of the bound",
     "wavelength_drift": "the fit has a free phase and fringe vector in each frame",
 }
-"""Effects that the free parameters of the fit take up, and how (docs/how-to/correct.md)."""
+"""Effects that the fit absorbs, and how (docs/appendix/correction-study.md)."""
 
 LEFT = {
     "cosmic_hits": "few samples are hit, and most of them are masked",
@@ -42,7 +42,7 @@ LEFT = {
     "row_noise": "noise that is independent in each frame averages out",
     "telegraph_noise": "such pixels have larger errors, and SIGMA shows them",
 }
-"""Effects that are noise, or too small to be worth undoing (docs/how-to/correct.md)."""
+"""Effects that are noise, or too small to be worth undoing (docs/appendix/correction-study.md)."""
 
 
 @dataclass(frozen=True)
