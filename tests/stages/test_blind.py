@@ -48,8 +48,11 @@ from pixcal.stages.blind.strengths import STRONGEST, WAYS, Way
 from pixcal.stages.blind.summary import summary
 from pixcal.stages.blind.table import as_markdown, write_between
 from pixcal.stages.diagnose import look
-from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
-from pixcal.storage.artefact import build, require, write_json
+from pixcal.storage.artefact import build, write_json
+from pixcal.storage.formats import STAGES
+from pixcal.storage.stage import require
+
+DIAGNOSIS_FORMAT = STAGES["diagnose"].format
 
 SYNC = Runtime(cluster="sync")
 BLOCK = 2880
@@ -561,7 +564,7 @@ def test_offsets_are_held_against_the_truth_in_bounds(
     ingest.run(folder / "case-0001", run_dir, ingest.Config(), SYNC)
     reduce.run(run_dir, reduce.Config(), SYNC)
     causes = [] if named is None else [{"effect": named.effect, "parameters": named.parameters}]
-    inputs = {"reduce": require(run_dir, "reduce", 1).key}
+    inputs = {"reduce": require(run_dir, "reduce").key}
     with build(run_dir, "diagnose", DIAGNOSIS_FORMAT, {"own": [], "nominal": {}}, inputs) as made:
         write_json(made.folder / "diagnosis.json", {"verdict": "explained", "causes": causes})
     correct.run(run_dir, correct.Config(), SYNC)

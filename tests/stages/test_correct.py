@@ -24,13 +24,16 @@ from pixcal.stages.correct.gain import repeating
 from pixcal.stages.correct.restored_set import RestoredSet
 from pixcal.stages.correct.swept import undone
 from pixcal.stages.correct.uncertainty import moved
-from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.treatment import ABSORBED, LEFT, treatments
-from pixcal.storage.artefact import build, require, write_json
+from pixcal.storage.artefact import build, write_json
 from pixcal.storage.cube import create_group, write_array
+from pixcal.storage.formats import STAGES
 from pixcal.storage.products import read_map
+from pixcal.storage.stage import require
 from pixcal_cli.main import invoke
+
+DIAGNOSIS_FORMAT = STAGES["diagnose"].format
 
 F64 = np.typing.NDArray[np.float64]
 SYNC = Runtime(cluster="sync")
@@ -63,7 +66,7 @@ def seen_through(bench: Any, act: Callable[[F64], F64]) -> Any:
 
 def diagnosed(run: Path, *causes: Effect | dict[str, Any], verdict: str = "explained") -> None:
     """Write the diagnosis that a run would have."""
-    inputs = {"reduce": require(run, "reduce", 1).key}
+    inputs = {"reduce": require(run, "reduce").key}
     with build(run, "diagnose", DIAGNOSIS_FORMAT, {"own": [], "nominal": {}}, inputs) as made:
         found = [
             {"effect": c.name, "parameters": to_plain(c)} if isinstance(c, Effect) else c
@@ -165,7 +168,7 @@ def test_the_same_bits_however_it_runs(coupled, tmp_path, runtime):
 
 
 def key(run: Path) -> bytes:
-    return require(run, "corrected", 2).key.encode()
+    return require(run, "corrected").key.encode()
 
 
 def test_a_piece_with_its_halo_is_undone_as_the_whole():

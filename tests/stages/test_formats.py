@@ -1,26 +1,21 @@
-"""Whoever reads artefacts reads them in the formats that they are written in."""
+"""The formats of artefacts are those that the documentation describes."""
 
-from pixcal.api import opened
-from pixcal.stages import allan, report
-from pixcal.stages.correct import stage as correct
-from pixcal.stages.diagnose import stage as diagnose
-from pixcal.stages.fit import stage as fit
-from pixcal.stages.fit import sweep
-from pixcal.stages.ingest import stage as ingest
-from pixcal.stages.reduce import stage as reduce
+import re
+from pathlib import Path
 
-WRITTEN = {
-    "ingest": ingest.FORMAT,
-    "reduce": reduce.FORMAT,
-    "sweep": sweep.FORMAT,
-    "fit": fit.FORMAT,
-    "allan": allan.FORMAT,
-    "diagnose": diagnose.FORMAT,
-    "corrected": correct.FORMAT,
-    "report": report.FORMAT,
-}
+from pixcal.storage.formats import STAGES
+
+PAGE = Path(__file__).parents[2] / "docs" / "architecture.md"
 
 
-def test_readers_know_the_formats() -> None:
-    for known in (opened.FORMATS, report.SHOWN_STAGES):
-        assert known == {stage: WRITTEN[stage] for stage in known}
+def test_the_page_describes_every_format() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    told = {
+        name: int(n) for name, n in re.findall(r"^\*\*`RUN/(\w+)`\*\* \(format (\d+)", text, re.M)
+    }
+    (of_compare,) = re.findall(r"`pixcal compare --out DIR`\*\* \(format (\d+)\)", text)
+    (of_simulate,) = re.findall(r"`ACQ` of `pixcal simulate` .*\(format (\d+)\)", text)
+    told |= {"compare": int(of_compare), "simulate": int(of_simulate)}
+    assert told | {"simulate-truth": told["simulate"]} == {
+        s.name: s.format for s in STAGES.values()
+    }

@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -298,7 +299,7 @@ def test_another_format_is_made_anew(
     acquisition: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(ingest, "FORMAT", ingest.FORMAT - 1)
+        patch.setattr(ingest, "STAGE", replace(ingest.STAGE, format=1))
         ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
     ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
     ingest.run(acquisition, tmp_path / "fresh", ingest.Config(), SYNC)
@@ -514,7 +515,7 @@ def test_only_what_changed_is_read(
     assert tree(run / "ingest") == tree(fresh / "ingest")
     assert after.key != before.key
     assert not list((run / ".partial").iterdir())
-    monkeypatch.setattr(ingest, "build", None)
+    monkeypatch.setattr("pixcal.storage.stage.build", None)
     assert ingest.run(bench, run, ingest.Config(), SYNC) == after
 
 

@@ -255,8 +255,7 @@ def test_where_cubes_are_is_remembered(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     with monkeypatch.context() as patch:
-        for stage in (ingest.stage, reduce.stage):
-            patch.setattr(stage, "build", None)
+        patch.setattr("pixcal.storage.stage.build", None)
         for cubes in (None, f"{store.url}/x", f"{store.url}/x/"):
             ingest.run(night, far, ingest.Config(copy=True, cubes=cubes), SYNC)
             reduce.run(far, reduce.Config(cubes=cubes), SYNC)

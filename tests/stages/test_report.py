@@ -16,9 +16,11 @@ from pixcal.engine.run import Runtime
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.report import blocks as blocks_module
 from pixcal.stages import report
-from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
 from pixcal.storage.artefact import build, read_manifest, write_json
 from pixcal.storage.cube import create_group, write_array
+from pixcal.storage.formats import STAGES
+
+DIAGNOSIS_FORMAT = STAGES["diagnose"].format
 
 SECTIONS = (
     "diagnosis", "maps", "levels", "temporal", "noise", "allan", "detector", "masks", "removed",
@@ -214,7 +216,11 @@ def write_diagnose(run: Path, verdict: str = "explained", effects: tuple[str, ..
     }  # fmt: skip
     inputs = {"reduce": read_manifest(run / "reduce").key}
     with build(
-        run, "diagnose", DIAGNOSIS_FORMAT, {"effects": list(effects), "nominal": {}}, inputs
+        run,
+        "diagnose",
+        DIAGNOSIS_FORMAT,
+        {"effects": list(effects), "nominal": {}},
+        inputs,
     ) as made:
         write_json(made.folder / "diagnosis.json", facts)
         write_json(made.folder / "curves.json", [curve])

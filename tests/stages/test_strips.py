@@ -110,7 +110,7 @@ def test_run_of_the_first_format_is_read(
 ) -> None:
     """A cube of raw samples, and neither catalogue nor list of files."""
     with monkeypatch.context() as patch:
-        patch.setattr(ingest_stage, "FORMAT", 1)
+        patch.setattr(ingest_stage, "STAGE", replace(ingest_stage.STAGE, format=1))
         ingest.run(acquisition, tmp_path, ingest.Config(copy=True), SYNC)
     ingested = tmp_path / "ingest"
     shutil.rmtree(ingested / "catalogue.zarr")

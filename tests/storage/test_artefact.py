@@ -24,10 +24,10 @@ from pixcal.storage.artefact import (
     lock,
     read_json,
     read_manifest,
-    require,
     up_to_date,
     write_json,
 )
+from pixcal.storage.stage import require
 
 CONFIG = {"model": "paraxial", "limit": 1.5}
 INPUTS = {"reduce": "abc"}
@@ -37,7 +37,7 @@ def complete(run: Path, config: dict[str, Any] = CONFIG, text: str = "first") ->
     with build(run, "fit", 1, config, INPUTS) as made:
         (made.folder / "data").write_text(text)
         made.summary = {"pixels": 7}
-    return require(run, "fit", 1)
+    return require(run, "fit")
 
 
 def test_a_complete_artefact(tmp_path: Path) -> None:
@@ -50,7 +50,7 @@ def test_a_complete_artefact(tmp_path: Path) -> None:
     key = artefact_key("fit", 1, CONFIG, INPUTS)
     files = {"data": sha256(b"x").hexdigest()[:32]}
     expected = Manifest("fit", 1, key, CONFIG, INPUTS, __version__, {}, files)
-    assert require(tmp_path, "fit", 1) == expected
+    assert require(tmp_path, "fit") == expected
     assert not list((tmp_path / ".partial").iterdir())
 
 
@@ -78,11 +78,11 @@ def test_another_key_replaces_only_when_complete(tmp_path: Path) -> None:
     with suppress(RuntimeError), build(tmp_path, "fit", 1, other, INPUTS) as made:
         (made.folder / "data").write_text("half")
         raise RuntimeError
-    assert require(tmp_path, "fit", 1) == first
+    assert require(tmp_path, "fit") == first
     assert (tmp_path / "fit" / "data").read_text() == "first"
     second = complete(tmp_path, other, "second")
     assert second.key != first.key
-    assert require(tmp_path, "fit", 1) == second
+    assert require(tmp_path, "fit") == second
     assert (tmp_path / "fit" / "data").read_text() == "second"
 
 
@@ -159,7 +159,7 @@ def test_a_second_process_is_refused_and_a_killed_one_resumed(tmp_path: Path) ->
         assert made.resumed
         assert made.journal() == {"one"}
         assert (made.folder / "data").read_text() == "by the other"
-    assert require(tmp_path, "fit", 1).config == CONFIG
+    assert require(tmp_path, "fit").config == CONFIG
 
 
 def test_the_lock_is_free_again(tmp_path: Path) -> None:
@@ -188,15 +188,17 @@ def test_an_exception_comes_through(tmp_path: Path) -> None:
 
 def test_what_must_have_been_run(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere: no such run directory.*pixcal ingest"):
-        require(tmp_path / "nowhere", "fit", 1)
+        require(tmp_path / "nowhere", "fit")
     with pytest.raises(InputError, match=r"fit: not there yet; run 'pixcal fit"):
-        require(tmp_path, "fit", 1)
+        require(tmp_path, "fit")
+    with build(tmp_path, "fit", 2, CONFIG, INPUTS):
+        pass
+    with pytest.raises(InputError, match=r"format fit/2, this pixcal reads fit/1"):
+        require(tmp_path, "fit")
     complete(tmp_path)
-    with pytest.raises(InputError, match=r"format fit/1, this pixcal reads fit/2"):
-        require(tmp_path, "fit", 2)
     (tmp_path / "fit").rename(tmp_path / "allan")
     with pytest.raises(InputError, match=r"format fit/1, this pixcal reads allan/1"):
-        require(tmp_path, "allan", 1)
+        require(tmp_path, "allan")
 
 
 @pytest.mark.parametrize("stage", ["fit", "allan", "corrected"])
@@ -204,7 +206,7 @@ def test_without_fringes_no_command_is_advised_that_needs_them(tmp_path: Path, s
     with build(tmp_path, "ingest", 1, {}, {}) as made:
         write_json(made.folder / "acquisition.json", {"frames": {"fringes": []}})
     with pytest.raises(InputError, match=f"lists no fringes, so there is no {stage}$"):
-        require(tmp_path, stage, 1)
+        require(tmp_path, stage)
 
 
 def test_a_damaged_manifest_is_named(tmp_path: Path) -> None:
@@ -260,7 +262,7 @@ for n in itertools.count(found.config["n"] + 1 if found else 0):
         os.kill(other.pid, signal.SIGKILL)
         other.communicate()
         with lock(tmp_path):
-            manifest = require(tmp_path, "fit", 1)
+            manifest = require(tmp_path, "fit")
         number = manifest.config["n"]
         assert number > seen
         assert [(tmp_path / "fit" / part).read_text() for part in "ab"] == [str(number)] * 2

@@ -16,17 +16,18 @@ from pixcal.storage.artefact import (
     lock,
     read_json,
     read_manifest,
-    require,
     up_to_date,
     write_json,
 )
 from pixcal.storage.cube import ArrayReader, create_array, create_group, write_array
 from pixcal.storage.products import is_whole, read_map, write_map
+from pixcal.storage.stage import require
 
 
 def complete(run: Path, stage: str = "fit") -> str:
     """An artefact with a file, an array in a group, and a list of numbers in its manifest."""
-    with lock(run), build(run, stage, 1, {"limits": (1.5, 1e-7)}, {"reduce": "key"}) as made:
+    format = 3 if stage == "sweep" else 1
+    with lock(run), build(run, stage, format, {"limits": (1.5, 1e-7)}, {"reduce": "key"}) as made:
         write_json(made.folder / "facts.json", {"name": "Übung"})
         create_group(made.folder / "maps.zarr")
         write_array(made.folder / "maps.zarr" / "delta", np.arange(6.0).reshape(2, 3), dims="yx")
@@ -60,7 +61,7 @@ def test_a_manifest_of_an_earlier_version_has_no_seal(tmp_path: Path) -> None:
     data = read_json(file)
     del data["seal"], data["files"]
     write_json(file, data)
-    assert require(tmp_path, "fit", 1).key == key
+    assert require(tmp_path, "fit").key == key
     assert up_to_date(tmp_path, "fit", key) is not None
 
 
@@ -90,7 +91,7 @@ def test_what_is_no_chunk_is_named_with_the_command_that_mends_it(
     assert up_to_date(tmp_path, "fit", key) is None
     if name != MANIFEST or damage != "missing":  # without a manifest there is no artefact
         with pytest.raises(DamagedError, match=rf"{name}: .*; make it again with 'pixcal fit "):
-            require(tmp_path, "fit", 1)
+            require(tmp_path, "fit")
     assert complete(tmp_path) == key
     assert up_to_date(tmp_path, "fit", key) is not None
 
@@ -122,9 +123,9 @@ def test_a_damaged_chunk_is_noted_and_its_command_told(
     )
     assert up_to_date(tmp_path, stage, key) is None
     with pytest.raises(DamagedError, match=r"c/0/0: damaged; make it again with"):
-        require(tmp_path, stage, 1)
+        require(tmp_path, stage)
     complete(tmp_path, stage)
-    assert require(tmp_path, stage, 1).key == key
+    assert require(tmp_path, stage).key == key
     ArrayReader(chunk.parents[2]).verify()
 
 
@@ -133,7 +134,7 @@ def test_a_note_that_is_damaged_itself_still_counts(tmp_path: Path) -> None:
     (tmp_path / "fit" / artefact.DAMAGE).write_text("{")
     assert up_to_date(tmp_path, "fit", key) is None
     with pytest.raises(DamagedError, match=artefact.DAMAGE):
-        require(tmp_path, "fit", 1)
+        require(tmp_path, "fit")
 
 
 def test_an_unfinished_build_that_is_damaged_is_begun_again(tmp_path: Path) -> None:

@@ -13,9 +13,10 @@ from pixcal.api.picture import Picture
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import StrPath, parse
 from pixcal.model.errors import InputError
-from pixcal.storage.artefact import damage_noted, read_json, require
+from pixcal.storage.artefact import damage_noted, read_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.products import read_map
+from pixcal.storage.stage import require
 
 if TYPE_CHECKING:
     from astropy.nddata import CCDData
@@ -24,16 +25,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 U8 = NDArray[np.uint8]
 
-FORMATS = {
-    "ingest": 2,
-    "reduce": 1,
-    "fit": 1,
-    "allan": 1,
-    "diagnose": 5,
-    "corrected": 2,
-    "report": 1,
-}
-"""Formats of the artefacts that are read here."""
 DETECTOR_MAPS = ("bias", "dark_rate", "flat", "read_noise", "mask")
 SERIES = ("time", "B", "A", "phi", "dkx", "dky")
 
@@ -110,13 +101,13 @@ class Run:
         return str(self.path)
 
     def _read(self, stage: str) -> Any:
-        require(self.path, stage, FORMATS[stage])
+        require(self.path, stage)
         return read_json(self.path / stage / f"{stage}.json")
 
     @cached_property
     def acquisition(self) -> Acquisition:
         """The contents of ``acquisition.yaml`` as they were understood."""
-        require(self.path, "ingest", FORMATS["ingest"])
+        require(self.path, "ingest")
         file = self.path / "ingest" / "acquisition.json"
         return parse(Acquisition, read_json(file), str(file))
 
@@ -126,7 +117,7 @@ class Run:
 
         The arrays are ``bias``, ``dark``, ``flat`` and ``fringes/<name of the set>``.
         """
-        require(self.path, "ingest", FORMATS["ingest"])
+        require(self.path, "ingest")
         found: dict[str, dict[str, list[Any]]] = read_json(self.path / "ingest" / "frames.json")
         return found
 
@@ -151,7 +142,7 @@ class Run:
     @cached_property
     def diagnosis(self) -> dict[str, Any]:
         """Contents of ``diagnosis.json``: verdict, causes, what is left of the gap."""
-        require(self.path, "diagnose", FORMATS["diagnose"])
+        require(self.path, "diagnose")
         found: dict[str, Any] = read_json(self.path / "diagnose" / "diagnosis.json")
         return found
 
@@ -162,7 +153,7 @@ class Run:
         ``bias`` (ADU), ``dark_rate`` (e-/s), ``flat`` (relative, median 1), ``read_noise`` (e-),
         float32, and ``mask`` (uint8, bits of `pixcal.PixelFlag`).
         """
-        require(self.path, "reduce", FORMATS["reduce"])
+        require(self.path, "reduce")
         folder = self.path / "reduce" / "calibration.zarr"
         with damage_noted(self.path):
             return {name: ArrayReader(folder / name).read() for name in DETECTOR_MAPS}
@@ -180,7 +171,7 @@ class Run:
     @cached_property
     def correction(self) -> dict[str, Any]:
         """Contents of ``correction.json``: what was done about each effect that was found."""
-        require(self.path, "corrected", FORMATS["corrected"])
+        require(self.path, "corrected")
         found: dict[str, Any] = read_json(self.path / "corrected" / "correction.json")
         return found
 
@@ -225,7 +216,7 @@ class Run:
     @property
     def report(self) -> Path:
         """The HTML page."""
-        require(self.path, "report", FORMATS["report"])
+        require(self.path, "report")
         return self.path / "products" / "report.html"
 
 
@@ -329,5 +320,5 @@ def open_run(path: StrPath) -> Run:
         If it is not a run directory.
     """
     folder = Path(path)
-    require(folder, "ingest", FORMATS["ingest"])
+    require(folder, "ingest")
     return Run(folder)

@@ -36,20 +36,12 @@ from pixcal.kernels.allan import allan_deviation, averaging_lengths, disjoint_di
 from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Allan, Region
-from pixcal.storage.artefact import (
-    Build,
-    Manifest,
-    artefact_key,
-    build,
-    lock,
-    read_json,
-    require,
-    up_to_date,
-    write_json,
-)
+from pixcal.storage.artefact import Build, Manifest, read_json, write_json
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
+from pixcal.storage.formats import STAGES
+from pixcal.storage.stage import copy_products, make, working
 
-FORMAT = 1
+STAGE = STAGES["allan"]
 SCHEMA = "pixcal/allan/1"
 MIN_BATCHES = 3
 TILES_A_SIDE = 4
@@ -121,9 +113,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     InputError
         If the fit has not been run, or a region is not inside the window.
     """
-    fit = require(run_dir, "fit", 1)
-    inputs = {"fit": fit.key}
-    with lock(run_dir):
+    with working(run_dir, "fit") as inputs:
         facts = read_json(run_dir / "fit" / "fit.json")["sets"]
         sets = {
             name: Batches.open(run_dir / "fit" / "fit.zarr" / name, found)
@@ -132,21 +122,19 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         for batches in sets.values():
             for region in (config.region, *config.regions):
                 _check_region(region, batches.window)
-        plain = result_options(config)
-        key = artefact_key("allan", FORMAT, plain, inputs)
-        if up_to_date(run_dir, "allan", key) is None:
-            with build(run_dir, "allan", FORMAT, plain, inputs) as made:
-                create_group(made.folder / "allan.zarr")
-                result = {
-                    name: _measure_set(made, name, batches, config, runtime)
-                    for name, batches in sets.items()
-                }
-                whole = {"schema": SCHEMA, "pixcal": __version__, "sets": result}
-                write_json(made.folder / "allan.json", whole)
-        (run_dir / "products").mkdir(exist_ok=True)
-        published = read_json(run_dir / "allan" / "allan.json")
-        write_json(run_dir / "products" / "allan.json", published)
-        return require(run_dir, "allan", FORMAT)
+
+        def body(made: Build) -> None:
+            create_group(made.folder / "allan.zarr")
+            result = {
+                name: _measure_set(made, name, batches, config, runtime)
+                for name, batches in sets.items()
+            }
+            whole = {"schema": SCHEMA, "pixcal": __version__, "sets": result}
+            write_json(made.folder / "allan.json", whole)
+
+        options = result_options(config)
+        publish = partial(copy_products, run_dir, STAGE, "allan.json")
+        return make(run_dir, STAGE, options, inputs, body, publish=publish)
 
 
 def _name(region: Region) -> str:

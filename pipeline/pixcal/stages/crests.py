@@ -11,7 +11,6 @@ less a piston, in px. That sigma adds both errors in square: too much where prio
 in both. ``warnings`` are sentences. ``crests.zarr/<set name>`` holds the points and the maps.
 """
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -52,22 +51,12 @@ from pixcal.report.crest_figures import CrestView, Extract, crest_figure, outerm
 from pixcal.report.drawing import png
 from pixcal.stages.fit.sweep import load_run, nominal_vector
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.storage.artefact import (
-    MANIFEST,
-    Build,
-    Manifest,
-    artefact_key,
-    build,
-    lock,
-    read_json,
-    require,
-    up_to_date,
-    write_json,
-)
+from pixcal.storage.artefact import MANIFEST, Build, Manifest, read_json, write_json
 from pixcal.storage.cube import create_group, write_array
+from pixcal.storage.formats import STAGES
+from pixcal.storage.stage import copy_products, make, require, working
 
-STAGE = "crests"
-FORMAT = 1
+STAGE = STAGES["crests"]
 SCHEMA = "pixcal/crests/1"
 MAP_SIDE = 21
 """Places along each side of a cost map; odd, so that the minimum is one of them."""
@@ -97,42 +86,28 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     InputError
         If reduce has not been run, or a set has no fringes or too few; the set is named.
     """
-    acquisition, reduced = load_run(run_dir)
+    acquisition = load_run(run_dir)
     if not acquisition.frames.fringes:
         raise InputError(
             f"{run_dir}: the acquisition lists no fringes; crests need some, in frames.fringes"
         )
-    with lock(run_dir):
-        inputs = {"reduce": reduced.key}
+    with working(run_dir, "reduce") as inputs:
         facts: dict[str, Any] = {}
         if (run_dir / "fit" / MANIFEST).exists():
-            inputs["fit"] = require(run_dir, "fit", 1).key
+            inputs["fit"] = require(run_dir, "fit").key
             facts = read_json(run_dir / "fit" / "fit.json")["sets"]
-        plain = result_options(config)
-        key = artefact_key(STAGE, FORMAT, plain, inputs)
-        if up_to_date(run_dir, STAGE, key) is None:
-            with build(run_dir, STAGE, FORMAT, plain, inputs) as made:
-                create_group(made.folder / "crests.zarr")
-                sets = {
-                    s.name: _measure(run_dir, made, acquisition, s.name, facts, config, runtime)
-                    for s in acquisition.frames.fringes
-                }
-                whole = {"schema": SCHEMA, "pixcal": __version__, "sets": sets}
-                write_json(made.folder / "crests.json", whole)
-        _publish(run_dir)
-        return require(run_dir, STAGE, FORMAT)
 
+        def body(made: Build) -> None:
+            create_group(made.folder / "crests.zarr")
+            sets = {
+                s.name: _measure(run_dir, made, acquisition, s.name, facts, config, runtime)
+                for s in acquisition.frames.fringes
+            }
+            whole = {"schema": SCHEMA, "pixcal": __version__, "sets": sets}
+            write_json(made.folder / "crests.json", whole)
 
-def _publish(run_dir: Path) -> None:
-    products = run_dir / "products"
-    products.mkdir(exist_ok=True)
-    for picture in products.glob("crests-*.png"):
-        picture.unlink()
-    for file in (run_dir / STAGE).glob("crests*.*"):
-        if file.is_file():
-            aside = products / f".{file.name}.aside"
-            shutil.copyfile(file, aside)
-            aside.replace(products / file.name)
+        publish = partial(copy_products, run_dir, STAGE, "crests*.*")
+        return make(run_dir, STAGE, result_options(config), inputs, body, publish=publish)
 
 
 def _measure(

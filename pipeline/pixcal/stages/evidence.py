@@ -14,8 +14,9 @@ from pixcal.model.errors import InputError
 from pixcal.stages.fit.scouting import read_frames
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.storage.artefact import read_json, require
+from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.stage import require
 
 Part = tuple[tuple[int, int], tuple[int, int]]
 """Rows and columns of the window: ((y0, y1), (x0, x1))."""
@@ -43,7 +44,7 @@ def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice
     InputError
         If a stage is missing, or the part holds more than `MAX_SAMPLES` samples.
     """
-    require(run_dir, "reduce", 1)
+    require(run_dir, "reduce")
     file = run_dir / "ingest" / "acquisition.json"
     acquisition = parse(Acquisition, read_json(file), str(file))
     ingested = Ingested(run_dir / "ingest")
@@ -55,7 +56,7 @@ def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice
     }
     fringes = {}
     if acquisition.frames.fringes:
-        require(run_dir, "fit", 1)
+        require(run_dir, "fit")
         for listed in acquisition.frames.fringes:
             fringes[listed.name] = _fringes(
                 run_dir, ingested, listed.name, listed.baseline_mm, (y, x), frames

@@ -1,10 +1,9 @@
 """Report: one HTML page on everything that a run holds."""
 
 import inspect
-import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,37 +47,19 @@ from pixcal.report.summary import (
 )
 from pixcal.simulation.effect import Effect
 from pixcal.stages.correct import HEADER, advice
-from pixcal.storage.artefact import (
-    MANIFEST,
-    Manifest,
-    artefact_key,
-    build,
-    lock,
-    read_json,
-    require,
-    up_to_date,
-)
+from pixcal.storage.artefact import MANIFEST, Build, Manifest, read_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.folder import INDEX
+from pixcal.storage.formats import STAGES
+from pixcal.storage.stage import copy_products, make, require, working
 
-STAGE = "report"
-FORMAT = 1
-SHOWN_STAGES = {
-    "ingest": 2,
-    "reduce": 1,
-    "sweep": 3,
-    "fit": 1,
-    "allan": 1,
-    "diagnose": 5,
-    "corrected": 2,
-}
-"""Stages and the formats of theirs that are understood."""
-COMMANDS = {"sweep": "fit", "corrected": "fit --with-diagnosis"}
-"""That make stages of another name."""
+SHOWN_STAGES = ("ingest", "reduce", "sweep", "fit", "allan", "diagnose", "corrected")
+"""Stages whose artefacts are read."""
 FIGURE_BYTES = 192 << 20
 """Matplotlib, one figure and the page."""
 
 
+STAGE = STAGES["report"]
 Config = Report
 
 
@@ -92,40 +73,22 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     InputError
         If reduce has not been run, or an artefact cannot be read.
     """
-    require(run_dir, "reduce", 1)
-    with lock(run_dir):
-        manifests = _manifests(run_dir)
+    with working(run_dir, "reduce"):
+        manifests = {
+            stage: require(run_dir, stage)
+            for stage in SHOWN_STAGES
+            if (run_dir / stage / MANIFEST).exists()
+        }
         inputs = {stage: manifest.key for stage, manifest in manifests.items()}
-        key = artefact_key(STAGE, FORMAT, result_options(config), inputs)
-        made = up_to_date(run_dir, STAGE, key)
-        if made is None:
-            contents = _collect(run_dir, manifests, runtime)
-            with build(run_dir, STAGE, FORMAT, result_options(config), inputs) as report:
-                page = render(contents)
-                (report.folder / "report.html").write_text(page, encoding="utf-8")
-                report.summary = {"bytes": len(page.encode()), "sections": page.count("<section")}
-            made = require(run_dir, STAGE, FORMAT)
-        _publish(run_dir)
-        return made
 
+        def body(made: Build) -> None:
+            page = render(_collect(run_dir, manifests, runtime))
+            (made.folder / "report.html").write_text(page, encoding="utf-8")
+            made.summary = {"bytes": len(page.encode()), "sections": page.count("<section")}
 
-def _publish(run_dir: Path) -> None:
-    product = run_dir / "products" / "report.html"
-    product.parent.mkdir(exist_ok=True)
-    aside = product.with_name(".report.html.aside")
-    shutil.copyfile(run_dir / STAGE / "report.html", aside)
-    with aside.open("rb") as copy:
-        os.fsync(copy.fileno())
-    aside.replace(product)
-
-
-def _manifests(run_dir: Path) -> dict[str, Manifest]:
-    """Manifests of the stages that there are."""
-    return {
-        stage: require(run_dir, stage, SHOWN_STAGES[stage])
-        for stage in SHOWN_STAGES
-        if (run_dir / stage / MANIFEST).exists()
-    }
+        options = result_options(config)
+        publish = partial(copy_products, run_dir, STAGE, "report.html")
+        return make(run_dir, STAGE, options, inputs, body, publish=publish)
 
 
 def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime) -> Contents:
@@ -308,7 +271,7 @@ def _warnings(manifests: Mapping[str, Manifest], facts: Mapping[str, Any]) -> tu
         for made_from, key in manifest.inputs.items():
             present = manifests.get(made_from)
             if present is not None and present.key != key:
-                command = COMMANDS.get(stage, stage)
+                command = STAGES[stage].command.replace(" RUN", "")
                 found.append(
                     f"{stage} was made from an earlier {made_from}: run 'pixcal {command}' again."
                 )

@@ -45,12 +45,10 @@ from pixcal.storage.artefact import (
 )
 from pixcal.storage.fits_map import content_digest
 from pixcal.storage.fits_out import COMPRESSED, FrameWriter
+from pixcal.storage.formats import STAGES, Stage
 
-STAGE = "simulate"
 TRUTH_MAPS = tuple(f for f in fields(DetectorMaps) if f.name not in ("read_noise", "adu_per_e"))
 """Maps that are told; read noise and gain of a simulated detector are the same in all pixels."""
-TRUTH = "simulate-truth"
-FORMAT = 1
 TRUTH_SCHEMA = "pixcal/truth/1"
 
 FRAMES_PER_TASK = 128
@@ -118,8 +116,9 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
         raise InputError(f"--truth {truth}: one inside the other with {out}; keep the truth apart")
     effects = _checked_effects(plan, bench, config.own)
     own = {f"effect {file.name}": content_digest(file) for file in config.own}
-    key = artefact_key(STAGE, FORMAT, to_plain(plan), own)
-    before, truth_before = _standing(out, STAGE, "--out"), _standing(truth, TRUTH, "--truth")
+    stage, told = STAGES["simulate"], STAGES["simulate-truth"]
+    key = artefact_key(stage.name, stage.format, to_plain(plan), own)
+    before, truth_before = _standing(out, stage, "--out"), _standing(truth, told, "--truth")
     if before and truth_before and _whole(out, before, key) and _whole(truth, truth_before, key):
         return before
     aside, truth_aside = (p.with_name(f".{p.name}.partial") for p in (out, truth))
@@ -188,11 +187,15 @@ def _build(
         shutil.copyfile(file, truth_made / file.name)
     _write_frames(plan, effects, recorded, made, runtime)
     _write_description(plan, made)
-    _put(truth_made, truth_out, Manifest(TRUTH, FORMAT, key, to_plain(plan), {}))
-    return _put(made, out, Manifest(STAGE, FORMAT, key, {}, {}))
+    _put(truth_made, truth_out, _manifest("simulate-truth", key, to_plain(plan)))
+    return _put(made, out, _manifest("simulate", key, {}))
 
 
-def _standing(folder: Path, stage: str, option: str) -> Manifest | None:
+def _manifest(name: str, key: str, plain: dict[str, Any]) -> Manifest:
+    return Manifest(name, STAGES[name].format, key, plain, {})
+
+
+def _standing(folder: Path, stage: Stage, option: str) -> Manifest | None:
     """Manifest of what stands where we want to write; refused when it is not simulate's."""
     if not folder.exists():
         return None
@@ -202,7 +205,7 @@ def _standing(folder: Path, stage: str, option: str) -> Manifest | None:
     if not there:
         return None
     manifest = read_manifest(folder)
-    if manifest is None or manifest.stage != stage:
+    if manifest is None or manifest.stage != stage.name:
         raise InputError(
             f"{option} {folder}: not empty, and not made by 'pixcal simulate'; choose another"
         )

@@ -24,6 +24,7 @@ from typing import Any
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.storage.cube_place import POINTER, cubes_of, remove_cubes, settle, settled
 from pixcal.storage.folder import DISK_FULL
+from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import (
     DAMAGE,
     JOURNAL,
@@ -58,66 +59,12 @@ __all__ = [
     "lock",
     "read_json",
     "read_manifest",
-    "require",
     "up_to_date",
     "write_json",
     "write_manifest",
 ]
 
 _KEY_IN_NAME = 16
-_FROM_FRINGES = ("sweep", "fit", "allan", "crests", "corrected", "astrometry")
-_EARLIER = {"ingest": (1,)}
-"""Formats that are read beside the one that is written."""
-
-
-def _command(run: Path, stage: str) -> str:
-    """What to type to have an artefact made."""
-    if stage == "ingest":
-        return f"pixcal ingest ACQ --out {run}"
-    if stage == "corrected":
-        return f"pixcal fit {run} --with-diagnosis"
-    # The sweep is a part of the command that reads it.
-    return f"pixcal {'fit' if stage == 'sweep' else stage} {run}"
-
-
-def require(run: Path, stage: str, format: int) -> Manifest:
-    """Manifest of a stage that must have been run.
-
-    Raises
-    ------
-    InputError
-        If the stage has not been run, or its format is another one.
-    DamagedError
-        If the artefact is damaged.
-    """
-    if not run.is_dir():
-        raise InputError(f"{run}: no such run directory; make one with 'pixcal ingest'")
-    folder, command = run / stage, _command(run, stage)
-    try:
-        manifest = read_manifest(folder)
-        if manifest is not None:
-            check_intact(folder, manifest)
-    except DamagedError as error:
-        error.advice = f"make it again with '{command}'"
-        raise
-    if manifest is None:
-        if stage in _FROM_FRINGES and _without_fringes(run):
-            raise InputError(f"{run}: the acquisition lists no fringes, so there is no {stage}")
-        raise InputError(f"{folder}: not there yet; run '{command}' first")
-    if manifest.stage != stage or manifest.format not in (format, *_EARLIER.get(stage, ())):
-        raise InputError(
-            f"{folder}: format {manifest.stage}/{manifest.format}, this pixcal reads "
-            f"{stage}/{format}; run '{command}' again"
-        )
-    return manifest
-
-
-def _without_fringes(run: Path) -> bool:
-    """Whether the acquisition that was ingested has detector frames alone."""
-    try:
-        return not read_json(run / "ingest" / "acquisition.json")["frames"]["fringes"]
-    except (DamagedError, LookupError):
-        return False
 
 
 @dataclass
@@ -297,7 +244,7 @@ def _settle_killed(run: Path) -> None:
 def _note_damage(run: Path, error: DamagedError) -> None:
     """See to it that what is damaged is made again by the next run of its stage."""
     if _name_within(run / "products", error.path) is not None:
-        error.advice = f"write it again with '{_command(run, 'fit')}'"
+        error.advice = f"write it again with '{STAGES['fit'].typed(run)}'"
         return
     for folder in [*run.glob(".partial/*/"), *(file.parent for file in run.glob(f"*/{MANIFEST}"))]:
         name = _name_within(folder, error.path)
@@ -307,8 +254,8 @@ def _note_damage(run: Path, error: DamagedError) -> None:
             _discard(folder, run)
             error.advice = "run the same command again"
             return
-        if name != POINTER:
-            error.advice = f"make it again with '{_command(run, folder.name)}'"
+        if name != POINTER and folder.name in STAGES:
+            error.advice = f"make it again with '{STAGES[folder.name].typed(run)}'"
         with suppress(OSError):
             write_json(folder / DAMAGE, {"files": sorted({*damaged_files(folder), name})})
 

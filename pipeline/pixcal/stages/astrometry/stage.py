@@ -16,9 +16,9 @@ and ``warnings`` (sentences). Errors are 1 sigma, of the simulation: other stars
 What is not seen above the maps' own errors is null. ``astrometry.zarr`` holds the maps of errors.
 """
 
-import shutil
 from collections.abc import Mapping
 from dataclasses import astuple
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,21 +43,11 @@ from pixcal.stages.astrometry.simulation import Observation, core_weights, obser
 from pixcal.stages.astrometry.summary import TARGET_PX, axis_facts, table
 from pixcal.stages.astrometry.telescope import Telescope, exposures, star
 from pixcal.stages.astrometry.truth import BAND, free_from_modes
-from pixcal.storage.artefact import (
-    Build,
-    Manifest,
-    artefact_key,
-    build,
-    lock,
-    read_json,
-    require,
-    up_to_date,
-    write_json,
-)
+from pixcal.storage.artefact import Build, Manifest, read_json, write_json
 from pixcal.storage.fits_map import content_digest
+from pixcal.storage.formats import STAGES
+from pixcal.storage.stage import copy_products, make, working
 
-STAGE = "astrometry"
-FORMAT = 1
 SCHEMA = "pixcal/astrometry/1"
 
 CURVE = np.geomspace(1e4, 1e12, 49)
@@ -78,6 +68,7 @@ _BYTES_PER_WINDOW_PIXEL = 200
 F64 = NDArray[np.float64]
 
 
+STAGE = STAGES["astrometry"]
 Config = Astrometry
 
 
@@ -93,35 +84,29 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         If fit has not been run, the maps are too small for a star, or the truth is not that of
         this detector.
     """
-    fitted = require(run_dir, "fit", 1)
-    described = run_dir / "ingest" / "acquisition.json"
-    acquisition = parse(Acquisition, read_json(described), str(described))
-    telescope = Telescope(
-        config.diameter_m, config.focal_length_m, config.wavelength_nm, config.obscuration,
-        acquisition.detector.pitch_um,
-    )  # fmt: skip
-    with lock(run_dir):
+    with working(run_dir, "fit") as inputs:
+        described = run_dir / "ingest" / "acquisition.json"
+        acquisition = parse(Acquisition, read_json(described), str(described))
+        telescope = Telescope(
+            config.diameter_m,
+            config.focal_length_m,
+            config.wavelength_nm,
+            config.obscuration,
+            acquisition.detector.pitch_um,
+        )
         fit = read_json(run_dir / "fit" / "fit.json")
         components = open_components(run_dir, fit, config.truth)
-        inputs = {"fit": fitted.key}
         for component in components:
             inputs[component.delta.path.name] = content_digest(component.delta.path)
             for _, image in component.truth:
                 inputs[f"truth/{image.path.name}"] = content_digest(image.path)
-        plain = result_options(config) | {"truth": None}
-        key = artefact_key(STAGE, FORMAT, plain, inputs)
-        if up_to_date(run_dir, STAGE, key) is None:
-            with build(run_dir, STAGE, FORMAT, plain, inputs) as made:
-                _measure(made, components, fit, acquisition, telescope, config, runtime)
-        _publish(run_dir)
-        return require(run_dir, STAGE, FORMAT)
 
+        def body(made: Build) -> None:
+            _measure(made, components, fit, acquisition, telescope, config, runtime)
 
-def _publish(run_dir: Path) -> None:
-    for name in ("astrometry.json", "astrometry.png"):
-        aside = run_dir / "products" / f".{name}.aside"
-        shutil.copyfile(run_dir / STAGE / name, aside)
-        aside.replace(run_dir / "products" / name)
+        options = result_options(config) | {"truth": None}
+        publish = partial(copy_products, run_dir, STAGE, "astrometry.*")
+        return make(run_dir, STAGE, options, inputs, body, publish=publish)
 
 
 def _measure(

@@ -21,15 +21,15 @@ from pixcal.kernels.optics import PARAMETERS, Geometry
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
-from pixcal.storage.artefact import read_json, require
+from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.stage import require
 
 F64 = NDArray[np.float64]
 Range = tuple[int, int]
 Tile = tuple[Range, Range]
 Vector = tuple[float, float]
 
-FIT_FORMAT = 1
 PART_OF = 1e-3
 """A set whose share in a direction is below this brings no modes of its own there."""
 
@@ -209,7 +209,7 @@ def whole_run(run: Path, label: str | None = None) -> Side:
     InputError
         If the run has not been fitted, or by a model that this comparison does not know.
     """
-    manifest = require(run, "fit", FIT_FORMAT)
+    manifest = require(run, "fit")
     result = read_json(run / "fit" / "fit.json")
     plain = read_json(run / "ingest" / "acquisition.json")
     acquisition = parse(Acquisition, plain, str(run / "ingest" / "acquisition.json"))

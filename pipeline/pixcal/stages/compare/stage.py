@@ -46,9 +46,9 @@ from pixcal.storage.artefact import (
     write_json,
     write_manifest,
 )
+from pixcal.storage.formats import STAGES
 
-STAGE = "compare"
-FORMAT = 1
+STAGE = STAGES["compare"]
 SCHEMA = "pixcal/compare/1"
 RESULT = "compare.json"
 STRAY = 0.05
@@ -92,7 +92,7 @@ def _run(sides: Sequence[Side], out: Path, config: Config, runtime: Runtime) -> 
     components = _components(sides)
     inputs = {f"{n} {side.run}": side.key for n, side in enumerate(sides)}
     plain = result_options(config)
-    key = artefact_key(STAGE, FORMAT, plain, inputs)
+    key = artefact_key(STAGE.name, STAGE.format, plain, inputs)
     with lock(out):
         ready = read_manifest(out)
         if ready is not None and ready.key == key and (out / RESULT).exists():
@@ -106,7 +106,7 @@ def _run(sides: Sequence[Side], out: Path, config: Config, runtime: Runtime) -> 
             aside.write_bytes(png(compare_figure(view)))
             aside.replace(out / name)
         write_json(out / RESULT, result)
-        manifest = Manifest(STAGE, FORMAT, key, plain, inputs)
+        manifest = Manifest(STAGE.name, STAGE.format, key, plain, inputs)
         write_manifest(out, manifest)
         return manifest
 
@@ -117,7 +117,7 @@ def _check_out(out: Path) -> None:
     if not out.is_dir():
         raise InputError(f"--out {out}: a file is in the way; choose another directory")
     made = read_manifest(out)
-    if (made is not None and made.stage != STAGE) or (out / "ingest").exists():
+    if (made is not None and made.stage != STAGE.name) or (out / "ingest").exists():
         raise InputError(f"--out {out}: holds something else of pixcal; choose another directory")
 
 

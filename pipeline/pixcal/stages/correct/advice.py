@@ -8,10 +8,10 @@ from typing import Any
 
 from pixcal.effects import known_effects, parse_effects
 from pixcal.model.errors import InputError
-from pixcal.stages.correct.stage import FORMAT, SUFFIX
-from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
+from pixcal.stages.correct.stage import SUFFIX
 from pixcal.stages.treatment import treatment_of
-from pixcal.storage.artefact import MANIFEST, read_json, require
+from pixcal.storage.artefact import MANIFEST, read_json
+from pixcal.storage.stage import require
 
 Json = Mapping[str, Any]
 
@@ -68,7 +68,7 @@ def maps_to_use(run_dir: Path) -> dict[str, Path]:
     InputError
         If the run was not fitted.
     """
-    require(run_dir, "fit", 1)
+    require(run_dir, "fit")
     source: Json = read_json(run_dir / "fit" / "fit.json")
     correction, suffix = _correction(run_dir), ""
     if correction is not None and correction["outputs"]:
@@ -79,7 +79,7 @@ def maps_to_use(run_dir: Path) -> dict[str, Path]:
 def _diagnosis(run_dir: Path) -> Json | None:
     if not (run_dir / "diagnose" / MANIFEST).exists():
         return None
-    require(run_dir, "diagnose", DIAGNOSIS_FORMAT)
+    require(run_dir, "diagnose")
     found: Json = read_json(run_dir / "diagnose" / "diagnosis.json")
     return found
 
@@ -88,7 +88,7 @@ def _correction(run_dir: Path) -> Json | None:
     """That of the present fit and diagnosis."""
     if not (run_dir / "corrected" / MANIFEST).exists():
         return None
-    made = require(run_dir, "corrected", FORMAT)
+    made = require(run_dir, "corrected")
     for stage, key in made.inputs.items():
         if read_json(run_dir / stage / MANIFEST)["key"] != key:
             return None

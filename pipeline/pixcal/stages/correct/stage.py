@@ -10,6 +10,7 @@ import json
 import shutil
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,31 +27,20 @@ from pixcal.stages.correct.sides import sides_of
 from pixcal.stages.correct.swept import Swept
 from pixcal.stages.correct.uncertainty import parameter_errors
 from pixcal.stages.correct.undoing import undo_on_maps
-from pixcal.stages.diagnose.stage import FORMAT as DIAGNOSIS_FORMAT
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
 from pixcal.stages.fit.maps import Totals, write_maps
 from pixcal.stages.fit.products import header_of, plan_products, publish_maps
-from pixcal.stages.fit.sweep import FORMAT as SWEEP_FORMAT
 from pixcal.stages.fit.sweep import Config as SweepConfig
 from pixcal.stages.fit.sweep import load_run, nominal_vector, sweep_set
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.treatment import HYPERBOLIC, Treatments, treatments
-from pixcal.storage.artefact import (
-    Build,
-    Manifest,
-    artefact_key,
-    build,
-    lock,
-    read_json,
-    require,
-    up_to_date,
-    write_json,
-)
+from pixcal.storage.artefact import Build, Manifest, lock, read_json, write_json
 from pixcal.storage.cube import create_group
+from pixcal.storage.formats import STAGES
 from pixcal.storage.products import Card, is_whole
+from pixcal.storage.stage import make, require
 
-FORMAT = 2
 SUFFIX = "_corrected"
 """Of the names of the products."""
 
@@ -73,8 +63,8 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         If the run was not diagnosed, or not as it is reduced now; if an effect that was found is of
         the user's own and its file was not given, or undoes what it should not.
     """
-    diagnosed = require(run_dir, "diagnose", DIAGNOSIS_FORMAT)
-    if diagnosed.inputs["reduce"] != require(run_dir, "reduce", 1).key:
+    diagnosed = require(run_dir, "diagnose")
+    if diagnosed.inputs["reduce"] != require(run_dir, "reduce").key:
         raise InputError(
             f"{run_dir / 'diagnose'}: of frames that were reduced otherwise; run "
             f"'pixcal diagnose {run_dir}' again"
@@ -93,17 +83,20 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         "effects": [t.plain for t in plan.every],
     }
     inputs = {"fit": fitted.key, "diagnose": diagnosed.key}
-    acquisition, _ = load_run(run_dir)
+    acquisition = load_run(run_dir)
     if plan.changes:
         plan_products(run_dir, [s.name for s in acquisition.frames.fringes], runtime)
     with lock(run_dir):
-        key = artefact_key("corrected", FORMAT, plain, inputs)
-        if up_to_date(run_dir, "corrected", key) is None:
-            with build(run_dir, "corrected", FORMAT, plain, inputs) as made:
-                made.summary = _correct(run_dir, made, plan, acquisition, runtime)
-        if not _published(run_dir):
-            _publish(run_dir)
-        return require(run_dir, "corrected", FORMAT)
+        body = partial(_correct, run_dir, plan, acquisition, runtime)
+        return make(
+            run_dir,
+            STAGES["corrected"],
+            plain,
+            inputs,
+            body,
+            publish=partial(_publish, run_dir),
+            published=partial(_published, run_dir),
+        )
 
 
 def attempt(run_dir: Path, config: Config, runtime: Runtime) -> str | None:
@@ -125,8 +118,8 @@ def attempt(run_dir: Path, config: Config, runtime: Runtime) -> str | None:
 
 
 def _correct(
-    run_dir: Path, made: Build, plan: Treatments, acquisition: Acquisition, runtime: Runtime
-) -> Json:
+    run_dir: Path, plan: Treatments, acquisition: Acquisition, runtime: Runtime, made: Build
+) -> None:
     before = read_json(run_dir / "fit" / "fit.json")
     plan = measured_again(run_dir, plan, runtime)
     result: Json = {
@@ -143,7 +136,7 @@ def _correct(
     if plan.changes:
         result |= _corrected_maps(run_dir, made, plan, acquisition, runtime)
     write_json(made.folder / "correction.json", result)
-    return {"outputs": result["outputs"], "undone": [e.name for e in plan.undone]}
+    made.summary = {"outputs": result["outputs"], "undone": [e.name for e in plan.undone]}
 
 
 def _corrected_maps(
@@ -199,7 +192,7 @@ def _sweep(
     run_dir: Path, made: Build, plan: Treatments, acquisition: Acquisition, runtime: Runtime
 ) -> tuple[Path, Mapping[str, Json]]:
     """Where the swept sets are, and their summaries: those of the fit, unless samples change."""
-    of_fit = require(run_dir, "sweep", SWEEP_FORMAT)
+    of_fit = require(run_dir, "sweep")
     if not plan.on_samples:
         return run_dir / "sweep" / "sweep.zarr", of_fit.summary["sets"]
     again = replace(made, folder=made.scratch)

@@ -24,7 +24,8 @@ from pixcal.stages.diagnose.trial import Curves, Window, averaged, looked_at
 from pixcal.stages.diagnose.windows import Split, chosen_windows, split
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.ingested import Ingested
-from pixcal.storage.artefact import read_json, require
+from pixcal.storage.artefact import read_json
+from pixcal.storage.stage import require
 
 EVIDENCE_BYTES = 34
 """Evidence in memory and the run that it is made of, for each sample of all fringe sets (measured,
@@ -236,6 +237,6 @@ def _plain_half(half: Half) -> dict[str, list[int]]:
 
 
 def _reduction(run_dir: Path) -> reduce.Config:
-    plain = dict(require(run_dir, "reduce", 1).config)
+    plain = dict(require(run_dir, "reduce").config)
     known = {k: v for k, v in plain.items() if k in reduce.Config.__dataclass_fields__}
     return parse(reduce.Config, known, str(run_dir / "reduce" / "manifest.json"))

@@ -7,6 +7,7 @@ data and every simulation of them are reduced and fitted by the same stages.
 import hashlib
 import shutil
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 from pixcal.effects import known_effects, parse_effects
@@ -20,20 +21,11 @@ from pixcal.stages.diagnose.inquiry import inquire, places
 from pixcal.stages.diagnose.on_map import on_map
 from pixcal.stages.diagnose.result import describe
 from pixcal.stages.diagnose.trial import Effects
-from pixcal.storage.artefact import (
-    Manifest,
-    artefact_key,
-    build,
-    lock,
-    read_json,
-    require,
-    up_to_date,
-    write_json,
-)
+from pixcal.storage.artefact import Build, Manifest, write_json
+from pixcal.storage.formats import STAGES
+from pixcal.storage.stage import copy_products, make, require, working
 
-FORMAT = 5
-
-
+STAGE = STAGES["diagnose"]
 Config = Diagnose
 
 
@@ -45,7 +37,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     InputError
         If the run was not reduced, a name of an effect is unknown, or the frames cannot be fitted.
     """
-    reduced = require(run_dir, "reduce", 1)
+    require(run_dir, "reduce")
     known = known_effects(config.own)
     kinds = _kinds(config, known)
     base = _base(config.nominal, known)
@@ -54,36 +46,32 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         "own": [hashlib.sha256(path.read_bytes()).hexdigest() for path in config.own],
         "nominal": {e.name: to_plain(e) for e in base},
     }
-    with lock(run_dir):
-        inputs = {"reduce": reduced.key}
-        key = artefact_key("diagnose", FORMAT, plain, inputs)
-        done = up_to_date(run_dir, "diagnose", key)
-        if done is None:
-            with build(run_dir, "diagnose", FORMAT, plain, inputs) as made:
-                scratch = made.folder / "scratch"
-                scratch.mkdir(exist_ok=True)
-                for unfinished in (p for p in scratch.iterdir() if p.is_dir()):
-                    shutil.rmtree(unfinished, ignore_errors=True)
-                own = inquire(run_dir, kinds, base, scratch, runtime)
-                diagnosis, curves = describe(
-                    own.found, own.data, own.look.measured, own.reference, own.look.facts,
-                    places(own),
-                )  # fmt: skip
-                shutil.rmtree(scratch, ignore_errors=True)
-                named = {effect.name: effect for effect in own.found.final.effects}
-                fits = [fit for window in own.look.windows for fit in window.bench.fits]
-                for cause in diagnosis["causes"]:
-                    cause["on_map"] = on_map(named[cause["effect"]], fits, run_dir)
-                write_json(made.folder / "diagnosis.json", diagnosis)
-                write_json(made.folder / "curves.json", curves)
-                made.summary.update(
-                    verdict=diagnosis["verdict"],
-                    causes=[cause["effect"] for cause in diagnosis["causes"]],
-                )
-        product = run_dir / "products" / "diagnosis.json"
-        product.parent.mkdir(exist_ok=True)
-        write_json(product, read_json(run_dir / "diagnose" / "diagnosis.json"))
-        return require(run_dir, "diagnose", FORMAT)
+    with working(run_dir, "reduce") as inputs:
+        body = partial(_diagnose, run_dir, kinds, base, runtime)
+        publish = partial(copy_products, run_dir, STAGE, "diagnosis.json")
+        return make(run_dir, STAGE, plain, inputs, body, publish=publish)
+
+
+def _diagnose(
+    run_dir: Path, kinds: Mapping[str, type[Effect]], base: Effects, runtime: Runtime, made: Build
+) -> None:
+    """Write ``diagnosis.json`` and ``curves.json``."""
+    made.scratch.mkdir(exist_ok=True)
+    for unfinished in (p for p in made.scratch.iterdir() if p.is_dir()):
+        shutil.rmtree(unfinished, ignore_errors=True)
+    own = inquire(run_dir, kinds, base, made.scratch, runtime)
+    diagnosis, curves = describe(
+        own.found, own.data, own.look.measured, own.reference, own.look.facts, places(own)
+    )
+    named = {effect.name: effect for effect in own.found.final.effects}
+    fits = [fit for window in own.look.windows for fit in window.bench.fits]
+    for cause in diagnosis["causes"]:
+        cause["on_map"] = on_map(named[cause["effect"]], fits, run_dir)
+    write_json(made.folder / "diagnosis.json", diagnosis)
+    write_json(made.folder / "curves.json", curves)
+    made.summary.update(
+        verdict=diagnosis["verdict"], causes=[cause["effect"] for cause in diagnosis["causes"]]
+    )
 
 
 def _kinds(config: Config, known: Mapping[str, type[Effect]]) -> dict[str, type[Effect]]:

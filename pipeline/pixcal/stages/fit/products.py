@@ -99,7 +99,7 @@ def header_of(run_dir: Path, result: dict[str, Any], key: str) -> tuple[list[Car
 
 def _detector_cards(run_dir: Path) -> list[Card]:
     """Which detector it is, and when its fringes were recorded (where the frames say)."""
-    detector = load_run(run_dir)[0].detector
+    detector = load_run(run_dir).detector
     cards: list[Card] = [
         ("DETECTOR", detector.name, "name of the detector"),
         ("PIXSIZE1", detector.pitch_um, "[um] pixel pitch along x"),

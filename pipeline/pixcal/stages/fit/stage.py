@@ -1,7 +1,7 @@
 """Offsets from the sweep's phases: a shape for each set, modes removed, sets joined, products."""
 
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 from pixcal import __version__
 from pixcal.engine.run import Runtime
@@ -13,19 +13,9 @@ from pixcal.stages.fit.maps import write_maps
 from pixcal.stages.fit.products import plan_products, publish, published
 from pixcal.stages.fit.sweep import load_run
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.storage.artefact import (
-    Build,
-    Manifest,
-    artefact_key,
-    build,
-    lock,
-    require,
-    up_to_date,
-    write_json,
-)
-
-FORMAT = 1
-
+from pixcal.storage.artefact import Build, Manifest, write_json
+from pixcal.storage.formats import STAGES
+from pixcal.storage.stage import make, require, working
 
 Config = Fit
 
@@ -42,31 +32,25 @@ def run(run_dir: Path, config: Config, runtime: Runtime, *, products: bool = Tru
     InputError
         If reduce has not been run, or the frames hold no fringes that can be fitted.
     """
-    require(run_dir, "reduce", 1)
-    acquisition, _ = load_run(run_dir)
-    sets = [listed.name for listed in acquisition.frames.fringes]
+    sets = [listed.name for listed in load_run(run_dir).frames.fringes]
     if products and sets:
         plan_products(run_dir, sets, runtime)
-    with lock(run_dir):
+    with working(run_dir, "reduce"):
         swept = sweep.run(run_dir, config, runtime)
-        inputs = {"sweep": swept.key}
-        plain = result_options(config)
-        key = artefact_key("fit", FORMAT, plain, inputs)
-        if (ready := up_to_date(run_dir, "fit", key)) is not None:
-            if products and not published(run_dir):
-                publish(run_dir)
-            return ready
-        with build(run_dir, "fit", FORMAT, plain, inputs) as made:
-            made.summary = _fit_all(run_dir, made, swept, config, runtime)
-        if products:
-            publish(run_dir)
-        return require(run_dir, "fit", FORMAT)
+        body = partial(_fit_all, run_dir, swept, config, runtime)
+        return make(
+            run_dir,
+            STAGES["fit"],
+            result_options(config),
+            {"sweep": swept.key},
+            body,
+            publish=lambda: publish(run_dir) if products else None,
+            published=lambda: published(run_dir),
+        )
 
 
-def _fit_all(
-    run_dir: Path, made: Build, swept: Manifest, config: Config, runtime: Runtime
-) -> dict[str, Any]:
-    acquisition, _ = load_run(run_dir)
+def _fit_all(run_dir: Path, swept: Manifest, config: Config, runtime: Runtime, made: Build) -> None:
+    acquisition = load_run(run_dir)
     fitted = [
         fit_set(
             run_dir / "sweep" / "sweep.zarr" / listed.name,
@@ -82,7 +66,7 @@ def _fit_all(
     result = {
         "schema": "pixcal/fit/1",
         "pixcal": __version__,
-        "input": require(run_dir, "ingest", 2).key,
+        "input": require(run_dir, "ingest").key,
         "model": config.model,
         "sets": {
             f.name: describe(f, totals.sets[f.name].masked, totals.sets[f.name].sigma_px)
@@ -92,4 +76,4 @@ def _fit_all(
         "sets_chi2_reduced": totals.consistency,
     }
     write_json(made.folder / "fit.json", result)
-    return result
+    made.summary = result

@@ -27,20 +27,11 @@ from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Sweep
 from pixcal.stages.fit.scouting import CACHE_BYTES, read_frames, scout_set
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.storage.artefact import (
-    Build,
-    Manifest,
-    artefact_key,
-    build,
-    file_digest,
-    read_json,
-    require,
-    up_to_date,
-    write_json,
-)
+from pixcal.storage.artefact import Build, Manifest, file_digest, read_json, write_json
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
+from pixcal.storage.formats import STAGES
+from pixcal.storage.stage import make, require
 
-FORMAT = 3
 CHI2_SAMPLES = 4096
 """Chi-squares kept in all to tell the usual one from (at least `MIN_SAMPLES` of a tile)."""
 MIN_SAMPLES = 16
@@ -64,11 +55,11 @@ def nominal_vector(acquisition: Acquisition, name: str) -> tuple[float, float]:
     return baseline[0] * per_mm, baseline[1] * per_mm
 
 
-def load_run(run_dir: Path) -> tuple[Acquisition, Manifest]:
-    """Acquisition and manifest of the reduce stage of a run."""
-    manifest = require(run_dir, "reduce", 1)
+def load_run(run_dir: Path) -> Acquisition:
+    """Acquisition of a run that must have been reduced."""
+    require(run_dir, "reduce")
     file = run_dir / "ingest" / "acquisition.json"
-    return parse(Acquisition, read_json(file), str(file)), manifest
+    return parse(Acquisition, read_json(file), str(file))
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -79,17 +70,13 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     InputError
         If there are no fringe sets, or a set has no fringes to fit; the set is named.
     """
-    acquisition, reduced = load_run(run_dir)
+    acquisition = load_run(run_dir)
     if not acquisition.frames.fringes:
         raise InputError(
             f"{run_dir}: the acquisition lists no fringes; a fit needs some, in frames.fringes"
         )
-    inputs = {"reduce": reduced.key}
-    plain = result_options(config, Config)
-    key = artefact_key("sweep", FORMAT, plain, inputs)
-    if (ready := up_to_date(run_dir, "sweep", key)) is not None:
-        return ready
-    with build(run_dir, "sweep", FORMAT, plain, inputs) as made:
+
+    def body(made: Build) -> None:
         create_group(made.folder / "sweep.zarr")
         sets = {}
         for fringe_set in acquisition.frames.fringes:
@@ -105,7 +92,9 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
                 raise InputError(f"{run_dir}: fringe set {fringe_set.name!r}: {error}") from error
         made.summary = {"sets": sets}
         write_json(made.folder / "sweep.json", made.summary)
-    return require(run_dir, "sweep", FORMAT)
+
+    inputs = {"reduce": require(run_dir, "reduce").key}
+    return make(run_dir, STAGES["sweep"], result_options(config, Config), inputs, body)
 
 
 @dataclass(frozen=True)

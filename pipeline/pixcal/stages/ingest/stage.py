@@ -27,30 +27,21 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import DamagedError, InputError, RemoteError
 from pixcal.model.options import Ingest
 from pixcal.stages.ingest.arrays import FRAMES_A_PIECE, Writers, find_kept, take_over
-from pixcal.storage.artefact import (
-    Build,
-    Manifest,
-    artefact_key,
-    build,
-    lock,
-    read_manifest,
-    up_to_date,
-    write_json,
-    write_manifest,
-)
+from pixcal.storage.artefact import Build, Manifest, lock, read_manifest, write_json, write_manifest
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.cube_place import base_of, chosen_base, cubes_of
 from pixcal.storage.fits_in import FrameFile
 from pixcal.storage.fits_rows import BAND, read_rows, unpack, unpack_bytes
 from pixcal.storage.folder import transit_bytes
+from pixcal.storage.formats import STAGES
 from pixcal.storage.frame_files import inspect
 from pixcal.storage.frame_reader import describe
 from pixcal.storage.frames import Frame, columns, tabulate
 from pixcal.storage.place import Place
 from pixcal.storage.sources import SourceFile, find_sources, fingerprint
+from pixcal.storage.stage import make
 
-STAGE = "ingest"
-FORMAT = 2
+STAGE = STAGES["ingest"]
 
 _BAND_ROWS = (512, 384, 256, 128)
 """Heights of a band, the first that fits the memory: whole chunks, and long reads."""
@@ -97,18 +88,19 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
     plain = {"acquisition": to_plain(described)}
     inputs = {array: fingerprint(files) for array, files in sources.items()}
     with lock(out):
-        base = chosen_base(config.cubes, out, out / STAGE)
-        done = up_to_date(out, STAGE, artefact_key(STAGE, FORMAT, plain, inputs))
-        if done is not None and base_of(out / STAGE) == base and _has_copies(done, config.copy):
-            return _place(out, description.parent)
+        base = chosen_base(config.cubes, out, out / STAGE.name)
         earlier = _earlier(out)
         same = _same_files(earlier, inputs)
         if earlier is not None and not same and not config.overwrite:
             _refuse_other(out, earlier, plain, inputs)
-        kept = []
-        if earlier is not None and earlier.format == FORMAT:
-            kept = find_kept(out / STAGE, earlier, same, sources, copy=config.copy)
-        with build(out, STAGE, FORMAT, plain, inputs, cubes=base) as made:
+
+        def keep(ready: Manifest) -> bool:
+            return base_of(out / STAGE.name) == base and _has_copies(ready, config.copy)
+
+        def body(made: Build) -> None:
+            kept = []
+            if earlier is not None and earlier.format == STAGE.format:
+                kept = find_kept(out / STAGE.name, earlier, same, sources, copy=config.copy)
             facts = take_over(made, kept, runtime)
             known = {k.array: k.files for k in kept if k.array in facts}
             tables, warnings = _check(described, sources, known, runtime)
@@ -119,6 +111,8 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
             _fill(made, {a: f for a, f in tables.items() if a not in known}, copied, runtime)
             _close(made, described, sources, tables, copied, facts)
             made.summary["warnings"] = warnings
+
+        make(out, STAGE, plain, inputs, body, cubes=base, keep=keep)
         return _place(out, description.parent)
 
 
@@ -132,7 +126,7 @@ def _needs_copy(frames: Sequence[Frame], config: Config) -> bool:
 
 def _place(out: Path, folder: Path) -> Manifest:
     """Note in the manifest where the files are now; they may have been moved as they are."""
-    manifest = read_manifest(out / STAGE)
+    manifest = read_manifest(out / STAGE.name)
     assert manifest is not None
     where = {
         "folder": str(folder.absolute()),
@@ -140,15 +134,15 @@ def _place(out: Path, folder: Path) -> Manifest:
     }
     if manifest.summary.get("acquisition") != where:
         manifest.summary["acquisition"] = where
-        write_manifest(out / STAGE, manifest)
+        write_manifest(out / STAGE.name, manifest)
     return manifest
 
 
 def _earlier(out: Path) -> Manifest | None:
     """Manifest of an earlier ingest; what cannot be read is made again."""
     try:
-        cubes_of(out / STAGE)
-        return read_manifest(out / STAGE)
+        cubes_of(out / STAGE.name)
+        return read_manifest(out / STAGE.name)
     except DamagedError:
         return None
 
@@ -170,8 +164,8 @@ def _refuse_other(
     if earlier.config != plain:
         other.insert(0, "acquisition.yaml")
     raise InputError(
-        f"{out / STAGE}: made from another acquisition ({', '.join(other) or 'format'} changed "
-        "since); choose another --out, or replace it with --overwrite"
+        f"{out / STAGE.name}: made from another acquisition ({', '.join(other) or 'format'} "
+        "changed since); choose another --out, or replace it with --overwrite"
     )
 
 

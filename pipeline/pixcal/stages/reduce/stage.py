@@ -33,27 +33,16 @@ from pixcal.stages.reduce.frame_statistics import (
 )
 from pixcal.stages.reduce.fringe_sets import Bounds, set_warnings, share_at_mean, write_set
 from pixcal.stages.reduce.ingested import Ingested
-from pixcal.storage.artefact import (
-    Build,
-    Manifest,
-    artefact_key,
-    build,
-    lock,
-    read_manifest,
-    require,
-    up_to_date,
-    write_json,
-)
+from pixcal.storage.artefact import Build, Manifest, write_json
 from pixcal.storage.cube import ArrayReader, create_group
 from pixcal.storage.cube_place import base_of, chosen_base
 from pixcal.storage.folder import transit_bytes
+from pixcal.storage.formats import STAGES
 from pixcal.storage.place import Place
+from pixcal.storage.stage import make, working
 
-STAGE = "reduce"
-FORMAT = 1
 SCHEMA = "pixcal/reduce/1"
 
-_INGEST_FORMAT = 2
 _MIN_READ_FRAMES = 8  # fewer do not tell the noise of each pixel
 _SHARED_BYTES = 64 << 20
 
@@ -83,26 +72,23 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     InputError
         If the frames have not been ingested, or the gain is to be measured and cannot be.
     """
-    require(run_dir, "ingest", _INGEST_FORMAT)
-    plain = result_options(config)
-    with lock(run_dir):
-        # Again: another process may have replaced it until then.
-        inputs = {"ingest": require(run_dir, "ingest", _INGEST_FORMAT).key}
+    with working(run_dir, "ingest") as inputs:
         base = chosen_base(config.cubes, run_dir, run_dir / "ingest")
-        done = up_to_date(run_dir, STAGE, artefact_key(STAGE, FORMAT, plain, inputs))
-        if done is not None and (config.cubes is None or base_of(run_dir / STAGE) == base):
-            return done
-        source = Ingested(run_dir / "ingest")
-        if config.gain == "measured" and len(source.tables.get("flat", {}).get("file", ())) < 2:
-            raise InputError(
-                "gain: 'measured' needs two flat frames or more; list them under frames.flat of "
-                "acquisition.yaml, or use gain: declared"
-            )
-        with build(run_dir, STAGE, FORMAT, plain, inputs, cubes=base) as made:
+
+        def body(made: Build) -> None:
+            source = Ingested(run_dir / "ingest")
+            if config.gain == "measured" and len(source.tables.get("flat", {}).get("file", ())) < 2:
+                raise InputError(
+                    "gain: 'measured' needs two flat frames or more; list them under frames.flat "
+                    "of acquisition.yaml, or use gain: declared"
+                )
             _reduce(made, source, config, runtime)
-    manifest = read_manifest(run_dir / STAGE)
-    assert manifest is not None
-    return manifest
+
+        def keep(_ready: Manifest) -> bool:
+            return config.cubes is None or base_of(run_dir / "reduce") == base
+
+        options = result_options(config)
+        return make(run_dir, STAGES["reduce"], options, inputs, body, cubes=base, keep=keep)
 
 
 def _reduce(made: Build, source: Ingested, config: Config, runtime: Runtime) -> None:

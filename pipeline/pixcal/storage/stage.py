@@ -1,0 +1,135 @@
+"""How every stage of a run works: what it needs is there, then lock, key, build and products."""
+
+import os
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from pixcal.model.errors import DamagedError, InputError
+from pixcal.storage.artefact import Build, artefact_key, build, lock, up_to_date
+from pixcal.storage.formats import STAGES, Stage
+from pixcal.storage.manifest import Manifest, check_intact, read_json, read_manifest
+from pixcal.storage.place import Place
+
+
+def require(run: Path, name: str) -> Manifest:
+    """Manifest of a stage that must have been run.
+
+    Raises
+    ------
+    InputError
+        If the stage has not been run, or its format is another one.
+    DamagedError
+        If the artefact is damaged.
+    """
+    if not run.is_dir():
+        raise InputError(f"{run}: no such run directory; make one with 'pixcal ingest'")
+    stage, folder = STAGES[name], run / name
+    command = stage.typed(run)
+    try:
+        manifest = read_manifest(folder)
+        if manifest is not None:
+            check_intact(folder, manifest)
+    except DamagedError as error:
+        error.advice = f"make it again with '{command}'"
+        raise
+    if manifest is None:
+        if stage.of_fringes and _without_fringes(run):
+            raise InputError(f"{run}: the acquisition lists no fringes, so there is no {name}")
+        raise InputError(f"{folder}: not there yet; run '{command}' first")
+    if manifest.stage != name or manifest.format not in (stage.format, *stage.earlier):
+        raise InputError(
+            f"{folder}: format {manifest.stage}/{manifest.format}, this pixcal reads "
+            f"{name}/{stage.format}; run '{command}' again"
+        )
+    return manifest
+
+
+def _without_fringes(run: Path) -> bool:
+    """Whether the acquisition that was ingested has detector frames alone."""
+    try:
+        return not read_json(run / "ingest" / "acquisition.json")["frames"]["fringes"]
+    except (DamagedError, LookupError):
+        return False
+
+
+@contextmanager
+def working(run: Path, *needed: str) -> Iterator[dict[str, str]]:
+    """Hold a run in which some stages must have been run; gives the keys of their artefacts.
+
+    Raises
+    ------
+    InputError
+        As of `require` and `pixcal.storage.artefact.lock`.
+    """
+    for name in needed:
+        require(run, name)
+    with lock(run):
+        # Again: another process may have replaced them until then.
+        yield {name: require(run, name).key for name in needed}
+
+
+def make(
+    run: Path,
+    stage: Stage,
+    config: dict[str, Any],
+    inputs: Mapping[str, str],
+    body: Callable[[Build], object],
+    *,
+    cubes: Place | None = None,
+    keep: Callable[[Manifest], bool] = lambda _ready: True,
+    publish: Callable[[], object] = lambda: None,
+    published: Callable[[], bool] = lambda: False,
+) -> Manifest:
+    """Make the artefact of a stage, unless it is up to date, in a run that the caller holds.
+
+    Parameters
+    ----------
+    run : Path
+    stage : Stage
+    config : dict
+        Plain data of the options that the result depends on.
+    inputs : mapping
+        Keys of what it is made from.
+    body : callable
+        Writes it, into the folder of a `Build`.
+    cubes : Path or UrlPath, optional
+        As of `pixcal.storage.artefact.build`.
+    keep : callable
+        Whether an artefact that is up to date can stay as it is.
+    publish : callable
+        Writes the products, when the artefact is complete.
+    published : callable
+        Whether those of an artefact that stays are there.
+
+    Returns
+    -------
+    Manifest
+    """
+    key = artefact_key(stage.name, stage.format, config, dict(inputs))
+    ready = up_to_date(run, stage.name, key)
+    stays = ready is not None and keep(ready)
+    if ready is None or not stays:
+        with build(run, stage.name, stage.format, config, dict(inputs), cubes=cubes) as made:
+            body(made)
+        ready = require(run, stage.name)
+    if not (stays and published()):
+        publish()
+    return ready
+
+
+def copy_products(run: Path, stage: Stage, pattern: str) -> None:
+    """Copy files of an artefact to ``RUN/products``; others there that match the pattern go."""
+    folder, products = run / stage.name, run / "products"
+    products.mkdir(exist_ok=True)
+    files = [file for file in folder.glob(pattern) if file.is_file()]
+    for other in {file.name for file in products.glob(pattern)} - {file.name for file in files}:
+        (products / other).unlink()
+    for file in files:
+        aside = products / f".{file.name}.aside"
+        shutil.copyfile(file, aside)
+        with aside.open("rb") as copy:
+            os.fsync(copy.fileno())
+        aside.replace(products / file.name)
