@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pixcal.storage.formats import STAGES
 
-PAGE = Path(__file__).parents[2] / "docs" / "explanation" / "architecture.md"
+PAGE = Path(__file__).parents[2] / "docs" / "reference" / "run-directory.md"
 
 
 def test_the_page_describes_every_format() -> None:
