@@ -37,7 +37,7 @@ SEE = {
     "pixcal simulate": "Keys of the bench file: [Files](files.md#bench-files). How to: [Add your "
     "own effect](../how-to/own-effect.md).",
     "pixcal budget": "How to: [Plan an exposure](../how-to/budget.md).",
-    "pixcal blind": "Rules and results: [Blind examination](../appendix/blind.md).",
+    "pixcal blind": "Rules: [Blind examination](../explanation/blind-examination.md).",
 }
 """Pages that say more."""
 
