@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import click
 
-from pixcal.model.options import Region
+from pixcal.model.options import Region, Running
 
 Command = Callable[..., Any]
 
@@ -73,8 +73,8 @@ class Finite(click.FloatRange):
         return number
 
 
-def config_options(kind: type) -> Callable[[Command], Command]:
-    """Add the options of a dataclass; the command receives an instance of it as ``config``."""
+def config_options(kind: type, name: str = "config") -> Callable[[Command], Command]:
+    """Add the options of a dataclass; the command receives an instance of it."""
     hints = get_type_hints(kind)
     offered = [f for f in fields(kind) if not f.metadata.get("python_only")]
 
@@ -82,7 +82,7 @@ def config_options(kind: type) -> Callable[[Command], Command]:
         @functools.wraps(command)
         def with_config(*args: Any, **values: Any) -> Any:
             config = kind(**{f.name: values.pop(f.name) for f in offered})
-            return command(*args, config=config, **values)
+            return command(*args, **{name: config}, **values)
 
         found: Command = with_config
         for field in reversed(offered):
@@ -102,6 +102,9 @@ def _option(field: Field[Any], hint: Any) -> Callable[[Command], Command]:
     multiple = get_origin(hint) is tuple and get_args(hint)[-1] is Ellipsis
     if multiple:
         hint = get_args(hint)[0]
+    shown: Any = meta.get("shown")
+    if meta["unit"] == "bytes":
+        default, shown = shown, None  # as it is typed
     told = not (default in (None, (), MISSING) or (hint is bool and not flag))
     number = (unit.upper() or "N") if hint in (int, float) else None
     return click.option(
@@ -112,7 +115,7 @@ def _option(field: Field[Any], hint: Any) -> Callable[[Command], Command]:
         is_flag=hint is bool,
         required=default is MISSING,
         default=None if default is MISSING or multiple else default,
-        show_default=meta.get("shown") or told,
+        show_default=shown or told,
         metavar=meta.get("metavar", number),
         help=meta["doc"],
     )
@@ -127,6 +130,8 @@ def _type(hint: Any, meta: Mapping[str, Any]) -> Any:
         return region
     if get_origin(hint) is tuple:
         return tuple(_type(one, meta) for one in get_args(hint))
+    if meta["unit"] == "bytes":
+        return memory_size
     if hint is int:
         return click.IntRange(low, high)
     if hint is float:
@@ -138,38 +143,13 @@ def runtime_options(command: Command) -> Command:
     """Add the options on how to run; the command receives them as ``runtime``."""
 
     @click.option("--quiet", is_flag=True, help="No progress on stderr.")
-    @click.option(
-        "--cluster",
-        default="threads",
-        show_default=True,
-        metavar="threads|processes|sync|tcp://…",
-        help="Run tasks here, or on the Dask cluster at this address.",
-    )
-    @click.option(
-        "--workers",
-        type=click.IntRange(0, 4096),
-        default=0,
-        show_default="all cores",
-        metavar="N",
-        help="Number of parallel tasks.",
-    )
-    @click.option(
-        "--memory",
-        type=memory_size,
-        default="2GiB",
-        show_default=True,
-        metavar="SIZE",
-        help="Memory limit; work that needs more is refused.",
-    )
+    @config_options(Running, "running")
     @functools.wraps(command)
-    def with_runtime(
-        *args: Any, quiet: bool, cluster: str, workers: int, memory: int, **options: Any
-    ) -> Any:
+    def with_runtime(*args: Any, quiet: bool, running: Running, **values: Any) -> Any:
         # Here, not at the top: Dask takes longer to import than all of `pixcal --help`.
         from pixcal.engine.run import Runtime
 
-        runtime = Runtime(cluster=cluster, workers=workers, memory=memory, quiet=quiet)
-        return command(*args, runtime=runtime, **options)
+        return command(*args, runtime=Runtime(**vars(running) | {"quiet": quiet}), **values)
 
     return with_runtime
 

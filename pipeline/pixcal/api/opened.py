@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from pixcal.api.picture import Picture
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.config import StrPath, parse
+from pixcal.model.config import StrPath
 from pixcal.model.errors import InputError
 from pixcal.storage.artefact import damage_noted, read_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.products import read_map
-from pixcal.storage.stage import require
+from pixcal.storage.stage import read_acquisition, require
 
 if TYPE_CHECKING:
     from astropy.nddata import CCDData
@@ -108,8 +108,7 @@ class Run:
     def acquisition(self) -> Acquisition:
         """The contents of ``acquisition.yaml`` as they were understood."""
         require(self.path, "ingest")
-        file = self.path / "ingest" / "acquisition.json"
-        return parse(Acquisition, read_json(file), str(file))
+        return read_acquisition(self.path)
 
     @cached_property
     def frames(self) -> dict[str, dict[str, list[Any]]]:

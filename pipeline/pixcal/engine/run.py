@@ -13,12 +13,13 @@ from threadpoolctl import ThreadpoolController
 from pixcal.engine.local import run_here, run_in_processes, run_in_threads
 from pixcal.engine.progress import Progress
 from pixcal.model.errors import InputError
+from pixcal.model.options import Running
 
 R = TypeVar("R")
 
 
 @dataclass(frozen=True)
-class Runtime:
+class Runtime(Running):
     """How a stage runs; has no influence on its results.
 
     Attributes
@@ -33,11 +34,6 @@ class Runtime:
     quiet : bool
         No progress on stderr.
     """
-
-    cluster: str = "threads"
-    workers: int = 0
-    memory: int = 2 << 30
-    quiet: bool = True
 
     def __post_init__(self) -> None:
         known = ("threads", "processes", "sync")

@@ -56,14 +56,7 @@ def quantity(
     **more
         Of options, as `pixcal.model.options` says.
     """
-    meta = more | {
-        "unit": unit,
-        "low": low,
-        "high": high,
-        "above": above,
-        "choices": choices,
-        "doc": doc,
-    }
+    meta = dict(more, unit=unit, low=low, high=high, above=above, choices=choices, doc=doc)
     if isinstance(default, (list, dict)):
         raise TypeError("defaults of configuration fields are immutable: use tuples")
     return dataclasses.field(default=default, metadata=meta)
@@ -259,10 +252,8 @@ def _value(hint: Any, value: Any, where: str, key: str, meta: Any) -> Any:
         args = get_args(hint)
         if not isinstance(value, (list, tuple)):
             raise InputError(f"{place}: expected a list, found {_kind(value)}")
-        if len(args) == 2 and args[1] is Ellipsis:
-            return tuple(
-                _value(args[0], v, where, f"{key}[{n}]", meta) for n, v in enumerate(value)
-            )
+        if args[-1] is Ellipsis:
+            args = args[:1] * len(value)
         if len(value) != len(args):
             raise InputError(f"{place}: expected {len(args)} values, found {len(value)}")
         return tuple(

@@ -61,6 +61,26 @@ def _own(doc: str, *, in_key: bool = True) -> Any:
 
 
 @dataclass(frozen=True)
+class Running:
+    """How a command runs; no result depends on it."""
+
+    cluster: str = quantity(
+        "threads",
+        metavar="threads|processes|sync|tcp://…",
+        doc="Run tasks here, or on the Dask cluster at this address.",
+    )
+    workers: int = quantity(0, low=0, high=4096, shown="all cores", doc="Number of parallel tasks.")
+    memory: int = quantity(
+        2 << 30,
+        unit="bytes",
+        metavar="SIZE",
+        shown="2GiB",
+        doc="Memory limit; work that needs more is refused.",
+    )
+    quiet: bool = _python(True, doc="No progress on stderr.")
+
+
+@dataclass(frozen=True)
 class Ingest:
     """Options of ``ingest``."""
 

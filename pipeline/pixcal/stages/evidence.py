@@ -8,15 +8,13 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack, free_frames
 from pixcal.estimators.fringes import grid
-from pixcal.model.acquisition import Acquisition
-from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages.fit.scouting import read_frames
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
-from pixcal.storage.stage import require
+from pixcal.storage.stage import read_acquisition, require
 
 Part = tuple[tuple[int, int], tuple[int, int]]
 """Rows and columns of the window: ((y0, y1), (x0, x1))."""
@@ -45,8 +43,7 @@ def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice
         If a stage is missing, or the part holds more than `MAX_SAMPLES` samples.
     """
     require(run_dir, "reduce")
-    file = run_dir / "ingest" / "acquisition.json"
-    acquisition = parse(Acquisition, read_json(file), str(file))
+    acquisition = read_acquisition(run_dir)
     ingested = Ingested(run_dir / "ingest")
     ny, nx = ingested.shape
     y, x = part or ((0, ny), (0, nx))

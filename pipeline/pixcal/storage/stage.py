@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from pixcal.model.acquisition import Acquisition
+from pixcal.model.config import parse
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.storage.artefact import Build, artefact_key, build, lock, up_to_date
 from pixcal.storage.formats import STAGES, Stage
@@ -45,6 +47,12 @@ def require(run: Path, name: str) -> Manifest:
             f"{name}/{stage.format}; run '{command}' again"
         )
     return manifest
+
+
+def read_acquisition(run: Path) -> Acquisition:
+    """The acquisition that was ingested."""
+    file = run / "ingest" / "acquisition.json"
+    return parse(Acquisition, read_json(file), str(file))
 
 
 def _without_fringes(run: Path) -> bool:

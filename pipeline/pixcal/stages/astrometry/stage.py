@@ -31,7 +31,7 @@ from pixcal.engine.run import Runtime
 from pixcal.estimators.centroids import Star
 from pixcal.kernels.psf import Psf
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.config import parse, result_options
+from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
 from pixcal.model.options import Astrometry
 from pixcal.report.astrometry_figures import AstrometryView, astrometry_figure
@@ -46,7 +46,7 @@ from pixcal.stages.astrometry.truth import BAND, free_from_modes
 from pixcal.storage.artefact import Build, Manifest, read_json, write_json
 from pixcal.storage.fits_map import content_digest
 from pixcal.storage.formats import STAGES
-from pixcal.storage.stage import copy_products, make, working
+from pixcal.storage.stage import copy_products, make, read_acquisition, working
 
 SCHEMA = "pixcal/astrometry/1"
 
@@ -85,8 +85,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         this detector.
     """
     with working(run_dir, "fit") as inputs:
-        described = run_dir / "ingest" / "acquisition.json"
-        acquisition = parse(Acquisition, read_json(described), str(described))
+        acquisition = read_acquisition(run_dir)
         telescope = Telescope(
             config.diameter_m,
             config.focal_length_m,

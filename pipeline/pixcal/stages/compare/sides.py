@@ -19,11 +19,10 @@ from pixcal.estimators.models.hyperbolic import Hyperbolic
 from pixcal.estimators.models.paraxial import Paraxial
 from pixcal.kernels.optics import PARAMETERS, Geometry
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
-from pixcal.storage.stage import require
+from pixcal.storage.stage import read_acquisition, require
 
 F64 = NDArray[np.float64]
 Range = tuple[int, int]
@@ -211,8 +210,7 @@ def whole_run(run: Path, label: str | None = None) -> Side:
     """
     manifest = require(run, "fit")
     result = read_json(run / "fit" / "fit.json")
-    plain = read_json(run / "ingest" / "acquisition.json")
-    acquisition = parse(Acquisition, plain, str(run / "ingest" / "acquisition.json"))
+    acquisition = read_acquisition(run)
     group = run / "fit" / "fit.zarr"
     first = ArrayReader(group / next(iter(result["sets"])) / "delta")
     window = (first.shape[0], first.shape[1])

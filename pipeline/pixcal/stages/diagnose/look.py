@@ -12,7 +12,6 @@ import numpy as np
 from pixcal.engine.plan import Plan, make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.evidence import Evidence
-from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
@@ -24,8 +23,7 @@ from pixcal.stages.diagnose.trial import Curves, Window, averaged, looked_at
 from pixcal.stages.diagnose.windows import Split, chosen_windows, split
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.ingested import Ingested
-from pixcal.storage.artefact import read_json
-from pixcal.storage.stage import require
+from pixcal.storage.stage import read_acquisition, require
 
 EVIDENCE_BYTES = 34
 """Evidence in memory and the run that it is made of, for each sample of all fringe sets (measured,
@@ -94,8 +92,7 @@ def look_at(
         If there are too few frames, or a part cannot be fitted.
     """
     ingested = Ingested(run_dir / "ingest")
-    file = run_dir / "ingest" / "acquisition.json"
-    acquisition = parse(Acquisition, read_json(file), str(file))
+    acquisition = read_acquisition(run_dir)
     # Every window is to be looked at with the saturation of the whole detector.
     saturation = acquisition.detector.saturation_adu or ingested.saturation_found
     acquisition = replace(

@@ -22,7 +22,7 @@ from pixcal.estimators.sweep import BOUND_PIXELS, TileMaps, frames_to_prime, swe
 from pixcal.estimators.tile import Tile
 from pixcal.estimators.tile_sums import Carrier, TileSums, sum_row
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.config import parse, result_options
+from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Sweep
 from pixcal.stages.fit.scouting import CACHE_BYTES, read_frames, scout_set
@@ -30,7 +30,7 @@ from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import Build, Manifest, file_digest, read_json, write_json
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
 from pixcal.storage.formats import STAGES
-from pixcal.storage.stage import make, require
+from pixcal.storage.stage import make, read_acquisition, require
 
 CHI2_SAMPLES = 4096
 """Chi-squares kept in all to tell the usual one from (at least `MIN_SAMPLES` of a tile)."""
@@ -58,8 +58,7 @@ def nominal_vector(acquisition: Acquisition, name: str) -> tuple[float, float]:
 def load_run(run_dir: Path) -> Acquisition:
     """Acquisition of a run that must have been reduced."""
     require(run_dir, "reduce")
-    file = run_dir / "ingest" / "acquisition.json"
-    return parse(Acquisition, read_json(file), str(file))
+    return read_acquisition(run_dir)
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.model.acquisition import Acquisition, Detector
-from pixcal.model.config import parse
+from pixcal.model.acquisition import Detector
 from pixcal.model.errors import InputError
 from pixcal.stages.reduce.exposures import Exposures, group_exposures
 from pixcal.stages.reduce.flat_survey import FlatSurvey
@@ -19,6 +18,7 @@ from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.frame_reader import FrameReader, Reader
 from pixcal.storage.place import Place
+from pixcal.storage.stage import read_acquisition
 
 MOST_ADU = 2.0**32
 """No converter gives more: real numbers beyond are no samples."""
@@ -44,8 +44,7 @@ class Ingested:
     @cached_property
     def detector(self) -> Detector:
         """The detector as declared."""
-        described = self.folder / "acquisition.json"
-        return parse(Acquisition, read_json(described), str(described)).detector
+        return read_acquisition(self.folder.parent).detector
 
     @cached_property
     def _listed(self) -> dict[str, dict[str, list[Any]]]:
