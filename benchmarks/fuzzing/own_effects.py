@@ -16,7 +16,7 @@ from pixcal.simulation.effect import Effect, Stage
 class Glow(Effect):
     """Light of the amplifier."""
 
-    name, title, stage = "glow", "amplifier glow", Stage.LIGHT
+    name, title, acts_at = "glow", "amplifier glow", Stage.LIGHT
     domains, strengths, sources = ("intensity",), ("electrons",), ("a guess, to be measured",)
     electrons: float = quantity(100.0, unit="e-", low=0, doc="in every pixel")
 
@@ -38,7 +38,7 @@ CHANGES = (
     (BODY, "raise KeyError('x')"), (BODY, "return mean[::-1, ::-1] + 0"), (BODY, "exit('bye')"),
     ('"glow", "amplifier', '"ipc", "amplifier'), ('"glow", "amplifier', 'None, "amplifier'),
     ('"glow", "amplifier', '3, "amplifier'), ('"glow", "amplifier', '"a\\nb", "amplifier'),
-    ("name, title, stage =", "title, title, stage ="), ("Stage.LIGHT", "7"), ("Stage.LIGHT",
+    ("name, title, acts_at =", "title, title, acts_at ="), ("Stage.LIGHT", "7"), ("Stage.LIGHT",
     "None"),
     ('("electrons",)', '("protons",)'), ('("electrons",)', "7"), ("(frozen=True)", ""),
     ("@dataclass(frozen=True)", ""), ("(Effect)", ""), ("(Effect)", "(Exception)"),

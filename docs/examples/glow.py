@@ -12,7 +12,7 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 class Glow(Effect):
     """Light of the read-out amplifier beside the first pixel, in every frame."""
 
-    name, title, stage = "glow", "amplifier glow", Stage.LIGHT
+    name, title, acts_at = "glow", "amplifier glow", Stage.LIGHT
     domains, strengths = ("space", "intensity"), ("rate",)
     sources = ("a guess, to be measured",)
 

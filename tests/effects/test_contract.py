@@ -56,7 +56,7 @@ def by_stem(bench: Bench) -> dict[str, Recording]:
 @EVERY
 def test_it_says_what_it_is(cls: type[Effect]) -> None:
     assert KNOWN[cls.name] is cls
-    assert isinstance(cls.stage, Stage)
+    assert isinstance(cls.acts_at, Stage)
     assert cls.title
     assert set(cls.domains) <= DOMAINS
     assert cls.domains
@@ -184,7 +184,7 @@ from pixcal.simulation.effect import Effect, Stage
 @dataclass(frozen=True)
 class Glow(Effect):
     """Light of the amplifier."""
-    name, title, stage = "glow", "glow", Stage.LIGHT
+    name, title, acts_at = "glow", "glow", Stage.LIGHT
     domains, strengths, sources = ("intensity",), ("electrons",), ("nowhere in particular",)
     electrons: float = quantity(100.0, unit="e-", low=0, doc="in every pixel")
 

@@ -277,7 +277,7 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 @dataclass(frozen=True)
 class Flicker(Effect):
     """Every second frame is brighter."""
-    name, title, stage = "flicker", "every second frame brighter", Stage.LIGHT
+    name, title, acts_at = "flicker", "every second frame brighter", Stage.LIGHT
     domains, strengths, sources = ("time",), ("size",), ("nowhere in particular",)
     size: float = quantity(0.01, low=-1, high=1, doc="relative")
 

@@ -12,7 +12,7 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.search import (
     CONFIRM,
-    LEAST_OF_HINTED,
+    MIN_LOGLIK_GAIN_WEAK,
     MOST,
     SCREEN,
     Candidate,
@@ -39,7 +39,7 @@ class Toy(Effect):
 
     name = "toy"
     title = "a toy"
-    stage = Stage.LIGHT
+    acts_at = Stage.LIGHT
     domains = ("noise",)
     strengths = ("size",)
     sources = ("the test",)
@@ -234,7 +234,7 @@ def test_an_effect_that_is_only_hinted_at_passes_a_higher_mark() -> None:
     sure, _ = search(weak, [candidate("left", 0.004, sigmas=20.0)])
     gain = sure.final.log_likelihood - sure.nominal.log_likelihood
     assert sure.taken == ("left",)
-    assert (found.taken == ("left",)) == (gain >= LEAST_OF_HINTED)
+    assert (found.taken == ("left",)) == (gain >= MIN_LOGLIK_GAIN_WEAK)
 
 
 def test_a_stand_in_for_an_unknown_cause_is_not_claimed() -> None:
@@ -265,7 +265,7 @@ def test_an_effect_that_was_hinted_at_and_not_taken_is_told_so() -> None:
     assert told
     for reason in told:
         gain = float(reason.split("by only ")[1].split(";")[0])
-        assert LEAST <= gain < LEAST_OF_HINTED
+        assert LEAST <= gain < MIN_LOGLIK_GAIN_WEAK
 
 
 def test_each_cause_is_weighed_alone_by_as_many_simulations_as_all_together() -> None:

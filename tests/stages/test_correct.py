@@ -46,7 +46,7 @@ from pixcal.simulation.effect import Effect, Stage
 @dataclass(frozen=True)
 class Glow(Effect):
     \"\"\"Light of the amplifier.\"\"\"
-    name, title, stage = "glow", "glow", Stage.LIGHT
+    name, title, acts_at = "glow", "glow", Stage.LIGHT
     domains, strengths, sources = ("intensity",), ("electrons",), ("nowhere in particular",)
     electrons: float = quantity(100.0, unit="e-", low=0, doc="in every pixel")
 """

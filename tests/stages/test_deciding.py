@@ -8,7 +8,7 @@ from pixcal.effects import effects
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.simulation.effect import Effect
-from pixcal.stages.diagnose.deciding import MORE, RANDOM, deciding, missing_frames
+from pixcal.stages.diagnose.deciding import MORE, RANDOM, missing_frames, recommend_frames
 
 LADDER = (0.01, 0.02, 0.03)
 FOUR = ((6.0, 0.0), (-9.0, 0.1), (0.0, 6.0), (0.0, 9.0))
@@ -69,7 +69,7 @@ def test_frames_that_would_decide_are_those_that_are_missing(
     lacking: dict[str, str], names: tuple[str, ...], words: list[str]
 ) -> None:
     kinds = effects() | {"mine": Mine}
-    assert deciding(lacking, [kinds[name] for name in names]) == words
+    assert recommend_frames(lacking, [kinds[name] for name in names]) == words
 
 
 BARE = missing(((6, 0),), (), dark=False, steps=(0.0,))
@@ -105,15 +105,15 @@ def test_frames_that_tell_on_one_effect_and_not_on_the_other_decide(
 ) -> None:
     words = [BARE[kind] for kind in BARE if kind in kinds] or [MORE]
     for order in (names, names[::-1]):
-        assert deciding(BARE, [effects()[name] for name in order]) == words
+        assert recommend_frames(BARE, [effects()[name] for name in order]) == words
 
 
 def test_what_tells_on_all_is_asked_for_once_nothing_parts_them() -> None:
     """Also where all frames that would part them are there."""
     both = [effects()[name] for name in ("nonlinearity", "brighter_fatter")]
-    assert set(both[0].told_by) & set(both[1].told_by) == {"ladder"}
+    assert set(both[0].frames_needed) & set(both[1].frames_needed) == {"ladder"}
     lacking = missing(FOUR, LADDER[:1])
-    assert deciding(lacking, both) == [lacking["ladder"]]
+    assert recommend_frames(lacking, both) == [lacking["ladder"]]
 
 
 @pytest.mark.parametrize(
@@ -126,11 +126,11 @@ def test_phases_are_asked_for_that_no_set_has(
     lacking = missing(FOUR if steps else (), LADDER, steps=steps)
     assert lacking == lacks
     both = [effects()[name] for name in ("rolling_shutter", "intensity_noise")]
-    assert deciding(lacking, both) == list(lacks.values() or [MORE])
+    assert recommend_frames(lacking, both) == list(lacks.values() or [MORE])
 
 
 def test_effects_name_kinds_of_frames_that_there_are() -> None:
     bare = [missing(((4, 4),), (), dark=False, steps=(step,)) for step in (0.0, 0.3)]
     known = {kind for lacking in bare for kind in lacking}
     for kind in (*effects().values(), Effect):
-        assert set(kind.told_by) <= known
+        assert set(kind.frames_needed) <= known

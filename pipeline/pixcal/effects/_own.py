@@ -41,7 +41,7 @@ def checked(effect: type[Effect], file: Path) -> type[Effect]:
 
 
 def _check(effect: type[Effect]) -> None:
-    for name, kind in (("name", str), ("title", str), ("stage", Stage)):
+    for name, kind in (("name", str), ("title", str), ("acts_at", Stage)):
         if not isinstance(getattr(effect, name, None), kind):
             raise InputError(f"{name} is missing or not a {kind.__name__}")
     if not effect.name.isidentifier():
@@ -51,7 +51,7 @@ def _check(effect: type[Effect]) -> None:
     default = effect()
     parse(effect, to_plain(default), effect.__name__)
     fields = {field.name for field in dataclasses.fields(effect)}
-    for what in ("strengths", "finer"):
+    for what in ("strengths", "optional_parameters"):
         if unknown := set(getattr(effect, what)) - fields:
             raise InputError(f"{what} names {', '.join(sorted(unknown))}, which is no field")
     domains = getattr(effect, "domains", None)

@@ -67,10 +67,10 @@ class BiasDrift(Effect):
 
     name = "bias_drift"
     title = "offset of the whole frame, changing"
-    stage = Stage.READOUT
+    acts_at = Stage.READOUT
     domains = ("time", "noise")
     strengths = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e", "run_walk_e_h", "tracks")
-    told_by = ("dark",)
+    frames_needed = ("dark",)
     sources = (
         "Rauscher 2015, PASP 127, 1144: pedestal drift of 4 e- rms at 5 e- of read noise",
         "M. Richmond, WIYN HDI technical note 6 (2014): level of the overscan changes by 5 to 20 "

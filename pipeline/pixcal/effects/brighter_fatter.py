@@ -41,10 +41,10 @@ class BrighterFatter(Effect):
 
     name = "brighter_fatter"
     title = "pixels that shrink as they fill"
-    stage = Stage.CHARGE
+    acts_at = Stage.CHARGE
     domains = ("intensity", "noise", "space")
     strengths = ("shift_px_per_e",)
-    told_by = ("ladder", "baseline")
+    frames_needed = ("ladder", "baseline")
     quick = False
     quick = False
     sources = (

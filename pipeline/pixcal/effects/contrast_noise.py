@@ -42,10 +42,10 @@ class ContrastNoise(Effect):
 
     name = "contrast_noise"
     title = "visibility changing from frame to frame"
-    stage = Stage.LIGHT
+    acts_at = Stage.LIGHT
     domains = ("time",)
     strengths = ("vibration_rad", "polarisation", "tracks")
-    told_by = ()
+    frames_needed = ()
     sources = (
         "Rousset et al., section 4.2: micro-vibrations within a frame are still to be looked at",
         "Colavita 1999, PASP 111, 111: the visibility falls by exp(-s²/2) for a phase of rms s "

@@ -52,10 +52,10 @@ class CosmicHits(Effect):
 
     name = "cosmic_hits"
     title = "particles that hit the detector"
-    stage = Stage.CHARGE
+    acts_at = Stage.CHARGE
     domains = ("noise",)
     strengths = ("rate_cm2_s",)
-    told_by = ("dark",)
+    frames_needed = ("dark",)
     sources = (
         "Particle Data Group, Review of Particle Physics, Cosmic Rays: about one muon per cm^2 and "
         "minute through a horizontal detector at sea level",

@@ -48,10 +48,10 @@ class FlatError(Effect):
 
     name = "flat_error"
     title = "flat that is not the response to the fringes' light"
-    stage = Stage.PIXEL
+    acts_at = Stage.PIXEL
     domains = ("space",)
     strengths = ("pixel_rms", "smooth_rms")
-    told_by = ("flat", "axis")
+    frames_needed = ("flat", "axis")
     sources = (
         "EMVA Standard 1288, release 4.0 (2021): nonuniformity is told with the wavelength and the "
         "f-number of the light that it was measured with",

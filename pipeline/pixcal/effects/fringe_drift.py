@@ -61,10 +61,10 @@ class FringeDrift(Effect):
 
     name = "fringe_drift"
     title = "fringe vector changing slowly, or swinging"
-    stage = Stage.LIGHT
+    acts_at = Stage.LIGHT
     domains = ("time", "space")
     strengths = ("ramp", "settle", "walk", "vibration", *TRACKS)
-    told_by = ()
+    frames_needed = ()
     sources = (
         "Rousset et al., sections 4.2, 4.3 and 5.2: thermal deformations and low-frequency "
         "vibrations move Kx, Ky; one of two data sets drifts after 30 minutes",

@@ -26,10 +26,10 @@ class FringeJitter(Effect):
 
     name = "fringe_jitter"
     title = "fringe vector changing from frame to frame"
-    stage = Stage.LIGHT
+    acts_at = Stage.LIGHT
     domains = ("time", "space")
     strengths = ("rms",)
-    told_by = ()
+    frames_needed = ()
     sources = (
         "Rousset et al., sections 4.2 and 5.2: fringe residuals are laid to changing Kx, Ky",
         "C. G. Gordon 1992, Proc. SPIE 1619, 71: laboratory floors of 12 to 50 um/s rms (curves "

@@ -47,10 +47,10 @@ class GainError(Effect):
 
     name = "gain_error"
     title = "gain that is not the one declared"
-    stage = Stage.CONVERTER
+    acts_at = Stage.CONVERTER
     domains = ("noise", "intensity")
     strengths = ("relative",)
-    told_by = ("flat",)
+    frames_needed = ("flat",)
     sources = (
         "Janesick 2007, Photon Transfer (SPIE PM170): gain by photon transfer, to about 1 % with "
         "some ten thousand pixels",

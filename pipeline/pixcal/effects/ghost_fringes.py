@@ -64,10 +64,10 @@ class GhostFringes(Effect):
 
     name = "ghost_fringes"
     title = "ghost fringes of a parasitic reflection"
-    stage = Stage.LIGHT
+    acts_at = Stage.LIGHT
     domains = ("space",)
     strengths = ("share", "waves")
-    told_by = ("baseline", "axis")
+    frames_needed = ("baseline", "axis")
     sources = (
         "a ghost of 0.5 % shifts by up to 0.005 / |K|: 4e-3 px at 5 px interfringe",
         "Born & Wolf, Principles of Optics, sections 1.5 and 7.6: a surface of n = 1.5 reflects "

@@ -63,10 +63,10 @@ class HyperbolicFringes(Effect):
 
     name = "hyperbolic_fringes"
     title = "hyperbolic fringes"
-    stage = Stage.LIGHT
+    acts_at = Stage.LIGHT
     domains = ("space",)
     strengths = ("share",)
-    told_by = ("axis",)
+    frames_needed = ("axis",)
     sources = (
         "Rousset et al., section 5.2 and figures 5, 14 and 15: fibres at 40 cm, (18 mm, 18 mm) "
         "from the middle of the window (design/paper.txt)",

@@ -49,10 +49,10 @@ class IntensityNoise(Effect):
 
     name = "intensity_noise"
     title = "intensity changing from frame to frame"
-    stage = Stage.LIGHT
+    acts_at = Stage.LIGHT
     domains = ("time",)
     strengths = ("rms", "line", "tracks")
-    told_by = ()
+    frames_needed = ()
     sources = (
         "Rousset et al., section on simulations: 2 % fluctuations of the laser (design/paper.txt)",
         "Thorlabs manual 12112-S01 (HRP350 He-Ne laser): modes that sweep through the gain curve "

@@ -38,10 +38,10 @@ class IntraPixelResponse(Effect):
 
     name = "intra_pixel_response"
     title = "pixels of a width"
-    stage = Stage.PIXEL
+    acts_at = Stage.PIXEL
     domains = ("space",)
     strengths = ("width_px", "width_rms_px")
-    told_by = ("baseline",)
+    frames_needed = ("baseline",)
     sources = (
         "Janesick, Scientific Charge-Coupled Devices (SPIE 2001), chapter 4: the aperture of a "
         "pixel has the transfer function sin(u) / u",

@@ -66,10 +66,10 @@ class Ipc(Effect):
 
     name = "ipc"
     title = "crosstalk between pixels"
-    stage = Stage.SIGNAL
+    acts_at = Stage.SIGNAL
     domains = ("space", "noise")
     strengths = ("couplings",)
-    told_by = ("dark", "flat", "baseline")
+    frames_needed = ("dark", "flat", "baseline")
     quick = False
     sources = (
         "Rousset et al., section 5.1: period of four rows, 2-3 % vertical, 0.6 % horizontal, "

@@ -62,11 +62,11 @@ class Lag(Effect):
 
     name = "lag"
     title = "charge left behind in the next frames"
-    stage = Stage.CHARGE
+    acts_at = Stage.CHARGE
     domains = ("time", "intensity")
     strengths = ("share",)
-    finer = ("decay_frames", "spread")
-    told_by = ("random",)
+    optional_parameters = ("decay_frames", "spread")
+    frames_needed = ("random",)
     sources = (
         "Bonjour, Blanc and Kayal 2012, IEEE Electron Device Letters 33(12), 1735: lag of pinned "
         "photodiodes by barriers, pockets and traps of the transfer gate",

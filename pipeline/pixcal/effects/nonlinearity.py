@@ -41,10 +41,10 @@ class Nonlinearity(Effect):
 
     name = "nonlinearity"
     title = "response that is not a straight line"
-    stage = Stage.SIGNAL
+    acts_at = Stage.SIGNAL
     domains = ("intensity",)
     strengths = ("quadratic", "cubic")
-    told_by = ("ladder",)
+    frames_needed = ("ladder",)
     quick = False
     sources = (
         "Rousset et al., table 1: 2 % linearity error of the GIGAPYX-4600 (design/paper.txt)",

@@ -46,10 +46,10 @@ class Quantisation(Effect):
 
     name = "quantisation"
     title = "steps and uneven codes of the converter"
-    stage = Stage.CONVERTER
+    acts_at = Stage.CONVERTER
     domains = ("noise", "intensity")
     strengths = ("coarse_adu", "dnl_rms", "ripple", "bits")
-    told_by = ("ladder",)
+    frames_needed = ("ladder",)
     sources = (
         "IEEE Std 1241-2010: code widths from histograms; round-off of step/sqrt(12) rms",
         "Widrow and Kollar 2008, Quantization Noise, Cambridge University Press: when round-off is "

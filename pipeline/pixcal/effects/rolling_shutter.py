@@ -39,10 +39,10 @@ class RollingShutter(Effect):
 
     name = "rolling_shutter"
     title = "rows exposed while the phase steps"
-    stage = Stage.LIGHT
+    acts_at = Stage.LIGHT
     domains = ("time", "space")
     strengths = ("line_time_us", "settling")
-    told_by = ("random",)
+    frames_needed = ("random",)
     sources = (
         "Pyxalis GIGAPYX-4600 as in Rousset et al.: 5456 rows at 152 frames/s are 1.2 us a row; at "
         "the 7 frames/s of the paper's bench 26 us",

@@ -38,10 +38,10 @@ class RowNoise(Effect):
 
     name = "row_noise"
     title = "noise common to a row or a column"
-    stage = Stage.READOUT
+    acts_at = Stage.READOUT
     domains = ("noise", "time")
     strengths = ("row_rms", "flicker_rms", "interlace_rms", "column_rms")
-    told_by = ("dark",)
+    frames_needed = ("dark",)
     sources = (
         "Rauscher 2015, PASP 127, 1144: infrared arrays of 5 e- read noise have 3 e- of correlated "
         "flicker noise, and 0.5 e- of noise of alternate columns",

@@ -63,10 +63,10 @@ class Straylight(Effect):
 
     name = "straylight"
     title = "scattered light that does not interfere"
-    stage = Stage.LIGHT
+    acts_at = Stage.LIGHT
     domains = ("space",)
     strengths = ("share", "slope_per_px", "bump", "patterns")
-    told_by = ("axis",)
+    frames_needed = ("axis",)
     sources = (
         "Rousset et al., eq. 3: straylight is a part of the mean term B iota (design/paper.txt)",
         "Harvey et al. 2012, Opt. Eng. 51, 013402: a clean surface of 2 nm rms scatters "

@@ -44,10 +44,10 @@ class TelegraphNoise(Effect):
 
     name = "telegraph_noise"
     title = "pixels that jump between two levels"
-    stage = Stage.READOUT
+    acts_at = Stage.READOUT
     domains = ("noise",)
     strengths = ("amplitude_e",)
-    told_by = ("dark",)
+    frames_needed = ("dark",)
     quick = False
     sources = (
         "Ozdogru et al. 2025, Proc. SPIE 13527, 135270V (arXiv:2505.24540): telegraph noise in 1 "

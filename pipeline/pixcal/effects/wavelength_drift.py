@@ -40,10 +40,10 @@ class WavelengthDrift(Effect):
 
     name = "wavelength_drift"
     title = "wavelength drifting, or hopping between modes"
-    stage = Stage.LIGHT
+    acts_at = Stage.LIGHT
     domains = ("time",)
     strengths = ("ramp", "walk", "hop")
-    told_by = ("baseline", "axis")
+    frames_needed = ("baseline", "axis")
     sources = (
         "CIPM 2007, Recommendation 2, and Stone et al. 2009, Metrologia 46, 11: an unstabilised "
         "He-Ne laser at 633 nm keeps its wavelength to 1.5e-6",

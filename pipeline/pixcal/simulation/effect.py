@@ -7,7 +7,7 @@ cited in ``sources``.
 
 An effect overrides the steps of the exposure that it acts on; the others leave things as they are.
 The order of the steps is that of a camera (`pixcal.simulation.exposure`); within a step, effects
-act in the order of `Effect.stage` and then of their names.
+act in the order of `Effect.acts_at` and then of their names.
 """
 
 import dataclasses
@@ -120,13 +120,13 @@ class Estimate:
 
     @property
     def sure(self) -> "Effect":
-        """The effect without those of its strengths and finer points that may as well be zero.
+        """The effect without strengths and optional parameters that are consistent with zero.
 
         What is known badly may be tiny in some frames and wild in others.
         """
         nothing = self.effect.scaled(0.0)
         unsure = {n: getattr(nothing, n) for n in self.effect.strengths if not self._is_sure(n)}
-        unsure |= {n: 0.0 for n in self.effect.finer if not self._is_sure(n)}
+        unsure |= {n: 0.0 for n in self.effect.optional_parameters if not self._is_sure(n)}
         pruned = dataclasses.replace(self.effect, **unsure)
         return self.effect if pruned.is_null else pruned
 
@@ -165,14 +165,14 @@ class Effect:
         In files and reports.
     title : str
         In a few words, for people.
-    stage : Stage
+    acts_at : Stage
     domains : tuple of str
         Where it shows: one or more of `DOMAINS`, the first before all.
     strengths : tuple of str
         Fields that `scaled` multiplies: with all of them zero the effect does nothing.
-    finer : tuple of str
+    optional_parameters : tuple of str
         Fields beside these that may be zero, with the effect still there in its simplest form.
-    told_by : tuple of str
+    frames_needed : tuple of str
         Frames that tell on it besides fringes of one set: ``dark``, ``flat``, ``ladder`` (of
         flats), ``baseline`` (a second one along an axis), ``axis`` (another one), ``random``
         (of the phases); if not said, any but the last.
@@ -185,11 +185,11 @@ class Effect:
 
     name: ClassVar[str]
     title: ClassVar[str]
-    stage: ClassVar[Stage]
+    acts_at: ClassVar[Stage]
     domains: ClassVar[tuple[str, ...]]
     strengths: ClassVar[tuple[str, ...]]
-    finer: ClassVar[tuple[str, ...]] = ()
-    told_by: ClassVar[tuple[str, ...]] = ("dark", "flat", "ladder", "baseline", "axis")
+    optional_parameters: ClassVar[tuple[str, ...]] = ()
+    frames_needed: ClassVar[tuple[str, ...]] = ("dark", "flat", "ladder", "baseline", "axis")
     sources: ClassVar[tuple[str, ...]]
     quick: ClassVar[bool] = True
 

@@ -45,7 +45,7 @@ class Camera:
     def __init__(self, bench: Bench, rows: Rows, effects: Sequence[Effect] = ()) -> None:
         self.bench = bench
         self.effects = sorted(
-            (e for e in effects if not e.is_null), key=lambda e: (e.stage, e.name)
+            (e for e in effects if not e.is_null), key=lambda e: (e.acts_at, e.name)
         )
         halo = sum(e.halo for e in self.effects)
         self.inside = rows

@@ -113,7 +113,7 @@ class Treatments:
     def _those(self, how: str) -> tuple[Effect, ...]:
         """Effects of a treatment, the last that acted first."""
         own = [t.effect for t in self.every if t.how == how]
-        return tuple(sorted(own, key=lambda e: (e.stage, e.name), reverse=True))
+        return tuple(sorted(own, key=lambda e: (e.acts_at, e.name), reverse=True))
 
     @property
     def on_samples(self) -> tuple[Effect, ...]:

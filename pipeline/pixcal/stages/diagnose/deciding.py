@@ -32,7 +32,7 @@ def missing_frames(
     Returns
     -------
     dict
-        By kind, as in `Effect.told_by`.
+        By kind, as in `Effect.frames_needed`.
     """
     axes = _axes([s.baseline_mm for s in acquisition.frames.fringes])
     missing = {}
@@ -52,13 +52,15 @@ def missing_frames(
     return missing
 
 
-def deciding(missing: Mapping[str, str], kinds: Iterable[type[Effect]] = (Effect,)) -> list[str]:
+def recommend_frames(
+    missing: Mapping[str, str], kinds: Iterable[type[Effect]] = (Effect,)
+) -> list[str]:
     """Those of the missing frames that tell effects apart, or all that tell on them (default: any).
 
     What tells on one effect and not on another parts them; what tells on all of them only where
     nothing else is missing, for each is known better then.
     """
-    told = [set(kind.told_by) for kind in kinds]
+    told = [set(kind.frames_needed) for kind in kinds]
     some, every = told[0].union(*told), told[0].intersection(*told)
     for wanted in (some - every, some):
         if frames := [words for name, words in missing.items() if name in wanted]:

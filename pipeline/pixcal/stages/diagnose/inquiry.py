@@ -16,7 +16,7 @@ from pixcal.estimators.gap import Reference, compare, expect_nominal, expect_wit
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.deciding import MORE
-from pixcal.stages.diagnose.look import Look, look_at, plain_part
+from pixcal.stages.diagnose.look import DiagnosisInput, look_at, plain_part
 from pixcal.stages.diagnose.result import by_domain
 from pixcal.stages.diagnose.search import CONFIRM, SCREEN, SURE, Candidate, Found, Search
 from pixcal.stages.diagnose.trial import Curves, Effects, Trials, estimate
@@ -39,7 +39,7 @@ class Inquiry:
     ----------
     base : tuple of Effect
         That the nominal bench has from the start.
-    look : Look
+    look : DiagnosisInput
     trials : Trials
     reference : Reference
     data : mapping
@@ -49,7 +49,7 @@ class Inquiry:
     """
 
     base: Effects
-    look: Look
+    look: DiagnosisInput
     trials: Trials
     reference: Reference
     data: Mapping[Key, F64]
@@ -180,7 +180,9 @@ def _candidates(
 
 def _needs(kind: type[Effect], facts: Mapping[str, Any]) -> str:
     """Frames without which an effect cannot be estimated."""
-    frames = [words for name, words in facts["missing_frames"].items() if name in kind.told_by]
+    frames = [
+        words for name, words in facts["missing_frames"].items() if name in kind.frames_needed
+    ]
     if not frames:
         frames = [MORE if facts["sets"] else "fringes"]
     return f"needs frames that this acquisition lacks: {' or '.join(frames)}"

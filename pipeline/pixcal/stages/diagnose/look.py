@@ -39,7 +39,7 @@ FEWEST_FRAMES = 24
 
 
 @dataclass(frozen=True)
-class Look:
+class DiagnosisInput:
     """What is looked at.
 
     Attributes
@@ -75,7 +75,7 @@ def look_at(
     scratch: Path,
     runtime: Runtime,
     learnt: Callable[[Evidence, Evidence, Runtime], Sequence[type[Effect]]] = lambda *_: (),
-) -> Look:
+) -> DiagnosisInput:
     """Take the parts of a reduced run that are looked at, and measure their nominal bench.
 
     Parameters
@@ -155,7 +155,7 @@ def look_at(
         windows.append(Window(part, bench, own.learn, own.test, shape, seed))
         if part in parts:
             measured.append(looked_at(halves[1], signatures))
-    return Look(
+    return DiagnosisInput(
         windows[0],
         tuple(w for w in windows if w.part in parts),
         tuple(measured),

@@ -30,7 +30,7 @@ from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import SEEDS_APART, Recording
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
-from pixcal.stages.diagnose.undone import Undone
+from pixcal.stages.diagnose.undone import IntensityBeforeEffects
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -80,7 +80,7 @@ class Measured(Effect):
 
     name = " measured"
     title = "as measured"
-    stage = Stage.LIGHT
+    acts_at = Stage.LIGHT
     domains = ()
     strengths = ()
     sources = ()
@@ -174,7 +174,7 @@ class FittedSet:
         maps = before = FringeMaps(
             filled(self.theta, self.k), self.k, self.origin, self.flat, self.name
         )
-        for effect in sorted(effects, key=lambda e: (e.stage, e.name), reverse=True):
+        for effect in sorted(effects, key=lambda e: (e.acts_at, e.name), reverse=True):
             maps = effect.undo(maps) or maps
         if maps is before:
             return replace(self, flat=None)
@@ -293,7 +293,7 @@ class NominalBench:
             If an effect and the bench do not go together.
         """
         own_seed = seed + SEEDS_APART * window
-        undone = Undone(effects if fitted else (), self.bench.detector)
+        undone = IntensityBeforeEffects(effects if fitted else (), self.bench.detector)
         detector = replace(self.bench.detector, seed=own_seed)
         bench = replace(self.bench, seed=seed, detector=detector)
         for effect in effects:
@@ -360,7 +360,9 @@ class NominalBench:
         )
         return replace(measured, maps=maps)
 
-    def _drawn(self, effects: Sequence[Effect], seed: int, undone: Undone) -> Measured:
+    def _drawn(
+        self, effects: Sequence[Effect], seed: int, undone: IntensityBeforeEffects
+    ) -> Measured:
         """As measured, with offsets that can be true where the effects are what they are."""
         if not self.fits:
             return self.measured

@@ -21,7 +21,7 @@ from pixcal.estimators.gap import (
 from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place
 from pixcal.simulation.effect import DOMAINS
-from pixcal.stages.diagnose.deciding import deciding
+from pixcal.stages.diagnose.deciding import recommend_frames
 from pixcal.stages.diagnose.search import Candidate, Found
 from pixcal.stages.diagnose.shrinkage import Shrinkage, Trial, differing, shrinkage
 
@@ -89,7 +89,7 @@ def describe(
         },
         "candidates": [_candidate(c, found, data, where) for c in found.candidates.values()],
         "more_would_tell": (
-            deciding(facts["missing_frames"])
+            recommend_frames(facts["missing_frames"])
             if verdict in ("unexplained", "partly explained")
             else []
         ),
@@ -175,7 +175,7 @@ def _cause(
         "why": estimate.why,
         "given_away_by": _telling(found.without[name], found.final, data),
         "not_told_apart_from": list(alike),
-        "would_decide": deciding(facts["missing_frames"], kinds) if alike else [],
+        "would_decide": recommend_frames(facts["missing_frames"], kinds) if alike else [],
     }
 
 

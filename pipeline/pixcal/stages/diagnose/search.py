@@ -35,7 +35,7 @@ HINTED = 1.5
 """as an effect that another looks like may have no more by itself;"""
 FAINT = 1.0
 """where no candidate is sure: of some that are only hinted at, the true one may be the faintest."""
-LEAST_OF_HINTED = 12.0
+MIN_LOGLIK_GAIN_WEAK = 12.0
 """By which an effect that the first frames only hint at must raise the log-likelihood of unseen
 data; others by `LEAST`."""
 SCREEN = 3
@@ -180,7 +180,7 @@ class Search:
             if not own:
                 # No law of any effect does; one of them may yet have acted by another law.
                 again = {n: t.log_likelihood - least for n, (t, _) in replays.items()}
-                own = {n: g for n, g in again.items() if g >= LEAST_OF_HINTED}
+                own = {n: g for n, g in again.items() if g >= MIN_LOGLIK_GAIN_WEAK}
                 gains |= own
                 trials |= {n: replays[n] for n in own}
             for name in gains.keys() - own.keys():
@@ -245,14 +245,14 @@ class Search:
             return "the held-out frames are not fitted better"
         return (
             f"the log-likelihood of the held-out frames rises by only {gain:.1f}; an effect of "
-            f"weak significance needs {LEAST_OF_HINTED:g}"
+            f"weak significance needs {MIN_LOGLIK_GAIN_WEAK:g}"
         )
 
     @staticmethod
     def _least(candidate: Candidate) -> float:
         """By how much the unseen frames must become likelier with a candidate."""
         assert candidate.estimate is not None
-        return LEAST if candidate.estimate.significance >= SURE else LEAST_OF_HINTED
+        return LEAST if candidate.estimate.significance >= SURE else MIN_LOGLIK_GAIN_WEAK
 
     def held_against(self, effects: Effects, curves: list[Curves]) -> Trial:
         """A bench with some effects against the data, from its simulations."""

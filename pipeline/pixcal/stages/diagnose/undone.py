@@ -23,7 +23,7 @@ F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Undone:
+class IntensityBeforeEffects:
     """Levels of light as they were before effects that are undone on samples, over those after."""
 
     effects: Sequence[Effect]
@@ -58,7 +58,7 @@ class Undone:
         """Even frames of these levels (e-) without the effects."""
         frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
         found = start = np.asarray(frames, np.float32)
-        for effect in sorted(self.effects, key=lambda e: (e.stage, e.name), reverse=True):
+        for effect in sorted(self.effects, key=lambda e: (e.acts_at, e.name), reverse=True):
             undone = effect.undo_samples(found)
             found = found if undone is None else undone
         if found is start:
