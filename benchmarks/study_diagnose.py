@@ -27,8 +27,8 @@ from scipy.stats import binomtest, kstest
 import pixcal
 from pixcal.effects import effects, parse_effects
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.battery import battery
 from pixcal.estimators.gap import compare, flagged
+from pixcal.estimators.test_statistics import known_statistics
 from pixcal.model.bench import SCHEMA
 from pixcal.model.config import to_plain
 from pixcal.simulation.effect import Effect
@@ -133,7 +133,7 @@ def played_nominal(folder: Path, seed: int) -> dict[str, Any]:
         "chances": {
             f"{c['statistic']} {c['set']}": float(ndtr(-c["significance"]))
             for c in curves
-            if c["statistic"] in battery() and not battery()[c["statistic"]].floor
+            if c["statistic"] in known_statistics() and not known_statistics()[c["statistic"]].floor
         },
         "estimates": {
             c["effect"]: float(ndtr(-c["sigmas"])) for c in diagnosis["candidates"] if "sigmas" in c
@@ -251,10 +251,10 @@ def shares_table(played: Sequence[dict[str, Any]]) -> str:
 
 
 def wrong_table(played: Sequence[dict[str, Any]]) -> str:
-    """What innocent effects close by themselves of the gap that another makes."""
+    """What absent effects close by themselves of the gap that another makes."""
     rows: list[tuple[Any, ...]] = []
     for what, of in (
-        ("innocent effects tried", "closed_by_wrong"),
+        ("absent effects tried", "closed_by_wrong"),
         ("effects tried that the answer says look like the true one", "closed_by_alike"),
     ):
         closed = [

@@ -16,7 +16,7 @@ DIAGNOSIS = {
     "candidates": [],
     "gap": {"after": 1.0, "where": []},
 }
-SAT = '{"code": "x", "seconds": {"diagnosis": 1.0, "maps": 1.0}, "no_maps": ""}'
+DONE = '{"code": "x", "seconds": {"diagnosis": 1.0, "maps": 1.0}, "no_maps": ""}'
 JUNK = (b"", b"[]", b"{}", b"null", b"3", b"\xff\xfe", b"{", b'{"schema": "pixcal/blind/1"}')
 
 
@@ -33,7 +33,7 @@ def _exams() -> tuple[Path, Path]:
             run = exam / "runs" / f"case-{number:04d}"
             (run / "products").mkdir(parents=True)
             (run / "products" / "diagnosis.json").write_text(json.dumps(DIAGNOSIS))
-            (run / "sat.json").write_text(SAT)
+            (run / "sat.json").write_text(DONE)
         made.append(folder / f"{seed}")
     return made[0], made[1]
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm
 
-from pixcal.estimators.battery import Curve, Key, battery
 from pixcal.estimators.gap import (
     CHANCE,
     Reference,
@@ -16,6 +15,7 @@ from pixcal.estimators.gap import (
     remaining,
     scaled,
 )
+from pixcal.estimators.test_statistics import Curve, Key, known_statistics
 from pixcal.stages.diagnose.shrinkage import LEAST
 
 LINEAR: Key = ("harmonics", "a")
@@ -36,8 +36,8 @@ def reference(seeds: range = range(100, 116)) -> Reference:
 
 
 def test_the_kinds_are_what_the_test_takes_them_for() -> None:
-    assert battery()[LINEAR[0]].kind == "linear"
-    assert battery()[POWER[0]].kind == "power"
+    assert known_statistics()[LINEAR[0]].kind == "linear"
+    assert known_statistics()[POWER[0]].kind == "power"
 
 
 def test_the_scale_of_powers_is_smooth_and_rises() -> None:

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pixcal.estimators.battery import DETECTOR, battery
-from pixcal.estimators.battery.look import STEPS
-from pixcal.estimators.battery.noise import OUTLIERS
+from pixcal.estimators.test_statistics import DETECTOR, known_statistics
+from pixcal.estimators.test_statistics.look import STEPS
+from pixcal.estimators.test_statistics.noise import OUTLIERS
 from pixcal.report import blocks as blocks_module
 from pixcal.report import curve_places, diagnosis_words
 from pixcal.report import diagnosis_maps as maps
@@ -419,7 +419,7 @@ def test_names_of_places_are_those_of_the_battery() -> None:
     limits = [*(-x for x in OUTLIERS), *OUTLIERS]
     outliers = places({"x_label": "sigma, low then high", "x": limits})
     assert outliers == [f"{v:+.0f}".replace("-", "−") for v in limits]
-    assert set(curve_places._AXES) <= {s.x_label for s in battery().values()}
+    assert set(curve_places._AXES) <= {s.x_label for s in known_statistics().values()}
     assert diagnosis_words.DETECTOR == DETECTOR
 
 

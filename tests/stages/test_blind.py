@@ -38,12 +38,12 @@ from pixcal.stages.blind.draw import (
     draw_examination,
 )
 from pixcal.stages.blind.grade import grade
+from pixcal.stages.blind.manifest import read_manifest
 from pixcal.stages.blind.offsets import offset_errors
-from pixcal.stages.blind.paper import read_paper
 from pixcal.stages.blind.parameters import held
+from pixcal.stages.blind.running import share
 from pixcal.stages.blind.seal import read_seal
 from pixcal.stages.blind.second import SecondCase, catalogue, second_offsets
-from pixcal.stages.blind.sitting import share
 from pixcal.stages.blind.strengths import STRONGEST, WAYS, Way
 from pixcal.stages.blind.summary import summary
 from pixcal.stages.blind.table import as_markdown, write_between
@@ -281,7 +281,7 @@ def exam(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def test_the_truth_cannot_be_changed_afterwards(exam: tuple[Path, Path], tmp_path: Path) -> None:
     folder, sealed = exam
-    paper = read_paper(folder)
+    paper = read_manifest(folder)
     assert paper.purpose == "examination"
     assert paper.without == ("lag", "ipc", "nonlinearity")
     opened = read_seal(sealed, paper.commitment)

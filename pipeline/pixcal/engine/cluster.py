@@ -22,7 +22,7 @@ from uuid import uuid4
 from distributed import Client, Future, KilledWorker, Security, as_completed
 from distributed.comm import CommClosedError
 
-from pixcal.engine.parcel import Errand, Job, abandon, pack, versions
+from pixcal.engine.parcel import Job, RemoteTask, abandon, pack, versions
 from pixcal.model.errors import ClusterError, InputError
 
 CONNECT = "10s"
@@ -218,10 +218,10 @@ class _Tasks:
         numbers = list(islice(self._waiting, max(0, self._window() - len(self._running))))
         if not numbers:
             return []
-        errands = [Errand(self._job, pack(self._items[n])).dumps() for n in numbers]
+        tasks = [RemoteTask(self._job, pack(self._items[n])).dumps() for n in numbers]
         # Keys in pairs: the dashboard groups tasks by the first, and shows it up to the dash.
         keys = [(self._name, n) for n in numbers]
-        futures: list[Future] = self._client.map(self._do, errands, key=keys, pure=False)
+        futures: list[Future] = self._client.map(self._do, tasks, key=keys, pure=False)
         self._running.update(futures)
         return futures
 

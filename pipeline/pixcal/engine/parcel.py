@@ -33,7 +33,7 @@ CODE, MACHINE = "code of pixcal", "machine"
 
 
 @dataclass(frozen=True)
-class Parcel:
+class PickledArguments:
     """An object for another process.
 
     Attributes
@@ -63,12 +63,12 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
         return super().reducer_override(obj)
 
 
-def pack(obj: Any) -> Parcel:
+def pack(obj: Any) -> PickledArguments:
     """Pickle an object for another process."""
     file = BytesIO()
     pickler = _Pickler(file)
     pickler.dump(obj)
-    return Parcel(file.getvalue(), tuple(path for path in pickler.paths if path.exists()))
+    return PickledArguments(file.getvalue(), tuple(path for path in pickler.paths if path.exists()))
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Errand:
+class RemoteTask:
     """A task to be done where it is unpickled.
 
     Schedulers, and workers that have another pixcal or none, can hold its bytes, as they could not
@@ -107,7 +107,7 @@ class Errand:
     """
 
     job: Job
-    item: Parcel
+    item: PickledArguments
 
     def __reduce__(self) -> tuple[Any, ...]:
         return call, (self.job, self.item)
@@ -123,7 +123,7 @@ _going_on: Counter[str] = Counter()
 _abandoned: set[str] = set()
 
 
-def call(job: Job, item: Parcel) -> Any:
+def call(job: Job, item: PickledArguments) -> Any:
     """Do one task of a job, in the process that was chosen for it.
 
     Raises

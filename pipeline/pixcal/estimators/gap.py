@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtri_exp
 from scipy.stats import t as student
 
-from pixcal.estimators.battery import Curve, Key
-from pixcal.estimators.battery.signature import statistic_named
+from pixcal.estimators.test_statistics import Curve, Key
+from pixcal.estimators.test_statistics.signature import statistic_named
 
 F64 = NDArray[np.float64]
 Curves = Mapping[Key, Curve]

@@ -3,6 +3,6 @@
 from pixcal.model.blind_options import MakeConfig, RunConfig, ScoreConfig
 from pixcal.stages.blind.cases import make
 from pixcal.stages.blind.marking import score
-from pixcal.stages.blind.sitting import run
+from pixcal.stages.blind.running import run
 
 __all__ = ["MakeConfig", "RunConfig", "ScoreConfig", "make", "run", "score"]

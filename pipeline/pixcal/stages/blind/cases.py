@@ -24,7 +24,7 @@ from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import Camera
 from pixcal.stages.blind.benches import LAYOUTS
 from pixcal.stages.blind.draw import Examination, Truth, draw_examination
-from pixcal.stages.blind.paper import EXAMINATION, case_name, write_paper
+from pixcal.stages.blind.manifest import EXAMINATION, case_name, write_manifest
 from pixcal.stages.blind.seal import write_seal
 from pixcal.stages.blind.second import record_second
 from pixcal.stages.simulate import acquire
@@ -60,7 +60,7 @@ def make(out: Path, sealed: Path, config: MakeConfig, runtime: Runtime) -> Exami
 
 
 def write_examination(out: Path, sealed: Path, examination: Examination, runtime: Runtime) -> None:
-    """Write cases, paper and seal."""
+    """Write cases, manifest and seal."""
     benches = tuple(examination.bench(n) for n in range(len(examination.truths)))
     partial_ones = f".{out.name}.partial-"
     key = digest(repr(examination), repr(benches))[:16]
@@ -69,7 +69,7 @@ def write_examination(out: Path, sealed: Path, examination: Examination, runtime
         items = list(zip(range(len(benches)), benches, examination.truths, strict=True))
         run_tasks(partial(_case, aside, examination.size), items, runtime, label="cases")
         made = _copied(aside, [case_name(n) for n in range(len(benches))])
-        write_paper(made, examination, write_seal(sealed, examination, benches))
+        write_manifest(made, examination, write_seal(sealed, examination, benches))
         _same_times(made)
         out.parent.mkdir(parents=True, exist_ok=True)
         made.rename(out)

@@ -20,7 +20,7 @@ from pixcal.stages.blind.offsets import AxisError
 from pixcal.stages.blind.parameters import held
 
 BLAMED = 0.5
-"""Share of the gap from which an innocent effect is blamed for most of it."""
+"""Share of the gap from which an absent effect is blamed for most of it."""
 WITHIN = (1, 2, 3)
 """Errors that a parameter may be off."""
 WORST = 3

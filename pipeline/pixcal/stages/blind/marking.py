@@ -13,11 +13,11 @@ from pixcal.model.errors import DamagedError, InputError, PixcalError, PlanError
 from pixcal.stages.blind.benches import LAYOUTS
 from pixcal.stages.blind.draw import LEFT_OUT, ONE
 from pixcal.stages.blind.grade import Grade, grade
+from pixcal.stages.blind.manifest import FILE, RUNS, Manifest, purpose_of, read_manifest
 from pixcal.stages.blind.offsets import offset_errors
 from pixcal.stages.blind.oracle import Oracle, ask_oracle
-from pixcal.stages.blind.paper import FILE, RUNS, Paper, purpose_of, read_paper
+from pixcal.stages.blind.running import DIAGNOSIS, DONE, FAILED, PRODUCTS, share
 from pixcal.stages.blind.seal import Sealed, read_seal
-from pixcal.stages.blind.sitting import DIAGNOSIS, FAILED, PRODUCTS, SAT, share
 from pixcal.stages.blind.summary import PLACE, median, summary
 from pixcal.stages.blind.table import as_markdown, write_between
 from pixcal.storage.artefact import read_json, write_json
@@ -31,7 +31,7 @@ _TIMED = ("diagnosis", "maps")
 def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> dict[str, Any]:
     """Score an examination: ``score.json`` and ``score.md`` in its folder.
 
-    Cases that were not sat yet are counted as missing, and not scored.
+    Cases that were not run yet are counted as missing, and not scored.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
     Raises
     ------
     InputError
-        If the truth is not the one that the cases were made with, no case was sat, or examinations
+        If the truth is not the one that the cases were made with, no case was run, or examinations
         of several sizes are given.
     """
     exams = [(folder, sealed), *config.also]
@@ -64,10 +64,10 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
     found = summary([g for grades, _ in named for g in grades]) | {
         "schema": SCHEMA,
         "purpose": "development" if "development" in purposes else "examination",
-        # Who has it can draw the cases that are still to be sat.
+        # Who has it can draw the cases that are still to be run.
         "seed": None if missing else seeds[0] if len(seeds) == 1 else seeds,
-        "size": first.paper.size,
-        "made": sum(len(one.paper.cases) for one in marked),
+        "size": first.manifest.size,
+        "made": sum(len(one.manifest.cases) for one in marked),
         "missing": missing,
         "sittings": _sittings([one.folder / RUNS / g.case for one in marked for g in one.grades]),
         "notes": list(dict.fromkeys(n for one in marked for n in one.opened.examination.notes)),
@@ -76,20 +76,20 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
     text = as_markdown(found)
     (folder / TABLE).write_text(text, encoding="utf-8")
     if config.write is not None:
-        write_between(config.write, first.paper.size, text)
+        write_between(config.write, first.manifest.size, text)
     return found
 
 
 def _require_alike(folders: Sequence[Path]) -> None:
     """Refuse what cannot be scored together, before the long work."""
-    papers = [read_paper(folder) for folder in folders]
-    for folder, paper in zip(folders, papers, strict=True):
-        if paper.size != papers[0].size:
+    manifests = [read_manifest(folder) for folder in folders]
+    for folder, manifest in zip(folders, manifests, strict=True):
+        if manifest.size != manifests[0].size:
             raise InputError(
-                f"--also {folder}: of size {paper.size}, {folders[0]} of {papers[0].size}; "
+                f"--also {folder}: of size {manifest.size}, {folders[0]} of {manifests[0].size}; "
                 "score them apart"
             )
-    if len({paper.commitment for paper in papers}) < len(papers):
+    if len({manifest.commitment for manifest in manifests}) < len(manifests):
         raise InputError("--also: an examination is given twice; name each once")
 
 
@@ -98,7 +98,7 @@ class _Marked:
     """An examination, opened."""
 
     folder: Path
-    paper: Paper
+    manifest: Manifest
     opened: Sealed
     grades: list[Grade]
     missing: list[str]
@@ -115,25 +115,25 @@ class _Marked:
 
 
 def _marked(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> _Marked:
-    paper = read_paper(folder)
-    opened = read_seal(sealed, paper.commitment)
-    if len(paper.cases) != len(opened.examination.truths):
+    manifest = read_manifest(folder)
+    opened = read_seal(sealed, manifest.commitment)
+    if len(manifest.cases) != len(opened.examination.truths):
         raise InputError(
-            f"{folder / FILE}: tells of {len(paper.cases)} cases, --sealed {sealed} of "
+            f"{folder / FILE}: lists {len(manifest.cases)} cases, --sealed {sealed} of "
             f"{len(opened.examination.truths)}; one of them is damaged"
         )
-    sat = [n for n, name in enumerate(paper.cases) if _was_sat(folder / RUNS / name)]
-    if not sat:
+    done = [n for n, name in enumerate(manifest.cases) if _is_done(folder / RUNS / name)]
+    if not done:
         raise InputError(f"{folder}: no case was diagnosed; run 'pixcal blind run {folder}'")
-    mark = partial(_graded, folder, paper, opened)
-    grades = run_tasks(mark, sat, runtime, label="score")
+    mark = partial(_graded, folder, manifest, opened)
+    grades = run_tasks(mark, done, runtime, label="score")
     if config.oracle:
-        grades = _with_oracle(folder, opened, dict(zip(sat, grades, strict=True)), config, runtime)
-    missing = [name for n, name in enumerate(paper.cases) if n not in sat]
-    return _Marked(folder, paper, opened, grades, missing)
+        grades = _with_oracle(folder, opened, dict(zip(done, grades, strict=True)), config, runtime)
+    missing = [name for n, name in enumerate(manifest.cases) if n not in done]
+    return _Marked(folder, manifest, opened, grades, missing)
 
 
-def _was_sat(run_dir: Path) -> bool:
+def _is_done(run_dir: Path) -> bool:
     """Whether a case was diagnosed, or could not be."""
     return (run_dir / DIAGNOSIS).is_file() or (run_dir / FAILED).is_file()
 
@@ -151,8 +151,8 @@ def _understood(file: Path) -> Iterator[None]:
         raise damaged from error
 
 
-def _graded(folder: Path, paper: Paper, opened: Sealed, number: int) -> Grade:
-    name, truth = paper.cases[number], opened.examination.truths[number]
+def _graded(folder: Path, manifest: Manifest, opened: Sealed, number: int) -> Grade:
+    name, truth = manifest.cases[number], opened.examination.truths[number]
     run_dir = folder / RUNS / name
     if not (run_dir / DIAGNOSIS).is_file():
         with _understood(run_dir / FAILED):
@@ -163,7 +163,7 @@ def _graded(folder: Path, paper: Paper, opened: Sealed, number: int) -> Grade:
         return found
     with _understood(run_dir / PRODUCTS / "correction.json"):
         errors = offset_errors(
-            run_dir / PRODUCTS, folder / name, truth, opened.benches[number], LAYOUTS[paper.size]
+            run_dir / PRODUCTS, folder / name, truth, opened.benches[number], LAYOUTS[manifest.size]
         )  # fmt: skip
     return replace(found, offsets=errors)
 
@@ -173,7 +173,7 @@ def _sittings(cases: Sequence[Path]) -> dict[str, Any]:
 
     One is right: what was changed after a part of the seal was opened is no blind examination.
     """
-    files = [case / SAT for case in cases]
+    files = [case / DONE for case in cases]
     told = [_sitting(file) for file in files if file.is_file()]
     return {
         "codes": sorted({one["code"] for one in told}),

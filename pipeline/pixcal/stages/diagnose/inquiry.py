@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.battery import Key
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.gap import Reference, compare, expect_nominal, expect_with
+from pixcal.estimators.test_statistics import Key
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.deciding import MORE
@@ -28,7 +28,7 @@ REFERENCES = 16
 """Simulations of the nominal bench."""
 LEARN_SEED = 900_000
 CLEAR = 20.0
-"""Standard deviations from which an effect whose estimate is slow is left to the battery."""
+"""Significance above which a slow estimate is no test statistic."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ def _replayed(candidate: Candidate, unseen: Evidence) -> Effect | None:
 def weakly_seen(
     candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]]
 ) -> tuple[type[Effect], ...]:
-    """Candidates that the frames they were fitted on show; slow ones if the battery may not."""
+    """Candidates seen in the fitted frames; slow ones only where they are weak."""
     # By name: the order of candidates is none of curves.
     return tuple(
         kinds[name]

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
 from pixcal import __version__
-from pixcal.estimators.battery import DETECTOR, Curve, Key
-from pixcal.estimators.battery.signature import statistic_named
 from pixcal.estimators.gap import (
     Difference,
     Expectation,
@@ -18,6 +16,8 @@ from pixcal.estimators.gap import (
     likelier,
     sigmas_of,
 )
+from pixcal.estimators.test_statistics import DETECTOR, Curve, Key
+from pixcal.estimators.test_statistics.signature import statistic_named
 from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place
 from pixcal.simulation.effect import DOMAINS

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.battery import Key
 from pixcal.estimators.gap import (
     Expectation,
     Reference,
@@ -23,6 +22,7 @@ from pixcal.estimators.gap import (
     log_likelihood,
     remaining,
 )
+from pixcal.estimators.test_statistics import Key
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.shrinkage import LEAST, Trial, differing
 from pixcal.stages.diagnose.trial import Curves, Effects

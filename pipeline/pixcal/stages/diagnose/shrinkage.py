@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.battery import Key
 from pixcal.estimators.gap import (
     Difference,
     Expectation,
@@ -16,6 +15,7 @@ from pixcal.estimators.gap import (
     likelier,
     remaining,
 )
+from pixcal.estimators.test_statistics import Key
 from pixcal.stages.diagnose.trial import Effects
 
 F64 = NDArray[np.float64]

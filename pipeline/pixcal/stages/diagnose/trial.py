@@ -10,9 +10,9 @@ import numpy as np
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.engine.scratch import scratch_folder
-from pixcal.estimators.battery import Curve, Key, measure
-from pixcal.estimators.battery.signature import signature_curve, signature_key
 from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.test_statistics import Curve, Key, measure
+from pixcal.estimators.test_statistics.signature import signature_curve, signature_key
 from pixcal.model.config import to_plain
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.simulation.effect import Effect, Estimate
@@ -233,7 +233,7 @@ def _made(
 
 
 def looked_at(evidence: Evidence, signatures: Sequence[type[Effect]]) -> Curves:
-    """The battery, and what the estimates of some effects see."""
+    """The test statistics, and the detection significance of some effects."""
     curves = measure(evidence)
     for kind in signatures:
         found = estimate(evidence, kind)

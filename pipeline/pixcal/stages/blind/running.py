@@ -21,14 +21,14 @@ from pixcal.model.blind_options import RunConfig
 from pixcal.model.errors import ClusterError, DamagedError, PlanError
 from pixcal.stages import correct, diagnose, ingest, reduce
 from pixcal.stages.blind.benches import LAYOUTS, MOST_SETS
-from pixcal.stages.blind.paper import RUNS, read_paper
+from pixcal.stages.blind.manifest import RUNS, read_manifest
 from pixcal.stages.diagnose.look import ESTIMATE_BYTES, EVIDENCE_BYTES
 from pixcal.storage.artefact import read_json, write_json
 
 PRODUCTS = "products"
 DIAGNOSIS = Path(PRODUCTS) / "diagnosis.json"
 FAILED = "failed.json"
-SAT = "sat.json"
+DONE = "sat.json"
 """Of a case that is done: by which code, in how many seconds, and why there are no maps."""
 BEGUN = "begun.json"
 """Of a case: by which code."""
@@ -53,13 +53,13 @@ def run(folder: Path, config: RunConfig, runtime: Runtime) -> tuple[int, int]:
     PlanError
         If a case does not fit the memory.
     """
-    paper = read_paper(folder)
+    manifest = read_manifest(folder)
     pending = [
         (name, left_out)
-        for name, left_out in zip(paper.cases, paper.without, strict=True)
-        if config.again or not (folder / RUNS / name / SAT).is_file()
+        for name, left_out in zip(manifest.cases, manifest.without, strict=True)
+        if config.again or not (folder / RUNS / name / DONE).is_file()
     ][: config.limit]
-    over, each = share("diagnosing a case", paper.size, len(pending), runtime)
+    over, each = share("diagnosing a case", manifest.size, len(pending), runtime)
     sit = partial(_case, folder, config, code_digest(), each)
     failed = run_tasks(sit, pending, over, label="diagnose")
     return len(pending), sum(failed)
@@ -156,7 +156,7 @@ def _begun_by(run_dir: Path) -> str | None:
 
 def _say_sat(run_dir: Path, code: str, seconds: Mapping[str, float], no_maps: str) -> None:
     rounded = {what: round(value, 1) for what, value in seconds.items()}
-    write_json(run_dir / SAT, {"code": code, "seconds": rounded, "no_maps": no_maps})
+    write_json(run_dir / DONE, {"code": code, "seconds": rounded, "no_maps": no_maps})
 
 
 def _fit_maps(run_dir: Path, runtime: Runtime) -> str:

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pixcal.effects import effects
-from pixcal.estimators.battery import DETECTOR, battery, measure
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.gap import Reference
+from pixcal.estimators.test_statistics import DETECTOR, known_statistics, measure
 
 
 @pytest.fixture(scope="module")
@@ -20,8 +20,8 @@ def plain(acquired: Callable[..., Evidence]) -> Evidence:
 
 
 def test_every_statistic_says_what_it_is() -> None:
-    assert len(battery()) > 50
-    for name, one in battery().items():
+    assert len(known_statistics()) > 50
+    for name, one in known_statistics().items():
         assert one.name == name
         assert one.domain in {"space", "time", "intensity", "noise"}
         assert one.kind in {"linear", "power"}
@@ -30,13 +30,13 @@ def test_every_statistic_says_what_it_is() -> None:
 
 def test_all_that_can_be_measured_is(plain: Evidence) -> None:
     found = measure(plain)
-    missing = set(battery()) - {name for name, _ in found}
+    missing = set(known_statistics()) - {name for name, _ in found}
     # Two baselines along one axis are not there.
     assert missing == {"apart"}
     for (name, of), curve in found.items():
         assert len(curve.x) == len(curve.value) > 0
-        assert (of == DETECTOR) != battery()[name].of_set
-        assert battery()[name].kind == "linear" or (curve.value >= 0).all()
+        assert (of == DETECTOR) != known_statistics()[name].of_set
+        assert known_statistics()[name].kind == "linear" or (curve.value >= 0).all()
 
 
 def changed(plain: Evidence, **fields: object) -> Evidence:

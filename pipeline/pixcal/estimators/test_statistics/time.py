@@ -5,9 +5,9 @@ from itertools import pairwise
 import numpy as np
 from scipy.fft import dct
 
-from pixcal.estimators.battery import Curve, Statistic, statistic
-from pixcal.estimators.battery.look import F64, Look
 from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.test_statistics import Curve, Statistic, statistic
+from pixcal.estimators.test_statistics.look import F64, Look
 from pixcal.kernels.sample_sums import frame_means
 
 SERIES = {

@@ -1,7 +1,7 @@
 """What data and simulation are compared by: curves of statistics, one file for each domain.
 
 A statistic is a function of an acquisition's evidence, marked by `statistic`; all that the files
-here hold are found by `battery`. It gives a short curve: values that mean the same in every
+here hold are found by `test_statistics`. It gives a short curve: values that mean the same in every
 acquisition of the same size, whatever made it.
 """
 
@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.battery.look import Look
 from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.test_statistics.look import Look
 
 F64 = NDArray[np.float64]
 
@@ -102,7 +102,7 @@ def statistic(
 
 
 @cache
-def battery() -> Mapping[str, Statistic]:
+def known_statistics() -> Mapping[str, Statistic]:
     """All statistics, by name."""
     found: dict[str, Statistic] = {}
     for module in pkgutil.iter_modules(__path__):
@@ -119,7 +119,7 @@ def measure(evidence: Evidence) -> dict[Key, Curve]:
     found: dict[Key, Curve] = {}
     looks = {name: Look(fringes, evidence) for name, fringes in evidence.fringes.items()}
     every: tuple[tuple[str, Any], ...] = ((DETECTOR, tuple(looks.values())),)
-    for name, one in battery().items():
+    for name, one in known_statistics().items():
         whole = every if one.of_all else ((DETECTOR, evidence),)
         for of, what in looks.items() if one.of_set else whole:
             curve = one.measure(what)

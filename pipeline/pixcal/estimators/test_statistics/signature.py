@@ -1,13 +1,13 @@
 """Detection significance of an effect as one more statistic.
 
-The battery looks at everything and so at nothing as sharply as an effect's own estimator does. For
-candidates that are seen weakly on the frames they are fitted on, the estimate's significance on the
-other frames is a statistic too.
+The test statistics cover everything, but each less sharply than the own estimate of an effect.
+For candidates of weak significance in the fitted frames, the significance in the other frames is
+a statistic too.
 """
 
 import numpy as np
 
-from pixcal.estimators.battery import DETECTOR, Curve, Key, Statistic, battery
+from pixcal.estimators.test_statistics import DETECTOR, Curve, Key, Statistic, known_statistics
 
 STRAIGHT = 10.0
 """Standard deviations beyond which they count by their logarithm."""
@@ -28,9 +28,9 @@ def signature_curve(significance: float) -> Curve:
 
 
 def statistic_named(name: str) -> Statistic:
-    """A statistic of the battery, or the signature of an effect."""
-    if name in battery():
-        return battery()[name]
+    """A statistic of the test statistics, or the signature of an effect."""
+    if name in known_statistics():
+        return known_statistics()[name]
     effect, _, domain = name.removeprefix(_PREFIX).rpartition(_INFIX)
     title = f"detection significance of {effect}"
 

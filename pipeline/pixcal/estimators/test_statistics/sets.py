@@ -5,9 +5,9 @@ from itertools import combinations
 
 import numpy as np
 
-from pixcal.estimators.battery import Curve, statistic
-from pixcal.estimators.battery.look import F64, Look
 from pixcal.estimators.structure import flattened
+from pixcal.estimators.test_statistics import Curve, statistic
+from pixcal.estimators.test_statistics.look import F64, Look
 
 SAME = 0.98
 """Cosine of the angle below which two sets measure along the same axis."""

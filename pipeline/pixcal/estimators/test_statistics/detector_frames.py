@@ -8,9 +8,9 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from pixcal.estimators.battery import Curve, Statistic, statistic
-from pixcal.estimators.battery.look import F32, F64, STEPS, Mask, neighbour_sums
 from pixcal.estimators.evidence import Evidence, Stack
+from pixcal.estimators.test_statistics import Curve, Statistic, statistic
+from pixcal.estimators.test_statistics.look import F32, F64, STEPS, Mask, neighbour_sums
 
 REPEATS = (1, 2, 3, 4)
 """Rows or columns between two that may share noise."""

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from pixcal.estimators.battery import Curve, statistic
-from pixcal.estimators.battery.look import CODES, LEVELS, Look
 from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.test_statistics import Curve, statistic
+from pixcal.estimators.test_statistics.look import CODES, LEVELS, Look
 
 CLASSES = (4, 16, 64)
 

@@ -3,8 +3,9 @@
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from pixcal.estimators.battery import Curve, Statistic, statistic
-from pixcal.estimators.battery.look import (
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.test_statistics import Curve, Statistic, statistic
+from pixcal.estimators.test_statistics.look import (
     CELLS,
     F32,
     F64,
@@ -15,7 +16,6 @@ from pixcal.estimators.battery.look import (
     by_cell,
     neighbour_sums,
 )
-from pixcal.estimators.evidence import Evidence
 from pixcal.kernels.sample_sums import count_beyond
 
 OUTLIERS = (5.0, 7.0, 10.0)

@@ -16,8 +16,8 @@ EXAMINATION = 1000
 
 
 @dataclass(frozen=True)
-class Paper:
-    """The question paper.
+class Manifest:
+    """What an examination consists of, without the truth.
 
     Attributes
     ----------
@@ -51,15 +51,15 @@ def purpose_of(seed: int) -> str:
     return "examination" if seed >= EXAMINATION else "development"
 
 
-def write_paper(folder: Path, examination: Examination, commitment: str) -> None:
+def write_manifest(folder: Path, examination: Examination, commitment: str) -> None:
     """Write it into the folder of the cases."""
     without = tuple(truth.left_out for truth in examination.truths)
     purpose = purpose_of(examination.seed)
-    paper = Paper(SCHEMA, purpose, examination.size, commitment, without)
-    write_json(folder / FILE, to_plain(paper))
+    manifest = Manifest(SCHEMA, purpose, examination.size, commitment, without)
+    write_json(folder / FILE, to_plain(manifest))
 
 
-def read_paper(folder: Path) -> Paper:
+def read_manifest(folder: Path) -> Manifest:
     """Read it.
 
     Raises
@@ -70,4 +70,4 @@ def read_paper(folder: Path) -> Paper:
     file = folder / FILE
     if not file.is_file():
         raise InputError(f"{file}: not found; give a directory that 'pixcal blind make' wrote")
-    return parse(Paper, read_json(file), str(file))
+    return parse(Manifest, read_json(file), str(file))

@@ -4,8 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pixcal.estimators.battery import Curve, Statistic, statistic
-from pixcal.estimators.battery.look import CELLS, F64, Look, by_cell
 from pixcal.estimators.structure import (
     PERIODS,
     fit_terms,
@@ -14,6 +12,8 @@ from pixcal.estimators.structure import (
     redness,
     repeats,
 )
+from pixcal.estimators.test_statistics import Curve, Statistic, statistic
+from pixcal.estimators.test_statistics.look import CELLS, F64, Look, by_cell
 
 UNITS = {"offset": "px", "contrast": "", "light": ""}
 LINES = {0: "rows", 1: "columns"}
