@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.middle import middle
 from pixcal.estimators.neighbours import shared_charge
-from pixcal.estimators.response import Boundaries, boundaries_alone, fit_response
+from pixcal.estimators.response import Boundaries, boundaries_alone, boundaries_beside
 from pixcal.kernels.boundaries import REACH, area_changes, boundary_shifts, moved_charge
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
@@ -23,8 +23,8 @@ POWERS = 3
 """Of the response that is free beside."""
 
 _DISAGREE = 4.0
-_THERE = 4.0
-"""Standard deviations beyond which it is there, with a response that is free beside."""
+_HINTED = 1.5
+"""Standard deviations, with a response that is free beside, from which it may explain all."""
 _NEEDED = 12.0
 """Chi-square of `POWERS` terms beyond which they are needed: one in 130 by chance."""
 _TURNS = 4
@@ -45,7 +45,6 @@ class BrighterFatter(Effect):
     domains = ("intensity", "noise", "space")
     strengths = ("shift_px_per_e",)
     frames_needed = ("ladder", "baseline")
-    quick = False
     quick = False
     sources = (
         "Antilogus et al. 2014, JINST 9, C03048: spots grow by up to 2 % over the full range; "
@@ -115,9 +114,9 @@ class BrighterFatter(Effect):
 
         The noise alone tells it from a nonlinear response: a response couples no pixels. From
         crosstalk between pixels it differs because it rises with the square of the level. In the
-        fringes it makes a second harmonic that depends on their spacing, which a response cannot;
-        that is far more precise, and is used as long as it does not contradict the noise. Where it
-        is there and explains all harmonics with some falloff, and as much along y as along x or
+        fringes it makes a second harmonic that depends on their spacing and direction, which a
+        response cannot; that is far more precise, and is used as long as it does not contradict the
+        noise. Where it explains all harmonics with some falloff, and as much along y as along x or
         another part of it, no response is taken to be beside it.
         """
         evidence = middle(evidence)
@@ -128,21 +127,23 @@ class BrighterFatter(Effect):
             return None
         size, variance = noise.size, noise.variance
         details = {"of_noise": size, "of_noise_error": float(np.sqrt(variance))}
+        significance = float(size / np.sqrt(variance))
         why = "covariance of neighbours that rises with the square of the level"
         if evidence.fringes:
-            sizes, covariance = fit_response(evidence, LEVEL, POWERS, shifts)
-            harmonic, spread = float(sizes[-1]), float(covariance[-1, -1])
-            details |= {"of_harmonics": harmonic, "of_harmonics_error": float(np.sqrt(spread))}
-            if abs(harmonic - size) < _DISAGREE * np.sqrt(variance + spread):
-                size = (size / variance + harmonic / spread) / (1 / variance + 1 / spread)
-                variance = 1 / (1 / variance + 1 / spread)
-                why += ", and the second harmonic of the fringes depends on their spacing"
+            free = boundaries_beside(evidence, LEVEL, POWERS, falloff)
+            details |= {"of_harmonics": free.shift, "of_harmonics_error": float(free.variance**0.5)}
+            if abs(free.shift - size) < _DISAGREE * np.sqrt(variance + free.variance):
+                both = boundaries_beside(evidence, LEVEL, POWERS, falloff, (size, variance))
+                size, variance = both.shift, both.variance
+                # Of chi-square with a degree of freedom for each axis.
+                beyond = max(both.gain - both.axes + 1, 0.0)
+                significance = float(np.copysign(np.sqrt(beyond), size))
+                why += ", and a second harmonic of the fringes that depends on their direction"
         error = float(np.sqrt(variance))
-        significance = float(size / error)
         errors: dict[str, float] = {"shift_px_per_e": error}
         together: tuple[dict[str, float], ...] = ()
         along_y = 1.0
-        alone = _alone(evidence, falloff) if significance > _THERE and evidence.fringes else None
+        alone = _alone(evidence, falloff) if significance > _HINTED and evidence.fringes else None
         if alone is not None:
             falloff, size, along_y = alone.falloff_px, alone.shift, alone.along_y
             errors, together = _errors(alone)

@@ -12,6 +12,7 @@ from pixcal.estimators.distortions import Freedom
 from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.levels_of_lag import BANDS, in_bands, shares_by_level
 from pixcal.estimators.middle import middle
+from pixcal.estimators.noiseless_charge import missing_noise
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
 from pixcal.kernels.transfer import left_behind
@@ -65,7 +66,7 @@ class Lag(Effect):
     acts_at = Stage.CHARGE
     domains = ("time", "intensity")
     strengths = ("share",)
-    optional_parameters = ("decay_frames", "spread")
+    optional_parameters = ("decay_frames", "spread", "quiet")
     frames_needed = ("random",)
     sources = (
         "Bonjour, Blanc and Kayal 2012, IEEE Electron Device Letters 33(12), 1735: lag of pinned "
@@ -97,6 +98,9 @@ class Lag(Effect):
         (), low=0, high=1, doc="parts of what stayed behind that come out 1, 2, ... frames later; "
         "empty: as decay_frames says"
     )  # fmt: skip
+    quiet: float = quantity(
+        0.0, low=0, high=1, doc="part of what comes out that has no shot noise of its own"
+    )
 
     @property
     def releases(self) -> F64:
@@ -122,14 +126,17 @@ class Lag(Effect):
             before = shot.charge(shot.frame - back)
             if before is None:
                 break
-            found += np.float32(release) * self._left_behind(before, shot, shot.frame - back)
+            stayed = self._left_behind(before, shot, shot.frame - back, 1 - self.quiet)
+            found += np.float32(release) * stayed
         return found
 
-    def _left_behind(self, charge: F32, shot: Shot, frame: int) -> F32:
+    def _left_behind(self, charge: F32, shot: Shot, frame: int, noisy: float = 1.0) -> F32:
         """Electrons of a frame that stay: each by its own chance, so that noise stays white."""
         share = _shares(self, shot.bench.detector, shot.rows)
         left = np.empty_like(charge)
-        noise = shot.normals(self.name, frame) if shot.bench.shot_noise else np.zeros_like(charge)
+        noise = np.zeros_like(charge)
+        if shot.bench.shot_noise and noisy > 0:
+            noise = shot.normals(self.name, frame) * np.float32(np.sqrt(noisy))
         begins, weights = _bands(self)
         left_behind(charge, share, begins, weights, noise, left)
         return left
@@ -207,14 +214,19 @@ class Lag(Effect):
         bands, of_bands = _by_level(
             part, cls(share, found.decay_frames, later=later, level_e=level_e), sigmas
         )
+        whole = cls(share, found.decay_frames, 0.0, bands, level_e, later)
+        quiet, quiet_error = _quiet(part, whole) if sigmas > _CLEAR else (0.0, 1.0)
         decay = -1 / np.log(keep) if keep else 0.0
         decay_error = keep_error * decay**2 / keep if keep else -1 / np.log(min(keep_error, 0.9))
         return Estimate(
-            cls(share, min(float(decay), _MAX_DECAY), min(spread, 1.0), bands, level_e, later),
+            cls(
+                share, min(float(decay), _MAX_DECAY), min(spread, 1.0), bands, level_e, later, quiet
+            ),
             {
                 "share": share_error,
                 "decay_frames": float(decay_error),
                 "spread": min(spread_error, 1.0),
+                "quiet": quiet_error,
             }
             | of_bands,
             sigmas_of_best(sigmas, uneven / uneven_error),
@@ -351,6 +363,19 @@ def _by_level(
     errors = np.sqrt(np.diag(covariance)) / lag.share
     bands = tuple(float(v) for v in np.clip(shares / lag.share, 0, 100))
     return bands, {f"bands[{n}]": float(e) for n, e in enumerate(errors)}
+
+
+def _quiet(evidence: Evidence, lag: Lag) -> tuple[float, float]:
+    """Part of what comes out that has no shot noise, and its error; zero unless it shows."""
+
+    def comes_out(_: FringeEvidence, signal: F32) -> F32:
+        stayed, late = lag._left(signal), np.zeros_like(signal)
+        for back, release in enumerate(lag.releases, start=1):
+            late[back:] += np.float32(release) * stayed[:-back]
+        return late
+
+    part, error = missing_noise(evidence, comes_out)
+    return float(np.clip(part, 0, 1)) if part > _CLEAR * error else 0.0, min(error, 1.0)
 
 
 def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:

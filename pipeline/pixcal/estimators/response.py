@@ -140,9 +140,7 @@ def boundaries_alone(
         Boundaries between rows may move by another shift than those between columns: fringes across
         each tell of it.
     """
-    sums = evidence.once(
-        "boundaries", level_e, powers, make=lambda: _boundary_sums(evidence, level_e, powers)
-    )
+    sums = _sums_by_axis(evidence, level_e, powers)
     if len(sums) < 2 or not by_axis:
         sums = [(sum(n for n, _ in sums), sum(r for _, r in sums))]  # type: ignore[list-item]
     found = [_alone(sums, powers, powers + n) for n in range(len(FALLOFFS_PX))]
@@ -182,6 +180,84 @@ def _boundary_sums(evidence: Evidence, level_e: float, powers: int) -> list[tupl
     ]
 
 
+@dataclass(frozen=True)
+class Beside:
+    """Moving boundaries with a bent response that is free beside them.
+
+    Attributes
+    ----------
+    shift, variance : float
+        By an electron, px; on the mean of boundaries between columns and between rows.
+    gain : float
+        Chi-square that they explain beyond the response.
+    axes : int
+        Of boundaries, each with a shift of its own: one or two.
+    """
+
+    shift: float
+    variance: float
+    gain: float
+    axes: int
+
+
+def boundaries_beside(
+    evidence: Evidence,
+    level_e: float,
+    powers: int,
+    falloff_px: float,
+    known: tuple[float, float] | None = None,
+) -> Beside:
+    """Boundaries of a given falloff, with a response that is free.
+
+    One fringe period tells little of them but how boundaries along x and y differ, which no
+    response brings about.
+
+    Parameters
+    ----------
+    evidence, level_e, powers
+        As of `boundaries_alone`.
+    falloff_px : float
+        One of `FALLOFFS_PX`.
+    known : (float, float), optional
+        Mean shift by an electron (px) and its variance, as the noise of neighbours has it.
+    """
+    sums = _sums_by_axis(evidence, level_e, powers)
+    normal, right = _joint(sums, powers, powers + FALLOFFS_PX.index(falloff_px))
+    mean = np.zeros(len(right))
+    mean[powers:] = 1 / len(sums)
+    if known is not None:
+        information = UNIT**2 / known[1]
+        normal = normal + information * np.outer(mean, mean)
+        right = right + information * known[0] / UNIT * mean
+    inverse, only = _inverse(normal), _inverse(normal[:powers, :powers])
+    gain = float(right @ inverse @ right - right[:powers] @ only @ right[:powers])
+    size, variance = float(mean @ inverse @ right), float(mean @ inverse @ mean)
+    return Beside(UNIT * size, UNIT**2 * variance, max(gain, 0.0), len(sums))
+
+
+def _sums_by_axis(evidence: Evidence, level_e: float, powers: int) -> list[tuple[F64, F64]]:
+    return evidence.once(
+        "boundaries", level_e, powers, make=lambda: _boundary_sums(evidence, level_e, powers)
+    )
+
+
+def _joint(sums: Sequence[tuple[F64, F64]], powers: int, at: int) -> tuple[F64, F64]:
+    """Normal equations: powers that all sums share, and a shift of each."""
+    n = powers + len(sums)
+    joint, right = np.zeros((n, n)), np.zeros(n)
+    for number, (normal, own) in enumerate(sums):
+        places, taken = [*range(powers), powers + number], [*range(powers), at]
+        joint[np.ix_(places, places)] += normal[np.ix_(taken, taken)]
+        right[places] += own[taken]
+    return joint, right
+
+
+def _inverse(normal: F64) -> F64:
+    scale = 1 / np.sqrt(np.diag(normal))
+    scaled = np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-9, hermitian=True)
+    return np.asarray(scaled * np.outer(scale, scale))
+
+
 def _alone(
     sums: Sequence[tuple[F64, F64]], powers: int, at: int
 ) -> tuple[float, float, float, float, float, float]:
@@ -191,17 +267,8 @@ def _alone(
     rights = np.array([right[at] for _, right in sums])
     sizes = rights / information
     gain = float(sizes @ rights)
-    # The powers are common to all, each sum has a shift of its own.
-    n = powers + len(sums)
-    own, both = np.zeros((n, n)), np.zeros(n)
-    for number, (normal, right) in enumerate(sums):
-        places, taken = [*range(powers), powers + number], [*range(powers), at]
-        own[np.ix_(places, places)] += normal[np.ix_(taken, taken)]
-        both[places] += right[taken]
-    scale = 1 / np.sqrt(np.diag(own))
-    scaled = both * scale
-    inverse = np.linalg.pinv(own * np.outer(scale, scale), rcond=1e-9, hermitian=True)
-    beside = float(scaled @ inverse @ scaled) - gain
+    joint, right = _joint(sums, powers, at)
+    beside = float(right @ _inverse(joint) @ right) - gain
     ratio = float(sizes[-1] / sizes[0])
     relative = 1 / np.sqrt(information) / sizes
     error = abs(ratio) * float(np.linalg.norm(relative)) if len(sums) > 1 else 0.0

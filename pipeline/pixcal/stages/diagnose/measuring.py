@@ -18,10 +18,10 @@ from pixcal.kernels.scene import DetectorMaps
 from pixcal.model.acquisition import Acquisition
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.description import bench_of, recordings_of
+from pixcal.stages.diagnose.measured_gain import MeasuredGain
 from pixcal.stages.diagnose.nominal import (
     FittedSet,
     Measured,
-    MeasuredGain,
     NominalBench,
     SetTruth,
     contrast_surface,
@@ -37,8 +37,6 @@ HOT = 40.0
 HOT_REACH = 2
 """Pixels around a hot one that may have got some of its charge: at most a share of `SHARED`."""
 SHARED = 0.1
-DECLARED_ERROR = 0.01
-"""Relative error that a declared gain may well have."""
 WILD = 8.0
 """Standard deviations beyond which a residual is left out."""
 NO_TEST = 10.0
@@ -272,14 +270,15 @@ def _gain(
     noise = [n for e in evidence for n in _noise_ratios(e)]
     if with_flats and noise:
         amplifiers = relative_gain(flat, np.mean(noise, axis=0), good)
-    means, weights = [1.0], [DECLARED_ERROR**-2]
-    for one in evidence:
-        value, error, chi2 = one.photon_transfer
-        if np.isfinite(value) and error > 0 and chi2 < NO_TEST:
-            means.append(value / one.gain)
-            weights.append((one.gain / error) ** 2)
-    mean = float(np.average(means, weights=weights))
-    return MeasuredGain(amplifiers, mean, float(np.sum(weights) ** -0.5))
+    found = [(one.gain, *one.photon_transfer) for one in evidence]
+    return MeasuredGain(
+        amplifiers,
+        tuple(
+            (value / used, error / used)
+            for used, value, error, chi2 in found
+            if np.isfinite(value) and error > 0 and chi2 < NO_TEST
+        ),
+    )
 
 
 def _noise_ratios(one: Evidence) -> list[F64]:

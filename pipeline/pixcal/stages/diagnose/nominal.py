@@ -29,8 +29,10 @@ from pixcal.simulation.effect import Effect, FringeMaps, Stage
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import SEEDS_APART, Recording
 from pixcal.stages import reduce
+from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
 from pixcal.stages.diagnose.undone import IntensityBeforeEffects
+from pixcal.stages.diagnose.undone_maps import undone_on_samples
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -171,11 +173,13 @@ class FittedSet:
 
     def without(self, effects: Sequence[Effect]) -> "FittedSet":
         """The same with effects undone that act on maps: offsets as fitted with them known."""
-        maps = before = FringeMaps(
+        maps = by_maps = before = FringeMaps(
             filled(self.theta, self.k), self.k, self.origin, self.flat, self.name
         )
         for effect in sorted(effects, key=lambda e: (e.acts_at, e.name), reverse=True):
-            maps = effect.undo(maps) or maps
+            # Levels before effects on samples are those of `IntensityBeforeEffects`, without the maps' noise.
+            by_maps = effect.undo(by_maps) or by_maps
+            maps = effect.undo(maps) or undone_on_samples(effect, maps) or maps
         if maps is before:
             return replace(self, flat=None)
         size = float(np.hypot(*self.k))
@@ -187,8 +191,8 @@ class FittedSet:
             size,
         )
         good = np.asarray(np.isfinite(self.theta).all(axis=0))
-        light = light_surface(maps.theta, good) / light_surface(before.theta, good)
-        contrast = contrast_surface(maps.theta, good) / contrast_surface(before.theta, good)
+        light = light_surface(by_maps.theta, good) / light_surface(before.theta, good)
+        contrast = contrast_surface(by_maps.theta, good) / contrast_surface(before.theta, good)
         return replace(
             self,
             delta=delta,
@@ -201,28 +205,6 @@ class FittedSet:
     def offsets(self) -> Offsets:
         """Offsets that can be true."""
         return true_offsets(self.delta, self.sigma, np.arctan2(*filled(self.theta, self.k)[1:]))
-
-
-@dataclass(frozen=True)
-class MeasuredGain:
-    """Gain of the amplifiers over the one that electrons were counted with.
-
-    Attributes
-    ----------
-    amplifiers : (y, x) float64
-        Of each pixel's amplifier over the detector's mean.
-    relative, error : float
-        Of the detector, and its 1-sigma error.
-    """
-
-    amplifiers: F64
-    relative: float
-    error: float
-
-    def drawn(self, rng: np.random.Generator) -> F32:
-        """Gain (y, x) over the one used, as it may be within its error."""
-        common = max(self.relative + self.error * rng.standard_normal(), 0.1)
-        return (common * self.amplifiers).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -302,7 +284,8 @@ class NominalBench:
         measured = self._drawn(effects if fitted else (), own_seed, undone)
         if fitted and effects:
             measured = self._of_measured_k(measured, bench, effects)
-        measured = self._electronics(measured, seed, own_seed)
+        change = photon_transfer_change(bench, measured, effects, self.recordings)
+        measured = self._electronics(measured, seed, own_seed, change)
         camera = Camera(bench, rows, [measured, *effects])
         arrays = {
             name: np.empty((len(frames), *bench.detector.shape), self.dtypes[name])
@@ -344,9 +327,9 @@ class NominalBench:
                 sets[n] = replace(found, psi=found.psi - dkx * x - dky * y, k=(kx - dkx, ky - dky))
         return replace(measured, sets=tuple(sets))
 
-    def _electronics(self, measured: Measured, seed: int, own_seed: int) -> Measured:
+    def _electronics(self, measured: Measured, seed: int, own_seed: int, change: float) -> Measured:
         """With gain and read noise drawn within what is known of them; samples keep their level."""
-        gain = self.gain.drawn(np.random.default_rng([seed, _GAIN]))
+        gain = self.gain.drawn(np.random.default_rng([seed, _GAIN]), change)
         m = measured.maps
         noise = m.read_noise * gain
         if self.noise is not None:

@@ -1,7 +1,6 @@
 """What each cause does to the map of offsets: how far it moves them, and what is to be done."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,11 @@ from pixcal.estimators.modes import solve_modes
 from pixcal.kernels.crosstalk import filled
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.diagnose.nominal import FittedSet
+from pixcal.stages.diagnose.undone_maps import undone_on_samples
 from pixcal.stages.treatment import treatment_of
 from pixcal.storage.artefact import MANIFEST, read_json
 
 F64 = NDArray[np.float64]
-
-PHASES = 12
-"""Frames, spread over a fringe, of which an effect on samples is undone."""
-LEAST_SIGNAL = 1.0
-"""Of a sample (e-), below which its shot noise is not taken."""
 
 
 def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str, Any]:
@@ -69,25 +64,6 @@ def _change(effect: Effect, fit: FittedSet) -> F64:
     modes = straight_modes(maps.theta, fit.k)[:, good]
     taken = solve_modes(modes @ modes.T, (modes @ change)[:, None])[:, 0]
     return np.asarray((change - taken @ modes) / np.hypot(*fit.k))
-
-
-def undone_on_samples(effect: Effect, maps: FringeMaps) -> FringeMaps | None:
-    """Maps that a fit finds in frames without noise that an effect was undone on.
-
-    None where the effect is not one of samples.
-    """
-    phi = 2 * np.pi * np.arange(PHASES) / PHASES
-    frames = np.stack([np.ones(PHASES), np.cos(phi), np.sin(phi)])
-    flat = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat
-    charge = np.einsum("mt,myx->tyx", frames, maps.theta * flat)
-    undone = effect.undo_samples(charge.astype(np.float32))
-    if undone is None:
-        return None
-    weight = 1 / np.maximum(charge, LEAST_SIGNAL)
-    normal = np.einsum("mt,nt,tyx->yxmn", frames, frames, weight)
-    right = np.einsum("mt,tyx->yxm", frames, weight * undone)
-    theta = np.moveaxis(np.linalg.solve(normal, right[..., None])[..., 0], -1, 0)
-    return replace(maps, theta=theta)
 
 
 def _rounded(value: float) -> float:

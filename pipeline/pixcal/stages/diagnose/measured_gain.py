@@ -1,0 +1,91 @@
+"""The gain that the nominal bench has: as flats and its declaration tell together."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.model.bench import Bench
+from pixcal.simulation.effect import Effect, Stage
+from pixcal.simulation.exposure import Camera
+from pixcal.simulation.recording import Recording
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+DECLARED_ERROR = 0.01
+"""Relative error that a declared gain may well have."""
+FRAMES = 8
+"""Flats that are simulated with and without effects, from the same random numbers."""
+OF_NOISE = (Stage.CHARGE, Stage.SIGNAL)
+"""Steps whose effects change the noise of flats otherwise than a gain does."""
+
+
+@dataclass(frozen=True)
+class MeasuredGain:
+    """Gain of the amplifiers over the one that electrons were counted with.
+
+    Attributes
+    ----------
+    amplifiers : (y, x) float64
+        Of each pixel's amplifier over the detector's mean.
+    transfer : tuple of (float, float)
+        Gain by photon transfer, and its 1-sigma error, of each part of the flats.
+    """
+
+    amplifiers: F64
+    transfer: tuple[tuple[float, float], ...] = ()
+
+    def drawn(self, rng: np.random.Generator, change: float = 1.0) -> F32:
+        """Gain (y, x) over the one used, as it may be within its error.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+        change : float
+            What effects do to the variance of flats over their mean: by as much the photon
+            transfer is wrong.
+        """
+        values = np.array([1.0, *(value * change for value, _ in self.transfer)])
+        weights = np.array([DECLARED_ERROR, *(error for _, error in self.transfer)]) ** -2.0
+        common = np.average(values, weights=weights) + weights.sum() ** -0.5 * rng.standard_normal()
+        return np.asarray(max(common, 0.1) * self.amplifiers, np.float32)
+
+
+def photon_transfer_change(
+    bench: Bench, measured: Effect, effects: Sequence[Effect], recordings: Sequence[Recording]
+) -> float:
+    """What effects do to the variance of flats over their mean.
+
+    One without flats below saturation. The gain that is measured by photon transfer is too large by
+    the inverse of it, and a bench that is simulated with the effects must not have them twice.
+    """
+    flats = [r for r in recordings if r.kind == "flat" and r.electrons > 0 and r.count > 1]
+    detector = bench.detector
+    room = (detector.top_adu - detector.bias_adu) * detector.gain_e_per_adu
+    flats = [r for r in flats if r.electrons < 0.8 * room]
+    if not flats or not any(effect.acts_at in OF_NOISE for effect in effects):
+        return 1.0
+    flat = max(flats, key=lambda r: r.electrons)
+    dark = [r for r in recordings if r.kind == "bias"][:1]
+    rows = (0, detector.shape[0])
+    ratios = []
+    for acting in ([measured], [measured, *effects]):
+        camera = Camera(bench, rows, acting)
+        good = camera.maps.mask == 0
+        moments = [_moments(camera, replace(r, bench=bench), good) for r in (flat, *dark)]
+        (mean, variance), *none = moments
+        for offset, noise in none:
+            mean, variance = mean - offset, variance - noise
+        ratios.append(variance / mean)
+    return float(np.clip(ratios[1] / ratios[0], 0.1, 10)) if min(ratios) > 0 else 1.0
+
+
+def _moments(camera: Camera, recording: Recording, good: NDArray[np.bool_]) -> tuple[float, float]:
+    """Mean and variance in time of good pixels, ADU; common changes of frames taken off."""
+    frames = range(min(FRAMES, recording.count))
+    samples = np.stack([s[good].astype(np.float32) for _, s in camera.expose(recording, frames)])
+    mean = float(samples.mean())
+    samples -= samples.mean(axis=1, keepdims=True)
+    return mean, float(samples.var(axis=0, ddof=1).mean())
