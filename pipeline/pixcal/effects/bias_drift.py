@@ -287,17 +287,18 @@ def _settling(
 def _tracks(light: FrameLight) -> tuple[Track, ...]:
     """Offsets of every set: the part of (B, log A/B) that moves the first and not A (Wiener)."""
     light = replace(light, dark=())
+    drifts, every = ("offset_walk", "offset_smooth"), (*PARTS, "offset_smooth")
     found = []
     for series in light.sets:
         alone = replace(light, sets=(series,))
-        modes = alone.modes(PARTS)
+        modes = alone.modes(every)
         size = np.maximum(estimate_components(modes).size, 0.0)
         n = len(series) - 1
         parts = size[:, None, None, None] * modes.parts[:, :n]
         level = light.level[series.name]
-        # Of unit walk in e-, what (B, log A/B) share with it.
-        walk = parts[PARTS.index("offset_walk")]
-        with_offset = level * np.stack([walk[:, 0, 0], walk[:, 1, 0]], axis=1)
+        # In e-, what (B, log A/B) share with the drift.
+        drift = sum(parts[every.index(name)] for name in drifts)
+        with_offset = level * drift[:, :, 0]
         weight = np.linalg.solve(parts.sum(axis=0), with_offset[..., None])[..., 0]
         smooth = np.einsum("nc,nc->n", weight, modes.values[:n])
         offset = idct(np.concatenate([[0.0], smooth]), type=2, norm="ortho")

@@ -71,8 +71,9 @@ class FrameLight:
         Parameters
         ----------
         parts : sequence of str
-            ``power``, ``contrast`` or ``offset`` (white), with ``_walk`` (a random walk; 1/s) or
-            ``_damped`` (of unit variance); offsets in e-², the others relative.
+            ``power``, ``contrast`` or ``offset`` (white), with ``_walk`` (a random walk; 1/s),
+            ``_smooth`` (ramps and settlings: the square of a walk's spectrum) or ``_damped`` (of
+            unit variance); offsets in e-², the others relative.
         keep : float
             Correlation of neighbours of a damped change.
         absent : sequence of str
@@ -97,6 +98,7 @@ class FrameLight:
         power = {
             "": np.ones(n - 1),
             "walk": walk_power(n) * series.step_s,
+            "smooth": walk_power(n) ** 2 / n**2,
             "damped": damped_power(n, keep),
         }[time]
         if level is None:

@@ -14,7 +14,7 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Track:
-    """A quantity of the frames of one fringe set, straight between its points, zero beyond them."""
+    """A quantity of the frames of one fringe set, straight between its points, constant beyond them."""
 
     set: str = quantity(doc="name of the fringe set")
     time_s: tuple[float, ...] = quantity(unit="s", doc="after the set's first frame, rising")
@@ -36,5 +36,5 @@ def at(tracks: Iterable[Track], name: str, time_s: F64 | float) -> F64:
     found = np.zeros(np.shape(time_s))
     for track in tracks:
         if track.set == name and track.time_s:
-            found = found + np.interp(time_s, track.time_s, track.value, left=0.0, right=0.0)
+            found = found + np.interp(time_s, track.time_s, track.value)
     return found
