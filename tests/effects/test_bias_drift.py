@@ -291,5 +291,5 @@ def test_tracks_are_replayed(make_effect_bench: Callable[..., Bench]) -> None:
     for r in recordings(bench):
         plain, on = (frames_of(bench, r, e).mean(axis=(1, 2)) for e in ((), (drift,)))
         time = r.period_s * np.arange(r.count)
-        wanted = np.interp(time, track.time_s, track.value, right=0.0) * (r.folder == "vertical")
+        wanted = np.interp(time, track.time_s, track.value) * (r.folder == "vertical")
         np.testing.assert_allclose(on - plain, wanted, atol=0.1)
