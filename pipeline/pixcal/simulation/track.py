@@ -14,7 +14,7 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Track:
-    """A quantity of the frames of one fringe set, straight between its points, constant beyond them."""
+    """A quantity of the frames of a fringe set, straight between points, constant beyond them."""
 
     set: str = quantity(doc="name of the fringe set")
     time_s: tuple[float, ...] = quantity(unit="s", doc="after the set's first frame, rising")
