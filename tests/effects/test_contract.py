@@ -20,7 +20,7 @@ from pixcal.simulation.recording import Recording, recordings
 ROOT = Path(__file__).parents[2]
 GLOW = ROOT / "docs" / "examples" / "glow.py"
 """An effect from outside, as the documentation shows how to write one."""
-KNOWN = known_effects([GLOW])
+KNOWN = known_effects([GLOW, *sorted((Path(__file__).parent / "own").glob("*.py"))])
 EVERY = pytest.mark.parametrize("cls", KNOWN.values(), ids=KNOWN)
 EVERY_OF_PIXCAL = pytest.mark.parametrize("cls", effects().values(), ids=effects())
 DOMAINS = {"space", "time", "intensity", "noise"}

@@ -62,8 +62,7 @@ def test_it_is_measured_with_its_error(acquisition: Path, tmp_path: Path) -> Non
     found = cls.estimate(load_evidence(run.path))
     assert found is not None
     assert found.effect.name == "glow"
-    (error,) = found.errors.values()
-    assert abs(found.effect.rate - 120.0) < 4 * error  # type: ignore[attr-defined]
+    assert abs(found.effect.rate - 120.0) < 3 * found.errors["rate"]  # type: ignore[attr-defined]
     assert found.significance > 10
 
 

@@ -55,6 +55,8 @@ class Freedom:
         One over the variance; zero where a sample has no weight.
     of_time : (k, t) float32
         The functions of time that a pixel is free to have, orthonormal.
+    of_place : (7, n) float32
+        The functions of place that a frame is free to have: the maps, and their slopes.
     """
 
     def __init__(self, fringes: FringeEvidence, harmonics: int = 1, margin: int = 0) -> None:
@@ -74,7 +76,7 @@ class Freedom:
         y, x = (np.broadcast_to(v, good.shape)[good] for v in grid((good.shape[0], good.shape[1])))
         theta = fringes.theta[:, good]
         # The maps, and their slopes along x and y; the latter turn with the phase of the frame.
-        self._of_place = np.stack(
+        self.of_place = np.stack(
             [*theta, x * theta[1], x * theta[2], y * theta[1], y * theta[2]]
         ).astype(np.float32)
         slopes = np.zeros((len(fringes.g), 5, 7))
@@ -104,7 +106,7 @@ class Freedom:
     def frame_covariance(self) -> F64:
         """Covariance (t, 7, 7) of the frames' share of the maps and slopes, from the noise."""
         upper = np.triu_indices(7)
-        products = self._of_place[upper[0]] * self._of_place[upper[1]]
+        products = self.of_place[upper[0]] * self.of_place[upper[1]]
         packed = self.weight @ products.T
         normal = np.empty((len(packed), 7, 7))
         normal[:, upper[0], upper[1]] = normal[:, upper[1], upper[0]] = packed
@@ -129,7 +131,7 @@ class Freedom:
         share, right = np.zeros((k, n), np.float32), np.empty((k, n), np.float32)
         for _ in range(_TURNS):
             turn(
-                rest, self.weight, self._of_place, self.frame_covariance,
+                rest, self.weight, self.of_place, self.frame_covariance,
                 self.of_time, share, right,
             )  # fmt: skip
             share[:] = np.einsum("nij,jn->in", self.pixel_inverse, right)
@@ -153,7 +155,7 @@ class Freedom:
         (t, pair) float32
             e-².
         """
-        a, b = self._of_place[:, one[self.good]], self._of_place[:, other[self.good]]
+        a, b = self.of_place[:, one[self.good]], self.of_place[:, other[self.good]]
         pairs = (a[:, None] * b[None]).reshape(len(a) ** 2, -1)
         covariance = self.frame_covariance[frames].astype(np.float32)
         taken: F32 = covariance.reshape(len(covariance), -1) @ pairs

@@ -7,6 +7,7 @@ before it has them made again.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import TypeVar
 
@@ -24,7 +25,7 @@ from pixcal.kernels.scene import (
 )
 from pixcal.kernels.synthesis import BLOCK_ROWS
 from pixcal.model.bench import Bench
-from pixcal.simulation.effect import Effect
+from pixcal.simulation.forward import ForwardModel
 from pixcal.simulation.recording import Recording
 
 F32 = NDArray[np.float32]
@@ -39,11 +40,21 @@ class Camera:
     bench : Bench
     rows : tuple of int
         First row of the window and the one after the last; any rows give the same samples.
-    effects : sequence of Effect
+    effects : sequence of ForwardModel
+    noise : bool
+        False: no shot noise and no read noise.
     """
 
-    def __init__(self, bench: Bench, rows: Rows, effects: Sequence[Effect] = ()) -> None:
-        self.bench = bench
+    def __init__(
+        self,
+        bench: Bench,
+        rows: Rows,
+        effects: Sequence[ForwardModel] = (),
+        *,
+        noise: bool = True,
+    ) -> None:
+        self.bench = bench if noise else replace(bench, shot_noise=False)
+        self.noise = noise
         self.effects = sorted(
             (e for e in effects if not e.is_null), key=lambda e: (e.acts_at, e.name)
         )
@@ -75,6 +86,13 @@ class Camera:
         keep = slice(skip, skip + self.inside[1] - self.inside[0])
         for frame in frames:
             yield frame, chain.samples(frame)[keep]
+
+    def analogue(self, recording: Recording, frames: range) -> Iterator[F32]:
+        """The same before the converter: float32 (y, x), ADU; a new array each."""
+        chain = _Chain(self, recording)
+        skip = self.inside[0] - self.rows[0]
+        for frame in frames:
+            yield chain.adu(frame)[skip : skip + self.inside[1] - self.inside[0]]
 
     def light(self, recording: Recording) -> LightMaps:
         """Mean and fringe amplitude of a recording on these rows and those around, e-."""
@@ -230,7 +248,11 @@ class _Chain:
 
     def samples(self, frame: int) -> NDArray[np.uint16]:
         """Codes of a frame."""
-        d = self.camera.bench.detector
+        synthesis.convert(self.adu(frame), self.camera.bench.detector.top_adu, self._samples)
+        return self._samples
+
+    def adu(self, frame: int) -> F32:
+        """Samples of a frame before they are rounded, ADU."""
         signal = self.charge(frame, len(self.effects)).copy()
         for at, effect in enumerate(self.effects):
             signal = effect.signal(signal, _Shot(self, frame, at))
@@ -240,11 +262,13 @@ class _Chain:
         synthesis.amplify(signal, maps.bias, read, maps.read_noise, maps.adu_per_e, adu)
         for at, effect in enumerate(self.effects):
             adu = effect.readout(adu, _Shot(self, frame, at))
-        synthesis.convert(adu, d.top_adu, self._samples)
-        return self._samples
+        return adu
 
     def _normals(self, frame: int) -> list[F32]:
         """Shot and read noise of a frame; made once for both."""
+        if not self.camera.noise:
+            nothing = np.zeros_like(self.dark)
+            return [nothing, nothing]
         if getattr(self, "_drawn", (-1, []))[0] != frame:
             width = self.camera.bench.detector.shape[1]
             drawn = synthesis.block_normals(
@@ -254,7 +278,7 @@ class _Chain:
         return self._drawn[1]
 
 
-def states_of(recording: Recording, effects: Sequence[Effect]) -> FrameStates:
+def states_of(recording: Recording, effects: Sequence[ForwardModel]) -> FrameStates:
     """What changes from frame to frame of a recording; of fringes only, with effects."""
     if recording.kind != "fringes":
         still, steady = np.zeros(recording.count), np.ones(recording.count)
@@ -266,7 +290,7 @@ def states_of(recording: Recording, effects: Sequence[Effect]) -> FrameStates:
 
 
 def frames_of(
-    bench: Bench, recording: Recording, effects: Sequence[Effect] = ()
+    bench: Bench, recording: Recording, effects: Sequence[ForwardModel] = ()
 ) -> NDArray[np.uint16]:
     """All frames (time, y, x) of a recording, in memory."""
     shape = bench.detector.shape

@@ -14,12 +14,12 @@ from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.gap import Reference, compare, expect_nominal, expect_with
 from pixcal.estimators.test_statistics import Key
 from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Effect, Estimate
+from pixcal.simulation.effect import Again, Effect, Estimate
 from pixcal.stages.diagnose.deciding import MORE
 from pixcal.stages.diagnose.look import DiagnosisInput, look_at, plain_part
 from pixcal.stages.diagnose.result import by_domain
 from pixcal.stages.diagnose.search import CONFIRM, SCREEN, SURE, Candidate, Found, Search
-from pixcal.stages.diagnose.trial import Curves, Effects, Trials, estimate
+from pixcal.stages.diagnose.trial import Curves, Effects, Signature, Trials, estimate
 from pixcal.stages.diagnose.windows import whole_of
 
 F64 = NDArray[np.float64]
@@ -83,9 +83,9 @@ def inquire(
         If the frames cannot be fitted or the nominal bench not be simulated.
     """
     candidates: dict[str, Candidate] = {}
-    signatures: tuple[type[Effect], ...] = ()
+    signatures: tuple[Signature, ...] = ()
 
-    def learnt(evidence: Evidence, unseen: Evidence, few: Runtime) -> tuple[type[Effect], ...]:
+    def learnt(evidence: Evidence, unseen: Evidence, few: Runtime) -> tuple[Signature, ...]:
         nonlocal signatures
         candidates.update(_candidates(evidence, kinds, base, few))
         for candidate in candidates.values():
@@ -114,7 +114,8 @@ def inquire(
             evidence = window.evidence(window.learn, (*base, *by_law), LEARN_SEED, scratch)
         except InputError:
             return {}  # These frames do not tell what the effects look like.
-        found = _estimates(evidence, {n: kinds[n] for n in names}, few, "estimate again")
+        asked = {n: _again(candidates[n]) or kinds[n] for n in names}
+        found = _estimates(evidence, asked, few, "estimate again")
         return {n: e.significance for n, e in found.items() if isinstance(e, Estimate)}
 
     answers: dict[tuple[Effects, tuple[str, ...]], dict[str, float]] = {}
@@ -200,13 +201,17 @@ def _replayed(candidate: Candidate, unseen: Evidence) -> Effect | None:
     return None if replay is None or replay.is_null else replay
 
 
+def _again(candidate: Candidate) -> Again | None:
+    return None if candidate.estimate is None else candidate.estimate.again
+
+
 def weakly_seen(
     candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]]
-) -> tuple[type[Effect], ...]:
+) -> tuple[Signature, ...]:
     """Candidates seen in the fitted frames; slow ones only where they are weak."""
     # By name: the order of candidates is none of curves.
     return tuple(
-        kinds[name]
+        candidate.estimate.again or kinds[name]
         for name, candidate in sorted(candidates.items())
         if candidate.estimate is not None
         and candidate.estimate.significance >= SURE
@@ -215,7 +220,7 @@ def weakly_seen(
 
 
 def _estimates(
-    evidence: Evidence, kinds: Mapping[str, type[Effect]], runtime: Runtime, label: str
+    evidence: Evidence, kinds: Mapping[str, Signature], runtime: Runtime, label: str
 ) -> dict[str, Estimate | str | None]:
     results = run_tasks(
         partial(estimate, evidence), list(kinds.values()), runtime.here, label=label

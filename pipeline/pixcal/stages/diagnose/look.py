@@ -14,12 +14,11 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.evidence import Evidence
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Effect
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.deciding import missing_frames
 from pixcal.stages.diagnose.measuring import nominal_bench
 from pixcal.stages.diagnose.parts import Half, Raw, evidence_of, take
-from pixcal.stages.diagnose.trial import Curves, Window, averaged, looked_at
+from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, looked_at
 from pixcal.stages.diagnose.windows import Split, chosen_windows, split
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.ingested import Ingested
@@ -74,7 +73,7 @@ def look_at(
     run_dir: Path,
     scratch: Path,
     runtime: Runtime,
-    learnt: Callable[[Evidence, Evidence, Runtime], Sequence[type[Effect]]] = lambda *_: (),
+    learnt: Callable[[Evidence, Evidence, Runtime], Sequence[Signature]] = lambda *_: (),
 ) -> DiagnosisInput:
     """Take the parts of a reduced run that are looked at, and measure their nominal bench.
 
@@ -126,7 +125,7 @@ def look_at(
     windows: list[Window] = []
     left_out: list[dict[str, Any]] = []
     measured: list[Curves] = []
-    signatures: tuple[type[Effect], ...] = ()
+    signatures: tuple[Signature, ...] = ()
     seed: int | None = None
     for part in dict.fromkeys((first, *parts)):
         raws = [take(ingested, acquisition, h, part, reduction) for h in (own.learn, own.test)]

@@ -15,7 +15,7 @@ from pixcal.estimators.test_statistics import Curve, Key, measure
 from pixcal.estimators.test_statistics.signature import signature_curve, signature_key
 from pixcal.model.config import to_plain
 from pixcal.model.errors import DamagedError, InputError
-from pixcal.simulation.effect import Effect, Estimate
+from pixcal.simulation.effect import Again, Effect, Estimate
 from pixcal.stages.diagnose.nominal import NominalBench
 from pixcal.stages.diagnose.parts import Half, evidence_of
 from pixcal.stages.evidence import Part
@@ -26,6 +26,8 @@ RUN_SHARE = 3
 """Times the raw frames that a run made of them may take."""
 
 Curves = dict[Key, Curve]
+Signature = type[Effect] | Again
+"""An effect whose estimate is a statistic; or, by its forward model, the score test of just it."""
 Effects = tuple[Effect, ...]
 
 
@@ -83,7 +85,7 @@ class Trials:
     scratch : Path
         Folder for what is written in between; a run that goes on finds its simulations there.
     runtime : Runtime
-    signatures : tuple of type
+    signatures : tuple of Signature
         Effects whose estimates are statistics too.
     estimates : mapping
         By name, of effects whose parameters are known within errors: from the seed ``exact`` on
@@ -94,7 +96,7 @@ class Trials:
     windows: tuple[Window, ...]
     scratch: Path
     runtime: Runtime
-    signatures: tuple[type[Effect], ...] = ()
+    signatures: tuple[Signature, ...] = ()
     estimates: Mapping[str, Estimate] = field(default_factory=dict)
     exact: int = 0
     _made: dict[tuple[frozenset[Effect], int], list[Curves] | str] = field(default_factory=dict)
@@ -183,7 +185,7 @@ def _call(task: Callable[[], Any]) -> Any:
 def _kept_or_made(
     windows: tuple[Window, ...],
     scratch: Path,
-    signatures: tuple[type[Effect], ...],
+    signatures: tuple[Signature, ...],
     item: tuple[Effects, int, int],
 ) -> Curves | str:
     """A simulation that an interrupted run has left, or a new one, which is left in turn."""
@@ -220,7 +222,7 @@ def _kept(file: Path) -> dict[str, Any] | None:
 def _made(
     windows: tuple[Window, ...],
     scratch: Path,
-    signatures: tuple[type[Effect], ...],
+    signatures: tuple[Signature, ...],
     item: tuple[Effects, int, int],
 ) -> Curves | str:
     effects, seed, number = item
@@ -232,7 +234,7 @@ def _made(
         return str(error)
 
 
-def looked_at(evidence: Evidence, signatures: Sequence[type[Effect]]) -> Curves:
+def looked_at(evidence: Evidence, signatures: Sequence[Signature]) -> Curves:
     """The test statistics, and the detection significance of some effects."""
     curves = measure(evidence)
     for kind in signatures:
@@ -256,7 +258,7 @@ def averaged(curves: Sequence[Curves]) -> Curves:
     return found
 
 
-def estimate(evidence: Evidence, kind: type[Effect]) -> Estimate | str | None:
+def estimate(evidence: Evidence, kind: Signature) -> Estimate | str | None:
     """Parameters of an effect; None without evidence, a sentence where the estimate failed."""
     try:
         found = kind.estimate(evidence)

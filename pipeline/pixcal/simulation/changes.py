@@ -1,0 +1,212 @@
+"""Deviations of an acquisition from the nominal bench, and how forward models change them.
+
+A change is the difference between frames that are taken again with a model and without. What two
+draws of all that is random have in common is none of it: half their difference is kept beside the
+mean, so that sums of squares are free of what chance adds to them.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.deviations import (
+    Change,
+    Deviation,
+    SetDeviations,
+    StackDeviations,
+    is_smooth,
+)
+from pixcal.estimators.evidence import Evidence
+from pixcal.simulation.forward import ForwardModel, Stage
+from pixcal.simulation.replica import Replica
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Key = tuple[str | int, str]
+"""Fringe set or number of a stack, and which of its deviations."""
+Draw = dict[Key, NDArray[Any]]
+
+SEEDS = (1, 2)
+FRAMES = 4
+"""Calibration frames of an exposure time that are looked at."""
+MIXED = 64
+"""Frames of a recording on which a model's hold on the noise is looked at."""
+COMMON = 0.5
+"""Share of a change that two draws have in common where it is none of chance."""
+LINEAR = ("residual", "frames", "maps")
+
+
+@dataclass(frozen=True)
+class Way:
+    """How a model shows.
+
+    Attributes
+    ----------
+    random : bool
+        Its change is another one with other random numbers, and zero on average.
+    mixes : bool
+        It makes the noise of samples correlated.
+    keys : tuple of Key
+        Deviations that it changes.
+    """
+
+    random: bool
+    mixes: bool
+    keys: tuple[Key, ...]
+
+
+@dataclass(frozen=True)
+class Template:
+    """Change of deviations: mean of two draws, and half their difference where they differ."""
+
+    mean: Mapping[Key, NDArray[Any]]
+    half: Mapping[Key, NDArray[Any]]
+
+    @classmethod
+    def of(cls, one: Draw, other: Draw) -> "Template":
+        """Of two draws; values that both share are none of chance."""
+        drawn = [k for k in one if one[k] is not other[k]]
+        mean = {k: (one[k] + other[k]) / 2 if k in drawn else one[k] for k in one}
+        return cls(mean, {k: (one[k] - other[k]) / 2 for k in drawn})
+
+    def slope(self, other: "Template", step: float) -> "Template":
+        """Derivative, from this one and that after a step of a parameter."""
+        return Template(
+            {k: (v - self.mean[k]) / step for k, v in other.mean.items()},
+            {k: (v - self.half[k]) / step for k, v in other.half.items()},
+        )
+
+
+class Changes:
+    """Deviations of some evidence, and what forward models make of them.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    """
+
+    def __init__(self, evidence: Evidence) -> None:
+        self._evidence, self._replica = evidence, Replica(evidence)
+        self._looks: dict[str | int, SetDeviations | StackDeviations] = {
+            n: StackDeviations(evidence, stack)
+            for n, stack in enumerate(evidence.stacks)
+            if stack.kind in ("bias", "dark") and len(stack.adu) >= FRAMES
+        }
+        self._looks |= {n: SetDeviations(evidence, s) for n, s in evidence.fringes.items()}
+        self._plain: dict[str | int, F32] = {}
+        flat = np.where(evidence.flat > 0, evidence.flat, 1.0)
+        self._flat = np.asarray(flat, float)
+        self._per_adu = (evidence.gain / self._flat).astype(np.float32)
+
+    def measured(self, key: Key) -> Deviation:
+        """A deviation of the data."""
+        return self._looks[key[0]].measured(key[1])
+
+    def way(self, model: ForwardModel) -> Way:
+        """How a model shows."""
+        every = [(of, name) for of, look in self._looks.items() for name in look.linear]
+        draws = [self._linear(model, seed, every) for seed in SEEDS]
+        sound = [
+            k for k in every if k[1] != "maps" or is_smooth(draws[0][k], self.measured(k).weight)
+        ]
+        draws = [{k: v for k, v in draw.items() if k in sound} for draw in draws]
+        random = not self._repeats(*draws)
+        keys = sound
+        if random:
+            keys = [(of, name) for of, look in self._looks.items() for name in look.quadratic]
+        pairs = [(of, "pairs") for of in self._looks]
+        mixes = model.acts_at >= Stage.CHARGE and self._repeats(
+            *(self._mixed(model, seed, pairs) for seed in SEEDS)
+        )
+        return Way(random, mixes, tuple(dict.fromkeys([*keys, *(pairs if mixes else ())])))
+
+    def _repeats(self, one: Draw, other: Draw) -> bool:
+        """Whether two draws of a change have most of it in common."""
+        weights = {key: self.measured(key).weight for key in one}
+        common = sum(dot(w, one[k], other[k]) for k, w in weights.items())
+        power = sum(dot(w, one[k], one[k]) for k, w in weights.items())
+        return bool(common > COMMON * power)
+
+    def template(self, model: ForwardModel, way: Way) -> Template:
+        """Change by a model that shows in some way."""
+        linear = [key for key in way.keys if key[1] in LINEAR]
+        pairs = [key for key in way.keys if key[1] == "pairs"]
+        one = other = self._linear(model, SEEDS[0], linear)
+        if way.random:
+            one, other = (self._second_moments(model, seed, way.keys) for seed in SEEDS)
+        if way.mixes:
+            a, b = (self._mixed(model, seed, pairs) for seed in SEEDS)
+            one = {**one, **{k: one.get(k, 0) + v for k, v in a.items()}}
+            other = {**other, **{k: other.get(k, 0) + v for k, v in b.items()}}
+        return Template.of(one, other)
+
+    def _taken(self, of: str | int) -> F32:
+        if of not in self._plain:
+            self._plain[of] = self._replica.taken(of)
+        return self._plain[of]
+
+    def _linear(self, model: ForwardModel, seed: int, keys: Iterable[Key]) -> Draw:
+        """Change of linear deviations."""
+        names: dict[str | int, list[str]] = {}
+        for of, name in keys:
+            names.setdefault(of, []).append(name)
+        found: Draw = {}
+        e, stacks = self._evidence, range(len(self._evidence.stacks))
+        bias = rate = relative = np.zeros(e.good.shape)
+        maps = any("maps" in own for own in names.values())
+        for of in [n for n in stacks if maps or n in names]:
+            samples = self._replica.taken(of, [model], seed=seed) - self._taken(of)
+            look, stack = self._looks.get(of), e.stacks[of]
+            if of in names and isinstance(look, StackDeviations):
+                found |= _named(of, look.change(samples, bias, names[of]))
+            mean, seconds = samples.mean(axis=0).astype(float), np.nan_to_num(stack.exptime_s)
+            if stack.kind == "bias":
+                bias = mean
+            elif stack.kind == "dark" and seconds > 0:
+                rate = (mean - bias) * e.gain / seconds
+            elif stack.kind == "flat":
+                light = float(self._taken(of).mean() - np.median(e.bias)) * e.gain
+                relative = (mean - bias) * e.gain - rate * seconds
+                relative = relative / self._flat / max(light, 1.0)
+        for of in [n for n in e.fringes if n in names]:
+            look = self._looks[of]
+            assert isinstance(look, SetDeviations)
+            samples = self._replica.taken(of, [model], seed=seed) - self._taken(of)
+            samples *= self._per_adu
+            seconds = np.nan_to_num(look.found.exptime_s)
+            constant = (bias * e.gain + rate * seconds) / self._flat
+            found |= _named(of, look.change(samples, constant, relative, names[of]))
+        return found
+
+    def _second_moments(self, model: ForwardModel, seed: int, keys: Sequence[Key]) -> Draw:
+        """What a random change adds to quadratic deviations."""
+        needed = [(of, "residual" if name == "pairs" else "frames") for of, name in keys]
+        change = self._linear(model, seed, needed)
+        return {
+            (of, name): self._looks[of].second_moments(name, change[of, source])
+            for (of, name), (_, source) in zip(keys, needed, strict=True)
+        }
+
+    def _mixed(self, model: ForwardModel, seed: int, keys: Iterable[Key]) -> Draw:
+        """Change of quadratic deviations since the model acts on the noise of samples."""
+        found: Draw = {}
+        for of, name in keys:
+            noise = self._replica.taken(of, noise=True, seed=seed, most=MIXED)
+            noise -= self._taken(of)[: len(noise)]
+            other = self._replica.taken(of, [model], noise=True, seed=seed, most=MIXED)
+            other -= self._replica.taken(of, [model], seed=seed, most=MIXED)
+            found[of, name] = self._looks[of].pairs_between(noise, other, self._per_adu)
+        return found
+
+
+def _named(of: str | int, change: Change) -> Draw:
+    return {(of, name): value for name, value in change.items()}
+
+
+def dot(weight: NDArray[Any], a: NDArray[Any], b: NDArray[Any]) -> float:
+    """Weighted sum of products: of each row in the arrays' type, of the rows in float64."""
+    rows = (v.reshape(len(v), -1) for v in (weight, a, b))
+    return float(np.einsum("tn,tn,tn->t", *rows).sum(dtype=float))

@@ -1,0 +1,149 @@
+"""The forward model of an effect: what it does to the frames of a simulation.
+
+A frozen dataclass of parameters, made with `pixcal.model.config.quantity`: units, ranges, and
+defaults of the size that the literature gives, cited in ``sources``. A model overrides the steps of
+the exposure that it acts on; the others leave things as they are. The order of the steps is that of
+a camera (`pixcal.simulation.exposure`); within a step, models act in the order of
+`ForwardModel.acts_at` and then of their names.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
+from pixcal.model.bench import Bench
+from pixcal.simulation.recording import Recording
+from pixcal.simulation.shot import Shot
+
+F32 = NDArray[np.float32]
+
+
+DOMAINS = ("space", "time", "intensity", "noise")
+"""Where an effect may show."""
+
+
+class Stage(IntEnum):
+    """Where in the chain from fibre to file an effect acts; effects are applied in this order."""
+
+    LIGHT = 1
+    """Laser, fibres, modulator, glass: before the photon is absorbed."""
+    PIXEL = 2
+    """Where and how well a pixel responds."""
+    CHARGE = 3
+    """Collected electrons, shot noise included."""
+    SIGNAL = 4
+    """Voltages: coupling between pixels, response of the amplifier."""
+    READOUT = 5
+    """Noise and drift of the electronics."""
+    CONVERTER = 6
+    """Analogue to digital: the last of all."""
+
+
+@dataclass(frozen=True)
+class ForwardModel:
+    """Base of all effects; a subclass is a frozen dataclass in a file of its own in ``effects/``.
+
+    Attributes
+    ----------
+    name : str
+        In files and reports.
+    title : str
+        In a few words, for people.
+    acts_at : Stage
+    domains : tuple of str
+        Where it shows: one or more of `DOMAINS`, the first before all.
+    strengths : tuple of str
+        Fields that `scaled` multiplies: with all of them zero the effect does nothing.
+    optional_parameters : tuple of str
+        Fields beside these that may be zero, with the effect still there in its simplest form.
+    frames_needed : tuple of str
+        Frames that tell on it besides fringes of one set: ``dark``, ``flat``, ``ladder`` (of
+        flats), ``baseline`` (a second one along an axis), ``axis`` (another one), ``random``
+        (of the phases); if not said, any but the last.
+    sources : tuple of str
+        Where the default sizes come from.
+    quick : bool
+        Whether an estimate takes about a second or less of 10⁷ samples, so that it can be made of
+        many simulations.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    acts_at: ClassVar[Stage]
+    domains: ClassVar[tuple[str, ...]]
+    strengths: ClassVar[tuple[str, ...]]
+    optional_parameters: ClassVar[tuple[str, ...]] = ()
+    frames_needed: ClassVar[tuple[str, ...]] = ("dark", "flat", "ladder", "baseline", "axis")
+    sources: ClassVar[tuple[str, ...]]
+    quick: ClassVar[bool] = True
+
+    def scaled(self, factor: float) -> Self:
+        """The same effect, ``factor`` times as strong."""
+        changed = {name: _times(getattr(self, name), factor) for name in self.strengths}
+        return dataclasses.replace(self, **changed)
+
+    @property
+    def is_null(self) -> bool:
+        """Whether it does nothing."""
+        return all(_is_zero(getattr(self, name)) for name in self.strengths)
+
+    @property
+    def halo(self) -> int:
+        """Rows above and below a piece of the window that the piece depends on."""
+        return 0
+
+    @property
+    def frames_back(self) -> int:
+        """Frames before a frame whose charge the frame depends on."""
+        return 0
+
+    # What it does to the frames.
+
+    def check(self, bench: Bench) -> None:
+        """Raise InputError where a bench and the effect do not go together."""
+
+    def states(self, states: FrameStates, recording: Recording) -> FrameStates:
+        """Intensity, amplitude, phase and fringe vector of every frame of a fringe set."""
+        return states
+
+    def detector(self, maps: DetectorMaps, bench: Bench, rows: Rows) -> DetectorMaps:
+        """The detector's maps on some rows of the window (first, one after the last)."""
+        return maps
+
+    def light(
+        self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
+    ) -> LightMaps:
+        """Mean and fringe amplitude on some rows (e-); of flats only the mean."""
+        return light
+
+    def photons(self, mean: F32, shot: Shot) -> F32:
+        """Mean electrons (y, x) of a frame, before shot noise; dark current comes after."""
+        return mean
+
+    def charge(self, charge: F32, shot: Shot) -> F32:
+        """Collected electrons (y, x), shot noise and full well included.
+
+        What is given is kept for later frames: give back another array, or the same unchanged.
+        """
+        return charge
+
+    def signal(self, signal: F32, shot: Shot) -> F32:
+        """Signal (y, x) at the amplifiers, in electrons."""
+        return signal
+
+    def readout(self, adu: F32, shot: Shot) -> F32:
+        """Samples (y, x) in ADU, bias and read noise included, before they are rounded."""
+        return adu
+
+
+def _times(value: Any, factor: float) -> Any:
+    return tuple(_times(v, factor) for v in value) if isinstance(value, tuple) else value * factor
+
+
+def _is_zero(value: Any) -> bool:
+    return all(map(_is_zero, value)) if isinstance(value, tuple) else value == 0

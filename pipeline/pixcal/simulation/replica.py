@@ -1,0 +1,301 @@
+"""The frames of an acquisition taken again: its bench as the fit has it, sample by sample.
+
+Light, phases, fringe vectors and offsets are those that were fitted, calibration maps those that
+were measured: without effects and noise, the frames come out as the fit's own model. What an effect
+changes of them is then the derivative that a score test needs.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
+from pixcal.kernels.crosstalk import filled
+from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
+from pixcal.model.bench import (
+    SCHEMA,
+    Bench,
+    Rung,
+    SimulatedDetector,
+    SimulatedFrames,
+    SimulatedOptics,
+    SimulatedSet,
+)
+from pixcal.simulation.exposure import Camera
+from pixcal.simulation.forward import ForwardModel, Stage
+from pixcal.simulation.recording import Recording
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+LEAST_S = 1e-6
+"""Exposure time and period where none is known."""
+TOP_ADU = 65535.0
+
+
+@dataclass(frozen=True)
+class Fitted(ForwardModel):
+    """The light and the pixels of an acquisition, as its fit has them.
+
+    Attributes
+    ----------
+    maps : DetectorMaps
+    theta : tuple of (3, y, x) float64
+        Maps of each fringe set, e-, through the pixels' response.
+    k : tuple of (float, float)
+        Fringe vector of each, rad/px.
+    frames : tuple of FrameStates
+        Of each set, from the first frame of its recording on.
+    """
+
+    name = " fitted"
+    title = "as fitted"
+    acts_at = Stage.LIGHT
+    domains = ()
+    strengths = ()
+    sources = ()
+
+    maps: DetectorMaps
+    theta: tuple[F64, ...]
+    k: tuple[tuple[float, float], ...]
+    frames: tuple[FrameStates, ...]
+
+    @property
+    def is_null(self) -> bool:
+        """Never."""
+        return False
+
+    def detector(self, maps: DetectorMaps, bench: Bench, rows: Rows) -> DetectorMaps:
+        """As in `ForwardModel.detector`."""
+        return self.maps
+
+    def light(
+        self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
+    ) -> LightMaps:
+        """As in `ForwardModel.light`; offsets and response that were changed change it."""
+        if recording.kind != "fringes":
+            return light
+        iota, of_sine, of_cosine = self.theta[recording.number]
+        if maps is not self.maps:
+            kx, ky = self.k[recording.number]
+            turn = kx * (maps.delta_x - self.maps.delta_x) + ky * (maps.delta_y - self.maps.delta_y)
+            more = maps.response / np.where(self.maps.response > 0, self.maps.response, 1)
+            phasor = (of_cosine + 1j * of_sine) * np.exp(1j * turn) * more
+            iota, of_sine, of_cosine = iota * more, phasor.imag, phasor.real
+        return LightMaps(
+            iota.astype(np.float32), of_sine.astype(np.float32), of_cosine.astype(np.float32)
+        )
+
+    def states(self, states: FrameStates, recording: Recording) -> FrameStates:
+        """As in `ForwardModel.states`."""
+        return self.frames[recording.number]
+
+
+class Replica:
+    """The frames of some evidence, taken again.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    """
+
+    def __init__(self, evidence: Evidence) -> None:
+        sets = list(evidence.fringes.values())
+        self._fitted = _fitted(evidence, sets)
+        self._bench = _bench(evidence, sets)
+        starts = _starts(evidence, sets)
+        self._recordings: dict[str | int, tuple[Recording, int]] = {}
+        for n, stack in enumerate(evidence.stacks):
+            self._recordings[n] = _of_stack(self._bench, n, stack, evidence, starts[n])
+        for n, found in enumerate(sets):
+            self._recordings[found.name] = _of_set(self._bench, n, found, starts[found.name])
+
+    def taken(
+        self,
+        of: str | int,
+        models: Sequence[ForwardModel] = (),
+        *,
+        noise: bool = False,
+        seed: int = 0,
+        most: int | None = None,
+    ) -> F32:
+        """Samples (t, y, x) before they are rounded, ADU.
+
+        Parameters
+        ----------
+        of : str or int
+            Name of a fringe set, or number of a stack.
+        models : sequence of ForwardModel
+            What acts on them.
+        noise : bool
+            With shot and read noise.
+        seed : int
+            Of all that is random.
+        most : int, optional
+            Frames.
+
+        Raises
+        ------
+        InputError
+            If a model and the bench do not go together.
+        """
+        detector = replace(self._bench.detector, seed=seed)
+        bench = replace(self._bench, seed=seed, detector=detector)
+        for model in models:
+            model.check(bench)
+        recording, first = self._recordings[of]
+        frames = range(first, recording.count)[:most]
+        rows = (0, bench.detector.shape[0])
+        camera = Camera(bench, rows, [self._fitted, *models], noise=noise)
+        out = np.empty((len(frames), *bench.detector.shape), np.float32)
+        for n, adu in enumerate(camera.analogue(replace(recording, bench=bench), frames)):
+            out[n] = adu
+        return out
+
+
+def _fitted(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Fitted:
+    flat, shape = evidence.flat, evidence.good.shape
+    delta = np.zeros((2, *shape))
+    if sets:
+        directions = np.stack([np.array(s.k) / np.hypot(*s.k) for s in sets])
+        along = np.stack([np.where(np.isfinite(s.delta), s.delta, 0.0) for s in sets])
+        delta = np.tensordot(np.linalg.pinv(directions), along, 1)
+
+    def same(value: float) -> F32:
+        return np.full(shape, value, np.float32)
+
+    maps = DetectorMaps(
+        delta[0].astype(np.float32),
+        delta[1].astype(np.float32),
+        np.nan_to_num(flat, nan=1.0).astype(np.float32),
+        np.nan_to_num(evidence.bias).astype(np.float32),
+        np.maximum(np.nan_to_num(evidence.dark_rate), 0).astype(np.float32),
+        same(evidence.amplifier_noise),
+        same(1 / evidence.gain),
+        np.where(evidence.good, 0, 1).astype(np.uint8),
+    )
+    theta = tuple(
+        filled(np.where(s.good, s.theta, np.nan), s.k) * np.nan_to_num(flat, nan=1.0) for s in sets
+    )
+    return Fitted(maps, theta, tuple(s.k for s in sets), tuple(_states(s) for s in sets))
+
+
+def _states(found: FringeEvidence) -> FrameStates:
+    """Of all frames of the recording; of those before the first they are nothing in particular."""
+    before = _first(found)
+
+    def padded(values: F64, value: float) -> F64:
+        return np.concatenate([np.full(before, value), values])
+
+    b, a_cos, a_sin = found.g.T
+    return FrameStates(
+        phi=padded(np.arctan2(a_sin, a_cos), 0.0),
+        level=padded(b, float(b.mean())),
+        amplitude=padded(np.hypot(a_cos, a_sin), float(np.hypot(a_cos, a_sin).mean())),
+        dkx=padded(found.dk[:, 0], 0.0),
+        dky=padded(found.dk[:, 1], 0.0),
+    )
+
+
+def _period(time_s: F64) -> float:
+    return max(float(np.median(np.diff(time_s))), LEAST_S) if len(time_s) > 1 else LEAST_S
+
+
+def _first(found: FringeEvidence) -> int:
+    """Number of the first frame in its recording."""
+    return max(round(float(found.time_s[0]) / _period(found.time_s)), 0)
+
+
+def _starts(evidence: Evidence, sets: Sequence[FringeEvidence]) -> dict[str | int, float]:
+    """Start of each recording after that of the acquisition, s; in order where unknown."""
+    known = [*(s.start_s for s in evidence.stacks), *(s.start_s for s in sets)]
+    in_order = not np.isfinite(known).all()
+    found: dict[str | int, float] = {}
+    clock = 0.0
+    for n, stack in enumerate(evidence.stacks):
+        found[n] = clock if in_order else stack.start_s + float(stack.time_s[0])
+        clock += len(stack.adu) * _period(stack.time_s)
+    for s in sets:
+        found[s.name] = clock if in_order else s.start_s - float(s.time_s[0])
+        clock += float(s.time_s[-1]) + _period(s.time_s)
+    return found
+
+
+def _of_set(
+    bench: Bench, number: int, found: FringeEvidence, start_s: float
+) -> tuple[Recording, int]:
+    first = _first(found)
+    exposure = found.exptime_s if np.isfinite(found.exptime_s) else 0.0
+    count = first + len(found.g)
+    period = _period(found.time_s)
+    return (
+        Recording(
+            bench, "fringes", number, found.name, found.name, count, exposure, start_s, period, 1.0
+        ),
+        first,
+    )
+
+
+def _of_stack(
+    bench: Bench, number: int, stack: Stack, evidence: Evidence, start_s: float
+) -> tuple[Recording, int]:
+    exposure = stack.exptime_s if np.isfinite(stack.exptime_s) else 0.0
+    electrons = 0.0
+    if stack.kind == "flat":
+        good = evidence.good & (evidence.flat > 0)
+        light = (stack.adu.mean(axis=0) - evidence.bias) * evidence.gain
+        light = (light - evidence.dark_rate * exposure)[good] / evidence.flat[good]
+        electrons = float(np.median(light)) if light.size else 0.0
+    period, count = _period(stack.time_s), len(stack.adu)
+    recording = Recording(
+        bench, stack.kind, number, stack.kind, stack.kind, count, exposure, start_s, period,
+        electrons,
+    )  # fmt: skip
+    return recording, 0
+
+
+def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:
+    """What effects ask a bench for; its own pixels and light are those of `Fitted`."""
+    shape, top = evidence.good.shape, min(evidence.saturation_adu, TOP_ADU)
+    exposures = [s.exptime_s for s in sets if np.isfinite(s.exptime_s)]
+    exposure = max([*exposures[:1], LEAST_S])
+    period = max(_period(sets[0].time_s) if sets else 0.0, exposure)
+    contrast = [np.median(np.hypot(*s.theta[1:])[s.good] / s.theta[0][s.good]) for s in sets]
+    light = [float(np.median(s.theta[0][s.good])) for s in sets]
+    return Bench(
+        schema=SCHEMA,
+        detector=SimulatedDetector(
+            shape=(shape[0], shape[1]),
+            pitch_um=evidence.pitch_um,
+            gain_e_per_adu=evidence.gain,
+            read_noise_e=evidence.amplifier_noise,
+            chip=sets[0].window if sets else None,
+            origin_px=evidence.origin if sets else None,
+            saturation_adu=top,
+            bias_adu=float(np.clip(np.median(evidence.bias), 0, top - 1)),
+        ),
+        optics=SimulatedOptics(
+            wavelength_nm=evidence.wavelength_nm,
+            distance_mm=evidence.distance_mm,
+            beam_radius_mm=1e4,
+            visibility=float(np.clip(np.mean(contrast), 0.01, 1.0)) if contrast else 1.0,
+            fringes="straight",
+        ),
+        frames=SimulatedFrames(
+            exptime_s=exposure,
+            period_s=period,
+            flats=(Rung(exposure, 1),),
+            flat_rate_e_s=1.0,
+            fringes=tuple(
+                SimulatedSet(
+                    name=s.name,
+                    baseline_mm=s.baseline_mm,
+                    count=len(s.g),
+                    peak_e=float(np.clip(2 * level, 1.0, 1e7)),
+                )
+                for s, level in zip(sets, light, strict=True)
+            ),
+        ),
+    )

@@ -1,0 +1,311 @@
+"""Parameters of an effect from its forward model alone: score test and Gauss-Newton steps.
+
+The frames of an acquisition are taken again without noise (`pixcal.simulation.replica`), with and
+without the effect. The difference says how every deviation from the nominal bench
+(`pixcal.estimators.deviations`) changes, what the fit absorbs being taken off. Held against the
+deviations that were measured, weighed by their noise, it is the score test of strength zero (Rao
+1948, Proc. Camb. Phil. Soc. 44, 50). An effect that is drawn at random changes nothing on average;
+it is known by what it adds to second moments (Lin 1997, Biometrika 84, 309), as is one that mixes
+the noise of samples. Parameters then follow by Gauss-Newton steps on simulations with the same
+random numbers (indirect inference: Gourieroux, Monfort & Renault 1993, J. Appl. Econometrics 8,
+S85).
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+from scipy.stats import chi2
+
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.variance_components import log_chance_of_any, sigmas
+from pixcal.simulation.changes import Changes, Key, Template, Way, dot
+from pixcal.simulation.forward import ForwardModel
+
+F64 = NDArray[np.float64]
+
+STEP = 1.1
+"""Factor on a parameter for its derivative."""
+GRID = ((1 / 9, 1 / 3, 3.0, 9.0), (1 / 1.7, 1.7))
+"""Factors on the default of a parameter that is no strength, where the score test is made too, and
+on the best of them."""
+HINT = 2.0
+"""Standard deviations from which parameters are fitted."""
+ROUNDS = 4
+"""Steps, each halved up to"""
+HALVINGS = 4
+"""times, until the misfit falls by less than"""
+CONVERGED = 0.05
+MOST = 3.0
+"""Factor by which a step changes a parameter at most."""
+TELLING = 0.02
+"""Share of the information from which a deviation is looked at again."""
+RANDOM = "what it adds, at random, to the second moments of frames, by its forward model"
+STEADY = "what it changes in frames and maps, beyond what the fit absorbs, by its forward model"
+
+
+@dataclass(frozen=True)
+class Scored:
+    """What the forward model lets know of an effect's parameters.
+
+    Attributes
+    ----------
+    model : ForwardModel
+    errors : dict
+        1-sigma errors of the parameters that were fitted.
+    significance : float
+    why : str
+    way : Way
+        How it shows, in the deviations that tell most.
+    """
+
+    model: Any
+    errors: dict[str, float]
+    significance: float
+    why: str
+    way: Way
+
+
+def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
+    """Parameters of an effect, and how far it is from nothing.
+
+    Parameters
+    ----------
+    kind : type
+        The effect's class.
+    evidence : Evidence
+
+    Returns
+    -------
+    Scored or None
+        None where the effect changes nothing that these frames show.
+
+    Raises
+    ------
+    NotImplementedError
+        If none of the effect's strengths is a number.
+    """
+    start = kind()
+    names = tuple(n for n in kind.strengths if isinstance(getattr(start, n), float))
+    if not names:
+        raise NotImplementedError(f"{kind.__name__} has no strength that is a number")
+    changes = _changes(evidence)
+    return _Fit(changes, changes.way(start), names).result(start)
+
+
+def score_again(model: ForwardModel, way: Way, evidence: Evidence) -> float:
+    """Significance of an effect in other frames, with the parameters that it has.
+
+    Parameters
+    ----------
+    model : ForwardModel
+    way : Way
+        How it shows.
+    evidence : Evidence
+    """
+    changes = _changes(evidence)
+    return float(_Fit(changes, way, ()).amplitudes([model])[2])
+
+
+def _changes(evidence: Evidence) -> Changes:
+    return evidence.once("changes by forward models", make=lambda: Changes(evidence))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Score tests of an effect, and the fit of its parameters."""
+
+    changes: Changes
+    way: Way
+    strengths: tuple[str, ...]
+
+    def template(self, model: ForwardModel) -> Template:
+        """Change of the deviations by a model."""
+        return self.changes.template(model, self.way)
+
+    def sums(
+        self, templates: Sequence[Template], at: Template | None = None
+    ) -> tuple[F64, F64, F64]:
+        """Right-hand side, normal matrix, and variance of the right-hand side.
+
+        Where draws are random, the normal matrix is without what chance adds to it.
+        """
+        count = len(templates)
+        right, normal, variance = np.zeros(count), np.zeros((count, count)), np.zeros((count,) * 2)
+        for key in self.way.keys:
+            own = self.changes.measured(key)
+            rest = own.value if at is None else own.value - at.mean[key]
+            for i, a in enumerate(templates):
+                right[i] += dot(own.weight, a.mean[key], rest)
+                if at is not None and key in a.half:
+                    right[i] += dot(own.weight, a.half[key], at.half[key])
+                for j, b in enumerate(templates[: i + 1]):
+                    size = dot(own.weight, a.mean[key], b.mean[key])
+                    chance = dot(own.weight, a.half[key], b.half[key]) if key in a.half else 0.0
+                    variance[i, j] = variance[j, i] = variance[i, j] + size
+                    normal[i, j] = normal[j, i] = normal[i, j] + size - chance
+        return right, normal, variance
+
+    def amplitudes(self, alone: Sequence[ForwardModel]) -> tuple[F64, F64, float]:
+        """Of models that act together: over what they are, errors, and the significance of all."""
+        right, normal, variance = self.sums([self.template(one) for one in alone])
+        inverse = _inverse(normal)
+        size = inverse @ right
+        error = np.sqrt(np.maximum(np.diag(inverse @ variance @ inverse), 0))
+        if len(size) == 1:
+            return size, error, float(right[0] / max(variance[0, 0], 1e-300) ** 0.5)
+        square = float(right @ _inverse(variance) @ right)
+        return size, error, sigmas(float(chi2.logsf(square, len(size))))
+
+    def _each_strength(self, model: ForwardModel) -> list[ForwardModel]:
+        null = model.scaled(0.0)
+        return [dataclasses.replace(null, **{n: getattr(model, n)}) for n in self.strengths]
+
+    def result(self, start: ForwardModel) -> Scored | None:
+        """The fit, from the effect as it is by default."""
+        shape, (size, error, found), tried = self._best_shape(start)
+        if not np.any(error > 0):
+            return None
+        significance = sigmas(log_chance_of_any([float(log_ndtr(-found))] * tried))
+        model, errors = self._scaled(shape, size, error)
+        if significance > HINT and not model.is_null:
+            model, errors = self._fitted(model, errors)
+        why = RANDOM if self.way.random else STEADY
+        telling = dataclasses.replace(self.way, keys=self._telling(shape))
+        return Scored(model, errors, significance, why, telling)
+
+    def _best_shape(self, start: ForwardModel) -> tuple[ForwardModel, tuple[F64, F64, float], int]:
+        """Parameters that are no strengths, one after the other on a grid; how many were tried."""
+        best, found, tried = start, self.amplitudes(self._each_strength(start)), 1
+        for name in _shapes(start):
+            for factors in GRID:
+                value = getattr(best, name)
+                for factor in factors:
+                    changed = _replaced(best, {name: value * factor})
+                    if changed == best:
+                        continue
+                    tried += 1
+                    other = self.amplitudes(self._each_strength(changed))
+                    if other[2] > found[2]:
+                        best, found = changed, other
+                if found[2] < HINT:
+                    break
+        return best, found, tried
+
+    def _telling(self, model: ForwardModel) -> tuple[Key, ...]:
+        """Deviations that hold most of the information."""
+        mean = self.template(model).mean
+        sizes = {k: dot(self.changes.measured(k).weight, mean[k], mean[k]) for k in self.way.keys}
+        least = TELLING * sum(sizes.values())
+        return tuple(key for key, size in sizes.items() if size >= least)
+
+    def _scaled(
+        self, shape: ForwardModel, size: F64, error: F64
+    ) -> tuple[ForwardModel, dict[str, float]]:
+        """A model of these amplitudes: roots, where second moments tell of it."""
+        power = 0.5 if self.way.random else 1.0
+        values, errors = {}, {}
+        for name, a, da in zip(self.strengths, size, error, strict=True):
+            values[name] = float(getattr(shape, name) * np.sign(a) * abs(a) ** power)
+            above = (max(a, 0.0) + da) ** power - max(a, 0.0) ** power
+            errors[name] = float(abs(getattr(shape, name)) * (above if self.way.random else da))
+        return _replaced(shape, values), {n: e for n, e in errors.items() if e > 0}
+
+    def _fitted(
+        self, model: ForwardModel, errors: dict[str, float]
+    ) -> tuple[ForwardModel, dict[str, float]]:
+        """Gauss-Newton steps of all parameters."""
+        names = [n for n in self.strengths if getattr(model, n)] + _shapes(model)
+        at = self.template(model)
+        misfit = self._misfit(at)
+        for _ in range(ROUNDS):
+            slopes = self._slopes(model, names, at)
+            right, normal, variance = self.sums(list(slopes.values()), at)
+            inverse = _inverse(normal)
+            covariance = np.diag(inverse @ variance @ inverse)
+            errors |= {n: float(v) ** 0.5 for n, v in zip(slopes, covariance, strict=True) if v > 0}
+            step = dict(zip(slopes, inverse @ right, strict=True))
+            gain = 0.0
+            for _ in range(HALVINGS):
+                moved = _moved(model, step)
+                there = self.template(moved)
+                gain = misfit - self._misfit(there)
+                if gain > 0:
+                    model, at, misfit = moved, there, misfit - gain
+                    break
+                step = {name: size / 2 for name, size in step.items()}
+            if gain < CONVERGED:
+                break
+        return model, errors
+
+    def _slopes(
+        self, model: ForwardModel, names: Sequence[str], at: Template
+    ) -> dict[str, Template]:
+        """Derivatives of the deviations by parameters."""
+        slopes = {}
+        for name in names:
+            value = getattr(model, name)
+            moved = _replaced(model, {name: value * STEP})
+            if moved == model:
+                moved = _replaced(model, {name: value / STEP})
+            if step := getattr(moved, name) - value:
+                slopes[name] = at.slope(self.template(moved), step)
+        return slopes
+
+    def _misfit(self, at: Template) -> float:
+        """Weighted square of what a model leaves, but for that of the deviations themselves."""
+        total = 0.0
+        for key in self.way.keys:
+            own = self.changes.measured(key)
+            total += dot(own.weight, at.mean[key], at.mean[key] - 2 * own.value)
+            if key in at.half:
+                total -= dot(own.weight, at.half[key], at.half[key])
+        return total
+
+
+def _shapes(model: ForwardModel) -> list[str]:
+    """Parameters that are no strengths and can be fitted."""
+    return [
+        f.name
+        for f in dataclasses.fields(model)
+        if f.name not in model.strengths
+        and isinstance(getattr(model, f.name), float)
+        and getattr(model, f.name) != 0
+    ]
+
+
+def _moved(model: ForwardModel, step: Mapping[str, float]) -> ForwardModel:
+    """The model with parameters moved, none by more than a factor of `MOST`."""
+    new = {}
+    for name, size in step.items():
+        value = getattr(model, name)
+        low, high = sorted((value / MOST, value * MOST))
+        new[name] = float(np.clip(value + size, low, high))
+    return _replaced(model, new)
+
+
+def _replaced(model: ForwardModel, values: Mapping[str, float]) -> ForwardModel:
+    """The model with other parameters, held within their ranges."""
+    limits = {f.name: f.metadata for f in dataclasses.fields(model)}
+    held = {}
+    for name, value in values.items():
+        low, high, above = (limits[name].get(key) for key in ("low", "high", "above"))
+        if above is not None:
+            value = max(value, float(np.nextafter(above, np.inf)))
+        if low is not None:
+            value = max(value, float(low))
+        if high is not None:
+            value = min(value, float(high))
+        held[name] = float(value)
+    return dataclasses.replace(model, **held)
+
+
+def _inverse(matrix: F64) -> F64:
+    scale = np.sqrt(np.maximum(np.diag(matrix), 0))
+    scale = np.where(scale > 0, scale, 1.0)
+    both = np.outer(scale, scale)
+    return np.asarray(np.linalg.pinv(matrix / both, rcond=1e-6, hermitian=True) / both)

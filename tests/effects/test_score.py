@@ -1,0 +1,135 @@
+"""Effects that are no more than a forward model: found, measured, and not claimed elsewhere."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from pixcal.effects import effect_of_file
+from pixcal.engine.run import Runtime
+from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.pair_sums import pair_sums, pair_variance
+from pixcal.model.bench import Bench
+from pixcal.model.config import to_plain
+from pixcal.simulation.effect import Estimate
+from pixcal.simulation.replica import Replica
+from pixcal.stages import diagnose, fit, ingest, reduce, simulate
+from pixcal.stages.evidence import load_evidence
+
+ROOT = Path(__file__).parents[2]
+OWN = Path(__file__).parent / "own"
+SYNC = Runtime(cluster="sync")
+GLOW = ROOT / "docs" / "examples" / "glow.py"
+NO_DARKS = {"frames.darks": [], "detector.hot_fraction": 0.0}
+CASES: dict[str, tuple[Path, dict[str, float], dict[str, Any]]] = {
+    "glow": (GLOW, {"rate": 30000.0, "reach_px": 8.0}, NO_DARKS),
+    "warm_up": (OWN / "warm_up.py", {"lack": 0.002, "settling_s": 15.0}, {}),
+    "group_noise": (OWN / "group_noise.py", {"rms": 1.5}, {}),
+    "deferred": (OWN / "deferred.py", {"share": 0.006}, {}),
+}
+"""Mean in space, mean in time, covariance in space, charge: file, truth, changes of the bench."""
+OTHERS = ("lag", "row_noise", "fringe_jitter", "quantisation", "intensity_noise")
+"""Candidates beside it; crosstalk to the row below is what a deferred charge does."""
+
+
+@pytest.fixture(scope="module")
+def run_with(
+    tmp_path_factory: pytest.TempPathFactory, make_effect_bench: Callable[..., Bench]
+) -> Callable[[str], Path]:
+    """A fitted run of a small bench with one of the cases."""
+    made: dict[str, Path] = {}
+
+    def make(case: str) -> Path:
+        if case not in made:
+            file, truth, changes = CASES[case]
+            folder = tmp_path_factory.mktemp(case)
+            plain = to_plain(make_effect_bench(changes)) | {"effects": {case: truth}}
+            (folder / "bench.yaml").write_text(yaml.safe_dump(plain))
+            simulate.run(folder / "bench.yaml", folder / "acq", simulate.Config(own=(file,)), SYNC)
+            ingest.run(folder / "acq", folder / "run", ingest.Config(), SYNC)
+            reduce.run(folder / "run", reduce.Config(), SYNC)
+            fit.run(folder / "run", fit.Config(), SYNC)
+            made[case] = folder / "run"
+        return made[case]
+
+    return make
+
+
+def within(found: dict[str, float], errors: dict[str, float], truth: dict[str, float]) -> bool:
+    """Strengths and shapes within three errors."""
+    return all(abs(found[name] - value) < 3 * errors[name] for name, value in truth.items())
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_its_parameters_follow_from_its_forward_model(
+    case: str, run_with: Callable[[str], Path]
+) -> None:
+    file, truth, _ = CASES[case]
+    kind = effect_of_file(file)
+    assert "estimate" not in vars(kind)
+    found = kind.estimate(load_evidence(run_with(case)))
+    assert isinstance(found, Estimate)
+    assert found.significance > 5
+    assert within(to_plain(found.effect), dict(found.errors), truth), found
+    assert found.again is not None
+    # The score test of just what was found, in the same frames: nothing is chosen any more.
+    again = found.again.estimate(load_evidence(run_with(case)))
+    assert again.significance > found.significance - 1
+
+
+def test_without_effects_the_frames_are_the_fits_model(acquired: Callable[..., Evidence]) -> None:
+    evidence = acquired()
+    replica = Replica(evidence)
+    for name, found in evidence.fringes.items():
+        electrons = (replica.taken(name) - evidence.bias) * evidence.gain
+        # Noise of the darks may be below zero, a mean is not.
+        dark = np.maximum(evidence.dark_rate, 0) * found.exptime_s
+        electrons = (electrons - dark) / evidence.flat
+        off = (electrons - found.model)[:, found.good]
+        assert np.abs(off).max() < 0.1
+
+
+def test_pairs_of_independent_samples_have_the_variance_that_is_said() -> None:
+    rng = np.random.default_rng(4)
+    good = rng.random((13, 17)) > 0.1
+    made = []
+    for _ in range(300):
+        values = rng.standard_normal((11, *good.shape)).astype(np.float32) * good
+        made.append(pair_sums(values.astype(np.float32), good))
+    variance = pair_variance(11, good)
+    z = np.stack(made) / np.sqrt(variance)
+    assert np.abs(z.mean(axis=0)).max() < 5 / np.sqrt(300)
+    np.testing.assert_allclose((z**2).mean(axis=0), 1, atol=0.5)
+    assert (z**2).mean() == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("case", CASES)
+def test_it_is_named_by_the_diagnosis(case: str, run_with: Callable[[str], Path]) -> None:
+    file, truth, _ = CASES[case]
+    run = run_with(case)
+    diagnose.run(run, diagnose.Config(only=(*OTHERS, case), own=(file,)), SYNC)
+    found = json.loads((run / "products" / "diagnosis.json").read_text())
+    assert [cause["effect"] for cause in found["causes"]] == [case]
+    (cause,) = found["causes"]
+    assert within(cause["parameters"], cause["uncertainty"], truth), cause
+    assert cause["gap_closed"] > 0.7
+
+
+@pytest.mark.long
+def test_of_a_nominal_bench_none_is_claimed(
+    tmp_path: Path, make_effect_bench: Callable[..., Bench]
+) -> None:
+    (tmp_path / "bench.yaml").write_text(yaml.safe_dump(to_plain(make_effect_bench())))
+    simulate.run(tmp_path / "bench.yaml", tmp_path / "acq", simulate.Config(), SYNC)
+    ingest.run(tmp_path / "acq", tmp_path / "run", ingest.Config(), SYNC)
+    reduce.run(tmp_path / "run", reduce.Config(), SYNC)
+    own = tuple(file for file, _, _ in CASES.values())
+    diagnose.run(tmp_path / "run", diagnose.Config(only=tuple(CASES), own=own), SYNC)
+    found = json.loads((tmp_path / "run" / "products" / "diagnosis.json").read_text())
+    assert found["verdict"] == "no gap"
+    assert not found["causes"]
