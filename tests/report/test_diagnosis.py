@@ -235,7 +235,7 @@ def test_parameters_of_any_shape_are_listed() -> None:
     assert [row[:2] for row in table(section, "Parameters").rows] == [
         ["pair", "1 (not fitted), 2.00 ± 0.10"], ["on", "yes"], ["kind", "slow"], ["none", "–"],
     ]  # fmt: skip
-    assert "In all: every 4." in text_of(section)
+    assert "Common to all: every 4." in text_of(section)
     first, rest = (
         b for b in every(section.blocks) if isinstance(b, Table) and b.title.startswith("coupl")
     )

@@ -27,6 +27,7 @@ from pixcal.estimators.variance_components import (
     sigmas,
 )
 from pixcal.kernels.processes import brownian
+from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.kernels.synthesis import Stream, generator
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
@@ -37,8 +38,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 HOUR_S = 3600.0
-SURE = 4.0
-"""Standard deviations from which a settling is told from a ramp and a walk."""
 STEADY = 3.0
 """The same for a ramp and a walk; below, a walk explains the frames as well."""
 SETTLINGS = 8
@@ -269,7 +268,7 @@ def _settling(
     chance = log_chance_of_any(
         [log_chance(max(fits[best].profile - plain.profile, 0.0))] * (SETTLINGS // 2)
     )
-    if sigmas(chance) < SURE:
+    if sigmas(chance) < SIGNIFICANT:
         return None, chance
     log_time, width = float(np.log(times[best])), float(np.log(times[1] / times[0]))
     bend = 1e-9

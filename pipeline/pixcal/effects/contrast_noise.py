@@ -16,13 +16,12 @@ from pixcal.estimators.variance_components import (
 )
 from pixcal.kernels.processes import damped_walk
 from pixcal.kernels.scene import FrameStates
+from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.track import Track, at
 
-SURE = 4.0
-"""Standard deviations from which a slow change is told from a white one."""
 POWERS = ("power", "power_walk", *OFFSETS)
 PARTS = ("contrast", "contrast_walk", *POWERS)
 
@@ -111,8 +110,8 @@ class ContrastNoise(Effect):
         none = light.components(PARTS, absent=PARTS[:2])
         damping = _damping(light)
         slow = sigmas(log_chance(damping.growth))
-        values, errors = _shaken(light, damping.components if slow > SURE else None)
-        if slow > SURE:
+        values, errors = _shaken(light, damping.components if slow > SIGNIFICANT else None)
+        if slow > SIGNIFICANT:
             drift = _drifting(damping, float(np.mean([s.step_s for s in light.sets])))
             values, errors = values | drift[0], errors | drift[1]
         return Estimate(

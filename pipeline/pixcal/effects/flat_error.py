@@ -26,7 +26,7 @@ Mask = NDArray[np.bool_]
 
 WAVES = 6
 """Plane waves that make up the smooth part."""
-SURE = 3.0
+SMOOTH_SEEN = 3.0
 """Standard deviations of the smooth part from which its scale is fitted."""
 AGREE = 3.0
 """Standard deviations within which waves of one length are all that neighbours share."""
@@ -126,7 +126,7 @@ class FlatError(Effect):
             np.array([np.hypot(alone, noise), smooth_error]),
         )
         pixel, whole = (min(float(v), 0.5) for v in rms)
-        waves = ring.variance > SURE * ring.noise
+        waves = ring.variance > SMOOTH_SEEN * ring.noise
         return Estimate(
             cls(pixel, whole, ring.scale if waves else cls().scale_px),
             {"pixel_rms": float(errors[0]), "smooth_rms": float(errors[1])}

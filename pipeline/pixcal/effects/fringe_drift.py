@@ -29,6 +29,7 @@ from pixcal.estimators.variance_components import (
 )
 from pixcal.kernels.processes import swing
 from pixcal.kernels.scene import FrameStates
+from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
@@ -37,8 +38,6 @@ from pixcal.simulation.track import Track, at
 F64 = NDArray[np.float64]
 
 HOUR_S = 3600.0
-SURE = 4.0
-"""Standard deviations from which a settling is told from a ramp and a walk."""
 SETTLINGS = 10
 """Time constants tried at first, from `QUICKEST` frames to the length of the run."""
 QUICKEST = 3.0
@@ -223,7 +222,7 @@ def _settling(
 
     trials = np.geomspace(QUICKEST * step, length, SETTLINGS)
     tau = float(max(trials, key=lambda t: fitted(t, 0).profile))
-    if sigmas(log_chance(fitted(tau, MAX_STEPS).profile - plain.profile, 2)) < SURE - 1:
+    if sigmas(log_chance(fitted(tau, MAX_STEPS).profile - plain.profile, 2)) < SIGNIFICANT - 1:
         return None, plain
     reach = trials[1] / trials[0]
     found = minimize_scalar(
@@ -234,7 +233,7 @@ def _settling(
     )
     tau = float(np.exp(found.x))
     best = fitted(tau, MAX_STEPS)
-    if sigmas(log_chance(best.profile - plain.profile, 2)) < SURE:
+    if sigmas(log_chance(best.profile - plain.profile, 2)) < SIGNIFICANT:
         return None, plain
     at = 3 if motion.crossed else 2
     size = (float(best.beta[at]), float(best.beta[at + 1]))

@@ -24,13 +24,12 @@ from pixcal.estimators.variance_components import (
 )
 from pixcal.kernels.processes import damped_walk, swing
 from pixcal.kernels.scene import FrameStates
+from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.track import Track, at
 
-SURE = 4.0
-"""Standard deviations from which a change is taken for correlated in time."""
 MOST_AMBIENT = 0.3
 """Share of light that does not follow the laser beyond which contrast noise is likelier."""
 PARTS = ("power", "power_walk", "contrast", "contrast_walk", *OFFSETS)
@@ -128,7 +127,7 @@ class IntensityNoise(Effect):
         if light.line is not None and light.line.sure:
             values, errors = _with_line(values, errors, light.line, light.sets[0].exptime_s)
         shares = ambient_shares(evidence)
-        clear = any(SURE * error < share < MOST_AMBIENT for share, error in shares)
+        clear = any(SIGNIFICANT * error < share < MOST_AMBIENT for share, error in shares)
         ambient = tuple(float(np.clip(share, 0, MOST_AMBIENT)) for share, _ in shares)
         return Estimate(
             cls(**cast("Any", values), ambient=ambient if clear else ()),
@@ -149,7 +148,7 @@ def _damping(light: FrameLight) -> Damping:
 
 def _change(damping: Damping, step: float) -> tuple[dict[str, float], dict[str, float]]:
     """Size of the change and its correlation time, without a line; values and errors."""
-    if sigmas(log_chance(damping.growth)) < SURE or not damping.rms:
+    if sigmas(log_chance(damping.growth)) < SIGNIFICANT or not damping.rms:
         rms, error = damping.white.root(0)
         # Less than a frame is not told from none.
         return (

@@ -17,7 +17,7 @@ from pixcal.estimators.code_density import (
 )
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.variance_components import sigmas
-from pixcal.kernels.significance import sigmas_of_best, sigmas_of_chi2
+from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best, sigmas_of_chi2
 from pixcal.kernels.synthesis import Stream, generator
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
@@ -26,8 +26,6 @@ from pixcal.simulation.shot import Shot
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-SURE = 4.0
-"""Standard deviations from which a ripple is told."""
 FARTHEST = 0.98
 """A step between codes moves by less than a code, so that only its neighbours need be asked."""
 _KEY = 997
@@ -221,7 +219,7 @@ def _uneven(widths: CodeWidths) -> tuple[dict[str, Any], dict[str, float], list[
     bits, covariance = widths.bits(2 * variance)
     chi2 = float(bits @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ bits)
     wrong = sigmas_of_chi2(chi2, max(int((np.diag(covariance) > 0).sum()), 1))
-    if wrong > max(SURE, sure):
+    if wrong > max(SIGNIFICANT, sure):
         rest = widths.without(bits).scatter()[0]
         bits, covariance = widths.bits(2 * rest)
         values, errors, others = _uneven(widths.without(bits))
@@ -229,7 +227,7 @@ def _uneven(widths: CodeWidths) -> tuple[dict[str, Any], dict[str, float], list[
         spread = np.sqrt(np.diag(covariance))
         errors |= {f"bits[{n}]": float(e) for n, e in enumerate(spread) if e}
         return values, errors, [wrong, *others]
-    if sure > SURE:
+    if sure > SIGNIFICANT:
         share = 1.0 if line.period == 2 else 0.5
         for _ in range(2):
             rest = variance - share * line.amplitude**2

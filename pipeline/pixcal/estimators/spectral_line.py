@@ -9,6 +9,7 @@ from scipy.fft import idct
 
 from pixcal.estimators.frame_series import FrameSeries, without
 from pixcal.estimators.variance_components import cosine_modes, log_chance, sigmas
+from pixcal.kernels.significance import SIGNIFICANT
 
 F64 = NDArray[np.float64]
 
@@ -16,8 +17,6 @@ FINER = 8
 """Frequencies looked at for each that a series tells apart."""
 SLOWEST = 4.0
 """Fewest swings of a line within a run; what is slower is drift."""
-SURE = 4.0
-"""Standard deviations from which a line is taken for one."""
 TRIALS = 4.0
 """Looks for each frequency that a series tells apart: the highest place lies between any two."""
 
@@ -45,7 +44,7 @@ class Line:
     @property
     def sure(self) -> bool:
         """Whether it is taken for one."""
-        return sigmas(self.log_chance) > SURE
+        return sigmas(self.log_chance) > SIGNIFICANT
 
 
 def find_line(

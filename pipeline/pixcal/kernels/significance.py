@@ -6,6 +6,8 @@ import numpy as np
 from scipy.special import log_ndtr, ndtri_exp
 from scipy.stats import chi2, poisson
 
+SIGNIFICANT = 4.0
+"""Standard deviations from which an estimate or a part of its law is taken for real."""
 _LARGE = 1000.0
 
 

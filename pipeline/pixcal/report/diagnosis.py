@@ -212,7 +212,7 @@ def _parameters(cause: Facts, words: EffectWords) -> Iterator[Block]:
             meaning = words.parameters.get(name, ("", ""))[1]
             table, same = _list_of(name, value, errors)
             about = f"{name}: {meaning}." if meaning else ""
-            yield Words(" ".join(filter(None, (about, f"In all: {same}." if same else ""))))
+            yield Words(" ".join(filter(None, (about, f"Common to all: {same}." if same else ""))))
             yield from folded(table, SHOWN, "rows")
 
 
@@ -263,8 +263,9 @@ def _in_short(value: Any) -> str:
     """A value in full; of a long list of numbers how many there are, their range and rms."""
     if not _is_long(value):
         return exact(value)
+    ends = f"{len(value)} values, {number(min(value))} to {number(max(value))}"
     rms = math.sqrt(sum(one * one for one in value) / len(value))
-    return f"{len(value)} values, {number(min(value))} to {number(max(value))} (rms {number(rms)})"
+    return f"{ends} (rms {number(rms)})" if min(value) < 0 else ends
 
 
 # Where

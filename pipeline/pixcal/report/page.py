@@ -275,8 +275,8 @@ def _masks(contents: Contents) -> Section:
 
 def _removed(contents: Contents) -> Section:
     lead = (
-        "The data cannot tell these modes of the maps from the bench. They are not in the "
-        "products; remove them from both sides before you compare a map with another."
+        "These modes of the maps are degenerate with the geometry of the bench. The products do "
+        "not contain them. Remove them from both sides before you compare maps."
     )
     groups: dict[tuple[str, ...], list[str]] = {}
     for fringes in contents.sets:
@@ -284,14 +284,14 @@ def _removed(contents: Contents) -> Section:
     blocks = [
         Table(
             f"Set{'s' if len(names) > 1 else ''} {', '.join(names)}",
-            ["mode", "what it is"],
+            ["mode", "description"],
             [[mode, mode_in_words(mode)] for mode in modes],
         )
         for modes, names in groups.items()
     ]
     if not blocks:
         lead = "Nothing was removed: there are no maps of offsets."
-    return Section("removed", "What was removed", lead, blocks)
+    return Section("removed", "Removed modes", lead, blocks)
 
 
 def _provenance(contents: Contents) -> Section:
@@ -304,5 +304,5 @@ def _provenance(contents: Contents) -> Section:
     # Detector frames alone have no optics.
     listed = {key: value for key, value in contents.acquisition.items() if value is not None}
     blocks.append(Table("Acquisition as understood", ["key", "value"], flat_rows(listed)))
-    lead = "What this page was made from. Equal keys mean equal results."
+    lead = "Origin of the results. Equal keys mean equal results."
     return Section("provenance", "Provenance", lead, blocks)

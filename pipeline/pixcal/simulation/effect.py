@@ -28,8 +28,8 @@ F64 = NDArray[np.float64]
 
 __all__ = ["DOMAINS", "Effect", "Estimate", "FringeMaps", "Stage"]
 
-SURE = 3.0
-"""Errors that a strength must have to stand beside others of the same effect."""
+NONZERO = 3.0
+"""Errors from which a strength of an effect counts as different from zero."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ class Estimate:
         value = getattr(self.effect, name)
         parts = {f"{name}[{n}]": v for n, v in enumerate(value if isinstance(value, tuple) else ())}
         return not all(
-            isinstance(part, (int, float)) and abs(part) <= SURE * self.errors.get(key, 0.0)
+            isinstance(part, (int, float)) and abs(part) <= NONZERO * self.errors.get(key, 0.0)
             for key, part in (parts or {name: value}).items()
         )
 

@@ -13,12 +13,13 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.gap import Reference, compare, expect_nominal, expect_with
 from pixcal.estimators.test_statistics import Key
+from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Again, Effect, Estimate
 from pixcal.stages.diagnose.deciding import MORE
 from pixcal.stages.diagnose.look import DiagnosisInput, look_at, plain_part
 from pixcal.stages.diagnose.result import by_domain
-from pixcal.stages.diagnose.search import CONFIRM, SCREEN, SURE, Candidate, Found, Search
+from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Candidate, Found, Search
 from pixcal.stages.diagnose.trial import Curves, Effects, Signature, Trials, estimate
 from pixcal.stages.diagnose.windows import whole_of
 
@@ -192,7 +193,7 @@ def _needs(kind: type[Effect], facts: Mapping[str, Any]) -> str:
 def _replayed(candidate: Candidate, unseen: Evidence) -> Effect | None:
     """The effect as the unseen frames have it one by one; None where its law says all."""
     found = candidate.estimate
-    if found is None or found.significance < SURE:
+    if found is None or found.significance < SIGNIFICANT:
         return None
     try:
         replay = found.effect.replayed(unseen)
@@ -214,7 +215,7 @@ def weakly_seen(
         candidate.estimate.again or kinds[name]
         for name, candidate in sorted(candidates.items())
         if candidate.estimate is not None
-        and candidate.estimate.significance >= SURE
+        and candidate.estimate.significance >= SIGNIFICANT
         and (kinds[name].quick or candidate.estimate.significance < CLEAR)
     )
 

@@ -23,16 +23,15 @@ from pixcal.estimators.gap import (
     remaining,
 )
 from pixcal.estimators.test_statistics import Key
+from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.shrinkage import LEAST, Trial, differing
 from pixcal.stages.diagnose.trial import Curves, Effects
 
 F64 = NDArray[np.float64]
 
-SURE = 4.0
-"""Standard deviations that the estimate on the first frames must have; or, where there is a gap,"""
 HINTED = 1.5
-"""as an effect that another looks like may have no more by itself;"""
+"""Significance that an estimate needs where there is a gap, instead of `SIGNIFICANT`;"""
 FAINT = 1.0
 """where no candidate is sure: of some that are only hinted at, the true one may be the faintest."""
 MIN_LOGLIK_GAIN_WEAK = 12.0
@@ -225,9 +224,9 @@ class Search:
             for name, candidate in open_ones.items()
             if candidate.estimate is not None
         }
-        least = SURE
+        least = SIGNIFICANT
         if flagged(compare(self.data, current.expected)):
-            least = HINTED if max(sizes.values(), default=0.0) >= SURE else FAINT
+            least = HINTED if max(sizes.values(), default=0.0) >= SIGNIFICANT else FAINT
         for name, size in sizes.items():
             candidate = open_ones[name]
             assert candidate.estimate is not None
@@ -252,7 +251,7 @@ class Search:
     def _least(candidate: Candidate) -> float:
         """By how much the unseen frames must become likelier with a candidate."""
         assert candidate.estimate is not None
-        return LEAST if candidate.estimate.significance >= SURE else MIN_LOGLIK_GAIN_WEAK
+        return LEAST if candidate.estimate.significance >= SIGNIFICANT else MIN_LOGLIK_GAIN_WEAK
 
     def held_against(self, effects: Effects, curves: list[Curves]) -> Trial:
         """A bench with some effects against the data, from its simulations."""
