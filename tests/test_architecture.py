@@ -118,6 +118,28 @@ def test_a_library_stays_in_its_folder(module: str) -> None:
                 assert folder_of(module) == folder, f"{name} belongs in {folder}/"
 
 
+EFFECTS = {file.stem for file in (PACKAGES["pixcal"] / "effects").glob("[!_]*.py")}
+NAMED = {
+    "pixcal.stages.blind.strengths": EFFECTS,  # What the examination asks of each.
+    "pixcal.stages.budget": {"quantisation", "flat_error"},  # Terms of a budget, as the next ones.
+    "pixcal_cli.budget": {"flat_error"},
+    "pixcal.stages.reduce.fringe_sets": {"quantisation"},
+    "pixcal.stages.reduce.stage": {"quantisation"},
+    "pixcal.report.tables": {"quantisation"},
+}
+"""Names of effects outside their files."""
+
+
+@pytest.mark.parametrize("module", sorted(MODULES))
+def test_no_effect_is_a_special_case_outside_its_file(module: str) -> None:
+    if module.startswith("pixcal.effects."):
+        return
+    words = {n.value for n in ast.walk(syntax(MODULES[module])) if isinstance(n, ast.Constant)}
+    assert not (words & EFFECTS) - NAMED.get(module, set())
+    if module not in NAMED:
+        assert not own_imports(module) & {f"pixcal.effects.{name}" for name in EFFECTS}
+
+
 def test_no_module_imports_itself_in_a_circle() -> None:
     graph = {module: own_imports(module) for module in MODULES}
     try:

@@ -25,7 +25,7 @@ from pixcal.stages.correct.restored_set import RestoredSet
 from pixcal.stages.correct.swept import undone
 from pixcal.stages.correct.uncertainty import moved
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.stages.treatment import ABSORBED, LEFT, treatments
+from pixcal.stages.treatment import treatments
 from pixcal.storage.artefact import build, write_json
 from pixcal.storage.cube import create_group, write_array
 from pixcal.storage.formats import STAGES
@@ -295,7 +295,7 @@ def test_every_effect_of_pixcal_has_a_treatment_with_a_reason(tmp_path):
     causes = [{"effect": name, "parameters": {}} for name in effects()]
     for one in treatments(causes, {}, "auto", {"only": "paraxial"}, (), tmp_path).every:
         assert "its file" not in one.why, one.effect.name
-    assert set(ABSORBED) | set(LEFT) <= set(effects())
+    assert not any(kind.absorbed_because and kind.left_because for kind in effects().values())
 
 
 def test_without_a_diagnosis_it_says_what_to_run(make_bench, write_reduced, tmp_path):

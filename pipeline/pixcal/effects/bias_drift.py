@@ -69,6 +69,7 @@ class BiasDrift(Effect):
     acts_at = Stage.READOUT
     domains = ("time", "noise")
     strengths = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e", "run_walk_e_h", "tracks")
+    absorbed_because = "the free intensity of each frame absorbs a level common to all pixels"
     frames_needed = ("dark",)
     sources = (
         "Rauscher 2015, PASP 127, 1144: pedestal drift of 4 e- rms at 5 e- of read noise",

@@ -44,6 +44,7 @@ class ContrastNoise(Effect):
     acts_at = Stage.LIGHT
     domains = ("time",)
     strengths = ("vibration_rad", "polarisation", "tracks")
+    absorbed_because = "the fit has a free fringe amplitude in each frame"
     frames_needed = ()
     sources = (
         "Rousset et al., section 4.2: micro-vibrations within a frame are still to be looked at",

@@ -55,6 +55,7 @@ class CosmicHits(Effect):
     acts_at = Stage.CHARGE
     domains = ("noise",)
     strengths = ("rate_cm2_s",)
+    left_because = "few samples are hit, and most of them are masked"
     frames_needed = ("dark",)
     sources = (
         "Particle Data Group, Review of Particle Physics, Cosmic Rays: about one muon per cm^2 and "

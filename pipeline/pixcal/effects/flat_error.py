@@ -51,6 +51,7 @@ class FlatError(Effect):
     acts_at = Stage.PIXEL
     domains = ("space",)
     strengths = ("pixel_rms", "smooth_rms")
+    absorbed_because = "it scales level and fringes of a pixel equally and leaves the phase"
     frames_needed = ("flat", "axis")
     sources = (
         "EMVA Standard 1288, release 4.0 (2021): nonuniformity is told with the wavelength and the "

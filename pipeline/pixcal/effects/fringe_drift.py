@@ -63,6 +63,7 @@ class FringeDrift(Effect):
     acts_at = Stage.LIGHT
     domains = ("time", "space")
     strengths = ("ramp", "settle", "walk", "vibration", *TRACKS)
+    absorbed_because = "the fit has a free fringe vector in each frame where it moves"
     frames_needed = ()
     sources = (
         "Rousset et al., sections 4.2, 4.3 and 5.2: thermal deformations and low-frequency "

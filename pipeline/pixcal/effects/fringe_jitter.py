@@ -29,6 +29,7 @@ class FringeJitter(Effect):
     acts_at = Stage.LIGHT
     domains = ("time", "space")
     strengths = ("rms",)
+    absorbed_because = "the fit has a free fringe vector in each frame where it moves"
     frames_needed = ()
     sources = (
         "Rousset et al., sections 4.2 and 5.2: fringe residuals are laid to changing Kx, Ky",

@@ -50,6 +50,10 @@ class GainError(Effect):
     acts_at = Stage.CONVERTER
     domains = ("noise", "intensity")
     strengths = ("relative",)
+    left_because = (
+        "only SIGMA is wrong: correct gain_e_per_adu in acquisition.yaml, or use 'pixcal "
+        "reduce --gain measured', and fit again"
+    )
     frames_needed = ("flat",)
     sources = (
         "Janesick 2007, Photon Transfer (SPIE PM170): gain by photon transfer, to about 1 % with "

@@ -66,6 +66,7 @@ class HyperbolicFringes(Effect):
     acts_at = Stage.LIGHT
     domains = ("space",)
     strengths = ("share",)
+    fit_model = "hyperbolic"
     frames_needed = ("axis",)
     sources = (
         "Rousset et al., section 5.2 and figures 5, 14 and 15: fibres at 40 cm, (18 mm, 18 mm) "

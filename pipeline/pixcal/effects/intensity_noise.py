@@ -51,6 +51,7 @@ class IntensityNoise(Effect):
     acts_at = Stage.LIGHT
     domains = ("time",)
     strengths = ("rms", "line", "tracks")
+    absorbed_because = "the fit has a free intensity in each frame"
     frames_needed = ()
     sources = (
         "Rousset et al., section on simulations: 2 % fluctuations of the laser (design/paper.txt)",

@@ -66,6 +66,9 @@ class Lag(Effect):
     acts_at = Stage.CHARGE
     domains = ("time", "intensity")
     strengths = ("share",)
+    absorbed_because = (
+        "the fit absorbs a uniform lag; its variation moves phases by hundredths of the bound"
+    )
     optional_parameters = ("decay_frames", "spread", "quiet")
     frames_needed = ("random",)
     sources = (

@@ -47,6 +47,7 @@ class Quantisation(Effect):
     acts_at = Stage.CONVERTER
     domains = ("noise", "intensity")
     strengths = ("coarse_adu", "dnl_rms", "ripple", "bits")
+    left_because = "rounding adds noise of some hundredths of the bound"
     frames_needed = ("ladder",)
     sources = (
         "IEEE Std 1241-2010: code widths from histograms; round-off of step/sqrt(12) rms",

@@ -42,6 +42,7 @@ class RollingShutter(Effect):
     acts_at = Stage.LIGHT
     domains = ("time", "space")
     strengths = ("line_time_us", "settling")
+    left_because = "the part that the fit leaves is a tenth of the bound of 300 frames"
     frames_needed = ("random",)
     sources = (
         "Pyxalis GIGAPYX-4600 as in Rousset et al.: 5456 rows at 152 frames/s are 1.2 us a row; at "

@@ -41,6 +41,7 @@ class RowNoise(Effect):
     acts_at = Stage.READOUT
     domains = ("noise", "time")
     strengths = ("row_rms", "flicker_rms", "interlace_rms", "column_rms")
+    left_because = "noise that is independent in each frame averages out"
     frames_needed = ("dark",)
     sources = (
         "Rauscher 2015, PASP 127, 1144: infrared arrays of 5 e- read noise have 3 e- of correlated "

@@ -47,6 +47,7 @@ class TelegraphNoise(Effect):
     acts_at = Stage.READOUT
     domains = ("noise",)
     strengths = ("amplitude_e",)
+    left_because = "such pixels have larger errors, and SIGMA shows them"
     frames_needed = ("dark",)
     quick = False
     sources = (

@@ -43,6 +43,7 @@ class WavelengthDrift(Effect):
     acts_at = Stage.LIGHT
     domains = ("time",)
     strengths = ("ramp", "walk", "hop")
+    absorbed_because = "the fit has a free phase and fringe vector in each frame"
     frames_needed = ("baseline", "axis")
     sources = (
         "CIPM 2007, Recommendation 2, and Stone et al. 2009, Metrologia 46, 11: an unstabilised "

@@ -10,7 +10,7 @@ import re
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,7 +134,21 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Effect(ForwardModel):
-    """A forward model that can also be measured, and undone where physics allows."""
+    """A forward model that can also be measured, and undone where physics allows.
+
+    Attributes
+    ----------
+    absorbed_because : str
+        How the fit absorbs it; empty where it does not (docs/appendix/correction-study.md).
+    left_because : str
+        Why maps need no correction for it all the same: it is noise, or small.
+    fit_model : str
+        Shape of the fringes (`pixcal.estimators.models`) that takes it up.
+    """
+
+    absorbed_because: ClassVar[str] = ""
+    left_because: ClassVar[str] = ""
+    fit_model: ClassVar[str] = ""
 
     # What is learnt of it, and what becomes of the maps.
 

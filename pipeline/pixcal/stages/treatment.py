@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.effects import known_effects, parse_effects
-from pixcal.effects.hyperbolic_fringes import HyperbolicFringes
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
@@ -17,32 +16,10 @@ from pixcal.simulation.effect import Effect
 F64 = NDArray[np.float64]
 
 HYPERBOLIC = "hyperbolic"
-"""The shape of fringes (`pixcal.estimators.models`) that takes up `HyperbolicFringes`."""
+"""The shape of fringes (`pixcal.estimators.models`) beside straight ones."""
 IN_CORRECTED = "in the corrected fit"
 CORRECTED = ("undone on maps", "undone on samples", IN_CORRECTED)
 """Treatments after which the corrected maps are free of an effect."""
-ABSORBED = {
-    "bias_drift": "the free intensity of each frame absorbs a level common to all pixels",
-    "contrast_noise": "the fit has a free fringe amplitude in each frame",
-    "flat_error": "it scales level and fringes of a pixel equally and leaves the phase",
-    "fringe_drift": "the fit has a free fringe vector in each frame where it moves",
-    "fringe_jitter": "the fit has a free fringe vector in each frame where it moves",
-    "intensity_noise": "the fit has a free intensity in each frame",
-    "lag": "the fit absorbs a uniform lag; its variation moves phases by hundredths of the bound",
-    "wavelength_drift": "the fit has a free phase and fringe vector in each frame",
-}
-"""Effects that the fit absorbs, and how (docs/appendix/correction-study.md)."""
-
-LEFT = {
-    "cosmic_hits": "few samples are hit, and most of them are masked",
-    "gain_error": "only SIGMA is wrong: correct gain_e_per_adu in acquisition.yaml, or "
-    "use 'pixcal reduce --gain measured', and fit again",
-    "quantisation": "rounding adds noise of some hundredths of the bound",
-    "rolling_shutter": "the part that the fit leaves is a tenth of the bound of 300 frames",
-    "row_noise": "noise that is independent in each frame averages out",
-    "telegraph_noise": "such pixels have larger errors, and SIGMA shows them",
-}
-"""Effects that are noise, or too small to be worth undoing (docs/appendix/correction-study.md)."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +58,8 @@ class Treatment:
         """As in ``diagnosis.json``: what is to be done about the map."""
         if self.corrects:
             return "corrected"
-        absorbed = self.how in ("in the fit", "absorbed by the fit") or self.effect.name in LEFT
-        return "unaffected" if absorbed else "fix the bench"
+        absorbed = self.how in ("in the fit", "absorbed by the fit")
+        return "unaffected" if absorbed or self.effect.left_because else "fix the bench"
 
     @property
     def plain(self) -> dict[str, Any]:
@@ -211,11 +188,11 @@ def _treated(effect: Effect, asked: str, models: Mapping[str, str]) -> tuple[str
         return "undone on maps", "it acts on the three maps of a fit alike"
     if kind.undo_samples is not Effect.undo_samples:
         return "undone on samples", "it depends on the light of each frame: swept again without it"
-    if isinstance(effect, HyperbolicFringes):
+    if kind.fit_model == HYPERBOLIC:
         return _of_bent_fringes(asked, models)
-    if effect.name in ABSORBED:
-        return "absorbed by the fit", ABSORBED[effect.name]
-    return "not undone", LEFT.get(effect.name, "its file does not say how to undo it")
+    if kind.absorbed_because:
+        return "absorbed by the fit", kind.absorbed_because
+    return "not undone", kind.left_because or "its file does not say how to undo it"
 
 
 def _of_bent_fringes(asked: str, models: Mapping[str, str]) -> tuple[str, str]:
