@@ -29,7 +29,8 @@ def draw(run: pixcal.Run, file: Path) -> None:
 def _map(axes: Axes, run: pixcal.Run) -> None:
     offsets = 1e3 * run.delta_x.delta
     limit = float(np.nanpercentile(np.abs(offsets), 99.5))
-    image = axes.imshow(offsets, cmap="RdBu_r", vmin=-limit, vmax=limit, origin="lower")
+    image = axes.imshow(offsets, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
+    axes.invert_yaxis()
     axes.set(title="Measured offsets along x", xlabel="x (px)", ylabel="y (px)")
     plt.colorbar(image, ax=axes, label="offset (10⁻³ px)")
 
