@@ -72,6 +72,12 @@ class Template:
         mean = {k: (one[k] + other[k]) / 2 if k in drawn else one[k] for k in one}
         return cls(mean, {k: (one[k] - other[k]) / 2 for k in drawn})
 
+    def only(self, keys: Sequence[Key]) -> "Template":
+        """Of some deviations."""
+        return Template(
+            *({k: v for k, v in d.items() if k in keys} for d in (self.mean, self.half))
+        )
+
     def slope(self, other: "Template", step: float) -> "Template":
         """Derivative, from this one and that after a step of a parameter."""
         return Template(
@@ -104,6 +110,13 @@ class Changes:
     def measured(self, key: Key) -> Deviation:
         """A deviation of the data."""
         return self._looks[key[0]].measured(key[1])
+
+    def fits(self, template: Template) -> bool:
+        """Whether a template is of deviations as they are here."""
+        return all(
+            of in self._looks and self.measured((of, name)).value.shape == value.shape
+            for (of, name), value in template.mean.items()
+        )
 
     def way(self, model: ForwardModel) -> Way:
         """How a model shows."""

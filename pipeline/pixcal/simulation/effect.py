@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.evidence import Evidence
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
-from pixcal.simulation.changes import Way
+from pixcal.simulation.changes import Template, Way
 from pixcal.simulation.forward import DOMAINS, ForwardModel, Stage
 from pixcal.simulation.score import score, score_again
 
@@ -161,7 +161,7 @@ class Effect(ForwardModel):
         found = score(cls, evidence)
         if found is None:
             return None
-        again = Again(found.model, found.way)
+        again = Again(found.model, found.way, found.template)
         return Estimate(found.model, found.errors, found.significance, found.why, again=again)
 
     def replayed(self, evidence: Evidence) -> Self | None:
@@ -236,10 +236,13 @@ class Again:
     effect : Effect
     way : Way
         How it shows.
+    template : Template, optional
+        What it changes, where that holds for other frames too.
     """
 
     effect: Effect
     way: Way
+    template: Template | None = field(default=None, repr=False, compare=False)
 
     @property
     def name(self) -> str:
@@ -253,7 +256,7 @@ class Again:
 
     def estimate(self, evidence: Evidence) -> Estimate:
         """Its significance; nothing is fitted."""
-        size = score_again(self.effect, self.way, evidence)
+        size = score_again(self.effect, self.way, evidence, self.template)
         return Estimate(self.effect, {}, size, "")
 
 

@@ -23,7 +23,7 @@ from scipy.stats import chi2
 
 from pixcal.estimators.evidence import Evidence
 from pixcal.estimators.variance_components import log_chance_of_any, sigmas
-from pixcal.simulation.changes import Changes, Key, Template, Way, dot
+from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way, dot
 from pixcal.simulation.forward import ForwardModel
 
 F64 = NDArray[np.float64]
@@ -61,6 +61,8 @@ class Scored:
     why : str
     way : Way
         How it shows, in the deviations that tell most.
+    template : Template, optional
+        What it changes of them, where that holds for other frames too: second moments.
     """
 
     model: Any
@@ -68,6 +70,7 @@ class Scored:
     significance: float
     why: str
     way: Way
+    template: Template | None = None
 
 
 def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
@@ -94,10 +97,18 @@ def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
     if not names:
         raise NotImplementedError(f"{kind.__name__} has no strength that is a number")
     changes = _changes(evidence)
-    return _Fit(changes, changes.way(start), names).result(start)
+    way = changes.way(start)
+    fit = _Fit(changes, way, names)
+    if way.random or way.mixes:
+        # Frames without light may tell it all: then the others need not be taken again.
+        keys, _ = fit.telling(start)
+        fit = _Fit(changes, dataclasses.replace(way, keys=keys), names)
+    return fit.result(start)
 
 
-def score_again(model: ForwardModel, way: Way, evidence: Evidence) -> float:
+def score_again(
+    model: ForwardModel, way: Way, evidence: Evidence, template: Template | None = None
+) -> float:
     """Significance of an effect in other frames, with the parameters that it has.
 
     Parameters
@@ -106,9 +117,14 @@ def score_again(model: ForwardModel, way: Way, evidence: Evidence) -> float:
     way : Way
         How it shows.
     evidence : Evidence
+    template : Template, optional
+        What it changes; made anew where it is not of these pixels.
     """
     changes = _changes(evidence)
-    return float(_Fit(changes, way, ()).amplitudes([model])[2])
+    fit = _Fit(changes, way, ())
+    if template is None or not changes.fits(template):
+        template = fit.template(model)
+    return float(fit.together([template])[2])
 
 
 def _changes(evidence: Evidence) -> Changes:
@@ -152,7 +168,11 @@ class _Fit:
 
     def amplitudes(self, alone: Sequence[ForwardModel]) -> tuple[F64, F64, float]:
         """Of models that act together: over what they are, errors, and the significance of all."""
-        right, normal, variance = self.sums([self.template(one) for one in alone])
+        return self.together([self.template(one) for one in alone])
+
+    def together(self, templates: Sequence[Template]) -> tuple[F64, F64, float]:
+        """As `amplitudes`, of what each model changes."""
+        right, normal, variance = self.sums(templates)
         inverse = _inverse(normal)
         size = inverse @ right
         error = np.sqrt(np.maximum(np.diag(inverse @ variance @ inverse), 0))
@@ -175,8 +195,9 @@ class _Fit:
         if significance > HINT and not model.is_null:
             model, errors = self._fitted(model, errors)
         why = RANDOM if self.way.random else STEADY
-        telling = dataclasses.replace(self.way, keys=self._telling(shape))
-        return Scored(model, errors, significance, why, telling)
+        keys, template = self.telling(shape)
+        telling = dataclasses.replace(self.way, keys=keys)
+        return Scored(model, errors, significance, why, telling, template)
 
     def _best_shape(self, start: ForwardModel) -> tuple[ForwardModel, tuple[F64, F64, float], int]:
         """Parameters that are no strengths, one after the other on a grid; how many were tried."""
@@ -196,12 +217,15 @@ class _Fit:
                     break
         return best, found, tried
 
-    def _telling(self, model: ForwardModel) -> tuple[Key, ...]:
-        """Deviations that hold most of the information."""
-        mean = self.template(model).mean
+    def telling(self, model: ForwardModel) -> tuple[tuple[Key, ...], Template | None]:
+        """Deviations that hold most of the information, and their change if it holds elsewhere."""
+        template = self.template(model)
+        mean = template.mean
         sizes = {k: dot(self.changes.measured(k).weight, mean[k], mean[k]) for k in self.way.keys}
         least = TELLING * sum(sizes.values())
-        return tuple(key for key, size in sizes.items() if size >= least)
+        keys = tuple(key for key, size in sizes.items() if size >= least)
+        elsewhere = not any(name in LINEAR for _, name in keys)
+        return keys, template.only(keys) if elsewhere else None
 
     def _scaled(
         self, shape: ForwardModel, size: F64, error: F64
