@@ -27,8 +27,8 @@ from scipy.stats import binomtest, kstest
 import pixcal
 from pixcal.effects import effects, parse_effects
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.gap import compare, flagged
-from pixcal.estimators.test_statistics import known_statistics
+from pixcal.estimators.diagnosis.gap import compare, flagged
+from pixcal.estimators.diagnosis.test_statistics import known_statistics
 from pixcal.model.bench import SCHEMA
 from pixcal.model.config import to_plain
 from pixcal.simulation.effect import Effect

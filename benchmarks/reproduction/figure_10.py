@@ -7,13 +7,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pixcal.estimators.bound import phase_information
 from pixcal.kernels.scene import light_maps
 from pixcal.report.colours import BAR, BLUE, INK
 from pixcal.report.drawing import WIDE, finish, new_figure, png, span_scale, symmetric_scale
 from pixcal.report.text import number
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import recordings
+from pixcal.stages.budget.bound import phase_information
 from reproduction.draw import THOUSANDTHS, image
 from reproduction.lab import Lab, Scene, read_set
 from reproduction.maps import Whiteness, harmonics, plane, without

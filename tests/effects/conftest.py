@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from pixcal.engine.run import Runtime
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import SCHEMA, Bench
 from pixcal.model.config import parse
 from pixcal.stages import fit, ingest, reduce, simulate

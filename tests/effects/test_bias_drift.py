@@ -8,8 +8,8 @@ import pytest
 
 from pixcal.effects.bias_drift import BiasDrift
 from pixcal.effects.row_noise import RowNoise
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.frame_offset import FEWEST, fringe_offsets
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.offset import FEWEST, fringe_offsets
 from pixcal.kernels.processes import brownian
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect

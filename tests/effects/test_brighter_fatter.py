@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pixcal.effects.brighter_fatter import BrighterFatter
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.boundaries import (
     REACH,
     area_changes,

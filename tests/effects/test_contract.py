@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pixcal.effects import effect_of_file, effects, known_effects, parse_effects
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError

@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import skew
 
 from pixcal.effects.contrast_noise import ContrastNoise
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import states_of
 from pixcal.simulation.recording import recordings

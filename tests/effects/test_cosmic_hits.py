@@ -9,7 +9,7 @@ from scipy import stats
 from scipy.special import erf
 
 from pixcal.effects.cosmic_hits import CosmicHits
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.tracks import GRAZING, add_tracks, draw_tracks
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import frames_of

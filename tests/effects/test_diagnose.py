@@ -17,7 +17,7 @@ from pixcal.effects.intra_pixel_response import IntraPixelResponse
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.effects.straylight import Straylight
 from pixcal.engine.run import Runtime
-from pixcal.estimators.test_statistics import DETECTOR, measure
+from pixcal.estimators.diagnosis.test_statistics import DETECTOR, measure
 from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError

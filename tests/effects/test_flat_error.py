@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pixcal.effects.flat_error import FlatError
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.map_fit import polynomial, without
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.maps.map_fit import polynomial, without
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pixcal.effects.fringe_drift import FringeDrift
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import states_of
 from pixcal.simulation.recording import recordings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pixcal.effects.fringe_jitter import FringeJitter
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import frames_of, states_of
 from pixcal.simulation.recording import recordings

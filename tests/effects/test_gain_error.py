@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pixcal.effects.gain_error import GainError
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pixcal.effects.hyperbolic_fringes import HyperbolicFringes, bending
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels import optics
 from pixcal.kernels.optics import Geometry
 from pixcal.kernels.scene import detector_maps, electrons_per_unit, light_maps

@@ -8,8 +8,8 @@ import pytest
 
 from pixcal.effects.contrast_noise import ContrastNoise
 from pixcal.effects.intensity_noise import IntensityNoise
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.frame_light import ambient_shares
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.light import ambient_shares
 from pixcal.kernels.scene import frame_states
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pixcal.effects.intra_pixel_response import IntraPixelResponse, transfer
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.scene import detector_maps, light_maps
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import FringeMaps

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pixcal.effects.ipc import FOUR_ROWS, Ipc
-from pixcal.estimators.corrected import corrected_offsets, phase_change, straight_modes
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.maps.corrected import corrected_offsets, phase_change, straight_modes
 from pixcal.kernels.crosstalk import Coupling, couple, noise_shares, outflow, uncouple
 from pixcal.kernels.scene import detector_maps
 from pixcal.model.bench import Bench

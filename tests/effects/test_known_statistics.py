@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pixcal.effects import effects
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.gap import Reference
-from pixcal.estimators.test_statistics import DETECTOR, known_statistics, measure
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.gap import Reference
+from pixcal.estimators.diagnosis.test_statistics import DETECTOR, known_statistics, measure
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pixcal.effects.lag import Lag
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import Camera, frames_of
 from pixcal.simulation.recording import Recording, recordings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pixcal.effects.nonlinearity import Nonlinearity
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Estimate

@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pixcal.effects.quantisation import Quantisation
-from pixcal.estimators.code_density import histogram, step_of
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.detector.code_density import histogram, step_of
+from pixcal.estimators.diagnosis.evidence import Evidence
 
 TOP = 65535.0
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pixcal.effects.rolling_shutter import RollingShutter
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.scene import frame_states
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pixcal.effects.bias_drift import BiasDrift
 from pixcal.effects.row_noise import RowNoise
 from pixcal.effects.telegraph_noise import TelegraphNoise
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.line_noise import line_spectrum
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.line_noise import line_spectrum
 from pixcal.kernels.flicker import flicker, flicker_power
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect

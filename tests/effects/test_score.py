@@ -11,8 +11,8 @@ import yaml
 
 from pixcal.effects import effect_of_file
 from pixcal.engine.run import Runtime
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.pair_sums import pair_sums, pair_variance
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.pair_sums import pair_sums, pair_variance
 from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
 from pixcal.simulation.effect import Estimate

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from pixcal.estimators.gap import Reference, compare, flagged
-from pixcal.estimators.test_statistics import Curve, Key
+from pixcal.estimators.diagnosis.gap import Reference, compare, flagged
+from pixcal.estimators.diagnosis.test_statistics import Curve, Key
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.search import (

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from pixcal.effects.straylight import Straylight
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.structure import flattened
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.maps.structure import flattened
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import FringeMaps
 from pixcal.simulation.exposure import frames_of

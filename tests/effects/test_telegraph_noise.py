@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pixcal.effects.telegraph_noise import TelegraphNoise
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import Recording, recordings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pixcal.effects.wavelength_drift import WavelengthDrift
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.scene import detector_maps, light_maps
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import states_of

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
-from pixcal.estimators.agreement import (
+from pixcal.stages.compare.agreement import (
     Blocks,
     Estimate,
     Part,

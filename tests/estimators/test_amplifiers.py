@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.amplifiers import relative_gain
+from pixcal.estimators.detector.amplifiers import relative_gain
 
 SHAPE = (70, 61)
 GOOD = np.ones(SHAPE, bool)

@@ -5,8 +5,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from pixcal.estimators.bad_pixels import dead, hot, noisy, nonlinear
-from pixcal.estimators.detector import Rung
+from pixcal.estimators.detector.bad_pixels import dead, hot, noisy, nonlinear
+from pixcal.estimators.detector.calibration import Rung
 
 F64 = NDArray[np.float64]
 CLEAN = (1200, 1000)

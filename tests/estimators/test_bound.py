@@ -5,16 +5,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pixcal.estimators.bound import (
+from pixcal.estimators.fringe_fit.fringes import FrameParameters
+from pixcal.estimators.fringe_fit.sweep import phase_bound
+from pixcal.estimators.fringe_fit.tile import Tile
+from pixcal.stages.budget.bound import (
     FrameSpread,
     WeightErrors,
     phase_information,
     sampling_loss,
     unweighted_variance,
 )
-from pixcal.estimators.fringes import FrameParameters
-from pixcal.estimators.sweep import phase_bound
-from pixcal.estimators.tile import Tile
 
 U = 2 * np.pi * (np.arange(20_000) + 0.5) / 20_000
 LIGHT = st.floats(10, 1e5)

@@ -6,8 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pixcal.estimators.bound import WeightErrors, phase_information
-from pixcal.estimators.budget import (
+from pixcal.kernels.scene import electrons_per_unit, fibre_light
+from pixcal.model.bench import Bench, load_bench
+from pixcal.stages.budget.bound import WeightErrors, phase_information
+from pixcal.stages.budget.expected import (
     JoinedBound,
     SetBound,
     bias_frames_needed,
@@ -22,8 +24,6 @@ from pixcal.estimators.budget import (
     planned_split,
     sample_variance,
 )
-from pixcal.kernels.scene import electrons_per_unit, fibre_light
-from pixcal.model.bench import Bench, load_bench
 
 ROOT = Path(__file__).parents[2]
 

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 from scipy.integrate import dblquad
 
-from pixcal.estimators.centroid_correction import correct_centroids, correction_map, gaussian_star
+from pixcal.estimators.star_centroids.correction import (
+    correct_centroids,
+    correction_map,
+    gaussian_star,
+)
 
 SHAPE = (60, 70)
 

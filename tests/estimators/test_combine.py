@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.combine import axes_span_plane, combine_parallel, combine_sets
+from pixcal.estimators.fringe_fit.combine import axes_span_plane, combine_parallel, combine_sets
 
 
 def unit(*degrees):

@@ -7,7 +7,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pixcal.estimators.crest_fit import (
+from pixcal.kernels.demodulation import N_SUMS
+from pixcal.kernels.optics import Geometry, paraxial_vector, phase
+from pixcal.model.errors import InputError
+from pixcal.stages.crests.crest_fit import (
     CrestFit,
     Prior,
     cost_map,
@@ -16,7 +19,7 @@ from pixcal.estimators.crest_fit import (
     relative_phase,
     valley,
 )
-from pixcal.estimators.crests import (
+from pixcal.stages.crests.crests import (
     ArrayFrames,
     Carrier,
     CrestPaths,
@@ -24,9 +27,6 @@ from pixcal.estimators.crests import (
     crests_of_frames,
     tile_sums,
 )
-from pixcal.kernels.demodulation import N_SUMS
-from pixcal.kernels.optics import Geometry, paraxial_vector, phase
-from pixcal.model.errors import InputError
 
 F64 = NDArray[np.float64]
 WIDE_PITCH = 40e-3

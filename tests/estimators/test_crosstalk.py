@@ -5,19 +5,19 @@ import itertools
 import numpy as np
 import pytest
 
-from pixcal.estimators.corrected import (
+from pixcal.estimators.crosstalk.covariance import NORMAL, NORMALS, TERMS, Products
+from pixcal.estimators.crosstalk.hot_pixels import HotPixels
+from pixcal.estimators.crosstalk.information import Measured
+from pixcal.estimators.crosstalk.links import Classes, class_sums, links, periods, sums_of
+from pixcal.estimators.crosstalk.support import Choice, choose
+from pixcal.estimators.fringe_fit.modes import solve_modes
+from pixcal.estimators.maps.corrected import (
     corrected_offsets,
     offsets,
     phase_change,
     phase_sums,
     straight_modes,
 )
-from pixcal.estimators.crosstalk.covariance import NORMAL, NORMALS, TERMS, Products
-from pixcal.estimators.crosstalk.hot_pixels import HotPixels
-from pixcal.estimators.crosstalk.information import Measured
-from pixcal.estimators.crosstalk.links import Classes, class_sums, links, periods, sums_of
-from pixcal.estimators.crosstalk.support import Choice, choose
-from pixcal.estimators.modes import solve_modes
 from pixcal.model.errors import InputError
 
 

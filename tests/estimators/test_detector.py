@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from pixcal.estimators.detector import (
+from pixcal.estimators.detector.calibration import (
     Rung,
     dark_line,
     linearity,

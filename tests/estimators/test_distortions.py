@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pixcal.estimators.distortions import Distortion, Freedom, fit_distortions
-from pixcal.estimators.evidence import FringeEvidence
-from pixcal.estimators.fringes import grid
+from pixcal.estimators.diagnosis.distortions import Distortion, Freedom, fit_distortions
+from pixcal.estimators.diagnosis.evidence import FringeEvidence
+from pixcal.estimators.fringe_fit.fringes import grid
 
 F32 = NDArray[np.float32]
 RNG = np.random.default_rng(31)

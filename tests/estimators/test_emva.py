@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.emva import (
+from pixcal.estimators.detector.emva import (
     dark_slope,
     dynamic_range,
     nonuniformity,

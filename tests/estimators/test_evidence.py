@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.evidence import FringeEvidence
+from pixcal.estimators.diagnosis.evidence import FringeEvidence
 
 SHAPE = (23, 17)
 

@@ -6,17 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pixcal.estimators.evidence import NO_SAMPLE, FringeEvidence, free_frames, stripes
-from pixcal.estimators.frame_series import (
+from pixcal.estimators.diagnosis.evidence import NO_SAMPLE, FringeEvidence, free_frames, stripes
+from pixcal.estimators.frame_series.series import (
     FrameSeries,
     _follows_phase,
     light_series,
     motion_series,
     without,
 )
-from pixcal.estimators.spectral_line import find_line, without_line
-from pixcal.estimators.tile import Coding
-from pixcal.estimators.variance_components import walk_power
+from pixcal.estimators.frame_series.spectral_line import find_line, without_line
+from pixcal.estimators.frame_series.variance_components import walk_power
+from pixcal.estimators.fringe_fit.tile import Coding
 
 T = 297
 SHAPE = (61, 67)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm
 
-from pixcal.estimators.gap import (
+from pixcal.estimators.diagnosis.gap import (
     CHANCE,
     Reference,
     compare,
@@ -15,7 +15,7 @@ from pixcal.estimators.gap import (
     remaining,
     scaled,
 )
-from pixcal.estimators.test_statistics import Curve, Key, known_statistics
+from pixcal.estimators.diagnosis.test_statistics import Curve, Key, known_statistics
 from pixcal.stages.diagnose.shrinkage import LEAST
 
 LINEAR: Key = ("harmonics", "a")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pixcal.estimators.gauge import fringe_modes, gauge_matrix
+from pixcal.estimators.fringe_fit.gauge import fringe_modes, gauge_matrix
 
 
 def tile(b=0.0, c=0.0, d=0.0, seed=0):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.hopping import find_hopping, scatter_of
+from pixcal.estimators.frame_series.hopping import find_hopping, scatter_of
 
 STEP_S = 0.14
 F64 = np.ndarray

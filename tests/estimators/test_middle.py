@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
-from pixcal.estimators.fringes import grid
-from pixcal.estimators.middle import LEAST, middle
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.diagnosis.middle import LEAST, middle
+from pixcal.estimators.fringe_fit.fringes import grid
 
 RNG = np.random.default_rng(6)
 T, NY, NX = 50, 77, 91

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.pixel_read_noise import FEWEST, PixelNoise
+from pixcal.estimators.detector.pixel_read_noise import FEWEST, PixelNoise
 
 SHAPE = (70, 61)
 GOOD = np.ones(SHAPE, bool)

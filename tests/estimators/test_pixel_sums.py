@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.fringes import FrameParameters
-from pixcal.estimators.harmonics import PhaseWeights, moments, normal_matrices
-from pixcal.estimators.pixel_sums import FringeSums, SampleSums, pixel_sums
-from pixcal.estimators.tile import Coding, Tile
-from pixcal.estimators.tile_fit import start_model
+from pixcal.estimators.fringe_fit.fringes import FrameParameters
+from pixcal.estimators.fringe_fit.harmonics import PhaseWeights, moments, normal_matrices
+from pixcal.estimators.fringe_fit.pixel_sums import FringeSums, SampleSums, pixel_sums
+from pixcal.estimators.fringe_fit.tile import Coding, Tile
+from pixcal.estimators.fringe_fit.tile_fit import start_model
 
 CODING = Coding(1.5, -300.0, 65535)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pixcal.estimators.map_fit import polynomial, without
-from pixcal.estimators.ring_power import (
+from pixcal.estimators.maps.map_fit import polynomial, without
+from pixcal.estimators.maps.ring_power import (
     NARROW,
     Ring,
     _of_long_waves,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from pixcal.estimators import scout as scouting
-from pixcal.estimators.fringes import FrameParameters, find_fringe_vector, smooth_phasor
-from pixcal.estimators.pixel_sums import phase_sigma
-from pixcal.estimators.scout import Scout
-from pixcal.estimators.tile import Coding, Tile
-from pixcal.estimators.tile_fit import accumulate, start_model
+from pixcal.estimators.fringe_fit.fringes import FrameParameters, find_fringe_vector, smooth_phasor
+from pixcal.estimators.fringe_fit.pixel_sums import phase_sigma
+from pixcal.estimators.fringe_fit.scout import Scout
+from pixcal.estimators.fringe_fit.tile import Coding, Tile
+from pixcal.estimators.fringe_fit.tile_fit import accumulate, start_model
 from pixcal.kernels.bilinear import solve_pixels
 from pixcal.model.errors import InputError
 

@@ -10,7 +10,7 @@ import pytest
 from allantools import ci
 from numpy.typing import NDArray
 
-from pixcal.estimators.stability import (
+from pixcal.estimators.frame_series.stability import (
     ONE_SIGMA,
     Curve,
     White,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.structure import (
+from pixcal.estimators.maps.structure import (
     PERIODS,
     fit_terms,
     legendre,

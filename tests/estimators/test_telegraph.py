@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from pixcal.estimators.telegraph.classes import Mixture
-from pixcal.estimators.telegraph.find import find_telegraph
-from pixcal.estimators.telegraph.moments import Series
+from pixcal.estimators.detector.telegraph.classes import Mixture
+from pixcal.estimators.detector.telegraph.find import find_telegraph
+from pixcal.estimators.detector.telegraph.moments import Series
 
 PERIOD_S = 0.14
 

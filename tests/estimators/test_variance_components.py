@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from pixcal.estimators.damping import best_damping
-from pixcal.estimators.variance_components import (
+from pixcal.estimators.frame_series.damping import best_damping
+from pixcal.estimators.frame_series.variance_components import (
     Components,
     Modes,
     _State,

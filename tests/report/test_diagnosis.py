@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pixcal.estimators.test_statistics import DETECTOR, known_statistics
-from pixcal.estimators.test_statistics.look import STEPS
-from pixcal.estimators.test_statistics.noise import OUTLIERS
+from pixcal.estimators.diagnosis.test_statistics import DETECTOR, known_statistics
+from pixcal.estimators.diagnosis.test_statistics.look import STEPS
+from pixcal.estimators.diagnosis.test_statistics.noise import OUTLIERS
 from pixcal.report import blocks as blocks_module
 from pixcal.report import curve_places, diagnosis_words
 from pixcal.report import diagnosis_maps as maps

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from pixcal.estimators.gauge import FRINGE_MODES
+from pixcal.estimators.fringe_fit.gauge import FRINGE_MODES
 from pixcal.kernels.optics import PARAMETERS
 from pixcal.report.text import (
     date_of_mjd,

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.gap import Difference, Reference, compare, expect_nominal
-from pixcal.estimators.test_statistics import Key, measure
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.gap import Difference, Reference, compare, expect_nominal
+from pixcal.estimators.diagnosis.test_statistics import Key, measure
 from pixcal.model.acquisition import SCHEMA, Acquisition
 from pixcal.model.config import parse
 from pixcal.stages import reduce

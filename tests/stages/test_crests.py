@@ -13,7 +13,7 @@ from pixcal.engine.run import Runtime
 from pixcal.kernels.optics import PARAMETERS
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.stages import crests, fit
-from pixcal.stages.crests import Config
+from pixcal.stages.crests import Config, stage
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader
 
@@ -25,7 +25,7 @@ SETS = {"vertical": (6.0, 0.0), "diagonal": (-3.0, 4.5)}
 def _coarse_maps() -> Iterator[None]:
     """Maps of the cost of few places: their finer form is only for the eye."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(crests, "MAP_SIDE", 5)
+        patch.setattr(stage, "MAP_SIDE", 5)
         yield
 
 
@@ -49,7 +49,7 @@ def fitted(bench: Any, write_reduced: Any, tmp_path_factory: pytest.TempPathFact
 @pytest.fixture(autouse=True)
 def _undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pictures, but those of `fitted`, take longer than what is tested here."""
-    monkeypatch.setattr(crests, "png", lambda figure: b"")
+    monkeypatch.setattr(stage, "png", lambda figure: b"")
 
 
 def found(run: Path) -> dict[str, Any]:
@@ -59,8 +59,8 @@ def found(run: Path) -> dict[str, Any]:
 
 def bare(run: Path, other: Path) -> Path:
     """The run without what came after the reduction."""
-    for stage in ("ingest", "reduce"):
-        shutil.copytree(run / stage, other / stage)
+    for name in ("ingest", "reduce"):
+        shutil.copytree(run / name, other / name)
     return other
 
 

@@ -6,7 +6,7 @@ import pytest
 from numpy_detectors import Detector, held_against_nominal
 
 from pixcal.effects.quantisation import Quantisation
-from pixcal.estimators.gap import flagged
+from pixcal.estimators.diagnosis.gap import flagged
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,8 @@ from numpy_detectors import Detector, reduced
 
 from pixcal.effects.gain_error import GainError
 from pixcal.effects.nonlinearity import Nonlinearity
-from pixcal.estimators.test_statistics import DETECTOR, measure
-from pixcal.estimators.test_statistics.look import STEPS
+from pixcal.estimators.diagnosis.test_statistics import DETECTOR, measure
+from pixcal.estimators.diagnosis.test_statistics.look import STEPS
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.parts import Raw, evidence_of
 from pixcal.stages.diagnose.windows import whole_of

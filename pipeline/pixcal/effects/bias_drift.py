@@ -9,15 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import idct
 
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.frame_light import OFFSETS, FrameLight, light_of
-from pixcal.estimators.frame_offset import (
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.light import OFFSETS, FrameLight, light_of
+from pixcal.estimators.frame_series.offset import (
     OffsetSeries,
     dark_offsets,
     fringe_offsets,
     offset_modes,
 )
-from pixcal.estimators.variance_components import (
+from pixcal.estimators.frame_series.variance_components import (
     MAX_STEPS,
     Components,
     estimate_components,

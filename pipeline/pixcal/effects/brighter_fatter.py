@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.middle import middle
-from pixcal.estimators.neighbours import shared_charge
-from pixcal.estimators.response import Boundaries, boundaries_alone, boundaries_beside
+from pixcal.estimators.detector.neighbours import shared_charge
+from pixcal.estimators.detector.response import Boundaries, boundaries_alone, boundaries_beside
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.middle import middle
 from pixcal.kernels.boundaries import REACH, area_changes, boundary_shifts, moved_charge
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage

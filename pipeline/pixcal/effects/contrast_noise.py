@@ -5,10 +5,10 @@ from typing import Any, Self, cast
 
 import numpy as np
 
-from pixcal.estimators.damping import Damping, best_damping
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.frame_light import OFFSETS, FrameLight, light_courses, light_of
-from pixcal.estimators.variance_components import (
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.damping import Damping, best_damping
+from pixcal.estimators.frame_series.light import OFFSETS, FrameLight, light_courses, light_of
+from pixcal.estimators.frame_series.variance_components import (
     Components,
     joint_log_chance,
     log_chance,

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, stats
 from scipy.optimize import brentq
 
-from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.significance import sigmas_of_count
 from pixcal.kernels.tracks import add_tracks, draw_tracks
 from pixcal.model.config import quantity

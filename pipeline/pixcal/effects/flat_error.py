@@ -5,15 +5,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence, FringeEvidence
-from pixcal.estimators.map_fit import (
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.maps.map_fit import (
     gauge_terms,
     half_theta,
     neighbour_products,
     polynomial,
     without,
 )
-from pixcal.estimators.ring_power import Ring, ring_power
+from pixcal.estimators.maps.ring_power import Ring, ring_power
 from pixcal.kernels.scene import TILE, DetectorMaps, LightMaps, Rows, chip_map
 from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity

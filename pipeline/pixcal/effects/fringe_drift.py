@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.frame_series import FrameSeries
-from pixcal.estimators.fringe_motion import (
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.fringe_motion import (
     Motion,
     motion_of,
     ramps,
     ramps_and_colour,
     slow_vectors,
 )
-from pixcal.estimators.spectral_line import Line
-from pixcal.estimators.variance_components import (
+from pixcal.estimators.frame_series.series import FrameSeries
+from pixcal.estimators.frame_series.spectral_line import Line
+from pixcal.estimators.frame_series.variance_components import (
     MAX_STEPS,
     Components,
     joint_log_chance,

@@ -4,9 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.fringe_motion import motion_of, ramps
-from pixcal.estimators.variance_components import joint_log_chance, sigmas
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.fringe_motion import motion_of, ramps
+from pixcal.estimators.frame_series.variance_components import joint_log_chance, sigmas
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage

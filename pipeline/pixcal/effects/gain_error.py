@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
-from pixcal.estimators.flat_ladder import ladder_response
+from pixcal.estimators.detector.flat_ladder import ladder_response
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.noise_sums import product_sums
 from pixcal.kernels.scene import DetectorMaps, Rows
 from pixcal.model.bench import Bench

@@ -7,8 +7,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.map_waves import WaveFit, find_waves
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.maps.map_waves import WaveFit, find_waves
 from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence, FringeEvidence
-from pixcal.estimators.map_fit import (
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.maps.map_fit import (
     MapFit,
     MapPart,
     centred,

@@ -5,17 +5,17 @@ from typing import Any, Self, cast
 
 import numpy as np
 
-from pixcal.estimators.damping import Damping, best_damping
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.frame_light import (
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.damping import Damping, best_damping
+from pixcal.estimators.frame_series.light import (
     OFFSETS,
     FrameLight,
     ambient_shares,
     light_courses,
     light_of,
 )
-from pixcal.estimators.spectral_line import Line
-from pixcal.estimators.variance_components import (
+from pixcal.estimators.frame_series.spectral_line import Line
+from pixcal.estimators.frame_series.variance_components import (
     Components,
     joint_log_chance,
     log_chance,

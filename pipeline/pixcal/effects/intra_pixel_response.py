@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence, FringeEvidence
-from pixcal.estimators.map_fit import gauge_terms, half_theta, neighbour_products, without
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.maps.map_fit import gauge_terms, half_theta, neighbour_products, without
 from pixcal.kernels import optics
 from pixcal.kernels.scene import TILE, DetectorMaps, LightMaps, Rows, chip_map, geometry
 from pixcal.model.config import quantity

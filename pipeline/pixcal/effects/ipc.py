@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.crosstalk.dense import dense_kernel
 from pixcal.estimators.crosstalk.joined import Kernel, measure
 from pixcal.estimators.crosstalk.maps import map_periods
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import (
     Coupling,
     couple,

@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from pixcal.estimators.distortions import Freedom
-from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
-from pixcal.estimators.levels_of_lag import BANDS, in_bands, shares_by_level
-from pixcal.estimators.middle import middle
-from pixcal.estimators.noiseless_charge import missing_noise
+from pixcal.estimators.detector.levels_of_lag import BANDS, in_bands, shares_by_level
+from pixcal.estimators.detector.noiseless_charge import missing_noise
+from pixcal.estimators.diagnosis.distortions import Freedom
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.diagnosis.middle import middle
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
 from pixcal.kernels.transfer import left_behind

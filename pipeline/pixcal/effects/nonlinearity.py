@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.effects.gain_error import transfer_curve
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.flat_ladder import ladder_response
-from pixcal.estimators.middle import middle
-from pixcal.estimators.neighbours import shared_charge
-from pixcal.estimators.response import fit_response
+from pixcal.estimators.detector.flat_ladder import ladder_response
+from pixcal.estimators.detector.neighbours import shared_charge
+from pixcal.estimators.detector.response import fit_response
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.middle import middle
 from pixcal.kernels.boundaries import boundary_shifts
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.bench import Bench

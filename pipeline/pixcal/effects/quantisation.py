@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.code_density import (
+from pixcal.estimators.detector.code_density import (
     LEAST_NOISE,
     CodeWidths,
     code_widths,
@@ -15,8 +15,8 @@ from pixcal.estimators.code_density import (
     histogram,
     step_of,
 )
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.variance_components import sigmas
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.variance_components import sigmas
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best, sigmas_of_chi2
 from pixcal.kernels.synthesis import Stream, generator
 from pixcal.model.config import quantity

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence, FringeEvidence
-from pixcal.estimators.row_ramp import RowRamp, enough_for_rows, enough_frames
-from pixcal.estimators.row_settling import find_settling, profile, steps_of
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.frame_series.row_ramp import RowRamp, enough_for_rows, enough_frames
+from pixcal.estimators.frame_series.row_settling import find_settling, profile, steps_of
 from pixcal.kernels.synthesis import illuminate
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity

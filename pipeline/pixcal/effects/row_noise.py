@@ -5,8 +5,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence, FringeEvidence
-from pixcal.estimators.line_noise import FEWEST_FRAMES, LineSpectrum, fit_lines, line_spectrum
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.frame_series.line_noise import (
+    FEWEST_FRAMES,
+    LineSpectrum,
+    fit_lines,
+    line_spectrum,
+)
 from pixcal.kernels.flicker import flicker, flicker_power
 from pixcal.kernels.significance import sigmas_of_best
 from pixcal.model.config import quantity

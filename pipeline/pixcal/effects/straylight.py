@@ -6,9 +6,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence, FringeEvidence
-from pixcal.estimators.map_fit import MapFit, MapPart, fit_maps, gauge_terms, polynomial
-from pixcal.estimators.structure import legendre, legendre_at
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.maps.map_fit import MapFit, MapPart, fit_maps, gauge_terms, polynomial
+from pixcal.estimators.maps.structure import legendre, legendre_at
 from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.config import quantity

@@ -7,10 +7,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.distortions import Freedom
-from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
-from pixcal.estimators.telegraph.find import Telegraph, find_telegraph
-from pixcal.estimators.telegraph.moments import Series
+from pixcal.estimators.detector.telegraph.find import Telegraph, find_telegraph
+from pixcal.estimators.detector.telegraph.moments import Series
+from pixcal.estimators.diagnosis.distortions import Freedom
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.scene import TILE, chip_map
 from pixcal.kernels.synthesis import BLOCK_ROWS
 from pixcal.model.bench import SimulatedDetector

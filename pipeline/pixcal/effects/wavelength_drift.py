@@ -7,11 +7,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.frame_series import FrameSeries
-from pixcal.estimators.fringe_motion import Hop, Motion, colour_of, motion_of, ramps_and_colour
-from pixcal.estimators.hopping import Hopping, find_hopping, scatter_of
-from pixcal.estimators.variance_components import log_chance_of_any, sigmas, signed_sigmas
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.fringe_motion import (
+    Hop,
+    Motion,
+    colour_of,
+    motion_of,
+    ramps_and_colour,
+)
+from pixcal.estimators.frame_series.hopping import Hopping, find_hopping, scatter_of
+from pixcal.estimators.frame_series.series import FrameSeries
+from pixcal.estimators.frame_series.variance_components import (
+    log_chance_of_any,
+    sigmas,
+    signed_sigmas,
+)
 from pixcal.kernels import optics
 from pixcal.kernels.scene import FrameStates, geometry
 from pixcal.model.config import quantity

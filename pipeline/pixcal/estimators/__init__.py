@@ -1,1 +1,1 @@
-"""From samples to fringe parameters: scout, sweep, gauge, combination of sets."""
+"""From arrays of samples to fringe parameters, maps, detector properties, test statistics."""

@@ -1,7 +1,7 @@
 """Compiled sums of fringes that hold still: weights depend on the phase alone.
 
 The model is that of `pixcal.kernels.bilinear`; the normal matrices come from the frames
-(`pixcal.estimators.harmonics`), so that a sample costs three sums and its own square.
+(`pixcal.estimators.fringe_fit.harmonics`), so that a sample costs three sums and its own square.
 """
 
 from typing import Any
@@ -102,7 +102,7 @@ def fringe_block(
     """Right-hand sums of pixels for weights that depend on the phase of the fringe only.
 
     The weight is ``f / (1 + rho + s cos phi + c sin phi)``; the normal sums follow from the frames
-    (`pixcal.estimators.harmonics`), less those of samples without weight, given in ``missing``.
+    (`harmonics`), less those of samples without weight, given in ``missing``.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ def turn_table(table: F64) -> F32:
     Parameters
     ----------
     table : (6, size) float64
-        Normal sums over one turn of the phase (`pixcal.estimators.harmonics.normal_table`).
+        Normal sums over one turn of the phase (`harmonics.normal_table`).
 
     Returns
     -------
@@ -238,7 +238,7 @@ def close_fringes(
     Parameters
     ----------
     normal : (6, size) float64
-        Normal sums over one turn of the pixel's phase (`pixcal.estimators.harmonics`).
+        Normal sums over one turn of the pixel's phase (`pixcal.estimators.fringe_fit.harmonics`).
     turns : (size + 1, 9) float32
         What solves them, from `turn_table`.
     place : (p,) float32

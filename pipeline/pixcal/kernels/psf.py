@@ -173,7 +173,7 @@ def _shares(coefficients: F64, step: float, x: F64, y: F64) -> F64:
 def expected_windows(
     coefficients: F64, step: float, place: F64, offsets: F64, electrons: float, background: float
 ) -> F64:
-    """Mean electrons (n, side, side): see `pixcal.estimators.centroids.Star.expected`."""
+    """Mean electrons (n, side, side): see `centroids.Star.expected`."""
     n, _, side, _ = offsets.shape
     out = np.empty((n, side, side))
     half = side // 2
@@ -197,7 +197,7 @@ def fit_windows(
     least_variance: float,
     start: F64,
 ) -> F64:
-    """Place, electrons and background (n, 4): see `pixcal.estimators.centroids.Star.fit`."""
+    """Place, electrons and background (n, 4): see `centroids.Star.fit`."""
     n = data.shape[0]
     out = np.full((n, 4), np.nan)
     for star in range(n):

@@ -46,7 +46,7 @@ def _gain() -> Any:
 
 
 def _model() -> Any:
-    # The shapes of `pixcal.estimators.models`.
+    # The shapes of `pixcal.estimators.fringe_fit.models`.
     doc = "Shape of the fringes: hyperbolic, straight (paraxial), or chosen from the data."
     return quantity("auto", choices=("auto", "hyperbolic", "paraxial"), doc=doc)
 

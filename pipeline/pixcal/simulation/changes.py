@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.deviations import (
+from pixcal.estimators.diagnosis.deviations import (
     Change,
     Deviation,
     SetDeviations,
     StackDeviations,
     is_smooth,
 )
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.simulation.forward import ForwardModel, Stage
 from pixcal.simulation.replica import Replica
 

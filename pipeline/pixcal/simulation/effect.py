@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.changes import Template, Way
@@ -143,7 +143,7 @@ class Effect(ForwardModel):
     left_because : str
         Why maps need no correction for it all the same: it is noise, or small.
     fit_model : str
-        Shape of the fringes (`pixcal.estimators.models`) that takes it up.
+        Shape of the fringes (`pixcal.estimators.fringe_fit.models`) that takes it up.
     """
 
     absorbed_because: ClassVar[str] = ""

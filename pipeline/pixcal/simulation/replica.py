@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
 from pixcal.model.bench import (

@@ -2,7 +2,7 @@
 
 The frames of an acquisition are taken again without noise (`pixcal.simulation.replica`), with and
 without the effect. The difference says how every deviation from the nominal bench
-(`pixcal.estimators.deviations`) changes, what the fit absorbs being taken off. Held against the
+(`deviations`) changes, what the fit absorbs being taken off. Held against the
 deviations that were measured, weighed by their noise, it is the score test of strength zero (Rao
 1948, Proc. Camb. Phil. Soc. 44, 50). An effect that is drawn at random changes nothing on average;
 it is known by what it adds to second moments (Lin 1997, Biometrika 84, 309), as is one that mixes
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 from scipy.stats import chi2
 
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.variance_components import log_chance_of_any, sigmas
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.variance_components import log_chance_of_any, sigmas
 from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way, dot
 from pixcal.simulation.forward import ForwardModel
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pixcal import __version__
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.stability import (
+from pixcal.estimators.frame_series.stability import (
     MAX_DRAWS,
     NO_CURVE,
     ONE_SIGMA,

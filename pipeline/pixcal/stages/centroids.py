@@ -7,13 +7,13 @@ import numpy as np
 from astropy.wcs import WCS
 from numpy.typing import NDArray
 
-from pixcal.estimators.centroid_correction import (
+from pixcal.estimators.star_centroids.centroids import Star
+from pixcal.estimators.star_centroids.correction import (
     Corrected,
     correct_centroids,
     correction_map,
     gaussian_star,
 )
-from pixcal.estimators.centroids import Star
 from pixcal.model.errors import InputError
 from pixcal.stages.correct.advice import maps_to_use
 from pixcal.storage.artefact import read_json

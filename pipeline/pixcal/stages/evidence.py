@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack, free_frames
-from pixcal.estimators.fringes import grid
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, free_frames
+from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.model.errors import InputError
 from pixcal.stages.fit.scouting import read_frames
 from pixcal.stages.reduce.ingested import Ingested

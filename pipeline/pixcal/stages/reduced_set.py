@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.tile import Coding, Tile
+from pixcal.estimators.fringe_fit.tile import Coding, Tile
 from pixcal.storage.cube import ArrayReader, CachedReader
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.place import Place

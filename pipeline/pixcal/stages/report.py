@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pixcal.effects import effects
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.gap import CHANCE, sigmas_of
+from pixcal.estimators.diagnosis.gap import CHANCE, sigmas_of
 from pixcal.model.config import result_options
 from pixcal.model.options import Report
 from pixcal.report.contents import (

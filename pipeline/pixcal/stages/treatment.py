@@ -16,7 +16,7 @@ from pixcal.simulation.effect import Effect
 F64 = NDArray[np.float64]
 
 HYPERBOLIC = "hyperbolic"
-"""The shape of fringes (`pixcal.estimators.models`) beside straight ones."""
+"""The shape of fringes (`pixcal.estimators.fringe_fit.models`) beside straight ones."""
 IN_CORRECTED = "in the corrected fit"
 CORRECTED = ("undone on maps", "undone on samples", IN_CORRECTED)
 """Treatments after which the corrected maps are free of an effect."""

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.crosstalk.links import Place
 from pixcal.estimators.crosstalk.residuals import STRIDE, UNIT, Residuals, all_residuals
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling
 
 F32 = NDArray[np.float32]

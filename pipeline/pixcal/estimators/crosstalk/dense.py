@@ -20,7 +20,7 @@ from pixcal.estimators.crosstalk.pattern import pattern_information
 from pixcal.estimators.crosstalk.second_order import to_first_order
 from pixcal.estimators.crosstalk.shrinkage import Shrinkage
 from pixcal.estimators.crosstalk.support import coupling_of
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling, outflow
 
 F64 = NDArray[np.float64]

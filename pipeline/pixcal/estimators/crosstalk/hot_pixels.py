@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, median_filter
 
 from pixcal.estimators.crosstalk.links import REACH, Classes, Place
-from pixcal.estimators.detector import median_and_sigma
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.detector.calibration import median_and_sigma
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling, couple, outflow
 
 F64 = NDArray[np.float64]

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from pixcal.estimators.crosstalk.dense import Dense, Frames, frames_of, within
 from pixcal.estimators.crosstalk.links import links
 from pixcal.estimators.crosstalk.support import Choice, choose
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.errors import InputError
 

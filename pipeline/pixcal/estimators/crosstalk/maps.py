@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.crosstalk.links import MAX_PERIOD, MIN_REPEATS, REACH, Classes
-from pixcal.estimators.evidence import Evidence, FringeEvidence
-from pixcal.estimators.fringes import grid, polynomial_basis
-from pixcal.estimators.gauge import fringe_modes
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.fringe_fit.fringes import grid, polynomial_basis
+from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.kernels.crosstalk import Coupling, outflow
 
 F64 = NDArray[np.float64]

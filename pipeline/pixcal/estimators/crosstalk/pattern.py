@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.corrected import phase_change
 from pixcal.estimators.crosstalk.links import Classes
 from pixcal.estimators.crosstalk.maps import (
     MIN_PIXELS,
@@ -23,8 +22,9 @@ from pixcal.estimators.crosstalk.maps import (
     smooth_modes,
     without,
 )
-from pixcal.estimators.detector import median_and_sigma
-from pixcal.estimators.evidence import Evidence, FringeEvidence
+from pixcal.estimators.detector.calibration import median_and_sigma
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.maps.corrected import phase_change
 from pixcal.kernels.crosstalk import Coupling, filled, uncouple_fringes
 
 F64 = NDArray[np.float64]

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence, FringeEvidence, Stack
-from pixcal.estimators.fringes import grid
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.crosstalk import Coupling, filled, noise_shares, uncouple, uncouple_fringes
 
 F32 = NDArray[np.float32]

@@ -4,7 +4,7 @@ The true offsets of a real detector are not known, but the maps say what they ma
 offset and a draw of its error. That draw is what the maps do not know; a centroid that takes pixels
 where the maps say errs by it alone. Against a perfect grid such a detector is worse than the real
 one, its offsets holding the maps' errors twice (once in the maps, once in the draw):
-`pixcal.estimators.centroid_errors` takes both off. Where a truth is given, it is the detector, less
+`errors` takes both off. Where a truth is given, it is the detector, less
 the modes that no fringes can tell from the bench.
 """
 

@@ -1,7 +1,7 @@
 """The error of a star's centroid at every place of the detector, to first order, by convolution.
 
 A star in the middle of each pixel; its error is the sum of the displacements around it, weighted
-as `pixcal.estimators.centroids.Star.weights` says. Masked pixels have no part in it, and the
+as `centroids.Star.weights` says. Masked pixels have no part in it, and the
 others their weight (exact but for how they share it).
 """
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.centroids import Star
+from pixcal.estimators.star_centroids.centroids import Star
 from pixcal.stages.astrometry.detector import Detector
 from pixcal.stages.astrometry.simulation import MOST_LOST
 from pixcal.storage.cube import ArrayWriter, create_array, create_group

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.centroids import Star
+from pixcal.estimators.star_centroids.centroids import Star
 from pixcal.stages.astrometry.detector import Detector, Patch, generator
 
 F64 = NDArray[np.float64]
@@ -18,7 +18,7 @@ MOST_LOST = 0.1
 """A place is not used where masked pixels would tell more than so much of the position."""
 KINDS = ("perfect", "measured", "perfect_photons", "measured_photons", "linear", "linear_measured")
 """Errors of a star at a place: pixels taken for a perfect grid, or where the maps say; without and
-with photon noise; and the first two as `pixcal.estimators.centroids.Star.weights` predicts them."""
+with photon noise; and the first two as `centroids.Star.weights` predicts them."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from pixcal import __version__
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime
-from pixcal.estimators.centroids import Star
+from pixcal.estimators.star_centroids.centroids import Star
 from pixcal.kernels.psf import Psf
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import result_options

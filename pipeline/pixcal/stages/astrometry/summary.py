@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.centroid_errors import Comparison, Value, compare, running_means
+from pixcal.estimators.star_centroids.errors import Comparison, Value, compare, running_means
 from pixcal.stages.astrometry.simulation import KINDS
 
 F64 = NDArray[np.float64]

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from pixcal.estimators.centroids import Star
+from pixcal.estimators.star_centroids.centroids import Star
 from pixcal.kernels.psf import Psf, diffraction_psf
 from pixcal.model.acquisition import Detector as Declared
 from pixcal.model.errors import InputError

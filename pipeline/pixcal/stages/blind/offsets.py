@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.gauge import fringe_modes
+from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import Camera

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from pixcal.effects import effects
 from pixcal.engine.run import Runtime
-from pixcal.estimators.gap import Reference, expect_nominal, expect_with, log_likelihood
-from pixcal.estimators.test_statistics.signature import signature_key
+from pixcal.estimators.diagnosis.gap import Reference, expect_nominal, expect_with, log_likelihood
+from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect

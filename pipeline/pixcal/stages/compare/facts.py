@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm, poisson
 
-from pixcal.estimators.agreement import (
+from pixcal.stages.compare.agreement import (
     Estimate,
     Part,
     beyond_noise,

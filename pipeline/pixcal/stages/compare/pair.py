@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.agreement import Blocks, Grouping, Part, Projection, halve, part
+from pixcal.stages.compare.agreement import Blocks, Grouping, Part, Projection, halve, part
 from pixcal.stages.compare.sides import Side, SideTile, Tile, Vector
 
 F64 = NDArray[np.float64]

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.combine import axes_span_plane, combine_parallel, combine_sets
-from pixcal.estimators.gauge import fringe_modes
-from pixcal.estimators.models import FringeShape
-from pixcal.estimators.models.hyperbolic import Hyperbolic
-from pixcal.estimators.models.paraxial import Paraxial
+from pixcal.estimators.fringe_fit.combine import axes_span_plane, combine_parallel, combine_sets
+from pixcal.estimators.fringe_fit.gauge import fringe_modes
+from pixcal.estimators.fringe_fit.models import FringeShape
+from pixcal.estimators.fringe_fit.models.hyperbolic import Hyperbolic
+from pixcal.estimators.fringe_fit.models.paraxial import Paraxial
 from pixcal.kernels.optics import PARAMETERS, Geometry
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.errors import InputError

@@ -18,12 +18,12 @@ from scipy.stats import norm
 
 from pixcal import __version__
 from pixcal.engine.run import Runtime
-from pixcal.estimators.agreement import Estimate, three_cornered_hat
 from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
 from pixcal.model.options import Compare
 from pixcal.report.compare_figures import ComponentView, PairView, compare_figure
 from pixcal.report.drawing import png
+from pixcal.stages.compare.agreement import Estimate, three_cornered_hat
 from pixcal.stages.compare.facts import describe, estimate_facts
 from pixcal.stages.compare.pair import (
     DISAGREE,

@@ -9,7 +9,7 @@ import numpy as np
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.look import ESTIMATE_BYTES, EVIDENCE_BYTES

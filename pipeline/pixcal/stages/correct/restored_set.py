@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.tile import Coding
+from pixcal.estimators.fringe_fit.tile import Coding
 from pixcal.simulation.effect import Effect
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.cube import ArrayReader

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.corrected import phase_change
-from pixcal.estimators.tile_sums import Carrier
+from pixcal.estimators.fringe_fit.tile_sums import Carrier
+from pixcal.estimators.maps.corrected import phase_change
 from pixcal.kernels.crosstalk import FILL_REACH, filled
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps

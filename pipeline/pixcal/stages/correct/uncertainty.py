@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from pixcal.effects import parse_effects
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.corrected import phase_change, straight_modes
-from pixcal.estimators.modes import solve_modes
+from pixcal.estimators.fringe_fit.modes import solve_modes
+from pixcal.estimators.maps.corrected import phase_change, straight_modes
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps

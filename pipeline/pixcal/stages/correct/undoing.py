@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.corrected import phase_change
-from pixcal.estimators.fringes import wrapped
-from pixcal.estimators.geometry import tile_plane
-from pixcal.estimators.tile_sums import TileSums, sum_row
+from pixcal.estimators.fringe_fit.fringes import wrapped
+from pixcal.estimators.fringe_fit.geometry import tile_plane
+from pixcal.estimators.fringe_fit.tile_sums import TileSums, sum_row
+from pixcal.estimators.maps.corrected import phase_change
 from pixcal.simulation.effect import FringeMaps
 from pixcal.stages.correct.surroundings import disturbed, scatter_of
 from pixcal.stages.correct.swept import HALVES, Swept, border_change, maps_of, padded, undone

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.evidence import Evidence, Stack
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.bench import (
     SCHEMA,

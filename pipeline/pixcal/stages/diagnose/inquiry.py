@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.evidence import Evidence
-from pixcal.estimators.gap import Reference, compare, expect_nominal, expect_with
-from pixcal.estimators.test_statistics import Key
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.gap import Reference, compare, expect_nominal, expect_with
+from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Again, Effect, Estimate

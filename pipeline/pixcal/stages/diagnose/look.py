@@ -11,7 +11,7 @@ import numpy as np
 
 from pixcal.engine.plan import Plan, make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages import reduce

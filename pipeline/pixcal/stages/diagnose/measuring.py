@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from pixcal.estimators.amplifiers import relative_gain
-from pixcal.estimators.evidence import Evidence, FringeEvidence
-from pixcal.estimators.pixel_read_noise import PixelNoise
-from pixcal.estimators.structure import smooth_surface
+from pixcal.estimators.detector.amplifiers import relative_gain
+from pixcal.estimators.detector.pixel_read_noise import PixelNoise
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.maps.structure import smooth_surface
 from pixcal.kernels.processes import ramp_step
 from pixcal.kernels.rounding import level_before_rounding
 from pixcal.kernels.sample_sums import calm_residuals, pixel_moments

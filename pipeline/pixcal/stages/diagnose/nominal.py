@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.corrected import corrected_offsets, phase_change, straight_modes
-from pixcal.estimators.fringes import grid
-from pixcal.estimators.pixel_read_noise import PixelNoise
-from pixcal.estimators.structure import Offsets, smooth_surface, true_offsets
+from pixcal.estimators.detector.pixel_read_noise import PixelNoise
+from pixcal.estimators.fringe_fit.fringes import grid
+from pixcal.estimators.maps.corrected import corrected_offsets, phase_change, straight_modes
+from pixcal.estimators.maps.structure import Offsets, smooth_surface, true_offsets
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
 from pixcal.model.acquisition import Acquisition

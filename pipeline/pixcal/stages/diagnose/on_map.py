@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.corrected import phase_change, straight_modes
-from pixcal.estimators.modes import solve_modes
+from pixcal.estimators.fringe_fit.modes import solve_modes
+from pixcal.estimators.maps.corrected import phase_change, straight_modes
 from pixcal.kernels.crosstalk import filled
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.diagnose.nominal import FittedSet

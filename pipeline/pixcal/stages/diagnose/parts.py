@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime
-from pixcal.estimators.evidence import Evidence
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import to_plain
 from pixcal.stages import fit, reduce

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
 from pixcal import __version__
-from pixcal.estimators.gap import (
+from pixcal.estimators.diagnosis.gap import (
     Difference,
     Expectation,
     Reference,
@@ -16,8 +16,8 @@ from pixcal.estimators.gap import (
     likelier,
     sigmas_of,
 )
-from pixcal.estimators.test_statistics import DETECTOR, Curve, Key
-from pixcal.estimators.test_statistics.signature import statistic_named
+from pixcal.estimators.diagnosis.test_statistics import DETECTOR, Curve, Key
+from pixcal.estimators.diagnosis.test_statistics.signature import statistic_named
 from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place
 from pixcal.simulation.effect import DOMAINS

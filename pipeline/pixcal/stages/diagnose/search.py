@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.gap import (
+from pixcal.estimators.diagnosis.gap import (
     Expectation,
     Reference,
     compare,
@@ -22,7 +22,7 @@ from pixcal.estimators.gap import (
     log_likelihood,
     remaining,
 )
-from pixcal.estimators.test_statistics import Key
+from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.shrinkage import LEAST, Trial, differing

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.gap import (
+from pixcal.estimators.diagnosis.gap import (
     Difference,
     Expectation,
     Gap,
@@ -15,7 +15,7 @@ from pixcal.estimators.gap import (
     likelier,
     remaining,
 )
-from pixcal.estimators.test_statistics import Key
+from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.stages.diagnose.trial import Effects
 
 F64 = NDArray[np.float64]

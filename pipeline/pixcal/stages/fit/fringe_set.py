@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.geometry import TilePlane, unwrap
-from pixcal.estimators.models import FringeShape, Start, fringe_models
-from pixcal.estimators.modes import ModeBasis
-from pixcal.estimators.smooth import Polynomial
-from pixcal.estimators.tile_sums import Carrier, TileSums
+from pixcal.estimators.fringe_fit.geometry import TilePlane, unwrap
+from pixcal.estimators.fringe_fit.models import FringeShape, Start, fringe_models
+from pixcal.estimators.fringe_fit.modes import ModeBasis
+from pixcal.estimators.fringe_fit.smooth import Polynomial
+from pixcal.estimators.fringe_fit.tile_sums import Carrier, TileSums
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.errors import InputError
 from pixcal.stages.reduced_set import ReducedSet

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.combine import axes_span_plane, combine_parallel, combine_sets
-from pixcal.estimators.fringes import wrapped
-from pixcal.estimators.models import FringeShape
-from pixcal.estimators.tile_sums import local_modes
+from pixcal.estimators.fringe_fit.combine import axes_span_plane, combine_parallel, combine_sets
+from pixcal.estimators.fringe_fit.fringes import wrapped
+from pixcal.estimators.fringe_fit.models import FringeShape
+from pixcal.estimators.fringe_fit.tile_sums import local_modes
 from pixcal.stages.fit.fringe_set import FittedSet
 from pixcal.stages.fit.scouting import read_frames
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array

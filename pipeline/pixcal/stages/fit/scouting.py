@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, one_blas_thread, run_tasks
-from pixcal.estimators.fringes import FrameParameters
-from pixcal.estimators.scout import Scout, in_turn
+from pixcal.estimators.fringe_fit.fringes import FrameParameters
+from pixcal.estimators.fringe_fit.scout import Scout, in_turn
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader, write_array

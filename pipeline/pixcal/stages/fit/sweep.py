@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.batches import Batches, plan_batches
-from pixcal.estimators.fit_flags import fit_flags, usual_chi2
-from pixcal.estimators.fringes import FrameParameters
-from pixcal.estimators.geometry import tile_plane
-from pixcal.estimators.sweep import BOUND_PIXELS, TileMaps, frames_to_prime, sweep_tile
-from pixcal.estimators.tile import Tile
-from pixcal.estimators.tile_sums import Carrier, TileSums, sum_row
+from pixcal.estimators.fringe_fit.batches import Batches, plan_batches
+from pixcal.estimators.fringe_fit.fit_flags import fit_flags, usual_chi2
+from pixcal.estimators.fringe_fit.fringes import FrameParameters
+from pixcal.estimators.fringe_fit.geometry import tile_plane
+from pixcal.estimators.fringe_fit.sweep import BOUND_PIXELS, TileMaps, frames_to_prime, sweep_tile
+from pixcal.estimators.fringe_fit.tile import Tile
+from pixcal.estimators.fringe_fit.tile_sums import Carrier, TileSums, sum_row
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError

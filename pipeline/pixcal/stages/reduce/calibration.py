@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.bad_pixels import dead, hot, noisy
-from pixcal.estimators.detector import median_and_sigma, usual_variance
+from pixcal.estimators.detector.bad_pixels import dead, hot, noisy
+from pixcal.estimators.detector.calibration import median_and_sigma, usual_variance
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.columns import Index, extent, indices
 from pixcal.stages.reduce.frame_statistics import STATISTICS, Limits

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.detector import Linearity, linearity
-from pixcal.estimators.emva import saturation, transfer_points
+from pixcal.estimators.detector.calibration import Linearity, linearity
+from pixcal.estimators.detector.emva import saturation, transfer_points
 from pixcal.kernels.photon_transfer import GainFit, fit_gain
 from pixcal.kernels.rounding import SHEPPARD, UNTOLD, noise_before_rounding
 from pixcal.model.acquisition import Detector

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime
-from pixcal.estimators.emva import (
+from pixcal.estimators.detector.emva import (
     Measure,
     Nonuniformity,
     dark_slope,

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.bad_pixels import nonlinear
-from pixcal.estimators.detector import (
+from pixcal.estimators.detector.bad_pixels import nonlinear
+from pixcal.estimators.detector.calibration import (
     DarkLine,
     Rung,
     dark_line,

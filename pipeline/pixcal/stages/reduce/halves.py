@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.emva import Measure
+from pixcal.estimators.detector.emva import Measure
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.detector_summary import Summary
 from pixcal.stages.reduce.exposures import Group

@@ -1,0 +1,1 @@
+"""Detector characterisation: calibration frames, response, noise of pixels, charge."""

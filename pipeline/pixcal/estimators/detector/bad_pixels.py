@@ -1,0 +1,184 @@
+"""Which pixels are bad, one rule a flag. A flag is set only where there are data to decide.
+
+The rules compare a pixel with the others, and ask that the difference is beyond what the noise of
+the frames can do: on a perfect detector fewer than one pixel in 10⁵ is flagged.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from pixcal.estimators.detector.calibration import MIN_RUNGS, Rung, median_and_sigma
+
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+NEIGHBOURS = 16
+"""Pixels along each side of the blocks whose median a response is compared with."""
+
+_FALSE_ALARM = 1e-6
+_SIGNIFICANT = 5.0
+_MANY_SIGNIFICANT = 6.0
+_MIN_OUTLIERS = 3
+_OUTLIER_SHARE = 0.02
+_KURTOSIS_SIGMAS = 4.0
+_KURTOSIS_SAMPLES = 32
+_CURVES = 2
+_DEGREE = 3
+_FARTHEST = 4.0
+_CLIPPINGS = 4
+_CLIP = 4.0
+_FEWEST = 64
+_SAMPLE = 4096
+
+
+def hot(rate: F64, error: F64, median: float, sigma: float, limit: float) -> Mask:
+    """Dark signal far above that of the other pixels.
+
+    Parameters
+    ----------
+    rate, error : (y, x) float64
+        Dark signal of each pixel and its standard error (ADU/s).
+    median, sigma : float
+        Of the detector's dark signals (ADU/s).
+    limit : float
+        In units of ``sigma``.
+    """
+    excess = rate - median
+    return (excess > limit * sigma) & (excess > _SIGNIFICANT * error) & (error > 0)
+
+
+def dead(flat: F64, error: F64, low: float, high: float, floor: float) -> Mask:
+    """Response far below or above that of the neighbours, or next to none at all.
+
+    Parameters
+    ----------
+    flat, error : (y, x) float64
+        Relative response and its standard error; they begin on a border of blocks (as columns of
+        chunks do).
+    low : float
+        Limit in units of the median of the pixel's block of `NEIGHBOURS` by `NEIGHBOURS`.
+    high : float
+        Limit in units of the block's upper quartile: beside a dark edge most may see no light.
+    floor : float
+        Lowest response at all.
+    """
+    median, upper = _around(flat)
+    below = (flat < low * median) & (median - flat > _SIGNIFICANT * error)
+    above = (flat > high * upper) & (flat - upper > _SIGNIFICANT * error) & (flat > floor)
+    return below | above | (flat < floor)
+
+
+def _around(flat: F64) -> tuple[F64, F64]:
+    """Median and upper quartile of each pixel's block."""
+    ny, nx = flat.shape
+    size = NEIGHBOURS
+    rows, columns = -(-ny // size), -(-nx // size)
+    padded = np.full((rows * size, columns * size), np.nan)
+    padded[:ny, :nx] = flat
+    blocks = padded.reshape(rows, size, columns, size).swapaxes(1, 2).reshape(rows, columns, -1)
+    ordered = np.sort(blocks, axis=-1)  # NaN last
+    last = np.maximum(np.isfinite(blocks).sum(axis=-1) - 1, 0)
+    maps = []
+    for rank in ((last + 1) // 2, (3 * last + 3) // 4):
+        value = np.take_along_axis(ordered, rank[..., None], -1)[..., 0]
+        maps.append(value.repeat(size, axis=0).repeat(size, axis=1)[:ny, :nx])
+    return maps[0], maps[1]
+
+
+def noisy(
+    variance: F64, dof: F64, expected: F64, kurtosis: F64, outliers: F64, factor: float
+) -> Mask:
+    """Noise without light far above the read noise, telegraph noise included.
+
+    Three signs: a standard deviation ``factor`` times the usual one; a smaller excess with the flat
+    top of noise that has two levels; more samples out of the limits than particles make.
+
+    Parameters
+    ----------
+    variance, dof : (y, x) float64
+        Temporal variance (ADU²) and its degrees of freedom.
+    expected : (y, x) float64
+        Variance of a usual pixel with the same dark signal (ADU²).
+    kurtosis : (y, x) float64
+        Excess kurtosis; NaN when unknown.
+    outliers : (y, x) float64
+        Samples out of the limits.
+    factor : float
+        Of the standard deviation.
+    """
+    ratio = variance / expected
+    dofs, which = np.unique(dof, return_inverse=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        limits = chi2.isf(_FALSE_ALARM, dofs) / dofs
+        significant = (dof > 0) & (ratio > limits[which].reshape(dof.shape))
+        flat_top = kurtosis < -_KURTOSIS_SIGMAS * np.sqrt(24 / dof)
+    loud = significant & (ratio > factor**2)
+    telegraph = significant & flat_top & (dof >= _KURTOSIS_SAMPLES)
+    blinking = outliers >= np.maximum(_MIN_OUTLIERS, _OUTLIER_SHARE * dof)
+    return np.asarray(loud | telegraph | blinking)
+
+
+def nonlinear(rungs: Sequence[Rung], limit: float) -> Mask:
+    """Signal that does not follow that of the other pixels over a ladder of flats.
+
+    The pixel's share of the median level of the rungs (of the same tile, so that the lamp's own
+    drift drops out) is constant for a good pixel on a linear detector. Where the response of all
+    pixels is curved, brighter pixels are further along the curve: what pixels of one brightness
+    have in common is the detector's response, and no defect.
+
+    Parameters
+    ----------
+    rungs : sequence of Rung
+        Any number; with fewer than three for a pixel it is not flagged.
+    limit : float
+        Largest relative change of the share.
+    """
+    shape = rungs[0].signal.shape
+    if len(rungs) < MIN_RUNGS:
+        return np.zeros(shape, np.bool_)
+    signal = np.stack([rung.signal for rung in rungs])
+    variance = np.stack([rung.variance for rung in rungs])
+    levels = np.array([median_and_sigma(s)[0] for s in signal])[:, None, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = signal / levels
+        error = np.sqrt(variance) / levels
+        weight = np.where(np.isfinite(share) & (error > 0) & (levels > 0), error**-2, 0.0)
+        share = np.where(weight > 0, share, 0.0)
+        for _ in range(_CURVES):
+            mean = (weight * share).sum(axis=0) / weight.sum(axis=0)
+            share = share - mean * _common(share / mean - 1, mean, weight > 0)
+        total = weight.sum(axis=0)
+        mean = (weight * share).sum(axis=0) / total
+        # A rung is part of the mean, so their difference varies less than the rung alone.
+        spread = np.sqrt(np.maximum(error**2 - 1 / total, 0))
+        off = np.abs(share - mean)
+        beyond = (off > limit * np.abs(mean)) & (off > _MANY_SIGNIFICANT * spread) & (weight > 0)
+    enough = (weight > 0).sum(axis=0) >= MIN_RUNGS
+    return np.asarray(beyond.any(axis=0) & enough)
+
+
+def _common(off: F64, brightness: F64, used: Mask) -> F64:
+    """What pixels of one brightness (y, x) have in common of their departures (rung, y, x)."""
+    usual, scale = median_and_sigma(brightness)
+    x = (
+        np.clip((brightness - usual) / scale, -_FARTHEST, _FARTHEST)
+        if scale > 0
+        else 0 * brightness
+    )
+    x = np.nan_to_num(x)
+    some = np.zeros(x.shape, np.bool_)
+    some.flat[:: max(x.size // _SAMPLE, 1) | 1] = True
+    found = np.zeros_like(off)
+    for rest, out, own in zip(off, found, used & np.isfinite(off), strict=True):
+        kept = own & some
+        for _ in range(_CLIPPINGS):
+            if kept.sum() < _FEWEST:
+                break
+            terms = np.polynomial.polynomial.polyfit(x[kept], rest[kept], _DEGREE)
+            out[:] = np.polynomial.polynomial.polyval(x, terms)
+            left = rest - out
+            kept = own & some & (np.abs(left) < _CLIP * max(median_and_sigma(left[kept])[1], 1e-12))
+    return np.nan_to_num(found)

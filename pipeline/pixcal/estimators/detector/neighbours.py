@@ -1,0 +1,203 @@
+"""Noise that neighbouring pixels share because collected charge moves their boundary.
+
+The covariance of neighbours has three parts that differ in how they grow with the level: constant
+(noise of rows and columns, electronics), in proportion (crosstalk between pixels: a share of the
+shot noise), and with its square (brighter-fatter). They are told apart by weighted least squares on
+the products of neighbouring residuals of fringe frames and of flats; the first two are free for
+each direction.
+
+Before that the residuals lose all that is the same function of the frame's phase in every frame, up
+to the fifth harmonic, so that a nonlinear response cannot pass for noise; and outliers, since a
+particle hits neighbours together.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pixcal.estimators.diagnosis.distortions import Freedom
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.kernels.boundaries import REACH, boundary_pushes, shared_noise
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
+"""Rows and columns from a pixel to its neighbours."""
+
+HARMONICS = 5
+BLOCK = 64
+"""Frames that are taken together."""
+
+_CLIP = 6.0
+_MIN_FRAMES = 4
+
+
+@dataclass(frozen=True)
+class _Noise:
+    """Some frames less what they should be; all (t, y, x) or (y, x), e- before the flat."""
+
+    residual: F32
+    """Zero where a sample is not to be used."""
+    variance: F32
+    charge: F32
+    """Mean charge."""
+    taken: Callable[[Mask, Mask], F32]
+    """Covariance (t, pair) that was taken off the residuals of pairs of pixels with the frames."""
+    kept: float
+    """Share of the covariance that is left where each pixel was fitted."""
+    good: Mask
+
+
+@dataclass(frozen=True)
+class SharedCharge:
+    """Size of the brighter-fatter effect as the covariance of neighbours shows it.
+
+    Attributes
+    ----------
+    size, variance : float
+        Of the shift by an electron, px.
+    """
+
+    size: float
+    variance: float
+
+
+def shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
+    """Size of the brighter-fatter effect from the covariance of neighbours.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    shifts : float64 array
+        `pixcal.kernels.boundaries.boundary_shifts`, of size one.
+
+    Returns
+    -------
+    SharedCharge or None
+        None where there are neither fringe frames nor flats.
+    """
+    given = shifts.shape, shifts.tobytes()
+    return evidence.once("shared_charge", *given, make=lambda: _shared_charge(evidence, shifts))
+
+
+def _shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
+    n = 2 * len(DIRECTIONS) + 1
+    normal, right = np.zeros((n, n)), np.zeros(n)
+    for noise in _noises(evidence):
+        pushes = boundary_pushes(noise.charge, shifts)
+        for d, step in enumerate(DIRECTIONS):
+            at = [2 * d, 2 * d + 1, n - 1]
+            shared = shared_noise(noise.charge, pushes, shifts, *step)
+            more, more_right = _sums(noise, shared, *step)
+            normal[np.ix_(at, at)] += more
+            right[at] += more_right
+    if not normal[-1, -1]:
+        return None
+    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-9, hermitian=True)
+    covariance = inverse / np.outer(scale, scale)
+    return SharedCharge(float(covariance[-1] @ right), float(covariance[-1, -1]))
+
+
+def _sums(noise: _Noise, shared: F32, dy: int, dx: int) -> tuple[F64, F64]:
+    """Normal matrix and right-hand side for (constant, in proportion, boundaries) of a pair."""
+    one = np.zeros_like(noise.good)
+    ny, nx = one.shape
+    m = REACH
+    one[m + max(0, -dy) : ny - m - max(0, dy), m + max(0, -dx) : nx - m - max(0, dx)] = True
+    one &= noise.good & np.roll(noise.good, (-dy, -dx), axis=(0, 1))
+    other = np.roll(one, (dy, dx), axis=(0, 1))
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    _add_products(
+        noise.residual, noise.variance, noise.charge, shared, noise.taken(one, other),
+        *np.nonzero(one), dy, dx, normal, right,
+    )  # fmt: skip
+    return noise.kept**2 * normal, noise.kept * right
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _add_products(
+    residual: Any, variance: Any, charge: Any, shared: Any, taken: Any,
+    rows: Any, columns: Any, dy: int, dx: int, normal: Any, right: Any,
+) -> None:  # fmt: skip
+    for t in range(len(residual)):
+        s0 = s1 = s2 = s11 = s12 = s22 = p0 = p1 = p2 = 0.0
+        for n in range(len(rows)):
+            y, x = rows[n], columns[n]
+            v, u = y + dy, x + dx
+            product = residual[t, y, x] * residual[t, v, u]
+            if product != 0:
+                w = 1 / (variance[t, y, x] * variance[t, v, u])
+                one, two = charge[t, y, x] + charge[t, v, u], shared[t, y, x]
+                product = w * (product + taken[t, n])
+                s0 += w
+                s1 += w * one
+                s2 += w * two
+                s11 += w * one * one
+                s12 += w * one * two
+                s22 += w * two * two
+                p0 += product
+                p1 += product * one
+                p2 += product * two
+        normal += np.array([[s0, s1, s2], [s1, s11, s12], [s2, s12, s22]])
+        right += np.array([p0, p1, p2])
+
+
+def _noises(evidence: Evidence) -> Iterator[_Noise]:
+    for fringes in evidence.fringes.values():
+        yield from _of_fringes(fringes, evidence)
+    for stack in evidence.of_kind("flat"):
+        yield from _of_flats(stack, evidence)
+
+
+def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Iterator[_Noise]:
+    count, good = len(fringes.g), fringes.good
+    kept = 1 - (2 * HARMONICS + 1) / count
+    if kept <= 0:
+        return
+    freedom = Freedom(fringes, HARMONICS)
+    left = freedom.left_over(freedom.of_good(fringes.residual))
+    left[np.abs(left) * np.sqrt(freedom.weight) > _CLIP] = 0
+    # Shot noise and what moves it are those of the charge, before the flat is divided out.
+    flat = evidence.flat.astype(np.float32)
+    for first in range(0, count, BLOCK):
+        frames = slice(first, min(first + BLOCK, count))
+
+        def taken(one: Mask, other: Mask, frames: slice = frames) -> F32:
+            return freedom.taken_by_frames(frames, one, other) * flat[one] * flat[other]
+
+        residual = np.zeros(fringes.electrons[frames].shape, np.float32)
+        residual[:, good] = left[frames]
+        charge = np.maximum(np.nan_to_num(fringes.model[frames]), 0) * flat
+        variance = fringes.variance[frames] * flat**2
+        yield _Noise(residual * flat, variance, charge, taken, kept, good)
+
+
+def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[_Noise]:
+    if len(stack.adu) < _MIN_FRAMES or not np.isfinite(stack.exptime_s):
+        return
+    good = evidence.good & (stack.adu < evidence.saturation_adu).all(axis=0)
+    frames = ((stack.adu - evidence.bias) * evidence.gain).astype(np.float32)
+    charge = np.maximum(frames.mean(axis=0), 0).astype(np.float32)
+    dark = (evidence.dark_rate * stack.exptime_s).astype(np.float32)
+    light = np.where(good, np.maximum(charge - dark, 0), 0)
+    variance = charge + np.float32(evidence.read_noise**2)
+    power = np.float32((light**2 / variance).sum())
+    if power <= 0:
+        return
+    lamp = ((frames - dark) * light / variance)[:, good].sum(axis=1) / power
+    factor = (lamp / lamp.mean())[:, None, None].astype(np.float32)
+    residual = np.where(good, frames - charge - (factor - 1) * light, 0).astype(np.float32)
+    residual[np.abs(residual) > _CLIP * np.sqrt(variance)] = 0
+
+    def taken(one: Mask, other: Mask) -> F32:
+        return np.tile(light[one] * light[other] / power, (len(frames), 1)).astype(np.float32)
+
+    every = [np.broadcast_to(a, frames.shape) for a in (variance, charge)]
+    yield _Noise(residual, every[0], every[1], taken, 1 - 1 / len(frames), good)

@@ -1,0 +1,53 @@
+"""Whether charge that an effect adds to the samples has shot noise of its own."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+
+F32 = NDArray[np.float32]
+
+_CLIP = 25.0
+"""Squares of residuals, over their variance, that are left to particles and the like."""
+
+
+def missing_noise(
+    evidence: Evidence, added: Callable[[FringeEvidence, F32], F32]
+) -> tuple[float, float]:
+    """Part of the shot noise of an added charge that the residuals lack.
+
+    Squared residuals are fitted by weighted least squares with the expected variance, a constant
+    and the added charge. So a gain or a read noise that is off does not pass for it: only the
+    frames before tell how much was added to samples of the same level.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        With fringes.
+    added : callable
+        Added charge (t, y, x), e-, of a fringe set and its signal (t, y, x), e- before the flat.
+
+    Returns
+    -------
+    part, error : float
+        Zero where every added electron came by its own chance, one where none did.
+    """
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    flat = evidence.flat.astype(np.float32)
+    for fringes in evidence.fringes.values():
+        charge = added(fringes, fringes.model * flat)
+        square = (fringes.residual[:, fringes.good] * flat[fringes.good]) ** 2
+        variance = fringes.variance[:, fringes.good] * flat[fringes.good] ** 2
+        weight = np.where(square < _CLIP * variance, 0.5 / variance**2, 0)
+        terms = [variance, np.ones_like(variance), -charge[:, fringes.good]]
+        for i, one in enumerate(terms):
+            right[i] += float(np.vdot(weight * one, square))
+            for j in range(i, 3):
+                normal[i, j] += float(np.vdot(weight * one, terms[j]))
+    normal = np.triu(normal) + np.triu(normal, 1).T
+    scale = 1 / np.sqrt(np.diag(normal))
+    inverse = np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-9, hermitian=True)
+    covariance = inverse * np.outer(scale, scale)
+    return float(covariance[2] @ right), float(np.sqrt(covariance[2, 2]))

@@ -1,0 +1,297 @@
+"""From collected light to signal: boundaries that move with the charge, and a bent response.
+
+The two are fitted together to what the fringe fit leaves, because both make a second harmonic of
+the phase: a response the same for all fringes, moving boundaries (brighter-fatter) one that depends
+on the fringes' spacing.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.diagnosis.distortions import distortion_sums, fit_distortions
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.kernels.boundaries import REACH, boundary_shifts, moved_charge
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+UNIT = 1e-7
+"""Shift of boundaries (px per electron) that is fitted as one."""
+FALLOFFS_PX = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
+"""In equal steps of the logarithm, nearly; what the boundaries' shift may fall by is looked for
+among these."""
+TOLD = 0.5
+"""Error of the falloff's logarithm with which it is told from others."""
+
+
+def fit_response(
+    evidence: Evidence,
+    level_e: float,
+    powers: int,
+    shifts: F64,
+    known_shift: tuple[float, float] | None = None,
+) -> tuple[F64, F64]:
+    """Coefficients of the response and the shift of the boundaries, from all fringe sets.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        With fringes.
+    level_e : float
+        Electrons for which u is one.
+    powers : int
+        Terms of the relative response 1 + c_1 u + c_2 u² + ...
+    shifts : float64 array
+        `pixcal.kernels.boundaries.boundary_shifts`, of size one.
+    known_shift : (float, float), optional
+        Shift by an electron (px) and its variance as they are known from the noise of neighbours.
+
+    Returns
+    -------
+    sizes : (powers + 1,) float64
+        c_1, c_2, ...; the shift by an electron, px.
+    covariance : (powers + 1, powers + 1) float64
+    """
+
+    def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> tuple[F32, Iterable[F32]]:
+        level = evidence.level(fringes, signal)
+        gained = np.stack([moved_charge(frame, UNIT * shifts) for frame in level])
+        charge = level + np.float32(sizes[-1]) * gained
+        flat = evidence.flat.astype(np.float32)
+        response = [np.float32(size) for size in sizes[:-1]]
+
+        def slopes() -> Iterator[F32]:
+            u = charge / np.float32(level_e)
+            power, steepness = charge / flat, np.float32(1) / flat
+            to_the_n = np.ones_like(u)
+            for n, size in enumerate(response, start=1):
+                power = power * u
+                yield np.asarray(power, np.float32)
+                to_the_n *= u
+                steepness = steepness + (size * np.float32(n + 1) / flat) * to_the_n
+            yield np.asarray(steepness * gained, np.float32)
+
+        # Horner's scheme of c_1 u + c_2 u² + ...
+        bend = np.zeros_like(charge)
+        for size in reversed(response):
+            bend += size
+            bend *= charge / np.float32(level_e)
+        return (charge * (1 + bend) - level) / flat, slopes()
+
+    prior = None
+    if known_shift is not None:
+        value, information = np.zeros(powers + 1), np.zeros(powers + 1)
+        value[-1], information[-1] = known_shift[0] / UNIT, UNIT**2 / known_shift[1]
+        prior = value, information
+    sizes, covariance = fit_distortions(
+        tuple(evidence.fringes.values()), distortion, powers + 1, margin=REACH, prior=prior
+    )
+    scale = np.ones(powers + 1)
+    scale[-1] = UNIT
+    return sizes * scale, covariance * np.outer(scale, scale)
+
+
+@dataclass(frozen=True)
+class Boundaries:
+    """Moving boundaries without a bent response, as the second harmonics of all sets show them.
+
+    Attributes
+    ----------
+    falloff_px, falloff_error : float
+        The error infinite where one falloff does about as well as another.
+    shift, shift_error : float
+        By an electron, px, for this falloff.
+    with_falloff : float
+        By how much the shift changes with the falloff's error, px.
+    against : float
+        Chi-square by which a bent response beside them would fit better.
+    along_y, along_y_error : float
+        Shift of boundaries between rows over that between columns; the error is zero where it was
+        held.
+    """
+
+    falloff_px: float
+    falloff_error: float
+    shift: float
+    shift_error: float
+    with_falloff: float
+    against: float
+    along_y: float = 1.0
+    along_y_error: float = 0.0
+
+
+def boundaries_alone(
+    evidence: Evidence, level_e: float, powers: int, otherwise_px: float, *, by_axis: bool = False
+) -> Boundaries:
+    """Boundaries that explain the harmonics by themselves, with the falloff that does it best.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        With fringes.
+    level_e, powers
+        Of the response that may be beside them, as of `fit_response`.
+    otherwise_px : float
+        Falloff where the harmonics do not tell it; one of `FALLOFFS_PX`.
+    by_axis : bool
+        Boundaries between rows may move by another shift than those between columns: fringes across
+        each tell of it.
+    """
+    sums = _sums_by_axis(evidence, level_e, powers)
+    if len(sums) < 2 or not by_axis:
+        sums = [(sum(n for n, _ in sums), sum(r for _, r in sums))]  # type: ignore[list-item]
+    found = [_alone(sums, powers, powers + n) for n in range(len(FALLOFFS_PX))]
+    one = _best_falloff([f[:4] for f in found], FALLOFFS_PX.index(otherwise_px))
+    if len(sums) < 2:
+        return one
+    near = int(np.argmin(np.abs(np.log(np.array(FALLOFFS_PX) / one.falloff_px))))
+    return replace(one, along_y=found[near][4], along_y_error=found[near][5])
+
+
+def _boundary_sums(evidence: Evidence, level_e: float, powers: int) -> list[tuple[F64, F64]]:
+    """Sums of `distortion_sums` for powers and falloffs, of fringes across columns and rows."""
+    every = [UNIT * boundary_shifts(falloff) for falloff in FALLOFFS_PX]
+
+    def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> tuple[F32, Iterable[F32]]:
+        level = evidence.level(fringes, signal)
+        flat = evidence.flat.astype(np.float32)
+
+        def slopes() -> Iterator[F32]:
+            u = level / np.float32(level_e)
+            power = level / flat
+            for _ in range(powers):
+                power = power * u
+                yield np.asarray(power, np.float32)
+            for shifts in every:
+                yield np.stack([moved_charge(frame, shifts) for frame in level]) / flat
+
+        return np.zeros_like(signal), slopes()
+
+    sets = evidence.fringes.values()
+    across = [
+        tuple(f for f in sets if (abs(f.k[0]) >= abs(f.k[1])) == of_columns)
+        for of_columns in (True, False)
+    ]
+    return [
+        distortion_sums(own, distortion, powers + len(every), margin=REACH) for own in across if own
+    ]
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Moving boundaries with a bent response that is free beside them.
+
+    Attributes
+    ----------
+    shift, variance : float
+        By an electron, px; on the mean of boundaries between columns and between rows.
+    gain : float
+        Chi-square that they explain beyond the response.
+    axes : int
+        Of boundaries, each with a shift of its own: one or two.
+    """
+
+    shift: float
+    variance: float
+    gain: float
+    axes: int
+
+
+def boundaries_beside(
+    evidence: Evidence,
+    level_e: float,
+    powers: int,
+    falloff_px: float,
+    known: tuple[float, float] | None = None,
+) -> Beside:
+    """Boundaries of a given falloff, with a response that is free.
+
+    One fringe period tells little of them but how boundaries along x and y differ, which no
+    response brings about.
+
+    Parameters
+    ----------
+    evidence, level_e, powers
+        As of `boundaries_alone`.
+    falloff_px : float
+        One of `FALLOFFS_PX`.
+    known : (float, float), optional
+        Mean shift by an electron (px) and its variance, as the noise of neighbours has it.
+    """
+    sums = _sums_by_axis(evidence, level_e, powers)
+    normal, right = _joint(sums, powers, powers + FALLOFFS_PX.index(falloff_px))
+    mean = np.zeros(len(right))
+    mean[powers:] = 1 / len(sums)
+    if known is not None:
+        information = UNIT**2 / known[1]
+        normal = normal + information * np.outer(mean, mean)
+        right = right + information * known[0] / UNIT * mean
+    inverse, only = _inverse(normal), _inverse(normal[:powers, :powers])
+    gain = float(right @ inverse @ right - right[:powers] @ only @ right[:powers])
+    size, variance = float(mean @ inverse @ right), float(mean @ inverse @ mean)
+    return Beside(UNIT * size, UNIT**2 * variance, max(gain, 0.0), len(sums))
+
+
+def _sums_by_axis(evidence: Evidence, level_e: float, powers: int) -> list[tuple[F64, F64]]:
+    return evidence.once(
+        "boundaries", level_e, powers, make=lambda: _boundary_sums(evidence, level_e, powers)
+    )
+
+
+def _joint(sums: Sequence[tuple[F64, F64]], powers: int, at: int) -> tuple[F64, F64]:
+    """Normal equations: powers that all sums share, and a shift of each."""
+    n = powers + len(sums)
+    joint, right = np.zeros((n, n)), np.zeros(n)
+    for number, (normal, own) in enumerate(sums):
+        places, taken = [*range(powers), powers + number], [*range(powers), at]
+        joint[np.ix_(places, places)] += normal[np.ix_(taken, taken)]
+        right[places] += own[taken]
+    return joint, right
+
+
+def _inverse(normal: F64) -> F64:
+    scale = 1 / np.sqrt(np.diag(normal))
+    scaled = np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-9, hermitian=True)
+    return np.asarray(scaled * np.outer(scale, scale))
+
+
+def _alone(
+    sums: Sequence[tuple[F64, F64]], powers: int, at: int
+) -> tuple[float, float, float, float, float, float]:
+    """Shift, its variance, the chi-square explained, and what a bent response would beside it;
+    shift along y over that along x, and its error, of two sums."""
+    information = np.array([normal[at, at] for normal, _ in sums])
+    rights = np.array([right[at] for _, right in sums])
+    sizes = rights / information
+    gain = float(sizes @ rights)
+    joint, right = _joint(sums, powers, at)
+    beside = float(right @ _inverse(joint) @ right) - gain
+    ratio = float(sizes[-1] / sizes[0])
+    relative = 1 / np.sqrt(information) / sizes
+    error = abs(ratio) * float(np.linalg.norm(relative)) if len(sums) > 1 else 0.0
+    return UNIT * float(sizes[0]), UNIT**2 / float(information[0]), gain, beside, ratio, error
+
+
+def _best_falloff(found: Sequence[tuple[float, float, float, float]], otherwise: int) -> Boundaries:
+    """By a parabola through the best of all and those beside it."""
+    sizes, variances, gains, beside = np.array(found).T
+    best = int(np.clip(np.argmax(gains), 1, len(gains) - 2))
+    at = np.log(FALLOFFS_PX[best - 1 : best + 2])
+    bend, slope, _ = np.polyfit(at - at[1], gains[best - 1 : best + 2], 2)
+    error = 1 / np.sqrt(-bend) if bend < 0 else np.inf
+    if error > TOLD:
+        size, variance, _, against = found[otherwise]
+        return Boundaries(FALLOFFS_PX[otherwise], np.inf, size, variance**0.5, 0.0, against)
+    top = float(at[1] - slope / (2 * bend))
+    # Not beyond what was tried; how far that is from the best is not known then.
+    there = float(np.clip(top, *np.log([FALLOFFS_PX[0], FALLOFFS_PX[-1]])))
+    error = float(np.hypot(error, top - there))
+    near = slice(best - 1, best + 2)
+    bends = [np.polyfit(at - at[1], values[near], 2) for values in (sizes, variances, beside)]
+    own = [float(np.polyval(coefficients, there - at[1])) for coefficients in bends]
+    rise = float(np.polyval(np.polyder(bends[0]), there - at[1]))
+    falloff = float(np.exp(there))
+    return Boundaries(falloff, falloff * error, own[0], own[1] ** 0.5, rise * error, own[2])

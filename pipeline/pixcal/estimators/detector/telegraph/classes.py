@@ -1,0 +1,158 @@
+"""Likelihoods of pixels' variances by classes of amplitudes, and mixtures of the classes.
+
+A pixel that jumps by A between two equally likely levels has A²/4 more variance, or less of that
+where it stays long.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp, softmax
+
+from pixcal.estimators.detector.telegraph.moments import Moments
+
+F64 = NDArray[np.float64]
+
+AMPLITUDES = np.geomspace(0.1, 300, 90)
+"""Amplitudes over the common noise that are looked at."""
+
+_DRAWN = 600
+_UNDERFLOW = 1e-200
+
+
+@dataclass(frozen=True)
+class Classes:
+    """Pixels of a series, for each amplitude that they may have.
+
+    Attributes
+    ----------
+    likely : (n, class) float64
+        Likelihood of each pixel's variance over the largest of its own.
+    largest : (n, 1) float64
+        The logarithm of that, over the likelihood of a quiet pixel.
+    added : (class,) float64
+        Variance that an amplitude adds, over the common one.
+    chances, products : (level, class) float64
+        From `_levels`.
+    """
+
+    likely: F64
+    largest: F64
+    added: F64
+    chances: F64
+    products: F64
+
+    @classmethod
+    def of(cls, m: Moments, unit: float, switching_s: float) -> "Classes":
+        added = (AMPLITUDES * unit / m.sigma / 2) ** 2
+        levels = m.variance[:, None] * (added / (1 + added))
+        levels -= np.log1p(added)
+        levels *= m.dof / 2
+        largest = levels.max(axis=1, keepdims=True)
+        levels -= largest
+        np.exp(levels, out=levels)
+        of_levels = _levels(_keep(switching_s, m.period_s), m.frames)
+        return cls(levels, largest, added, *of_levels)
+
+    def mixed(self) -> F64:
+        """Likelihoods (n, class) by what a pixel may have shown of its amplitude."""
+        mixed = self.likely @ self.chances
+        return np.asarray(np.maximum(mixed, _UNDERFLOW, out=mixed))
+
+    def log_ratio(self) -> F64:
+        """Logarithms (n, class) of the likelihoods over that of a quiet pixel."""
+        mixed = self.mixed()
+        np.log(mixed, out=mixed)
+        mixed += self.largest
+        return mixed
+
+    def neighbours(self) -> F64:
+        """Products of neighbouring frames (n, class) to be expected, as in `Moments`."""
+        return np.asarray((self.likely @ self.products) * self.added / self.mixed())
+
+
+def _keep(switching_s: float, period_s: float) -> float:
+    return float(np.exp(-2 * period_s / switching_s)) if switching_s > 0 else 0.0
+
+
+@lru_cache(maxsize=64)
+def _levels(keep: float, count: int) -> tuple[F64, F64]:
+    """What a pixel of an amplitude shows in a number of frames, by its stays.
+
+    One that stays long shows more or less of its two levels, or only one: it looks as if it had
+    another amplitude.
+
+    Returns
+    -------
+    chances : (level, class) float64
+        That a pixel of a class has the variance that those of another have on average.
+    products : (level, class) float64
+        That chance, times the products of neighbouring frames it then has over its full variance.
+    """
+    rng = np.random.default_rng(0)
+    turns = np.where(rng.random((count, _DRAWN)) < (1 - keep) / 2, -1.0, 1.0)
+    states = np.cumprod(turns, axis=0)
+    states -= states.mean(axis=0)
+    seen = (states**2).sum(axis=0) / (count - 1)
+    near = (states[1:] * states[:-1]).sum(axis=0) / (count - 1)
+    step = np.log(AMPLITUDES[1] / AMPLITUDES[0])
+    moves = np.rint(np.log(np.maximum(seen, 1e-12)) / 2 / step).astype(int)
+    classes = np.arange(len(AMPLITUDES))
+    chances, products = np.zeros((2, len(classes), len(classes)))
+    for move in np.unique(moves):
+        at = np.clip(classes + move, 0, classes[-1]), classes
+        np.add.at(chances, at, np.mean(moves == move))
+        np.add.at(products, at, near[moves == move].sum() / _DRAWN)
+    return chances, products
+
+
+def joined(pixels: NDArray[np.intp], parts: Sequence[Moments], classes: Iterable[Classes]) -> F64:
+    """Logarithms (pixel, class) of the likelihood ratios of all series together."""
+    total = np.zeros((len(pixels), len(AMPLITUDES)))
+    for m, one in zip(parts, classes, strict=True):
+        np.add.at(total, np.searchsorted(pixels, m.pixel), one.log_ratio())
+    return total
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Likelihood ratios (pixel, class) over the largest of each pixel, and the logarithm of that.
+
+    Pixels that are of no class are quiet; their ratio is one.
+    """
+
+    ratio: F64
+    largest: F64
+    logarithms: F64
+
+    @classmethod
+    def of(cls, logarithms: F64) -> "Mixture":
+        largest = logarithms.max(axis=1)
+        return cls(np.exp(logarithms - largest[:, None]), largest, logarithms)
+
+    def log_telegraph(self, weight: F64) -> F64:
+        """Of each pixel, of all classes with their weights (class,)."""
+        total = self.ratio @ weight
+        found = self.largest + np.log(np.maximum(total, _UNDERFLOW))
+        # Where the largest has hardly any weight the others have been rounded to nothing.
+        lost = total <= _UNDERFLOW
+        found[lost] = logsumexp(self.logarithms[lost], b=weight, axis=1)
+        return found
+
+    def log_likelihood(self, weight: F64) -> F64:
+        """Of each pixel, quiet or not."""
+        # Amplitudes below those looked at do nothing.
+        quiet = np.log(max(1 - weight.sum(), 1e-12))
+        return np.asarray(np.logaddexp(quiet, self.log_telegraph(weight)))
+
+    def chance(self, weight: F64) -> F64:
+        """Of each pixel, that it is not quiet."""
+        return np.asarray(np.exp(self.log_telegraph(weight) - self.log_likelihood(weight)))
+
+    def shares(self, weight: F64) -> F64:
+        """Chances (pixel, class) of the classes, if it is not."""
+        logarithms = self.logarithms + np.log(np.maximum(weight, _UNDERFLOW))
+        return np.asarray(softmax(logarithms, axis=1))

@@ -1,0 +1,161 @@
+"""How many pixels jump, how far, and how long they stay.
+
+The distribution of the pixels' variances gives the share of such pixels and their mean amplitude,
+by maximum likelihood: most pixels have the common noise, a share has more, with amplitudes from a
+gamma distribution (an exponential one unless the pixels say otherwise). Neighbouring frames give
+the time.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq, minimize
+from scipy.special import expit
+from scipy.stats import gamma
+
+from pixcal.estimators.detector.telegraph.classes import AMPLITUDES, Classes, Mixture, joined
+from pixcal.estimators.detector.telegraph.moments import Moments
+
+F64 = NDArray[np.float64]
+
+_USUAL, _MOST = 1.5, 4.0
+"""Logarithm of the shape: what is usual, and the most that is tried."""
+_CLEAR = 8.0
+"""By which another shape than the exponential's must be likelier."""
+LIKELY = 0.1
+"""Chance of telegraph noise from which a pixel's frames are looked at for how long it stays."""
+
+
+@dataclass(frozen=True)
+class Population:
+    """Pixels with telegraph noise.
+
+    Attributes
+    ----------
+    share, amplitude, shape, share_error, amplitude_error, shape_error : float
+        Of the pixels; mean, e-; of the amplitudes' gamma distribution.
+    unit : float
+        Noise that `AMPLITUDES` are over, e-.
+    weight : (class,) float64
+        Share of the pixels in each class of amplitudes.
+    pixels : (n,) int
+        All that there are.
+    chance : (n,) float64
+        That each is one of them.
+    """
+
+    share: float
+    amplitude: float
+    shape: float
+    share_error: float
+    amplitude_error: float
+    shape_error: float
+    unit: float
+    weight: F64
+    pixels: NDArray[np.intp]
+    chance: F64
+
+
+def find_population(parts: Sequence[Moments], switching_s: float) -> Population:
+    """Of how many pixels, and how strong, for a mean stay in a level."""
+    pixels = np.unique(np.concatenate([m.pixel for m in parts]))
+    unit = min(m.sigma for m in parts)
+    # One after the other: each is large.
+    classes = (Classes.of(m, unit, switching_s) for m in parts)
+    mixture = Mixture.of(joined(pixels, parts, classes))
+
+    def weights(p: F64) -> F64:
+        """Share of the pixels in each class of amplitudes."""
+        share, mean, shape = expit(p[0]), np.exp(p[1]), _shape(p)
+        density = gamma.pdf(AMPLITUDES, shape, scale=mean / shape)
+        return np.asarray(share * density * np.gradient(AMPLITUDES))
+
+    def cost(p: F64) -> float:
+        far = float(np.sum(p[2:] ** 2)) / (2 * _USUAL**2)
+        return far - float(mixture.log_likelihood(weights(p)).sum())
+
+    def lowest(start: F64) -> F64:
+        options = {"xatol": 1e-3, "fatol": 1e-3}
+        return np.asarray(minimize(cost, start, method="Nelder-Mead", options=options).x)
+
+    best = lowest(np.array([-4.0, 1.0]))
+    other = lowest(np.append(best, 0.5))
+    if cost(other) < cost(best) - _CLEAR:
+        best = other
+    share, mean, shape = float(expit(best[0])), float(np.exp(best[1])), _shape(best)
+    of_all = unit, weights(best), pixels, mixture.chance(weights(best))
+    covariance = _curvature(cost, best)
+    if covariance is None:
+        return Population(share, unit * mean, shape, 1.0, unit * mean, 0.0, *of_all)
+    errors = np.sqrt(np.diag(covariance))
+    share_error = float(min(errors[0] * share * (1 - share) + 1e-9, 1.0))
+    amplitude_error = float(unit * mean * errors[1])
+    shape_error = float(shape * errors[2]) if len(best) > 2 else 0.0
+    return Population(share, unit * mean, shape, share_error, amplitude_error, shape_error, *of_all)
+
+
+def _shape(p: F64) -> float:
+    """Of the gamma distribution: exponential where it is not asked for."""
+    return float(np.exp(np.clip(p[2], -_MOST, _MOST))) if len(p) > 2 else 1.0
+
+
+def _curvature(cost: Callable[[F64], float], at: F64, step: float = 0.05) -> F64 | None:
+    """Inverse of the second derivatives; None where it is not a minimum."""
+    moves = step * np.eye(len(at))
+    second = np.array(
+        [
+            [
+                cost(at + a + b) - cost(at + a - b) - cost(at - a + b) + cost(at - a - b)
+                for b in moves
+            ]
+            for a in moves
+        ]
+    ) / (4 * step**2)
+    if np.linalg.eigvalsh(second)[0] <= 1e-9:
+        return None
+    return np.asarray(np.linalg.inv(second))
+
+
+def find_switching(parts: Sequence[Moments], population: "Population") -> tuple[float, float]:
+    """Mean stay in a level and its error, s, from neighbouring frames."""
+    period = min(m.period_s for m in parts)
+    # The others say nothing of it.
+    few = population.pixels[population.chance > LIKELY]
+    if not len(few):
+        return 0.0, period
+    own = [m.of(few) for m in parts]
+
+    def rest(log_time: float) -> tuple[float, float]:
+        """Products of neighbours beyond those for a time, and their error."""
+        classes = [Classes.of(m, population.unit, float(np.exp(log_time))) for m in own]
+        mixture = Mixture.of(joined(few, own, classes))
+        chance = mixture.chance(population.weight)
+        of_class = mixture.shares(population.weight)
+        total = square = 0.0
+        for m, one in zip(own, classes, strict=True):
+            at = np.searchsorted(few, m.pixel)
+            expected = np.einsum("nk,nk->n", of_class[at], one.neighbours())
+            left = chance[at] * (m.neighbours + 1 / m.count - chance[at] * expected)
+            total += float(left.sum())
+            square += float(left @ left)
+        return total, square**0.5
+
+    # Of longer stays the frames do not tell how long.
+    longest = max(m.period_s * m.frames for m in parts)
+    low, high = np.log(0.1 * period), np.log(max(longest, period))
+
+    def solved(more: float) -> float:
+        """Logarithm of the time for which so much more than was measured is expected."""
+        if rest(high)[0] + more >= 0:
+            return float(high)
+        return float(brentq(lambda v: rest(v)[0] + more, low, high, xtol=3e-3))
+
+    none, error = rest(low)
+    if none <= 3 * error:
+        at_most = float(np.exp(solved(error))) if none + error > 0 else 0.0
+        return 0.0, max(at_most, period)
+    found = solved(0.0)
+    slope = abs(rest(found + 0.05)[0] - rest(found - 0.05)[0]) / 0.1
+    return float(np.exp(found)), float(np.exp(found) * rest(found)[1] / max(slope, 1e-12))

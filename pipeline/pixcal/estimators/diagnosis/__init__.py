@@ -1,0 +1,1 @@
+"""What the diagnosis compares: evidence, test statistics, and the gap between them."""

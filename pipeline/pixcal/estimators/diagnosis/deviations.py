@@ -1,0 +1,368 @@
+"""How frames differ from those of the nominal bench, and what a change of the samples makes of it.
+
+Of a fringe set: the residuals that its fit leaves, the parameters of the frames, the maps of the
+pixels, and second moments of the first two. Of calibration frames: their change in time, their
+mean, second moments. The nominal bench lets all of these be zero, but for noise of known variance
+and the scatter of the pixels. What a change of the samples makes of the first three is linear in
+it, with all that the fit absorbs taken off.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import dct
+from scipy.ndimage import median_filter
+
+from pixcal.estimators.diagnosis.distortions import Freedom
+from pixcal.estimators.diagnosis.evidence import (
+    NO_SAMPLE,
+    Evidence,
+    FringeEvidence,
+    Stack,
+    free_frames,
+)
+from pixcal.estimators.diagnosis.pair_sums import pair_sums, pair_variance, taken_by_fit
+from pixcal.estimators.diagnosis.test_statistics.look import Look
+from pixcal.estimators.fringe_fit.tile import Coding
+from pixcal.estimators.maps.structure import flattened, without_outliers
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+WILD = 8.0
+"""Standard deviations beyond which a residual is an outlier."""
+HARMONICS = 2
+"""Of the phase, with which parameters of the frames may go for reasons of the fit."""
+DEGREES = {"offset": 3, "contrast": 2, "light": 3}
+"""Of the smooth surface that maps of the nominal bench may have."""
+MAPS = tuple(DEGREES)
+AROUND = 5
+"""Pixels along the side of a pixel's surroundings."""
+ALONE = 0.5
+"""Share of the changes of pixels by which they may differ from those of their surroundings."""
+KNOWN = 0.02
+"""Relative error of the variance that the noise model gives to parameters of a frame."""
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Values that differ from what is nominal, and one over their variance."""
+
+    value: NDArray[Any]
+    weight: NDArray[Any]
+
+
+Change = dict[str, NDArray[Any]]
+
+
+class _Deviations:
+    """What fringes and calibration frames have in common.
+
+    Attributes
+    ----------
+    linear, quadratic : tuple of str
+        Names of the deviations.
+    good : (y, x) bool
+    """
+
+    linear: tuple[str, ...]
+    quadratic: tuple[str, ...]
+    good: Mask
+
+    def measured(self, name: str) -> Deviation:
+        """A deviation of the data."""
+        found: Deviation = getattr(self, name)
+        return found
+
+    residual: Any
+
+    @cached_property
+    def _root(self) -> F32:
+        return np.asarray(np.sqrt(self.residual.weight))
+
+    def over_noise(self, rest: F32) -> F32:
+        """Residuals (t, n) of the first frames over their noise, as frames; zero without weight."""
+        values = np.zeros((len(rest), *self.good.shape), np.float32)
+        values[:, self.good] = rest * self._root[: len(rest)]
+        return values
+
+    def _pairs(self, place: F32, covariance: F64, of_time: F32) -> Deviation:
+        values = self.over_noise(self.residual.value)
+        taken = taken_by_fit(place, covariance, of_time, self.good)
+        variance = pair_variance(len(values), self.good)
+        return Deviation(pair_sums(values, self.good) - taken, _inverse(variance))
+
+    def pairs_between(self, noise: F32, other: F32, per_adu: F32) -> F64:
+        """Change of ``pairs`` where noise (t, y, x) of the first frames, ADU, becomes another.
+
+        Parameters
+        ----------
+        noise, other : (t, y, x) float32
+        per_adu : (y, x) float32
+            Reduced electrons of an ADU.
+        """
+        before, after = (
+            pair_sums(self.over_noise((values * per_adu)[:, self.good]), self.good)
+            for values in (noise, other)
+        )
+        return np.asarray((after - before) * len(self._root) / len(noise))
+
+    def second_moments(self, name: str, change: NDArray[Any]) -> F64:
+        """What a random change of the residuals adds to ``pairs``."""
+        return pair_sums(self.over_noise(change), self.good)
+
+
+class SetDeviations(_Deviations):
+    """A fringe set against the nominal bench.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    found : FringeEvidence
+    """
+
+    linear = ("residual", "frames", "maps")
+    quadratic = ("pairs", "power")
+
+    def __init__(self, evidence: Evidence, found: FringeEvidence) -> None:
+        self.found, self._evidence, self.good = found, evidence, found.good
+        turns = np.arange(1, HARMONICS + 1)[:, None] * found.phi
+        terms = np.concatenate([np.ones((1, len(found.phi))), np.cos(turns), np.sin(turns)])
+        self._of_phase = np.linalg.svd(terms, full_matrices=False)[2]
+
+    @cached_property
+    def freedom(self) -> Freedom:
+        """Of the fit."""
+        return Freedom(self.found)
+
+    @cached_property
+    def residual(self) -> Deviation:
+        """What the fit leaves of the samples (t, n) of good pixels, e-."""
+        freedom = self.freedom
+        rest = freedom.left_over(freedom.of_good(self.found.residual))
+        weight = np.where(rest**2 * freedom.weight < WILD**2, freedom.weight, np.float32(0))
+        return Deviation(rest, weight)
+
+    @cached_property
+    def frames(self) -> Deviation:
+        """Parameters (4, t) of the frames, with the noise of samples or more, as frames that follow
+        one another show it."""
+        series = self._series(self.found.free)
+        steps = np.diff(series, axis=1)
+        spread = (1.4826 * np.median(np.abs(steps), axis=1, keepdims=True)) ** 2 / 2
+        return Deviation(series, _inverse(np.maximum(spread, self._frame_noise**2)))
+
+    @cached_property
+    def maps(self) -> Deviation:
+        """Maps (3, y, x) of the pixels, of `MAPS`."""
+        maps = Look(self.found, self._evidence).maps
+        return _weighed(np.stack([maps[name] for name in MAPS]))
+
+    @cached_property
+    def pairs(self) -> Deviation:
+        """Products of residuals (`pair_sums`)."""
+        freedom = self.freedom
+        place = freedom.of_place * self._root.mean(axis=0)
+        return self._pairs(place, freedom.frame_covariance.mean(axis=0), freedom.of_time)
+
+    @cached_property
+    def power(self) -> Deviation:
+        """Power (4, band) of the parameters of the frames over that of noise."""
+        series = self._series(self.found.free)
+        power = band_power(series / self._frame_noise)
+        modes = band_power(np.ones(series.shape), squares=False)
+        modes *= 1 - len(self._of_phase) / series.shape[1]
+        return Deviation(power - modes, _inverse(2 * modes + (KNOWN * modes) ** 2))
+
+    @cached_property
+    def _frame_noise(self) -> F64:
+        """Of the series (4, t), from the noise of the samples."""
+        found, nothing = self.found, np.zeros(len(self.found.g))
+        b, a_cos, a_sin = found.g.T
+        size = a_cos**2 + a_sin**2
+        kx, ky = (np.full(len(b), k) for k in found.k)
+        slopes = np.stack(
+            [
+                [1 / b, nothing, nothing, nothing, nothing],
+                [-1 / b, a_cos / size, a_sin / size, nothing, nothing],
+                [nothing, nothing, nothing, kx, ky],
+                [nothing, nothing, nothing, -ky, kx],
+            ]
+        )
+        variance = np.einsum("sit,tij,sjt->st", slopes, found.free_covariance, slopes)
+        return np.asarray(np.sqrt(np.maximum(variance, 1e-30)))
+
+    def _series(self, free: F64) -> F64:
+        """Intensity and contrast (relative), fringe vector along and across it, (4, t)."""
+        b, a_cos, a_sin, dkx, dky = free.T
+        contrast = np.hypot(a_cos, a_sin) / b
+        kx, ky = self.found.k
+        series = np.stack(
+            [b / b.mean(), contrast / contrast.mean(), kx * dkx + ky * dky, kx * dky - ky * dkx]
+        )
+        return np.asarray(series - (series @ self._of_phase.T) @ self._of_phase)
+
+    def change(
+        self, samples: F32, constant: F64, relative: F64, names: Sequence[str] = linear
+    ) -> Change:
+        """What a change of the samples does to the linear deviations.
+
+        Parameters
+        ----------
+        samples : (t, y, x) float32
+            e-, as reduced.
+        constant, relative : (y, x) float64
+            What bias and darks that changed with them take off every frame, e-; and by how much the
+            flats did, relative.
+        names : sequence of str
+            Which.
+        """
+        found, good = self.found, self.good
+        changed = np.take(samples.reshape(len(samples), -1), np.flatnonzero(good), axis=1)
+        share = np.linalg.pinv(found.g).astype(np.float32) @ changed
+        change: Change = {}
+        if "residual" in names:
+            change["residual"] = self.freedom.left_over(changed)
+        if "frames" in names:
+            # What is left once the pixels have taken their part.
+            beside = found.model.copy()
+            beside[:, good] += changed - found.g.astype(np.float32) @ share
+            free, _ = free_frames(
+                beside, Coding(1.0, 0.0, NO_SAMPLE), found.g, found.dk, found.theta,
+                found.read_variance, found.shot_factor, good,
+            )  # fmt: skip
+            own = np.hstack([found.g, found.dk])
+            change["frames"] = self._series(free) - self._series(own)
+        if "maps" in names:
+            theta = share.astype(float) - found.theta[:, good] * relative[good]
+            theta[0] -= constant[good] / found.g[:, 0].mean()
+            change["maps"] = self._map_change(theta)
+        return change
+
+    def _map_change(self, change: F64) -> F64:
+        good = self.good
+        (iota, s, c), (d_iota, d_s, d_c) = self.found.theta[:, good], change
+        alpha2 = np.maximum(s**2 + c**2, 1e-30)
+        light, amplitude = d_iota / iota, (s * d_s + c * d_c) / alpha2
+        turn = (c * d_s - s * d_c) / alpha2 / float(np.hypot(*self.found.k))
+        of_map = {"offset": turn, "contrast": amplitude - light, "light": light}
+        out = np.full((len(MAPS), *good.shape), np.nan)
+        out[:, good] = [of_map[name] for name in MAPS]
+        return _changed(out, self.maps)
+
+    def second_moments(self, name: str, change: NDArray[Any]) -> F64:
+        """What a random change of residuals adds to ``pairs``, of frames to ``power``."""
+        if name == "power":
+            return band_power(change / self._frame_noise)
+        return super().second_moments(name, change)
+
+
+class StackDeviations(_Deviations):
+    """Calibration frames of one kind and exposure time against the nominal bench.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    stack : Stack
+    """
+
+    linear = ("residual", "maps")
+    quadratic = ("pairs",)
+
+    def __init__(self, evidence: Evidence, stack: Stack) -> None:
+        self._evidence, self._stack, self.good = evidence, stack, evidence.good
+
+    @cached_property
+    def residual(self) -> Deviation:
+        """Samples (t, n) of good pixels less their mean over time, ADU."""
+        e, adu = self._evidence, self._stack.adu[:, self.good]
+        dark = np.maximum(e.dark_rate[self.good], 0) * np.nan_to_num(self._stack.exptime_s)
+        variance = (e.read_noise**2 + dark) / e.gain**2 * max(1 - 1 / len(adu), 0.5)
+        rest = adu - adu.mean(axis=0)
+        weight = np.where(rest**2 < WILD**2 * variance, 1 / variance, 0)
+        return Deviation(rest, weight.astype(np.float32))
+
+    @cached_property
+    def maps(self) -> Deviation:
+        """Mean (1, y, x) of the frames, less the bias, ADU."""
+        mean = self._stack.adu.mean(axis=0)
+        if self._stack.kind != "bias":
+            mean = mean - self._evidence.bias
+        return _weighed(without_outliers(np.where(self.good, mean, np.nan))[None])
+
+    @cached_property
+    def pairs(self) -> Deviation:
+        """Products of residuals (`pair_sums`)."""
+        count = len(self._stack.adu)
+        same = np.full((1, count), count**-0.5, np.float32)
+        nowhere = np.zeros((1, np.count_nonzero(self.good)), np.float32)
+        return self._pairs(nowhere, np.zeros((1, 1)), same)
+
+    def pairs_between(self, noise: F32, other: F32, per_adu: F32) -> F64:
+        """As of `SetDeviations`, in ADU."""
+        return super().pairs_between(noise, other, np.ones_like(per_adu))
+
+    def change(self, samples: F32, bias: F64, names: Sequence[str] = linear) -> Change:
+        """As of `SetDeviations`, ADU; the bias changed with them."""
+        changed = samples[:, self.good]
+        change: Change = {}
+        if "residual" in names:
+            change["residual"] = changed - changed.mean(axis=0)
+        if "maps" in names:
+            mean = np.full((1, *self.good.shape), np.nan)
+            mean[0, self.good] = changed.mean(axis=0) - bias[self.good]
+            change["maps"] = _changed(mean, self.maps)
+        return change
+
+
+def band_power(series: F64, *, squares: bool = True) -> F64:
+    """Sums of squares (s, band) of cosine modes of series (s, t) in octaves, or their number."""
+    power = dct(series, norm="ortho", axis=1)[:, 1:] ** 2 if squares else series[:, 1:]
+    return np.asarray(np.add.reduceat(power, _octaves(power.shape[1]), axis=1))
+
+
+def _octaves(modes: int) -> NDArray[np.intp]:
+    starts = 2 ** np.arange(2, max(int(np.log2(max(modes, 8))), 3)) - 4
+    return np.asarray(starts[starts < modes])
+
+
+def _weighed(maps: F64) -> Deviation:
+    """Maps less their smooth surfaces, weighed by what neighbours differ by; NaN by nothing."""
+    flat, weight = _flattened(maps), np.zeros(maps.shape)
+    for own, out in zip(maps, weight, strict=True):
+        steps = np.diff(own, axis=1)
+        if np.isfinite(steps).any():
+            spread = 1.4826 * float(np.nanmedian(np.abs(steps))) / np.sqrt(2)
+            out[np.isfinite(own)] = 1 / max(spread**2, 1e-30)
+    return Deviation(flat, weight)
+
+
+def is_smooth(maps: F64, weight: F64) -> bool:
+    """Whether maps (m, y, x) change from pixel to pixel by less than they do at large.
+
+    Of others, the noise of the maps that were measured may decide.
+    """
+    around = np.stack([median_filter(own, AROUND, mode="reflect") for own in maps])
+    rough, whole = (float((weight * v**2).sum()) for v in (maps - around, maps))
+    return rough <= ALONE**2 * whole
+
+
+def _changed(maps: F64, measured: Deviation) -> F64:
+    """Change of maps less smooth surfaces, on the pixels that were measured."""
+    return _flattened(np.where(measured.weight > 0, maps, np.nan))
+
+
+def _flattened(maps: F64) -> F64:
+    degrees = [DEGREES[name] for name in MAPS] if len(maps) == len(MAPS) else [DEGREES["light"]]
+    return np.nan_to_num(
+        np.stack([flattened(own, degree) for own, degree in zip(maps, degrees, strict=True)])
+    )
+
+
+def _inverse(variance: F64) -> F64:
+    return np.where(variance > 0, 1 / np.where(variance > 0, variance, 1), 0)

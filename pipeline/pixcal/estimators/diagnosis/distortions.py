@@ -1,0 +1,271 @@
+"""Distortions of the signal that the fit of the fringes cannot absorb, fitted to its residuals.
+
+A distortion adds something to the samples that depends on the signal and a few sizes. The fit takes
+up whatever its free pixels and frames can follow; what it leaves is the rest, once the directions
+in which it is free are projected out (with its weights). The same projection on the residuals makes
+them blind to every error of the fit, a moving fringe vector included, and the sizes are a weighted
+least-squares fit of one to the other (Gauss-Newton, since the fitted signal is itself distorted).
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.diagnosis.evidence import FringeEvidence
+from pixcal.estimators.fringe_fit.fringes import grid
+from pixcal.kernels.two_way import turn
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+Distortion = Callable[[FringeEvidence, F32, F64], tuple[F32, Iterable[F32]]]
+
+_TURNS = 4
+"""Of the alternating projections: with the weights of fringes of full contrast 0.5 % of the rest
+still lies in directions that are free, and half as much with each turn more."""
+
+_INDEPENDENT = 1e-3
+_NEGLIGIBLE = 1e-6
+
+_ROUNDS = 3
+"""Steps, all with the slopes of no distortion; each gains a factor of the distortion's size."""
+
+
+class Freedom:
+    """The directions in which a fit of a fringe set is free.
+
+    Of the frames (B, A cos phi, A sin phi) and the fringe vector; of the pixels the three maps and,
+    where asked, as much again for each higher harmonic of the phase.
+
+    Parameters
+    ----------
+    fringes : FringeEvidence
+    harmonics : int
+        Highest harmonic of the phase that a pixel is free to have.
+    margin : int
+        Pixels along the edges that are left out.
+
+    Attributes
+    ----------
+    good : (y, x) bool
+        The n pixels that are used.
+    weight : (t, n) float32
+        One over the variance; zero where a sample has no weight.
+    of_time : (k, t) float32
+        The functions of time that a pixel is free to have, orthonormal.
+    of_place : (7, n) float32
+        The functions of place that a frame is free to have: the maps, and their slopes.
+    """
+
+    def __init__(self, fringes: FringeEvidence, harmonics: int = 1, margin: int = 0) -> None:
+        inside = np.zeros_like(fringes.good)
+        ny, nx = inside.shape
+        inside[margin : ny - margin, margin : nx - margin] = True
+        self.good = good = fringes.good & inside
+        usable = np.isfinite(self.of_good(fringes.electrons))
+        self.weight: F32 = np.where(usable, 1 / self.of_good(fringes.variance), np.float32(0))
+        of_time = [fringes.g / np.abs(fringes.g).max(axis=0)]
+        for n in range(2, harmonics + 1):
+            of_time += [np.cos(n * fringes.phi)[:, None], np.sin(n * fringes.phi)[:, None]]
+        # Where there are few different phases, harmonics are not independent.
+        independent, size, _ = np.linalg.svd(np.hstack(of_time), full_matrices=False)
+        independent = independent[:, size > _INDEPENDENT * size[0]]
+        self.of_time = np.ascontiguousarray(independent.T, np.float32)
+        y, x = (np.broadcast_to(v, good.shape)[good] for v in grid((good.shape[0], good.shape[1])))
+        theta = fringes.theta[:, good]
+        # The maps, and their slopes along x and y; the latter turn with the phase of the frame.
+        self.of_place = np.stack(
+            [*theta, x * theta[1], x * theta[2], y * theta[1], y * theta[2]]
+        ).astype(np.float32)
+        slopes = np.zeros((len(fringes.g), 5, 7))
+        slopes[:, [0, 1, 2], [0, 1, 2]] = 1
+        for row, column in ((3, 3), (4, 5)):
+            slopes[:, row, column] = -fringes.g[:, 2]
+            slopes[:, row, column + 1] = fringes.g[:, 1]
+        self._slopes = slopes
+
+    def of_good(self, samples: F32) -> F32:
+        """The good pixels (t, n) of samples (t, y, x)."""
+        return np.take(samples.reshape(len(samples), -1), np.flatnonzero(self.good), axis=1)
+
+    @cached_property
+    def pixel_inverse(self) -> F64:
+        """Inverse (n, k, k) of the pixels' normal matrices for their functions of time."""
+        k, n = len(self.of_time), self.weight.shape[1]
+        upper = np.triu_indices(k)
+        products = self.of_time[upper[0]] * self.of_time[upper[1]]
+        normal = np.empty((n, k, k))
+        normal[:, upper[0], upper[1]] = normal[:, upper[1], upper[0]] = (products @ self.weight).T
+        # A pixel with hardly a sample has no parameters.
+        trace = np.einsum("nii->n", normal)[:, None, None]
+        return np.linalg.inv(normal + (_NEGLIGIBLE * trace + 1e-30) * np.eye(k))
+
+    @cached_property
+    def frame_covariance(self) -> F64:
+        """Covariance (t, 7, 7) of the frames' share of the maps and slopes, from the noise."""
+        upper = np.triu_indices(7)
+        products = self.of_place[upper[0]] * self.of_place[upper[1]]
+        packed = self.weight @ products.T
+        normal = np.empty((len(packed), 7, 7))
+        normal[:, upper[0], upper[1]] = normal[:, upper[1], upper[0]] = packed
+        inverse = _inverse(self._slopes @ normal @ self._slopes.swapaxes(1, 2))
+        return self._slopes.swapaxes(1, 2) @ inverse @ self._slopes
+
+    def left_over(self, change: F32) -> F32:
+        """What the fit leaves of a change of the samples.
+
+        Parameters
+        ----------
+        change : (t, n) float32
+            Of the good pixels, e-; not used where a sample has no weight.
+
+        Returns
+        -------
+        (t, n) float32
+            Zero where a sample has no weight.
+        """
+        rest = np.where(self.weight > 0, change, np.float32(0))
+        k, n = len(self.of_time), rest.shape[1]
+        share, right = np.zeros((k, n), np.float32), np.empty((k, n), np.float32)
+        for _ in range(_TURNS):
+            turn(
+                rest, self.weight, self.of_place, self.frame_covariance,
+                self.of_time, share, right,
+            )  # fmt: skip
+            share[:] = np.einsum("nij,jn->in", self.pixel_inverse, right)
+        rest -= self.of_time.T @ share
+        rest[self.weight == 0] = 0
+        return rest
+
+    def taken_by_frames(
+        self, frames: slice, one: NDArray[np.bool_], other: NDArray[np.bool_]
+    ) -> F32:
+        """Covariance that the free frames take off the residuals of pairs of pixels.
+
+        Parameters
+        ----------
+        frames : slice
+        one, other : (y, x) bool
+            Good pixels, and as many others, in the same order.
+
+        Returns
+        -------
+        (t, pair) float32
+            e-².
+        """
+        a, b = self.of_place[:, one[self.good]], self.of_place[:, other[self.good]]
+        pairs = (a[:, None] * b[None]).reshape(len(a) ** 2, -1)
+        covariance = self.frame_covariance[frames].astype(np.float32)
+        taken: F32 = covariance.reshape(len(covariance), -1) @ pairs
+        return taken
+
+
+def _inverse(normal: F64) -> F64:
+    """Inverse of symmetric matrices (n, k, k), without the directions that nothing constrains."""
+    scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-30))
+    both = scale[:, :, None] * scale[:, None, :]
+    return np.asarray(np.linalg.pinv(normal / both, rcond=1e-7, hermitian=True) / both)
+
+
+def fit_distortions(
+    sets: Sequence[FringeEvidence],
+    distortion: Distortion,
+    count: int,
+    *,
+    margin: int = 0,
+    prior: tuple[F64, F64] | None = None,
+) -> tuple[F64, F64]:
+    """Sizes of distortions that all sets have in common.
+
+    Parameters
+    ----------
+    sets : sequence of FringeEvidence
+    distortion : callable
+        From a set, its signal (t, y, x) without distortion and the sizes, what is added to the
+        signal (t, y, x), and its derivative by each size.
+    count : int
+        Number of sizes.
+    margin : int
+        Pixels along the edges that are not used.
+    prior : (float64 array, float64 array), optional
+        Values of the sizes that are known otherwise, and their information (inverse variance; zero
+        of those that are not known).
+
+    Returns
+    -------
+    sizes : (count,) float64
+    covariance : (count, count) float64
+        From the noise of the samples.
+    """
+    fits = [_SetFit(fringes, distortion, count, margin) for fringes in sets]
+    known, information = (np.zeros(count), np.zeros(count)) if prior is None else prior
+    covariance = _inverse((sum(fit.normal for fit in fits) + np.diag(information))[None])[0]
+    sizes = np.zeros(count)
+    for _ in range(_ROUNDS):
+        right = sum(fit.right(sizes) for fit in fits) + information * (known - sizes)
+        sizes = sizes + covariance @ right
+    return sizes, covariance
+
+
+def distortion_sums(
+    sets: Sequence[FringeEvidence], distortion: Distortion, count: int, *, margin: int = 0
+) -> tuple[F64, F64]:
+    """Normal matrix (count, count) and right-hand side (count,) about no distortion.
+
+    Parameters
+    ----------
+    sets, distortion, count, margin
+        As of `fit_distortions`. What holds for all sizes together holds for any of them.
+    """
+    normal, right = np.zeros((count, count)), np.zeros(count)
+    for fringes in sets:
+        fit = _SetFit(fringes, distortion, count, margin)
+        normal, right = normal + fit.normal, right + fit.right(np.zeros(count))
+    return normal, right
+
+
+class _SetFit:
+    """One set: its residuals, and what its fit took up of the distortion.
+
+    Attributes
+    ----------
+    normal : (count, count) float64
+        Normal matrix of the sizes where there is no distortion.
+    """
+
+    def __init__(
+        self, fringes: FringeEvidence, distortion: Distortion, count: int, margin: int
+    ) -> None:
+        self._fringes, self._distortion = fringes, distortion
+        self._freedom = Freedom(fringes, margin=margin)
+        self._residual = self._freedom.left_over(self._freedom.of_good(fringes.residual))
+        # Where there is no fit, the samples themselves act on the pixels around.
+        seen = np.isfinite(fringes.electrons) & ~fringes.good
+        self._fitted = np.nan_to_num(np.where(seen, fringes.electrons, fringes.model))
+        self._signal = self._fitted
+        _, slopes = distortion(fringes, self._signal, np.zeros(count))
+        self._left = [self._freedom.left_over(self._freedom.of_good(slope)) for slope in slopes]
+        self.normal = np.array([self._weighted_dots(rest) for rest in self._left])
+
+    def right(self, sizes: F64) -> F64:
+        """Right-hand side for a step from some sizes to better ones."""
+        residual = self._residual
+        if np.any(sizes):
+            freedom = self._freedom
+            change = freedom.of_good(self._distortion(self._fringes, self._signal, sizes)[0])
+            left = freedom.left_over(change)
+            self._signal = self._fitted.copy()
+            self._signal[:, freedom.good] -= change - left
+            residual = residual - left
+        return self._weighted_dots(residual)
+
+    def _weighted_dots(self, rest: F32) -> F64:
+        weighted = self._freedom.weight * rest
+        return np.array([_dot(left, weighted) for left in self._left])
+
+
+def _dot(a: F32, b: F32) -> float:
+    """Sum of the products: of each frame in float32, of the frames in float64."""
+    return float(np.einsum("tn,tn->t", a, b).sum(dtype=float))

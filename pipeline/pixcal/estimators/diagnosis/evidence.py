@@ -1,0 +1,342 @@
+"""What a part of an acquisition tells about its effects: samples, maps, frames, side by side."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.fringe_fit.fringes import grid
+from pixcal.estimators.fringe_fit.tile import Coding
+from pixcal.kernels.bilinear import frame_sums
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+T = TypeVar("T")
+
+STRIPE = 4
+"""Rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves."""
+SATURATED = 1e-3
+"""Share of saturated samples from which flats tell nothing of levels and noise."""
+STEADY = 0.3
+"""Relative change of the light a second of flats beyond which it is the lamp that was changed."""
+DITHER = 0.38
+"""Noise over a code from which means of rounded samples are right to 2 % of a code."""
+NO_SAMPLE = -(1 << 30)
+"""Electrons that stand for a sample without weight."""
+
+
+@dataclass(frozen=True)
+class FringeEvidence:
+    """One fringe set on a part of the window, and what the fit found there.
+
+    Attributes
+    ----------
+    name : str
+    baseline_mm : (float, float)
+        Nominal.
+    k : (float, float)
+        Fringe vector (kx, ky) at the window's centre, rad/px.
+    origin : (int, int)
+        Row and column of the part's first pixel in the window.
+    window : (int, int)
+        Rows and columns of the whole window.
+    time_s, exptime_s : (t,), float
+        Time of each frame, s; exposure time (nan when unknown).
+    electrons : (t, y, x) float32
+        Reduced samples (bias and dark taken off, divided by the flat); NaN without weight.
+    adu : (t, y, x) uint16 or other
+        The same samples as the camera wrote them.
+    g : (t, 3) float64
+        (B, A cos phi, A sin phi) at the middle of the part.
+    dk : (t, 2) float64
+        Change of the fringe vector (x, y), rad/px; zeros when the fit held it.
+    free : (t, 5) float64
+        (B, A cos phi, A sin phi, dkx, dky) of each frame by itself, from this part's pixels, with
+        the fringe vector free whether the fit held it or not.
+    free_covariance : (t, 5, 5) float64
+        Of ``free``, from the noise of the samples.
+    theta : (3, y, x) float64
+        (iota, alpha sin psi, alpha cos psi), e-.
+    sigma : (y, x) float64
+        1-sigma error of the phase psi, rad, of the noise.
+    delta : (y, x) float64
+        Offset along the fringe axis, px, modes removed; NaN where masked.
+    good : (y, x) bool
+    read_variance, shot_factor : (y, x) float64
+        Variance of a sample: ``shot_factor * model + read_variance`` (e-²).
+    start_s : float
+        Time of the set's first frame after that of the acquisition; nan when unknown.
+    """
+
+    name: str
+    baseline_mm: tuple[float, float]
+    k: tuple[float, float]
+    origin: tuple[int, int]
+    window: tuple[int, int]
+    time_s: F64
+    exptime_s: float
+    electrons: F32
+    adu: NDArray[np.generic]
+    g: F64
+    dk: F64
+    free: F64
+    free_covariance: F64
+    theta: F64
+    sigma: F64
+    delta: F64
+    good: NDArray[np.bool_]
+    read_variance: F64
+    shot_factor: F64
+    start_s: float = np.nan
+
+    @cached_property
+    def model(self) -> F32:
+        """Fitted model (t, y, x), e-; the change of the fringe vector to first order."""
+        frames, maps = self.g, self.theta
+        if np.any(self.dk):
+            y, x = grid((self.good.shape[0], self.good.shape[1]))
+            _, c, s = self.g.T
+            kx, ky = self.dk.T
+            _, of_sine, of_cosine = self.theta
+            frames = np.column_stack([self.g, kx * c, ky * c, kx * s, ky * s])
+            turned = [x * of_cosine, y * of_cosine, -x * of_sine, -y * of_sine]
+            maps = np.concatenate([self.theta, turned])
+        flat = maps.reshape(len(maps), -1).astype(np.float32)
+        return np.asarray((frames.astype(np.float32) @ flat).reshape(-1, *self.good.shape))
+
+    @cached_property
+    def residual(self) -> F32:
+        """Samples less the model (t, y, x), e-; NaN without weight."""
+        return np.asarray(self.electrons - self.model)
+
+    @cached_property
+    def variance(self) -> F32:
+        """Variance (t, y, x) that the noise model predicts, e-²."""
+        variance = np.maximum(self.model, np.float32(0))
+        variance *= self.shot_factor.astype(np.float32)
+        variance += self.read_variance.astype(np.float32)
+        return np.asarray(variance)
+
+    @property
+    def phi(self) -> F64:
+        """Phase of each frame, rad."""
+        return np.arctan2(self.g[:, 2], self.g[:, 1])
+
+    @cached_property
+    def halves(self) -> tuple[tuple[F64, F64], tuple[F64, F64]]:
+        """``free`` and ``free_covariance`` of each half of the pixels, taken by stripes of rows.
+
+        The bench is common to both, the noise of the samples is not, that of whole rows included.
+        """
+        own = stripes(self.good.shape)
+        codes = np.where(np.isnan(self.electrons), np.float32(NO_SAMPLE), self.electrons)
+        one, other = (
+            free_frames(
+                codes, Coding(1.0, 0.0, NO_SAMPLE), self.g, self.dk, self.theta,
+                self.read_variance, self.shot_factor, self.good & half,
+            )
+            for half in (own, ~own)
+        )  # fmt: skip
+        return one, other
+
+
+@dataclass(frozen=True)
+class Stack:
+    """Calibration frames of one kind and exposure time, as the camera wrote them.
+
+    Attributes
+    ----------
+    kind : str
+        ``bias``, ``dark`` or ``flat``.
+    exptime_s : float
+        nan when unknown.
+    time_s : (t,) float64
+        Time of each frame, from the first of its kind.
+    adu : (t, y, x) float32
+    start_s : float
+        Time of the first of its kind after the first frame of the acquisition; nan when unknown.
+    step : int
+        Of the lamp, among flats of one exposure time; 0 is the dimmest.
+    """
+
+    kind: str
+    exptime_s: float
+    time_s: F64
+    adu: F32
+    start_s: float = np.nan
+    step: int = 0
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A part of the window of an acquisition that was reduced and fitted.
+
+    Attributes
+    ----------
+    fringes : mapping
+        Fringe sets by name.
+    stacks : tuple of Stack
+        Bias, darks and flats.
+    gain : float
+        e-/ADU.
+    read_noise : float
+        Of a sample, the rounding of the converter included; e- rms.
+    amplifier_noise : float
+        The same before rounding.
+    bias, dark_rate, flat : (y, x) float64
+        Calibration maps: ADU, e-/s, relative.
+    good : (y, x) bool
+        Pixels without flags.
+    saturation_adu : float
+        Declared, or the end of the samples' type.
+    pitch_um, wavelength_nm, distance_mm : float
+        Nominal bench.
+    origin : (int, int)
+        Row and column of the part's first pixel in the window.
+    photon_transfer : (float, float, float)
+        Gain that photon transfer gives (e-/ADU), its error, and the reduced chi-square; nan where
+        it gives none.
+    """
+
+    fringes: Mapping[str, FringeEvidence]
+    stacks: tuple[Stack, ...]
+    gain: float
+    read_noise: float
+    amplifier_noise: float
+    bias: F64
+    dark_rate: F64
+    flat: F64
+    good: NDArray[np.bool_]
+    saturation_adu: float
+    pitch_um: float
+    wavelength_nm: float
+    distance_mm: float
+    notes: tuple[str, ...] = field(default=())
+    origin: tuple[int, int] = (0, 0)
+    photon_transfer: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+    _found: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def once(self, name: str, *given: Any, make: Callable[[], T]) -> T:
+        """What follows from this evidence and what is given (hashable), made when first asked for.
+
+        For little things that several estimates need.
+        """
+        if (name, *given) not in self._found:
+            self._found[name, *given] = make()
+        return cast(T, self._found[name, *given])
+
+    def level(self, fringes: FringeEvidence, signal: F32) -> F32:
+        """Electrons in the pixels for a signal (t, y, x) of a set: flat and dark put back."""
+        seconds = fringes.exptime_s if np.isfinite(fringes.exptime_s) else 0.0
+        dark = np.maximum(self.dark_rate, 0) * seconds
+        return signal * self.flat.astype(np.float32) + dark.astype(np.float32)
+
+    def dark_noise(self, stack: Stack) -> tuple[F32, F32]:
+        """Samples of darks less the median of each pixel and of each frame, and their sigma.
+
+        Returns
+        -------
+        rest, sigma : (t, y, x) float32
+            e-; NaN in pixels with flags.
+        """
+        rest = (stack.adu - np.median(stack.adu, axis=0)) * self.gain
+        rest = np.where(self.good, rest, np.nan)
+        rest -= np.nanmedian(rest, axis=(1, 2), keepdims=True) if self.good.any() else 0
+        seconds = np.nan_to_num(stack.exptime_s)
+        sigma = np.sqrt(self.read_noise**2 + np.maximum(self.dark_rate, 0) * seconds)
+        every = np.broadcast_to(sigma.astype(np.float32), rest.shape)
+        return rest.astype(np.float32), every
+
+    @property
+    def dithered(self) -> bool:
+        """Whether the read noise spans so much of a code that means of dark samples are right."""
+        return self.amplifier_noise > DITHER * self.gain
+
+    @property
+    def steady_lamp(self) -> bool:
+        """Whether flats of different exposure times can be of one lamp."""
+        times = [s.exptime_s for s in self.ladder]
+        if not times or not min(times) > 0 or len(set(times)) < len(times):
+            return False
+        good = self.good
+        rates = [
+            float((s.adu.mean(axis=0) - self.bias)[good].mean()) / s.exptime_s for s in self.ladder
+        ]
+        return min(rates) > 0 and max(rates) < (1 + STEADY) * min(rates)
+
+    @property
+    def ladder(self) -> tuple[Stack, ...]:
+        """Flats by exposure time, without those that are saturated in part."""
+        return tuple(s for s in self.of_kind("flat") if self._saturated(s) < SATURATED)
+
+    def _saturated(self, stack: Stack) -> float:
+        """Share of the samples of good pixels."""
+        return float((stack.adu[:, self.good] >= self.saturation_adu).mean())
+
+    def of_kind(self, kind: str) -> tuple[Stack, ...]:
+        """Stacks of a kind, by exposure time."""
+        return tuple(
+            sorted((s for s in self.stacks if s.kind == kind), key=lambda s: (s.exptime_s, s.step))
+        )
+
+
+def stripes(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """One half of a window by stripes of rows (columns if rows are few), to broadcast to (y, x).
+
+    The sequence of Thue and Morse: it has no period that a fringe could fall in with.
+    """
+    axis = 0 if shape[0] >= 2 * STRIPE else 1
+    half = np.bitwise_count(np.arange(shape[axis]) // STRIPE) % 2 == 0
+    return np.expand_dims(half, 1 - axis)
+
+
+def free_frames(
+    codes: NDArray[np.generic],
+    coding: Coding,
+    g: F64,
+    dk: F64,
+    theta: F64,
+    read_variance: F64,
+    shot_factor: F64,
+    good: NDArray[np.bool_],
+) -> tuple[F64, F64]:
+    """Parameters of every frame by itself, the pixels being known, and their covariance.
+
+    Parameters
+    ----------
+    codes : (t, y, x) uint16 or float32
+        Samples as they are stored, or in electrons.
+    coding : Coding
+    g, dk : (t, 3), (t, 2) float64
+        Start, at the middle of the part.
+    theta, read_variance, shot_factor, good
+        As in `FringeEvidence`.
+
+    Returns
+    -------
+    free : (t, 5) float64
+    covariance : (t, 5, 5) float64
+        As in `FringeEvidence`.
+    """
+    n = len(g)
+    y, x = np.broadcast_arrays(*grid((good.shape[0], good.shape[1])))
+    packed, right = np.zeros((n, 15)), np.zeros((n, 5))
+    start, turned = g.astype(np.float32), dk.astype(np.float32)
+    frame_sums(
+        np.ascontiguousarray(codes[:, good]), coding.scale, coding.offset, coding.fill,
+        start, turned, y[good].astype(np.float32), x[good].astype(np.float32),
+        np.ascontiguousarray(theta[:, good], np.float32), read_variance[good].astype(np.float32),
+        shot_factor[good].astype(np.float32), packed, right,
+    )  # fmt: skip
+    normal = np.zeros((n, 5, 5))
+    upper = np.triu_indices(5)
+    normal[:, upper[0], upper[1]] = packed
+    normal[:, upper[1], upper[0]] = packed
+    scale = np.sqrt(np.maximum(np.einsum("tii->ti", normal), 1e-30))
+    both = scale[:, :, None] * scale[:, None, :]
+    covariance = np.linalg.pinv(normal / both, rcond=1e-10, hermitian=True) / both
+    step = np.einsum("tij,tj->ti", covariance, right)
+    return np.hstack([start, turned]) + step, covariance

@@ -1,0 +1,319 @@
+"""The gap between data and simulations: curve by curve, how far beyond what chance allows.
+
+Simulations of the same bench with other random numbers show how a statistic scatters. A value of
+the data is held against them by Student's distribution: with few simulations, a deviation counts
+for as much as it can. Mean squares are compared through a root below their usual size and a
+logarithm above it: the scatter of both is nearly normal, and the same for strong effects and weak.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri_exp
+from scipy.stats import t as student
+
+from pixcal.estimators.diagnosis.test_statistics import Curve, Key
+from pixcal.estimators.diagnosis.test_statistics.signature import statistic_named
+
+F64 = NDArray[np.float64]
+Curves = Mapping[Key, Curve]
+
+TOLERANCE = 0.05
+"""Share of what an effect does that its simulation may be wrong by."""
+ALLOWED = 2.0
+"""Standard deviations that a value may be off by before it counts as a gap."""
+CHANCE = 1e-3
+"""Chance, of all statistics together, below which a difference is a gap."""
+
+
+def scaled(values: F64, usual: F64) -> F64:
+    """Mean squares over their usual size, on a scale where chance is nearly normal."""
+    ratio = values / np.maximum(usual, 1e-300)
+    low = 3 * (np.cbrt(np.minimum(ratio, 1.0)) - 1)
+    return np.asarray(np.where(ratio > 1, np.log(np.maximum(ratio, 1.0)), low))
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What the nominal bench lets expect: simulations with different seeds, on their scales.
+
+    Attributes
+    ----------
+    usual : mapping
+        Median (n,) of each curve that is a power; None for the others.
+    values : mapping
+        (simulation, n) of each curve, in the order of the seeds.
+    independent : mapping
+        As how many independent values each curve's are, `independent_values`.
+    """
+
+    usual: Mapping[Key, F64 | None]
+    values: Mapping[Key, F64]
+    independent: Mapping[Key, float]
+
+    @classmethod
+    def of(cls, simulated: Sequence[Curves]) -> "Reference":
+        """From simulations; curves that not all of them have are left out."""
+        keys = [k for k in simulated[0] if all(k in s for s in simulated)]
+        keys = [k for k in keys if len({len(s[k].value) for s in simulated}) == 1]
+        usual: dict[Key, F64 | None] = {}
+        values = {}
+        for key in keys:
+            stack = np.stack([s[key].value for s in simulated])
+            power = statistic_named(key[0]).kind == "power"
+            usual[key] = np.median(stack, axis=0) if power else None
+            own = usual[key]
+            values[key] = stack if own is None else scaled(stack, own)
+        floors = {key: statistic_named(key[0]).floor for key in values}
+        independent = {key: independent_values(v, floors[key]) for key, v in values.items()}
+        return cls(usual, values, independent)
+
+    def on_scale(self, curves: Curves) -> dict[Key, F64]:
+        """Curves on the scales of the reference, where it has them."""
+        found = {}
+        for key, usual in self.usual.items():
+            curve = curves.get(key)
+            if curve is not None and len(curve.value) == self.values[key].shape[1]:
+                found[key] = curve.value if usual is None else scaled(curve.value, usual)
+        return found
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """What a bench, nominal or with effects, lets expect of every curve.
+
+    Attributes
+    ----------
+    mean, variance : mapping
+        (n,) on the reference's scales; the variance of a value of the data about the mean.
+    noise : mapping
+        Variance (n,) of the nominal bench alone.
+    independent : mapping
+        As of the reference.
+    dof : int
+    """
+
+    mean: Mapping[Key, F64]
+    variance: Mapping[Key, F64]
+    noise: Mapping[Key, F64]
+    independent: Mapping[Key, float]
+    dof: int
+
+
+def expect_nominal(reference: Reference) -> Expectation:
+    """What the nominal bench lets expect."""
+    mean, variance, noise, count = {}, {}, {}, 2
+    for key, values in reference.values.items():
+        count = len(values)
+        noise[key] = _variance(values, statistic_named(key[0]).floor)
+        mean[key] = values.mean(axis=0)
+        variance[key] = noise[key] * (1 + 1 / count)
+    return Expectation(mean, variance, noise, reference.independent, count - 1)
+
+
+def expect_with(
+    reference: Reference, simulated: Sequence[Curves], error: float = 0.0
+) -> Expectation:
+    """What a bench with effects lets expect.
+
+    Parameters
+    ----------
+    reference : Reference
+    simulated : sequence of Curves
+        With the first seeds of the reference, in the same order: what differs is due to effects.
+    error : float
+        Relative error of the effects' strength.
+    """
+    nominal = expect_nominal(reference)
+    scaled_ones = [reference.on_scale(s) for s in simulated]
+    mean, variance = dict(nominal.mean), dict(nominal.variance)
+    count = len(simulated)
+    for key, values in reference.values.items():
+        if any(key not in s for s in scaled_ones):
+            continue
+        own = np.stack([s[key] for s in scaled_ones])
+        same_seeds = values[:count]
+        change = own - same_seeds
+        shift = change.mean(axis=0)
+        mean[key] = nominal.mean[key] + shift
+        more = (TOLERANCE**2 + error**2) * shift**2
+        if count > 1:
+            paired = change.var(axis=0, ddof=1)
+            more += paired / count
+            # What the effects add to the scatter; what few seeds have by chance is not theirs.
+            more += np.maximum(own.var(axis=0, ddof=1) - same_seeds.var(axis=0, ddof=1), 0)
+        variance[key] = nominal.variance[key] + more
+    return replace(nominal, mean=mean, variance=variance)
+
+
+def _variance(values: F64, floor: float) -> F64:
+    """Variance (n,), leaning on the other values of the curve so that none is tiny by chance."""
+    own = values.var(axis=0, ddof=1)
+    rounding = (1e-9 * np.abs(values).max(axis=0)) ** 2
+    leaning = 0.9 * own + 0.1 * np.median(own) + rounding + 1e-300
+    return np.asarray(np.maximum(leaning, floor**2))
+
+
+def independent_values(values: F64, floor: float = 0.0) -> float:
+    """As how many independent values those of a curve are, when the least likely one is looked at.
+
+    Each simulation is held against the others. Of n independent values the least chance u has
+    -log(1 - u) distributed as an exponential with the mean 1 / n, whose likelihood gives n.
+
+    Parameters
+    ----------
+    values : (simulation, n) float64
+    floor : float
+        Least standard deviation.
+    """
+    count, n = values.shape
+    if n == 1 or count < 3:
+        return float(n)
+    total = 0.0
+    for number in range(count):
+        others = np.delete(values, number, axis=0)
+        error = np.sqrt(_variance(others, floor) * (1 + 1 / len(others)))
+        chance = 2 * student.sf(np.abs(values[number] - others.mean(axis=0)) / error, count - 2)
+        total -= float(np.log1p(-min(float(chance.min()), 1 - 1e-9)))
+    return float(np.clip(count / total, 1, n))
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One curve of the data against an expectation.
+
+    Attributes
+    ----------
+    sigmas : (n,) float64
+        Signed; of a normal, as rare as the deviation is.
+    log_chance : float
+        Logarithm of the chance that any of the curve's values is as far off; uniform (its
+        exponential) where there is no gap.
+    excess : float
+        Squares of the deviations, as far as they are beyond `ALLOWED` standard deviations, over
+        the nominal noise.
+    """
+
+    sigmas: F64
+    log_chance: float
+    excess: float
+
+    @property
+    def worst(self) -> int:
+        """Number of the value that is furthest off."""
+        return int(np.argmax(np.abs(self.sigmas)))
+
+
+def compare(data: Mapping[Key, F64], expected: Expectation) -> dict[Key, Difference]:
+    """Curves of the data (on the reference's scales) against an expectation."""
+    keys = [key for key in expected.mean if key in data]
+    if not keys:
+        return {}
+    # All values at once: a call of SciPy's distributions takes longer than a curve.
+    sizes = [len(data[key]) for key in keys]
+    starts = np.cumsum([0, *sizes[:-1]])
+    off = np.concatenate([data[key] - expected.mean[key] for key in keys])
+    error = np.sqrt(np.concatenate([expected.variance[key] for key in keys]))
+    noise = np.concatenate([expected.noise[key] for key in keys])
+    tails = student.logsf(np.abs(off) / error, expected.dof)
+    sigmas = -ndtri_exp(np.minimum(tails, -1e-300)) * np.sign(off)
+    least = np.minimum.reduceat(tails, starts) + np.log(2)
+    any_of = _any_of(least, np.array([expected.independent[key] for key in keys]))
+    beyond = np.maximum(np.abs(off) - ALLOWED * error, 0) ** 2
+    excess = np.add.reduceat(beyond / noise, starts)
+    return {
+        key: Difference(sigmas[first : first + size], float(chance), float(more))
+        for key, first, size, chance, more in zip(keys, starts, sizes, any_of, excess, strict=True)
+    }
+
+
+def _any_of(log_chance: F64, count: F64) -> F64:
+    """Logarithm of the chance that the least of some independent chances is as small."""
+    none = count * np.log1p(-np.minimum(np.exp(log_chance), 1 - 1e-15))
+    tiny = log_chance < -30
+    many = np.log(-np.expm1(np.where(tiny, -1.0, none)))
+    return np.asarray(np.where(tiny, log_chance + np.log(count), many))
+
+
+def flagged(differences: Mapping[Key, Difference]) -> set[Key]:
+    """Curves that differ by more than chance, all statistics being looked at (Bonferroni)."""
+    limit = np.log(CHANCE / max(len(differences), 1))
+    return {key for key, d in differences.items() if d.log_chance < limit}
+
+
+def sigmas_of(log_chance: float) -> float:
+    """Standard deviations of a normal that are as rare, one-sided."""
+    return float(-ndtri_exp(min(log_chance, -1e-300)))
+
+
+def log_likelihood(data: Mapping[Key, F64], expected: Expectation) -> float:
+    """Logarithm of the chance density (Student's) of the data, of all curves together."""
+    return sum(_log_density(data[key], expected, key) for key in expected.mean if key in data)
+
+
+def likelier(data: Mapping[Key, F64], before: Expectation, after: Expectation) -> dict[Key, float]:
+    """By how much the logarithm of the chance density of each curve rises."""
+    return {
+        key: _log_density(data[key], after, key) - _log_density(data[key], before, key)
+        for key in before.mean
+        if key in data
+    }
+
+
+def _log_density(values: F64, expected: Expectation, key: Key) -> float:
+    """Of one curve; of more than three values it counts as three, for they are not independent."""
+    variance, nu = expected.variance[key], expected.dof
+    square = (values - expected.mean[key]) ** 2 / variance
+    terms = -(nu + 1) / 2 * np.log1p(square / nu) - np.log(variance) / 2
+    return float(terms.sum()) / max(1.0, len(values) / 3)
+
+
+@dataclass(frozen=True)
+class Gap:
+    """How much of the gap is left, against the nominal bench's.
+
+    Attributes
+    ----------
+    total : float
+        1: all of it; 0: none.
+    weights, left : mapping
+        Of each curve: its weight, and the share of its excess that is left.
+    """
+
+    total: float
+    weights: Mapping[Key, float]
+    left: Mapping[Key, float]
+
+    def of_domain(self, domain: str) -> tuple[float, float]:
+        """Weight of a domain, and of what is left of it, over all of the gap at the start."""
+        whole = sum(self.weights.values()) or 1.0
+        own = [k for k in self.left if statistic_named(k[0]).domain == domain]
+        return (
+            sum(self.weights.get(k, 0.0) for k in own) / whole,
+            sum(self.weights.get(k, 0.0) * self.left[k] for k in own) / whole,
+        )
+
+
+def remaining(
+    before: Mapping[Key, Difference], after: Mapping[Key, Difference], where: set[Key]
+) -> Gap:
+    """The gap that is left of what differed before.
+
+    Every curve that differed (``where``) counts by the square of its significance; of it, the share
+    of its excess that is left. What differs only after counts in full.
+    """
+    weights = {k: sigmas_of(before[k].log_chance) ** 2 for k in where}
+    whole = sum(weights.values())
+    left = {
+        k: float(np.clip(after[k].excess / max(before[k].excess, 1e-12), 0, 2))
+        for k in where
+        if k in after
+    }
+    total = sum(weights[k] * left[k] for k in left)
+    for key in flagged(after) - where:
+        own = sigmas_of(after[key].log_chance) ** 2
+        total += own
+        left[key] = own / max(whole, 1e-12)
+    return Gap(total / whole if whole else 0.0, weights, left)

@@ -1,0 +1,56 @@
+"""The middle of a part of the window, where less evidence is enough and sooner looked at."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+
+MOST = 1 << 21
+"""Samples of a set that are looked at where every one costs some hundred operations."""
+
+LEAST = 32
+"""Pixels that stay along each side, and frames, if there are as many."""
+
+
+def middle(evidence: Evidence, samples: int = MOST) -> Evidence:
+    """Pixels about the middle of the part; of very long sets also the first frames only.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    samples : int
+        That a fringe set may have.
+    """
+    ny, nx = evidence.good.shape
+    longest = max((len(f.g) for f in evidence.fringes.values()), default=1)
+    shrink = min(1.0, float(np.sqrt(samples / (longest * ny * nx))))
+    # As much is cut at both ends: what is counted from the middle stays right.
+    cut_y, cut_x = (max(0, int((n - max(LEAST, n * shrink)) / 2)) for n in (ny, nx))
+    rows, columns = slice(cut_y, ny - cut_y), slice(cut_x, nx - cut_x)
+    frames = max(LEAST, samples // ((ny - 2 * cut_y) * (nx - 2 * cut_x)))
+    if not cut_y and not cut_x and frames >= longest:
+        return evidence
+    return replace(
+        evidence,
+        fringes={
+            name: _part(fringes, slice(0, frames), rows, columns)
+            for name, fringes in evidence.fringes.items()
+        },
+        stacks=tuple(replace(s, adu=s.adu[:, rows, columns]) for s in evidence.stacks),
+        origin=(evidence.origin[0] + cut_y, evidence.origin[1] + cut_x),
+        **{n: getattr(evidence, n)[rows, columns] for n in ("bias", "dark_rate", "flat", "good")},
+    )
+
+
+def _part(fringes: FringeEvidence, frames: slice, rows: slice, columns: slice) -> FringeEvidence:
+    of_frames = ("time_s", "g", "dk", "free", "free_covariance")
+    of_pixels = ("theta", "sigma", "delta", "good", "read_variance", "shot_factor")
+    return replace(
+        fringes,
+        origin=(fringes.origin[0] + rows.start, fringes.origin[1] + columns.start),
+        electrons=fringes.electrons[frames, rows, columns],
+        adu=fringes.adu[frames, rows, columns],
+        **{name: getattr(fringes, name)[frames] for name in of_frames},
+        **{name: getattr(fringes, name)[..., rows, columns] for name in of_pixels},
+    )

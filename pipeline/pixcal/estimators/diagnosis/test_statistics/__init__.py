@@ -1,0 +1,128 @@
+"""What data and simulation are compared by: curves of statistics, one file for each domain.
+
+A statistic is a function of an acquisition's evidence, marked by `statistic`; all that the files
+here hold are found by `test_statistics`. It gives a short curve: values that mean the same in every
+acquisition of the same size, whatever made it.
+"""
+
+import importlib
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.test_statistics.look import Look
+
+F64 = NDArray[np.float64]
+
+DETECTOR = "detector"
+"""Stands for the name of a set where a curve is of the detector or of several sets."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Values of a statistic.
+
+    Attributes
+    ----------
+    x : (n,) float64
+    value : (n,) float64
+        In the statistic's unit; its square where the statistic is a power.
+    """
+
+    x: F64
+    value: F64
+
+
+Key = tuple[str, str]
+"""Name of a statistic and of the fringe set (or `DETECTOR`)."""
+
+
+@dataclass(frozen=True)
+class Statistic:
+    """A way of looking at data.
+
+    Attributes
+    ----------
+    name, title : str
+    domain : str
+        ``space``, ``time``, ``intensity`` or ``noise``.
+    unit, x_label : str
+    kind : str
+        ``linear``, or ``power``: mean squares, which are compared by their logarithms.
+    of_set : bool
+        Looks at one fringe set; else at all of the evidence,
+    of_all : bool
+        or at all fringe sets together.
+    floor : float
+        Least standard deviation that chance has, where simulations may all be alike.
+    measure : callable
+        From a `Look` (of a set), those of all sets, or `Evidence`; None where there is nothing to
+        look at.
+    """
+
+    name: str
+    title: str
+    domain: str
+    unit: str
+    x_label: str
+    kind: str
+    of_set: bool
+    of_all: bool
+    floor: float
+    measure: Callable[[Any], Curve | None]
+
+
+def statistic(
+    domain: str,
+    title: str,
+    *,
+    unit: str = "",
+    x: str = "",
+    power: bool = False,
+    sets: bool = True,
+    together: bool = False,
+    floor: float = 0.0,
+) -> Callable[[Callable[[Any], Curve | None]], Statistic]:
+    """Mark a function as a statistic; its name becomes that of the statistic."""
+
+    def mark(measure: Callable[[Any], Curve | None]) -> Statistic:
+        kind = "power" if power else "linear"
+        of_set = sets and not together
+        return Statistic(
+            measure.__name__, title, domain, unit, x, kind, of_set, together, floor, measure
+        )
+
+    return mark
+
+
+@cache
+def known_statistics() -> Mapping[str, Statistic]:
+    """All statistics, by name."""
+    found: dict[str, Statistic] = {}
+    for module in pkgutil.iter_modules(__path__):
+        contents = vars(importlib.import_module(f"{__name__}.{module.name}"))
+        for value in contents.values():
+            for one in value if isinstance(value, tuple) else (value,):
+                if isinstance(one, Statistic):
+                    found[one.name] = one
+    return found
+
+
+def measure(evidence: Evidence) -> dict[Key, Curve]:
+    """Every statistic of an acquisition that it has the frames for."""
+    found: dict[Key, Curve] = {}
+    looks = {name: Look(fringes, evidence) for name, fringes in evidence.fringes.items()}
+    every: tuple[tuple[str, Any], ...] = ((DETECTOR, tuple(looks.values())),)
+    for name, one in known_statistics().items():
+        whole = every if one.of_all else ((DETECTOR, evidence),)
+        for of, what in looks.items() if one.of_set else whole:
+            curve = one.measure(what)
+            if curve is not None and len(curve.value) and np.isfinite(curve.value).all():
+                found[name, of] = curve
+    return found

@@ -1,0 +1,135 @@
+"""Statistics of bias, dark and flat frames: what changes between two frames of one scene.
+
+The difference of two frames holds no fixed pattern, only noise: what neighbours, rows and columns
+share of it, at several distances, and how that grows with the level.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
+from pixcal.estimators.diagnosis.test_statistics.look import F32, F64, STEPS, Mask, neighbour_sums
+
+REPEATS = (1, 2, 3, 4)
+"""Rows or columns between two that may share noise."""
+WILD = 8.0
+BANDS = 4
+"""Of the spectrum, from the size of the window to two pixels."""
+
+
+def differences(evidence: Evidence, stack: Stack) -> F32:
+    """Differences (t, y, x) of frames 0 and 1, 2 and 3, ..., over their noise; outliers zero."""
+    light = stack.adu - evidence.bias.astype(np.float32)
+    good = evidence.good
+    if stack.kind == "flat":
+        means = light[:, good].mean(axis=1)
+        light = light * (means.mean() / means)[:, None, None].astype(np.float32)
+    count = len(light) // 2 * 2
+    steps = light[1:count:2] - light[:count:2]
+    steps -= steps[:, good].mean(axis=1)[:, None, None]
+    # Root mean squares: medians of whole numbers jump.
+    rest = steps / np.sqrt((steps[:, good] ** 2).mean())
+    rest[np.abs(rest) > WILD] = 0
+    return np.asarray(rest * good, np.float32)
+
+
+def _stacks(evidence: Evidence, kind: str) -> tuple[Stack, ...]:
+    if kind != "flat" and not evidence.dithered:
+        return ()
+    stacks = evidence.ladder if kind == "flat" else evidence.of_kind(kind)
+    return tuple(s for s in stacks if len(s.adu) >= 2)
+
+
+def _neighbours(rest: Iterable[F32], good: Mask) -> F64:
+    """Correlation (step,) of pixels some rows and columns apart."""
+    total, pairs = np.zeros(len(STEPS)), np.zeros(len(STEPS))
+    square = count = 0.0
+    for steps in rest:
+        sums, number = neighbour_sums(steps, good, STEPS)
+        total += sums.sum(axis=1)
+        pairs += number.sum(axis=1)
+        square += float((steps.astype(float) ** 2).sum())
+        count += len(steps) * np.count_nonzero(good)
+    return np.asarray(total / np.maximum(pairs, 1) / (square / max(count, 1)))
+
+
+def _neighbours_of(kind: str) -> Statistic:
+    def measured(evidence: Evidence) -> Curve | None:
+        stacks = _stacks(evidence, kind)
+        if not stacks:
+            return None
+        value = _neighbours((differences(evidence, s) for s in stacks), evidence.good)
+        return Curve(np.arange(float(len(STEPS))), value)
+
+    measured.__name__ = f"{kind}_neighbours"
+    title = f"correlation of neighbours in {kind} frames"
+    return statistic("noise", title, x="neighbour", sets=False)(measured)
+
+
+def _lines_of(kind: str) -> Statistic:
+    def measured(evidence: Evidence) -> Curve | None:
+        stacks = _stacks(evidence, kind)
+        if not stacks:
+            return None
+        rest = np.concatenate([differences(evidence, s) for s in stacks])
+        value = [one for axis in (2, 1) for one in _repeats(rest, evidence.good, axis)]
+        return Curve(np.arange(float(len(value))), np.array(value))
+
+    measured.__name__ = f"{kind}_line_repeats"
+    title = f"correlated row and column noise in {kind} frames"
+    return statistic("noise", title, x="distance: rows, then columns", sets=False)(measured)
+
+
+def _repeats(rest: F32, good: Mask, axis: int) -> F64:
+    """Products of the means of lines some lines apart, over the variance of a mean."""
+    means = rest.sum(axis=axis) / np.sqrt(np.maximum(good.sum(axis=axis - 1), 1))
+    means = means - means.mean(axis=1, keepdims=True)
+    return np.array([float((means[:, n:] * means[:, :-n]).mean()) for n in REPEATS])
+
+
+@statistic(
+    "noise", "correlation of neighbours in flats, bright minus dim", x="neighbour", sets=False
+)
+def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
+    """Of the brighter half of the levels less that of the others."""
+    stacks = _stacks(evidence, "flat")
+    if len(stacks) < 2:
+        return None
+    levels = [float(s.adu.mean()) for s in stacks]
+    order = np.argsort(levels, kind="stable")
+    half = len(order) // 2
+    dim, bright = (
+        _neighbours((differences(evidence, stacks[n]) for n in own), evidence.good)
+        for own in (order[:half], order[half:])
+    )
+    return Curve(np.arange(float(len(STEPS))), bright - dim)
+
+
+@statistic(
+    "time", "change of the bias: spatial spectrum", x="band, then two rows, two columns",
+    power=True, sets=False,
+)  # fmt: skip
+def bias_change(evidence: Evidence) -> Curve | None:
+    """Power of the change from the first half of the frames to the second, over that of noise."""
+    stacks = [s for s in _stacks(evidence, "bias") if len(s.adu) >= 4]
+    if not stacks:
+        return None
+    adu, good = stacks[0].adu, evidence.good
+    half = len(adu) // 2
+    change = adu[:half].mean(axis=0) - adu[-half:].mean(axis=0)
+    change = np.where(good, change - change[good].mean(), 0)
+    noise = np.sqrt(2 / half) * evidence.read_noise / evidence.gain
+    change = np.clip(change / noise, -WILD, WILD)
+    power = np.abs(np.fft.rfft2(change)) ** 2 / change.size
+    fy, fx = np.abs(np.fft.fftfreq(change.shape[0])), np.fft.rfftfreq(change.shape[1])
+    band = np.minimum((2 * BANDS * np.maximum(fy[:, None], fx[None, :])).astype(int), BANDS - 1)
+    power[0, 0] = 0
+    bands = np.bincount(band.ravel(), power.ravel()) / np.bincount(band.ravel())
+    ends = [power[len(fy) // 2].mean(), power[:, -1].mean()]
+    return Curve(np.arange(BANDS + 2.0), np.concatenate([bands, ends]))
+
+
+NEIGHBOURS = tuple(_neighbours_of(kind) for kind in ("bias", "dark", "flat"))
+LINES = tuple(_lines_of(kind) for kind in ("bias", "dark", "flat"))

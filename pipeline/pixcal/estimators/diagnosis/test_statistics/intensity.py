@@ -1,0 +1,94 @@
+"""Statistics in intensity: harmonics of the phase, residuals by level, photon transfer, codes."""
+
+import numpy as np
+
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.test_statistics import Curve, statistic
+from pixcal.estimators.diagnosis.test_statistics.look import CODES, LEVELS, Look
+
+CLASSES = (4, 16, 64)
+
+
+@statistic("intensity", "harmonics of the fringes", x="harmonic (cosine, sine)")
+def harmonics(look: Look) -> Curve:
+    """Two to four times the phase in the residuals, over the fringe amplitude."""
+    found, good = look.found, look.good
+    alpha = float(np.median(np.hypot(found.theta[1], found.theta[2])[good]))
+    phi, psi = found.phi, look.psi[good]
+    orders = (2, 3, 4)
+    turns = np.stack([f(n * phi) for n in orders for f in (np.cos, np.sin)]).astype(np.float32)
+    moments = (turns @ look.electrons)[:, good.ravel()]
+    places, values = [], []
+    for at, n in enumerate(orders):
+        # The signal goes with sin(phi + psi).
+        moment = moments[2 * at] - 1j * moments[2 * at + 1]
+        size = 2 * np.mean(moment * np.exp(-1j * n * psi)) / len(phi) / alpha
+        places += [n, n + 0.25]
+        values += [float(size.real), float(size.imag)]
+    return Curve(np.array(places), np.array(values))
+
+
+@statistic("intensity", "mean residual against signal", unit="e-", x="bin of level")
+def residual_by_level(look: Look) -> Curve:
+    """Mean residual in bins of the level."""
+    return Curve(np.arange(LEVELS, dtype=float), look.by_level[0])
+
+
+@statistic(
+    "intensity",
+    "photon transfer: variance of flats against signal",
+    x="flat",
+    power=True,
+    sets=False,
+)
+def photon_transfer(evidence: Evidence) -> Curve | None:
+    """Variance of differences of flats over what shot and read noise give, for each level."""
+    values = []
+    for stack in evidence.ladder:
+        if len(stack.adu) < 2:
+            continue
+        light = (stack.adu - evidence.bias.astype(np.float32))[:, evidence.good] * np.float32(
+            evidence.gain
+        )
+        light /= light.mean(axis=1, keepdims=True) / light.mean()
+        steps = np.diff(light, axis=0)
+        expected = np.maximum(light.mean(axis=0), 0) + evidence.read_noise**2
+        values.append(float(np.mean(np.minimum(steps**2 / 2 / expected, 50))))
+    return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None
+
+
+@statistic("intensity", "linearity: signal of flats against exposure time", x="flat", sets=False)
+def flat_ladder(evidence: Evidence) -> Curve | None:
+    """Electrons a second of each level, over their mean."""
+    levels, times = [], []
+    for stack in evidence.ladder:
+        if np.isfinite(stack.exptime_s) and stack.exptime_s > 0:
+            light = (stack.adu.mean(axis=0) - evidence.bias)[evidence.good] * evidence.gain
+            dark = evidence.dark_rate[evidence.good] * stack.exptime_s
+            levels.append(float(np.mean(light - dark)))
+            times.append(stack.exptime_s)
+    if len(levels) < 2 or not evidence.dithered or not evidence.steady_lamp:
+        return None
+    rate = np.array(levels) / np.array(times)
+    return Curve(np.array(times), rate / rate.mean() - 1)
+
+
+@statistic("intensity", "frequency of each bit in the samples", x="bit")
+def bits(look: Look) -> Curve | None:
+    """How much more often than every second time each of the lowest bits is set."""
+    count = look.remainders
+    if count is None:
+        return None
+    bit = np.arange(CODES.bit_length() - 1)
+    is_set = (np.arange(CODES) >> bit[:, None]) & 1
+    return Curve(bit.astype(float), is_set @ count / count.sum() - 0.5)
+
+
+@statistic("intensity", "uniformity of ADC codes", x="codes a class", power=True)
+def code_classes(look: Look) -> Curve | None:
+    """Scatter of how often codes come up, by their remainders on division by powers of two."""
+    count = look.remainders
+    if count is None:
+        return None
+    value = [float(np.var(count.reshape(-1, n).sum(axis=0) * n / count.sum())) for n in CLASSES]
+    return Curve(np.array(CLASSES, float), np.array(value))

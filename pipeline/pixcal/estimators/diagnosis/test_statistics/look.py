@@ -1,0 +1,188 @@
+"""One fringe set as the statistics look at it: residuals in units of their noise, maps, frames."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.maps.structure import flattened, smooth_surface, without_outliers
+from pixcal.kernels.sample_sums import (
+    calm_residuals,
+    level_sums,
+    neighbour_products,
+    pixel_moments,
+)
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+WILD = 8.0
+"""Standard deviations beyond which a residual counts as an outlier and no more."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """A fringe set of some evidence, and what several statistics need of it.
+
+    Attributes
+    ----------
+    found : FringeEvidence
+    evidence : Evidence
+    """
+
+    found: FringeEvidence
+    evidence: Evidence
+
+    @property
+    def good(self) -> Mask:
+        """Pixels (y, x) that are looked at."""
+        return self.found.good
+
+    @cached_property
+    def _calm(self) -> tuple[F32, F32]:
+        calm, kept = calm_residuals(self.found.residual, self.found.variance, self.good, WILD)
+        return calm, kept
+
+    @property
+    def residual(self) -> F32:
+        """Residuals (t, y, x) over their noise; zero for outliers and where there is no weight."""
+        return self._calm[0]
+
+    @property
+    def electrons(self) -> F32:
+        """The same residuals, e-, as (t, pixel) of all pixels."""
+        return self._calm[1].reshape(len(self.residual), -1)
+
+    @cached_property
+    def theta(self) -> F32:
+        """Maps (3, pixel) of all pixels as the fit has them; zero in those that are not good."""
+        theta = np.where(self.good, self.found.theta, 0).astype(np.float32)
+        return np.asarray(theta.reshape(3, -1))
+
+    @cached_property
+    def by_level(self) -> tuple[F64, F64]:
+        """Mean residual (e-) and mean square over the noise, in bins of the level (bin,)."""
+        model = self.found.model
+        some = model[:: max(1, len(model) // 40)][:, self.good]
+        low, high = (float(level) for level in np.quantile(some, (0.005, 0.995)))
+        sums = np.zeros((LEVELS, 3))
+        step = max(high - low, 1e-9) / LEVELS
+        level_sums(model, self.good, low, step, self._calm[1], self.residual, sums)
+        count, total, squares = sums.T
+        return total / np.maximum(count, 1), squares / np.maximum(count, 1)
+
+    @cached_property
+    def moments(self) -> tuple[F64, F64]:
+        """Mean square and mean fourth power (y, x) of the residuals over their noise."""
+        second, fourth = pixel_moments(self.residual)
+        return second, fourth
+
+    @property
+    def thinned(self) -> int:
+        """One of so many frames is enough for statistics of pairs of pixels."""
+        return max(1, len(self.residual) // MOST)
+
+    @cached_property
+    def neighbours(self) -> tuple[F64, F64]:
+        """Products of residuals over their noise and those of neighbours (`neighbour_sums`)."""
+        return neighbour_sums(self.residual, self.good, STEPS, self.thinned)
+
+    @cached_property
+    def remainders(self) -> NDArray[np.intp] | None:
+        """How often codes of good pixels have each remainder on division by `CODES`.
+
+        None where what the camera wrote is not whole numbers.
+        """
+        codes: NDArray[Any] = self.found.adu
+        if codes.dtype.kind not in "iu":
+            return None
+        some = codes[:: max(1, len(codes) // 100)][:, self.good]
+        return np.bincount((some & (CODES - 1)).ravel(), minlength=CODES)
+
+    @cached_property
+    def psi(self) -> F64:
+        """Phase (y, x) of the pixels, rad."""
+        return np.asarray(np.arctan2(self.found.theta[1], self.found.theta[2]))
+
+    @cached_property
+    def maps(self) -> dict[str, F64]:
+        """Offset (px), contrast and light (relative), (y, x) about zero; NaN in bad pixels."""
+        theta, good = self.found.theta, self.good
+        iota = np.where(good, theta[0], np.nan)
+        contrast = np.where(good, np.hypot(theta[1], theta[2]), np.nan) / iota
+        light = iota / smooth_surface(iota, good)
+        return {
+            "offset": without_outliers(np.where(good, self.found.delta, np.nan)),
+            "contrast": without_outliers(contrast / np.nanmedian(contrast) - 1),
+            "light": without_outliers(light - 1),
+        }
+
+    @cached_property
+    def flat_maps(self) -> dict[str, F64]:
+        """The maps less their smooth surfaces."""
+        return {name: flattened(values) for name, values in self.maps.items()}
+
+    @cached_property
+    def frames(self) -> dict[str, F64]:
+        """Per frame (t,): intensity and contrast (relative), turns of the fringe vector edge to
+        edge along and across it (rad)."""
+        b, a_cos, a_sin, dkx, dky = self.found.free.T
+        contrast = np.hypot(a_cos, a_sin) / b
+        ny, nx = self.good.shape
+        kx, ky = self.found.k
+        size = float(np.hypot(kx, ky))
+        span = float(np.hypot(kx * nx, ky * ny)) / size
+        return {
+            "intensity": b / b.mean() - 1,
+            "contrast": contrast / contrast.mean() - 1,
+            "turn_along": (kx * dkx + ky * dky) / size * span,
+            "turn_across": (kx * dky - ky * dkx) / size * span,
+        }
+
+
+LEVELS = 8
+"""Bins of level."""
+CODES = 64
+"""Codes whose remainders are told apart, a power of two."""
+CELLS = 4
+"""Cells of the window along each side."""
+STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4), (4, 0))
+"""Rows and columns to a neighbour."""
+MOST = 120
+"""Frames for statistics of pairs of pixels."""
+
+
+def neighbour_sums(
+    values: F32, good: Mask, steps: Sequence[tuple[int, int]], every: int = 1
+) -> tuple[F64, F64]:
+    """Products of samples (t, y, x) with those of neighbours, where both pixels are good.
+
+    Returns
+    -------
+    sums, count : (step, y) float64
+        By the row of the first pixel, and of how many pairs.
+    """
+    ny, nx = good.shape
+    pairs = np.zeros((len(steps), ny, nx), np.float32)
+    for own, (dy, dx) in zip(pairs, steps, strict=True):
+        here = (slice(0, ny - dy), slice(max(0, -dx), nx - max(0, dx)))
+        there = (slice(dy, ny), slice(max(0, dx), nx + min(0, dx)))
+        own[: ny - dy, : nx - abs(dx)] = good[here] & good[there]
+    sums = neighbour_products(values, pairs, np.array(steps), every)
+    return sums, pairs.sum(axis=2, dtype=float) * len(range(0, len(values), every))
+
+
+def by_cell(values: F64, good: Mask) -> F64 | None:
+    """Means (cell,) of the good pixels of each cell; None where a cell has hardly any."""
+    ny, nx = good.shape
+    row = np.arange(ny)[:, None] * CELLS // ny
+    cell = row * CELLS + np.arange(nx)[None, :] * CELLS // nx
+    count = np.bincount(cell[good], minlength=CELLS**2)
+    if count.min() < 8:
+        return None
+    return np.asarray(np.bincount(cell[good], values[good], minlength=CELLS**2) / count)

@@ -1,0 +1,219 @@
+"""Statistics of noise: its size, what neighbours, rows and columns share, pixels that stand out."""
+
+import numpy as np
+from scipy.ndimage import maximum_filter
+
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
+from pixcal.estimators.diagnosis.test_statistics.look import (
+    CELLS,
+    F32,
+    F64,
+    LEVELS,
+    STEPS,
+    Look,
+    Mask,
+    by_cell,
+    neighbour_sums,
+)
+from pixcal.kernels.sample_sums import count_beyond
+
+OUTLIERS = (5.0, 7.0, 10.0)
+LEAST_DARKS = 5
+QUANTILES = (0.5, 0.9, 0.99, 0.999)
+
+
+@statistic("noise", "residual variance against signal", x="bin of level", power=True)
+def variance_by_level(look: Look) -> Curve:
+    """Mean square of residuals over their noise, in bins of the level."""
+    return Curve(np.arange(LEVELS, dtype=float), look.by_level[1])
+
+
+@statistic("noise", "residual noise", unit="e-", x="", power=True)
+def residual_noise(look: Look) -> Curve:
+    """Mean square of the residuals."""
+    squares = np.einsum("tp,tp->p", look.electrons, look.electrons) / len(look.electrons)
+    return Curve(np.zeros(1), np.array([float(squares[look.good.ravel()].mean())]))
+
+
+@statistic("noise", "residual variance by position", x="cell of 4 × 4", power=True)
+def variance_by_place(look: Look) -> Curve | None:
+    """Mean square of residuals over their noise, in cells of the window, row by row."""
+    cells = by_cell(look.moments[0], look.good)
+    return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
+
+
+@statistic("noise", "residual variance against time", x="eighth of the frames", power=True)
+def variance_by_time(look: Look) -> Curve:
+    """Mean square of residuals over their noise, in eighths of the frames."""
+    squares = np.einsum("tyx,tyx->t", look.residual, look.residual) / look.good.sum()
+    value = [float(part.mean()) for part in np.array_split(squares, 8)]
+    return Curve(np.arange(1.0, 9.0), np.array(value))
+
+
+@statistic("noise", "correlation of neighbours", x="neighbour")
+def neighbours(look: Look) -> Curve:
+    """Correlation of the residuals of pixels some rows and columns apart."""
+    sums, count = look.neighbours
+    return Curve(np.arange(len(STEPS), dtype=float), _mean_product(sums, count))
+
+
+@statistic("noise", "correlation of neighbours by row, modulo 4", x="row of four, down then right")
+def neighbours_by_row(look: Look) -> Curve:
+    """Correlation with the pixel below and to the right, for each row of four."""
+    sums, count = (of[[STEPS.index((1, 0)), STEPS.index((0, 1))]] for of in look.neighbours)
+    row = (np.arange(look.good.shape[0]) + look.found.origin[0]) % 4
+    value = np.stack(
+        [_mean_product(sums[:, row == n], count[:, row == n]) for n in range(4)], axis=1
+    )
+    return Curve(np.arange(8.0), (value - value.mean(axis=1, keepdims=True)).ravel())
+
+
+@statistic("noise", "correlation of neighbours, bright minus dark", x="neighbour")
+def neighbours_by_level(look: Look) -> Curve:
+    """Covariance over shot noise in bright samples less that in dark ones."""
+    keep = slice(None, None, look.thinned)
+    rest, model = look.residual[keep], look.found.model[keep]
+    bright = (model > np.median(model[::4, look.good])).astype(np.float32)
+    one, other = (
+        _mean_product(*neighbour_sums(rest * part, look.good, STEPS[:4]))
+        for part in (bright, 1 - bright)
+    )
+    return Curve(np.arange(4.0), 2 * (one - other))
+
+
+def _mean_product(sums: F64, count: F64) -> F64:
+    """Mean (step,) of sums by rows and their numbers of pairs (step, y)."""
+    return np.asarray(sums.sum(axis=1) / np.maximum(count.sum(axis=1), 1))
+
+
+def _line_power(rest: F32, good: Mask) -> F64:
+    """Mean square of the means of rows and of columns over that of white noise: (2,).
+
+    Of residuals (t, y, x) that are zero in pixels that are not good.
+    """
+    squares = float(np.einsum("tyx,tyx->t", rest, rest).mean(dtype=float)) / good.sum()
+    out = []
+    for axis in (2, 1):
+        count = np.maximum(good.sum(axis=axis - 1), 1)
+        means = rest.sum(axis=axis) / np.sqrt(count)
+        means -= means.mean(axis=1, keepdims=True)
+        out.append(float((means**2).mean()) / max(squares, 1e-30))
+    return np.array(out)
+
+
+@statistic("noise", "row and column noise", x="rows, columns", power=True)
+def lines(look: Look) -> Curve:
+    """Of the fringe frames' residuals."""
+    return Curve(np.arange(2.0), _line_power(look.residual, look.good))
+
+
+def _lines_of(kind: str) -> Statistic:
+    def measured(evidence: Evidence) -> Curve | None:
+        stacks = [s for s in evidence.of_kind(kind) if len(s.adu) >= 3]
+        if not stacks or not evidence.dithered:
+            return None
+        values, weights = [], []
+        for stack in stacks:
+            rest = _calm(stack.adu, evidence.good)
+            values.append(_line_power(rest, evidence.good))
+            weights.append(len(rest))
+        return Curve(np.arange(2.0), np.average(values, axis=0, weights=weights))
+
+    measured.__name__ = f"lines_of_{kind}"
+    title = f"row and column noise in {kind} frames"
+    return statistic("noise", title, x="rows, columns", power=True, sets=False)(measured)
+
+
+def _calm(frames: F32, good: Mask) -> F32:
+    """Frames less the mean of each pixel and of each frame, over the noise; outliers zero."""
+    rest = frames - frames.mean(axis=0)
+    rest -= rest[:, good].mean(axis=1)[:, None, None]
+    spread = 1.4826 * float(np.median(np.abs(rest[:, good]))) or 1.0
+    rest = rest / np.float32(spread)
+    rest[np.abs(rest) > 8] = 0
+    return np.asarray(rest * good, np.float32)
+
+
+@statistic("noise", "outliers", x="sigma, low then high", unit="2 √count", floor=1.0)
+def outliers(look: Look) -> Curve:
+    """Residuals of good pixels beyond 5, 7 and 10 sigma: twice the root of their number."""
+    limits = np.array(OUTLIERS)
+    count = count_beyond(look.found.residual, look.found.variance, look.good, limits)
+    return Curve(np.concatenate([-limits, limits]), 2 * np.sqrt(np.concatenate(count)))
+
+
+@statistic(
+    "noise",
+    "outliers in dark frames",
+    x="sigma, low then high",
+    unit="2 √count",
+    sets=False,
+    floor=1.0,
+)
+def dark_outliers(evidence: Evidence) -> Curve | None:
+    """The same of samples of darks, which last longer and have less noise."""
+    limits, counts = np.array(OUTLIERS), np.zeros((2, len(OUTLIERS)))
+    stacks = [s for s in evidence.of_kind("dark") if len(s.adu) >= LEAST_DARKS]
+    for stack in stacks:
+        rest, sigma = evidence.dark_noise(stack)
+        # The read noise is that of most pixels.
+        spread = 1.4826 * float(np.nanmedian(np.abs(rest / sigma)))
+        variance = np.ascontiguousarray((max(spread, 1.0) * sigma) ** 2)
+        counts += count_beyond(np.nan_to_num(rest), variance, evidence.good, limits)
+    value = 2 * np.sqrt(counts.ravel())
+    return Curve(np.concatenate([-limits, limits]), value) if stacks else None
+
+
+@statistic("noise", "noise distribution of the pixels", x="quantile", power=True)
+def pixel_noise(look: Look) -> Curve:
+    """Quantiles over the pixels of the mean square of their residuals."""
+    return Curve(np.array(QUANTILES), np.quantile(look.moments[0][look.good], QUANTILES))
+
+
+@statistic("noise", "kurtosis of the pixels' residuals", x="quantile")
+def pixel_peakedness(look: Look) -> Curve:
+    """Quantiles over the pixels of the kurtosis of their residuals."""
+    second, fourth = (moment[look.good] for moment in look.moments)
+    return Curve(np.array(QUANTILES), np.quantile(fourth / second**2, QUANTILES))
+
+
+@statistic(
+    "noise",
+    "read noise distribution of the pixels (bias frames)",
+    x="quantile",
+    power=True,
+    sets=False,
+)
+def read_noise(evidence: Evidence) -> Curve | None:
+    """Quantiles over all pixels of their variance over the read noise's."""
+    stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= 8]
+    if not stacks or not evidence.dithered:
+        return None
+    # Of whole numbers a median jumps by a code.
+    frames = stacks[0].adu - stacks[0].adu[:, evidence.good].mean(axis=1)[:, None, None]
+    variance = np.var(frames, axis=0, ddof=1) * (evidence.gain / evidence.read_noise) ** 2
+    return Curve(np.array(QUANTILES), np.quantile(variance, QUANTILES))
+
+
+@statistic("noise", "neighbours of hot pixels", x="left, right, above, below", sets=False)
+def hot_neighbours(evidence: Evidence) -> Curve | None:
+    """Dark current beside hot pixels over theirs."""
+    dark = evidence.dark_rate - np.median(evidence.dark_rate)
+    spread = 1.4826 * float(np.median(np.abs(dark)))
+    # Only the brightest about: what it gave to its neighbours does not make them hot.
+    hot = (dark > max(40 * spread, 1e-9)) & (dark >= maximum_filter(dark, size=5))
+    hot[[0, -1]] = hot[:, [0, -1]] = False
+    y, x = np.nonzero(hot)
+    # A neighbour may be warm by itself, or the rows differ: medians over alike rows.
+    classes = [own for row in range(4) if (own := (y + evidence.origin[0]) % 4 == row).sum() >= 3]
+    if not classes:
+        return None
+    value = []
+    for dy, dx in ((0, -1), (0, 1), (-1, 0), (1, 0)):
+        share = dark[y + dy, x + dx] / dark[y, x]
+        value.append(float(np.mean([np.median(share[own]) for own in classes])))
+    return Curve(np.arange(4.0), np.array(value))
+
+
+LINES = tuple(_lines_of(kind) for kind in ("bias", "dark"))

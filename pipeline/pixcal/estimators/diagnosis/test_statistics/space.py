@@ -1,0 +1,150 @@
+"""Statistics in space: structure of the maps of offset, contrast and light."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
+from pixcal.estimators.diagnosis.test_statistics.look import CELLS, F64, Look, by_cell
+from pixcal.estimators.maps.structure import (
+    PERIODS,
+    fit_terms,
+    legendre,
+    profile,
+    redness,
+    repeats,
+)
+
+UNITS = {"offset": "px", "contrast": "", "light": ""}
+LINES = {0: "rows", 1: "columns"}
+VARIATION = {
+    "offset": "curvature",
+    "contrast": "large-scale variation",
+    "light": "large-scale variation",
+}
+BINS = 6
+FLOOR = 0.3
+"""Least standard deviation of a term over the one that the map's own scatter gives."""
+
+
+def _repeats(name: str, axis: int) -> Statistic:
+    def measured(look: Look) -> Curve:
+        size = np.abs(repeats(look.flat_maps[name], axis))
+        return Curve(np.array(PERIODS, float), size)
+
+    measured.__name__ = f"{name}_{LINES[axis]}_repeat"
+    title = f"{name}: periodic pattern of {LINES[axis]}"
+    return statistic("space", title, unit=UNITS[name], x=f"period, {LINES[axis]}")(measured)
+
+
+def _profile(name: str, axis: int) -> Statistic:
+    def measured(look: Look) -> Curve:
+        along = profile(look.flat_maps[name], axis)
+        power = np.abs(np.fft.rfft(along)[1:]) ** 2 * 2 / len(along) ** 2
+        return _binned(np.arange(1, len(power) + 1) / len(along), power)
+
+    measured.__name__ = f"{name}_{LINES[axis]}"
+    title = f"{name}: profile of {LINES[axis]}"
+    return statistic("space", title, unit=UNITS[name], x="cycles a pixel", power=True)(measured)
+
+
+def _fringes(name: str) -> Statistic:
+    def measured(look: Look) -> Curve:
+        values, psi = look.flat_maps[name], look.psi
+        terms = np.stack([np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)])
+        return Curve(np.array([1.0, 1.25, 2.0, 2.25]), fit_terms(values, terms))
+
+    measured.__name__ = f"{name}_fringes"
+    title = f"{name}: residual fringes, first and second harmonic"
+    return statistic("space", title, unit=UNITS[name], x="harmonic (cosine, sine)")(measured)
+
+
+def _low_orders(name: str) -> Statistic:
+    def measured(look: Look) -> Curve:
+        """Over what a map as red as this one has by chance."""
+        values = look.maps[name]
+        terms = legendre(values.shape, 4 if name == "contrast" else 3)
+        size = fit_terms(values, terms)
+        rest = values - np.tensordot(size, terms, 1)
+        good = np.isfinite(rest)
+        variance = float(np.nanvar(rest)) * redness(rest)
+        error = np.sqrt(variance / (terms[:, good] ** 2).sum(axis=1))
+        # Two Gaussian beams make a contrast that bends in any direction, but no more than that.
+        first = 3 if name != "contrast" else 6
+        return Curve(np.arange(first, len(terms), dtype=float), (size / error)[first:])
+
+    measured.__name__ = f"{name}_bending"
+    title = f"{name}: {VARIATION[name]}"
+    # Of light, whose surface is taken off, nothing is left but what outliers do to it.
+    return statistic("space", title, unit="sigma", x="Legendre term", floor=FLOOR)(measured)
+
+
+def _scales(name: str) -> Statistic:
+    def measured(look: Look) -> Curve:
+        values = np.nan_to_num(look.flat_maps[name])
+        power = np.abs(np.fft.rfft2(values)) ** 2 / values.size**2
+        fy = np.fft.fftfreq(values.shape[0])[:, None]
+        fx = np.fft.rfftfreq(values.shape[1])[None, :]
+        radius = np.hypot(fy, fx)
+        # Rows, columns and their means have statistics of their own.
+        apart = (np.abs(fy) > 1.5 / values.shape[0]) & (np.abs(fx) > 1.5 / values.shape[1])
+        return _binned(radius[apart], power[apart] * values.size, 0.5)
+
+    measured.__name__ = f"{name}_scales"
+    title = f"{name}: power by spatial frequency"
+    return statistic("space", title, unit=UNITS[name], x="cycles a pixel", power=True)(measured)
+
+
+def _peak(name: str) -> Statistic:
+    def measured(look: Look) -> Curve:
+        values = np.nan_to_num(look.flat_maps[name])
+        power = np.abs(np.fft.rfft2(values)) ** 2
+        fy = np.fft.fftfreq(values.shape[0])[:, None]
+        fx = np.fft.rfftfreq(values.shape[1])[None, :]
+        apart = (np.abs(fy) > 1.5 / values.shape[0]) & (np.abs(fx) > 1.5 / values.shape[1])
+        at = np.unravel_index(int(np.argmax(np.where(apart, power, 0))), power.shape)
+        highest = float(power[at]) / values.size**2 * 4
+        return Curve(np.array([float(np.hypot(fy[at[0], 0], fx[0, at[1]]))]), np.array([highest]))
+
+    measured.__name__ = f"{name}_peak"
+    title = f"{name}: strongest isolated spatial frequency"
+    return statistic("space", title, unit=UNITS[name], x="cycles a pixel", power=True)(measured)
+
+
+def _by_place(name: str) -> Statistic:
+    def measured(look: Look) -> Curve | None:
+        squares = look.flat_maps[name] ** 2
+        cells = by_cell(squares, np.isfinite(squares))
+        return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
+
+    measured.__name__ = f"{name}_by_place"
+    title = f"{name}: power by position"
+    return statistic("space", title, unit=UNITS[name], x="cell of 4 × 4", power=True)(measured)
+
+
+def _binned(frequency: F64, power: F64, highest: float = 0.5) -> Curve:
+    """Mean power in `BINS` bins of frequency, each twice as wide as the one before."""
+    edges = highest * 2.0 ** np.arange(-BINS + 1, 1)
+    number = np.searchsorted(edges, frequency)
+    middle, value = [], []
+    for n in range(BINS):
+        inside = number == n
+        if inside.sum() >= 3:
+            middle.append(float(frequency[inside].mean()))
+            value.append(float(power[inside].mean()))
+    return Curve(np.array(middle), np.array(value))
+
+
+_OF_AXIS: tuple[Callable[[str, int], Statistic], ...] = (_repeats, _profile)
+_OF_MAP: tuple[Callable[[str], Statistic], ...] = (
+    _fringes,
+    _low_orders,
+    _scales,
+    _peak,
+    _by_place,
+)
+
+STATISTICS = tuple(
+    [make(name, axis) for make in _OF_AXIS for name in UNITS for axis in LINES]
+    + [make(name) for make in _OF_MAP for name in UNITS]
+)

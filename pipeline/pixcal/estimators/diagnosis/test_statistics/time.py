@@ -1,0 +1,165 @@
+"""Statistics in time: what changes from frame to frame, slowly or with the frame before."""
+
+from itertools import pairwise
+
+import numpy as np
+from scipy.fft import dct
+
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
+from pixcal.estimators.diagnosis.test_statistics.look import F64, Look
+from pixcal.kernels.sample_sums import frame_means
+
+SERIES = {
+    "intensity": ("intensity", ""),
+    "contrast": ("contrast", ""),
+    "turn_along": ("fringe vector, along", "rad"),
+    "turn_across": ("fringe vector, across", "rad"),
+}
+LAGS = (1, 2, 3, -1, -2)
+BATCHES = 8
+DISTINCT = 0.05
+"""Smallest singular value, of the largest, of shapes that a sequence of phases can tell apart: a
+ramp of equal steps, or four of them, cannot tell all."""
+
+
+def _spectrum(name: str) -> Statistic:
+    title, unit = SERIES[name]
+
+    def measured(look: Look) -> Curve:
+        return power_of(look.frames[name])
+
+    measured.__name__ = f"{name}_of_frames"
+    return statistic(
+        "time", f"{title}: spectrum over the frames", unit=unit, x="cycles a frame", power=True
+    )(measured)
+
+
+def power_of(series: F64) -> Curve:
+    """Mean squares of a series of frames in bins of frequency, of three modes and more."""
+    power = dct(series, norm="ortho")[1:] ** 2
+    edges = [0]
+    while edges[-1] < len(power):
+        edges.append(min(2 * edges[-1] + 3, len(power)))
+    if len(edges) > 2 and edges[-1] - edges[-2] < 3:
+        edges.pop(-2)
+    middle = [(a + b + 1) / 4 / len(series) for a, b in pairwise(edges)]
+    value = [float(power[a:b].mean()) for a, b in pairwise(edges)]
+    return Curve(np.array(middle), np.array(value))
+
+
+@statistic("time", "signal carried over from other frames", x="frames before")
+def frames_before(look: Look) -> Curve:
+    """Share of another frame's fringes in the residuals.
+
+    By pixels: the coefficient of the other frame's model, after what the pixel's own fit absorbs.
+    """
+    g, theta = look.found.g, look.theta
+    noise = np.sqrt(frame_means(look.found.variance, look.good))[:, None]
+    basis = np.linalg.qr(g)[0]
+    along = noise * (look.residual.reshape(len(g), -1) @ theta.T)
+    square = (theta @ theta.T).astype(float)
+    values = []
+    for lag in LAGS:
+        other = np.roll(g, lag, axis=0)
+        other -= basis @ (basis.T @ other)
+        size = np.einsum("ti,ij,tj->", other, square, other)
+        values.append(float(np.vdot(other, along) / size))
+    return Curve(np.array(LAGS, float), np.array(values))
+
+
+@statistic("time", "contrast against the phase step from earlier frames", x="frames before")
+def contrast_by_step(look: Look) -> Curve:
+    """Slope of the contrast against the cosine of the step."""
+    contrast, phi = look.frames["contrast"], look.found.phi
+    slow = np.stack([np.ones(len(phi)), np.linspace(-1, 1, len(phi))], axis=1)
+    values = []
+    for lag in LAGS[:3]:
+        step = np.cos(phi[lag:] - phi[:-lag])
+        terms = np.column_stack([slow[lag:], step])
+        values.append(float(np.linalg.lstsq(terms, contrast[lag:], rcond=DISTINCT)[0][-1]))
+    return Curve(np.array(LAGS[:3], float), np.array(values))
+
+
+@statistic("time", "contrast and intensity against phase", x="term")
+def frames_by_phase(look: Look) -> Curve:
+    """Amplitudes of contrast and intensity at one, two and three times the frame's phase."""
+    phi = look.found.phi
+    turns = [f(n * phi) for n in (1, 2, 3) for f in (np.cos, np.sin)]
+    terms = np.stack([np.ones(len(phi)), *turns], axis=1)
+    values = [
+        np.linalg.lstsq(terms, look.frames[name], rcond=DISTINCT)[0][1:]
+        for name in ("contrast", "intensity")
+    ]
+    value = np.concatenate(values)
+    return Curve(np.arange(len(value), dtype=float), value)
+
+
+@statistic(
+    "time",
+    "Allan deviation of the offsets over batches",
+    unit="px",
+    x="batches averaged",
+    power=True,
+)
+def allan_of_batches(look: Look) -> Curve | None:
+    """Allan variance of the pixels' offsets, over lengths of one, two and four batches."""
+    found = look.found
+    size = len(found.g) // BATCHES
+    if size < 8:
+        return None
+    k = float(np.hypot(*found.k))
+    good = look.good.ravel()
+    _, of_sine, of_cosine = look.theta[:, good].astype(float)
+    shifts = []
+    for n in range(BATCHES):
+        own = slice(n * size, (n + 1) * size)
+        inverse = np.linalg.pinv(found.g[own])[1:].astype(np.float32)
+        c, s = (inverse @ look.electrons[own])[:, good]
+        # theta = (iota, alpha sin psi, alpha cos psi): a turn of psi moves along (cos, -sin).
+        shifts.append((c * of_cosine - s * of_sine) / (of_sine**2 + of_cosine**2) / k)
+    values = np.stack(shifts)
+    out = []
+    for length in (1, 2, 4):
+        means = values.reshape(BATCHES // length, length, -1).mean(axis=1)
+        out.append(float((np.diff(means, axis=0) ** 2).mean() / 2))
+    return Curve(np.array([1.0, 2.0, 4.0]), np.array(out))
+
+
+def _of_stacks(kind: str) -> Statistic:
+    def measured(evidence: Evidence) -> Curve | None:
+        every = evidence.ladder if kind == "flat" else evidence.of_kind(kind)
+        stacks = [s for s in every if len(s.adu) >= MIN_FRAMES]
+        if not stacks:
+            return None
+        values = []
+        for stack in stacks:
+            means = frame_means(stack.adu, evidence.good) * evidence.gain
+            light = float(means.mean() - evidence.gain * evidence.bias[evidence.good].mean())
+            scale = light if kind == "flat" and light > 0 else 1.0
+            values.append(power_of(means / scale).value[:3])
+        shortest = min(map(len, values))
+        value = np.mean([v[:shortest] for v in values], axis=0)
+        return Curve(np.arange(shortest, dtype=float), value)
+
+    measured.__name__ = f"{kind}_of_frames"
+    return statistic(
+        "time", f"mean of {kind} frames: spectrum", unit="" if kind == "flat" else "e-",
+        x="bin of frequency", power=True, sets=False,
+    )(measured)  # fmt: skip
+
+
+MIN_FRAMES = 8
+SPECTRA = tuple(_spectrum(name) for name in SERIES)
+STACKS = tuple(_of_stacks(kind) for kind in ("bias", "dark", "flat"))
+
+
+@statistic("time", "trend of the bias level", unit="e-", x="", sets=False)
+def bias_trend(evidence: Evidence) -> Curve | None:
+    """Slope of the mean of bias and dark frames over their run, last less first."""
+    values = []
+    for stack in (*evidence.of_kind("bias"), *evidence.of_kind("dark")):
+        if len(stack.adu) >= MIN_FRAMES:
+            means = frame_means(stack.adu, evidence.good) * evidence.gain
+            values.append(2 * float(np.polyfit(np.linspace(-1, 1, len(means)), means, 1)[0]))
+    return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None

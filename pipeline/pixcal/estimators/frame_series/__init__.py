@@ -1,0 +1,1 @@
+"""Time series of frames: light, offset, fringe vector, lines and rows."""

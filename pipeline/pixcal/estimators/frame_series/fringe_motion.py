@@ -1,0 +1,278 @@
+"""How the fringe vectors of an acquisition move: jitter, walk, ramp, vibration, change of colour.
+
+All sets are taken together. A change of wavelength by epsilon takes ``epsilon k`` off every set's
+own vector k; a motion of the fibres moves all vectors alike. Sets with fringes of different
+directions therefore tell them apart; with one direction only, what happens along k is either.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import idct
+
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.series import MEDIAN, SLOW, FrameSeries, assemble, motion_series
+from pixcal.estimators.frame_series.spectral_line import Line, find_line, without_line
+from pixcal.estimators.frame_series.variance_components import (
+    MAX_STEPS,
+    Components,
+    cosine_modes,
+    estimate_components,
+    walk_power,
+)
+
+F64 = NDArray[np.float64]
+Shapes = Callable[[FrameSeries], F64]
+
+CROSSED = 0.5
+"""Sine of the angle between fringes from which they count as different."""
+HOP_WINDOWS = (2, 4, 8, 16, 32)
+"""Frames before and after, of which the means are compared."""
+SURE_HOP = 6.5
+SURE_STEP = 2.5
+"""Standard deviations of a hop beside a slope, which tells half as well."""
+MOST_HOPS = 64
+
+
+@dataclass(frozen=True)
+class Hop:
+    """A jump of the wavelength.
+
+    Attributes
+    ----------
+    frame : int
+        First after it, among the usable ones.
+    size, error : float
+        Relative change of the wavelength.
+    sigmas : float
+        Over the scatter of such differences in the same series.
+    """
+
+    frame: int
+    size: float
+    error: float
+    sigmas: float
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Changes of the fringe vectors of all sets.
+
+    Attributes
+    ----------
+    series : tuple of FrameSeries
+        Without hops and a sure line.
+    raw : tuple of FrameSeries
+        With them.
+    hops : mapping of str to tuple of Hop
+        Of each set.
+    line : Line, optional
+        The strongest, sure or not.
+    crossed : bool
+        Whether there are fringes of different directions.
+    """
+
+    series: tuple[FrameSeries, ...]
+    raw: tuple[FrameSeries, ...]
+    hops: dict[str, tuple[Hop, ...]]
+    line: Line | None
+    crossed: bool
+
+    def components(
+        self,
+        parts: Sequence[str],
+        known: Shapes | None = None,
+        absent: Sequence[str] = (),
+        raw: bool = False,
+        start: Components | None = None,
+        steps: int = MAX_STEPS,
+    ) -> Components:
+        """Sizes of kinds of motion, from all sets together.
+
+        Parameters
+        ----------
+        parts : sequence of str
+            Of ``jitter_x``, ``jitter_y`` (rad²/px²), ``walk_x``, ``walk_y``, ``walk`` (both alike;
+            rad²/px²/s) and ``walk_k`` (of the relative wavelength; 1/s).
+        known : callable, optional
+            Shapes (t, 2, q) of a series, with coefficients common to all sets.
+        absent : sequence of str
+            Of ``parts``, those to hold at zero.
+        raw : bool
+            With the hops.
+        start, steps
+            As of `estimate_components`.
+        """
+        every = self.raw if raw else self.series
+        modes = assemble(every, lambda s: np.stack([_part(name, s) for name in parts]), known)
+        held = [list(parts).index(name) for name in absent]
+        return estimate_components(modes, held, start, steps)
+
+
+def motion_of(evidence: Evidence) -> Motion | None:
+    """Motion of the fringes in all sets with frames enough; None without any."""
+    found = [s for s in map(motion_series, evidence.fringes.values()) if s is not None]
+    if not found:
+        return None
+    hops = {s.name: find_hops(s) for s in found}
+    # A hop is in all cosine modes: what follows the phase is sought where none is left.
+    still = [_with_hops(s, hops[s.name], -1.0).cleaned() for s in found]
+    line = find_line(still, _level)
+    cleared = still
+    if line is not None and line.sure:
+        cleared = [without_line(s, line) for s in still]
+        # Once more, over a level that the line itself does not raise.
+        levels = {s.name: _level(s) for s in cleared}
+        line = find_line(still, lambda s: levels[s.name]) or line
+        cleared = [without_line(s, line) for s in still]
+    return Motion(
+        series=tuple(cleared),
+        raw=tuple(_with_hops(s, hops[s.name], 1.0) for s in still),
+        hops=hops,
+        line=line,
+        crossed=_crossed(found),
+    )
+
+
+def slow_vectors(evidence: Evidence) -> list[tuple[str, F64, F64]]:
+    """Of every set: name, times (t,), and slow change (t, 2) of the fringe vector, rad/px.
+
+    The first cosine modes, each smaller than it was seen by the share that is noise (Wiener).
+    """
+    found = []
+    for fringes in evidence.fringes.values():
+        series = motion_series(fringes)
+        if series is None:
+            continue
+        modes = cosine_modes(series.values)
+        noise = np.median(modes[SLOW:] ** 2, axis=0) / MEDIAN
+        kept = modes[:SLOW] * np.maximum(1 - noise / np.maximum(modes[:SLOW] ** 2, 1e-300), 0)
+        every = np.zeros_like(series.values)
+        every[1 : len(kept) + 1] = kept
+        found.append((series.name, series.time_s, idct(every, type=2, norm="ortho", axis=0)))
+    return found
+
+
+def ramps(series: FrameSeries) -> F64:
+    """Shapes (t, 2, 2): a ramp of the vector along x and one along y, rad/px/s."""
+    time = series.time_s - series.time_s.mean()
+    return np.asarray(time[:, None, None] * np.eye(2))
+
+
+def ramps_and_colour(series: FrameSeries) -> F64:
+    """Shapes (t, 2, 3): as `ramps`, and one of the relative wavelength, 1/s."""
+    colour = -(series.time_s - series.time_s.mean())[:, None] * np.array(series.k)
+    return np.concatenate([ramps(series), colour[..., None]], axis=2)
+
+
+def colour_of(series: FrameSeries) -> F64:
+    """Relative change (t,) of the wavelength that each frame's vector shows by itself."""
+    k = np.array(series.k)
+    weight = np.linalg.solve(series.noise, k)
+    return np.asarray(-(series.values @ weight) / (k @ weight))
+
+
+def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
+    """Jumps of the wavelength: along the fringe vector, and sharp among what else moves it.
+
+    The difference of the means before and after is held against its own scatter along the run, so
+    that neither noise, jitter nor drift is taken for a hop. The narrowest difference that shows a
+    hop places it.
+    """
+    k, along = np.array(series.k), colour_of(series)
+    across = series.values @ np.array([-k[1], k[0]]) / (k @ k)
+    rest, found = along, dict[int, float]()
+    for width in HOP_WINDOWS:
+        if len(along) < 6 * width:
+            break
+        aside, aside_scatter = _differences(across, width)
+        smooth = np.zeros(len(aside), bool)
+        for _ in range(MOST_HOPS):
+            change, scatter = _differences(rest, width)
+            at = int(np.argmax(np.where(smooth, 0.0, np.abs(change))))
+            sharpness = abs(change[at]) / scatter
+            if smooth[at] or sharpness < max(SURE_HOP, 2 * abs(aside[at]) / aside_scatter):
+                break
+            if not _is_step(rest, at, width, float(change[at])):
+                smooth[max(0, at - width) : at + width] = True
+                continue
+            found[at + width] = max(sharpness, found.get(at + width, 0.0))
+            rest = rest - change[at] * (np.arange(len(rest)) >= at + width)
+    return _measured(along, found)
+
+
+def _is_step(values: F64, at: int, width: int, size: float) -> bool:
+    """Whether a change stays the same beside a slope: that of a slow drift does not."""
+    frame = np.arange(-width, width, dtype=float)
+    design = np.stack([np.ones(2 * width), frame, frame >= 0], axis=1)
+    steps = np.convolve(values, np.linalg.pinv(design)[2, ::-1], "valid")
+    scatter = 1.4826 * float(np.median(np.abs(steps - np.median(steps))))
+    same = abs(steps[at] - size) < 3 * scatter
+    return bool(same and abs(steps[at]) > SURE_STEP * scatter)
+
+
+def _measured(along: F64, found: dict[int, float]) -> tuple[Hop, ...]:
+    """Sizes of hops from the frames between each and its neighbours."""
+    if not found:
+        return ()
+    width = max(HOP_WINDOWS)
+    steps = np.diff(along)
+    slope = float(np.median(along[width:] - along[:-width])) / width if len(along) > width else 0.0
+    scatter = float(1.4826 * np.median(np.abs(steps - np.median(steps)))) / np.sqrt(2)
+    hops, frames = [], sorted(found)
+    for at, before, after in zip(frames, [0, *frames[:-1]], [*frames[1:], len(along)], strict=True):
+        first, last = max(before, at - width), min(after, at + width)
+        apart = (last - first) / 2
+        size = along[at:last].mean() - along[first:at].mean() - slope * apart
+        error = scatter * np.sqrt(1 / (at - first) + 1 / (last - at))
+        hops.append(Hop(at, float(size), float(error), found[at]))
+    return tuple(hops)
+
+
+def _differences(values: F64, width: int) -> tuple[F64, float]:
+    """Mean of the next frames less that of the last ones, less its median; and its scatter."""
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    means = (sums[width:] - sums[:-width]) / width
+    change = means[width:] - means[:-width]
+    change = change - np.median(change)
+    return change, float(1.4826 * np.median(np.abs(change))) or 1e-300
+
+
+def _with_hops(series: FrameSeries, hops: Sequence[Hop], times: float) -> FrameSeries:
+    """The series with its hops added so many times."""
+    colour = np.zeros(len(series))
+    for hop in hops:
+        colour += times * hop.size * (np.arange(len(series)) >= hop.frame)
+    return replace(series, values=series.values - colour[:, None] * np.array(series.k))
+
+
+def _part(name: str, series: FrameSeries) -> F64:
+    """Covariance (t - 1, 2, 2) of the modes of a series for a unit of a kind of motion."""
+    kind, _, axis = name.partition("_")
+    n = len(series)
+    power = np.ones(n - 1) if kind == "jitter" else walk_power(n) * series.step_s
+    k = np.array(series.k)
+    direction = {
+        "x": np.diag([1.0, 0.0]),
+        "y": np.diag([0.0, 1.0]),
+        "k": np.outer(k, k),
+        "": np.eye(2),
+    }
+    return np.asarray(power[:, None, None] * direction[axis])
+
+
+def _level(series: FrameSeries) -> F64:
+    """Variance (t - 1, 2) of the cosine modes, of noise, jitter and walk."""
+    names = ("jitter_x", "jitter_y", "walk_x", "walk_y")
+    modes = assemble([series], lambda s: np.stack([_part(name, s) for name in names]))
+    size = np.maximum(estimate_components(modes).size, 0.0)
+    # The first half of the modes are those of the series, the others of its two halves.
+    covariance = np.einsum("i,inab->nab", size, modes.parts)[: len(series) - 1]
+    return np.asarray(np.einsum("naa->na", covariance))
+
+
+def _crossed(every: Sequence[FrameSeries]) -> bool:
+    angles = [np.arctan2(s.k[1], s.k[0]) for s in every]
+    return any(abs(np.sin(a - b)) > CROSSED for a in angles for b in angles)

@@ -1,0 +1,208 @@
+"""How the light of the frames of an acquisition changes: its level, its contrast, its offset.
+
+Three things move a frame's mean intensity B and fringe amplitude A. The power of the light moves
+both alike; the contrast moves A alone; an offset of the electronics, or light without fringes,
+moves B alone. So the covariance of (B, log A/B) tells them apart, whatever the size of each, and
+frames without light say how large the offset is by itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack, stripes
+from pixcal.estimators.frame_series.series import FrameSeries, assemble, light_series
+from pixcal.estimators.frame_series.spectral_line import Line, find_line, without_line
+from pixcal.estimators.frame_series.variance_components import (
+    MAX_STEPS,
+    Components,
+    Modes,
+    damped_power,
+    estimate_components,
+    walk_power,
+)
+
+F64 = NDArray[np.float64]
+
+FEWEST_DARK = 12
+"""Frames without light from which their offset is learnt."""
+OFFSETS = ("offset", "offset_walk")
+PATTERNS = {
+    # What moves (B, log A/B), as the covariance of the two.
+    "power": np.array([[1.0, 0.0], [0.0, 0.0]]),
+    "contrast": np.array([[0.0, 0.0], [0.0, 1.0]]),
+    "offset": np.array([[1.0, -1.0], [-1.0, 1.0]]),
+}
+
+
+@dataclass(frozen=True)
+class FrameLight:
+    """Light of the frames of all sets.
+
+    Attributes
+    ----------
+    sets : tuple of FrameSeries
+        (B over its mean less one, log A/B), without a sure line.
+    dark : tuple of FrameSeries
+        Mean level of frames without light (e-), and nothing.
+    level : mapping of str to float
+        Mean signal of each set, e-.
+    line : Line, optional
+        The strongest in B, sure or not.
+    """
+
+    sets: tuple[FrameSeries, ...]
+    dark: tuple[FrameSeries, ...]
+    level: dict[str, float]
+    line: Line | None = None
+
+    def components(
+        self,
+        parts: Sequence[str],
+        keep: float = 0.0,
+        absent: Sequence[str] = (),
+        start: Components | None = None,
+        steps: int = MAX_STEPS,
+    ) -> Components:
+        """Sizes of kinds of change, from all sets together.
+
+        Parameters
+        ----------
+        parts : sequence of str
+            ``power``, ``contrast`` or ``offset`` (white), with ``_walk`` (a random walk; 1/s),
+            ``_smooth`` (ramps and settlings: the square of a walk's spectrum) or ``_damped`` (of
+            unit variance); offsets in e-², the others relative.
+        keep : float
+            Correlation of neighbours of a damped change.
+        absent : sequence of str
+            Of ``parts``, those to hold at zero.
+        start, steps
+            As of `estimate_components`.
+        """
+        held = [list(parts).index(name) for name in absent]
+        return estimate_components(self.modes(parts, keep), held, start, steps)
+
+    def modes(self, parts: Sequence[str], keep: float = 0.0) -> Modes:
+        """Cosine modes of all series; parameters as of `components`."""
+
+        def covariance(series: FrameSeries) -> F64:
+            return np.stack([self._part(name, keep, series) for name in parts])
+
+        return assemble([*self.sets, *self.dark], covariance)
+
+    def _part(self, name: str, keep: float, series: FrameSeries) -> F64:
+        kind, _, time = name.partition("_")
+        n, level = len(series), self.level.get(series.name)
+        power = {
+            "": np.ones(n - 1),
+            "walk": walk_power(n) * series.step_s,
+            "smooth": walk_power(n) ** 2 / n**2,
+            "damped": damped_power(n, keep),
+        }[time]
+        if level is None:
+            pattern = PATTERNS["power"] * (kind == "offset")
+        else:
+            pattern = PATTERNS[kind] / (level**2 if kind == "offset" else 1.0)
+        return np.asarray(power[:, None, None] * pattern)
+
+
+def light_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
+    """Of every set: name, times (t,), and changes (t,) of intensity and contrast of its frames.
+
+    Relative, and smaller than they were seen by the share of their scatter that is noise.
+    """
+    found = []
+    for f in evidence.fringes.values():
+        series = light_series(f)
+        if series is None:
+            continue
+        b, a = f.free[:, 0], np.hypot(f.free[:, 1], f.free[:, 2])
+        changes = []
+        for channel, values in enumerate((b / b.mean(), a / b / np.median(a / b))):
+            noise, seen = float(series.noise[channel, channel]), float(np.var(values))
+            changes.append((values - 1) * np.sqrt(max(1 - noise / max(seen, 1e-300), 0.0)))
+        found.append((f.name, f.time_s, changes[0], changes[1]))
+    return found
+
+
+def ambient_shares(evidence: Evidence) -> list[tuple[float, float]]:
+    """Share of each set's mean light that does not follow the laser, and its error.
+
+    A change x of the laser's power changes the mean by (1 - share) x and the contrast by share x.
+    """
+    found = dict.fromkeys(evidence.fringes, (0.0, 1.0))
+    for name, _, level, contrast in light_courses(evidence):
+        square = float(level @ level)
+        if square > 0:
+            slope = float(level @ contrast) / square
+            rest = contrast - slope * level
+            error = np.sqrt(float(rest @ rest) / max(len(rest) - 1, 1) / square)
+            found[name] = slope / (1 + slope), float(error) / (1 + slope) ** 2
+    return list(found.values())
+
+
+def light_of(evidence: Evidence) -> FrameLight | None:
+    """Light of all sets with frames enough; None without any."""
+    found = {f.name: light_series(f) for f in evidence.fringes.values()}
+    sets = [s.cleaned() for s in found.values() if s is not None]
+    if not sets:
+        return None
+    level = {
+        f.name: float(np.median(f.theta[0][f.good]) * f.free[:, 0].mean())
+        for f in evidence.fringes.values()
+    }
+    stacks = (*evidence.of_kind("bias"), *evidence.of_kind("dark"))
+    dark = [_dark_series(s, n, evidence) for n, s in enumerate(stacks)]
+    return _with_line(FrameLight(tuple(sets), tuple(d for d in dark if d is not None), level))
+
+
+def _with_line(light: FrameLight) -> FrameLight:
+    line = find_line(light.sets, lambda s: _level(light, s), channels=(0,))
+    if line is None or not line.sure:
+        return FrameLight(light.sets, light.dark, light.level, line)
+    cleared = tuple(without_line(s, line) for s in light.sets)
+    calm = FrameLight(cleared, light.dark, light.level)
+    levels = {s.name: _level(calm, s) for s in cleared}
+    # Once more, over a level that the line itself does not raise.
+    line = find_line(light.sets, lambda s: levels[s.name], channels=(0,)) or line
+    cleared = tuple(without_line(s, line) for s in light.sets)
+    return FrameLight(cleared, light.dark, light.level, line)
+
+
+def _level(light: FrameLight, series: FrameSeries) -> F64:
+    """Variance (t - 1, 2) of a series' cosine modes, of noise and white and walking changes."""
+    alone = FrameLight((series,), (), light.level)
+    modes = alone.modes(("power", "power_walk", "contrast", "contrast_walk"))
+    size = np.maximum(estimate_components(modes).size, 0.0)
+    # The first half of the modes are those of the series, the others of its two halves.
+    covariance = np.einsum("i,inab->nab", size, modes.parts)[: len(series) - 1]
+    return np.asarray(np.einsum("naa->na", covariance))
+
+
+def _dark_series(stack: Stack, number: int, evidence: Evidence) -> FrameSeries | None:
+    """Mean level of frames without light, as the first of two quantities."""
+    if len(stack.adu) < FEWEST_DARK:
+        return None
+    signal = (stack.adu - stack.adu.mean(axis=0)) * evidence.gain
+    half = stripes(evidence.good.shape)
+    masks = [evidence.good, evidence.good & half, evidence.good & ~half]
+    if min(int(mask.sum()) for mask in masks) == 0:
+        return None
+    whole, one, other = (signal[:, mask].mean(axis=1) for mask in masks)
+    noise = evidence.read_noise**2 / np.array([mask.sum() for mask in masks])
+    nothing = np.zeros(len(whole))
+    step = float(np.ptp(stack.time_s)) / (len(whole) - 1) or 1.0
+    return FrameSeries(
+        name=f"{stack.kind}:{number}",
+        k=(0.0, 0.0),
+        time_s=stack.time_s,
+        step_s=step,
+        exptime_s=stack.exptime_s,
+        values=np.stack([whole, nothing], axis=1).astype(float),
+        apart=np.stack([(one - other) / 2, nothing], axis=1).astype(float),
+        shapes=np.zeros((len(whole), 0)),
+        noise=np.diag([max(noise[0], 1e-12), 1.0]),
+        apart_noise=np.diag([max(noise[1] + noise[2], 1e-12) / 4, 1.0]),
+    )

@@ -1,0 +1,183 @@
+"""What a constant added to a whole frame does, told apart from noise of rows, columns and pixels.
+
+The pixels are halved by stripes of rows and by stripes of columns, which makes four quarters. The
+mean of a frame (W) holds its offset and all of the noise. The difference of the halves by rows (R)
+holds the noise of rows and pixels, that by columns (C) of columns and pixels, the one across (K)
+of the pixels alone; each as much of it as the mean does. So the variances of the four give that of
+the offset, and no model of the noise stands between.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.diagnosis.evidence import STRIPE, FringeEvidence, Stack
+from pixcal.estimators.frame_series.variance_components import Modes, cosine_modes, walk_power
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+FEWEST = 8
+"""Frames from which something is learnt; of fewer, chance is not what it is taken for."""
+FEWEST_PIXELS = 16
+"""In each quarter."""
+CONTRASTS = np.array([[1, 1, -1, -1], [1, -1, 1, -1], [1, -1, -1, 1]]) / 4
+"""R, C, K of the quarters."""
+NOISES = np.array([[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 1, 0]])
+"""Where noise of pixels, rows and columns shows among W, R, C, K."""
+LEAST_NOISE = 0.05
+"""Lowest size of the noise of pixels, of what is predicted; other parts may go as far below zero
+as `BELOW` of it."""
+BELOW = 0.3
+
+
+@dataclass(frozen=True)
+class OffsetSeries:
+    """Offsets of frames that were taken one after the other.
+
+    Attributes
+    ----------
+    name : str
+    time_s : (t,) float64
+        After the first frame of the acquisition where that is known.
+    step_s : float
+        Mean time from frame to frame.
+    values : (t, 4) float64
+        W, R, C, K, e-.
+    noise : (4,) float64
+        Variance that the noise of the pixels gives them, e-².
+    nuisance : (t, p) float64
+        Shapes that are no offsets.
+    """
+
+    name: str
+    time_s: F64
+    step_s: float
+    values: F64
+    noise: F64
+    nuisance: F64
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+
+def dark_offsets(
+    stack: Stack, good: NDArray[np.bool_], gain: float, read_noise: float
+) -> OffsetSeries | None:
+    """Of frames without light, in e-; None where they are too few."""
+    masks = _quarters(good)
+    if len(stack.adu) < FEWEST or masks is None:
+        return None
+    signal = (stack.adu - stack.adu.mean(axis=0)) * np.float32(gain)
+    means = np.stack([signal[:, mask].mean(axis=1, dtype=float) for mask in (good, *masks)])
+    noise = [max(read_noise, 0.1) ** 2 / mask.sum() for mask in (good, *masks)]
+    nothing = np.zeros((len(stack.adu), 0))
+    return _series(stack.kind, stack.time_s, stack.start_s, means, np.array(noise), nothing)
+
+
+def fringe_offsets(found: FringeEvidence, flat: F64) -> OffsetSeries | None:
+    """Of fringes, whose samples were divided by the flat: what B, A and phi do not take up.
+
+    An offset is ``1 / flat`` times the same in all pixels, the light ``iota``: where the light is
+    even, they differ by the flat's own pattern alone, and the noise is large.
+    """
+    masks = _quarters(found.good)
+    if len(found.g) < FEWEST or masks is None:
+        return None
+    good = found.good
+    pattern = np.concatenate([found.theta[:, good], 1 / flat[None, good]]).astype(np.float32)
+    residual = found.residual[:, good]
+    weight = np.where(np.isfinite(residual), 1 / found.variance[:, good], np.float32(0))
+    residual = np.nan_to_num(residual)
+    fits = [_constant(pattern, weight, residual, mask[good]) for mask in (good, *masks)]
+    if not all(np.isfinite(f).all() for f in fits):
+        return None
+    means = np.stack([value for value, _ in fits])
+    noise = np.array([variance.mean() for _, variance in fits])
+    phi = found.phi
+    # A bent response: harmonics of the phase, and the level of the light.
+    shapes = [np.cos(phi), np.sin(phi), np.cos(2 * phi), np.sin(2 * phi), found.g[:, 0]]
+    return _series(found.name, found.time_s, found.start_s, means, noise, np.stack(shapes, axis=1))
+
+
+def offset_modes(every: Sequence[OffsetSeries], shapes: Sequence[F64]) -> Modes:
+    """All series for `estimate_components`; offsets white and walking (e-², e-²/s) come first.
+
+    Parameters
+    ----------
+    every : sequence of OffsetSeries
+    shapes : sequence of (t, q) float64
+        Of each series, known changes of the offset; their coefficients, common to all, come first.
+    """
+    widths = [s.nuisance.shape[1] for s in every]
+    q = shapes[0].shape[1]
+    values, designs, parts, least = [], [], [], np.full(2, -np.inf)
+    at = q
+    for i, s in enumerate(every):
+        n = len(s) - 1
+        design = np.zeros((n, 4, q + sum(widths)))
+        design[:, 0, :q] = cosine_modes(shapes[i])
+        design[:, 0, at : at + widths[i]] = cosine_modes(s.nuisance)
+        at += widths[i]
+        part = np.zeros((2 + 3 * len(every), n, 4, 4))
+        walk = walk_power(len(s)) * s.step_s
+        part[0, :, 0, 0], part[1, :, 0, 0] = 1.0, walk
+        part[2 + 3 * i : 5 + 3 * i] = _diagonals(NOISES * s.noise)[:, None]
+        values.append(cosine_modes(s.values))
+        designs.append(design)
+        parts.append(part)
+        least = np.maximum(least, -BELOW * s.noise[0] / np.array([1.0, walk.max()]))
+    own = [LEAST_NOISE, -BELOW * LEAST_NOISE, -BELOW * LEAST_NOISE]
+    return Modes(
+        values=np.concatenate(values),
+        known=np.concatenate(designs),
+        parts=np.concatenate(parts, axis=1),
+        start=np.concatenate([np.zeros(2), np.tile([1.0, 0.0, 0.0], len(every))]),
+        least=np.concatenate([least, np.tile(own, len(every))]),
+    )
+
+
+def _quarters(good: NDArray[np.bool_]) -> list[NDArray[np.bool_]] | None:
+    """Good pixels of the four quarters, as `CONTRASTS` takes them."""
+    ny, nx = good.shape
+    rows, columns = _half(ny)[:, None], _half(nx)
+    masks = [good & (rows == a) & (columns == b) for a in (True, False) for b in (True, False)]
+    return masks if min(int(mask.sum()) for mask in masks) >= FEWEST_PIXELS else None
+
+
+def _half(count: int) -> NDArray[np.bool_]:
+    """Every other stripe, in the order of Thue and Morse."""
+    return np.asarray(np.bitwise_count(np.arange(count) // STRIPE) % 2 == 0)
+
+
+def _constant(pattern: F32, weight: F32, residual: F32, mask: NDArray[np.bool_]) -> tuple[F64, F64]:
+    """Last coefficient (t,) of a weighted fit of patterns to the residual, and its variance."""
+    own, w = pattern[:, mask], weight[:, mask]
+    n = len(own)
+    normal = (w @ (own[:, None] * own).reshape(n * n, -1).T).reshape(-1, n, n).astype(float)
+    right = ((w * residual[:, mask]) @ own.T).astype(float)
+    scale = np.sqrt(np.maximum(np.einsum("tii->ti", normal), 1e-30))
+    inverse = np.linalg.pinv(normal / (scale[:, :, None] * scale[:, None]), hermitian=True)
+    last = inverse[:, -1] / (scale * scale[:, -1:])
+    return np.einsum("ti,ti->t", last, right), last[:, -1]
+
+
+def _series(
+    name: str, time_s: F64, start_s: float, means: F64, noise: F64, nuisance: F64
+) -> OffsetSeries:
+    """From the means of all pixels and of the quarters (5, t), and their variances (5,)."""
+    step = float(np.ptp(time_s)) / (len(time_s) - 1) or 1.0
+    return OffsetSeries(
+        name=name,
+        time_s=time_s + (start_s if np.isfinite(start_s) else 0.0),
+        step_s=step,
+        values=np.concatenate([means[:1], CONTRASTS @ means[1:]]).T,
+        noise=np.concatenate([noise[:1], CONTRASTS**2 @ noise[1:]]),
+        nuisance=nuisance,
+    )
+
+
+def _diagonals(values: F64) -> F64:
+    return np.asarray(values[:, :, None] * np.eye(values.shape[1]))

@@ -1,0 +1,126 @@
+"""Phase that differs from row to row while the modulator settles, as a share of its step.
+
+No law is asked of the profile along the rows: it is a spline, free but for its mean, which the
+frame's own phase takes up.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
+
+from pixcal.estimators.diagnosis.evidence import FringeEvidence
+from pixcal.estimators.frame_series.row_ramp import INSIDE, rows_of
+from pixcal.kernels.significance import sigmas_of_chi2
+
+F64 = NDArray[np.float64]
+
+KNOTS = 9
+"""Rows at equal distances at which the profile is given."""
+ORIGINS = 8
+"""Phases tried as the one where the modulator's range begins."""
+CLEAR, FINEST = 4.0, 0.01
+"""Standard deviations from which that phase is sought more finely, and how finely, rad."""
+
+
+@dataclass(frozen=True)
+class Settling:
+    """Share of a step by which the phase of a row is off.
+
+    Attributes
+    ----------
+    way : int
+        -1: of the step from the last frame; 1: of the step to the next one.
+    origin_rad : float or None
+        Where the modulator's range of one turn begins; None: it goes the shorter way.
+    share, error : (KNOTS,) float64
+        At rows at equal distances from first to last, mean zero; 1-sigma errors.
+    significance : float
+    """
+
+    way: int
+    origin_rad: float | None
+    share: F64
+    error: F64
+    significance: float
+
+
+def steps_of(phi: F64, way: int, origin_rad: float | None) -> F64:
+    """Phase of the frame before (way -1) or after (1) less that of each frame (t,), rad.
+
+    The first frame has none before and the last none after: zero.
+    """
+    place = phi if origin_rad is None else np.mod(phi - origin_rad, 2 * np.pi)
+    step = np.zeros(len(phi))
+    own = slice(1, None) if way < 0 else slice(None, -1)
+    apart = place[:-1] - place[1:] if way < 0 else place[1:] - place[:-1]
+    step[own] = apart if origin_rad is not None else np.angle(np.exp(1j * apart))
+    return step
+
+
+def profile(share: Sequence[float] | F64, rows: F64) -> F64:
+    """Profile at rows (0 first, 1 last) through its values at equal distances."""
+    at = np.linspace(0, 1, len(share))
+    return np.asarray(make_interp_spline(at, np.array(share), k=min(3, len(share) - 1))(rows))
+
+
+def find_settling(sets: Sequence[FringeEvidence]) -> Settling:
+    """The likeliest profile, of the last step or the next, along either way around the turn."""
+    origins = [None, *(2 * np.pi * n / ORIGINS for n in range(ORIGINS))]
+    found = [_fit(sets, way, origin) for way in (-1, 1) for origin in origins]
+    gain, share, error, way, origin = max(found, key=lambda f: f[0])
+    chance = sigmas_of_chi2(max(gain - 2 * np.log(len(found)), 1e-9), KNOTS - 1)
+    width = np.pi / ORIGINS
+    while origin is not None and chance > CLEAR and width > FINEST:
+        # A frame whose step is taken around the wrong way is off by the share of a turn.
+        near = [_fit(sets, way, origin + side * width / 2) for side in (-1, 1)]
+        gain, share, error, way, origin = max(
+            [(gain, share, error, way, origin), *near], key=lambda f: f[0]
+        )
+        width /= 2
+    return Settling(way, origin, share, error, chance)
+
+
+def _fit(
+    sets: Sequence[FringeEvidence], way: int, origin: float | None
+) -> tuple[float, F64, F64, int, float | None]:
+    normal, right = np.zeros((KNOTS, KNOTS)), np.zeros(KNOTS)
+    slopes = []
+    for f in sets:
+        _, cosine, sine = f.g.T
+        step = steps_of(f.phi, way, origin)
+        # Of B, A cos phi and A sin phi, what a turn of the phase does, times the step.
+        other = (step[:, None] * np.stack([np.zeros(len(step)), -sine, cosine], axis=1))[INSIDE]
+        _, own, vector = rows_of(f, other)
+        at = np.linspace(0, 1, len(vector))
+        terms = np.stack([profile(unit, at) for unit in np.eye(KNOTS)], axis=1)
+        terms -= terms.mean(axis=0)
+        normal += terms.T @ own @ terms
+        right += terms.T @ vector
+        if np.any(f.dk):
+            slopes.append(_slope(f, step))
+    covariance = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
+    share, variance = covariance @ right, np.diag(covariance)
+    gain = float(right @ share)
+    if slopes:
+        value, weight = np.array(slopes).T
+        mean = float(np.average(value, weights=weight))
+        line = np.linspace(-0.5, 0.5, KNOTS)
+        # Of a straight profile the fit's free fringe vectors have left nothing.
+        share = share - line * (line @ share) / (line @ line) + mean * line
+        variance = variance + line**2 / weight.sum()
+        gain += mean**2 * float(weight.sum())
+    return gain, share, np.sqrt(variance), way, origin
+
+
+def _slope(found: FringeEvidence, step: F64) -> tuple[float, float]:
+    """Change of the share from the first row to the last, by the fringe vectors; its weight."""
+    size = step[INSIDE] - step[INSIDE].mean()
+    moved = found.free[INSIDE, 4] - found.free[INSIDE, 4].mean()
+    value = float(size @ moved / (size @ size))
+    left = moved - value * size
+    variance = float(left @ left) / max(len(left) - 2, 1) / float(size @ size)
+    rows = found.good.shape[0] - 1
+    return value * rows, 1 / (variance * rows**2)

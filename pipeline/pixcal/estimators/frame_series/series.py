@@ -1,0 +1,262 @@
+"""What a fringe set's frames do by themselves, as series: their light, their fringe vector.
+
+The bench is the same for all pixels of a frame, the noise of the samples is not. The half
+difference of two halves of the pixels therefore holds the noise alone, whatever it is made of, and
+is fitted beside the series: no model of the noise stands between them.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import idct
+from scipy.ndimage import median_filter
+
+from pixcal.estimators.diagnosis.evidence import FringeEvidence
+from pixcal.estimators.frame_series.variance_components import Modes, cosine_modes
+
+F64 = NDArray[np.float64]
+
+FEWEST = 32
+"""Frames of a set from which something is learnt."""
+HARMONICS = 10
+"""Of the phase, that are no noise."""
+SPENT = 0.25
+"""Share of the frames' freedom that shapes which follow the phase may take."""
+SLOW = 12
+"""Cosine modes that are drift."""
+AROUND, MEDIAN = 15, 0.455
+"""Modes whose power is the level of the one in their middle; median of chi-square."""
+OUTLIER = 9.0
+"""Power over the level from which a mode counts less."""
+DARK = 0.05
+"""Share of the mean light below which a frame tells nothing."""
+LEAST_NOISE = 0.05
+"""Lowest size of the noise, of what is predicted."""
+BELOW = 0.15
+"""How far below zero a size may come out, of the noise."""
+
+
+@dataclass(frozen=True)
+class FrameSeries:
+    """Two quantities of every usable frame of a set.
+
+    Attributes
+    ----------
+    name : str
+        Of the set.
+    k : (float, float)
+        Fringe vector (kx, ky), rad/px.
+    time_s : (t,) float64
+    step_s : float
+        Mean time from frame to frame.
+    exptime_s : float
+        nan when unknown.
+    values, apart : (t, 2) float64
+        The quantities, and the half difference of theirs from two halves of the pixels.
+    shapes : (t, p) float64
+        What follows the phase of the fringes, which is no noise.
+    noise, apart_noise : (2, 2) float64
+        Covariance that the noise model predicts of them, mean over frames.
+    share : float
+        Of the frames' freedom that is left.
+    """
+
+    name: str
+    k: tuple[float, float]
+    time_s: F64
+    step_s: float
+    exptime_s: float
+    values: F64
+    apart: F64
+    shapes: F64
+    noise: F64
+    apart_noise: F64
+    share: float = 1.0
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def cleaned(self) -> "FrameSeries":
+        """The series without its shapes."""
+        if not self.shapes.size:
+            return self
+        rest = without(np.hstack([self.values, self.apart]), self.shapes)
+        return replace(
+            self,
+            values=rest[:, :2],
+            apart=rest[:, 2:],
+            shapes=self.shapes[:, :0],
+            share=self.share * (1 - np.linalg.matrix_rank(self.shapes) / len(self)),
+        )
+
+
+def motion_series(found: FringeEvidence) -> FrameSeries | None:
+    """Change of the fringe vector (x, y), rad/px; None where too few frames tell."""
+    return _series(found, lambda free: free[:, 3:5], lambda free: _rows(free, 3, 4))
+
+
+def light_series(found: FringeEvidence) -> FrameSeries | None:
+    """B over its mean less one, and the logarithm of A/B; None where too few frames tell."""
+
+    def values(free: F64) -> F64:
+        b, a = free[:, 0], np.hypot(free[:, 1], free[:, 2])
+        return np.stack([b / mean - 1, np.log(np.maximum(a / b, 1e-6))], axis=1)
+
+    def slopes(free: F64) -> F64:
+        jacobian = np.zeros((len(free), 2, 5))
+        square = free[:, 1] ** 2 + free[:, 2] ** 2
+        jacobian[:, 0, 0] = 1 / mean
+        jacobian[:, 1, 0] = -1 / free[:, 0]
+        jacobian[:, 1, 1:3] = free[:, 1:3] / square[:, None]
+        return jacobian
+
+    mean = float(found.free[_lit(found), 0].mean()) if _lit(found).any() else 1.0
+    return _series(found, values, slopes)
+
+
+def _rows(free: F64, *columns: int) -> F64:
+    jacobian = np.zeros((len(free), len(columns), 5))
+    jacobian[:, np.arange(len(columns)), columns] = 1.0
+    return jacobian
+
+
+def _lit(found: FringeEvidence) -> NDArray[np.bool_]:
+    """Frames with light, fringes and samples in both halves of the pixels."""
+    usable = np.ones(len(found.free), bool)
+    for free, covariance in ((found.free, found.free_covariance), *found.halves):
+        usable &= np.isfinite(free).all(axis=1) & (np.einsum("tii->ti", covariance)[:, :3] > 0).all(
+            axis=1
+        )
+        b, a = free[:, 0], np.hypot(free[:, 1], free[:, 2])
+        usable &= (b > DARK * np.median(b)) & (a > DARK * np.median(a))
+    return usable
+
+
+def _series(
+    found: FringeEvidence, values: Callable[[F64], F64], slopes: Callable[[F64], F64]
+) -> FrameSeries | None:
+    use = _lit(found)
+    if use.sum() < FEWEST:
+        return None
+    taken, noises = [], []
+    for free, covariance in ((found.free, found.free_covariance), *found.halves):
+        jacobian = slopes(free[use])
+        taken.append(values(free[use]))
+        noises.append(np.einsum("tai,tij,tbj->ab", jacobian, covariance[use], jacobian) / use.sum())
+    # A window of one row tells nothing of ky.
+    if min(np.diag(noise).min() for noise in noises) <= 0:
+        return None
+    # What neighbours leave in a frame is told from all but the end frames.
+    inside = slice(1, -1)
+    time = found.time_s[use][inside]
+    return FrameSeries(
+        name=found.name,
+        k=found.k,
+        time_s=time,
+        step_s=float((time[-1] - time[0]) / (len(time) - 1)) or 1.0,
+        exptime_s=found.exptime_s,
+        values=taken[0][inside],
+        apart=((taken[1] - taken[2]) / 2)[inside],
+        shapes=_follows_phase(np.arctan2(found.free[use, 2], found.free[use, 1])),
+        noise=noises[0],
+        apart_noise=(noises[1] + noises[2]) / 4,
+    )
+
+
+def without(values: F64, shapes: F64) -> F64:
+    """Series (t, c) without shapes (t, p) and mean, by weighted least squares of the cosine modes.
+
+    A mode's weight is the inverse of the power around it, so that drifts and lines are not taken
+    for the shapes; what noise and jitter lose to the shapes is given back to each mode.
+    """
+    modes, design = cosine_modes(values), cosine_modes(shapes)
+    rest = np.empty_like(modes)
+    for channel, wanted in enumerate(modes.T):
+        own = wanted
+        for _ in range(2):
+            power = own**2
+            around = median_filter(power, AROUND, mode="reflect") / MEDIAN
+            root = 1 / np.sqrt(np.maximum(np.maximum(around, power / OUTLIER), 1e-300))
+            left, size, _ = np.linalg.svd(design * root[:, None], full_matrices=False)
+            left = left[:, size > 1e-6 * size.max(initial=1e-300)]
+            own = wanted - left @ (left.T @ (wanted * root)) / root
+        kept = 1 - np.einsum("kp,kp->k", left, left)
+        rest[:, channel] = own / np.sqrt(np.maximum(kept, 0.1))
+    nothing = np.zeros((1, modes.shape[1]))
+    return np.asarray(idct(np.vstack([nothing, rest]), type=2, norm="ortho", axis=0))
+
+
+def _follows_phase(phase: F64) -> F64:
+    """Shapes (t - 2, p) of what is no noise but goes with the phases, of all but the end frames.
+
+    What a bent response, the window's edges and the maps' gauge leave goes with the frame's own
+    phase and its harmonics, up to the one at which the samples of a fringe meet again; what other
+    frames leave in it (lag, rolling shutter) with the steps from and to them, and with both. The
+    likeliest come first. A scan so slow that such a shape is a drift does not count.
+    """
+    own, steps = phase[1:-1], (phase[:-2] - phase[1:-1], phase[2:] - phase[1:-1])
+    angles = [own, 2 * own, *steps, 3 * own, 4 * own]
+    for order in range(1, HARMONICS + 1):
+        angles += [(order + 4) * own] * (order + 4 <= HARMONICS)
+        angles += [step + turns * own for step in steps for turns in (order, -order)]
+    angles = angles[: max(1, int(len(own) * SPENT / 2))]
+    shapes = np.stack([turn(angle) for angle in angles for turn in (np.cos, np.sin)], axis=1)
+    power = cosine_modes(shapes) ** 2
+    fast = power[SLOW:].sum(axis=0) > np.maximum(power.sum(axis=0) / 2, 1e-9)
+    return np.asarray(shapes[:, fast])
+
+
+def assemble(
+    every: Sequence[FrameSeries],
+    parts: Callable[[FrameSeries], F64],
+    known: Callable[[FrameSeries], F64] | None = None,
+) -> Modes:
+    """Series of all sets, with their noise, for `estimate_components`.
+
+    Parameters
+    ----------
+    every : sequence of FrameSeries
+    parts : callable
+        Of a series, the covariance (m, t - 1, 2, 2) of its modes for unit sizes; the sizes are
+        common to all sets and come first in the result, three of the noise of each set after them.
+    known : callable, optional
+        Of a series, shapes (t, 2, q) whose coefficients are common to all sets; they come first.
+    """
+    shared = [np.asarray(parts(s)) for s in every]
+    shapes = [np.zeros((len(s), 2, 0)) if known is None else known(s) for s in every]
+    m, q = len(shared[0]), shapes[0].shape[2]
+    values, designs, covariances = [], [], []
+    least = np.full(m, -np.inf)
+    for i, s in enumerate(every):
+        n = len(s) - 1
+        design = np.zeros((2 * n, 2, q))
+        design[:n] = cosine_modes(shapes[i])
+        covariance = np.zeros((m + 3 * len(every), 2 * n, 2, 2))
+        covariance[:m, :n] = shared[i]
+        for half, noise in ((slice(n), s.noise), (slice(n, 2 * n), s.apart_noise)):
+            covariance[m + 3 * i : m + 3 * i + 3, half] = _noise_parts(noise)[:, None]
+        values.append(np.concatenate([cosine_modes(s.values), cosine_modes(s.apart)]))
+        designs.append(design)
+        covariances.append(covariance)
+        share = np.einsum("ab,inba->in", np.linalg.inv(s.noise), shared[i]).max(axis=1)
+        least = np.maximum(least, -BELOW / np.maximum(share, 1e-300))
+    stacked = np.concatenate(covariances, axis=1)
+    of_noise = np.tile([LEAST_NOISE, -np.inf, LEAST_NOISE], len(every))
+    return Modes(
+        values=np.concatenate(values),
+        known=np.concatenate(designs),
+        parts=stacked,
+        start=np.concatenate([np.zeros(m), np.ones(3 * len(every))]),
+        least=np.concatenate([least, of_noise]),
+        share=float(np.average([s.share for s in every], weights=[len(s) for s in every])),
+    )
+
+
+def _noise_parts(noise: F64) -> F64:
+    """Covariance of two channels as three parts of unit size: one, both, the other."""
+    parts = np.zeros((3, 2, 2))
+    parts[0, 0, 0], parts[2, 1, 1] = noise[0, 0], noise[1, 1]
+    parts[1, 0, 1] = parts[1, 1, 0] = noise[0, 1]
+    return parts

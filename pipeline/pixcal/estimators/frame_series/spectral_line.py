@@ -1,0 +1,122 @@
+"""A vibration among series of frames: the line that stands out of their spectrum."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import idct
+
+from pixcal.estimators.frame_series.series import FrameSeries, without
+from pixcal.estimators.frame_series.variance_components import cosine_modes, log_chance, sigmas
+from pixcal.kernels.significance import SIGNIFICANT
+
+F64 = NDArray[np.float64]
+
+FINER = 8
+"""Frequencies looked at for each that a series tells apart."""
+SLOWEST = 4.0
+"""Fewest swings of a line within a run; what is slower is drift."""
+TRIALS = 4.0
+"""Looks for each frequency that a series tells apart: the highest place lies between any two."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of one frequency in the series of all sets.
+
+    Attributes
+    ----------
+    hz, hz_error : float
+        As the frames see it: above half their rate it is folded below.
+    amplitude, amplitude_error : (2,) float64
+        Of each channel; mean square over the sets, less that of the noise.
+    log_chance : float
+        Logarithm of the chance that noise makes such a line anywhere in the spectrum.
+    """
+
+    hz: float
+    hz_error: float
+    amplitude: F64
+    amplitude_error: F64
+    log_chance: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether it is taken for one."""
+        return sigmas(self.log_chance) > SIGNIFICANT
+
+
+def find_line(
+    every: Sequence[FrameSeries],
+    level: Callable[[FrameSeries], F64],
+    channels: Sequence[int] = (0, 1),
+) -> Line | None:
+    """The strongest line; None where the runs are too short for one.
+
+    Parameters
+    ----------
+    every : sequence of FrameSeries
+    level : callable
+        Of a series, the variance (t - 1, 2) of its cosine modes without a line.
+    channels : sequence of int
+        That may hold the line.
+    """
+    longest = max(every, key=len)
+    top = min(0.5 / s.step_s for s in every)
+    low = max(SLOWEST / (len(s) * s.step_s) for s in every)
+    grid = np.arange(low, top, 1 / (FINER * len(longest) * longest.step_s))
+    if len(grid) < FINER:
+        return None
+    powers = [_spectrum(s, level(s), channels, grid) for s in every]
+    power = np.sum([p.sum(axis=1) for p, _ in powers], axis=0)
+    at = int(np.argmax(power))
+    looks = TRIALS * len(grid) / FINER
+    chance = log_chance(float(power[at]), len(every) * len(channels)) + np.log(looks)
+    hz, sharpness = _peak(grid, power, at)
+    amplitude, error = np.zeros(2), np.zeros(2)
+    for n, channel in enumerate(channels):
+        # Power in units of the noise's mean 1; the amplitude's square is 4 / t of it.
+        unit = [4 * v[at, n] / len(s) for s, (_, v) in zip(every, powers, strict=True)]
+        square = np.mean([(p[at, n] - 1) * u for (p, _), u in zip(powers, unit, strict=True)])
+        amplitude[channel] = np.sqrt(max(square, 0.0))
+        error[channel] = np.sqrt(np.mean(unit) / 2 / len(every))
+    return Line(hz, sharpness, amplitude, error, min(float(chance), 0.0))
+
+
+def without_line(series: FrameSeries, line: Line) -> FrameSeries:
+    """The series without the line."""
+    turn = 2 * np.pi * line.hz * series.time_s
+    swing = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    return replace(series, values=without(series.values, swing))
+
+
+def _spectrum(s: FrameSeries, level: F64, channels: Sequence[int], grid: F64) -> tuple[F64, F64]:
+    """Power (f, channel) in units of the level, and the level, both at frequencies ``grid``.
+
+    Made white by its cosine modes first: a walk or a ramp would leak all over the spectrum.
+    """
+    n = len(s)
+    level = level[:, list(channels)]
+    modes = cosine_modes(s.values[:, list(channels)]) / np.sqrt(level)
+    white = idct(np.vstack([np.zeros(len(channels)), modes]), type=2, norm="ortho", axis=0)
+    size = 1 << int(np.ceil(np.log2(2 * FINER * n)))
+    power = np.abs(np.fft.rfft(white, size, axis=0)) ** 2 / n
+    own = np.arange(len(power)) / (size * s.step_s)
+    at = np.arange(1, n) / (2 * n * s.step_s)
+    levels = [np.interp(grid, at, column) for column in level.T]
+    found = [np.interp(grid, own, column) for column in power.T]
+    return np.stack(found, axis=1), np.stack(levels, axis=1)
+
+
+def _peak(grid: F64, power: F64, at: int) -> tuple[float, float]:
+    """Frequency of a peak and its error, by the parabola through its three highest values."""
+    step = grid[1] - grid[0]
+    inside = min(max(at, 1), len(grid) - 2)
+    before, here, after = power[inside - 1 : inside + 2]
+    bend = before - 2 * here + after
+    if bend >= 0:
+        return float(grid[at]), float(step)
+    shift = float(np.clip((before - after) / (2 * bend), -1, 1))
+    # The power is the growth of the log-likelihood: its bend is the information.
+    return float(grid[inside] + shift * step), float(step / np.sqrt(-bend))

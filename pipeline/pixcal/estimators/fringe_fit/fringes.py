@@ -1,0 +1,289 @@
+"""What a set's fringes look like: frame parameters, the local fringe vector, smooth phasors."""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from math import gcd
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+from scipy.optimize import minimize
+
+from pixcal.estimators.fringe_fit.harmonics import FrameMoments
+from pixcal.model.errors import InputError
+
+F64 = NDArray[np.float64]
+C128 = NDArray[np.complex128]
+Phases = TypeVar("Phases", NDArray[np.float32], NDArray[np.float64])
+
+MIN_FRINGES = 1.5
+"""Fewest fringes across a window for a peak to be looked for."""
+HONEST_FRINGES = 1.95
+"""Fewest fringes for maps with honest errors: with 1.3 to 1.8 the gauge takes true offsets for
+fringes, and errors were 2 to 4 times what SIGMA says (measured on 80 x 80 px)."""
+SHORTEST_PX = 2.2
+"""Shortest period along x and y: below 2 px fringes look like wider ones of another direction, and
+nominal vectors are good to some 10 %."""
+MOST_TURNED = 0.5
+"""Least cosine between the fringes' axis and the nominal one: the nominal vector gives the sign."""
+MOST_PIXELS = 6000
+"""Pixels that a smooth phasor is fitted to, about: ten terms are then known to 4 % of the noise of
+one pixel."""
+
+
+@dataclass(frozen=True)
+class FrameParameters:
+    """What changes from frame to frame.
+
+    Attributes
+    ----------
+    g : (t, 3) float64
+        (B, A cos phi, A sin phi) at the reference point.
+    dk : (t, 2) float64
+        Change of the fringe vector along x and y (rad/px); all zero when it is held.
+    reference : (float, float)
+        Point (y, x) where ``g`` holds, in pixels.
+    """
+
+    g: F64
+    dk: F64
+    reference: tuple[float, float]
+
+    @cached_property
+    def moving(self) -> bool:
+        """Whether the fringe vector is free in each frame."""
+        return bool(np.any(self.dk != 0))
+
+    def at(self, y: float, x: float) -> F64:
+        """Frame parameters (t, 3) at another point: the phase turned by dk times the distance."""
+        if not self.moving:
+            return self.g
+        turn = self.dk[:, 0] * (x - self.reference[1]) + self.dk[:, 1] * (y - self.reference[0])
+        phasor = (self.g[:, 1] + 1j * self.g[:, 2]) * np.exp(1j * turn)
+        return np.stack([self.g[:, 0], phasor.real, phasor.imag], axis=1)
+
+    @cached_property
+    def _moments(self) -> FrameMoments:
+        return FrameMoments.of(self.g)
+
+    def moments_at(self, y: float, x: float) -> FrameMoments:
+        """The frames' moments at a point; the same for all where the fringe vector is held."""
+        return FrameMoments.of(self.at(y, x)) if self.moving else self._moments
+
+    @property
+    def B(self) -> F64:
+        """Mean intensity of each frame."""
+        return self.g[:, 0]
+
+    @property
+    def A(self) -> F64:
+        """Fringe amplitude of each frame."""
+        return np.hypot(self.g[:, 1], self.g[:, 2])
+
+    @property
+    def phi(self) -> F64:
+        """Phase of each frame (rad, in ±pi)."""
+        return np.arctan2(self.g[:, 2], self.g[:, 1])
+
+
+def grid(shape: tuple[int, int]) -> tuple[F64, F64]:
+    """Pixel coordinates (y, 1) and (1, x) relative to the centre of a tile."""
+    ny, nx = shape
+    y = np.arange(ny, dtype=float)[:, None] - (ny - 1) / 2
+    x = np.arange(nx, dtype=float)[None, :] - (nx - 1) / 2
+    return y, x
+
+
+def find_fringe_vector(
+    maps: F64, good: NDArray[np.bool_], nominal: tuple[float, float]
+) -> tuple[float, float]:
+    """Fringe vector of a tile, from maps that hold fringes of any amplitude and phase.
+
+    The highest peak of the summed power spectra, refined on the continuous spectrum; its sign is
+    that of the nominal vector.
+
+    Parameters
+    ----------
+    maps : (n, y, x) float64
+        Maps without their mean light (ratios to the mean map).
+    good : (y, x) bool
+        Pixels to use.
+    nominal : (float, float)
+        Fringe vector (kx, ky) of the bench's nominal geometry, rad/px.
+
+    Returns
+    -------
+    (float, float)
+        (kx, ky) in rad/px.
+
+    Raises
+    ------
+    InputError
+        If no peak stands out: the frames hold no fringes, or fewer than `MIN_FRINGES`; if fringes
+        are nominally narrower than `SHORTEST_PX`, or lie across the nominal ones.
+    """
+    if max(map(abs, nominal)) * SHORTEST_PX > 2 * np.pi:
+        raise InputError(
+            f"baseline_mm and optics give fringes of {2 * np.pi / np.hypot(*nominal):.2g} px: "
+            f"pixels show them from {SHORTEST_PX:g} px on along x and y; correct the numbers, or "
+            "use a shorter baseline"
+        )
+    shape = maps.shape[1:]
+    window = np.hanning(shape[0] + 2)[1:-1, None] * np.hanning(shape[1] + 2)[None, 1:-1]
+    weight = window * good
+    y, x = grid((shape[0], shape[1]))
+    # A plane is taken off each map: what is left of the illumination must not win.
+    basis = np.stack(np.broadcast_arrays(1.0, x, y), axis=-1).reshape(-1, 3) * weight.reshape(-1, 1)
+    flat = np.where(good, maps, 0.0).reshape(len(maps), -1) * weight.reshape(1, -1)
+    coefficients = np.linalg.lstsq(basis, flat.T, rcond=None)[0]
+    light = (flat - (basis @ coefficients).T).reshape(maps.shape)
+
+    size = [2 * n for n in shape]
+    power = (np.abs(np.fft.fft2(light, s=size)) ** 2).sum(axis=0)
+    fy, fx = np.meshgrid(*(np.fft.fftfreq(n) for n in size), indexing="ij")
+    fringes_across = np.hypot(fy * shape[0], fx * shape[1])
+    allowed = fringes_across >= MIN_FRINGES
+    # Nominal positions are good to some 10 %: the peak there wins unless it is no peak at all.
+    near = np.hypot(2 * np.pi * fx - nominal[0], 2 * np.pi * fy - nominal[1])
+    reach = 0.25 * np.hypot(*nominal) + 2 * np.pi * 1.5 / min(shape)
+    floor = np.median(power[allowed]) if allowed.any() else np.inf
+    # The foot of a peak beyond is none, nor are its side lobes.
+    within = np.where(allowed, power, 0.0)
+    crest = (power >= maximum_filter(within, 3, mode="wrap")) & (power > 0.1 * within.max())
+    peak = None
+    for region in (allowed & crest & (near < reach), allowed):
+        if region.any():
+            candidate = int(np.argmax(np.where(region, power, -1)))
+            if power.flat[candidate] > 50 * floor:
+                peak = candidate
+                break
+    if peak is None:
+        raise InputError(
+            "no fringes found: the frames are constant in phase or without contrast, or the "
+            f"fringes are wider than the window of {shape[1]} x {shape[0]} px allows; look at the "
+            "frames, and at which files the set lists"
+        )
+
+    def minus_power(k: F64) -> float:
+        phasor = np.exp(-1j * k[0] * x) * np.exp(-1j * k[1] * y)
+        return -float((np.abs((light * phasor).sum(axis=(1, 2))) ** 2).sum())
+
+    start = 2 * np.pi * np.array([fx.flat[peak], fy.flat[peak]])
+    scale = -minus_power(start)
+    found = minimize(
+        lambda k: minus_power(k) / scale,
+        start,
+        method="Nelder-Mead",
+        options={
+            "initial_simplex": start + np.array([[0, 0], [0.3, 0], [0, 0.3]]) / min(shape),
+            "xatol": 1e-7,
+            "fatol": 1e-12,
+        },
+    ).x
+    cosine = found @ np.array(nominal) / max(np.hypot(*found) * np.hypot(*nominal), 1e-300)
+    if abs(cosine) < MOST_TURNED:
+        raise InputError(
+            f"the fringes lie {np.degrees(np.arccos(abs(cosine))):.0f} degrees from where "
+            "baseline_mm says; correct it, or list the files of the right set"
+        )
+    sign = np.sign(cosine)
+    return float(sign * found[0]), float(sign * found[1])
+
+
+@lru_cache(maxsize=8)
+def polynomial_basis(shape: tuple[int, int], degree: int, step: int = 1) -> F64:
+    """Terms x^i y^j, i + j up to ``degree``, on coordinates scaled to ±1: (y * x, terms).
+
+    Of every ``step``-th pixel.
+    """
+    y, x = grid(shape)
+    y, x = y / max(1.0, shape[0] / 2), x / max(1.0, shape[1] / 2)
+    terms = [x**i * y**j for n in range(degree + 1) for i in range(n, -1, -1) for j in (n - i,)]
+    return np.stack([np.broadcast_to(t, shape).ravel()[::step] for t in terms], axis=1)
+
+
+@dataclass(frozen=True)
+class SmoothPhasor:
+    """A smooth phasor over a tile.
+
+    Attributes
+    ----------
+    map : (y, x) complex128
+        Visibility times exp(i psi), on every pixel.
+    k : (float, float)
+        Fringe vector (kx, ky), the mean over the tile, rad/px.
+    """
+
+    map: C128
+    k: tuple[float, float]
+
+
+def smooth_phasor(
+    phasor: C128, good: NDArray[np.bool_], k: tuple[float, float], degree: int = 3
+) -> SmoothPhasor:
+    """Smooth version of a phasor map alpha exp(i psi) / iota.
+
+    The fringe vector is first corrected by the mean phase step from pixel to pixel, then a complex
+    polynomial is fitted to the map turned back by it, leaving outliers out.
+
+    Parameters
+    ----------
+    phasor : (y, x) complex128
+        Visibility times exp(i psi), noisy.
+    good : (y, x) bool
+        Pixels to use.
+    k : (float, float)
+        Fringe vector (kx, ky) to start from, rad/px.
+    degree : int
+        Of the polynomial; lowered for tiles of few pixels.
+    """
+    shape = (phasor.shape[0], phasor.shape[1])
+    kx, ky = k
+    turned = np.where(good, phasor, 0) * plane_wave(shape, (-kx, -ky))
+    if shape[1] > 1:
+        kx += float(np.angle(np.vdot(turned[:, :-1], turned[:, 1:])))
+    if shape[0] > 1:
+        ky += float(np.angle(np.vdot(turned[:-1], turned[1:])))
+    carrier = plane_wave(shape, (kx, ky))
+    turned = (np.where(good, phasor, 0) * carrier.conj()).ravel()
+    # Real and imaginary part are two maps of the same real fit.
+    parts = np.ascontiguousarray(turned).view(float).reshape(-1, 2)
+    use = good.ravel()
+    while degree > 0 and min(shape) < 4 * (degree + 1):
+        degree -= 1
+    # Some thousand pixels are enough, of all columns: the step and their number share no factor.
+    step = max(1, len(parts) // MOST_PIXELS)
+    while gcd(step, shape[1]) > 1:
+        step += 1
+    parts, use = parts[::step], use[::step]
+    every, basis = polynomial_basis(shape, degree), polynomial_basis(shape, degree, step)
+    fit = np.zeros((basis.shape[1], 2))
+    for _ in range(3):
+        n = np.count_nonzero(use)
+        if n < 2 * basis.shape[1]:
+            every = polynomial_basis(shape, 0)
+            fit = parts[use].mean(axis=0)[None] if n else np.zeros((1, 2))
+            break
+        # Terms of low degree on ±1 are nearly orthogonal: normal equations keep their digits.
+        # A tile of which a few rows are good does not tell all of them: least squares, not solve.
+        inside = basis if n == use.size else basis * use[:, None]
+        fit = np.linalg.lstsq(inside.T @ basis, inside.T @ parts, rcond=1e-10)[0]
+        rest = ((parts - basis @ fit) ** 2).sum(axis=1)
+        kept = good.ravel()[::step] & (rest <= 25 * np.median(rest[use]) + 1e-24)
+        if np.array_equal(kept, use):
+            break
+        use = kept
+    return SmoothPhasor((every @ fit).view(complex).reshape(shape) * carrier, (kx, ky))
+
+
+def plane_wave(shape: tuple[int, int], k: tuple[float, float], phase: float = 0.0) -> C128:
+    """``exp(i (phase + k . r))`` over a tile (y, x), r from its centre: a product of two sides."""
+    y, x = grid(shape)
+    return np.asarray(np.exp(1j * (phase + k[1] * y)) * np.exp(1j * k[0] * x))
+
+
+def wrapped(phase: Phases) -> Phases:
+    """Phases in ±pi, rad."""
+    turn = phase.dtype.type(2 * np.pi)
+    return np.asarray(phase - turn * np.rint(phase / turn))

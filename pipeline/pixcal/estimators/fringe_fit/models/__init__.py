@@ -1,0 +1,107 @@
+"""Shapes of the fringes over the window, one file each; found by `fringe_models`.
+
+A shape is what the offsets are measured from: a phase with a few parameters, whose derivatives are
+modes that the offsets cannot hold. A new one is a file with a class like `FringeShape` and a
+module-level ``SHAPE`` naming it.
+"""
+
+import importlib
+import pkgutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a shape starts from.
+
+    Attributes
+    ----------
+    k : (float, float)
+        Measured fringe vector (kx, ky) at the reference, rad/px.
+    reference : (float, float)
+        Point (y, x), px.
+    scale : float
+        Half the window's size, px.
+    planes : sequence
+        Unwrapped `geometry.TilePlane` of every tile, relative to the carrier
+        ``k . (r - reference)``.
+    wavelength_mm, pitch_mm, distance_mm : float
+        Nominal optics.
+    baseline_mm : (float, float)
+        Nominal baseline (x, y).
+    """
+
+    k: tuple[float, float]
+    reference: tuple[float, float]
+    scale: float
+    planes: Sequence[Any]
+    wavelength_mm: float
+    pitch_mm: float
+    distance_mm: float
+    baseline_mm: tuple[float, float]
+
+
+class FringeShape(Protocol):
+    """A shape with its present parameters.
+
+    Attributes
+    ----------
+    linear : bool
+        Whether the phase is linear in the coefficients, so that one step is all.
+    """
+
+    linear: ClassVar[bool]
+
+    @classmethod
+    def start(cls, start: Start) -> Self:
+        """Parameters near enough for Gauss-Newton steps to converge."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the modes."""
+
+    @property
+    def precision(self) -> F64:
+        """What is known beforehand: 1 / variance of each mode's coefficient, zero for nothing."""
+
+    @property
+    def prior_offset(self) -> F64:
+        """Present coefficients, counted from what was known beforehand."""
+
+    def phase(self, y: F64, x: F64) -> F64:
+        """Phase (rad) at pixel coordinates that broadcast."""
+
+    def modes(self, y: F64, x: F64) -> F64:
+        """Derivatives (mode, y, x) of the phase with respect to the coefficients."""
+
+    def moved(self, step: F64) -> Self:
+        """The shape after a step of the coefficients."""
+
+    def vector(self, y: float, x: float) -> tuple[float, float]:
+        """Local fringe vector (kx, ky), rad/px."""
+
+    def facts(self, covariance: F64) -> dict[str, Any]:
+        """Parameters with 1-sigma errors in natural units, for ``fit.json``.
+
+        Parameters
+        ----------
+        covariance : (mode, mode) float64
+            Of the coefficients.
+        """
+
+
+def fringe_models() -> dict[str, type[FringeShape]]:
+    """All shapes, by name."""
+    found = {}
+    for module in pkgutil.iter_modules(__path__):
+        shape = getattr(importlib.import_module(f"{__name__}.{module.name}"), "SHAPE", None)
+        if shape is not None:
+            found[module.name] = shape
+    return found

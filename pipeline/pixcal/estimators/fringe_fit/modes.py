@@ -1,0 +1,149 @@
+"""Least squares of the modes that the data cannot tell from the bench, from the sums of tiles.
+
+Sums of each tile are taken by themselves and added in the order of the tiles, so that the result
+is the same however the work was shared out.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.fringe_fit.gauge import FRINGE_MODES
+from pixcal.estimators.fringe_fit.geometry import TilePlane
+from pixcal.estimators.fringe_fit.local_basis import SCALE_PX, expand, powers
+from pixcal.estimators.fringe_fit.models import FringeShape
+from pixcal.estimators.fringe_fit.tile_sums import N_LOCAL, Carrier, TileSums
+
+F64 = NDArray[np.float64]
+
+TILES_AT_ONCE = 256
+"""Tiles whose modes are held together."""
+
+
+@dataclass(frozen=True)
+class ModeBasis:
+    """The modes of a set's phase map: those of the fringes' shape, then those of the gauge.
+
+    Attributes
+    ----------
+    shape : FringeShape
+        Present shape of the fringes.
+    carrier : Carrier
+        That measured phases are relative to.
+    """
+
+    shape: FringeShape
+    carrier: Carrier
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the modes."""
+        return (*self.shape.names, *FRINGE_MODES)
+
+    def _local(self, planes: list[TilePlane]) -> tuple[F64, F64]:
+        """The modes (tile, mode, local) and the shape's phase (tile, local) in local modes.
+
+        The phase is relative to each tile's plane.
+        """
+        centres = np.array([p.centre for p in planes])
+        n_poly, n_own = len(powers()), len(self.shape.names)
+        modes = np.zeros((len(planes), len(self.names), N_LOCAL))
+        modes[:, :n_own, :n_poly] = expand(self.shape.modes, centres)
+        modes[:, n_own:, n_poly:] = np.eye(len(FRINGE_MODES))
+        phase = np.zeros((len(planes), N_LOCAL))
+        phase[:, :n_poly] = expand(
+            lambda y, x: self.shape.phase(y, x) - self.carrier.phase(y, x), centres
+        )
+        at = {p: n for n, p in enumerate(powers())}
+        phase[:, at[0, 0]] -= [p.phase for p in planes]
+        phase[:, at[1, 0]] -= [p.kx * SCALE_PX for p in planes]
+        phase[:, at[0, 1]] -= [p.ky * SCALE_PX for p in planes]
+        return modes, phase
+
+    def sums(self, tiles: TileSums) -> tuple[F64, F64, float]:
+        """Normal matrix (mode, mode), right-hand sides (mode, 1 + batch) and weighted square.
+
+        Of the phases less the shape's.
+        """
+        size = len(self.names)
+        normal, rights = np.zeros((size, size)), np.zeros((size, tiles.right.shape[2]))
+        square = 0.0
+        # Some tiles at a time: their modes are many numbers.
+        for first in range(0, len(tiles.planes), TILES_AT_ONCE):
+            part = slice(first, first + TILES_AT_ONCE)
+            modes, phase = self._local(tiles.planes[part])
+            right = tiles.right[part].copy()
+            moved = np.einsum("tij,tj->ti", tiles.normal[part], phase)
+            square += float((phase * (moved - 2 * right[:, :, 0])).sum())
+            square += float(tiles.square[part].sum())
+            right[:, :, 0] -= moved
+            normal += np.einsum("tmi,tni->mn", modes @ tiles.normal[part], modes)
+            rights += np.einsum("tmi,tib->mb", modes, right)
+        return normal, rights, square
+
+    def removed(self, planes: list[TilePlane], coefficients: F64) -> F64:
+        """What to take off each tile's phases, in its local modes.
+
+        Parameters
+        ----------
+        planes : list of TilePlane
+        coefficients : (mode, 1 + batch) float64
+            Of the run's phases relative to the shape, and of the batches' relative to the run's.
+
+        Returns
+        -------
+        (tile, local, 1 + batch) float64
+            The first column is relative to the tile's plane and holds the shape as well.
+        """
+        removed = np.empty((len(planes), N_LOCAL, coefficients.shape[1]))
+        for first in range(0, len(planes), TILES_AT_ONCE):
+            part = slice(first, first + TILES_AT_ONCE)
+            modes, phase = self._local(planes[part])
+            removed[part] = np.einsum("tmi,mb->tib", modes, coefficients)
+            removed[part, :, 0] += phase
+        return removed
+
+    def solve(self, normal: F64, right: F64, spread: float) -> F64:
+        """Coefficients (mode, n) of maps from their sums, with what the shape knows beforehand.
+
+        Parameters
+        ----------
+        normal : (mode, mode) float64
+        right : (mode, n) float64
+            The first map is the whole run's; the prior's offset acts on it alone, the others are
+            differences from it.
+        spread : float
+            Variance of the map over that of its noise: true offsets act as noise here.
+        """
+        precision = self._precision(spread)
+        offset = np.zeros(len(precision))
+        offset[: len(self.shape.names)] = self.shape.prior_offset
+        right = right.copy()
+        right[:, 0] -= precision * offset
+        return solve_modes(normal + np.diag(precision), right)
+
+    def covariance(self, normal: F64, spread: float) -> F64:
+        """Covariance of the coefficients."""
+        n = normal / spread + np.diag(self._precision(1.0))
+        scale = _scales(n)
+        return np.asarray(np.linalg.pinv(n / np.outer(scale, scale)) / np.outer(scale, scale))
+
+    def _precision(self, spread: float) -> F64:
+        known = self.shape.precision * spread
+        return np.concatenate([known, np.zeros(len(FRINGE_MODES))])
+
+
+def _scales(normal: F64) -> F64:
+    """Size of each mode; 1 for one that is zero all over the window (y on a single row)."""
+    size = np.sqrt(np.maximum(np.diag(normal), 0.0))
+    return np.where(size > 0, size, 1.0)
+
+
+def solve_modes(normal: F64, right: F64) -> F64:
+    """Coefficients (mode, n); modes that the window cannot tell apart share what they explain."""
+    scale = _scales(normal)
+    unit = normal / np.outer(scale, scale)
+    return np.asarray(
+        np.linalg.lstsq(unit, right / scale[:, None], rcond=1e-12)[0] / scale[:, None]
+    )

@@ -1,0 +1,449 @@
+"""Frame parameters of a set, from a few tiles spread over the detector.
+
+The first look takes some hundred frames spread over the run: their samples are a matrix of rank
+three, and any three vectors that span it are turned into (iota, alpha sin psi, alpha cos psi) with
+the help of the fringe vector and the gauge (physics note, sections 2 and 3). With the pixels of
+these tiles known, every frame is then solved by itself, block after block.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+
+from pixcal.estimators.fringe_fit.fringes import (
+    HONEST_FRINGES,
+    FrameParameters,
+    find_fringe_vector,
+    grid,
+    smooth_phasor,
+)
+from pixcal.estimators.fringe_fit.gauge import gauge_matrix
+from pixcal.estimators.fringe_fit.tile import Coding, Tile
+from pixcal.estimators.fringe_fit.tile_fit import fit_tile, residual_chi2
+from pixcal.kernels.bilinear import frame_sums
+from pixcal.model.errors import InputError
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+Pixels = NDArray[np.intp] | slice
+Samples = tuple[NDArray[np.intp], NDArray[np.uint16]]
+"""Flat numbers of pixels of a tile, and their codes (t, p)."""
+Each = Callable[[Callable[[int], Any], Sequence[int]], list[Any]]
+
+MAX_PIXELS = 20_000
+"""Pixels that frames are solved with: their noise then adds some 2e-4 to a map's variance."""
+FEW = 4
+"""Of so many of these one is enough to start with: that only gives weights, and the point about
+which a moving phase is linear."""
+MIN_FRAMES = 6
+"""Three unknowns a pixel, and as many again to tell whether they fit."""
+ODD_VISIBILITY = 12.0
+"""Departure from the visibility of a tile's pixels, over the usual one, of a pixel not to learn
+from; some 8 standard deviations."""
+MANY = 3.0
+"""Mean light over that of most pixels, or the reverse, of pixels not to learn from."""
+FOLLOWS_RAD = 0.8
+"""Most of the usual distance of the pixels' phases from smooth ones; random ones have 1.57."""
+TURNS, TURNS_MOVING = 3, 8
+"""Most turns of pixels from frames and frames from pixels."""
+SETTLED = 0.02
+"""Change of the frames by a turn, over their errors, after which no other is needed. Each turn
+halves it: what is left is less than this share of the frames' noise, which is little itself."""
+ABOVE_NOISE = 1.5
+"""Least power of the weakest of three components over the next, which is noise: frames of two
+phases only have no third component, and noise in its place would pass for the fringes' shape."""
+
+
+def in_turn(function: Callable[[int], Any], numbers: Sequence[int]) -> list[Any]:
+    """Call a function with each of some numbers, one after the other."""
+    return [function(n) for n in numbers]
+
+
+@dataclass
+class Scout:
+    """Frame parameters from a few tiles.
+
+    Parameters
+    ----------
+    tiles : sequence of Tile
+        The first is the one whose fringe vector is sought.
+    coding : Coding
+        Of the stored samples.
+    nominal : (float, float)
+        Nominal fringe vector (kx, ky), rad/px.
+    reference : (float, float)
+        Point (y, x) at which the frame parameters hold.
+    each : callable
+        Does what is to be done for every tile: as `in_turn`, or several at a time.
+
+    Attributes
+    ----------
+    k : (float, float)
+        Fringe vector of the first tile, rad/px.
+    moving, moving_significance : bool, float
+        Whether the fringe vector changes from frame to frame, and the test's statistic.
+    noise : float
+        Usual reduced chi-square of the pixels.
+    theta : list of (3, y, x) float64
+        Of each tile.
+    """
+
+    tiles: Sequence[Tile]
+    coding: Coding
+    nominal: tuple[float, float]
+    reference: tuple[float, float]
+    each: Each = field(default=in_turn, repr=False)
+    k: tuple[float, float] = (0.0, 0.0)
+    moving: bool = False
+    moving_significance: float = 0.0
+    noise: float = 1.0
+    theta: list[F64] = field(default_factory=list)
+
+    def prime(self, codes: Sequence[NDArray[np.uint16]]) -> FrameParameters:
+        """Learn the pixels of the tiles from frames spread over the run.
+
+        Parameters
+        ----------
+        codes : sequence of (t, y, x) arrays
+            The same frames for each tile.
+
+        Returns
+        -------
+        FrameParameters
+            Of these frames.
+
+        Raises
+        ------
+        InputError
+            If there are too few frames or good pixels, no fringes, or the phase does not change.
+        """
+        n_frames = codes[0].shape[0]
+        if n_frames < MIN_FRAMES:
+            raise InputError(f"{n_frames} frames: at least {MIN_FRAMES} are needed; take more")
+        self._drop_odd_levels(codes)
+        self._require_pixels()
+        g = self._subspace(codes)
+        frames = FrameParameters(g, np.zeros((n_frames, 2)), self.reference)
+        frames = self._settled(codes, frames, TURNS)
+        self._count_fringes()
+        noise = self._noise(codes, frames)
+        significance = self._motion_significance(codes, frames) / noise
+        self.moving_significance = significance
+        # Six standard deviations of what frames without motion would show.
+        self.moving = significance > 1 + 6 / np.sqrt(n_frames)
+        if self.moving:
+            frames = self._settled(codes, frames, TURNS_MOVING)
+            noise = self._noise(codes, frames)
+        self.noise = noise / (1 - 2 / (9 * (n_frames - 3))) ** 3
+        return frames
+
+    def solve(
+        self, codes: Sequence[NDArray[np.uint16]], start: FrameParameters | None = None
+    ) -> FrameParameters:
+        """Parameters of further frames, the pixels of the tiles being known.
+
+        Parameters
+        ----------
+        codes : sequence of (t, y, x) arrays
+            The same frames for each tile.
+        start : FrameParameters, optional
+            Where to start; else from an unweighted fit.
+        """
+        samples = self._samples(codes)
+        frames = self._unweighted(samples) if start is None else start
+        # Weights come from the step before: where the phase is linear one is enough.
+        for _ in range(3 if self.moving else 1):
+            frames, _, _ = self._frame_step(samples, frames, self.moving)
+        return frames
+
+    def _samples(self, codes: Sequence[NDArray[np.uint16]]) -> list[Samples]:
+        """Of each tile, the samples that frames are solved with."""
+
+        def taken(n: int) -> Samples:
+            picked, size = self._picked(self.tiles[n]), self.tiles[n].good.size
+            if 4 * len(picked) > 3 * size:
+                # Those of no use are zero in theta, and take less time than leaving them out.
+                picked = np.arange(size)
+            return picked, _taken(codes[n], picked)
+
+        return self.each(taken, range(len(self.tiles)))
+
+    def _unweighted(self, samples: Sequence[Samples]) -> FrameParameters:
+        """Frames by plain least squares."""
+        matrix: F64 = np.zeros((3, 3))
+        right: F64 = np.zeros((len(samples[0][1]), 3))
+        for theta, (picked, codes) in zip(self.theta, samples, strict=True):
+            few = _scattered(len(picked), -(-len(picked) // FEW))
+            design = theta.reshape(3, -1)[:, picked[few]]
+            matrix = matrix + design @ design.T
+            right = right + self._electrons(codes, few) @ design.T.astype(np.float32)
+        g = np.asarray(np.linalg.solve(matrix, right.T).T, dtype=np.float64)
+        return FrameParameters(g, np.zeros((len(g), 2)), self.reference)
+
+    def _require_pixels(self) -> None:
+        if sum(int(t.good.sum()) for t in self.tiles) < 30:
+            raise InputError(
+                "fewer than 30 good pixels are left to find the fringes with: the others are "
+                "masked, saturated too often, or do not fit the fringes; look at the mask, the "
+                "bias frames and the level of the light"
+            )
+
+    def _picked(self, tile: Tile) -> NDArray[np.intp]:
+        """Flat numbers of the good pixels that frames are solved with."""
+        good = np.flatnonzero(tile.good)
+        return good[_scattered(len(good), max(1, MAX_PIXELS // len(self.tiles)))]
+
+    def _electrons(self, codes: NDArray[np.uint16], picked: Pixels) -> F32:
+        """Samples (t, p) in electrons, for first values that know no weights.
+
+        Most samples without weight are saturated: the brightest of the pixel stands for them. A
+        frame that has no other samples is zero.
+        """
+        flat = _taken(codes, picked)
+        electrons = flat * np.float32(self.coding.scale) + np.float32(self.coding.offset)
+        lost = flat == self.coding.fill
+        if lost.any():
+            electrons[lost] = 0
+            lost &= ~lost.all(axis=1, keepdims=True)
+            electrons = np.where(lost, electrons.max(axis=0), electrons)
+        return np.asarray(electrons, np.float32)
+
+    def _drop_odd_levels(self, codes: Sequence[NDArray[np.uint16]]) -> None:
+        """Leave out pixels whose mean light is far from that of most: few would outweigh all."""
+
+        def drop(n: int) -> None:
+            tile = self.tiles[n]
+            if not tile.good.any():
+                return
+            parts = _parts(tile.good.size)
+            level = np.concatenate([self._electrons(codes[n], p).mean(axis=0) for p in parts])
+            level = level.reshape(tile.shape)
+            usual = np.median(level[tile.good])
+            tile.good &= (level > usual / MANY) & (level < MANY * usual)
+
+        self.each(drop, range(len(self.tiles)))
+
+    def _subspace(self, codes: Sequence[NDArray[np.uint16]]) -> F64:
+        """First frame parameters: rank three, then turned by means of the fringe vector."""
+
+        def gram_of(n: int) -> F64:
+            own: F64 = np.zeros((len(codes[n]), len(codes[n])))
+            picked = self._picked(self.tiles[n])
+            for part in _parts(len(picked)):
+                electrons = self._electrons(codes[n], picked[part])
+                own += electrons @ electrons.T
+            return own
+
+        gram = np.sum(self.each(gram_of, range(len(self.tiles))), axis=0)
+        last = len(gram) - 1
+        values, vectors = eigh(gram, subset_by_index=(last - 3, last), overwrite_a=True)
+        if values[1] <= 1e-12 * values[3] or values[1] < ABOVE_NOISE * values[0]:
+            raise InputError(
+                "no fringes found, or their phase was scanned too little: what differs from frame "
+                "to frame is noise; look at the frames, and scan evenly over a turn or more"
+            )
+        g = vectors[:, :0:-1]
+        first, block = self.tiles[0], codes[0]
+        every = _parts(first.good.size)
+        maps = np.hstack([g.T @ self._electrons(block, part) for part in every])
+        maps = maps.reshape(3, *first.shape)
+        mean = np.where(first.good & (np.abs(maps[0]) > 0), maps[0], 1.0)
+        ratios = np.where(first.good, maps[1:] / mean, 0.0)
+        # A third map that is only noise must not drown the fringes of the second.
+        self.k = find_fringe_vector(ratios, first.good, self.nominal)
+        y, x = grid(first.shape)
+        target = np.exp(1j * (self.k[0] * x + self.k[1] * y))[first.good]
+        span = np.stack([m[first.good] for m in maps], axis=1)
+        level = np.median(np.abs(span[:, 0]))
+        fringe = np.linalg.lstsq(span / level, target, rcond=None)[0]
+        light = np.linalg.lstsq(span / level, np.ones(len(span)), rcond=None)[0]
+        mix = np.stack([light, fringe.imag, fringe.real])
+        if not np.linalg.cond(mix) < 1e6:
+            raise InputError(
+                "the frames do not differ enough: the phase was scanned too little; scan it evenly "
+                "over a turn or more"
+            )
+        g = g @ np.linalg.inv(mix)
+        return np.asarray(g / self._norm(g))
+
+    def _count_fringes(self) -> None:
+        """Refuse what is no fringe, and fringes too wide (their vector is well known by now)."""
+        tile, theta = self.tiles[0], self.theta[0]
+        level = np.where(tile.good, theta[0], 1.0)
+        phasor = np.where(tile.good, theta[2] + 1j * theta[1], 0.0) / level
+        smooth = smooth_phasor(np.asarray(phasor, complex), tile.good, self.k)
+        away = np.abs(np.angle(phasor * smooth.map.conj()))[tile.good]
+        (kx, ky), (ny, nx) = smooth.k, tile.shape
+        turned = np.hypot((kx - self.k[0]) * nx, (ky - self.k[1]) * ny)
+        if not np.median(away) < FOLLOWS_RAD or turned > np.pi:
+            raise InputError(
+                "no fringes found that the pixels follow; look at the frames, at the bias frames, "
+                "and at which files the set lists"
+            )
+        across = float(np.hypot(kx * nx, ky * ny)) / (2 * np.pi)
+        if across < HONEST_FRINGES:
+            raise InputError(
+                f"{across:.1f} fringes across {nx} x {ny} px: at least {HONEST_FRINGES:g} are "
+                "needed; use a longer baseline or a larger window"
+            )
+
+    @staticmethod
+    def _norm(g: F64) -> F64:
+        """Scales that make the mean of B and the mean of A equal to 1."""
+        amplitude = np.hypot(g[:, 1], g[:, 2]).mean()
+        return np.array([g[:, 0].mean(), amplitude, amplitude])
+
+    def _settled(
+        self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters, most: int
+    ) -> FrameParameters:
+        """Turns until they change the frames no more than their noise allows."""
+        for _ in range(most):
+            before = frames
+            frames, normal = self._refine(codes, before)
+            size = 5 if self.moving else 3
+            change = np.hstack([frames.g - before.g, frames.dk - before.dk])[:, :size]
+            square = np.einsum("ti,tij,tj->", change, normal[:, :size, :size], change)
+            if square < SETTLED**2 * size * len(change):
+                break
+        return frames
+
+    def _refine(
+        self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters
+    ) -> tuple[FrameParameters, F64]:
+        """One turn: pixels from frames, gauge, frames from pixels; with their normal matrices."""
+        before: Sequence[F64 | None] = self.theta or [None] * len(self.tiles)
+
+        def fit(n: int) -> tuple[F64, NDArray[np.complex128]]:
+            return fit_tile(self.tiles[n], [codes[n]], self.coding, frames, self.k, before[n])
+
+        thetas, smooths = zip(*self.each(fit, range(len(self.tiles))), strict=True)
+        goods = [
+            _like_most(theta, t.good & np.isfinite(theta).all(axis=0) & (theta[0] > 0))
+            for t, theta in zip(self.tiles, thetas, strict=True)
+        ]
+        q = gauge_matrix(list(zip(thetas, goods, smooths, strict=True)))
+        g = frames.g @ np.linalg.inv(q)
+        norm = self._norm(g)
+        self.theta = [
+            np.where(good, ((norm[:, None] * q) @ theta.reshape(3, -1)).reshape(theta.shape), 0.0)
+            for theta, good in zip(thetas, goods, strict=True)
+        ]
+        for tile, good in zip(self.tiles, goods, strict=True):
+            tile.good &= good
+        self._require_pixels()
+        frames = FrameParameters(g / norm, frames.dk, self.reference)
+        frames, _, normal = self._frame_step(self._samples(codes), frames, self.moving)
+        return frames, normal
+
+    def _frame_step(
+        self, samples: Sequence[Samples], frames: FrameParameters, moving: bool
+    ) -> tuple[FrameParameters, F64, F64]:
+        """One Gauss-Newton step of every frame; its size and normal matrices (t, 5, 5) too."""
+        n = len(frames.g)
+        g, dk = frames.g.astype(np.float32), frames.dk.astype(np.float32)
+
+        def sums_of(number: int) -> tuple[F64, F64]:
+            tile, theta, (picked, codes) = self.tiles[number], self.theta[number], samples[number]
+            packed, right = np.zeros((n, 15)), np.zeros((n, 5))
+            yy, xx = np.divmod(picked, tile.shape[1])
+            frame_sums(
+                codes,
+                self.coding.scale,
+                self.coding.offset,
+                self.coding.fill,
+                g,
+                dk,
+                (yy + tile.y[0] - self.reference[0]).astype(np.float32),
+                (xx + tile.x[0] - self.reference[1]).astype(np.float32),
+                np.ascontiguousarray(theta[:, yy, xx], np.float32),
+                tile.read[yy, xx],
+                tile.shot[yy, xx],
+                packed,
+                right,
+            )
+            return packed, right
+
+        every = self.each(sums_of, range(len(self.tiles)))
+        packed, right = (np.sum(sums, axis=0) for sums in zip(*every, strict=True))
+        normal = np.zeros((n, 5, 5))
+        upper = np.triu_indices(5)
+        normal[:, upper[0], upper[1]] = packed
+        normal[:, upper[1], upper[0]] = packed
+        size = 5 if moving else 3
+        step = np.zeros((n, 5))
+        step[:, :size] = np.einsum(
+            "tij,tj->ti", _inverses(normal[:, :size, :size]), right[:, :size]
+        )
+        # The kernel saw float32 parameters: the step is from those.
+        moved = FrameParameters(
+            g.astype(float) + step[:, :3], dk.astype(float) + step[:, 3:], frames.reference
+        )
+        return moved, step, normal
+
+    def _motion_significance(
+        self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters
+    ) -> float:
+        """Mean of dk' C^-1 dk / 2 over frames: that of the samples' noise without motion."""
+        _, step, normal = self._frame_step(self._samples(codes), frames, moving=True)
+        seen = normal[:, 0, 0] > 0
+        covariance = _inverses(normal[seen])[:, 3:, 3:]
+        dk = step[seen, 3:]
+        dk = dk - dk.mean(axis=0)
+        return float(np.einsum("ti,tij,tj->t", dk, _inverses(covariance), dk).mean() / 2)
+
+    def _noise(self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters) -> float:
+        """Usual reduced chi-square of the pixels."""
+
+        def chi2(n: int) -> float:
+            return residual_chi2(self.tiles[n], codes[n], self.coding, frames, self.theta[n])
+
+        seen = [n for n, tile in enumerate(self.tiles) if tile.good.any()]
+        return float(np.median(self.each(chi2, seen)))
+
+
+def _like_most(theta: F64, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Those of the pixels (y, x) with about the visibility of the others.
+
+    Others have the wrong bias: the weights of their samples, too, and all frames would feel it.
+    """
+    visibility = np.hypot(theta[1], theta[2]) / np.where(good, theta[0], 1.0)
+    away = np.abs(visibility - np.median(visibility[good])) if good.any() else visibility
+    usual = np.median(away[good]) if good.any() else 0.0
+    return np.asarray(good & (away < ODD_VISIBILITY * usual + 1e-9))
+
+
+@lru_cache(maxsize=64)
+def _scattered(n: int, wanted: int) -> NDArray[np.intp]:
+    """Some of ``n`` numbers, at random: at even steps pixels may all have the same phase."""
+    if wanted >= n:
+        return np.arange(n)
+    return np.sort(np.random.default_rng(n).permutation(n)[:wanted])
+
+
+def _parts(n: int) -> list[slice]:
+    """Of so many pixels a thousand at a time: their samples are many bytes as floating point."""
+    return [slice(first, min(first + 1024, n)) for first in range(0, n, 1024)]
+
+
+def _taken(codes: NDArray[np.uint16], picked: Pixels) -> NDArray[np.uint16]:
+    """Samples (t, p) of some pixels; of all of them no copy."""
+    flat = codes.reshape(len(codes), -1)
+    if isinstance(picked, slice):
+        return flat[:, picked]
+    return flat if len(picked) == flat.shape[1] else np.take(flat, picked, axis=1)
+
+
+def _inverses(matrices: F64) -> F64:
+    """Inverses of symmetric matrices (t, n, n), zero where samples tell nothing.
+
+    A frame may have no sample with weight, and a window of one row tells nothing of ky.
+    """
+    scale = np.sqrt(np.einsum("tii->ti", matrices))
+    scale = np.where(scale > 0, scale, 1.0)
+    both = scale[:, :, None] * scale[:, None, :]
+    return np.asarray(np.linalg.pinv(matrices / both, rcond=1e-10, hermitian=True) / both)

@@ -1,0 +1,207 @@
+"""The one pass over the cube: every pixel's parameters, its error, and those of every batch."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.fringe_fit.batches import Batches
+from pixcal.estimators.fringe_fit.fringes import FrameParameters, SmoothPhasor, plane_wave, wrapped
+from pixcal.estimators.fringe_fit.pixel_sums import PixelSums, pixel_sums
+from pixcal.estimators.fringe_fit.tile import Coding, Tile
+from pixcal.estimators.fringe_fit.tile_fit import start_model
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+BOUND_PIXELS = 128
+"""Pixels of a tile for which the Cramér-Rao bound is worked out, where there are few tiles."""
+
+
+@dataclass(frozen=True)
+class TileMaps:
+    """What the sweep of a tile gives.
+
+    Attributes
+    ----------
+    iota, alpha : (y, x) float32
+        Mean and amplitude (e-) at B = A = 1.
+    phase : (y, x) float32
+        Phase (rad, in ±pi) relative to the carrier ``k . (r - reference)``.
+    sigma : (y, x) float32
+        1-sigma error of the phase (rad) that the noise model predicts.
+    chi2 : (y, x) float32
+        Reduced chi-square.
+    count : (y, x) float32
+        Samples with weight.
+    smooth : SmoothPhasor
+        Of the start model.
+    batch_phase, batch_sigma : (batch, y, x) float32
+        Phase of each batch relative to that of all frames, and its error (rad); NaN in gaps.
+    bound : (n,) float64
+        Cramér-Rao bound of the phase (rad) for some of the good pixels.
+    """
+
+    iota: F32
+    alpha: F32
+    phase: F32
+    sigma: F32
+    chi2: F32
+    count: F32
+    smooth: SmoothPhasor
+    batch_phase: F32
+    batch_sigma: F32
+    bound: F64
+
+
+def frames_to_prime(frames: FrameParameters, block: int) -> int:
+    """Frames, a multiple of ``block``, after which a pixel's system is well conditioned."""
+    n = len(frames.g)
+    for stop in range(block, n, block):
+        g = frames.g[:stop]
+        scale = np.sqrt((g**2).mean(axis=0))
+        if np.linalg.cond((g / scale).T @ (g / scale)) < 50:
+            return stop
+    return n
+
+
+def sweep_tile(
+    tile: Tile,
+    blocks: Iterable[NDArray[np.uint16]],
+    coding: Coding,
+    frames: FrameParameters,
+    k: tuple[float, float],
+    batches: Batches,
+    prime: int,
+    bound_pixels: int = BOUND_PIXELS,
+) -> TileMaps:
+    """Fit a tile, taking its samples block after block.
+
+    Parameters
+    ----------
+    tile : Tile
+    blocks : iterable of (t, y, x) arrays
+        Stored codes in the order of time; together as many frames as ``frames`` holds. The first
+        ``prime`` frames are held until the start model is made from them.
+    coding : Coding
+    frames : FrameParameters
+    k : (float, float)
+        Carrier (kx, ky), rad/px.
+    batches : Batches
+    prime : int
+        From `frames_to_prime`.
+    bound_pixels : int
+        Pixels for which to work out the Cramér-Rao bound.
+    """
+    held: list[NDArray[np.uint16]] = []
+    sums: _BatchSums | None = None
+    position = 0
+    for block in blocks:
+        if sums is None:
+            held.append(block.copy())
+            n_held = sum(map(len, held))
+            if n_held < prime and n_held < len(frames.g):
+                continue
+            first = FrameParameters(frames.g[:n_held], frames.dk[:n_held], frames.reference)
+            model, smooth = start_model(tile, held, coding, first, k)
+            pixels = pixel_sums(tile, coding, frames, model, smooth.map)
+            sums = _BatchSums(tile, frames, batches, smooth, pixels)
+            for part in held:
+                sums.add(part, position)
+                position += len(part)
+            held = []
+        else:
+            sums.add(block, position)
+            position += len(block)
+    if sums is None or position != len(frames.g):
+        raise ValueError(f"{position} frames given, {len(frames.g)} expected")
+    return sums.finish(k, bound_pixels)
+
+
+class _BatchSums:
+    """Sums of the whole run and of the batch at hand, cut where batches begin and end."""
+
+    def __init__(
+        self,
+        tile: Tile,
+        frames: FrameParameters,
+        batches: Batches,
+        smooth: SmoothPhasor,
+        sums: PixelSums,
+    ) -> None:
+        self.tile, self.frames, self.smooth, self.sums = tile, frames, smooth, sums
+        shape = (len(batches.ranges), *tile.shape)
+        # Phases relative to the start model, and their errors.
+        self.turn = np.full(shape, np.nan, np.float32)
+        self.sigma = np.full(shape, np.nan, np.float32)
+        # Where the sums are cut: at the ends of batches (those of gaps do not cut).
+        self.ends = {b: n for n, (a, b) in enumerate(batches.ranges) if b > a}
+        self.cuts = sorted({a for a, b in batches.ranges if b > a} | set(self.ends))
+
+    def add(self, block: NDArray[np.uint16], position: int) -> None:
+        stop = position + len(block)
+        cuts = [c for c in self.cuts if position < c < stop]
+        for a, b in zip([position, *cuts], [*cuts, stop], strict=True):
+            self.sums.add(block[a - position : b - position], slice(a, b))
+            if b in self.ends:
+                n = self.ends[b]
+                self.turn[n], self.sigma[n] = self.sums.close()
+            elif b in self.cuts:
+                self.sums.close()
+
+    def finish(self, k: tuple[float, float], bound_pixels: int) -> TileMaps:
+        theta, sigma, chi2, count = self.sums.finish()
+        z = theta[2] + 1j * theta[1]
+        cy, cx = self.tile.centre
+        ry, rx = self.frames.reference
+        carrier = plane_wave(self.tile.shape, k, k[0] * (cx - rx) + k[1] * (cy - ry))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            reduced = np.where(count > 3, chi2 / (count - 3), np.nan)
+        turn = np.angle(z * self.smooth.map.conj()).astype(np.float32)
+        return TileMaps(
+            iota=theta[0].astype(np.float32),
+            alpha=np.abs(z).astype(np.float32),
+            phase=np.angle(z * carrier.conj()).astype(np.float32),
+            sigma=sigma.astype(np.float32),
+            chi2=reduced.astype(np.float32),
+            count=count.astype(np.float32),
+            smooth=self.smooth,
+            batch_phase=self._relative_to(turn),
+            batch_sigma=self.sigma,
+            bound=phase_bound(self.tile, theta, self.frames, bound_pixels),
+        )
+
+    def _relative_to(self, turn: F32) -> F32:
+        """Phases of the batches (batch, y, x) relative to those of the run; the batches' change."""
+        self.turn -= turn
+        # Most are near: to wrap them all would take longer than to look.
+        near = not len(self.turn) or np.abs(self.turn).max() < np.pi
+        return self.turn if near else wrapped(self.turn)
+
+
+def phase_bound(tile: Tile, theta: F64, frames: FrameParameters, number: int = BOUND_PIXELS) -> F64:
+    """Cramér-Rao bound of the phase (rad) for some pixels of a tile.
+
+    For known frame parameters and Gaussian noise of the variance that the pixel's own fitted model
+    gives, without the approximations of the sweep's weights (physics note, section 3).
+    """
+    usable = tile.good & np.isfinite(theta).all(axis=0)
+    where = np.flatnonzero(usable)
+    if not len(where):
+        return np.zeros(0)
+    # Golden-ratio steps: an even step would fall on the same phase of the fringe again and again.
+    spread = np.arange(min(number, len(where))) * 0.6180339887498949 % 1.0
+    picked = where[(spread * len(where)).astype(int)]
+    bounds = []
+    for y, x in zip(*np.unravel_index(picked, tile.shape), strict=True):
+        own = theta[:, y, x]
+        g = frames.at(y + tile.y[0], x + tile.x[0])
+        variance = tile.shot[y, x] * np.maximum(g @ own, 0) + tile.read[y, x]
+        information = g.T @ (g / variance[:, None])
+        gradient = np.array([0.0, own[2], -own[1]]) / (own[1] ** 2 + own[2] ** 2)
+        try:
+            bounds.append(np.sqrt(gradient @ np.linalg.solve(information, gradient)))
+        except np.linalg.LinAlgError:
+            continue
+    return np.array(bounds)

@@ -1,0 +1,141 @@
+"""Sums over a tile's phases from which every shape of the fringes can be fitted."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.fringe_fit.fringes import plane_wave, wrapped
+from pixcal.estimators.fringe_fit.gauge import FRINGE_MODES
+from pixcal.estimators.fringe_fit.geometry import TilePlane
+from pixcal.estimators.fringe_fit.local_basis import polynomials, powers
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+N_LOCAL = len(powers()) + len(FRINGE_MODES)
+"""Modes of a tile: the polynomials, then the fringes that free intensities leave open."""
+_PLANE = 7
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """The plane wave that phases are relative to: ``k . (r - reference)``.
+
+    Attributes
+    ----------
+    k : (float, float)
+        (kx, ky), rad/px.
+    reference : (float, float)
+        (y, x), px.
+    """
+
+    k: tuple[float, float]
+    reference: tuple[float, float]
+
+    def phase(self, y: F64, x: F64) -> F64:
+        """Phase (rad) at coordinates that broadcast."""
+        ry, rx = self.reference
+        return np.asarray(self.k[0] * (x - rx) + self.k[1] * (y - ry))
+
+
+@dataclass(frozen=True)
+class TileSums:
+    """Least squares of the modes of tiles, one entry a tile; phases are relative to the planes.
+
+    Attributes
+    ----------
+    planes : list of TilePlane
+    normal : (tile, mode, mode) float64
+    right : (tile, mode, 1 + batch) float64
+        Of the whole run's phases, then of the batches' relative to it.
+    square : (tile,) float64
+        Weighted square of the whole run's phases.
+    pixels : (tile,) float64
+        With weight.
+    """
+
+    planes: list[TilePlane]
+    normal: F64
+    right: F64
+    square: F64
+    pixels: F64
+
+    @classmethod
+    def width(cls, n_batches: int) -> int:
+        """Numbers that `row` writes."""
+        return _PLANE + 2 + N_LOCAL * (N_LOCAL + 1 + n_batches)
+
+    @classmethod
+    def of_rows(cls, rows: F64) -> "TileSums":
+        """Sums of tiles from the rows (tile, number) that `row` wrote."""
+        n = len(rows)
+        planes = [
+            TilePlane((r[0], r[1]), r[2], r[3], r[4], r[5], r[6]) for r in rows[:, :_PLANE].tolist()
+        ]
+        square, pixels = rows[:, _PLANE], rows[:, _PLANE + 1]
+        rest = rows[:, _PLANE + 2 :]
+        normal = rest[:, : N_LOCAL**2].reshape(n, N_LOCAL, N_LOCAL)
+        right = rest[:, N_LOCAL**2 :].reshape(n, N_LOCAL, -1)
+        return cls(planes, normal, right, square, pixels)
+
+    def with_planes(self, planes: Sequence[TilePlane]) -> "TileSums":
+        """The same with planes on other turns."""
+        return TileSums(list(planes), self.normal, self.right, self.square, self.pixels)
+
+
+def local_modes(carrier: Carrier, plane: TilePlane, shape: tuple[int, int]) -> F64:
+    """The modes (mode, y * x) of a tile."""
+    cy, cx = plane.centre
+    at_centre = float(carrier.phase(np.asarray(cy), np.asarray(cx))) + plane.phase
+    wave = plane_wave(shape, (carrier.k[0] + plane.kx, carrier.k[1] + plane.ky), at_centre).ravel()
+    c, s = wave.real, wave.imag
+    modes = np.empty((N_LOCAL, wave.size))
+    modes[: -len(FRINGE_MODES)] = polynomials(shape)
+    # In the order of FRINGE_MODES (`pixcal.estimators.fringe_fit.gauge.fringe_modes`).
+    modes[-4], modes[-3] = plane.ratio * c, plane.ratio * s
+    modes[-2], modes[-1] = c * c - s * s, 2 * c * s
+    return modes
+
+
+def sum_row(
+    phase: F32,
+    sigma: F32,
+    good: NDArray[np.bool_],
+    batches: F32,
+    carrier: Carrier,
+    plane: TilePlane,
+) -> F64:
+    """The sums of one tile, as a row of `TileSums.of_rows`.
+
+    Parameters
+    ----------
+    phase, sigma : (y, x) float32
+        Phases relative to the carrier and their errors, rad.
+    good : (y, x) bool
+        Pixels that count.
+    batches : (batch, y, x) float32
+        Phases of the batches relative to the whole run's, rad; NaN in gaps.
+    carrier : Carrier
+    plane : TilePlane
+        Smooth phase of the tile.
+    """
+    shape = (phase.shape[0], phase.shape[1])
+    modes = local_modes(carrier, plane, shape)
+    usable = (good & np.isfinite(phase)).ravel()
+    weight = np.where(usable, 1 / np.where(usable, sigma.ravel(), 1.0).astype(float) ** 2, 0.0)
+    rest = np.where(usable, wrapped(phase - plane.on(shape)).ravel(), 0.0)
+    root = np.sqrt(weight)
+    modes *= root
+    normal, right = modes @ modes.T, np.empty((N_LOCAL, 1 + len(batches)))
+    right[:, 0] = modes @ (root * rest)
+    # Small numbers, all of them noise: float32 is enough, and takes a third of the time.
+    several = np.where(usable, batches.reshape(len(batches), phase.size), np.float32(0))
+    several[np.isnan(several)] = 0
+    right[:, 1:] = (modes.astype(np.float32) * root.astype(np.float32)) @ several.T
+    square = float(weight @ rest**2)
+    facts = [*plane.centre, plane.phase, plane.kx, plane.ky, plane.sigma, plane.ratio]
+    return np.concatenate(
+        [np.array([*facts, square, float(usable.sum())]), normal.ravel(), right.ravel()]
+    )

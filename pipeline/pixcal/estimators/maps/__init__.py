@@ -1,0 +1,1 @@
+"""Maps of a fit: their structure, waves and rings, and offsets corrected by them."""

@@ -1,0 +1,75 @@
+"""Offsets of a fit, after an effect that is linear in the intensity was undone on its three maps.
+
+The change of each pixel's phase is added to the phases that the fit left, and the modes that the
+data cannot tell from the bench are taken off again: the change holds them as well. Sums of pieces
+of the window add up, so a detector is done piece by piece: `phase_sums` of each, `solve_modes` of
+their sum, then `offsets` of each.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.fringe_fit.fringes import grid
+from pixcal.estimators.fringe_fit.gauge import fringe_modes
+from pixcal.estimators.fringe_fit.modes import solve_modes
+
+F64 = NDArray[np.float64]
+
+
+def phase_change(before: F64, after: F64) -> F64:
+    """Change of the phase psi (y, x), rad, from maps (iota, alpha sin psi, alpha cos psi)."""
+    z, moved = before[2] + 1j * before[1], after[2] + 1j * after[1]
+    return np.asarray(np.angle(moved * z.conj()))
+
+
+def straight_modes(theta: F64, k: tuple[float, float]) -> F64:
+    """Modes (7, y, x) that a fit of straight fringes with free intensities takes off.
+
+    1, x, y, and the fringes at the fringe frequency and twice it (physics note, section 2).
+
+    Parameters
+    ----------
+    theta : (3, y, x) float64
+    k : (float, float)
+        Fringe vector (kx, ky), rad/px.
+    """
+    shape = (theta.shape[1], theta.shape[2])
+    y, x = np.broadcast_arrays(*grid(shape))
+    carrier = k[0] * x + k[1] * y
+    phasor = (theta[2] + 1j * theta[1]) * np.exp(-1j * carrier)
+    psi = carrier + np.angle(np.nansum(phasor))
+    ratio = np.nanmedian(theta[0] / np.maximum(np.abs(phasor), 1e-300))
+    return np.stack([np.ones(shape), x, y, *fringe_modes(psi, np.full(shape, ratio))])
+
+
+def phase_sums(modes: F64, delta: F64, sigma: F64, change: F64, k: float) -> tuple[F64, F64]:
+    """Least-squares sums (mode, mode), (mode, 1) of a piece's phases after a change.
+
+    Parameters
+    ----------
+    modes : (mode, y, x) float64
+    delta, sigma : (y, x) float64
+        Offset and its error, px; NaN where masked.
+    change : (y, x) float64
+        Of the phase, rad.
+    k : float
+        Length of the fringe vector, rad/px.
+    """
+    good = np.isfinite(delta) & np.isfinite(change) & (sigma > 0)
+    own = modes[:, good]
+    weighted = own / (sigma[good] * k) ** 2
+    return weighted @ own.T, (weighted @ (delta[good] * k + change[good]))[:, None]
+
+
+def offsets(modes: F64, coefficients: F64, delta: F64, change: F64, k: float) -> F64:
+    """Offset (y, x) along the fringe axis after a change of the phase, px; modes taken off.
+
+    Parameters as in `phase_sums`; ``coefficients`` (mode, 1) are of `solve_modes`.
+    """
+    return np.asarray(delta + (change - np.tensordot(coefficients[:, 0], modes, 1)) / k)
+
+
+def corrected_offsets(delta: F64, sigma: F64, change: F64, modes: F64, k: float) -> F64:
+    """Offsets (y, x) of a window in one piece after a change of the phase; as `offsets`."""
+    coefficients = solve_modes(*phase_sums(modes, delta, sigma, change, k))
+    return offsets(modes, coefficients, delta, change, k)

@@ -1,0 +1,176 @@
+"""Terms fitted to the maps of several fringe sets at once, with errors that the maps show.
+
+The noise of a map is what the fit leaves, true offsets included: its scatter gives the errors, and
+where what is left is alike in neighbouring pixels, blocks of pixels give larger ones.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.diagnosis.evidence import FringeEvidence
+from pixcal.estimators.fringe_fit.fringes import grid, polynomial_basis
+from pixcal.estimators.fringe_fit.gauge import fringe_modes
+
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+BLOCK = 8
+"""Pixels along the side of a block."""
+
+_CLIP = 5.0
+_LEAST = 1e-30
+"""Variance of a map that its signals fit exactly."""
+
+
+@dataclass(frozen=True)
+class MapPart:
+    """One map as a fit sees it; over its good pixels.
+
+    Attributes
+    ----------
+    signals : (pixel, n) float64
+        What one unit of each parameter does to the map.
+    data : (pixel,) float64
+    block : (pixel,) int
+        Number of the block that a pixel lies in.
+    dof : int
+        Pixels less the terms that were taken off.
+    """
+
+    signals: F64
+    data: F64
+    block: NDArray[np.intp]
+    dof: int
+
+    @classmethod
+    def of(cls, signals: F64, data: F64, free: F64, good: Mask) -> "MapPart":
+        """A map whose free terms are taken off, from data and from signals; outliers left out.
+
+        Parameters
+        ----------
+        signals : (n, y, x) float64
+        data : (y, x) float64
+        free : (m, y, x) float64
+        good : (y, x) bool
+        """
+        use = good
+        for _ in range(2):
+            left = without(data[use][:, None], free[:, use].T)[:, 0]
+            centre = np.median(left)
+            scatter = 1.4826 * np.median(np.abs(left - centre))
+            kept = use.copy()
+            kept[use] = np.abs(left - centre) <= _CLIP * scatter
+            use = kept
+        columns = np.concatenate([signals[:, use], data[None, use]]).T
+        rest = without(columns, free[:, use].T)
+        y, x = np.nonzero(use)
+        width = -(-use.shape[1] // BLOCK)
+        block = (y // BLOCK) * width + x // BLOCK
+        return cls(
+            np.ascontiguousarray(rest[:, :-1]), rest[:, -1].copy(), block, len(y) - len(free)
+        )
+
+
+@dataclass(frozen=True)
+class MapFit:
+    """Parameters, their covariance, and chi-square with none of them less that with all."""
+
+    values: F64
+    covariance: F64
+    gain: float
+
+
+def fit_maps(parts: Sequence[MapPart]) -> MapFit:
+    """Weighted least squares of the same parameters in several maps."""
+    n = parts[0].signals.shape[1]
+    values = np.zeros(n)
+    variances = np.array([max(p.data @ p.data / max(p.dof, 1), _LEAST) for p in parts])
+    for _ in range(3):
+        normal, right = np.zeros((n, n)), np.zeros(n)
+        for part, variance in zip(parts, variances, strict=True):
+            normal += part.signals.T @ part.signals / variance
+            right += part.signals.T @ part.data / variance
+        values = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) @ right
+        left = [p.data - p.signals @ values for p in parts]
+        variances = np.array(
+            [max(r @ r / max(p.dof - n, 1), _LEAST) for p, r in zip(parts, left, strict=True)]
+        )
+    covariance = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
+    meat = np.zeros((n, n))
+    for part, rest, variance in zip(parts, left, variances, strict=True):
+        scores = np.zeros((part.block.max(initial=0) + 1, n))
+        np.add.at(scores, part.block, part.signals * (rest / variance)[:, None])
+        meat += scores.T @ scores
+    inside = covariance @ meat @ covariance
+    more = float(np.mean(np.diag(inside) / np.diag(covariance)))
+    wider = np.asarray(covariance * max(1.0, more), np.float64)
+    return MapFit(
+        np.asarray(values, np.float64), wider, float(values @ normal @ values) / max(1.0, more)
+    )
+
+
+def phase_map(found: FringeEvidence) -> F64:
+    """Phase (y, x) of a set less the plane of its fringe vector, about its mean, rad; NaN masked.
+
+    In ±pi: the bending of the fringes across the part must stay below half a fringe.
+    """
+    y, x = centred(found.good.shape)
+    kx, ky = found.k
+    phasor = (found.theta[2] + 1j * found.theta[1]) * np.exp(-1j * (kx * x + ky * y))
+    phasor = np.where(found.good, phasor, 0)
+    total = phasor.sum()
+    rest = np.angle(phasor * np.conj(total if total else 1.0))
+    return np.where(found.good, rest, np.nan)
+
+
+def gauge_terms(found: FringeEvidence) -> F64:
+    """Fringe modes (4, y, x) that the fit leaves open in the maps of a set."""
+    alpha = np.maximum(np.hypot(found.theta[1], found.theta[2]), 1e-9)
+    psi = np.arctan2(found.theta[1], found.theta[2])
+    return np.stack(fringe_modes(psi, found.theta[0] / alpha))
+
+
+def polynomial(shape: tuple[int, ...], degree: int) -> F64:
+    """Polynomials (term, y, x) up to a degree."""
+    basis = polynomial_basis((shape[0], shape[1]), degree)
+    return np.ascontiguousarray(basis.T).reshape(-1, *shape)
+
+
+def centred(shape: tuple[int, ...]) -> tuple[F64, F64]:
+    """Coordinates y (y, 1) and x (1, x) of the pixels from the middle of a map."""
+    ny, nx = shape
+    return grid((ny, nx))
+
+
+def without(columns: F64, free: F64) -> F64:
+    """Columns (pixel, n) less their least-squares fit by free terms (pixel, m)."""
+    size = np.sqrt((free**2).sum(axis=0))
+    unit = free / np.where(size > 0, size, 1.0)
+    inverse = np.linalg.pinv(unit.T @ unit, rcond=1e-10, hermitian=True)
+    return np.asarray(columns - unit @ (inverse @ (unit.T @ columns)))
+
+
+def half_theta(found: FringeEvidence, half: int, good: Mask) -> F64:
+    """Maps (3, pixel) of a set on some pixels, from every other frame (half 0 or 1) alone."""
+    rest = np.nan_to_num(found.residual[half::2][:, good])
+    return np.asarray(found.theta[:, good] + np.linalg.pinv(found.g[half::2]) @ rest)
+
+
+def neighbour_products(one: F64, other: F64, good: Mask) -> F64:
+    """Products (3, y, x) of one map with another, and with it one and two pixels away."""
+    products = [one * other]
+    for step in (1, 2):
+        total, count = np.zeros(good.shape), np.zeros(good.shape)
+        for axis in (0, 1):
+            for way in (step, -step):
+                inside = np.roll(good, way, axis).astype(float)
+                edge = [slice(None)] * 2
+                edge[axis] = slice(0, step) if way > 0 else slice(-step, None)
+                inside[tuple(edge)] = 0
+                total += inside * np.roll(other, way, axis)
+                count += inside
+        products.append(one * total / np.maximum(count, 1))
+    return np.stack(products)

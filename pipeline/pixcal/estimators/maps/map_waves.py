@@ -1,0 +1,339 @@
+"""Waves that several maps of a fit share: mean light, visibility and phase, set by set.
+
+A weak third beam multiplies the mean light by ``1 + Re(s e)`` and the fringe's phasor by
+``1 + f e + b / e``, with ``e = exp(i q·r)``. The logarithms of the maps then hold, to first order,
+``Re(s e)`` (light over the flat), ``Re((f - s) e) + Re(b / e)`` (visibility) and
+``Im(f e) + Im(b / e)`` (phase). Nothing ties s, f and b here: that is for the laws of the effect.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri_exp
+
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.maps.map_fit import (
+    MapPart,
+    centred,
+    fit_maps,
+    gauge_terms,
+    phase_map,
+    polynomial,
+    without,
+)
+from pixcal.estimators.maps.structure import PERIODS
+from pixcal.kernels.significance import sigmas_of_chi2
+
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+NEAR = 1.5
+"""Periods in the window: no wave is looked for closer than that to what the fit leaves open."""
+HARMONICS = 4
+"""Of the fringes: a response that is not linear leaves waves there."""
+MOST = 3
+"""Waves of one set."""
+SIGNIFICANT = 5.0
+"""Standard deviations of a further wave."""
+APART = 30.0
+"""Chi-square by which vectors of their own must fit the sets better than a common one."""
+
+_MIN_PIXELS = 200
+_CLIP = 6.0
+_ITERATIONS = 4
+_SMOOTH = 3
+"""Degree of what beams and lamp do to the maps."""
+
+LIGHT = "the mean light"
+STATIC, FORWARD, BACKWARD = slice(0, 2), slice(2, 4), slice(4, 6)
+
+
+@dataclass(frozen=True)
+class WaveFit:
+    """One wave of one set.
+
+    Attributes
+    ----------
+    set : str
+    q : (float, float)
+        Along x and y, rad/px.
+    static, forward, backward : complex
+        s, f and b, counted from the middle of the part.
+    errors : (5,) float
+        Of s, f, b (each of real and imaginary part) and of q.
+    """
+
+    set: str
+    q: tuple[float, float]
+    static: complex
+    forward: complex
+    backward: complex
+    errors: tuple[float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Waves:
+    """Waves of all sets.
+
+    Attributes
+    ----------
+    waves : tuple of WaveFit
+    in_flats : bool
+        Whether the flats have the static pattern, and not the light over the flat.
+    significance : float
+        Of the map that shows the strongest wave second best, or of the mean light if that shows it
+        best; in standard deviations.
+    seen_in : tuple of str
+        Maps that show it.
+    by_map : mapping
+        Standard deviations in each map.
+    """
+
+    waves: tuple[WaveFit, ...]
+    in_flats: bool
+    significance: float
+    seen_in: tuple[str, ...]
+    by_map: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class _Map:
+    """A map (y, x), its free terms (n, y, x), and how the wave's six numbers show in it.
+
+    Attributes
+    ----------
+    kind : str
+    row : (3,) complex
+        The map holds ``Re(row · (s e, f e, b / e))``.
+    """
+
+    kind: str
+    data: F64
+    free: F64
+    good: Mask
+    row: tuple[complex, complex, complex]
+
+    def rest(self) -> tuple[F64, float]:
+        """The map without its free terms, zero where masked, and its variance."""
+        left = without(self.data[self.good][:, None], self.free[:, self.good].T)[:, 0]
+        scatter = 1.4826 * float(np.median(np.abs(left - np.median(left))))
+        left = np.where(np.abs(left) > _CLIP * scatter, 0, left)
+        out = np.zeros(self.good.shape)
+        out[self.good] = left
+        return out, float((left @ left) / max(len(left), 1)) or 1e-30
+
+    def signals(self, q: F64) -> F64:
+        """What a unit of each of the six numbers does (6, y, x)."""
+        y, x = centred(self.good.shape)
+        e = np.exp(1j * (q[0] * x + q[1] * y))
+        waves = [factor * wave for factor, wave in zip(self.row, (e, e, e.conj()), strict=True)]
+        return np.stack([part for w in waves for part in (w.real, -w.imag)])
+
+
+Maps = Mapping[str, Sequence[_Map]]
+"""Of each set, by its name."""
+
+
+def find_waves(evidence: Evidence) -> Waves | None:
+    """The strongest waves in the maps of all sets; None without enough pixels.
+
+    The chance is that of the best of all waves that the window can tell apart; those near the
+    fringes' harmonics, near no wave at all, and of rows or columns that repeat are left out.
+    """
+    sets = [f for f in evidence.fringes.values() if np.count_nonzero(f.good) > _MIN_PIXELS]
+    if not sets:
+        return None
+    ways = {still: {f.name: _maps(f, evidence, still) for f in sets} for still in (False, True)}
+    allowed = _allowed(sets)
+    in_flats = max(ways, key=lambda way: _second_best(ways[way], allowed))
+    best = _strongest(ways[in_flats], sets, allowed, in_flats)
+    waves = list(best.waves)
+    if best.significance > SIGNIFICANT:
+        maps: Maps = ways[best.in_flats]
+        for _ in range(MOST - 1):
+            maps = _less(maps, waves[-len(sets) :])
+            more = _strongest(maps, sets, allowed, best.in_flats)
+            if more.significance < SIGNIFICANT:
+                break
+            waves += more.waves
+    return Waves(tuple(waves), best.in_flats, best.significance, best.seen_in, best.by_map)
+
+
+def _maps(found: FringeEvidence, evidence: Evidence, in_flats: bool) -> list[_Map]:
+    alpha = np.hypot(found.theta[1], found.theta[2])
+    good = found.good & (alpha > 0) & (found.theta[0] > 0) & (evidence.flat > 0)
+    iota = np.where(good, found.theta[0], 1.0)
+    visibility = np.log(np.where(good, alpha, 1.0) / iota)
+    terms = np.concatenate([polynomial(good.shape, _SMOOTH), gauge_terms(found)])
+    light = evidence.flat if in_flats else iota
+    light = np.log(np.where(good, light, 1.0))
+    free = polynomial(good.shape, _SMOOTH) if in_flats else terms
+    return [
+        _Map("the flats" if in_flats else LIGHT, light, free, good, (1, 0, 0)),
+        _Map("the visibility", visibility, terms, good, (-1, 1, 1)),
+        _Map("the phase", np.nan_to_num(phase_map(found)), terms, good, (0, -1j, -1j)),
+    ]
+
+
+def _second_best(maps: Maps, allowed: Mask) -> float:
+    """Chi-square of the wave that is strongest in all maps, in the map that shows it second best.
+
+    A pattern of the light that flats share is in flats and visibility, not in light over flat.
+    """
+    common = sum((_power(own, allowed) for own in maps.values()), np.zeros(allowed.shape))
+    q = _vector(common)
+    gains: dict[str, float] = {}
+    for own in maps.values():
+        for m in own:
+            gains[m.kind] = gains.get(m.kind, 0.0) + _plain_gain(m, q)
+    return sorted(gains.values())[-2]
+
+
+def _strongest(maps: Maps, sets: Sequence[FringeEvidence], allowed: Mask, in_flats: bool) -> Waves:
+    """The strongest wave of each set, of a vector common to all where that fits as well."""
+    power = {name: _power(own, allowed) for name, own in maps.items()}
+    common = sum(power.values(), np.zeros(allowed.shape))
+    apart = sum(float(p.max()) for p in power.values()) - float(common.max())
+    groups = [[name] for name in maps] if apart > APART and len(maps) > 1 else [list(maps)]
+    trials = 3 * np.count_nonzero(allowed) / 4
+    waves: list[WaveFit] = []
+    gains: dict[str, float] = {}
+    dof = 2 * len(maps)
+    for names in groups:
+        start = _vector(sum((power[n] for n in names), np.zeros(allowed.shape)))
+        own = [(n, m) for n in names for m in maps[n]]
+        fitted, q = _fitted(own, names, start)
+        waves += fitted
+        for kind in dict.fromkeys(m.kind for _, m in own):
+            gains[kind] = gains.get(kind, 0.0) + sum(
+                _plain_gain(m, q) for _, m in own if m.kind == kind
+            )
+    by_map = {kind: sigmas_of_chi2(gain, dof) for kind, gain in gains.items()}
+    order = sorted(by_map, key=lambda kind: -by_map[kind])
+    first = _best_of(gains[order[0]], trials * len(groups), dof)
+    significance = float(min(first, by_map[order[1]]))
+    if order[0] == LIGHT:
+        # Ghosts of both fibres alike move neither visibility nor phase.
+        significance = float(first)
+    return Waves(
+        tuple(waves), in_flats, significance,
+        tuple(kind for kind in order if by_map[kind] > SIGNIFICANT) or tuple(order[:2]), by_map,
+    )  # fmt: skip
+
+
+def _less(maps: Maps, waves: Sequence[WaveFit]) -> Maps:
+    """Maps without some waves."""
+    found: dict[str, list[_Map]] = {}
+    for name, own in maps.items():
+        found[name] = []
+        for m in own:
+            data = m.data
+            for w in waves:
+                if w.set == name:
+                    six = [p for v in (w.static, w.forward, w.backward) for p in (v.real, v.imag)]
+                    data = data - np.tensordot(six, m.signals(np.array(w.q)), 1)
+            found[name].append(_Map(m.kind, data, m.free, m.good, m.row))
+    return found
+
+
+def _power(maps: Sequence[_Map], allowed: Mask) -> F64:
+    """Chi-square (frequency, frequency) of a wave in all maps of a set."""
+    total = np.zeros(allowed.shape)
+    for m in maps:
+        data, variance = m.rest()
+        count = np.count_nonzero(m.good)
+        total += 2 * np.abs(np.fft.fft2(data, allowed.shape)) ** 2 / (count * variance)
+    return np.where(allowed, total, 0.0)
+
+
+def _allowed(sets: Sequence[FringeEvidence]) -> Mask:
+    """Frequencies of a grid twice as fine as the window's where a wave is looked for."""
+    shape = sets[0].good.shape
+    fy, fx = np.meshgrid(*(np.fft.fftfreq(2 * n) for n in shape), indexing="ij")
+    allowed = ~_of_lines(fx, fy, shape) & ((fy > 0) | ((fy == 0) & (fx > 0)))
+    for f in sets:
+        for n in range(HARMONICS + 1):
+            for sign in (1, -1):
+                dx, dy = fx - sign * n * f.k[0] / 2 / np.pi, fy - sign * n * f.k[1] / 2 / np.pi
+                far = np.hypot((dx - np.rint(dx)) * shape[1], (dy - np.rint(dy)) * shape[0])
+                allowed &= far > NEAR
+    return np.asarray(allowed)
+
+
+def _vector(power: F64) -> F64:
+    fy, fx = np.meshgrid(*(np.fft.fftfreq(n) for n in power.shape), indexing="ij")
+    at = int(np.argmax(power))
+    return 2 * np.pi * np.array([fx.flat[at], fy.flat[at]])
+
+
+def _of_lines(fx: F64, fy: F64, shape: tuple[int, ...]) -> Mask:
+    """Frequencies (cycles/px) of rows or columns that repeat: those are circuits, and not glass."""
+    found = np.zeros(fx.shape, bool)
+    for across, along, n, m in ((fx, fy, shape[1], shape[0]), (fy, fx, shape[0], shape[1])):
+        level = np.abs(across) * n < NEAR
+        for period in PERIODS:
+            harmonic = np.abs(along * period - np.rint(along * period)) / period * m < NEAR
+            found |= level & harmonic & (np.abs(along) * m >= NEAR)
+    return found
+
+
+def _fitted(
+    maps: Sequence[tuple[str, _Map]], names: Sequence[str], start: F64
+) -> tuple[list[WaveFit], F64]:
+    """Six numbers of every set and the common vector, by Gauss and Newton."""
+    q, size = start.copy(), 6 * len(names)
+    six = np.zeros(size)
+    limit = 2 * np.pi / np.array(maps[0][1].good.shape[::-1])
+    errors = np.ones(size + 2)
+    for turn in range(_ITERATIONS):
+        parts = []
+        for name, m in maps:
+            y, x = centred(m.good.shape)
+            own = slice(6 * names.index(name), 6 * names.index(name) + 6)
+            signals = np.zeros((size + 2, *m.good.shape))
+            signals[own] = m.signals(q)
+            # d/dq of each of Re(row s e): the same with s turned by a quarter, times x or y.
+            turned = _quarter(six[own])
+            slope = np.tensordot(turned, signals[own], 1)
+            signals[size], signals[size + 1] = x * slope, y * slope
+            model = np.tensordot(six[own], signals[own], 1)
+            parts.append(MapPart.of(signals if turn else signals[:size], m.data - model, m.free,
+                                    m.good))  # fmt: skip
+        fit = fit_maps(parts)
+        six = six + fit.values[:size]
+        if turn:
+            q = np.clip(q + fit.values[size:], start - limit, start + limit)
+        errors = np.sqrt(np.diag(fit.covariance))
+    waves = []
+    for n, name in enumerate(names):
+        s, f, b = (complex(*six[6 * n : 6 * n + 6][part]) for part in (STATIC, FORWARD, BACKWARD))
+        own_errors = errors[6 * n : 6 * n + 6]
+        spread = [float(own_errors[part].max()) for part in (STATIC, FORWARD, BACKWARD)]
+        waves.append(WaveFit(
+            name, (float(q[0]), float(q[1])), s, f, b,
+            (spread[0], spread[1], spread[2], float(errors[size]), float(errors[size + 1])),
+        ))  # fmt: skip
+    return waves, q
+
+
+def _quarter(six: F64) -> F64:
+    """The numbers times i where they go with e, times -i where with 1 / e."""
+    s, f, b = (complex(*six[part]) for part in (STATIC, FORWARD, BACKWARD))
+    return np.array([v for w in (1j * s, 1j * f, -1j * b) for v in (w.real, w.imag)])
+
+
+def _plain_gain(m: _Map, q: F64) -> float:
+    """Chi-square of a wave of any amplitude and phase in one map."""
+    y, x = centred(m.good.shape)
+    e = np.exp(1j * (q[0] * x + q[1] * y))
+    signals = np.stack([e.real, e.imag])
+    return fit_maps([MapPart.of(signals, m.data, m.free, m.good)]).gain
+
+
+def _best_of(gain: float, trials: float, dof: int) -> float:
+    """Standard deviations as rare as the best chi-square of so many waves."""
+    log_rate = np.log(trials) + np.log(dof / 2) - gain / 2
+    log_chance = log_rate if log_rate < -20 else np.log(-np.expm1(-np.exp(log_rate)))
+    return -float(ndtri_exp(min(float(log_chance), -1e-300)))

@@ -1,0 +1,1 @@
+"""Star centroids: what the offsets do to them, and their correction."""

@@ -1,0 +1,137 @@
+"""Centroids that were measured as if pixels were a perfect grid, put right by a map of offsets.
+
+A pixel whose offset is +d responds at larger x by d: the star that it shows lies at larger x than
+its index says. A centroid is wrong by a weighted sum of the offsets under the star
+(`centroids`), and each pixel counts by what it tells of the position.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import spline_filter
+from scipy.signal import oaconvolve
+from scipy.special import erf
+
+from pixcal.estimators.star_centroids.centroids import Star
+from pixcal.kernels.psf import MARGIN, Psf
+
+F64 = NDArray[np.float64]
+
+MOST_UNKNOWN = 0.1
+"""Share of a star's weights on pixels without an offset beyond which it is not corrected."""
+_SIGMA_OF_FWHM = 1 / math.sqrt(8 * math.log(2))
+_KNOTS = 24
+_FAINT = 1e12
+"""Variance of a pixel beside which that of the star's own light does not count, e-²."""
+
+
+def gaussian_star(fwhm: float, electrons: float | None, read_noise: float) -> Star:
+    """A star with the shape of a Gaussian, averaged over square pixels.
+
+    Parameters
+    ----------
+    fwhm : float
+        Full width at half maximum, px.
+    electrons : float or None
+        Of the star, which set the weights of its fit by photon noise; None where all pixels of the
+        fit count alike.
+    read_noise : float
+        Of a pixel, e-.
+    """
+    sigma = fwhm * _SIGMA_OF_FWHM
+    half = max(2, math.ceil(4 * sigma))
+    step = min(fwhm / _KNOTS, 0.25)
+    at = step * np.arange(math.ceil((half + MARGIN) / step) + 3)
+    ends = [erf((at + side) / (math.sqrt(2) * sigma)) for side in (-0.5, 0.5)]
+    line = (ends[1] - ends[0]) / 2
+    line = np.concatenate([line[:0:-1], line])
+    table = spline_filter(line[:, None] * line[None, :], order=3, mode="mirror")
+    psf = Psf(np.asarray(table), step)
+    if electrons is None:
+        return Star(psf, half, 1.0, read_variance=_FAINT)
+    return Star(psf, half, electrons, read_variance=read_noise**2)
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """Places of stars.
+
+    Attributes
+    ----------
+    place : (n, 2) float64
+        (x, y), px, the first pixel's centre being 0; NaN where too little is known of the pixels.
+    error : (n, 2) float64
+        What the errors of the map leave in it, px, 1 sigma.
+    """
+
+    place: F64
+    error: F64
+
+
+def correct_centroids(
+    place: F64, offsets: NDArray[np.floating], sigma: NDArray[np.floating], star: Star
+) -> Corrected:
+    """Add to each centroid what the offsets under the star have taken from it.
+
+    Parameters
+    ----------
+    place : (n, 2) float64
+        (x, y) as measured on a perfect grid, px.
+    offsets, sigma : (2, y, x)
+        Offsets along x and y and their errors, px; NaN where unknown.
+    star : Star
+        How stars look, and with what weights they were fitted.
+    """
+    _, ny, nx = offsets.shape
+    found = np.full(place.shape, np.nan)
+    error = np.full(place.shape, np.nan)
+    inside = np.isfinite(place).all(axis=1)
+    # Far from the detector, and beyond what integers hold.
+    inside &= (np.abs(np.nan_to_num(place)) < 2 * max(ny, nx)).all(axis=1)
+    for n in np.flatnonzero(inside):
+        middle = np.rint(place[n]).astype(int)
+        weights = star.weights(place[n] - middle)
+        window = np.full((2, 2, star.side, star.side), np.nan)
+        (y0, x0), (h, w) = middle[::-1] - star.half, (star.side, star.side)
+        rows, columns = (max(0, y0), min(ny, y0 + h)), (max(0, x0), min(nx, x0 + w))
+        if rows[0] >= rows[1] or columns[0] >= columns[1]:
+            continue
+        source = (slice(*rows), slice(*columns))
+        target = tuple(slice(a - o, b - o) for (a, b), o in ((rows, y0), (columns, x0)))
+        window[0][:, *target] = offsets[:, *source]
+        window[1][:, *target] = sigma[:, *source]
+        known = np.isfinite(window).all(axis=(0, 1))
+        lost = np.abs(weights * ~known).sum() / np.abs(weights).sum()
+        if lost > MOST_UNKNOWN:
+            continue
+        delta, spread = np.where(known, window, 0.0)
+        found[n] = place[n] - np.einsum("acyx,cyx->a", weights, delta)
+        error[n] = np.sqrt(np.einsum("acyx,cyx->a", weights**2, spread**2))
+    return Corrected(found, error)
+
+
+def correction_map(offsets: NDArray[np.floating], star: Star | None) -> NDArray[np.float32]:
+    """What to add to the centroid of a star in the middle of each pixel.
+
+    Parameters
+    ----------
+    offsets : (2, y, x)
+        Along x and y, px; NaN, where unknown, counts as 0.
+    star : Star or None
+        None for the pixels' own places.
+
+    Returns
+    -------
+    (2, y, x) float32
+    """
+    known = np.nan_to_num(offsets.astype(np.float32))
+    if star is None:
+        return known
+    weights = star.weights(np.zeros(2))[..., ::-1, ::-1].astype(np.float32)
+    made = [
+        -sum(oaconvolve(d, w, mode="same") for d, w in zip(known, along, strict=True))
+        for along in weights
+    ]
+    return np.stack(made).astype(np.float32)

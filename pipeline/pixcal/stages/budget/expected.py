@@ -1,0 +1,433 @@
+"""What a bench can reach before any photon is spent: frames for a precision, and what limits it.
+
+The bound of `bound` on a grid of pixels spread over the window, for each fringe
+set and for the sets joined. What is systematic is not in it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import ceil
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from pixcal.estimators.fringe_fit.combine import axes_span_plane
+from pixcal.kernels.optics import fringe_vector
+from pixcal.kernels.scene import fibre_light, geometry
+from pixcal.model.bench import Bench
+from pixcal.model.errors import InputError
+from pixcal.stages.budget.bound import (
+    FrameSpread,
+    WeightErrors,
+    phase_information,
+    sampling_loss,
+    unweighted_variance,
+)
+
+F64 = NDArray[np.float64]
+Shares = Sequence[float] | F64
+
+SAMPLES = 96
+"""Pixels along each side of the grid: light changes little from one to the next."""
+MAX_PHASES = 2000
+"""Frames of a ramp that are looked at: it repeats itself, or fills the turn evenly by then."""
+DARKNESS = 1e-12
+"""Least information of one frame, 1/rad²."""
+NEGLIGIBLE = 1e-3
+"""Share of the frames that the noise of calibration frames may cost."""
+FINER_PX = (5.0, 4.0, 3.0)
+"""Interfringes that a longer baseline is tried for; the paper keeps to 5 px (section 4.2)."""
+
+
+def sample_variance(bench: Bench) -> float:
+    """Variance (e-²) of a sample without light: read noise, converter's step, dark current."""
+    d = bench.detector
+    dark = d.dark_e_s * bench.frames.exptime_s
+    return d.read_noise_e**2 + d.gain_e_per_adu**2 / 12 + dark
+
+
+@dataclass(frozen=True)
+class SetBound:
+    """Bound of a fringe set on the grid of pixels.
+
+    Attributes
+    ----------
+    iota, alpha : (n,) float64
+        Mean and amplitude, e-.
+    kx, ky : (n,) float64
+        Local fringe vector, rad/px.
+    variance : float
+        Of a sample without light, e-².
+    frames : FrameSpread
+    loss : (float, float)
+        What the choice of phases costs, of the frames: median and worst fringe phase.
+    """
+
+    iota: F64
+    alpha: F64
+    kx: F64
+    ky: F64
+    variance: float
+    frames: FrameSpread
+    loss: tuple[float, float]
+
+    @classmethod
+    def of(cls, bench: Bench, number: int, contrast: float = 1.0) -> "SetBound":
+        """For a set of a bench.
+
+        Parameters
+        ----------
+        bench : Bench
+        number : int
+            Of the set.
+        contrast : float
+            Times the bench's visibility.
+
+        Raises
+        ------
+        InputError
+            If no light falls on the window.
+        """
+        scan, optics = bench.frames.fringes[number], bench.optics
+        x, y = grid(bench.detector.shape)
+        a, b = (
+            np.concatenate([fibre_light(bench, number, (row, row + 1))[fibre][:, x] for row in y])
+            for fibre in (0, 1)
+        )
+        visibility = optics.visibility * contrast
+        mean, swing = a + b, 2 * visibility * np.sqrt(a * b)
+        brightest = float((mean + swing).max())
+        if brightest == 0:
+            raise InputError(
+                f"set {scan.name!r}: no light falls on the window; see beam_radius_mm and pointing"
+            )
+        electrons = scan.peak_e / brightest
+        kx, ky = fringe_vector(x[None, :], y[:, None], geometry(bench, number))
+        spread = FrameSpread.normal(
+            optics.laser_noise_rms, scan.visibility_jitter_rms, min(visibility, 1.0)
+        )
+        iota, alpha = (electrons * mean).ravel(), (electrons * swing).ravel()
+        bare = cls(iota, alpha, kx.ravel(), ky.ravel(), sample_variance(bench), spread, (1.0, 1.0))
+        if scan.phase_law == "random":
+            return bare
+        phases = scan.phase_step_rad * np.arange(min(scan.count, MAX_PHASES), dtype=float)
+        typical = bare.typical
+        return replace(
+            bare, loss=sampling_loss(iota[typical], alpha[typical], bare.variance, phases)
+        )
+
+    @property
+    def typical(self) -> int:
+        """Number of the pixel with the median of the light."""
+        return int(np.argsort(self.iota)[len(self.iota) // 2])
+
+    @cached_property
+    def information(self) -> F64:
+        """Of one frame on each pixel's phase, 1/rad², at the median fringe phase."""
+        found = phase_information(self.iota, self.alpha, self.variance, self.frames)
+        # A pixel beyond the beams would take for ever; it still must have a number.
+        return np.asarray(np.maximum(found, DARKNESS) / self.loss[0])
+
+    @property
+    def k(self) -> F64:
+        """Length of the fringe vector, rad/px."""
+        return np.hypot(self.kx, self.ky)
+
+    @property
+    def axis(self) -> tuple[float, float]:
+        """Unit vector along which the set measures, at the typical pixel."""
+        n = self.typical
+        return float(self.kx[n] / self.k[n]), float(self.ky[n] / self.k[n])
+
+    @property
+    def interfringe(self) -> float:
+        """At the typical pixel, px."""
+        return float(2 * np.pi / self.k[self.typical])
+
+    @property
+    def visibility(self) -> float:
+        """Median over the window."""
+        return float(np.median(self.alpha / self.iota))
+
+    @property
+    def per_frame(self) -> F64:
+        """Variance of the offset along the set's axis that one frame gives, px²."""
+        return np.asarray(1 / (self.information * self.k**2))
+
+    @property
+    def worst(self) -> float:
+        """Of `per_frame`, at the least favourable fringe phase."""
+        return float(self.per_frame.max()) * self.loss[1] / self.loss[0]
+
+    def shares(self) -> dict[str, float]:
+        """What the frames are for: the least number, and the factors that raise it.
+
+        ``photons`` is the variance (px²) of one frame of a pixel in the brightest light, at full
+        contrast, without other noise; each factor is for what its name says, given those before.
+        """
+        peak = float((self.iota + self.alpha).max())
+        bright = np.array([peak / 2])
+        ideal = float(np.median(1 / (phase_information(bright, bright, 0.0) * self.k**2)))
+        level = (self.iota + self.alpha) / 2
+        steps = {
+            "uneven_light": phase_information(level, level, 0.0),
+            "visibility": phase_information(self.iota, self.alpha, 0.0, self.frames),
+            "read_noise": phase_information(self.iota, self.alpha, self.variance, self.frames),
+            "phases": self.information,
+        }
+        found, before = {"photons": ideal}, ideal
+        for name, information in steps.items():
+            now = float(np.median(1 / (np.maximum(information, DARKNESS) * self.k**2)))
+            found[name] = now / before
+            before = now
+        return found
+
+    def calibration(self) -> WeightErrors:
+        """What errors of bias and flat cost the typical pixel."""
+        n = self.typical
+        return WeightErrors.of(float(self.iota[n]), float(self.alpha[n]), self.variance)
+
+
+def grid(shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Columns and rows of a window at which its bound is taken, the outermost among them."""
+    rows, columns = (
+        np.unique(np.linspace(0, n - 1, min(n, SAMPLES)).round().astype(np.int64)) for n in shape
+    )
+    return columns, rows
+
+
+@dataclass(frozen=True)
+class JoinedBound:
+    """Fringe sets joined by weighted least squares.
+
+    Attributes
+    ----------
+    sets : tuple of SetBound
+        On the same grid.
+    """
+
+    sets: tuple[SetBound, ...]
+
+    @property
+    def components(self) -> tuple[str, ...]:
+        """What the sets together give."""
+        both = axes_span_plane([s.axis for s in self.sets])
+        return ("delta_x", "delta_y") if both else ("delta_fringe",)
+
+    def variance(self, frames: Shares, *, worst: bool = False) -> F64:
+        """Of each component (component, pixel), px².
+
+        Parameters
+        ----------
+        frames : (set,) float
+            Of each set; shares of one frame will do.
+        worst : bool
+            At the least favourable fringe phases.
+        """
+        xx, xy, yy = np.zeros((3, len(self.sets[0].iota)))
+        for n, s in zip(frames, self.sets, strict=True):
+            weight = n * s.information / (s.loss[1] / s.loss[0] if worst else 1.0)
+            xx, xy, yy = xx + weight * s.kx**2, xy + weight * s.kx * s.ky, yy + weight * s.ky**2
+        if len(self.components) == 1:
+            return np.asarray(1 / (xx + yy))[None]
+        return np.stack([yy, xx]) / (xx * yy - xy**2)
+
+    def median(self, frames: Shares) -> F64:
+        """Variance (component,) of the median pixel, px²."""
+        return np.asarray(np.median(self.variance(frames), axis=1))
+
+    def best_split(self) -> F64:
+        """Share of each set's frames with which the worse component is best."""
+        n = len(self.sets)
+        if len(self.components) == 1 or n == 1:
+            best = int(np.argmin([np.median(s.per_frame) for s in self.sets]))
+            return np.asarray(np.eye(n)[best])
+        scale = float(self.median(np.full(n, 1 / n)).max())
+        # Least t with every component below it: smooth where the largest itself is not.
+        found = minimize(
+            lambda v: v[-1],
+            [*np.full(n, 1 / n), 1.0],
+            bounds=[(1e-4, 1.0)] * n + [(0.0, None)],
+            constraints=[
+                {"type": "eq", "fun": lambda v: v[:-1].sum() - 1},
+                {"type": "ineq", "fun": lambda v: v[-1] - self.median(v[:-1]) / scale},
+            ],
+        ).x[:-1]
+        return np.asarray(found / found.sum(), float)
+
+
+def joined(bench: Bench, contrast: Sequence[float] | None = None) -> JoinedBound:
+    """Bounds of all sets of a bench; ``contrast`` as in `SetBound.of`, one for each."""
+    factors = contrast or [1.0] * len(bench.frames.fringes)
+    return JoinedBound(tuple(SetBound.of(bench, n, c) for n, c in enumerate(factors)))
+
+
+def planned_split(bench: Bench) -> F64:
+    """Share of each set in the frames that the bench plans."""
+    counts = np.array([s.count for s in bench.frames.fringes], float)
+    return np.asarray(counts / counts.sum())
+
+
+def frames_needed(variance: float, precision: float) -> int:
+    """Frames after which a variance (px²) of one frame has become the precision (px) squared."""
+    return max(1, ceil(variance / precision**2))
+
+
+@dataclass(frozen=True)
+class Lever:
+    """A change of the bench, and what it does to the variance of one frame of all sets joined.
+
+    Attributes
+    ----------
+    name : str
+    variance : float
+        Of the worse component at the median pixel, px², for one frame shared by the sets.
+    period_s : float
+        From frame to frame.
+    note : str
+        What it assumes, or "".
+    """
+
+    name: str
+    variance: float
+    period_s: float
+    note: str = ""
+
+
+def levers(bench: Bench, now: JoinedBound) -> list[Lever]:
+    """What could be changed, the most helpful first; and what equal weights would lose."""
+    split, period = planned_split(bench), bench.frames.period_s
+    best = now.best_split()
+    found = [
+        Lever("as planned", _worse(now, split), period),
+        *(
+            Lever(name, _worse(joined(changed, contrast), split), changed.frames.period_s, note)
+            for name, changed, contrast, note in _changes(bench, now)
+        ),
+    ]
+    if len(now.components) == 2 and np.abs(best - split).max() > 0.02:
+        shares = " : ".join(f"{100 * s:.0f}" for s in best)
+        found.append(Lever(f"frames shared {shares} %", _worse(now, best), period))
+    plain = tuple(
+        replace(s, loss=(s.loss[0] * ratio, s.loss[1] * ratio))
+        for s, ratio in ((s, _unweighted_ratio(s)) for s in now.sets)
+    )
+    found.append(
+        Lever("equal weights", _worse(JoinedBound(plain), split), period, "a loss: do not")
+    )
+    return sorted(found, key=lambda lever: lever.variance * lever.period_s)
+
+
+def _worse(bound: JoinedBound, split: F64) -> float:
+    return float(bound.median(split).max())
+
+
+def _unweighted_ratio(s: SetBound) -> float:
+    plain = unweighted_variance(s.iota, s.alpha, s.variance, s.frames)
+    return float(np.median(plain * phase_information(s.iota, s.alpha, s.variance, s.frames)))
+
+
+Change = tuple[str, Bench, list[float] | None, str]
+
+
+def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
+    """(name, bench, contrast of each set, note) of every change that is one."""
+    d, o, f = bench.detector, bench.optics, bench.frames
+    found = _finer_fringes(bench, now)
+    limit = brightest_allowed(bench)
+    if limit is not None and min(s.peak_e for s in f.fringes) < 0.95 * limit:
+        fuller = tuple(replace(s, peak_e=max(s.peak_e, limit)) for s in f.fringes)
+        name = f"brightest fringe at {limit / 1e3:.3g} ke-"
+        found.append((name, replace(bench, frames=replace(f, fringes=fuller)), None, "no margin"))
+    doubled = tuple(replace(s, peak_e=2 * s.peak_e) for s in f.fringes)
+    found.append(
+        ("twice the light a frame", replace(bench, frames=replace(f, fringes=doubled)), None,
+         "and the well for it")
+    )  # fmt: skip
+    if d.read_noise_e > 0:
+        quiet = replace(d, read_noise_e=d.read_noise_e / 2)
+        found.append(
+            (f"read noise {quiet.read_noise_e:.3g} e-", replace(bench, detector=quiet), None, "")
+        )
+    if o.visibility < 0.995:
+        clear = replace(o, visibility=1.0)
+        found.append(("visibility 1", replace(bench, optics=clear), None, ""))
+    if abs(np.log(o.power_ratio)) > 0.02:
+        equal = replace(o, power_ratio=1.0)
+        found.append(("fibres of equal power", replace(bench, optics=equal), None, ""))
+    if any(s.loss[0] > 1.01 for s in now.sets):
+        random = tuple(replace(s, phase_law="random") for s in f.fringes)
+        found.append(
+            ("phases over the whole turn", replace(bench, frames=replace(f, fringes=random)),
+             None, "")
+        )  # fmt: skip
+    if f.period_s > 1.05 * f.exptime_s:
+        fast = replace(bench, frames=replace(f, period_s=f.exptime_s))
+        found.append((f"a frame every {f.exptime_s:.3g} s", fast, None, "no dead time"))
+    return found
+
+
+def _finer_fringes(bench: Bench, now: JoinedBound) -> list[Change]:
+    """Longer baselines, down to the next interfringe of `FINER_PX`."""
+    widest = max(s.interfringe for s in now.sets)
+    wanted = next((w for w in FINER_PX if w < 0.9 * widest), None)
+    if wanted is None:
+        return []
+    longer, contrast = [], []
+    for scan, s in zip(bench.frames.fringes, now.sets, strict=True):
+        stretch = max(1.0, s.interfringe / wanted)
+        bx, by = scan.baseline_mm
+        longer.append(replace(scan, baseline_mm=(bx * stretch, by * stretch)))
+        kx, ky = np.array(s.axis) * float(s.k[s.typical])
+        contrast.append(pixel_contrast(kx * stretch, ky * stretch) / pixel_contrast(kx, ky))
+    length = max(float(np.hypot(*scan.baseline_mm)) for scan in longer)
+    changed = replace(bench, frames=replace(bench.frames, fringes=tuple(longer)))
+    loss = 100 * (1 - min(contrast))
+    note = f"contrast {loss:.2g} % less: a pixel averages over itself"
+    return [(f"interfringe {wanted:g} px (baseline {length:.3g} mm)", changed, contrast, note)]
+
+
+def pixel_contrast(kx: float, ky: float) -> float:
+    """Contrast that a square pixel, sensitive all over, leaves of fringes (kx, ky) rad/px."""
+    return float(np.sinc(kx / (2 * np.pi)) * np.sinc(ky / (2 * np.pi)))
+
+
+def brightest_allowed(bench: Bench) -> float | None:
+    """Electrons that the well and the converter hold, or None where nothing limits them."""
+    d = bench.detector
+    converter = (d.top_adu - d.bias_adu) * d.gain_e_per_adu
+    return converter if d.full_well_e is None else min(d.full_well_e, converter)
+
+
+def bias_frames_needed(errors: WeightErrors, variance: float) -> int:
+    """Bias frames whose noise costs less than `NEGLIGIBLE` of the fringe frames.
+
+    A pixel's bias is absorbed by its iota; what is left is that the weights take a wrong level and,
+    where each pixel's read noise is measured from the same frames, a wrong read noise.
+    """
+    n = 2
+    while errors.offset * (variance / n + 2 * variance**2 / (n - 1)) > NEGLIGIBLE:
+        n += 1
+    return n
+
+
+def flat_error(bench: Bench) -> float | None:
+    """Relative error of a pixel's flat from the flats that the bench plans; None without any."""
+    f = bench.frames
+    if not f.flats or f.flat_rate_e_s is None:
+        return None
+    variance = sample_variance(bench)
+    levels = [(rung.count, f.flat_rate_e_s * rung.exptime_s) for rung in f.flats]
+    weight = sum(count * level**2 / (level + variance) for count, level in levels if level > 0)
+    return float(weight**-0.5) if weight > 0 else None
+
+
+def flats_needed(errors: WeightErrors, level: float, variance: float) -> int:
+    """Flats of a level (e-) whose noise costs less than `NEGLIGIBLE` of the fringe frames.
+
+    A flat's error scales iota and alpha alike and leaves their phase, and its error, as they are;
+    only weights that come from neighbouring pixels take notice.
+    """
+    return max(1, ceil(errors.scale * (level + variance) / level**2 / NEGLIGIBLE))

@@ -1,0 +1,316 @@
+"""``pixcal budget``: what a bench can reach, before any photon is spent.
+
+``budget.json`` holds ``schema``, ``pixcal``, ``bench`` (its file and digest), ``precision_px``
+wanted and ``frames`` given (null where not asked for), ``window`` (y, x) and, by part, the
+``variance_e2`` of a sample without light. For each fringe set under ``sets``: ``interfringe_px``,
+``mean_e`` and ``visibility`` of the median pixel; ``frame_px``, the 1-sigma bound of one frame
+along the set's axis, of the median and of the worst pixel; ``planned`` frames and what they reach;
+``wanted`` frames, hours and bytes for the precision; what the frames ``given`` reach; ``shares``
+of the frames, ``limited_by``, and ``calibration``. ``joined`` has the same of the sets together:
+its frames are those of all sets, shared as the bench plans. ``levers`` are changes of the bench,
+the most helpful first; ``left_out`` and ``warnings`` are sentences.
+"""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal import __version__
+from pixcal.estimators.fringe_fit.fringes import HONEST_FRINGES
+from pixcal.model.bench import Bench, load_bench
+from pixcal.model.config import to_plain
+from pixcal.model.errors import InputError
+from pixcal.model.options import Budget
+from pixcal.report.budget_figures import BudgetView, Line, budget_figure
+from pixcal.report.drawing import png
+from pixcal.stages.budget.expected import (
+    JoinedBound,
+    Lever,
+    SetBound,
+    bias_frames_needed,
+    brightest_allowed,
+    flat_error,
+    flats_needed,
+    frames_needed,
+    joined,
+    levers,
+    planned_split,
+    sample_variance,
+)
+from pixcal.storage.artefact import digest, write_json
+
+SCHEMA = "pixcal/budget/1"
+PRECISION_PX = 5e-5
+"""What the paper asks for (section 1)."""
+SAMPLE_BYTES = 2
+"""Of a sample as a camera writes it."""
+MARGIN = 4.0
+"""Standard deviations that the brightest fringe should keep below the end of the range."""
+DOMINANT = 1.5
+"""A factor of the frames below this does not limit a set: photons do."""
+
+F64 = NDArray[np.float64]
+
+
+Config = Budget
+
+
+def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, Any]:
+    """Work out the budget of a bench.
+
+    Parameters
+    ----------
+    bench_file : Path
+        As ``pixcal simulate`` takes it.
+    config : Config
+    out : Path, optional
+        Directory for ``budget.json`` and ``budget.png``.
+
+    Returns
+    -------
+    dict
+        The contents of ``budget.json``.
+
+    Raises
+    ------
+    InputError
+        If the bench cannot be read, has no fringes, or its phases determine nothing.
+    """
+    bench = load_bench(bench_file)
+    if not bench.frames.fringes:
+        raise InputError(f"{bench_file}: frames.fringes: no fringe sets, nothing to budget")
+    try:
+        bound = joined(bench)
+    except InputError as error:
+        raise InputError(f"{bench_file}: {error}") from error
+    for scan, s in zip(bench.frames.fringes, bound.sets, strict=True):
+        if not np.isfinite(s.loss[0]):
+            raise InputError(
+                f"{bench_file}: set {scan.name!r}: phase_step_rad: its phases do not determine "
+                "offset, level and contrast; at least three different ones are needed"
+            )
+    precision = config.precision_px
+    if precision is None and config.frames is None:
+        precision = PRECISION_PX
+    result = _budget(bench, bound, precision, config.frames)
+    result = {
+        "schema": SCHEMA,
+        "pixcal": __version__,
+        "bench": {"file": str(bench_file), "digest": digest(to_plain(bench))},
+    } | result
+    if out is not None:
+        _write(out, result, _view(bench, bound, result))
+    return result
+
+
+def _write(out: Path, result: dict[str, Any], view: BudgetView) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise InputError(f"--out {out}: a file is in the way; choose another directory") from error
+    aside = out / ".budget.png.aside"
+    aside.write_bytes(png(budget_figure(view)))
+    aside.replace(out / "budget.png")
+    write_json(out / "budget.json", result)
+
+
+def _budget(
+    bench: Bench, bound: JoinedBound, precision: float | None, frames: int | None
+) -> dict[str, Any]:
+    d, f = bench.detector, bench.frames
+    split = planned_split(bench)
+    return {
+        "precision_px": precision,
+        "frames": frames,
+        "window": list(d.shape),
+        "variance_e2": {
+            "read_noise": d.read_noise_e**2,
+            "quantisation": d.gain_e_per_adu**2 / 12,
+            "dark": d.dark_e_s * f.exptime_s,
+        },
+        "sets": {
+            scan.name: _set_facts(bench, s, scan.count, precision, frames)
+            for scan, s in zip(f.fringes, bound.sets, strict=True)
+        },
+        "joined": _joined_facts(bench, bound, split, precision, frames),
+        "levers": [_lever_facts(lever, precision) for lever in levers(bench, bound)],
+        "left_out": _left_out(bench),
+        "warnings": _warnings(bench, bound),
+    }
+
+
+def _cost(bench: Bench, frames: int) -> dict[str, Any]:
+    """Frames with their time and their bytes."""
+    ny, nx = bench.detector.shape
+    return {
+        "frames": frames,
+        "hours": frames * bench.frames.period_s / 3600,
+        "bytes": frames * ny * nx * SAMPLE_BYTES,
+    }
+
+
+def _set_facts(
+    bench: Bench, s: SetBound, planned: int, precision: float | None, frames: int | None
+) -> dict[str, Any]:
+    median, worst = float(np.median(s.per_frame)), s.worst
+
+    def reached(n: int) -> dict[str, Any]:
+        return {"frames": n, "median_px": (median / n) ** 0.5, "worst_px": (worst / n) ** 0.5}
+
+    shares = s.shares()
+    factors = {name: value for name, value in shares.items() if name != "photons"}
+    largest = max(factors, key=lambda name: factors[name])
+    facts = {
+        "interfringe_px": s.interfringe,
+        "mean_e": float(np.median(s.iota)),
+        "visibility": s.visibility,
+        "frame_px": {"median": median**0.5, "worst": worst**0.5},
+        "planned": reached(planned),
+        "given": None if frames is None else reached(frames),
+        "wanted": None,
+        "shares": shares,
+        "limited_by": largest if factors[largest] > DOMINANT else "photons",
+        "calibration": _calibration(bench, s),
+    }
+    if precision is not None:
+        facts["wanted"] = _cost(bench, frames_needed(median, precision)) | {
+            "frames_worst": frames_needed(worst, precision)
+        }
+        shares["photons_frames"] = frames_needed(shares["photons"], precision)
+    return facts
+
+
+def _calibration(bench: Bench, s: SetBound) -> dict[str, Any]:
+    """Frames of bias and flat that leave nothing to gain, and what those planned leave."""
+    errors, f = s.calibration(), bench.frames
+    level, flat = float(np.median(s.iota)), flat_error(bench)
+    bias_e = None if not f.bias else (sample_variance(bench) / f.bias) ** 0.5
+    return {
+        "bias_frames_needed": bias_frames_needed(errors, s.variance),
+        "bias_frames": f.bias,
+        "bias_error_e": bias_e,
+        "flats_needed": flats_needed(errors, level, s.variance),
+        "flats": sum(rung.count for rung in f.flats),
+        "flat_error": flat,
+        "flat_cost": errors.scale * (flat**2 if flat is not None else bench.detector.prnu_rms**2),
+    }
+
+
+def _joined_facts(
+    bench: Bench, bound: JoinedBound, split: F64, precision: float | None, frames: int | None
+) -> dict[str, Any]:
+    """Of each component: its unit is a frame of all sets, shared as planned."""
+    counts = [s.count for s in bench.frames.fringes]
+    one = bound.variance(split)
+    median, worst = np.median(one, axis=1), bound.variance(split, worst=True).max(axis=1)
+    facts = {}
+    for n, name in enumerate(bound.components):
+        facts[name] = {
+            "frame_px": {"median": float(median[n]) ** 0.5, "worst": float(worst[n]) ** 0.5},
+            "planned": _reached(bound, counts, n),
+            "given": None if frames is None else _reached(bound, [frames] * len(counts), n),
+            "wanted": None
+            if precision is None
+            else _cost(bench, frames_needed(float(median[n]), precision))
+            | {"frames_worst": frames_needed(float(worst[n]), precision)},
+        }
+    both = None if precision is None else frames_needed(float(median.max()), precision)
+    return {
+        "components": facts,
+        "wanted": None if both is None else _cost(bench, both),
+        "split": split.tolist(),
+        "best_split": bound.best_split().tolist(),
+    }
+
+
+def _reached(bound: JoinedBound, counts: list[int], component: int) -> dict[str, Any]:
+    return {
+        "frames": sum(counts),
+        "median_px": float(np.median(bound.variance(counts)[component])) ** 0.5,
+        "worst_px": float(bound.variance(counts, worst=True)[component].max()) ** 0.5,
+    }
+
+
+def _lever_facts(lever: Lever, precision: float | None) -> dict[str, Any]:
+    frames = None if precision is None else frames_needed(lever.variance, precision)
+    return asdict(lever) | {
+        "frames": frames,
+        "hours": None if frames is None else frames * lever.period_s / 3600,
+    }
+
+
+def _left_out(bench: Bench) -> list[str]:
+    """What the bound does not know."""
+    d, found = bench.detector, []
+    found.append(
+        "systematic errors (crosstalk, drifts, ghosts, nonlinearity): no number of frames removes "
+        "them"
+    )
+    if bench.effects:
+        found.append(f"the effects of the bench file: {', '.join(sorted(bench.effects))}")
+    if d.prnu_rms > 0:
+        found.append(
+            f"the response of single pixels: its {100 * d.prnu_rms:.2g} % rms scatters their "
+            f"errors by {50 * d.prnu_rms:.2g} %"
+        )
+    if not bench.shot_noise:
+        found.append("shot_noise: false in the bench file: a budget always counts it")
+    return found
+
+
+def _warnings(bench: Bench, bound: JoinedBound) -> list[str]:
+    found, limit = [], brightest_allowed(bench)
+    ny, nx = bench.detector.shape
+    for scan, s in zip(bench.frames.fringes, bound.sets, strict=True):
+        noise = s.variance + scan.peak_e + (bench.optics.laser_noise_rms * scan.peak_e) ** 2
+        top = scan.peak_e + MARGIN * noise**0.5
+        if limit is not None and top > limit:
+            found.append(
+                f"{scan.name}: the brightest fringe, {scan.peak_e / 1e3:.4g} ke-, reaches "
+                f"{top / 1e3:.4g} ke- at {MARGIN:.0f} sigma; the range ends at "
+                f"{limit / 1e3:.4g} ke-, so that some samples are lost"
+            )
+        if s.interfringe < 2:
+            found.append(
+                f"{scan.name}: interfringe {s.interfringe:.3g} px is below two pixels: the fringes "
+                "cannot be told from coarser ones"
+            )
+        across = float(np.hypot(np.median(s.kx) * nx, np.median(s.ky) * ny) / (2 * np.pi))
+        if across < HONEST_FRINGES:
+            found.append(
+                f"{scan.name}: {across:.2g} fringes across the window; fewer than "
+                f"{HONEST_FRINGES:g} leave true offsets and fringes mixed up"
+            )
+    return found
+
+
+def _view(bench: Bench, bound: JoinedBound, result: dict[str, Any]) -> BudgetView:
+    """What the figure shows."""
+    lines = [
+        Line(
+            f"{name} ({facts['interfringe_px']:.3g} px)",
+            facts["frame_px"]["median"],
+            facts["frame_px"]["worst"],
+            facts["planned"]["frames"],
+        )
+        for name, facts in result["sets"].items()
+    ]
+    total = sum(scan.count for scan in bench.frames.fringes)
+    joint = [
+        Line(name, facts["frame_px"]["median"], facts["frame_px"]["worst"], total)
+        for name, facts in result["joined"]["components"].items()
+    ]
+    return BudgetView(
+        name=Path(result["bench"]["file"]).name,
+        sets=tuple(lines),
+        joined=tuple(joint) if len(bound.sets) > 1 else (),
+        precision=result["precision_px"],
+        frames=result["frames"],
+        period_s=bench.frames.period_s,
+        levers=tuple(
+            (lever["name"], lever["variance"], lever["period_s"]) for lever in result["levers"]
+        ),
+    )

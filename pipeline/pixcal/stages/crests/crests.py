@@ -1,0 +1,556 @@
+"""Crests and valleys of the fringes (paper, section 6, equation 6), found in noisy frames.
+
+Where the phase of the fringes is k pi they have a crest (k even) or a valley (k odd). A maximum of
+single samples is lost in the noise, and moved by any slope of the illumination. Here the phase is
+measured in windows a few fringes wide and a segment of the fringe long, apart from the background
+and from slopes of the contrast; a path's point is where that phase crosses k pi.
+
+Windows share no pixel, so the errors of their points are independent; nothing is gained by points
+on the paths between, whose windows would overlap. A first pass over one frame, with a straight
+carrier, is followed outwards from a seed by a polynomial that numbers the fringes; the second pass,
+over every frame, takes this polynomial for a carrier and divides by the smooth illumination, so
+that neither curved fringes nor the shape of the beam move a point.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.polynomial import polynomial
+from numpy.typing import NDArray
+
+from pixcal.estimators.fringe_fit.fringes import find_fringe_vector
+from pixcal.kernels.demodulation import N_SUMS, solve_windows, window_sums
+from pixcal.model.errors import InputError
+
+F64 = NDArray[np.float64]
+Vector = tuple[float, float]
+
+FRINGES_A_WINDOW = 2.5
+"""Fewest across a window. Half an odd number: points of neighbours lie on crest and valley."""
+MIN_WIDTH = 12.0
+"""Fewest pixels across a window: where fringes run along the columns, the model's seven functions
+across them need as many samples and more."""
+MAX_SIGMA = 0.2
+"""Windows whose phase is known worse (rad) hold no fringes to speak of."""
+MIN_COVERAGE = 0.5
+"""Share of a window's pixels that must be there and good."""
+MIN_POINTS = 12
+"""Fewest windows with fringes: as many again as the geometry has parameters."""
+MAX_AWAY = 0.5
+"""A vector farther from the nominal one, as a share of it, is not the fringes' but the beam's."""
+MAX_DEGREE = 5
+"""Of the polynomial that follows the phase."""
+SEED_PIXELS = 256
+"""Side of the patch where the fringe vector is first sought."""
+SETTLING = 2
+"""Passes over the first frame: curvature left by the second moves points by some 1e-6 rad."""
+_SOLVED_AT_ONCE = 2048
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Rectangles that tile a frame, their sides across and along the fringes.
+
+    Attributes
+    ----------
+    frame : (int, int)
+        (y, x) size of the frame.
+    direction : (float, float)
+        Unit vector (x, y) across the fringes.
+    edge : (float, float)
+        First edge across and along, px.
+    size : (float, float)
+        Of a window across and along, px.
+    shape : (int, int)
+        Windows across and along.
+    """
+
+    frame: tuple[int, int]
+    direction: Vector
+    edge: Vector
+    size: Vector
+    shape: tuple[int, int]
+
+    @classmethod
+    def lay(cls, frame: tuple[int, int], k: Vector, segment: int | None = None) -> Self:
+        """Windows over a frame for a fringe vector (kx, ky), rad/px.
+
+        Raises
+        ------
+        InputError
+            If there is not room for two windows across the fringes.
+        """
+        ny, nx = frame
+        length = float(np.hypot(*k))
+        ux, uy = k[0] / length, k[1] / length
+        fringes = max(FRINGES_A_WINDOW, np.ceil(MIN_WIDTH * length / (2 * np.pi) - 0.5) + 0.5)
+        width = 2 * np.pi * fringes / length
+        corner_x = np.array([-0.5, nx - 0.5, -0.5, nx - 0.5])
+        corner_y = np.array([-0.5, -0.5, ny - 0.5, ny - 0.5])
+        across, along = ux * corner_x + uy * corner_y, ux * corner_y - uy * corner_x
+        if np.ptp(across) < 2 * width:
+            raise InputError(
+                f"too few fringes: {np.ptp(across) * length / (2 * np.pi):.1f} across {nx} x {ny} "
+                f"px, crests need {2 * fringes:.0f}; take a larger window"
+            )
+        if segment is None:
+            segment = int(np.clip(np.ptp(along) / 8, 8, 128))
+        n_across = int(np.ptp(across) / width)
+        n_along = max(1, round(np.ptp(along) / segment))
+        size = (float(np.ptp(across) / n_across), float(np.ptp(along) / n_along))
+        # A hair outwards: the outermost pixels must not fall out by rounding.
+        edge = (float(across.min()) - 1e-9, float(along.min()) - 1e-9)
+        return cls(frame, (ux, uy), edge, size, (n_across, n_along))
+
+    @property
+    def layout(self) -> F64:
+        """As `pixcal.kernels.demodulation.window_sums` takes it."""
+        return np.array([*self.direction, *self.edge, *self.size])
+
+    @cached_property
+    def centres(self) -> tuple[F64, F64]:
+        """y and x (across, along) of the windows' centres, px."""
+        u = self.edge[0] + (np.arange(self.shape[0])[:, None] + 0.5) * self.size[0]
+        v = self.edge[1] + (np.arange(self.shape[1])[None, :] + 0.5) * self.size[1]
+        ux, uy = self.direction
+        return uy * u + ux * v, ux * u - uy * v
+
+    def touched(self, y: tuple[int, int], x: tuple[int, int]) -> tuple[tuple[int, int], ...]:
+        """First window, and the one after the last, across and along, that a tile touches."""
+        ux, uy = self.direction
+        at_x = np.array([x[0], x[1] - 1, x[0], x[1] - 1])
+        at_y = np.array([y[0], y[0], y[1] - 1, y[1] - 1])
+        spans = []
+        for n, at in enumerate((ux * at_x + uy * at_y, ux * at_y - uy * at_x)):
+            number = np.floor((at - self.edge[n]) / self.size[n])
+            # One more on each side for what rounding does to pixels on a border.
+            spans.append((int(number.min()) - 1, int(number.max()) + 2))
+        return tuple((max(0, a), min(n, b)) for (a, b), n in zip(spans, self.shape, strict=True))
+
+
+@dataclass(frozen=True)
+class Smooth:
+    """A polynomial ``sum c[i, j] Y^i X^j`` of scaled pixel coordinates.
+
+    Attributes
+    ----------
+    coefficients : (n, n) float64
+    centre : (float, float)
+        (y, x) where X = Y = 0, px.
+    scale : float
+        Pixels to a unit of X and Y.
+    """
+
+    coefficients: F64
+    centre: Vector
+    scale: float
+
+    @classmethod
+    def plane(cls, slope: Vector, frame: tuple[int, int]) -> Self:
+        """A plane of slope (x, y) a pixel, zero at the frame's centre."""
+        scale = max(frame) / 2
+        c = np.array([[0.0, slope[0] * scale], [slope[1] * scale, 0.0]])
+        return cls(c, ((frame[0] - 1) / 2, (frame[1] - 1) / 2), scale)
+
+    def scaled(self, y: F64, x: F64) -> tuple[F64, F64]:
+        """Y and X at pixel coordinates."""
+        return (y - self.centre[0]) / self.scale, (x - self.centre[1]) / self.scale
+
+    def on(self, y: F64, x: F64) -> F64:
+        """Value at pixel coordinates."""
+        return np.asarray(polynomial.polyval2d(*self.scaled(y, x), self.coefficients))
+
+    def gradient(self, y: F64, x: F64) -> tuple[F64, F64]:
+        """Derivatives (by x, by y) at pixel coordinates, 1/px."""
+        at = self.scaled(y, x)
+        by_y, by_x = (polynomial.polyder(self.coefficients / self.scale, axis=n) for n in (0, 1))
+        return np.asarray(polynomial.polyval2d(*at, by_x)), np.asarray(
+            polynomial.polyval2d(*at, by_y)
+        )
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """What a frame is demodulated with.
+
+    Attributes
+    ----------
+    phase : Smooth
+        rad.
+    light : Smooth
+        Natural logarithm of the illumination; coordinates scaled as those of ``phase``.
+    """
+
+    phase: Smooth
+    light: Smooth
+
+    @classmethod
+    def straight(cls, k: Vector, frame: tuple[int, int]) -> Self:
+        """Straight fringes of a vector (kx, ky) and even light."""
+        return cls(Smooth.plane(k, frame), Smooth.plane((0.0, 0.0), frame))
+
+
+Accumulate = Callable[[int, Windows, Carrier], F64]
+"""(number of a frame, windows, carrier) -> sums (across, along, N_SUMS) of the whole frame."""
+
+
+@dataclass(frozen=True)
+class CrestPaths:
+    """Points on crests (k even) and valleys (k odd).
+
+    Attributes
+    ----------
+    x, y : (point,) float64
+        r_jk, pixel coordinates.
+    k : (point,) int64
+        Number of the path, consistent over the frame; grows along the fringe vector.
+    sigma : (point,) float64
+        1-sigma error of the phase there, rad, from the scatter of the samples.
+    slope : (point,) float64
+        Length of the local fringe vector, rad/px.
+    phi : (frame,) float64
+        Phase of each frame relative to the first, rad; NaN where a frame has no fringes.
+    vector : (float, float)
+        Fringe vector (kx, ky) at the frame's centre, rad/px.
+    frame : (int, int)
+        (y, x) size.
+    segment : float
+        Length of the windows along the fringes, px.
+    """
+
+    x: F64
+    y: F64
+    k: NDArray[np.int64]
+    sigma: F64
+    slope: F64
+    phi: F64
+    vector: Vector
+    frame: tuple[int, int]
+    segment: float
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    @property
+    def interfringe(self) -> float:
+        """At the frame's centre, px."""
+        return float(2 * np.pi / np.hypot(*self.vector))
+
+    @property
+    def sigma_px(self) -> F64:
+        """Errors of the points across their path, px."""
+        return self.sigma / self.slope
+
+    @property
+    def reference(self) -> Vector:
+        """(y, x) of the frame's centre, px."""
+        return (self.frame[0] - 1) / 2, (self.frame[1] - 1) / 2
+
+    def take(self, use: NDArray[Any]) -> "CrestPaths":
+        """The points that a mask or a list of numbers chooses."""
+        return CrestPaths(
+            self.x[use], self.y[use], self.k[use], self.sigma[use], self.slope[use],
+            self.phi, self.vector, self.frame, self.segment,
+        )  # fmt: skip
+
+    def outermost(self, paths: int) -> "CrestPaths":
+        """So many paths of each end only, the most informative ones (paper, figure 16)."""
+        every = np.unique(self.k)
+        ends = np.union1d(every[:paths], every[-paths:])
+        return self.take(np.isin(self.k, ends))
+
+
+def seed_vector(patch: NDArray[Any], good: NDArray[np.bool_], nominal: Vector) -> Vector:
+    """Fringe vector (kx, ky), rad/px, of a patch (y, x) of a frame; its sign is the nominal one's.
+
+    Raises
+    ------
+    InputError
+        If the patch has no good samples or holds no fringes.
+    """
+    if good.sum() < MIN_POINTS**2:
+        raise InputError("no fringes found: too few good samples at the middle of the frame")
+    level = float(patch[good].mean())
+    if not level > 0:
+        raise InputError("no fringes found: the frame is dark")
+    maps = np.where(good, patch, level).astype(np.float64)[None] / level - 1
+    k = find_fringe_vector(maps, good, nominal)
+    if np.hypot(k[0] - nominal[0], k[1] - nominal[1]) > MAX_AWAY * np.hypot(*nominal):
+        found, expected = (2 * np.pi / np.hypot(*v) for v in (k, nominal))
+        raise InputError(
+            f"no fringes found near the nominal ones: the strongest period is {found:.1f} px, at "
+            f"{np.degrees(np.arctan2(k[1], k[0])):.0f} degrees from x, where baseline_mm gives "
+            f"{expected:.1f} px at {np.degrees(np.arctan2(nominal[1], nominal[0])):.0f} degrees"
+        )
+    return k
+
+
+def tile_sums(
+    signal: NDArray[Any],
+    good: NDArray[np.bool_],
+    start: tuple[int, int],
+    windows: Windows,
+    carrier: Carrier,
+) -> tuple[tuple[int, int], F64]:
+    """Sums of the windows that a tile touches.
+
+    Parameters
+    ----------
+    signal : (y, x) float
+        Electrons.
+    good : (y, x) bool
+        Samples to use.
+    start : (int, int)
+        (y, x) of the first pixel.
+
+    Returns
+    -------
+    first : (int, int)
+        Number across and along of the first window.
+    sums : (across, along, N_SUMS) float64
+    """
+    ny, nx = signal.shape
+    (i0, i1), (j0, j1) = windows.touched((start[0], start[0] + ny), (start[1], start[1] + nx))
+    sums = np.zeros((i1 - i0, j1 - j0, N_SUMS))
+    phase, light = carrier.phase, carrier.light
+    window_sums(
+        signal, good, start, windows.layout, (i0, j0), phase.coefficients, light.coefficients,
+        np.array([phase.centre[1], phase.centre[0], phase.scale]), sums,
+    )  # fmt: skip
+    return (i0, j0), sums
+
+
+@dataclass(frozen=True)
+class ArrayFrames:
+    """Frames in memory, as an `Accumulate`.
+
+    Attributes
+    ----------
+    frames : (t, y, x) float
+        Electrons; not finite: no sample.
+    good : (y, x) bool
+    """
+
+    frames: NDArray[Any]
+    good: NDArray[np.bool_]
+
+    def __call__(self, frame: int, windows: Windows, carrier: Carrier) -> F64:
+        """Sums of a frame."""
+        sums = np.zeros((*windows.shape, N_SUMS))
+        signal = self.frames[frame]
+        for y in range(0, signal.shape[0], 512):
+            band = signal[y : y + 512]
+            good = self.good[y : y + 512] & np.isfinite(band)
+            (i, j), part = tile_sums(band, good, (y, 0), windows, carrier)
+            sums[i : i + part.shape[0], j : j + part.shape[1]] += part
+        return sums
+
+
+def crests_of_frames(
+    frames: NDArray[Any],
+    nominal: Vector,
+    good: NDArray[np.bool_] | None = None,
+    segment: int | None = None,
+) -> CrestPaths:
+    """Crests and valleys of one frame, or of several of the same fringes.
+
+    Parameters
+    ----------
+    frames : (y, x) or (t, y, x) float
+        Electrons; each frame may have its own phase.
+    nominal : (float, float)
+        Nominal fringe vector (kx, ky), rad/px.
+    good : (y, x) bool, optional
+        Pixels to use; all by default.
+    segment : int, optional
+        Pixels along the fringes that share a point.
+
+    Raises
+    ------
+    InputError
+        If the frames hold no fringes, or too few.
+    """
+    frames = frames if frames.ndim == 3 else frames[None]
+    shape = (frames.shape[1], frames.shape[2])
+    good = np.ones(shape, bool) if good is None else good
+    y, x = (slice(max(0, (n - SEED_PIXELS) // 2), (n + SEED_PIXELS) // 2) for n in shape)
+    k = seed_vector(frames[0, y, x], good[y, x] & np.isfinite(frames[0, y, x]), nominal)
+    return find_crests(ArrayFrames(frames, good), len(frames), shape, k, segment)
+
+
+def find_crests(
+    accumulate: Accumulate,
+    n_frames: int,
+    frame: tuple[int, int],
+    k: Vector,
+    segment: int | None = None,
+) -> CrestPaths:
+    """Crests and valleys of frames that need not be in memory.
+
+    Parameters
+    ----------
+    accumulate : callable
+        Makes the sums of a frame; called once for each frame, and twice more for the first.
+    n_frames : int
+    frame : (int, int)
+        (y, x) size.
+    k : (float, float)
+        Fringe vector (kx, ky) near the frame's centre, rad/px.
+    segment : int, optional
+        Pixels along the fringes that share a point; by default an eighth of the frame, 8 to 128.
+
+    Raises
+    ------
+    InputError
+        If there are too few fringes, or too few windows show them.
+    """
+    carrier, windows = Carrier.straight(k, frame), Windows.lay(frame, k, segment)
+    for _ in range(SETTLING):
+        phase, sigma, light = _window_phases(accumulate(0, windows, carrier), windows)
+        carrier = Carrier(
+            _follow(windows, phase, sigma, carrier.phase),
+            _brightened(windows, light, sigma, carrier.light),
+        )
+        cy, cx = np.array(carrier.phase.centre)
+        kx, ky = (float(v) for v in carrier.phase.gradient(cy, cx))
+        windows = Windows.lay(frame, (kx, ky), segment)
+
+    phi = np.full(n_frames, np.nan)
+    total, weight = np.zeros(windows.shape), np.zeros(windows.shape)
+    for n in range(n_frames):
+        phase, sigma, _ = _window_phases(accumulate(n, windows, carrier), windows)
+        precision = np.where(np.isfinite(sigma), 1 / sigma**2, 0.0)
+        if not precision.any():
+            continue
+        phi[n] = np.angle((precision * np.exp(1j * phase)).sum())
+        away = _wrapped(phase - phi[n])
+        # A whole radian from the carrier is no fringe that the polynomial could follow.
+        precision[np.abs(away) > 1] = 0
+        total += precision * away
+        weight += precision
+    use = weight > 0
+    if use.sum() < MIN_POINTS:
+        raise InputError(_too_few(int(use.sum()), use.size))
+    rest = np.where(use, total, 0.0) / np.where(use, weight, 1.0) + np.nan_to_num(phi[0])
+    return _points(windows, carrier.phase, rest, weight, phi - np.nan_to_num(phi[0]), (kx, ky))
+
+
+def _too_few(windows: int, of: int) -> str:
+    return (
+        f"no fringes found in enough windows: {windows} of {of} show them, at least {MIN_POINTS} "
+        "are needed; give a shorter --segment, or more --frames"
+    )
+
+
+def _wrapped(phase: F64) -> F64:
+    return np.asarray(np.remainder(phase + np.pi, 2 * np.pi) - np.pi)
+
+
+def _window_phases(sums: F64, windows: Windows) -> tuple[F64, F64, F64]:
+    """Phases relative to the carrier, errors (infinite where not usable), light (across, along)."""
+    flat = sums.reshape(-1, N_SUMS)
+    parts = [
+        solve_windows(flat[n : n + _SOLVED_AT_ONCE]) for n in range(0, len(flat), _SOLVED_AT_ONCE)
+    ]
+    phase, sigma, light = (
+        np.concatenate(part).reshape(windows.shape) for part in zip(*parts, strict=True)
+    )
+    y, x = windows.centres
+    inside = (y > -0.5) & (y < windows.frame[0] - 0.5) & (x > -0.5) & (x < windows.frame[1] - 0.5)
+    enough = sums[..., -1] >= MIN_COVERAGE * windows.size[0] * windows.size[1]
+    return phase, np.where(inside & enough & (sigma < MAX_SIGMA), sigma, np.inf), light
+
+
+def _design(y: F64, x: F64, degree: int) -> tuple[F64, list[tuple[int, int]]]:
+    powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+    return np.stack([y**i * x**j for i, j in powers], axis=1), powers
+
+
+def _highest_degree(windows: Windows, number: int) -> int:
+    """Of a polynomial that so many windows determine."""
+    degree = min(MAX_DEGREE, max(1, min(windows.shape) - 1))
+    while degree > 1 and 0.75 * (degree + 1) * (degree + 2) > number:
+        degree -= 1
+    return degree
+
+
+def _plus(before: Smooth, powers: list[tuple[int, int]], fit: NDArray[Any]) -> Smooth:
+    """The polynomial with terms added to it."""
+    size = max(max(powers)[0] + 1, len(before.coefficients))
+    coefficients = np.zeros((size, size))
+    coefficients[: len(before.coefficients), : len(before.coefficients)] = before.coefficients
+    for (i, j), c in zip(powers, fit, strict=True):
+        coefficients[i, j] += c
+    return Smooth(coefficients, before.centre, before.scale)
+
+
+def _brightened(windows: Windows, light: F64, sigma: F64, before: Smooth) -> Smooth:
+    """Logarithm of the illumination: what it was times the light of the windows with fringes."""
+    use = np.isfinite(sigma) & (light > 0)
+    y, x = before.scaled(*(c[use] for c in windows.centres))
+    basis, powers = _design(y, x, _highest_degree(windows, len(y)))
+    fit = np.linalg.lstsq(basis, np.log(light[use]), rcond=1e-12)[0]
+    return _plus(before, powers, fit)
+
+
+def _follow(windows: Windows, phase: F64, sigma: F64, before: Smooth) -> Smooth:
+    """Polynomial through the phases of the windows, numbered outwards from the middle.
+
+    Each time the known region grows by a third, the polynomial through it tells the turn of
+    the phases beyond: gaps are crossed, and single bad windows do no harm.
+    """
+    use = np.isfinite(sigma)
+    if use.sum() < MIN_POINTS:
+        raise InputError(_too_few(int(use.sum()), use.size))
+    cy, cx = (c[use] for c in windows.centres)
+    y, x = before.scaled(cy, cx)
+    measured, precision = phase[use], 1 / sigma[use]
+    distance = np.hypot(y, x)
+    highest = _highest_degree(windows, len(measured))
+    reach = float(np.sort(distance)[MIN_POINTS - 1])
+    nearest = np.argsort(distance)[:4]
+    known = np.full(len(measured), float(np.angle(np.exp(1j * measured[nearest]).sum())))
+    while True:
+        near = distance <= reach
+        number = int(near.sum())
+        degree = min(highest, 1 if number < 40 else 2 if number < 150 else 3)
+        if near.all():
+            degree = highest
+        basis, powers = _design(y, x, degree)
+        for _ in range(3):
+            value = known + _wrapped(measured - known)
+            off = np.abs(_wrapped(measured - known))
+            kept = near & (off <= max(1.0, 6 * float(np.median(off[near]))))
+            scaled = basis[kept] * precision[kept, None]
+            fit = np.linalg.lstsq(scaled, value[kept] * precision[kept], rcond=1e-12)[0]
+            known = basis @ fit
+        if near.all():
+            break
+        reach *= 1.33
+    return _plus(before, powers, fit)
+
+
+def _points(
+    windows: Windows, carrier: Smooth, rest: F64, weight: F64, phi: F64, vector: Vector
+) -> CrestPaths:
+    """Where the phase, carrier plus ``rest`` (constant in a window), crosses k pi."""
+    use = weight > 0
+    y, x = windows.centres
+    here = carrier.on(y, x) + rest
+    # A column of windows follows one path as long as that path runs through its windows.
+    column = np.array([np.median(p[u]) if u.any() else 0.0 for p, u in zip(here, use, strict=True)])
+    k = np.broadcast_to(np.rint(column / np.pi)[:, None], here.shape)
+    k = np.where(np.abs(here - k * np.pi) < np.pi * FRINGES_A_WINDOW / 2, k, np.rint(here / np.pi))
+    y, x, rest, k = y[use], x[use], rest[use], k[use]
+    for _ in range(4):
+        kx, ky = carrier.gradient(y, x)
+        step = (k * np.pi - carrier.on(y, x) - rest) / (kx**2 + ky**2)
+        y, x = y + step * ky, x + step * kx
+    kx, ky = carrier.gradient(y, x)
+    return CrestPaths(
+        x, y, k.astype(np.int64), 1 / np.sqrt(weight[use]), np.hypot(kx, ky),
+        phi, vector, windows.frame, windows.size[1],
+    )  # fmt: skip

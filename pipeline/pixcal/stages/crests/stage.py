@@ -1,0 +1,417 @@
+"""Crests and valleys: fibre positions found apart from the fit (paper, section 6, figures 16, 17).
+
+``crests.json`` holds ``schema``, ``pixcal`` and, for each fringe set under ``sets``: ``frames``
+(numbers of those read), ``points``, ``points_used`` (no outliers), ``paths``, ``interfringe_px``,
+``segment_px``, ``point_sigma_median_px``; ``geometry`` (of each parameter the value, its 1-sigma
+error, the nominal value and the prior's error, mm, from pixel (0, 0)); ``cost_rad2`` (equation 7),
+``chi2_reduced``, ``evaluations``; ``unique_minimum`` of the cost as far as the maps go; and
+``agreement`` with the geometry of ``RUN/fit`` (null, with ``agreement_note``, where it has none):
+of each parameter the difference in mm and in its sigma, and the phases of both over the window,
+less a piston, in px. That sigma adds both errors in square: too much where priors or frames count
+in both. ``warnings`` are sentences. ``crests.zarr/<set name>`` holds the points and the maps.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal import __version__
+from pixcal.engine.plan import make_plan
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.kernels.demodulation import N_SUMS
+from pixcal.kernels.optics import PARAMETERS, Geometry, phase, phase_jacobian
+from pixcal.model.acquisition import Acquisition
+from pixcal.model.config import result_options
+from pixcal.model.errors import DamagedError, InputError
+from pixcal.model.options import Crests
+from pixcal.report.crest_figures import CrestView, Extract, crest_figure, outermost
+from pixcal.report.drawing import png
+from pixcal.stages.crests.crest_fit import (
+    CostMap,
+    CrestFit,
+    Prior,
+    cost_map,
+    falls_then_rises,
+    fit_crests,
+    valley,
+)
+from pixcal.stages.crests.crests import (
+    SEED_PIXELS,
+    Carrier,
+    CrestPaths,
+    Windows,
+    find_crests,
+    seed_vector,
+    tile_sums,
+)
+from pixcal.stages.fit.sweep import load_run, nominal_vector
+from pixcal.stages.reduced_set import ReducedSet
+from pixcal.storage.artefact import MANIFEST, Build, Manifest, read_json, write_json
+from pixcal.storage.cube import create_group, write_array
+from pixcal.storage.formats import STAGES
+from pixcal.storage.stage import copy_products, make, require, working
+
+STAGE = STAGES["crests"]
+SCHEMA = "pixcal/crests/1"
+MAP_SIDE = 21
+"""Places along each side of a cost map; odd, so that the minimum is one of them."""
+MAP_REACH = 0.04
+"""How far the maps go from the minimum, as a share of distance and baseline."""
+NOTABLE_CHI2 = 3.0
+"""From here on the reduced chi-square of the points is pointed out."""
+FIGURE_BYTES = 128 << 20
+"""Matplotlib and one figure."""
+
+F64 = NDArray[np.float64]
+F32 = NDArray[np.float32]
+Range = tuple[int, int]
+
+
+Config = Crests
+
+
+def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
+    """Find the fibres from crests and valleys and hold them against the fit.
+
+    Reads ``RUN/reduce`` and, where it is there, ``RUN/fit``; makes ``RUN/crests`` and the products
+    ``crests.json`` and ``crests-<set>.png``.
+
+    Raises
+    ------
+    InputError
+        If reduce has not been run, or a set has no fringes or too few; the set is named.
+    """
+    acquisition = load_run(run_dir)
+    if not acquisition.frames.fringes:
+        raise InputError(
+            f"{run_dir}: the acquisition lists no fringes; crests need some, in frames.fringes"
+        )
+    with working(run_dir, "reduce") as inputs:
+        facts: dict[str, Any] = {}
+        if (run_dir / "fit" / MANIFEST).exists():
+            inputs["fit"] = require(run_dir, "fit").key
+            facts = read_json(run_dir / "fit" / "fit.json")["sets"]
+
+        def body(made: Build) -> None:
+            create_group(made.folder / "crests.zarr")
+            sets = {
+                s.name: _measure(run_dir, made, acquisition, s.name, facts, config, runtime)
+                for s in acquisition.frames.fringes
+            }
+            whole = {"schema": SCHEMA, "pixcal": __version__, "sets": sets}
+            write_json(made.folder / "crests.json", whole)
+
+        publish = partial(copy_products, run_dir, STAGE, "crests*.*")
+        return make(run_dir, STAGE, result_options(config), inputs, body, publish=publish)
+
+
+def _measure(
+    run_dir: Path,
+    made: Build,
+    acquisition: Acquisition,
+    name: str,
+    facts: Mapping[str, Any],
+    config: Config,
+    runtime: Runtime,
+) -> dict[str, Any]:
+    """One fringe set: its part of ``crests.json``; writes its arrays and figure."""
+    source = ReducedSet(run_dir / "reduce" / "reduced.zarr" / name)
+    count = min(config.frames, source.n_frames)
+    frames = np.unique(np.linspace(0, source.n_frames - 1, count).astype(int)).tolist()
+    nominal = _nominal(acquisition, name, source)
+    try:
+        paths = _extract(source, frames, nominal_vector(acquisition, name), name, config, runtime)
+        fit = fit_crests(paths, nominal, Prior.of_bench(nominal))
+    except DamagedError:
+        raise
+    except InputError as error:
+        raise InputError(f"{run_dir}: fringe set {name!r}: {error}") from error
+    maps = _cost_maps(paths, fit)
+    _write_arrays(made.folder / "crests.zarr" / name, paths, fit, maps)
+    other, note = _fitted_geometry(facts.get(name), nominal)
+    view = _view(name, source, frames[0], paths, fit, maps)
+    (made.folder / f"crests-{name}.png").write_bytes(png(crest_figure(view)))
+    return {
+        "frames": [n for n, phi in zip(frames, paths.phi, strict=True) if np.isfinite(phi)],
+        "points": len(paths),
+        "points_used": int(fit.used.sum()),
+        "paths": len(np.unique(paths.k)),
+        "interfringe_px": paths.interfringe,
+        "segment_px": paths.segment,
+        "point_sigma_median_px": float(np.median(paths.sigma_px)),
+        "geometry": _geometry_facts(fit),
+        "cost_rad2": fit.cost,
+        "chi2_reduced": fit.chi2_reduced,
+        "evaluations": fit.evaluations,
+        "unique_minimum": all(
+            falls_then_rises(cost)
+            for cost in (maps.baseline.cost, maps.ratio.cost, maps.valley_cost)
+        ),
+        "warnings": _warnings(fit),
+        "agreement": None if other is None else _agreement(paths, fit, *other),
+        "agreement_note": note,
+    }
+
+
+def _nominal(acquisition: Acquisition, name: str, source: ReducedSet) -> Geometry:
+    """The bench's nominal geometry: the fibres' centre before the middle of the window."""
+    (baseline,) = (s.baseline_mm for s in acquisition.frames.fringes if s.name == name)
+    pitch = acquisition.detector.pitch_um * 1e-3
+    ny, nx = source.shape
+    return Geometry(
+        acquisition.fibres.wavelength_nm * 1e-6, pitch, (nx - 1) / 2 * pitch, (ny - 1) / 2 * pitch,
+        acquisition.fibres.distance_mm, *baseline,
+    )  # fmt: skip
+
+
+def _extract(
+    source: ReducedSet,
+    frames: list[int],
+    nominal: tuple[float, float],
+    name: str,
+    config: Config,
+    runtime: Runtime,
+) -> CrestPaths:
+    y, x = ((max(0, (n - SEED_PIXELS) // 2), min(n, (n + SEED_PIXELS) // 2)) for n in source.shape)
+    patch, good = read_patch(source, frames[0], y, x)
+    k = seed_vector(patch, good, nominal)
+    number = int(np.prod(Windows.lay(source.shape, k, config.segment).shape))
+    chunk = int(np.prod(source.signal.chunks)) * source.signal.dtype.itemsize
+    pixels = int(np.prod(source.signal.chunks[1:]))
+    # Codes, packed and not, and a tile's maps; the sums, those on their way, and their solution.
+    plan = make_plan(
+        f"the crests of {name}",
+        3 * chunk + 40 * pixels,
+        4 * 8 * N_SUMS * number + FIGURE_BYTES,
+        runtime,
+    )
+    reader = _SetFrames(source, tuple(frames), runtime.with_workers(plan.workers), name)
+    paths = find_crests(reader, len(frames), source.shape, k, config.segment)
+    return paths if config.paths is None else paths.outermost(config.paths)
+
+
+def read_patch(source: ReducedSet, frame: int, y: Range, x: Range) -> tuple[F32, NDArray[np.bool_]]:
+    """Electrons (y, x) of a part of one frame, and its good samples."""
+    values = np.zeros((y[1] - y[0], x[1] - x[0]), np.float32)
+    good = np.zeros(values.shape, bool)
+    for at in source.tiles():
+        (ty0, ty1), (tx0, tx1) = source.ranges(at)
+        y0, y1, x0, x1 = max(y[0], ty0), min(y[1], ty1), max(x[0], tx0), min(x[1], tx1)
+        if y0 < y1 and x0 < x1:
+            part = (slice(y0 - ty0, y1 - ty0), slice(x0 - tx0, x1 - tx0))
+            to = (slice(y0 - y[0], y1 - y[0]), slice(x0 - x[0], x1 - x[0]))
+            tile, fine = _tile(source, at, frame)
+            values[to], good[to] = tile[part], fine[part]
+    return values, good
+
+
+def _tile(source: ReducedSet, at: tuple[int, int], frame: int) -> tuple[F32, NDArray[np.bool_]]:
+    """Electrons and good samples of a tile of one frame."""
+    coding = source.coding
+    codes = source.codes(at, frame // source.block)[frame % source.block]
+    good = (source.mask(at) == 0) & (codes != coding.fill)
+    return codes.astype(np.float32) * np.float32(coding.scale) + np.float32(coding.offset), good
+
+
+@dataclass(frozen=True)
+class _SetFrames:
+    """Frames of a reduced set, as `pixcal.stages.crests.crests.Accumulate`."""
+
+    source: ReducedSet
+    frames: tuple[int, ...]
+    runtime: Runtime
+    name: str
+
+    def __call__(self, frame: int, windows: Windows, carrier: Carrier) -> F64:
+        task = partial(_row_task, self.source, self.frames[frame], windows, carrier)
+        label = f"crests {self.name}"
+        sums = np.zeros((*windows.shape, N_SUMS))
+        flat = sums.reshape(-1, N_SUMS)
+        # In the order of the rows, whoever was first: the same sums to the last bit.
+        rows = range(self.source.grid[0])
+        for index, part in run_tasks(task, rows, self.runtime, label=label):
+            flat[index] += part
+        return sums
+
+
+def _row_task(
+    source: ReducedSet, frame: int, windows: Windows, carrier: Carrier, row: int
+) -> tuple[NDArray[np.int64], F64]:
+    """Numbers and sums of the windows that a row of tiles touches."""
+    numbers, parts = [], []
+    for column in range(source.grid[1]):
+        at = (row, column)
+        signal, good = _tile(source, at, frame)
+        y, x = source.ranges(at)
+        (i, j), sums = tile_sums(signal, good, (y[0], x[0]), windows, carrier)
+        there = np.nonzero(sums[..., -1])
+        numbers.append(np.ravel_multi_index((there[0] + i, there[1] + j), windows.shape))
+        parts.append(sums[there])
+    index, place = np.unique(np.concatenate(numbers), return_inverse=True)
+    merged = np.zeros((len(index), N_SUMS))
+    np.add.at(merged, place, np.concatenate(parts))
+    return index, merged
+
+
+@dataclass(frozen=True)
+class _Maps:
+    """Figure 17: (D, B) with the others held, (D, B/D) with the others refitted, and its valley."""
+
+    baseline: CostMap
+    ratio: CostMap
+    valley_ratio: F64
+    valley_cost: F64
+
+
+def _cost_maps(paths: CrestPaths, fit: CrestFit) -> _Maps:
+    best = fit.geometry
+    length = float(np.hypot(best.baseline_x, best.baseline_y))
+    steps = np.linspace(-1, 1, MAP_SIDE)
+    distance = best.distance * (1 + MAP_REACH * steps)
+    ratio, cost = valley(paths, fit, distance)
+    middle = length / best.distance
+    # As wide as the valley wanders, and wide enough to see its walls.
+    reach = max(2 * float(np.max(np.abs(ratio - middle))), 1e-5 * middle)
+    lengths, ratios = length * (1 + MAP_REACH * steps), middle + reach * steps
+    return _Maps(
+        cost_map(paths, fit, distance, lengths, ratio=False, refit=False),
+        cost_map(paths, fit, distance, ratios, ratio=True, refit=True),
+        ratio,
+        cost,
+    )
+
+
+def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit, maps: _Maps) -> None:
+    create_group(folder)
+    points: dict[str, tuple[NDArray[Any], str]] = {
+        "x": (paths.x, "pixel"), "y": (paths.y, "pixel"), "k": (paths.k, "1"),
+        "sigma": (paths.sigma, "rad"), "residual": (fit.residual, "rad"),
+        "used": (fit.used.astype(np.uint8), "1"),
+    }  # fmt: skip
+    for array, (data, units) in points.items():
+        write_array(folder / array, data, dims=("point",), attrs={"units": units})
+    for axis, found, units in (("baseline", maps.baseline, "mm"), ("ratio", maps.ratio, "1")):
+        note = "others refitted" if found.refitted else "phase refitted, others held"
+        attrs = {"units": "1", "comment": note}
+        write_array(folder / f"cost_{axis}", found.cost, dims=("distance", axis), attrs=attrs)
+        write_array(folder / axis, found.second, dims=(axis,), attrs={"units": units})
+    distance = maps.baseline.distance
+    write_array(folder / "distance", distance, dims=("distance",), attrs={"units": "mm"})
+    write_array(folder / "valley_ratio", maps.valley_ratio, dims=("distance",))
+    write_array(folder / "valley_cost", maps.valley_cost, dims=("distance",))
+
+
+def _from_prior(fit: CrestFit) -> NDArray[np.bool_]:
+    """Parameters of which the prior says more than the points."""
+    return np.asarray(fit.sigma > np.sqrt(0.5) * fit.prior.sigma)
+
+
+def _warnings(fit: CrestFit) -> list[str]:
+    found = []
+    if fit.chi2_reduced > NOTABLE_CHI2:
+        found.append(
+            f"points scatter {np.sqrt(fit.chi2_reduced):.1f} times more than their noise; errors "
+            "allow for it as if points were independent, which offsets of whole blocks are not"
+        )
+    lost = int((~fit.used).sum())
+    if lost > 0.05 * len(fit.used):
+        found.append(f"{lost} of {len(fit.used)} points are outliers and were left out")
+    return found
+
+
+def _geometry_facts(fit: CrestFit) -> dict[str, float]:
+    facts = {}
+    columns = (fit.geometry.vector(), fit.sigma, fit.prior.nominal.vector(), fit.prior.sigma)
+    for name, *values in zip(PARAMETERS, *columns, strict=True):
+        for suffix, value in zip(
+            ("_mm", "_sigma_mm", "_nominal_mm", "_prior_sigma_mm"), values, strict=True
+        ):
+            facts[name + suffix] = float(value)
+    return facts
+
+
+def _fitted_geometry(
+    facts: Mapping[str, Any] | None, nominal: Geometry
+) -> tuple[tuple[Geometry, F64] | None, str]:
+    """Geometry of the hyperbolic fit and its errors (mm), or why there is none."""
+    if facts is None:
+        return None, "RUN/fit is not there yet"
+    if facts["model"] != "hyperbolic":
+        return None, f"the fit took {facts['model']} fringes, which have no positions of the fibres"
+    found = facts["geometry"]
+    geometry = nominal.with_vector([found[f"{name}_mm"] for name in PARAMETERS])
+    return (geometry, np.array([found[f"{name}_sigma_mm"] for name in PARAMETERS])), ""
+
+
+def _agreement(paths: CrestPaths, fit: CrestFit, other: Geometry, sigma: F64) -> dict[str, Any]:
+    """Differences to another fit's geometry, parameter by parameter and in what they predict."""
+    difference = fit.geometry.vector() - other.vector()
+    both = np.hypot(fit.sigma, sigma)
+    ny, nx = paths.frame
+    y, x = (a.ravel() for a in np.mgrid[0 : ny - 1 : 33j, 0 : nx - 1 : 33j])
+    away = phase(x, y, fit.geometry) - phase(x, y, other)
+    modes = phase_jacobian(x, y, fit.geometry)
+    modes -= modes.mean(axis=0)
+    expected = np.einsum("ni,ij,nj->n", modes, fit.covariance, modes)
+    px = paths.interfringe / (2 * np.pi)
+    return {
+        "parameters": {
+            name: {
+                "difference_mm": float(d),
+                "sigma_mm": float(s),
+                "difference_sigma": float(d / s),
+                "from_prior": bool(prior),
+            }
+            for name, d, s, prior in zip(
+                PARAMETERS, difference, both, _from_prior(fit), strict=True
+            )
+        },
+        "phase_rms_px": float(np.std(away) * px),
+        "phase_max_px": float(np.max(np.abs(away - away.mean())) * px),
+        "phase_sigma_px": float(np.sqrt(expected.mean()) * px),
+    }
+
+
+def _view(
+    name: str, source: ReducedSet, frame: int, paths: CrestPaths, fit: CrestFit, maps: _Maps
+) -> CrestView:
+    """What the figure shows."""
+    best = fit.geometry
+    first, last = outermost(paths.k)
+    foot = np.array([best.centre_x, best.centre_y])
+    half = np.array([best.baseline_x, best.baseline_y]) / 2
+    return CrestView(
+        name=name, frame=paths.frame, direction=paths.vector,
+        x=paths.x, y=paths.y, k=paths.k, used=fit.used,
+        sigma_px=paths.sigma_px * np.sqrt(fit.spread), residual_px=fit.residual / paths.slope,
+        fibres=((foot - half) / best.pitch, (foot + half) / best.pitch),
+        extracts=tuple(_extract_at(source, frame, paths, k) for k in (first[0], last[-1])),
+        distance=maps.baseline.distance,
+        baseline=maps.baseline.second,
+        ratio=maps.ratio.second,
+        cost_baseline=maps.baseline.cost,
+        cost_ratio=maps.ratio.cost,
+        valley_ratio=maps.valley_ratio, valley_cost=maps.valley_cost,
+        best=(best.distance, float(np.hypot(best.baseline_x, best.baseline_y))),
+        distance_sigma=float(fit.sigma[2]),
+        distance_from_prior=bool(_from_prior(fit)[2]),
+    )  # fmt: skip
+
+
+def _extract_at(source: ReducedSet, frame: int, paths: CrestPaths, k: int) -> Extract:
+    """A few fringes of the first frame about the middle of a path."""
+    on = np.flatnonzero(paths.k == k)
+    ry, rx = paths.reference
+    near = on[np.argmin((paths.x[on] - rx) ** 2 + (paths.y[on] - ry) ** 2)]
+    side = int(np.clip(max(8 * paths.interfringe, 1.7 * paths.segment), 32, 320))
+    ranges = []
+    for at, n in ((paths.y[near], source.shape[0]), (paths.x[near], source.shape[1])):
+        first = int(np.clip(round(at) - side // 2, 0, max(0, n - side)))
+        ranges.append((first, min(n, first + side)))
+    values, good = read_patch(source, frame, ranges[0], ranges[1])
+    return Extract(np.where(good, values, np.nan), (ranges[0][0], ranges[1][0]))
