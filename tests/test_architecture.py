@@ -121,7 +121,8 @@ def test_a_library_stays_in_its_folder(module: str) -> None:
 EFFECTS = {file.stem for file in (PACKAGES["pixcal"] / "effects").glob("[!_]*.py")}
 NAMED = {
     "pixcal.stages.blind.strengths": EFFECTS,  # What the examination asks of each.
-    "pixcal.stages.budget": {"quantisation", "flat_error"},  # Terms of a budget, as the next ones.
+    # Terms of a budget, as the next ones.
+    "pixcal.stages.budget.stage": {"quantisation", "flat_error"},
     "pixcal_cli.budget": {"flat_error"},
     "pixcal.stages.reduce.fringe_sets": {"quantisation"},
     "pixcal.stages.reduce.stage": {"quantisation"},
