@@ -18,6 +18,7 @@ from pixcal.model.config import to_plain
 from pixcal.simulation.effect import Estimate
 from pixcal.simulation.replica import Replica
 from pixcal.stages import diagnose, fit, ingest, reduce, simulate
+from pixcal.stages.diagnose.trial import estimate
 from pixcal.stages.evidence import load_evidence
 
 ROOT = Path(__file__).parents[2]
@@ -105,6 +106,18 @@ def test_pairs_of_independent_samples_have_the_variance_that_is_said() -> None:
     assert np.abs(z.mean(axis=0)).max() < 5 / np.sqrt(300)
     np.testing.assert_allclose((z**2).mean(axis=0), 1, atol=0.5)
     assert (z**2).mean() == pytest.approx(1, abs=0.02)
+
+
+def test_strengths_that_are_no_numbers_need_an_estimate_of_their_own(
+    tmp_path: Path, acquired: Callable[..., Evidence]
+) -> None:
+    file = tmp_path / "lines.py"
+    text = GLOW.read_text().replace(
+        "rate: float = quantity(200.0", "rate: tuple[float, ...] = quantity((1.0,)"
+    )
+    file.write_text(text.replace("self.rate *", "self.rate[0] *"))
+    reason = estimate(acquired(), effect_of_file(file))
+    assert reason == "none of its strengths is one number: give it an estimate"
 
 
 @pytest.mark.long

@@ -19,10 +19,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
-from scipy.stats import chi2
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.variance_components import log_chance_of_any, sigmas
+from pixcal.estimators.frame_series.variance_components import (
+    log_chance,
+    log_chance_of_any,
+    sigmas,
+)
 from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way, dot
 from pixcal.simulation.forward import ForwardModel
 
@@ -95,7 +98,7 @@ def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
     start = kind()
     names = tuple(n for n in kind.strengths if isinstance(getattr(start, n), float))
     if not names:
-        raise NotImplementedError(f"{kind.__name__} has no strength that is a number")
+        raise NotImplementedError("none of its strengths is one number: give it an estimate")
     changes = _changes(evidence)
     way = changes.way(start)
     fit = _Fit(changes, way, names)
@@ -179,7 +182,7 @@ class _Fit:
         if len(size) == 1:
             return size, error, float(right[0] / max(variance[0, 0], 1e-300) ** 0.5)
         square = float(right @ _inverse(variance) @ right)
-        return size, error, sigmas(float(chi2.logsf(square, len(size))))
+        return size, error, sigmas(log_chance(square / 2, (len(size) + 1) // 2))
 
     def _each_strength(self, model: ForwardModel) -> list[ForwardModel]:
         null = model.scaled(0.0)

@@ -262,8 +262,8 @@ def estimate(evidence: Evidence, kind: Signature) -> Estimate | str | None:
     """Parameters of an effect; None without evidence, a sentence where the estimate failed."""
     try:
         found = kind.estimate(evidence)
-    except NotImplementedError:
-        return "its file defines no estimate"
+    except NotImplementedError as error:
+        return str(error)
     except np.linalg.LinAlgError:
         return "cannot be estimated here: these frames do not determine its parameters"
     except (InputError, ValueError, ArithmeticError) as error:
