@@ -8,11 +8,12 @@ import pytest
 
 from pixcal.effects.bias_drift import BiasDrift
 from pixcal.effects.row_noise import RowNoise
+from pixcal.estimators.detector.noiseless_charge import noiseless_level
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.offset import FEWEST, fringe_offsets
 from pixcal.kernels.processes import brownian
 from pixcal.model.bench import Bench
-from pixcal.simulation.effect import Effect
+from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.simulation.exposure import frames_of
 from pixcal.simulation.recording import recordings
 from pixcal.simulation.track import Track
@@ -293,3 +294,27 @@ def test_tracks_are_replayed(make_effect_bench: Callable[..., Bench]) -> None:
         time = r.period_s * np.arange(r.count)
         wanted = np.interp(time, track.time_s, track.value) * (r.folder == "vertical")
         np.testing.assert_allclose(on - plain, wanted, atol=0.1)
+
+
+def test_the_level_of_an_offset_shows_in_the_shot_noise_it_lacks(
+    acquired: Callable[..., Evidence],
+) -> None:
+    evidence = acquired(None, {"bias_drift": {**RUN, "tracks": [
+        {"set": "vertical", "time_s": [0.0], "value": [900.0]},
+    ]}})  # fmt: skip
+    level, error = noiseless_level(evidence, evidence.fringes["vertical"])
+    none, _ = noiseless_level(evidence, evidence.fringes["horizontal"])
+    assert error < 200
+    assert abs(level - 900) < 4 * error
+    assert abs(none) < 4 * error
+
+
+def test_the_level_of_a_replayed_run_is_no_light() -> None:
+    drift = BiasDrift(**RUN, tracks=(Track("vertical", (0.0, 20.0), (100.0, 300.0)),))
+    theta, flat = np.full((3, 4, 5), 5000.0), np.full((4, 5), 0.8)
+    maps = FringeMaps(theta, (0.6, 0.0), (0, 0), flat, "vertical")
+    undone = drift.undo(maps)
+    assert undone is not None
+    np.testing.assert_allclose(undone.theta[0], 5000 - 200 / 0.8)
+    np.testing.assert_array_equal(undone.theta[1:], theta[1:])
+    assert drift.undo(replace(maps, name="horizontal")) is None

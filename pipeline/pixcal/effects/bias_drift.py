@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import idct
 
+from pixcal.estimators.detector.noiseless_charge import noiseless_level
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.light import OFFSETS, FrameLight, light_of
 from pixcal.estimators.frame_series.offset import (
@@ -30,7 +31,7 @@ from pixcal.kernels.processes import brownian
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.kernels.synthesis import Stream, generator
 from pixcal.model.config import quantity
-from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.shot import Shot
 from pixcal.simulation.track import Track, at
 
@@ -147,7 +148,17 @@ class BiasDrift(Effect):
         light = light_of(evidence)
         if light is None:
             return None
-        return replace(self.scaled(0.0), jitter_rms=self.jitter_rms, tracks=_tracks(light))
+        tracks = tuple(_with_level(track, evidence) for track in _tracks(light))
+        return replace(self.scaled(0.0), jitter_rms=self.jitter_rms, tracks=tracks)
+
+    def undo(self, maps: FringeMaps) -> FringeMaps | None:
+        """As in `Effect.undo`: the mean offset of a replayed run is no light."""
+        level = sum(float(np.mean(t.value)) for t in self.tracks if t.set == maps.name and t.value)
+        if not level:
+            return None
+        theta = maps.theta.copy()
+        theta[0] -= level / (1.0 if maps.flat is None else maps.flat)
+        return replace(maps, theta=theta)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
@@ -282,6 +293,14 @@ def _settling(
         error, width = width / np.sqrt(bend), width / 2
     time = float(np.exp(log_time))
     return (time, fit(time, MAX_STEPS), time * min(float(error), 3.0)), chance
+
+
+def _with_level(track: Track, evidence: Evidence) -> Track:
+    """The track about the level of the run's offset, where the shot noise that it lacks shows."""
+    level, error = noiseless_level(evidence, evidence.fringes[track.set])
+    if abs(level) < SIGNIFICANT * error:
+        return track
+    return replace(track, value=tuple(v + level for v in track.value))
 
 
 def _tracks(light: FrameLight) -> tuple[Track, ...]:

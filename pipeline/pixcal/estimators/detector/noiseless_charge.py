@@ -51,3 +51,31 @@ def missing_noise(
     inverse = np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-9, hermitian=True)
     covariance = inverse * np.outer(scale, scale)
     return float(covariance[2] @ right), float(np.sqrt(covariance[2, 2]))
+
+
+def noiseless_level(evidence: Evidence, fringes: FringeEvidence) -> tuple[float, float]:
+    """Constant part of the signal of a fringe set that has no shot noise: an offset.
+
+    Squared residuals are fitted with the expected variance, times a gain, less a constant. The read
+    noise is that of the bias frames.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    fringes : FringeEvidence
+        One of its sets.
+
+    Returns
+    -------
+    level, error : float
+        e-, before the flat.
+    """
+    flat = evidence.flat[fringes.good].astype(np.float32)
+    square = (fringes.residual[:, fringes.good] * flat) ** 2
+    variance = fringes.variance[:, fringes.good] * flat**2
+    weight = np.where(square < _CLIP * variance, 0.5 / variance**2, 0)
+    terms = [variance, -np.ones_like(variance)]
+    normal = np.array([[float(np.vdot(weight * a, b)) for b in terms] for a in terms])
+    right = np.array([float(np.vdot(weight * a, square)) for a in terms])
+    covariance = np.linalg.inv(normal)
+    return float(covariance[1] @ right), float(np.sqrt(covariance[1, 1]))
