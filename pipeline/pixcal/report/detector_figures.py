@@ -6,7 +6,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from pixcal.report.colours import BLUE, INK
-from pixcal.report.drawing import WIDE, finish, new_figure
+from pixcal.report.drawing import WIDE, axes_grid, finish
 
 
 def linearity(levels: Sequence[Mapping[str, Any]]) -> Figure:
@@ -19,8 +19,7 @@ def linearity(levels: Sequence[Mapping[str, Any]]) -> Figure:
     """
     used = [v for v in levels if v.get("deviation_percent") is not None]
     left_out = [v for v in levels if v.get("deviation_percent") is None]
-    figure = new_figure(WIDE, 3.2)
-    axes = figure.subplots()
+    figure, ((axes,),) = axes_grid((WIDE, 3.2), left=1.0)
     axes.axhline(0, color=INK, linewidth=1, ls="--")
     axes.plot(
         [v["level_e"] / 1e3 for v in used],

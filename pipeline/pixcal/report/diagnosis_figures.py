@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pixcal.report.colours import BAND, BLUE, GREY, INK, RED
 from pixcal.report.curve_places import axis_label, places
 from pixcal.report.diagnosis_words import DETECTOR, percent, unit
-from pixcal.report.drawing import WIDE, Unit, finish, new_figure, unit_for
+from pixcal.report.drawing import TITLE, WIDE, Unit, axes_grid, finish, unit_for
 
 F64 = NDArray[np.float64]
 
@@ -52,15 +52,19 @@ class Closed:
 
 def gap_figure(bars: Sequence[Bar], causes: Sequence[Closed]) -> Figure:
     """The gap by domain, before and after, and beside it what each cause closes."""
-    height = 1.5 + 0.5 * max(len(bars), len(causes))
-    figure = new_figure(WIDE, height)
+    size = WIDE, 1.5 + 0.5 * max(len(bars), len(causes))
+    margin = _room(_domain_names(bars))
     if not causes:
-        _bars(figure.subplots(), bars, with_after=False)
+        figure, ((axes,),) = axes_grid(size, left=margin, top=0.4)
+        _bars(axes, bars, with_after=False)
         return figure
-    left, right = figure.subplots(1, 2, width_ratios=[1.25, 1])
+    figure, ((left, right),) = axes_grid(
+        size, 1, 2, left=margin, bottom=0.95, top=0.4, beside=_room(_cause_names(causes)),
+        width_ratios=[1.25, 1],
+    )  # fmt: skip
     _bars(left, bars, with_after=True)
     _causes(right, causes)
-    figure.legend(loc="outside lower center", ncols=4, fontsize=9.5, frameon=False)
+    figure.legend(loc="lower center", ncols=4, fontsize=9.5, frameon=False)
     return figure
 
 
@@ -83,11 +87,11 @@ def _bars(axes: Axes, bars: Sequence[Bar], *, with_after: bool) -> None:
                 end = max(end, high)
                 axes.plot([100 * low, 100 * high], [y + shift] * 2, color=INK, linewidth=1.6)
             _note(axes, 100 * end, y + shift, percent(bar.after))
-    axes.set_yticks(at, [_plain(b.name, 24) for b in bars])
+    axes.set_yticks(at, _domain_names(bars))
     axes.set_ylim(len(bars) - 0.4, -0.6)
     axes.set_xlim(0, 118 * max([1e-9, *(max(b.before, b.after) for b in bars)]))
     axes.set_xlabel("share of the gap (%)")
-    axes.set_title("the gap by domain")
+    axes.set_title("the gap by domain", **TITLE)
     finish(axes)
     axes.grid(visible=False, axis="y")
 
@@ -109,15 +113,27 @@ def _causes(axes: Axes, causes: Sequence[Closed]) -> None:
             100 * cause.over_rest, y, "D", color=INK, markersize=7, fillstyle="none",
             label="reopened when removed" if first else None,
         )  # fmt: skip
-    names = ["\n".join(textwrap.wrap(_plain(c.name, 60), 22)[:3]) for c in causes]
-    axes.set_yticks(range(len(causes)), names)
+    axes.set_yticks(range(len(causes)), _cause_names(causes))
     axes.set_ylim(len(causes) - 0.4, -0.6)
     ends = [100 * v for c in causes for v in (*c.interval, c.over_rest, c.alone)]
     axes.set_xlim(min(-3.0, *ends) - 2, max(103.0, *ends) + 2)
     axes.set_xlabel("share of the gap (%)")
-    axes.set_title("what each cause closes")
+    axes.set_title("what each cause closes", **TITLE)
     finish(axes)
     axes.grid(visible=False, axis="y")
+
+
+def _domain_names(bars: Sequence[Bar]) -> list[str]:
+    return [_plain(b.name, 24) for b in bars]
+
+
+def _cause_names(causes: Sequence[Closed]) -> list[str]:
+    return ["\n".join(textwrap.wrap(_plain(c.name, 60), 22)[:3]) for c in causes]
+
+
+def _room(names: Sequence[str]) -> float:
+    """Inches that names beside an axis take."""
+    return 0.4 + 0.085 * max(len(line) for name in names for line in name.splitlines() or [""])
 
 
 # Curves
@@ -134,9 +150,11 @@ def curves_figure(curves: Sequence[Mapping[str, Any]], *, with_effects: bool = T
         False where no effect was found: then that curve is the nominal one.
     """
     turned = any(_is_named(c) and _turned(places(c)) for c in curves)
-    figure = new_figure(WIDE * (1 + len(curves)) / 4, 5.0 + 0.5 * turned)
-    axes: Any = figure.subplots(
-        2, len(curves), squeeze=False, sharex="col", height_ratios=[2.1, 1]
+    lines = max(_title(c).count("\n") + 1 for c in curves)
+    figure, axes = axes_grid(
+        (WIDE * (1 + len(curves)) / 4, 5.0 + 0.5 * turned), 2, len(curves), left=0.9, right=0.35,
+        bottom=1.3 if turned else 0.6, top=0.45 + 0.2 * lines, beside=0.9, between=0.2,
+        sharex="col", height_ratios=[2.1, 1],
     )  # fmt: skip
     for n, (top, below, curve) in enumerate(zip(axes[0], axes[1], curves, strict=True)):
         _panel(top, below, curve, with_effects)
@@ -145,7 +163,7 @@ def curves_figure(curves: Sequence[Mapping[str, Any]], *, with_effects: bool = T
     handles, labels = axes[0, 0].get_legend_handles_labels()
     shown = dict(sorted(zip(labels, handles, strict=True), key=lambda pair: ORDER.index(pair[0])))
     figure.legend(
-        shown.values(), shown, loc="outside upper center", ncols=3, fontsize=10, frameon=False
+        shown.values(), shown, loc="upper center", ncols=3, fontsize=10, frameon=False
     )  # fmt: skip
     return figure
 
@@ -171,12 +189,15 @@ def _panel(top: Axes, below: Axes, curve: Mapping[str, Any], with_effects: bool)
     _value_axis(top, curve, every * scale.factor, scale)
     _sigma_axis(below, [_numbers(curve[k]) for k in ("z", "z_after")])
     _place_axis(below, curve, x, named)
+    top.set_title(_title(curve), **TITLE)
+    top.tick_params(labelbottom=False)
+
+
+def _title(curve: Mapping[str, Any]) -> str:
     of = "" if curve["set"] == DETECTOR else f"set {curve['set']}"
     title = _plain(str(curve["title"]), 70)
     width = 36 if len(title) <= 36 else len(title) // 2 + 6
-    lines = [*textwrap.wrap(title, width)[:2], _plain(of, 30)]
-    top.set_title("\n".join(lines).strip(), fontsize=11)
-    top.tick_params(labelbottom=False)
+    return "\n".join([*textwrap.wrap(title, width)[:2], _plain(of, 30)]).strip()
 
 
 def _simulated(

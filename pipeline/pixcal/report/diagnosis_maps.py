@@ -13,7 +13,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from pixcal.report.colours import GREY, INK
-from pixcal.report.drawing import WIDE, new_figure
+from pixcal.report.drawing import TITLE, WIDE, axes_grid
 
 F64 = NDArray[np.float64]
 
@@ -112,8 +112,10 @@ def _of_cells(shape: tuple[int, int], curves: Sequence[Mapping[str, Any]]) -> li
 def where_figure(shape: tuple[int, int], maps: Sequence[Panel], *, with_after: bool) -> Figure:
     """Maps side by side, in the nominal simulation and, below, with the causes."""
     rows = 1 + with_after
-    figure = new_figure(WIDE * (1 + len(maps)) / 4, 0.9 + 3.0 * rows)
-    axes: Any = figure.subplots(rows, len(maps), squeeze=False, sharex=True, sharey=True)
+    figure, axes = axes_grid(
+        (WIDE * (1 + len(maps)) / 4, 0.9 + 3.0 * rows), rows, len(maps), left=0.95, top=0.6,
+        beside=0.3, between=0.25, sharex=True, sharey=True,
+    )  # fmt: skip
     largest = min(max(panel.largest for panel in maps), LARGEST)
     scale = Normalize(-largest, largest)
     for row, words in zip(axes, ("nominal simulation", "with the causes"), strict=False):
@@ -121,7 +123,7 @@ def where_figure(shape: tuple[int, int], maps: Sequence[Panel], *, with_after: b
             after = ax in axes[-1] and with_after
             _draw(ax, shape, panel, scale, after=after)
             if not after:
-                ax.set_title(panel.title.replace("$", r"\$"), fontsize=11)
+                ax.set_title(panel.title.replace("$", r"\$"), **TITLE)
             if number == 0:
                 ax.set_ylabel(f"{words}\nrow (px)")
     for ax in axes[-1]:

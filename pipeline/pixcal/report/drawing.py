@@ -24,6 +24,8 @@ from pixcal.report.summary import MapSummary, robust_spread
 WIDE = 10.4
 """Width of a figure that takes the whole page, inches."""
 DPI = 130
+TITLE: dict[str, Any] = {"fontsize": 11, "y": 1.0}
+"""Of titles at a fixed height: the labels around them need not be measured."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,48 @@ def new_figure(width: float, height: float) -> Figure:
 def bare_figure(width: float, height: float) -> Figure:
     """A figure whose axes are placed by `place`."""
     return Figure(figsize=(width, height), dpi=DPI)
+
+
+def axes_grid(
+    size: tuple[float, float],
+    rows: int = 1,
+    columns: int = 1,
+    *,
+    left: float = 0.85,
+    right: float = 0.2,
+    bottom: float = 0.6,
+    top: float = 0.2,
+    beside: float = 1.0,
+    between: float = 0.75,
+    **look: Any,
+) -> tuple[Figure, NDArray[Any]]:
+    """A figure and its grid of axes at fixed places: a computed layout takes half of the drawing.
+
+    Parameters
+    ----------
+    size : (float, float)
+        Width and height, inches.
+    rows, columns : int
+        Of the grid.
+    left, right, bottom, top, beside, between : float
+        Margins, and gaps of columns and of rows, inches; labels have to fit.
+    **look
+        For ``Figure.subplots``.
+
+    Returns
+    -------
+    Figure, ndarray of Axes (rows, columns)
+    """
+    width, height = size
+    figure = Figure(figsize=size, dpi=DPI)
+    # Gaps are shares of the mean width and height of the axes.
+    wide = (width - left - right - (columns - 1) * beside) / columns
+    high = (height - bottom - top - (rows - 1) * between) / rows
+    figure.subplots_adjust(
+        left / width, bottom / height, 1 - right / width, 1 - top / height,
+        beside / wide, between / high,
+    )  # fmt: skip
+    return figure, figure.subplots(rows, columns, squeeze=False, **look)
 
 
 def place(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
@@ -187,5 +231,6 @@ def png(figure: Figure) -> bytes:
     palette.putpalette(PALETTE)
     reduced = picture.quantize(palette=palette, dither=Image.Dither.NONE)
     out = io.BytesIO()
-    reduced.save(out, "PNG", optimize=True)
+    # Level 9 takes four times as long for 7 % fewer bytes.
+    reduced.save(out, "PNG", compress_level=7)
     return out.getvalue()

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pixcal.report.colours import BLUE, GREY, INK, RED
-from pixcal.report.drawing import WIDE, finish, new_figure
+from pixcal.report.drawing import WIDE, axes_grid, finish
 
 Curves = Mapping[str, Any]
 
@@ -28,8 +28,7 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
     shown = (level > 0) & (variance > 0)
     level, variance, error = level[shown], variance[shown], error[shown]
     line = level / curve["gain"] + curve["read_variance"]
-    figure = new_figure(WIDE, 3.9)
-    left, right = figure.subplots(1, 2, width_ratios=[1.1, 1])
+    figure, ((left, right),) = axes_grid((WIDE, 3.9), 1, 2, width_ratios=[1.1, 1])
     look = {"fmt": "o", "color": BLUE, "markersize": 3.5, "elinewidth": 1}
     left.errorbar(level, variance, error, **look, label="pairs of flats")
     at = np.geomspace(level.min(), level.max(), 200)
@@ -44,6 +43,7 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
     right.axhline(1, color=INK, linewidth=1.2)
     right.set(xlabel="level (ADU)", ylabel="variance over the line")
     right.margins(y=0.15)
+    right.locator_params(axis="x", nbins=6)
     for axes in (left, right):
         if saturation is not None:
             axes.axvline(saturation, color=RED, ls="--", linewidth=1, label="saturation")
@@ -63,8 +63,7 @@ def nonuniformity(curves: Curves, name: str) -> Figure:
     name : str
         ``DSNU`` or ``PRNU``.
     """
-    figure = new_figure(WIDE, 5.4)
-    grid = figure.subplots(2, 2, width_ratios=[1, 1.3])
+    figure, grid = axes_grid((WIDE, 5.4), 2, 2, beside=1.2, width_ratios=[1, 1.3])
     unit = str(curves["unit"]).replace("e-", "e⁻")
     for (left, right), along, across in zip(
         grid, ("rows", "columns"), ("row", "column"), strict=True

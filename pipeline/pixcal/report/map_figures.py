@@ -29,10 +29,12 @@ from pixcal.report.colours import (
 )
 from pixcal.report.contents import OffsetMap
 from pixcal.report.drawing import (
+    TITLE,
     WIDE,
     ColourScale,
     Unit,
     add_bar,
+    axes_grid,
     bare_figure,
     block_note,
     covered,
@@ -40,7 +42,6 @@ from pixcal.report.drawing import (
     finish,
     fit_box,
     limits,
-    new_figure,
     place,
     span_scale,
     symmetric_scale,
@@ -51,6 +52,8 @@ from pixcal.report.text import SYMBOLS, flag_name
 
 F64 = NDArray[np.float64]
 
+BESIDE_BAR = 1.95
+"""Room between a map and what is beside it, for a colour bar, its numbers and labels, inches."""
 MEANS_DRAWN = 800
 """Most means of a profile that are drawn one by one."""
 
@@ -159,8 +162,9 @@ def _nearby(values: F64) -> tuple[F64, F64, F64]:
 def errors_and_histogram(offset: OffsetMap) -> Figure:
     """The map of errors, and the histograms of offsets and of errors."""
     sigma = offset.sigma
-    figure = new_figure(WIDE, 4.5)
-    left, right = figure.subplots(1, 2, width_ratios=[1, 1.15])
+    figure, ((left, right),) = axes_grid(
+        (WIDE, 4.5), 1, 2, beside=BESIDE_BAR, width_ratios=[1, 1.15]
+    )
     unit = unit_for([sigma.median], "px")
     scale = span_scale(sigma.image * unit.factor)
     drawn = draw_map(left, sigma, scale, unit.factor)
@@ -213,8 +217,10 @@ def power(name: str, spectrum: Spectrum, vectors: Mapping[str, tuple[float, floa
     vectors : mapping
         Fringe vector (kx, ky), rad/px, of each set.
     """
-    figure = new_figure(WIDE, 4.9)
-    left, right = figure.subplots(1, 2, width_ratios=[1, 1.1])
+    top = 0.3 + 0.2 * max(len(vectors), 1)
+    figure, ((left, right),) = axes_grid(
+        (WIDE, 4.4 + top), 1, 2, top=top, beside=BESIDE_BAR, width_ratios=[1, 1.1]
+    )
     relative = spectrum.power / spectrum.white if spectrum.white > 0 else spectrum.power
     positive = relative[relative > 0]
     low, high = np.percentile(positive, [1, 99.9]) if len(positive) else (0.1, 10.0)
@@ -233,7 +239,7 @@ def power(name: str, spectrum: Spectrum, vectors: Mapping[str, tuple[float, floa
             fontsize=9, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False,
         )  # fmt: skip
     _power_lines(right, spectrum, vectors)
-    right.set_title(f"{SYMBOLS[name]}: means over rings and cuts", fontsize=11)
+    right.set_title(f"{SYMBOLS[name]}: means over rings and cuts", **TITLE)
     return figure
 
 
@@ -289,17 +295,18 @@ def map_row(panels: Sequence[tuple[str, str, MapSummary]], *, symmetric: bool = 
     ny, nx = panels[0][2].shape
     columns = min(2, len(panels))
     rows = -(-len(panels) // columns)
-    tall = float(np.clip(3.4 * ny / nx, 1.2, 4.4))
-    figure = new_figure(WIDE if columns == 2 else WIDE / 2 + 0.5, rows * (tall + 0.85))
-    # The layout does not count the labels of colour bars.
-    grid = figure.subplots(rows, columns, squeeze=False, gridspec_kw={"wspace": 0.12})
+    tall = float(np.clip(3.2 * ny / nx, 1.2, 4.4))
+    figure, grid = axes_grid(
+        (WIDE if columns == 2 else WIDE / 2 + 0.5, rows * (tall + 0.9)), rows, columns,
+        right=1.2, bottom=0.6, top=0.3, beside=BESIDE_BAR, between=0.9,
+    )  # fmt: skip
     for axes in grid.ravel()[len(panels) :]:
         axes.set_visible(False)
     for axes, (title, unit, summary) in zip(grid.ravel(), panels, strict=False):
         scale: ColourScale = (symmetric_scale if symmetric else span_scale)(summary.image)
         drawn = draw_map(axes, summary, scale)
         _square(axes, summary.shape)
-        axes.set_title(", ".join(filter(None, (title, block_note(summary)))), fontsize=11)
+        axes.set_title(", ".join(filter(None, (title, block_note(summary)))), **TITLE)
         axes.set(xlabel="x (px)", ylabel="y (px)")
         add_bar(figure, axes, drawn, unit, scale.beyond)
     return figure
@@ -315,27 +322,30 @@ def flags(panels: Sequence[tuple[str, FlagSummary]]) -> Figure:
     columns = min(3, max(2, len(panels)))
     rows = -(-len(panels) // columns)
     tall = float(np.clip(8.4 / columns * ny / nx, 1.4, 4.6))
-    figure = new_figure(WIDE, rows * (tall + 0.75) + 0.6)
-    grid = figure.subplots(rows, columns, squeeze=False)
+    whole = panels[0][1].block == 1
+    bottom, top = 1.0 if whole else 0.6, 0.15 + 0.2 * max(t.count("\n") + 1 for t, _ in panels)
+    height = rows * (tall + top) + (rows - 1) * 0.6 + bottom
+    figure, grid = axes_grid((WIDE, height), rows, columns,
+        right=0.2 if whole else 1.4, bottom=bottom, top=top, between=top + 0.6,
+    )  # fmt: skip
     for axes in grid.ravel()[len(panels) :]:
         axes.set_visible(False)
-    whole = panels[0][1].block == 1
-    top = 100 * max(float(s.share.max()) for _, s in panels)
+    most = 100 * max(float(s.share.max()) for _, s in panels)
     drawn = None
     for axes, (title, summary) in zip(grid.ravel(), panels, strict=False):
-        drawn = _draw_classes(axes, summary) if whole else _draw_share(axes, summary, top)
+        drawn = _draw_classes(axes, summary) if whole else _draw_share(axes, summary, most)
         axes.set(xlim=(-0.5, summary.shape[1] - 0.5), ylim=(-0.5, summary.shape[0] - 0.5))
         _square(axes, summary.shape)
-        axes.set_title(title, fontsize=11)
+        axes.set_title(title, **TITLE)
         axes.set(xlabel="x (px)", ylabel="y (px)")
     if whole:
         handles = [Patch(color=FLAGS[f.value], label=flag_name(f)) for f in PixelFlag]
         handles.append(Patch(color=SEVERAL, label="several"))
-        figure.legend(
-            handles=handles, loc="outside lower center", ncols=8, frameon=False, fontsize=9.5
-        )
+        figure.legend(handles=handles, loc="lower center", ncols=8, frameon=False, fontsize=9.5)
     elif drawn is not None:
-        bar = figure.colorbar(drawn, ax=grid, shrink=0.9)
+        bar = figure.colorbar(
+            drawn, cax=place(figure, WIDE - 1.1, bottom, 0.2, height - bottom - top)
+        )
         bar.set_label(f"masked (%)\nof {panels[0][1].block} × {panels[0][1].block} px")
     return figure
 

@@ -15,11 +15,11 @@ from pixcal.report.contents import FringeSet
 from pixcal.report.drawing import (
     WIDE,
     add_bar,
+    axes_grid,
     block_note,
     draw_map,
     finish,
     limits,
-    new_figure,
     span_scale,
     unit_for,
 )
@@ -48,10 +48,10 @@ def temporal(fringes: FringeSet) -> Figure:
         unit = unit_for(np.concatenate([series.dkx, series.dky]), "rad/px")
         rows.append((f"δkx ({unit.label})", series.dkx * unit.factor, None))
         rows.append((f"δky ({unit.label})", series.dky * unit.factor, None))
-    figure = new_figure(WIDE, 1.75 * len(rows) + 0.5)
-    grid = figure.subplots(
-        len(rows), 2, width_ratios=[4, 1], sharex="col", sharey="row", squeeze=False
-    )
+    figure, grid = axes_grid(
+        (WIDE, 1.75 * len(rows) + 0.5), len(rows), 2, left=0.95, beside=0.25, between=0.25,
+        width_ratios=[4, 1], sharex="col", sharey="row",
+    )  # fmt: skip
     for (left, right), (label, values, bounds) in zip(grid, rows, strict=True):
         low, high = bounds or limits([values], 0.0)
         left.plot(
@@ -97,8 +97,7 @@ def _dot(frames: int) -> float:
 
 def residuals(fringes: FringeSet) -> Figure:
     """Map of the reduced chi-square, and its histogram against what chance gives."""
-    figure = new_figure(WIDE, 4.4)
-    left, right = figure.subplots(1, 2, width_ratios=[1, 1.15])
+    figure, ((left, right),) = axes_grid((WIDE, 4.4), 1, 2, beside=1.95, width_ratios=[1, 1.15])
     summary = fringes.chi2
     scale = span_scale(summary.image)
     drawn = draw_map(left, summary, scale)
@@ -163,8 +162,9 @@ def allan(name: str, measured: dict[str, Any], facts: dict[str, Any] | None) -> 
     )  # fmt: skip
     unit = unit_for(adev, "px")
     bars = np.nan_to_num(np.abs(np.stack([adev - low, high - adev])))
-    figure = new_figure(WIDE, 6.2)
-    axes, below = figure.subplots(2, 1, sharex=True, height_ratios=[3, 1.1])
+    figure, ((axes,), (below,)) = axes_grid(
+        (WIDE, 6.2), 2, 1, top=0.65, between=0.2, sharex=True, height_ratios=[3, 1.1]
+    )
     look = {"fmt": "o", "color": BLUE, "elinewidth": 1.3, "capsize": 3, "markersize": 6}
     axes.errorbar(
         frames, adev * unit.factor, bars * unit.factor, zorder=3, **look,
