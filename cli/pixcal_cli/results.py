@@ -272,7 +272,7 @@ def show_report(run: Path) -> None:
 
 def show_advice(run: Path) -> None:
     """Print which map to use, what limits it, and what each cause does to it."""
-    from pixcal.stages.correct import HEADER, advice  # here: for a fast `pixcal --help`
+    from pixcal.stages.advice import HEADER, advice  # here: for a fast `pixcal --help`
 
     found = advice(run)
     if found is None:

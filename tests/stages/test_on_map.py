@@ -8,7 +8,7 @@ from pixcal.effects.ipc import Ipc
 from pixcal.effects.lag import Lag
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.simulation.effect import FringeMaps
-from pixcal.stages.correct.advice import size_of
+from pixcal.stages.advice import size_of
 from pixcal.stages.diagnose.nominal import FittedSet
 from pixcal.stages.diagnose.on_map import on_map
 

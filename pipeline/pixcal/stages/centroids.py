@@ -15,7 +15,7 @@ from pixcal.estimators.star_centroids.correction import (
     gaussian_star,
 )
 from pixcal.model.errors import InputError
-from pixcal.stages.correct.advice import maps_to_use
+from pixcal.stages.advice import maps_to_use
 from pixcal.storage.artefact import read_json
 from pixcal.storage.distortion import distortion, write_distortion
 from pixcal.storage.products import read_map

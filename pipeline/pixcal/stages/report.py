@@ -46,7 +46,7 @@ from pixcal.report.summary import (
     summarise_flags,
 )
 from pixcal.simulation.effect import Effect
-from pixcal.stages.correct import HEADER, advice
+from pixcal.stages.advice import HEADER, advice
 from pixcal.storage.artefact import MANIFEST, Build, Manifest, read_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.folder import INDEX

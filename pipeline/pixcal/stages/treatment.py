@@ -17,6 +17,8 @@ F64 = NDArray[np.float64]
 
 HYPERBOLIC = "hyperbolic"
 """The shape of fringes (`pixcal.estimators.fringe_fit.models`) beside straight ones."""
+SUFFIX = "_corrected"
+"""Of the names of the corrected products."""
 IN_CORRECTED = "in the corrected fit"
 CORRECTED = ("undone on maps", "undone on samples", IN_CORRECTED)
 """Treatments after which the corrected maps are free of an effect."""

@@ -1,6 +1,5 @@
 """``pixcal fit --with-diagnosis``: offset maps without the effects that a diagnosis found."""
 
-from pixcal.stages.correct.advice import HEADER, Advice, advice
 from pixcal.stages.correct.stage import Config, attempt, run
 
-__all__ = ["HEADER", "Advice", "Config", "advice", "attempt", "run"]
+__all__ = ["Config", "attempt", "run"]

@@ -34,15 +34,12 @@ from pixcal.stages.fit.sweep import Config as SweepConfig
 from pixcal.stages.fit.sweep import load_run, nominal_vector, sweep_set
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.stages.treatment import HYPERBOLIC, Treatments, treatments
+from pixcal.stages.treatment import HYPERBOLIC, SUFFIX, Treatments, treatments
 from pixcal.storage.artefact import Build, Manifest, lock, read_json, write_json
 from pixcal.storage.cube import create_group
 from pixcal.storage.formats import STAGES
 from pixcal.storage.products import Card, is_whole
 from pixcal.storage.stage import make, require
-
-SUFFIX = "_corrected"
-"""Of the names of the products."""
 
 Json = dict[str, Any]
 

@@ -8,8 +8,7 @@ from typing import Any
 
 from pixcal.effects import known_effects, parse_effects
 from pixcal.model.errors import InputError
-from pixcal.stages.correct.stage import SUFFIX
-from pixcal.stages.treatment import treatment_of
+from pixcal.stages.treatment import SUFFIX, treatment_of
 from pixcal.storage.artefact import MANIFEST, read_json
 from pixcal.storage.stage import require
 
