@@ -131,6 +131,18 @@ def test_its_share_is_found(acquired: Callable[..., Evidence], truth: Lag) -> No
     assert found.significance > 20
 
 
+@pytest.mark.parametrize("quiet", [0.0, 1.0])
+def test_whether_what_comes_out_has_noise_shows_in_the_residuals(
+    acquired: Callable[..., Evidence], quiet: float
+) -> None:
+    found = Lag.estimate(acquired(None, {"lag": {"share": 0.03, "spread": 0.0, "quiet": quiet}}))
+    assert found is not None
+    effect, error = found.effect, found.errors["quiet"]
+    assert isinstance(effect, Lag)
+    assert error < 0.25
+    assert abs(effect.quiet - quiet) < 4 * error
+
+
 def test_pixels_that_differ_tell_where_the_contrast_is_noisy(
     acquired: Callable[..., Evidence],
 ) -> None:

@@ -1,0 +1,60 @@
+"""What effects do to the gain that photon transfer gives, and the gain of the nominal bench."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from pixcal.effects.brighter_fatter import BrighterFatter
+from pixcal.effects.gain_error import GainError
+from pixcal.effects.ipc import Coupling, Ipc
+from pixcal.effects.lag import Lag
+from pixcal.model.bench import Bench
+from pixcal.simulation.effect import Effect
+from pixcal.simulation.recording import recordings
+from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
+
+SHARE = 0.02
+SIDES = tuple(Coupling(dy, dx, SHARE) for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)))
+KERNEL = (1 - 4 * SHARE) ** 2 + 4 * SHARE**2
+
+
+def change(bench: Bench, *effects: Effect) -> float:
+    return photon_transfer_change(bench, Lag(0.0), effects, recordings(bench))
+
+
+@pytest.mark.parametrize(
+    ("effect", "variance"),
+    [
+        (Ipc(SIDES), KERNEL),
+        (Lag(0.02, 0.0, 0.0), 1.0),
+        (Lag(0.02, 0.0, 0.0, quiet=1.0), 1 - 0.02),
+        (GainError(0.05), 1.0),
+    ],
+    ids=["crosstalk", "lag by single electrons", "lag without noise", "of the gain itself"],
+)
+def test_the_noise_of_flats_changes_as_the_kernel_says(
+    make_effect_bench: Callable[..., Bench], effect: Effect, variance: float
+) -> None:
+    bench = make_effect_bench({"detector.shape": [61, 67]})
+    assert change(bench, effect) == pytest.approx(variance, abs=4e-3)
+
+
+def test_brighter_fatter_takes_noise_in_proportion_to_the_level(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    bench = make_effect_bench({"detector.shape": [61, 67]})
+    weak, strong = (1 - change(bench, BrighterFatter(s)) for s in (2e-7, 4e-7))
+    assert weak > 0.005
+    assert strong == pytest.approx(2 * weak, rel=0.15)
+
+
+def test_a_gain_lies_between_what_was_declared_and_measured() -> None:
+    gain = MeasuredGain(np.ones((3, 5)), ((1.06, 0.01), (1.06, 0.01)))
+    rng = np.random.default_rng(5)
+    drawn = np.array([gain.drawn(rng)[0, 0] for _ in range(2000)])
+    # Two of three equally good values say 1.06.
+    assert drawn.mean() == pytest.approx(1.04, abs=1e-3)
+    assert drawn.std() == pytest.approx(0.01 / np.sqrt(3), rel=0.1)
+    corrected = np.array([gain.drawn(rng, 1 / 1.06)[0, 0] for _ in range(2000)])
+    assert corrected.mean() == pytest.approx(1.0, abs=1e-3)
