@@ -52,14 +52,14 @@ class Closed:
 
 def gap_figure(bars: Sequence[Bar], causes: Sequence[Closed]) -> Figure:
     """The gap by domain, before and after, and beside it what each cause closes."""
-    size = WIDE, 1.5 + 0.5 * max(len(bars), len(causes))
+    size = WIDE, 1.6 + 0.5 * max(len(bars), len(causes))
     margin = _room(_domain_names(bars))
     if not causes:
-        figure, ((axes,),) = axes_grid(size, left=margin, top=0.4)
+        figure, ((axes,),) = axes_grid(size, left=margin, top=0.35)
         _bars(axes, bars, with_after=False)
         return figure
     figure, ((left, right),) = axes_grid(
-        size, 1, 2, left=margin, bottom=0.95, top=0.4, beside=_room(_cause_names(causes)),
+        size, 1, 2, left=margin, bottom=0.85, top=0.35, beside=_room(_cause_names(causes)),
         width_ratios=[1.25, 1],
     )  # fmt: skip
     _bars(left, bars, with_after=True)
