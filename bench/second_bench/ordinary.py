@@ -19,6 +19,7 @@ from second_bench.model import (
 VARIATIONS = (
     "aim", "centred", "radii", "powers", "read_noise", "dust", "phases", "amplifiers",
     "bad_pixels", "gain", "period", "rotated", "ambient",
+    "declared_gain",
 )  # fmt: skip
 """What differs from bench to bench."""
 CHANCE = {
@@ -28,6 +29,7 @@ CHANCE = {
     "gain": 0.5,
     "rotated": 0.25,
     "ambient": 0.3,
+    "declared_gain": 0.3,
 }
 """With which probability, where that is not one."""
 PITCH_UM, WAVELENGTH_NM, DISTANCE_MM, PERIOD_S = 4.4, 632.8, 400.0, 0.14
@@ -117,6 +119,11 @@ def _vary_detector(bench: Bench, varied: set[str]) -> None:
         bench.notes["dust_specks"] = specks
     if "amplifiers" in varied:
         _amplifiers(bench, rng)
+    if "declared_gain" in varied:
+        # Flats tell better than the data sheet.
+        wrong = float(rng.choice([-1, 1])) * rng.uniform(0.01, 0.1)
+        bench.declared_gain *= 1 + wrong
+        bench.notes["declared_gain"] = bench.declared_gain
 
 
 def _dust(bench: Bench, specks: int, rng: np.random.Generator) -> F64:

@@ -173,10 +173,6 @@ def test_every_law_shows_and_weakly_less_than_strongly(one: Law) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         weak, strong = (made(case, strength=s) for s in (0.0, 1.0))
-        if one.effect == "gain_error":
-            off = [abs(b.declared_gain / b.gain_e_per_adu - 1) for b in (weak, strong)]
-            assert off == pytest.approx([one.weak, one.strong])
-            return
         cubes = [frames(b) for b in (weak, strong)]
     changed = [np.abs(cubes[1][name] - cube).max() for name, cube in cubes[0].items()]
     assert max(changed) > 5 / strong.gain_e_per_adu

@@ -78,11 +78,3 @@ def etalon(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
     rings = np.sqrt(2) * np.cos(2 * np.pi * r / period + rng.uniform(0, 2 * np.pi))
     bench.flat_response = bench.flat_response * (1 + size * rings)
     return {"period_px": period, "centre_px": centre.tolist()}
-
-
-@law("gain_error", "declared", 0.015, 0.15, "of the gain")
-def declared(bench: Bench, size: float, rng: np.random.Generator) -> _Drawn:
-    """The declared gain is not the true one."""
-    sign = float(rng.choice([-1, 1]))
-    bench.declared_gain *= 1 + sign * size
-    return {"declared_e_per_adu": bench.declared_gain, "true_e_per_adu": bench.gain_e_per_adu}
