@@ -209,14 +209,15 @@ def _again(candidate: Candidate) -> Again | None:
 def weakly_seen(
     candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]]
 ) -> tuple[Signature, ...]:
-    """Candidates seen in the fitted frames; slow ones only where they are weak."""
+    """Candidates seen in the fitted frames; a slow one only if it is weak and none is stronger."""
+    seen = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
+    most = max((e.significance for e in seen.values()), default=0.0)
     # By name: the order of candidates is none of curves.
     return tuple(
-        candidate.estimate.again or kinds[name]
-        for name, candidate in sorted(candidates.items())
-        if candidate.estimate is not None
-        and candidate.estimate.significance >= SIGNIFICANT
-        and (kinds[name].quick or candidate.estimate.significance < CLEAR)
+        estimate.again or kinds[name]
+        for name, estimate in sorted(seen.items())
+        if estimate.significance >= SIGNIFICANT
+        and (kinds[name].quick or estimate.significance == most < CLEAR)
     )
 
 
