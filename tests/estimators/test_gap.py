@@ -152,3 +152,17 @@ def test_effects_that_scatter_by_themselves_are_not_asked_to_agree() -> None:
         assert not flagged(after)
         left.append(remaining(before, after, flagged(before)).total)
     assert np.median(left) < 0.35
+
+
+@pytest.mark.parametrize("failed", [0, 1, 3, 4])
+def test_a_statistic_that_fails_in_a_few_simulations_is_expected_from_the_others(
+    failed: int,
+) -> None:
+    known = reference()
+    with_effect = [drawn(seed, shift=40) for seed in range(100, 108)]
+    for curves in with_effect[:failed]:
+        del curves[LINEAR]
+    shift = expect_with(known, with_effect).mean[LINEAR] - expect_nominal(known).mean[LINEAR]
+    # Of half of the simulations or more nothing is known.
+    usual = known.on_scale(drawn(100, 40))[LINEAR] - known.on_scale(drawn(100))[LINEAR]
+    np.testing.assert_allclose(shift, usual if failed < 4 else 0, rtol=1e-9)
