@@ -140,7 +140,7 @@ def read_cube(run: Path, name: str) -> F64:
 
 def nominal_vector(run: Path, name: str) -> tuple[float, float]:
     """Fringe vector (kx, ky) that the acquisition declares, rad/px."""
-    return declared_vector(load_run(run)[0], name)
+    return declared_vector(load_run(run), name)
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from pixcal.effects.ghost_fringes import GhostFringes, GhostWave
-from pixcal.estimators import map_waves
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.maps import map_waves
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import FringeMaps
 from pixcal.simulation.exposure import frames_of

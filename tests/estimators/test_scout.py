@@ -5,7 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from pixcal.estimators import scout as scouting
+from pixcal.estimators.fringe_fit import scout as scouting
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, find_fringe_vector, smooth_phasor
 from pixcal.estimators.fringe_fit.pixel_sums import phase_sigma
 from pixcal.estimators.fringe_fit.scout import Scout

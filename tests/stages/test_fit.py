@@ -8,7 +8,7 @@ import pytest
 from astropy.io import fits
 
 from pixcal.engine.run import Runtime
-from pixcal.estimators import fit_flags
+from pixcal.estimators.fringe_fit import fit_flags
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.flags import PixelFlag
 from pixcal.stages import fit
