@@ -239,10 +239,35 @@ def test_an_effect_that_is_only_hinted_at_passes_a_higher_mark() -> None:
 
 def test_a_stand_in_for_an_unknown_cause_is_not_claimed() -> None:
     """It makes the data likelier, but next to nothing of the gap is closed."""
-    found, left = search({"unknown": 0.05, "little": 0.004}, [candidate("little", 0.006)])
+    found, left = search({"unknown": 0.05, "little": 0.003}, [candidate("little", 0.006)])
     assert not found.taken
     assert left == pytest.approx(1, abs=0.02)
     assert "stays unexplained" in found.candidates["little"].reason
+
+
+def test_a_small_remainder_of_what_another_cause_brings_about_is_not_claimed() -> None:
+    both = [candidate("left", 0.03), candidate("little", 0.003)]
+    truth = {"left": 0.03, "little": 0.003}
+    alone, _ = search(truth, both)
+    assert alone.taken == ("left", "little")
+    beside, _ = search(truth, both, {"little": 20.0})
+    assert beside.taken == ("left",)
+    assert "40% of its significance" in beside.candidates["little"].reason
+
+
+def test_a_large_share_of_the_gap_is_claimed_whatever_another_cause_brings_about() -> None:
+    both = [candidate("left", 0.03), candidate("right", 0.03)]
+    found, _ = search({"left": 0.03, "right": 0.018}, both, {"right": 20.0})
+    assert set(found.taken) == {"left", "right"}
+
+
+def test_of_law_and_replay_the_one_that_leaves_less_of_the_gap_is_taken() -> None:
+    law = candidate("left", 0.022)
+    law.replay = candidate("left", 0.03).estimate.effect  # type: ignore[union-attr]
+    found, left = search({"left": 0.03}, [law])
+    assert found.final.effects == (law.replay,)
+    assert left < 0.05
+    assert found.by_law["left"].effects == (law.estimate.effect,)  # type: ignore[union-attr]
 
 
 def test_a_cause_beyond_the_most_is_told_that_no_more_were_sought() -> None:

@@ -187,9 +187,8 @@ class Search:
             if not own:
                 break
             best = max(own, key=lambda n: own[n])
-            replay = replays.get(best)
-            if replay and replay[0].log_likelihood > trials[best][0].log_likelihood:
-                trials[best] = replay
+            if best in replays and self._closer(replays[best][0], trials[best][0]):
+                trials[best] = replays[best]
             del open_ones[best]
             confirmed = self._confirmed((*effects.values(), trials[best][1]), asked=[*open_ones])
             if isinstance(confirmed, str):
@@ -302,6 +301,21 @@ class Search:
             open_ones.pop(name).reason = refused[name]
         return found, replays
 
+    def _closer(self, replay: Trial, law: Trial) -> bool:
+        """Whether a replay does better than the law: likelier, or less of the gap is left.
+
+        A law that leaves single frames to chance allows for more, and may be as likely for that.
+        """
+        if replay.log_likelihood > law.log_likelihood:
+            return True
+        where = differing(self.nominal, replay, self.data) | differing(self.nominal, law, self.data)
+        return self._left(replay, where) < self._left(law, where)
+
+    def _left(self, trial: Trial, where: set[Key]) -> float:
+        """Share of the gap that is left."""
+        before = compare(self.data, self.nominal.expected)
+        return remaining(before, compare(self.data, trial.expected), where).total
+
     def _tolerant(self, trial: Trial, taken: Trial) -> Trial:
         """A trial that allows for what other laws of the effects taken may do otherwise."""
         if not taken.effects:
@@ -357,7 +371,9 @@ class Search:
         """Leave each effect out again; drop those that are worth nothing beside the others."""
         while True:
             without = self._each_left_out(taken, effects)
-            dropped = self._worthless(current, without) or self._doubtful(current, without)
+            dropped = self._worthless(current, without) or self._doubtful(
+                current, without, candidates
+            )
             if dropped is None:
                 break
             least, reason = dropped
@@ -406,24 +422,34 @@ class Search:
             return None
         return least, "the other causes explain the data as well without it"
 
-    def _doubtful(self, current: Trial, without: Mapping[str, Trial]) -> tuple[str, str] | None:
-        """An effect that closes little of a gap that stays open: it may stand in for another."""
+    def _doubtful(
+        self,
+        current: Trial,
+        without: Mapping[str, Trial],
+        candidates: Mapping[str, Candidate],
+    ) -> tuple[str, str] | None:
+        """An effect that closes little of the gap and may stand in for another.
+
+        For an unknown one, if much of the gap stays open; for another law of those taken before
+        it, if their law as it is brings about a good part of its significance.
+        """
         where = differing(self.nominal, current, self.data)
-        before = compare(self.data, self.nominal.expected)
-
-        def left(trial: Trial) -> float:
-            return remaining(before, compare(self.data, trial.expected), where).total
-
-        open_still = left(current)
-        if open_still <= OPEN:
-            return None
-        gains = {name: left(trial) - open_still for name, trial in without.items()}
-        least = min(gains, key=lambda n: gains[n], default=None)
+        open_still = self._left(current, where)
+        gains = {name: self._left(trial, where) - open_still for name, trial in without.items()}
+        mimicked = [n for n in gains if candidates[n].share < 1 - LAW_ERROR]
+        among = list(gains) if open_still > OPEN else mimicked
+        least = min(among, key=lambda n: gains[n], default=None)
         if least is None or gains[least] >= LITTLE:
             return None
+        closes = f"closes only {max(gains[least], 0):.1%} of the gap"
+        if open_still > OPEN:
+            return least, (
+                f"{closes} while {open_still:.0%} stays unexplained; it may stand in for an "
+                "unknown cause"
+            )
         return least, (
-            f"closes only {max(gains[least], 0):.1%} of the gap while {open_still:.0%} stays "
-            "unexplained; it may stand in for an unknown cause"
+            f"{closes}, and the other causes bring about {1 - candidates[least].share:.0%} of its "
+            "significance; it may stand in for what their laws do not describe"
         )
 
     def _each_left_out(
