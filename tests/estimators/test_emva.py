@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pixcal.estimators.detector.emva import (
+    alternation,
     dark_slope,
     dynamic_range,
     nonuniformity,
@@ -115,3 +116,17 @@ def test_dark_current_counts_the_drift_of_frames():
     assert abs(np.mean(pulls)) < 4 / np.sqrt(60)
     assert abs(np.std(pulls) - 1) < 0.3
     assert dark_slope(np.ones(9), np.ones(9)) is None
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_every_second_line_that_is_higher_is_told_with_its_error(axis: int) -> None:
+    rng = np.random.default_rng(20)
+    found, shape = [], (120, 161)
+    for size in (0.0, 2.5):
+        line = size * (np.arange(shape[axis]) % 2)
+        fixed = rng.normal(0, 3, shape) + np.expand_dims(line, 1 - axis)
+        halves = (fixed + rng.normal(0, 1, shape) for _ in range(2))
+        found.append(alternation(*halves, np.ones(shape, np.bool_), axis=axis))
+    (none, of_none), (seen, error) = found
+    assert none < 5 * of_none
+    assert abs(seen - 2.5) < 5 * error < 1.5

@@ -107,6 +107,22 @@ def test_points_off_the_line_widen_the_error() -> None:
     assert bent.error > 3 * straight.error
 
 
+@pytest.mark.parametrize("size", [0.01, 0.04, 0.12])
+def test_a_response_that_bends_leaves_the_gain_at_level_zero(size: float) -> None:
+    rng = np.random.default_rng(9)
+    electrons = np.linspace(1e3, 4e4, 10)
+    bent = electrons * (1 - size * electrons / 4e4) / GAIN
+    slope = 1 - 2 * size * electrons / 4e4
+    variance = electrons * slope**2 / GAIN**2 + READ_ADU**2
+    dof = np.full(10, 65_000.0)
+    for _ in range(20):
+        seen = variance * (1 + rng.standard_normal(10) * np.sqrt(2 / dof))
+        fitted = fit_gain(np.stack([dof, dof * bent, dof * seen], 1), READ_ADU**2, 0.02, np.inf)
+        assert fitted is not None
+        assert fitted.gain == pytest.approx(GAIN, rel=0.01)
+        assert (fitted.curved < -size) or size < 0.04
+
+
 def test_without_light_there_is_no_gain() -> None:
     rng = np.random.default_rng(7)
     assert fit_gain(np.zeros((N_BINS, 3)), 25.0, 0.1, np.inf) is None

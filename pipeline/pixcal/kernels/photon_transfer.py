@@ -33,6 +33,13 @@ _CLIP = 5.0
 _MIN_PIXELS = 32  # fewer do not tell outliers from noise
 _SIGMA_OF_MAD = 1.482602218505602
 _ITERATIONS = 4
+_TERMS = 3
+"""Of the polynomial of the slope, at most: a response that bends by 12 % needs three."""
+_CURVED = 4.0
+"""Errors that its last term has at least."""
+_ALIKE = 1e12
+_SPARE, _RANGE = 3, 3.0
+"""Points more than terms, and range of levels, that tell a curve from points off a line."""
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -142,20 +149,26 @@ class GainFit:
         Of the points about the line.
     levels : (float, float)
         Lowest and highest level used, ADU.
+    curved : float
+        Slope at the highest level (variance over level) relative to that at zero, less one; zero
+        where a straight line fits.
     """
 
     gain: float
     error: float
     chi2_reduced: float
     levels: tuple[float, float]
+    curved: float = 0.0
 
 
 def fit_gain(
     sums: F64, read_variance: float, read_variance_error: float, highest: float
 ) -> GainFit | None:
-    """Fit the straight line from the read noise through the points of variance against level.
+    """Fit the curve from the read noise through the points of variance against level.
 
-    The weights come from the line itself, never from the measured variances: those that are low
+    It is a straight line, unless curvature is significant: a nonlinear response and charge that
+    neighbours share in proportion to the level bend it, and the gain is its slope at level zero.
+    The weights come from the curve itself, never from the measured variances: those that are low
     by chance would weigh more.
 
     Parameters
@@ -179,18 +192,55 @@ def fit_gain(
     dof, level, shot = dof[used], level[used], variance[used] - read_variance
     if not used.any() or not (dof * shot).sum() > 0:
         return None
-    slope = (dof * shot).sum() / (dof * level).sum()
-    weight = curvature = np.zeros(0)
-    for _ in range(_ITERATIONS):
-        weight = dof / (2 * (slope * level + read_variance) ** 2)
-        curvature = (weight * level**2).sum()
-        slope = (weight * level * shot).sum() / curvature
-        if slope <= 0:
-            return None
-    chi2 = float((weight * (shot - slope * level) ** 2).sum() / max(len(level) - 1, 1))
-    scatter = max(1.0, chi2) / curvature
-    lever = (weight * level).sum() / curvature * read_variance_error
-    error = math.sqrt(scatter + lever**2)
+    top = float(level.max())
+    curve = None
+    for terms in range(1, _TERMS + 1):
+        more = _curve(dof, level, shot, read_variance, terms)
+        if more is None:
+            break
+        found, covariance, chi2, _ = more
+        last = math.sqrt(max(1.0, chi2) * covariance[-1, -1])
+        if curve is not None and abs(found[-1]) < _CURVED * last:
+            break
+        curve = more
+    if curve is None:
+        return None
+    found, covariance, chi2, of_read = curve
+    slope = float(found[0])
+    error = math.sqrt(max(1.0, chi2) * covariance[0, 0] + (of_read * read_variance_error) ** 2)
     return GainFit(
-        float(1 / slope), float(error / slope**2), chi2, (float(level.min()), float(level.max()))
+        1 / slope, error / slope**2, chi2, (float(level.min()), top), float(found.sum() / slope - 1)
     )
+
+
+def _curve(
+    dof: F64, level: F64, shot: F64, read_variance: float, terms: int
+) -> tuple[F64, F64, float, float] | None:
+    """Polynomial of the slope over the level, as a share of the highest.
+
+    Returns
+    -------
+    found, covariance : (terms,), (terms, terms) float64
+        Coefficients, and their covariance for points that scatter as their noise lets expect.
+    chi2 : float
+        Reduced.
+    of_read : float
+        Change of the first coefficient with the read variance.
+    """
+    if terms > 1 and (len(level) < terms + _SPARE or level.max() < _RANGE * level.min()):
+        return None
+    design = level * (level / level.max()) ** np.arange(terms)[:, None]
+    expected = (dof * shot).sum() / (dof * level).sum() * level
+    for _ in range(_ITERATIONS):
+        weight = dof / (2 * (np.maximum(expected, 0) + read_variance) ** 2)
+        normal = (weight * design) @ design.T
+        if not np.linalg.cond(normal) < _ALIKE:
+            return None
+        covariance = np.linalg.inv(normal)
+        found = covariance @ (design @ (weight * shot))
+        if found[0] <= 0 or found.sum() <= 0:
+            return None
+        expected = found @ design
+    chi2 = float((weight * (shot - expected) ** 2).sum() / max(len(level) - terms, 1))
+    of_read = float((covariance @ (design @ weight))[0])
+    return found, covariance, chi2, of_read

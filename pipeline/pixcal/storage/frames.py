@@ -78,7 +78,8 @@ def tabulate(
     if stamped and any(f.shape[0] > 1 and not s for f, s in zip(ordered, steps, strict=True)):
         stamped = False
         warnings.append(
-            "a cube has neither EXPTIME nor is optics.frame_period_s given, so frames are numbered"
+            "a cube's EXPTIME is missing or zero, and optics.frame_period_s is not given, so its "
+            "frames are numbered"
         )
     if stamped:
         frames = _stamped_frames(ordered, steps, frame_period_s)

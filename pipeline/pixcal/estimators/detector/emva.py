@@ -18,6 +18,7 @@ Measure = tuple[float, float]
 
 _FALL = 0.8
 """Variance over its maximum below which samples saturate: noise alone does not fall so far."""
+_BLOCKS = 16
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,31 @@ def _squares(a: F64, b: F64) -> F64:
 def _root(variance: float, error: float) -> Measure:
     value = math.sqrt(max(variance, 0.0))
     return (value, error / (2 * value)) if variance > error else (value, math.sqrt(error))
+
+
+def alternation(first: F64, second: F64, good: NDArray[np.bool_], *, axis: int) -> Measure:
+    """By how much every second row (axis 0) or column (axis 1) is higher than those between.
+
+    Parameters
+    ----------
+    first, second, good
+        As for `nonuniformity`.
+
+    Returns
+    -------
+    (float, float)
+        Amplitude at the Nyquist frequency, twice; the error is by the scatter of the other lines.
+    """
+    means = (_filled(first, good) + _filled(second, good)).mean(axis=1 - axis) / 2
+    # Slow structure differs little between neighbours; only pairs of lines are compared.
+    steps = np.diff(means)
+    signed = steps * (-1.0) ** np.arange(len(steps))
+    # Neighbouring steps share a line: blocks of them are independent, or nearly so.
+    size = max(len(signed) // _BLOCKS, 2)
+    blocks = signed[: len(signed) // size * size].reshape(-1, size).mean(axis=1)
+    if len(blocks) < 2:
+        return 0.0, math.inf
+    return abs(float(blocks.mean())), float(blocks.std(ddof=1)) / math.sqrt(len(blocks))
 
 
 def without_trend(values: F64, good: NDArray[np.bool_]) -> F64:

@@ -128,6 +128,13 @@ class Summary:
                 f"{self.gain.chi2_reduced:.3g}): do not rely on the gain measured; causes are a "
                 "nonlinear response, a lamp that flickers, or charge shared by neighbours"
             )
+        if self.gain is not None and self.gain.curved:
+            found.append(
+                "the photon-transfer curve bends: variance over level changes by "
+                f"{100 * self.gain.curved:+.2g} % up to {self.gain.levels[1]:.0f} ADU; the gain is "
+                "that at level zero; causes are a nonlinear response, or charge that neighbours "
+                "share the more the brighter they are"
+            )
         if self.linearity is not None and self.linearity.max_deviation > _LINEARITY:
             found.append(
                 f"the levels of the flats are up to {100 * self.linearity.max_deviation:.2g} % off "

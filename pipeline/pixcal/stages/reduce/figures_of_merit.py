@@ -15,6 +15,7 @@ from pixcal.engine.run import Runtime
 from pixcal.estimators.detector.emva import (
     Measure,
     Nonuniformity,
+    alternation,
     dark_slope,
     dynamic_range,
     nonuniformity,
@@ -167,6 +168,10 @@ def _full_well(
 
 
 _TITLES = {"dsnu": "DSNU", "prnu": "PRNU"}
+_ALTERNATES = 6.0
+"""Errors of a difference between every second line that is worth a word."""
+_ALTERNATING_SHARE = 0.04
+"""Of the variance of the map that its square is at least."""
 
 
 def _spread(
@@ -174,7 +179,12 @@ def _spread(
 ) -> None:
     """Standard deviations, spectra and profiles of a pair of maps."""
     spread: Nonuniformity = nonuniformity(halves[0], halves[1], good)
-    note = "quadratic trend of the lamp removed" if name == "prnu" else ""
+    said = ["quadratic trend of the lamp removed"] if name == "prnu" else []
+    for axis, lines in ((0, "row"), (1, "column")):
+        size, error = alternation(halves[0], halves[1], good, axis=axis)
+        if size > _ALTERNATES * error and size**2 > _ALTERNATING_SHARE * spread.total[0] ** 2:
+            said.append(f"every second {lines} is {size:.3g} {unit} higher: a fixed pattern")
+    note = "; ".join(said)
     found[name] = _figure(_TITLES[name], unit, spread.total, note)
     for part in ("row", "column", "pixel"):
         title = f"{_TITLES[name]} of {part}s"

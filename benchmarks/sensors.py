@@ -1,0 +1,134 @@
+"""Examination on simulated cameras without fringes: right causes, gain, read noise, masks, time.
+
+Every draw is made by ``second_bench.sensors``, which shares no code with pixcal, and run by the
+command line::
+
+    python benchmarks/sensors.py --draws 8 --seed 1 --out /tmp/sensors [KIND ...]
+
+Time is that of the processors (user and system). ``--out`` keeps a line of JSON for each draw.
+"""
+
+import argparse
+import json
+import os
+import resource
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+PROGRAM = [sys.executable, "-m"]
+GAIN_WITHIN, NOISE_WITHIN, MASK_WITHIN = 0.01, 0.01, 1e-3
+
+
+def _processor_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def examine(kind: str, seed: int, folder: Path, options: list[str]) -> dict[str, Any]:
+    """Simulate, run and mark one draw."""
+    acquisition, run, truth_file = (folder / name for name in ("acq", "run", "truth.json"))
+    quiet = {"capture_output": True, "text": True, "env": os.environ | {"OMP_NUM_THREADS": "1"}}
+    made = ["second_bench.sensors", kind, "--seed", str(seed), *options]
+    subprocess.run(
+        [*PROGRAM, *made, "--out", acquisition, "--truth", truth_file], check=True, **quiet
+    )  # fmt: skip
+    truth = json.loads(truth_file.read_text())
+    before = _processor_s()
+    done = subprocess.run(
+        [*PROGRAM, "pixcal_cli", "run", acquisition, "--out", run, "--quiet"], check=False, **quiet
+    )
+    marks = {"kind": kind, "seed": seed, "cpu_s": round(_processor_s() - before, 1)}
+    marks |= {key: truth[key] for key in ("ladder", "bits", "drawn")}
+    marks["e_per_adu"], marks["noise_e"] = round(truth["gain"], 3), round(truth["read_noise_e"], 3)
+    if done.returncode:
+        return marks | {"failed": done.stderr.strip()[-400:]}
+    return marks | mark(run, truth)
+
+
+def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
+    """What a run found, beside the truth."""
+    import pixcal
+
+    opened = pixcal.open_run(run)
+    reduced, found = opened.reduction, json.loads((run / "products/diagnosis.json").read_text())
+    figures = reduced["figures_of_merit"]
+
+    def off(name: str, true: float) -> float:
+        value = figures.get(name, {}).get("value")
+        return float("nan") if value is None else round(value / true - 1, 5)
+
+    mask = np.asarray(opened.detector["mask"]) != 0
+    true = np.zeros(mask.size, np.bool_)
+    true[truth["defects"]] = True
+    named = [cause["effect"] for cause in found["causes"]]
+    if truth["causes"]:
+        right = len(named) == 1 and named[0] in truth["causes"]
+    else:
+        right = not named and found["verdict"] == "no gap"
+    return {
+        "right": bool(right), "verdict": found["verdict"], "named": named,
+        "p": [cause["p_value"] for cause in found["causes"]],
+        "where": [w["statistic"] for w in found["gap"].get("where", [])][:4],
+        "gain_off": off("conversion_gain", truth["gain"]),
+        "noise_off": off("read_noise", truth["read_noise_e"]),
+        "missed": round(float((true & ~mask.ravel()).mean()), 6),
+        "false": round(float((mask.ravel() & ~true).mean()), 6),
+    }  # fmt: skip
+
+
+def table(lines: list[dict[str, Any]]) -> str:
+    """Counts by kind."""
+    rows = ["kind | draws | cause right | gain | read noise | mask | failed | CPU s, largest"]
+    rows.append(" | ".join(["---"] * 8))
+    for kind in dict.fromkeys(line["kind"] for line in lines):
+        own = [line for line in lines if line["kind"] == kind]
+        ran = [line for line in own if "failed" not in line]
+        rows.append(
+            f"{kind} | {len(own)} | {sum(n['right'] for n in ran)} | "
+            f"{sum(abs(n['gain_off']) < GAIN_WITHIN for n in ran)} | "
+            f"{sum(abs(n['noise_off']) < NOISE_WITHIN for n in ran)} | "
+            f"{sum(n['missed'] + n['false'] <= MASK_WITHIN for n in ran)} | "
+            f"{len(own) - len(ran)} | {max(n['cpu_s'] for n in own):.0f}"
+        )
+    return "\n".join(rows)
+
+
+def main() -> None:
+    """Examine kinds, and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("kinds", nargs="*")
+    parser.add_argument("--draws", type=int, default=8)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--size", default="256")
+    parser.add_argument("--bias", default="0")
+    parser.add_argument("--flats", default="0")
+    parser.add_argument("--ladder")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--keep", action="store_true", help="keep frames and runs")
+    asked = parser.parse_args()
+    from second_bench.sensors import KINDS
+
+    options = ["--size", asked.size, asked.size, "--bias", asked.bias, "--flats", asked.flats]
+    options += ["--ladder", asked.ladder] if asked.ladder else []
+    asked.out.mkdir(parents=True, exist_ok=True)
+    lines = []
+    for kind in asked.kinds or KINDS:
+        for seed in range(asked.seed, asked.seed + asked.draws):
+            folder = Path(tempfile.mkdtemp(prefix=f"{kind}-{seed}-", dir=asked.out))
+            lines.append(examine(kind, seed, folder, options))
+            print(json.dumps(lines[-1]), flush=True)
+            with (asked.out / "draws.jsonl").open("a") as file:
+                file.write(json.dumps(lines[-1]) + "\n")
+            if not asked.keep:
+                shutil.rmtree(folder)
+    print(table(lines))
+
+
+if __name__ == "__main__":
+    main()
