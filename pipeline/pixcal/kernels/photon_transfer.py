@@ -35,8 +35,8 @@ _SIGMA_OF_MAD = 1.482602218505602
 _ITERATIONS = 4
 _TERMS = 3
 """Of the polynomial of the slope, at most: a response that bends by 12 % needs three."""
-_CURVED = 4.0
-"""Errors that its last term has at least."""
+_CURVED = 2.0
+"""Errors that its last term has at least: one left out biases the gain by hardly more than that."""
 _ALIKE = 1e12
 _SPARE, _RANGE = 3, 3.0
 """Points more than terms, and range of levels, that tell a curve from points off a line."""
@@ -144,7 +144,8 @@ class GainFit:
     gain : float
         e-/ADU.
     error : float
-        1 sigma, e-/ADU; widened where the points leave the line by more than their noise.
+        1 sigma, e-/ADU; widened where the points leave the line by more than their noise, and by
+        what a curvature would change that is neither significant nor absent.
     chi2_reduced : float
         Of the points about the line.
     levels : (float, float)
@@ -193,7 +194,7 @@ def fit_gain(
     if not used.any() or not (dof * shot).sum() > 0:
         return None
     top = float(level.max())
-    curve = None
+    curve, left_out = None, 0.0
     for terms in range(1, _TERMS + 1):
         more = _curve(dof, level, shot, read_variance, terms)
         if more is None:
@@ -201,13 +202,16 @@ def fit_gain(
         found, covariance, chi2, _ = more
         last = math.sqrt(max(1.0, chi2) * covariance[-1, -1])
         if curve is not None and abs(found[-1]) < _CURVED * last:
+            if abs(found[-1]) > last:
+                left_out = float(found[0] - curve[0][0])
             break
         curve = more
     if curve is None:
         return None
     found, covariance, chi2, of_read = curve
     slope = float(found[0])
-    error = math.sqrt(max(1.0, chi2) * covariance[0, 0] + (of_read * read_variance_error) ** 2)
+    scatter = max(1.0, chi2) * covariance[0, 0]
+    error = math.sqrt(scatter + (of_read * read_variance_error) ** 2 + left_out**2)
     return GainFit(
         1 / slope, error / slope**2, chi2, (float(level.min()), top), float(found.sum() / slope - 1)
     )
