@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip --quiet install --no-compile
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: study-diagnose help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-full fuzz effect-pictures reproduce reproduce-full blind blind-second blind-full clean
+.PHONY: study-diagnose help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-full fuzz torture effect-pictures reproduce reproduce-full blind blind-second blind-full clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 17

@@ -213,3 +213,12 @@ def test_workers_end_when_what_they_work_for_is_killed() -> None:
         main.wait()
     _, alive = psutil.wait_procs(children, timeout=20)
     assert not alive
+
+
+def test_work_on_this_machine_does_without_distributed() -> None:
+    code = (
+        "import sys; from pixcal.engine.run import Runtime, run_tasks; "
+        "run_tasks(abs, [1, -2, 3], Runtime(workers=2, quiet=True), label='x'); "
+        "sys.exit('distributed' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -10,7 +10,8 @@ from functools import lru_cache, partial
 from multiprocessing import get_context, parent_process
 from typing import Any
 
-import dask
+import dask.multiprocessing
+import dask.threaded
 from dask.callbacks import Callback
 
 from pixcal.engine.parcel import Job, call, pack
@@ -35,7 +36,7 @@ def run_in_threads(
     # Bound to the function: inside a graph Dask would take some items for keys or tasks.
     tasks = {number: partial(function, item) for number, item in enumerate(items)}
     with ThreadPoolExecutor(workers) as pool:
-        _run_graph(tasks, ended, "threads", num_workers=workers, pool=pool)
+        _run_graph(tasks, ended, dask.threaded.get, num_workers=workers, pool=pool)
 
 
 def run_in_processes(
@@ -65,7 +66,7 @@ def run_in_processes(
         try:
             # One by one: a task is noted when it ends, not when some others do.
             _run_graph(
-                tasks, noted, "processes",
+                tasks, noted, dask.multiprocessing.get,
                 num_workers=workers, pool=pool, chunksize=1,
             )  # fmt: skip
         except BrokenProcessPool as error:
@@ -84,7 +85,7 @@ def run_in_processes(
 
 
 def _run_graph(
-    tasks: Mapping[int, Callable[[], Any]], ended: Ended, scheduler: str, **options: Any
+    tasks: Mapping[int, Callable[[], Any]], ended: Ended, get: Callable[..., Any], **options: Any
 ) -> None:
     names = {f"task-{number}": number for number in tasks}
     graph = {name: (tasks[number],) for name, number in names.items()}
@@ -93,7 +94,7 @@ def _run_graph(
         if key in names:
             ended(names[key], result)
 
-    get = dask.base.get_scheduler(scheduler=scheduler)
+    # Given, not looked up by name: for that Dask would import distributed.
     with Callback(posttask=posttask):
         get(graph, list(names), **options)
 
