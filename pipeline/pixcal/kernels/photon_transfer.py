@@ -163,7 +163,12 @@ class GainFit:
 
 
 def fit_gain(
-    sums: F64, read_variance: float, read_variance_error: float, highest: float
+    sums: F64,
+    read_variance: float,
+    read_variance_error: float,
+    highest: float,
+    *,
+    straight: bool = False,
 ) -> GainFit | None:
     """Fit the curve from the read noise through the points of variance against level.
 
@@ -180,6 +185,9 @@ def fit_gain(
         Variance at level zero and its error (ADU²).
     highest : float
         Highest level to use (ADU).
+    straight : bool
+        Fit a line only: within few flats the level changes from place to place, as the amplifiers
+        do.
 
     Returns
     -------
@@ -195,7 +203,7 @@ def fit_gain(
         return None
     top = float(level.max())
     curve, left_out = None, 0.0
-    for terms in range(1, _TERMS + 1):
+    for terms in range(1, 2 if straight else _TERMS + 1):
         more = _curve(dof, level, shot, read_variance, terms)
         if more is None:
             break

@@ -35,6 +35,8 @@ _LAMP = 0.3
 """Relative change of light a second between flats that are not of one lamp."""
 _LIT = 5.0
 """Least response of the usual pixel over its error: below it the flat would be noise."""
+_LADDER = 4
+"""Groups of flats from which the photon-transfer curve may bend."""
 
 
 @dataclass(frozen=True)
@@ -238,7 +240,9 @@ def _gain(
     noise, error = read_noise or (job.read_noise, _GUESS_ERROR * job.read_noise)
     # With light there is noise enough that rounding adds no more and no less than this.
     variance = noise**2 + SHEPPARD * job.quantum**2
-    fitted = fit_gain(sums, variance, 2 * noise * error, _LINEAR_SHARE * top)
+    fitted = fit_gain(
+        sums, variance, 2 * noise * error, _LINEAR_SHARE * top, straight=len(job.flat) < _LADDER
+    )
     return fitted if fitted is not None and fitted.error < _GAIN_ERROR * fitted.gain else None
 
 
