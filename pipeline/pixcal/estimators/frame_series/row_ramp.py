@@ -132,7 +132,9 @@ def _maps(found: FringeEvidence) -> F64:
     return np.asarray(np.where(found.good, found.theta, 0))
 
 
-def rows_of(found: FringeEvidence, other: F64, mean: F64 | None = None) -> tuple[F64, F64, F64]:
+def rows_of(
+    found: FringeEvidence, other: F64, mean: F64 | None = None, every: int = 1
+) -> tuple[F64, F64, F64]:
     """Rows of the window, and normal matrix and right-hand side of a light's share in each row.
 
     Parameters
@@ -142,14 +144,18 @@ def rows_of(found: FringeEvidence, other: F64, mean: F64 | None = None) -> tuple
         Parameters of the light in every frame but the first and the last, as in `FringeEvidence.g`.
     mean : (3, y, x) float64, optional
         Maps of the light; default: those of the fit.
+    every : int
+        One column of so many is looked at.
     """
-    inside, theta = INSIDE, _maps(found)
-    mean = theta if mean is None else mean
-    rest, variance = found.residual[inside], found.variance[inside]
-    used = np.isfinite(rest) & found.good
+    inside, columns = INSIDE, (..., slice(None, None, every))
+    theta = np.ascontiguousarray(_maps(found)[columns])
+    mean = theta if mean is None else mean[columns]
+    rest, variance = found.residual[inside][columns], found.variance[inside][columns]
+    used = np.isfinite(rest) & found.good[columns]
     weight = np.divide(np.float32(1), variance, out=np.zeros_like(rest), where=used)
     light = _apart(other, mean, found.g[inside], weight)
     y, x = (place.ravel().astype(np.float32) for place in centred(found.good.shape))
+    x = np.ascontiguousarray(x[::every])
     inner, of_rest, across, sums = row_sums(
         np.where(used, rest, np.float32(0)), weight, light,
         found.g[inside].astype(np.float32), theta.astype(np.float32), y, x,

@@ -23,6 +23,12 @@ ORIGINS = 8
 """Phases tried as the one where the modulator's range begins."""
 CLEAR, FINEST = 4.0, 0.01
 """Standard deviations from which that phase is sought more finely, and how finely, rad."""
+COLUMNS = 24
+"""Columns of the window that are enough to tell the steps' way and origin; of wide ones one in
+`MOST_APART` at most."""
+MOST_APART = 4
+OWN_ORDERS = 4
+"""Harmonics of a frame's own phase that a step must not be taken for."""
 
 
 @dataclass(frozen=True)
@@ -69,31 +75,36 @@ def profile(share: Sequence[float] | F64, rows: F64) -> F64:
 def find_settling(sets: Sequence[FringeEvidence]) -> Settling:
     """The likeliest profile, of the last step or the next, along either way around the turn."""
     origins = [None, *(2 * np.pi * n / ORIGINS for n in range(ORIGINS))]
-    found = [_fit(sets, way, origin) for way in (-1, 1) for origin in origins]
-    gain, share, error, way, origin = max(found, key=lambda f: f[0])
-    chance = sigmas_of_chi2(max(gain - 2 * np.log(len(found)), 1e-9), KNOTS - 1)
+    ways = [(way, origin) for way in (-1, 1) for origin in origins]
+    every = int(np.clip(min(f.good.shape[1] for f in sets) // COLUMNS, 1, MOST_APART))
+    found = {one: _fit(sets, *one, every)[0] for one in ways}
+    way, origin = max(found, key=lambda one: found[one])
+    gain = found[way, origin]
+    chance = sigmas_of_chi2(max(gain - 2 * np.log(len(ways)), 1e-9), KNOTS - 1)
     width = np.pi / ORIGINS
-    while origin is not None and chance > CLEAR and width > FINEST:
+    while origin is not None and chance > CLEAR / np.sqrt(every) and width > FINEST:
         # A frame whose step is taken around the wrong way is off by the share of a turn.
-        near = [_fit(sets, way, origin + side * width / 2) for side in (-1, 1)]
-        gain, share, error, way, origin = max(
-            [(gain, share, error, way, origin), *near], key=lambda f: f[0]
-        )
+        for near in (origin - width / 2, origin + width / 2):
+            found[way, near] = _fit(sets, way, near, every)[0]
+        way, origin = max(found, key=lambda one: found[one])
         width /= 2
+    gain, share, error = _fit(sets, way, origin)
+    chance = sigmas_of_chi2(max(gain - 2 * np.log(len(ways)), 1e-9), KNOTS - 1)
     return Settling(way, origin, share, error, chance)
 
 
 def _fit(
-    sets: Sequence[FringeEvidence], way: int, origin: float | None
-) -> tuple[float, F64, F64, int, float | None]:
+    sets: Sequence[FringeEvidence], way: int, origin: float | None, every: int = 1
+) -> tuple[float, F64, F64]:
+    """Gain in chi-square, profile and its error, from one column of so many."""
     normal, right = np.zeros((KNOTS, KNOTS)), np.zeros(KNOTS)
     slopes = []
     for f in sets:
         _, cosine, sine = f.g.T
-        step = steps_of(f.phi, way, origin)
+        step = beside_own_phase(steps_of(f.phi, way, origin), f.phi)
         # Of B, A cos phi and A sin phi, what a turn of the phase does, times the step.
         other = (step[:, None] * np.stack([np.zeros(len(step)), -sine, cosine], axis=1))[INSIDE]
-        _, own, vector = rows_of(f, other)
+        _, own, vector = rows_of(f, other, every=every)
         at = np.linspace(0, 1, len(vector))
         terms = np.stack([profile(unit, at) for unit in np.eye(KNOTS)], axis=1)
         terms -= terms.mean(axis=0)
@@ -112,7 +123,18 @@ def _fit(
         share = share - line * (line @ share) / (line @ line) + mean * line
         variance = variance + line**2 / weight.sum()
         gain += mean**2 * float(weight.sum())
-    return gain, share, np.sqrt(variance), way, origin
+    return gain, share, np.sqrt(variance)
+
+
+def beside_own_phase(step: F64, phi: F64) -> F64:
+    """Steps (t,) without what goes with the frames' own phases.
+
+    A response that bends, or pixels that shrink as they fill, turns the phase of rows by harmonics
+    of the frame's own phase; a step to or from it is partly such a harmonic too.
+    """
+    turns = np.outer(phi, np.arange(OWN_ORDERS + 1))
+    own = np.hstack([np.cos(turns), np.sin(turns[:, 1:])])
+    return np.asarray(step - own @ np.linalg.lstsq(own, step, rcond=1e-9)[0])
 
 
 def _slope(found: FringeEvidence, step: F64) -> tuple[float, float]:
