@@ -24,6 +24,7 @@ from pixcal.estimators.detector.calibration import (
     response_rate,
     usual_variance,
 )
+from pixcal.estimators.detector.full_wells import unsaturated
 from pixcal.kernels.photon_transfer import N_BINS, bin_pairs, pair_statistics
 from pixcal.kernels.robust import BATCH, Combination, Combined
 from pixcal.model.flags import PixelFlag
@@ -164,7 +165,7 @@ def measure(job: Measuring, strip: Strip) -> None:
             _measure_rung(job, column, number, combination)
     for column in columns:
         if job.flat:
-            maps, rungs = column.maps, column.rungs
+            maps, rungs = column.maps, unsaturated(column.rungs)
             maps["response"], maps["response_error"] = response_rate(rungs)
             maps["flags"][nonlinear(rungs, job.limits.nonlinear)] += int(PixelFlag.NONLINEAR)
         (y0, _), (x0, _) = extent(job.shape, column.index)

@@ -1,0 +1,51 @@
+"""Flats in which pixels are full, told by their noise: where the well ends, photon noise ends too.
+
+A well may be full far below the highest code, and read noise then spreads the samples: no code
+piles up. Such samples would flatten the response and outweigh all others by their small variance.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.detector.calibration import Rung
+
+COLLAPSED = 0.25
+"""Variance over the signal, in units of the least at lower levels, below which pixels are full. A
+response that bends by a fifth lessens it to 0.64."""
+NEARLY = 0.02
+"""Relative distance from a pixel's own full well within which its signal is not used."""
+
+
+def unsaturated(rungs: Sequence[Rung]) -> list[Rung]:
+    """Flats without the signal of full pixels, which becomes NaN.
+
+    Parameters
+    ----------
+    rungs : sequence of Rung
+        Of the same pixels, in any order.
+    """
+    levels = np.array([_median(rung.signal) for rung in rungs])
+    noise = np.array([_median(rung.variance) * rung.frames for rung in rungs])
+    full, least = np.zeros(len(rungs), np.bool_), np.inf
+    for n in np.argsort(levels):
+        if not levels[n] > 0:
+            continue
+        slope = noise[n] / levels[n]
+        full[n] = np.isfinite(least) and slope < COLLAPSED * least
+        least = least if full[n] else min(least, slope)
+    if not full.any():
+        return list(rungs)
+    well = np.mean([rung.signal for rung, ended in zip(rungs, full, strict=True) if ended], axis=0)
+    limit = np.where(np.isfinite(well), (1 - NEARLY) * well, np.inf)
+    return [
+        replace(rung, signal=np.where(ended | (rung.signal > limit), np.nan, rung.signal))
+        for rung, ended in zip(rungs, full, strict=True)
+    ]
+
+
+def _median(values: NDArray[np.float64]) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if known.size else np.nan

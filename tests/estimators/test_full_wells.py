@@ -1,0 +1,50 @@
+"""Full wells are told by the noise of flats, whatever code they end at."""
+
+import numpy as np
+import pytest
+
+from pixcal.estimators.detector.bad_pixels import nonlinear
+from pixcal.estimators.detector.calibration import Rung, response_rate
+from pixcal.estimators.detector.full_wells import unsaturated
+
+SHAPE = (37, 53)
+GAIN = 0.75
+
+
+def ladder(
+    well_e: float, *, well_spread: float = 0.0, read_e: float = 1.0, bend: float = 0.0
+) -> tuple[list[Rung], np.ndarray]:
+    rng = np.random.default_rng(3)
+    response = 1 + 0.02 * rng.standard_normal(SHAPE)
+    wells = well_e * (1 + well_spread * rng.standard_normal(SHAPE))
+    rungs = []
+    for exptime in np.arange(1, 11):
+        light = rng.poisson(4000.0 * exptime * response, (8, *SHAPE))
+        charge = np.minimum(light - bend * light**2 / 4e4, wells)
+        adu = (charge + read_e * rng.standard_normal(charge.shape)) / GAIN
+        rungs.append(Rung(float(exptime), 8, adu.mean(axis=0), adu.var(axis=0, ddof=1) / 8))
+    return rungs[::-1], response
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.01])
+def test_full_pixels_neither_flatten_the_response_nor_are_nonlinear(spread: float) -> None:
+    rungs, response = ladder(30_500.0, well_spread=spread)
+    assert nonlinear(rungs, 0.03).mean() > 0.05
+    kept = unsaturated(rungs)
+    assert not nonlinear(kept, 0.03).any()
+    rate, error = response_rate(kept)
+    off = rate / np.median(rate) - response / np.median(response)
+    assert np.std(off) == pytest.approx(np.median(error / rate), rel=0.1)
+
+
+def test_of_pixels_that_are_just_not_full_all_is_kept() -> None:
+    rungs, _ = ladder(28_100.0)
+    lost = [float(np.isnan(rung.signal).mean()) for rung in unsaturated(rungs)][::-1]
+    assert lost[:6] == [0.0] * 6
+    assert lost[7:] == [1.0] * 3
+
+
+@pytest.mark.parametrize(("read", "bend"), [(1.0, 0.0), (60.0, 0.0), (1.0, 0.15)])
+def test_without_an_end_nothing_is_left_out(read: float, bend: float) -> None:
+    rungs, _ = ladder(1e9, read_e=read, bend=bend)
+    assert all(np.isfinite(rung.signal).all() for rung in unsaturated(rungs))
