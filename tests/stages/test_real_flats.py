@@ -14,7 +14,7 @@ from pixcal.estimators.diagnosis.test_statistics import DETECTOR, measure
 from pixcal.estimators.diagnosis.test_statistics.look import STEPS
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.parts import Raw, evidence_of
-from pixcal.stages.diagnose.windows import whole_of
+from pixcal.stages.diagnose.windows import split, whole_of
 
 LEVELS = tuple(np.linspace(0.05, 1.0, 12))
 CAMERA = {"gain": 2.3, "noise": 8.0, "bias": 200.4, "scatter": 2.0, "top": 4095, "rate": 8000.0}
@@ -66,6 +66,30 @@ def test_saturation_is_found_and_what_is_below_it_used(tmp_path: Path) -> None:
         Detector(**CAMERA, flats=ladder([(t, 1) for t in LEVELS])), 3, tmp_path / "b"
     )
     assert plain["saturation_adu"]["found"] is None
+
+
+def test_full_wells_below_the_highest_code_are_no_response(tmp_path: Path) -> None:
+    flats = ladder([(t, 1) for t in LEVELS], 4)
+    camera = Detector(**CAMERA, flats=flats, prnu=0.03, response=lambda e: np.minimum(e, 5600.0))
+    evidence, report = reduced(camera, 6, tmp_path)
+    assert report["saturation_adu"]["found"] is None
+    full = report["saturation_adu"]["full_frames"]
+    assert set(full) >= set(range(4 * 9, 4 * 12))
+    assert report["flags"]["nonlinear"] <= 0.001 * 96**2
+    assert report["gain_e_per_adu"]["measured"] == pytest.approx(2.3, rel=0.02)
+    assert np.std(evidence.flat[evidence.good]) == pytest.approx(0.03, rel=0.05)
+
+
+def test_flats_with_full_wells_are_not_diagnosed() -> None:
+    tables = {
+        "bias": {"exptime_s": [0.0] * 4},
+        "flat": {"exptime_s": [1.0] * 4 + [2.0] * 4, "step": [0] * 8},
+    }
+    parted = split(tables, 100, full_flats=(4, 5, 6, 7))
+    both = np.concatenate([parted.learn.frames["flat"], parted.test.frames["flat"]])
+    assert sorted(set(both.tolist())) == [0, 1, 2, 3]
+    whole = split(tables, 100, full_flats=range(8))
+    assert len(whole.learn.frames["flat"]) > 0
 
 
 def test_a_curve_that_all_pixels_share_is_no_defect(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, lo
 from pixcal.stages.diagnose.windows import Split, chosen_windows, split
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.ingested import Ingested
+from pixcal.storage.artefact import read_json
 from pixcal.storage.stage import read_acquisition, require
 
 EVIDENCE_BYTES = 34
@@ -101,7 +102,8 @@ def look_at(
     shape = ingested.shape
     first, parts = chosen_windows(shape)
     pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
-    own = split(ingested.tables, pixels)
+    saturated = read_json(run_dir / "reduce" / "reduce.json")["saturation_adu"]
+    own = split(ingested.tables, pixels, saturated.get("full_frames", ()))
     _enough(own.test)
     largest, evidence = _samples(own.test, pixels)
     calibration = (

@@ -1,6 +1,6 @@
 """Which pixels and frames are looked at: all of a small window, some windows of a large one."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -60,7 +60,7 @@ class Split:
     test: Half
 
 
-def split(tables: Mapping[str, Table], pixels: int) -> Split:
+def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = ()) -> Split:
     """First and second half, in order of time, of every array and exposure time.
 
     Of long fringe sets the first and the last frames only, `SAMPLES` in each half.
@@ -71,13 +71,17 @@ def split(tables: Mapping[str, Table], pixels: int) -> Split:
         As in ``frames.json``.
     pixels : int
         Of a window.
+    full_flats : sequence of int
+        Flats whose pixels are full; left out unless all are.
     """
     learn, test = {}, {}
     for name, table in tables.items():
         exposures = np.array([np.nan if t is None else t for t in table["exptime_s"]], float)
         fringes = "/" in name
         early, late = [], []
-        for own in [np.arange(len(exposures))] if fringes else groups(table):
+        every = [np.arange(len(exposures))] if fringes else groups(table)
+        kept = [own for own in every if name != "flat" or not np.isin(own, full_flats).any()]
+        for own in kept or every:
             one, other = _halves(own, SAMPLES // pixels)
             early.append(one)
             late.append(other)

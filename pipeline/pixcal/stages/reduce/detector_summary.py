@@ -57,8 +57,8 @@ class Summary:
         By photon transfer.
     levels : (rung,) float64
         Of the ladder of flats (ADU above bias and dark).
-    usable : (rung,) bool
-        Rungs without saturation.
+    usable, full : (rung,) bool
+        Rungs without saturation; those with full pixels though the converter does not saturate.
     linearity : Linearity or None
         Of the usable rungs.
     """
@@ -70,6 +70,7 @@ class Summary:
     gain: GainFit | None
     levels: F64
     usable: NDArray[np.bool_]
+    full: NDArray[np.bool_]
     linearity: Linearity | None
 
     def gain_to_use(self, choice: str) -> float:
@@ -194,9 +195,10 @@ def summarise(job: Measuring, folder: Path, declared: Detector) -> Summary:
         sums += tables.read((i, i + 1), (j, j + 1))[0, 0]
     levels, usable = _rungs(ArrayReader(folder / "levels").read(), job)
     # Pixels that are full saturate the flats though no sample of the converter does.
-    full = saturation(transfer_points(sums[1]))
-    top = float(np.fmin(job.saturation - medians.bias, full[0] if full else math.inf))
-    usable &= levels <= top
+    well = saturation(transfer_points(sums[1]))
+    top = float(np.fmin(job.saturation - medians.bias, well[0] if well else math.inf))
+    full = usable & (levels > top)
+    usable &= ~full
     straight = None
     times = np.array([group.exptime for group in job.flat])
     if job.flats_timed and job.flat and _one_lamp(times[usable], levels[usable]):
@@ -208,7 +210,7 @@ def summarise(job: Measuring, folder: Path, declared: Detector) -> Summary:
         read_noise = (noise, read_variance[1] / (2 * noise) if noise else 0.0)
         own = _before_rounding(read_variance, folder, job) if job.quantum else read_noise
     gain = _gain(sums[1], own, top, job)
-    return Summary(declared, medians, read_noise, own, gain, levels, usable, straight)
+    return Summary(declared, medians, read_noise, own, gain, levels, usable, full, straight)
 
 
 def _before_rounding(

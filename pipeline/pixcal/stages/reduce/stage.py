@@ -215,6 +215,12 @@ def _report(
             "found": source.saturation_found,
             "used": job.saturation if math.isfinite(job.saturation) else None,
             "levels_left_out": int((~summary.usable).sum()),
+            "full_frames": sorted(
+                frame
+                for group, full in zip(source.exposures.flat, summary.full, strict=True)
+                for frame in group.frames
+                if full
+            ),
         },
         "flags": _count_flags(made.folder / "calibration.zarr" / "mask", source.shape),
         "quantisation": {name: found.pop("quantisation") for name, found in sets.items()},
