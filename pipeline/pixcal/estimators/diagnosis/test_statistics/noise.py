@@ -1,5 +1,7 @@
 """Statistics of noise: its size, what neighbours, rows and columns share, pixels that stand out."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.ndimage import maximum_filter
 
@@ -193,7 +195,21 @@ def read_noise(evidence: Evidence) -> Curve | None:
     # Of whole numbers a median jumps by a code.
     frames = stacks[0].adu - stacks[0].adu[:, evidence.good].mean(axis=1)[:, None, None]
     variance = np.var(frames, axis=0, ddof=1) * (evidence.gain / evidence.read_noise) ** 2
-    return Curve(np.array(QUANTILES), np.quantile(variance, QUANTILES))
+    return Curve(np.array(QUANTILES), ranges_about(variance.ravel(), QUANTILES))
+
+
+def ranges_about(values: F64, quantiles: Sequence[float]) -> F64:
+    """Means of the values from half as far from the near end as a quantile is to half as far again.
+
+    The variance of a few whole numbers has few values: a quantile is the same in many simulations,
+    and then jumps.
+    """
+    ordered, found = np.sort(values), []
+    for q in quantiles:
+        apart = min(q, 1 - q) / 2
+        first = int((q - apart) * len(ordered))
+        found.append(float(ordered[first : max(int((q + apart) * len(ordered)), first + 1)].mean()))
+    return np.array(found)
 
 
 @statistic("noise", "neighbours of hot pixels", x="left, right, above, below", sets=False)
