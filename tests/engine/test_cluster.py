@@ -178,10 +178,10 @@ def test_what_is_left_is_taken_back_and_workers_are_idle(
         def interrupt_at_work() -> None:
             # Not before: while the library connects, Python may be where it cannot raise.
             eventually(lambda: any(tmp_path.glob("*.ended")))
-            for _ in range(3):
+            for _ in range(8):
                 signal.pthread_kill(me, signal.SIGINT)
                 # In a callback of the library one can be lost; a user presses again.
-                if raised.wait(10):
+                if raised.wait(4):
                     break
 
         raised = threading.Event()
