@@ -286,9 +286,9 @@ def nonlinearity(sensor: Sensor) -> Drawn:
     return {"quadratic": -size}
 
 
-@kind("gain_error")
-def gain_error(sensor: Sensor) -> Drawn:
-    """A declared gain that is not the true one."""
+@kind()
+def declared_gain(sensor: Sensor) -> Drawn:
+    """A declared gain that is wrong: flats show the true one, so it is no gap."""
     factor = float(sensor.rng.choice([-1, 1]) * np.exp(sensor.rng.uniform(np.log(0.04), -1.2)))
     sensor.declared_gain = sensor.gain / (1 + factor)
     return {"relative": factor}

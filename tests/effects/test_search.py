@@ -1,7 +1,7 @@
 """The search for causes, in a world of a few curves where effects do what the test says."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -239,7 +239,7 @@ def test_an_effect_that_is_only_hinted_at_passes_a_higher_mark() -> None:
 
 def test_a_stand_in_for_an_unknown_cause_is_not_claimed() -> None:
     """It makes the data likelier, but next to nothing of the gap is closed."""
-    found, left = search({"unknown": 0.05, "little": 0.003}, [candidate("little", 0.006)])
+    found, left = search({"unknown": 0.05, "little": 0.004}, [candidate("little", 0.006)])
     assert not found.taken
     assert left == pytest.approx(1, abs=0.02)
     assert "stays unexplained" in found.candidates["little"].reason
@@ -261,7 +261,20 @@ def test_a_large_share_of_the_gap_is_claimed_whatever_another_cause_brings_about
     assert set(found.taken) == {"left", "right"}
 
 
-def test_of_law_and_replay_the_one_that_leaves_less_of_the_gap_is_taken() -> None:
+def test_of_a_vague_law_and_its_replay_the_one_that_leaves_less_of_the_gap_is_taken() -> None:
+    data = REFERENCE.on_scale(curves((), 500, {"left": 0.03}))
+    judged = Search(REFERENCE, data, simulate, lambda *_: {})
+    replay = judged.held_against((Toy("left", 0.0288),), [curves((Toy("left", 0.0288),), 0)])
+    vague = replace(
+        replay.expected,
+        mean={key: 0.75 * mean for key, mean in data.items()},
+        variance={key: 4 * v for key, v in judged.nominal.expected.variance.items()},
+    )
+    law = replace(replay, expected=vague, log_likelihood=replay.log_likelihood + 1)
+    assert judged._closer(replay, law)
+
+
+def test_a_replay_that_is_likelier_than_the_law_is_taken() -> None:
     law = candidate("left", 0.022)
     law.replay = candidate("left", 0.03).estimate.effect  # type: ignore[union-attr]
     found, left = search({"left": 0.03}, [law])

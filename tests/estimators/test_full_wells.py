@@ -1,4 +1,4 @@
-"""Full wells are told by the noise of flats, whatever code they end at."""
+"""Full wells are detected from the noise of flats, at whatever code they end."""
 
 import numpy as np
 import pytest

@@ -1,7 +1,6 @@
 """Read noise distribution of the pixels where samples are coarse."""
 
 import numpy as np
-import pytest
 
 from pixcal.estimators.diagnosis.test_statistics.noise import QUANTILES, ranges_about
 
@@ -12,12 +11,13 @@ def test_of_evenly_spread_values_they_are_the_quantiles() -> None:
 
 
 def test_whole_numbers_scatter_as_much_as_real_ones() -> None:
-    def scatter(of: str) -> float:
+    def scatter(of: str) -> np.ndarray:
         found = []
         for seed in range(40):
             samples = np.random.default_rng(seed).normal(0.3, 0.57, (20, 5000))
             samples = np.rint(samples) if of == "codes" else samples
-            found.append(ranges_about(samples.var(axis=0, ddof=1), QUANTILES)[-1])
-        return float(np.std(found) / np.mean(found))
+            found.append(ranges_about(samples.var(axis=0, ddof=1), QUANTILES))
+        return np.std(found, axis=0) / np.mean(found, axis=0)
 
-    assert scatter("codes") == pytest.approx(scatter("real"), rel=0.35)
+    # Quantiles themselves: 4.5 times as much at the median, 0.13 times at 0.9.
+    np.testing.assert_allclose(scatter("codes"), scatter("real"), rtol=0.35)

@@ -1,4 +1,4 @@
-"""Settling of rows: what a step may be taken for, and what columns are enough."""
+"""Settling of rows: a step of the phase is told from harmonics of the frame's own phase."""
 
 import numpy as np
 import pytest

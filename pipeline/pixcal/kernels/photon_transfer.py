@@ -6,8 +6,9 @@ level may differ within the block: both sides of that equation are means over th
 pixel's mean and difference are uncorrelated for Poisson light (given the sum of two Poisson counts,
 the expected square of their difference is that sum), so structured light does not bias the slope.
 
-Noise that neighbours share (crosstalk, brighter-fatter) lowers the variance and raises the gain
-that comes out; photon transfer cannot tell (physics note, section 6).
+Charge that neighbours share in proportion to the signal (crosstalk) lowers the variance and raises
+the gain that comes out; photon transfer cannot tell (physics note, section 6). What grows with the
+level, as brighter-fatter, bends the curve.
 """
 
 import math
@@ -25,6 +26,9 @@ F64 = NDArray[np.float64]
 
 BLOCK = 16
 """Pixels along each side of a block."""
+
+LADDER = 4
+"""Groups of flats from which the curve may bend."""
 
 N_BINS = 512
 """Bins of level: bin n holds ``n² / 4`` to ``(n + 1)² / 4`` ADU, the last one all above."""

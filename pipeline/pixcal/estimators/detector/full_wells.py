@@ -1,4 +1,4 @@
-"""Flats in which pixels are full, told by their noise: where the well ends, photon noise ends too.
+"""Flats with full wells, detected from their noise: a full well has no photon noise.
 
 A well may be full far below the highest code, and read noise then spreads the samples: no code
 piles up. Such samples would flatten the response and outweigh all others by their small variance.
@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pixcal.estimators.detector.calibration import Rung
+from pixcal.estimators.detector.calibration import Rung, median_and_sigma
 
 COLLAPSED = 0.25
 """Variance over the signal, in units of the least at lower levels, below which pixels are full. A
@@ -27,8 +26,8 @@ def unsaturated(rungs: Sequence[Rung]) -> list[Rung]:
     rungs : sequence of Rung
         Of the same pixels, in any order.
     """
-    levels = np.array([_median(rung.signal) for rung in rungs])
-    noise = np.array([_median(rung.variance) * rung.frames for rung in rungs])
+    levels = np.array([median_and_sigma(rung.signal)[0] for rung in rungs])
+    noise = np.array([median_and_sigma(rung.variance)[0] * rung.frames for rung in rungs])
     full, least = np.zeros(len(rungs), np.bool_), np.inf
     for n in np.argsort(levels):
         if not levels[n] > 0:
@@ -44,8 +43,3 @@ def unsaturated(rungs: Sequence[Rung]) -> list[Rung]:
         replace(rung, signal=np.where(ended | (rung.signal > limit), np.nan, rung.signal))
         for rung, ended in zip(rungs, full, strict=True)
     ]
-
-
-def _median(values: NDArray[np.float64]) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if known.size else np.nan

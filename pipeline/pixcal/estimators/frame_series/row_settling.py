@@ -129,8 +129,8 @@ def _fit(
 def beside_own_phase(step: F64, phi: F64) -> F64:
     """Steps (t,) without what goes with the frames' own phases.
 
-    A response that bends, or pixels that shrink as they fill, turns the phase of rows by harmonics
-    of the frame's own phase; a step to or from it is partly such a harmonic too.
+    Pixels that shrink as they fill shift the phase of rows by harmonics of the frame's own phase,
+    and a step to or from that phase correlates with them.
     """
     turns = np.outer(phi, np.arange(OWN_ORDERS + 1))
     own = np.hstack([np.cos(turns), np.sin(turns[:, 1:])])

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pixcal.kernels.photon_transfer import LADDER
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.exposure import Camera
@@ -18,6 +19,8 @@ DECLARED_ERROR = 0.01
 """Relative error that a declared gain may well have."""
 FRAMES = 8
 """Flats that are simulated with and without effects, from the same random numbers."""
+LIT = 4.0
+"""Shot noise over read noise, as variances, of a flat that tells what effects do to the former."""
 OF_NOISE = (Stage.CHARGE, Stage.SIGNAL)
 """Steps whose effects change the noise of flats otherwise than a gain does."""
 
@@ -67,7 +70,12 @@ def photon_transfer_change(
     flats = [r for r in flats if r.electrons < 0.8 * room]
     if not flats or not any(effect.acts_at in OF_NOISE for effect in effects):
         return 1.0
-    flat = max(flats, key=lambda r: r.electrons)
+    if len(flats) < LADDER:
+        flat = max(flats, key=lambda r: r.electrons)
+    else:
+        # Of a ladder the gain is that at level zero: the dimmest flat with little read noise.
+        lit = [r for r in flats if r.electrons > LIT * detector.read_noise_e**2] or flats
+        flat = min(lit, key=lambda r: r.electrons)
     dark = [r for r in recordings if r.kind == "bias"][:1]
     rows = (0, detector.shape[0])
     ratios = []

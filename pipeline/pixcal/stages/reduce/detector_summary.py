@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.detector.calibration import Linearity, linearity
 from pixcal.estimators.detector.emva import saturation, transfer_points
-from pixcal.kernels.photon_transfer import GainFit, fit_gain
+from pixcal.kernels.photon_transfer import LADDER, GainFit, fit_gain
 from pixcal.kernels.rounding import SHEPPARD, UNTOLD, noise_before_rounding
 from pixcal.model.acquisition import Detector
 from pixcal.model.errors import InputError
@@ -35,8 +35,6 @@ _LAMP = 0.3
 """Relative change of light a second between flats that are not of one lamp."""
 _LIT = 5.0
 """Least response of the usual pixel over its error: below it the flat would be noise."""
-_LADDER = 4
-"""Groups of flats from which the photon-transfer curve may bend."""
 
 
 @dataclass(frozen=True)
@@ -243,7 +241,7 @@ def _gain(
     # With light there is noise enough that rounding adds no more and no less than this.
     variance = noise**2 + SHEPPARD * job.quantum**2
     fitted = fit_gain(
-        sums, variance, 2 * noise * error, _LINEAR_SHARE * top, straight=len(job.flat) < _LADDER
+        sums, variance, 2 * noise * error, _LINEAR_SHARE * top, straight=len(job.flat) < LADDER
     )
     return fitted if fitted is not None and fitted.error < _GAIN_ERROR * fitted.gain else None
 

@@ -199,10 +199,10 @@ def read_noise(evidence: Evidence) -> Curve | None:
 
 
 def ranges_about(values: F64, quantiles: Sequence[float]) -> F64:
-    """Means of the values from half as far from the near end as a quantile is to half as far again.
+    """Mean of the values around each quantile q, over ranks within min(q, 1 - q) / 2 of it.
 
-    The variance of a few whole numbers has few values: a quantile is the same in many simulations,
-    and then jumps.
+    The sample variance of a few whole numbers takes few values: its quantiles are the same in many
+    simulations, and then jump.
     """
     ordered, found = np.sort(values), []
     for q in quantiles:
