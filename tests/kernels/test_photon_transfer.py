@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
+import scipy.ndimage
 from numpy.typing import NDArray
 
 from pixcal.kernels.photon_transfer import (
     BLOCK,
+    LAGS,
     N_BINS,
     GainFit,
+    add_neighbours,
     bin_pairs,
     fit_gain,
     pair_statistics,
@@ -29,12 +32,37 @@ def pair(rng: np.random.Generator, electrons: F64) -> F64:
 
 
 def measure(rng: np.random.Generator, scenes: list[F64]) -> GainFit:
-    dof, _, square = bin_pairs(pair(rng, np.zeros_like(scenes[0]))).sum(axis=0)
+    dof, _, square, *_ = bin_pairs(pair(rng, np.zeros_like(scenes[0]))).sum(axis=0)
     sums = sum(bin_pairs(pair(rng, scene)) for scene in scenes)
     variance = square / dof
     fitted = fit_gain(np.asarray(sums), variance, variance * np.sqrt(2 / dof), np.inf)
     assert fitted is not None
     return fitted
+
+
+def measure_shared(
+    scenes: list[F64], share: F64, seed: int, rows: float = 0.0, *, neighbours: bool = True
+) -> tuple[GainFit, list[tuple[int, int]]]:
+    """Gain of flats whose charge is spread by the kernel `share`, with row noise in ADU."""
+    rng = np.random.default_rng(seed)
+
+    def one(electrons: F64) -> NDArray[np.float32]:
+        spread = scipy.ndimage.convolve(rng.poisson(electrons).astype(float), share, mode="wrap")
+        noise = rng.normal(0, READ_ADU, spread.shape) + rng.normal(0, rows, (len(spread), 1))
+        return (np.round(spread / GAIN + noise + BIAS) - BIAS).astype(np.float32)
+
+    def pairs(electrons: F64) -> F64:
+        first, second = one(electrons), one(electrons)
+        return bin_pairs(pair_statistics(first, second, gain=1.5, read_noise=3.0, quantum=1.0))
+
+    dark = pairs(np.zeros_like(scenes[0]))
+    variance = dark[:, 2].sum() / dark[:, 0].sum()
+    lit = np.asarray(sum(pairs(scene) for scene in scenes))
+    sums, added = add_neighbours(lit, dark) if neighbours else (lit[:, :3], [])
+    error = variance * np.sqrt(2 / dark[:, 0].sum())
+    fitted = fit_gain(sums, variance, error, np.inf)
+    assert fitted is not None
+    return fitted, added
 
 
 def flats(shape: tuple[int, int], levels: tuple[float, ...]) -> list[F64]:
@@ -45,6 +73,50 @@ def test_the_gain_of_flats_is_right_to_half_a_percent() -> None:
     fitted = measure(np.random.default_rng(0), flats((701, 513), (2e3, 1e4, 4e4)))
     assert fitted.error < 0.002 * GAIN
     assert fitted.gain == pytest.approx(GAIN, abs=min(3 * fitted.error, 0.005 * GAIN))
+
+
+@pytest.mark.parametrize(
+    "share",
+    [
+        [[0, 0, 0], [0.01, 0.955, 0.025], [0, 0.01, 0]],
+        [[0.001, 0.02, 0.001], [0.02, 0.916, 0.02], [0.001, 0.02, 0.001]],
+        [[0, 0.03, 0], [0, 0, 0], [0, 0.94, 0], [0, 0, 0], [0, 0.03, 0]],
+    ],
+    ids=["asymmetric", "symmetric", "two rows away"],
+)
+def test_charge_that_neighbours_share_does_not_bias_the_gain(share: list[list[float]]) -> None:
+    scenes = flats((701, 513), (2e3, 1e4, 4e4))
+    fitted, added = measure_shared(scenes, np.array(share), 10)
+    assert added
+    assert fitted.gain == pytest.approx(GAIN, rel=0.01)
+    biased = measure_shared(scenes, np.array(share), 10, neighbours=False)[0]
+    assert biased.gain > 1.05 * GAIN
+
+
+@pytest.mark.parametrize("rows", [0.0, 3.0])
+def test_noise_that_neighbours_share_without_light_is_not_counted(rows: float) -> None:
+    scenes = flats((701, 513), (2e3, 1e4, 4e4))
+    fitted, added = measure_shared(scenes, np.ones((1, 1)), 11, rows)
+    assert added == []
+    assert fitted.gain == pytest.approx(GAIN, abs=3 * fitted.error)
+
+
+def test_covariances_of_neighbours_are_those_of_the_noise() -> None:
+    rng = np.random.default_rng(12)
+    white = rng.standard_normal((2, 640, 517))
+    noise = white + 0.3 * np.roll(white, 1, axis=2) + 0.2 * np.roll(white, (2, 1), axis=(1, 2))
+    blocks = pair_statistics(
+        noise[0].astype(np.float32),
+        noise[1].astype(np.float32),
+        gain=1.0,
+        read_noise=1.0,
+        quantum=0.0,
+    )
+    dof = blocks[:, 0]
+    found = dict(zip(map(tuple, LAGS.tolist()), dof @ blocks[:, 3:] / dof.sum(), strict=True))
+    expected = {(0, 1): 0.3, (2, 1): 0.2, (2, 0): 0.06}
+    for lag, value in found.items():
+        assert value == pytest.approx(expected.get(lag, 0.0), abs=0.01), lag
 
 
 def test_structured_light_does_not_bias_the_gain() -> None:

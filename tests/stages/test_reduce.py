@@ -693,7 +693,10 @@ def test_real_frames_give_the_gain_and_noise_of_their_camera(tmp_path: Path) -> 
     found = report(tmp_path / "run")
     gain, noise = found["gain_e_per_adu"], found["read_noise_e"]
     assert gain["error"] < 0.01
-    assert min(ESIS_GAINS) < gain["measured"] < max(ESIS_GAINS)
+    # Its package looks at single pixels. At 64,000 e- their charge moves the boundaries of others
+    # by 0.4 % of the variance a neighbour, which counts here.
+    assert gain["neighbours"] == [[0, 1], [1, 0]]
+    assert 0.98 < gain["measured"] / np.mean(ESIS_GAINS) < 1.0
     assert noise["measured"] / 2.5 == pytest.approx(np.sqrt(np.mean(np.square(ESIS_NOISES))), 0.01)
     assert any("no frame has EXPTIME" in w for w in found["warnings"])
     # 50 blank and 2 overscan columns for each half, and some rows, see no light.

@@ -6,12 +6,14 @@ level may differ within the block: both sides of that equation are means over th
 pixel's mean and difference are uncorrelated for Poisson light (given the sum of two Poisson counts,
 the expected square of their difference is that sum), so structured light does not bias the slope.
 
-Charge that neighbours share in proportion to the signal (crosstalk) lowers the variance and raises
-the gain that comes out; photon transfer cannot tell (physics note, section 6). What grows with the
-level, as brighter-fatter, bends the curve.
+Charge that neighbours share lowers the variance of single pixels and raises the gain that comes
+out: in proportion to the signal with crosstalk (Moore, Ninkov & Forrest 2006), bending the curve
+with brighter-fatter. The noise is not lost: it stands in the covariances of neighbours, which are
+measured as far as `REACH` and added where they are significant.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,6 +35,21 @@ LADDER = 4
 N_BINS = 512
 """Bins of level: bin n holds ``n² / 4`` to ``(n + 1)² / 4`` ADU, the last one all above."""
 
+REACH = 2
+"""Pixels between neighbours whose covariance is measured, along each axis."""
+
+LAGS = np.array(
+    [(y, x) for y in range(REACH + 1) for x in range(-REACH, REACH + 1) if (y, x) > (0, 0)]
+)
+"""Rows and columns from a pixel to its neighbours, each pair of pixels once."""
+
+COLUMNS = 3 + len(LAGS)
+"""Of the sums: degrees of freedom, level, variance and the covariance of each of `LAGS`."""
+
+_SHARED, _ALSO = 4.0, 2.0
+"""Errors beyond which neighbours share noise, and beyond which others do where some do."""
+_PAIRED = 1 - REACH / BLOCK
+"""Least share of a block's pixels, along each axis, that have a neighbour at a lag in it."""
 _CLIP = 5.0
 _MIN_PIXELS = 32  # fewer do not tell outliers from noise
 _SIGMA_OF_MAD = 1.482602218505602
@@ -48,12 +65,20 @@ _SPARE, _RANGE = 3, 3.0
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _block_statistics(
-    first: Any, second: Any, gain: float, read_noise: float, quantum: float, clip: float, size: int
+    first: Any,
+    second: Any,
+    gain: float,
+    read_noise: float,
+    quantum: float,
+    clip: float,
+    size: int,
+    lags: Any,
 ) -> Any:
     ny, nx = first.shape
     rows, columns = -(-ny // size), -(-nx // size)
-    out = np.zeros((rows * columns, 3))
+    out = np.zeros((rows * columns, 3 + len(lags)))
     ratio = np.empty(size * size)
+    used = np.empty((size, size))
     for block in range(rows * columns):
         y0, x0 = block // columns * size, block % columns * size
         y1, x1 = min(y0 + size, ny), min(x0 + size, nx)
@@ -70,6 +95,7 @@ def _block_statistics(
         centre = np.median(ratio[:n])
         spread = _SIGMA_OF_MAD * np.median(np.abs(ratio[:n] - centre))
         n = 0
+        used[:] = np.nan
         total, square, level = 0.0, 0.0, 0.0
         for y in range(y0, y1):
             for x in range(x0, x1):
@@ -80,6 +106,7 @@ def _block_statistics(
                 limit = clip * math.sqrt((spread * sigma) ** 2 + quantum**2) + quantum
                 if abs(d - centre * sigma) <= limit:
                     n += 1
+                    used[y - y0, x - x0] = d
                     total += d
                     square += d * d
                     level += mean
@@ -87,6 +114,19 @@ def _block_statistics(
             out[block, 0] = n - 1
             out[block, 1] = level / n
             out[block, 2] = 0.5 * (square - total * total / n) / (n - 1)
+            used -= total / n
+            for lag in range(len(lags)):
+                dy, dx = lags[lag]
+                pairs, product = 0, 0.0
+                for y in range(size - dy):
+                    for x in range(max(0, -dx), size - max(0, dx)):
+                        both = used[y, x] * used[y + dy, x + dx]
+                        if not math.isnan(both):
+                            pairs += 1
+                            product += both
+                # The mean that was taken off is of the same pixels: it takes 1 / n of the variance.
+                if pairs:
+                    out[block, 3 + lag] = 0.5 * product / pairs + out[block, 2] / n
     return out
 
 
@@ -108,15 +148,15 @@ def pair_statistics(
 
     Returns
     -------
-    (block, 3) float64
-        Degrees of freedom, level (ADU) and variance of one sample (ADU²), without outliers, the
-        variance corrected for the clipping. All zero for the rest of a block at the edge that has
-        fewer than 32 pixels.
+    (block, COLUMNS) float64
+        Degrees of freedom, level (ADU), variance of one sample (ADU²) without outliers, corrected
+        for the clipping, and covariance (ADU²) of pixels apart by each of `LAGS`. All zero for the
+        rest of a block at the edge that has fewer than 32 pixels.
     """
     out: F64 = _block_statistics(
-        first.astype(float), second.astype(float), gain, read_noise, quantum, _CLIP, BLOCK
+        first.astype(float), second.astype(float), gain, read_noise, quantum, _CLIP, BLOCK, LAGS
     )
-    out[:, 2] /= clipped_variance_factor(_CLIP)
+    out[:, 2:] /= clipped_variance_factor(_CLIP)
     return out
 
 
@@ -125,18 +165,83 @@ def bin_pairs(blocks: F64) -> F64:
 
     Parameters
     ----------
-    blocks : (block, 3) float64
+    blocks : (block, COLUMNS) float64
         As `pair_statistics` gives them.
 
     Returns
     -------
-    (N_BINS, 3) float64
-        Degrees of freedom; the same times level; the same times variance. May be added.
+    (N_BINS, COLUMNS) float64
+        Degrees of freedom; the same times level, variance and covariances. May be added.
     """
-    dof, level, variance = blocks.T
+    dof, level, *_ = blocks.T
     bins = np.minimum(2 * np.sqrt(np.maximum(level, 0)), N_BINS - 1).astype(int)
-    sums = (np.bincount(bins, w, N_BINS) for w in (dof, dof * level, dof * variance))
+    sums = (np.bincount(bins, w, N_BINS) for w in (dof, *(dof * v for v in blocks.T[1:])))
     return np.stack(list(sums), axis=1)
+
+
+def neighbour_noise(frames: F32, lags: Sequence[tuple[int, int]]) -> float:
+    """Variance of good pixels in time with that which neighbours share.
+
+    Parameters
+    ----------
+    frames : (t, y, x) float32
+        Of the same scene; NaN where a pixel is not to be used.
+    lags : sequence of (int, int)
+        Rows and columns to the neighbours that count, each pair once.
+
+    Returns
+    -------
+    float
+        Mean square about each pixel's mean, plus twice the covariance at each lag.
+    """
+    noise = frames - frames.mean(axis=0)
+    total = float(np.nanmean(noise**2))
+    ny, nx = noise.shape[1:]
+    for dy, dx in lags:
+        left, right = max(0, -dx), nx - max(0, dx)
+        here = noise[:, : ny - dy, left:right]
+        total += 2 * float(np.nanmean(here * noise[:, dy:, left + dx : right + dx]))
+    return total * len(frames) / (len(frames) - 1)
+
+
+def add_neighbours(lit: F64, dark: F64) -> tuple[F64, list[tuple[int, int]]]:
+    """Noise with that which neighbours share.
+
+    Covariances beyond those without light are added to the variance of the pixel itself, twice for
+    the two neighbours, where they are significant over all levels: the rest would only add noise.
+    Where any is, less is needed of the others: a kernel that reaches the nearest pixels reaches
+    those on the diagonal a little, and in twelve lags a little adds up.
+
+    Parameters
+    ----------
+    lit, dark : (N_BINS, COLUMNS) float64
+        As `bin_pairs` gives them, of flats and of frames without light.
+
+    Returns
+    -------
+    sums : (N_BINS, 3) float64
+        Of the flats; the degrees of freedom are those that their scatter has.
+    added : list of (int, int)
+        The lags that were added.
+    """
+    sums = lit[:, :3].copy()
+    used = np.flatnonzero((lit[:, 0] > 0) & (lit[:, 1] > 0))
+    without = dark.sum(axis=0)
+    if not len(used) or not without[0] > 0:
+        return sums, []
+    dof, level, variance, *_ = (lit[used] / np.maximum(lit[used, :1], 1)).T
+    dof = lit[used, 0]
+    beyond = lit[used, 3:] / dof[:, None] - without[3:] / without[0]
+    weight = dof * level / np.maximum(variance, 1e-300) ** 2
+    error = math.hypot(
+        math.sqrt((weight**2 * variance**2 / dof).sum()),
+        weight.sum() * without[2] / without[0] / math.sqrt(without[0]),
+    )
+    errors = np.abs(weight @ beyond) * _PAIRED / error
+    significant = errors > (_ALSO if (errors > _SHARED).any() else _SHARED)
+    sums[used, 2] += dof * 2 * beyond[:, significant].sum(axis=1)
+    sums[used] /= 1 + 2 * significant.sum() / _PAIRED**2
+    return sums, [(int(y), int(x)) for y, x in LAGS[significant]]
 
 
 @dataclass(frozen=True)
@@ -157,6 +262,8 @@ class GainFit:
     curved : float
         Slope at the highest level (variance over level) relative to that at zero, less one; zero
         where a straight line fits.
+    neighbours : tuple of (int, int)
+        Lags whose covariances were added to the variance: see `add_neighbours`.
     """
 
     gain: float
@@ -164,6 +271,7 @@ class GainFit:
     chi2_reduced: float
     levels: tuple[float, float]
     curved: float = 0.0
+    neighbours: tuple[tuple[int, int], ...] = ()
 
 
 def fit_gain(
@@ -184,7 +292,7 @@ def fit_gain(
     Parameters
     ----------
     sums : (N_BINS, 3) float64
-        As `bin_pairs` gives them.
+        As `add_neighbours` gives them.
     read_variance, read_variance_error : float
         Variance at level zero and its error (ADU²).
     highest : float

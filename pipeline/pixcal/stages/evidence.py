@@ -75,6 +75,7 @@ def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice
         distance_mm=acquisition.fibres.distance_mm,
         origin=(y[0], x[0]),
         photon_transfer=_photon_transfer(used["gain_e_per_adu"]),
+        neighbours=tuple((y, x) for y, x in used["gain_e_per_adu"]["neighbours"]),
     )
 
 

@@ -186,7 +186,7 @@ def transfer_points(sums: F64, most: int = 60) -> F64:
 
     Parameters
     ----------
-    sums : (bin, 3) float64
+    sums : (bin, 3 or more) float64
         Degrees of freedom; the same times level; times variance: see `photon_transfer.bin_pairs`.
     most : int
         Most points: neighbouring bins are put together.
@@ -200,7 +200,7 @@ def transfer_points(sums: F64, most: int = 60) -> F64:
     if not len(filled):
         return np.empty((0, 3))
     size = -(-len(filled) // most)
-    dof, level, variance = np.add.reduceat(filled, np.arange(0, len(filled), size)).T
+    dof, level, variance = np.add.reduceat(filled[:, :3], np.arange(0, len(filled), size)).T
     level, variance = level / dof, variance / dof
     return np.stack([level, variance, variance * np.sqrt(2 / dof)], axis=1)
 

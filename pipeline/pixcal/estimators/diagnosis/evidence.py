@@ -199,6 +199,8 @@ class Evidence:
     photon_transfer : (float, float, float)
         Gain that photon transfer gives (e-/ADU), its error, and the reduced chi-square; nan where
         it gives none.
+    neighbours : tuple of (int, int)
+        Lags (rows, columns) whose noise that gain counts.
     """
 
     fringes: Mapping[str, FringeEvidence]
@@ -217,6 +219,7 @@ class Evidence:
     notes: tuple[str, ...] = field(default=())
     origin: tuple[int, int] = (0, 0)
     photon_transfer: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+    neighbours: tuple[tuple[int, int], ...] = ()
     _found: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def once(self, name: str, *given: Any, make: Callable[[], T]) -> T:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.kernels.photon_transfer import LADDER
+from pixcal.kernels.photon_transfer import LADDER, neighbour_noise
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.exposure import Camera
@@ -35,10 +35,13 @@ class MeasuredGain:
         Of each pixel's amplifier over the detector's mean.
     transfer : tuple of (float, float)
         Gain by photon transfer, and its 1-sigma error, of each part of the flats.
+    neighbours : tuple of (int, int)
+        Lags (rows, columns) whose covariances the photon transfer counts.
     """
 
     amplifiers: F64
     transfer: tuple[tuple[float, float], ...] = ()
+    neighbours: tuple[tuple[int, int], ...] = ()
 
     def drawn(self, rng: np.random.Generator, change: float = 1.0) -> F32:
         """Gain (y, x) over the one used, as it may be within its error.
@@ -57,9 +60,13 @@ class MeasuredGain:
 
 
 def photon_transfer_change(
-    bench: Bench, measured: Effect, effects: Sequence[Effect], recordings: Sequence[Recording]
+    bench: Bench,
+    measured: Effect,
+    effects: Sequence[Effect],
+    recordings: Sequence[Recording],
+    neighbours: Sequence[tuple[int, int]] = (),
 ) -> float:
-    """What effects do to the variance of flats over their mean.
+    """What effects do to the variance of flats over their mean, neighbours at lags counted.
 
     One without flats below saturation. The gain that is measured by photon transfer is too large by
     the inverse of it, and a bench that is simulated with the effects must not have them twice.
@@ -82,7 +89,9 @@ def photon_transfer_change(
     for acting in ([measured], [measured, *effects]):
         camera = Camera(bench, rows, acting)
         good = camera.maps.mask == 0
-        moments = [_moments(camera, replace(r, bench=bench), good) for r in (flat, *dark)]
+        moments = [
+            _moments(camera, replace(r, bench=bench), good, neighbours) for r in (flat, *dark)
+        ]
         (mean, variance), *none = moments
         for offset, noise in none:
             mean, variance = mean - offset, variance - noise
@@ -90,10 +99,16 @@ def photon_transfer_change(
     return float(np.clip(ratios[1] / ratios[0], 0.1, 10)) if min(ratios) > 0 else 1.0
 
 
-def _moments(camera: Camera, recording: Recording, good: NDArray[np.bool_]) -> tuple[float, float]:
+def _moments(
+    camera: Camera,
+    recording: Recording,
+    good: NDArray[np.bool_],
+    neighbours: Sequence[tuple[int, int]],
+) -> tuple[float, float]:
     """Mean and variance in time of good pixels, ADU; common changes of frames taken off."""
     frames = range(min(FRAMES, recording.count))
-    samples = np.stack([s[good].astype(np.float32) for _, s in camera.expose(recording, frames)])
-    mean = float(samples.mean())
-    samples -= samples.mean(axis=1, keepdims=True)
-    return mean, float(samples.var(axis=0, ddof=1).mean())
+    samples = np.stack([s.astype(np.float32) for _, s in camera.expose(recording, frames)])
+    samples[:, ~good] = np.nan
+    of_frames = np.nanmean(samples, axis=(1, 2))
+    samples -= of_frames[:, None, None]
+    return float(of_frames.mean()), neighbour_noise(samples, neighbours)

@@ -278,6 +278,7 @@ def _gain(
             for used, value, error, chi2 in found
             if np.isfinite(value) and error > 0 and chi2 < NO_TEST
         ),
+        tuple(sorted({lag for e in evidence for lag in e.neighbours})),
     )
 
 

@@ -284,7 +284,9 @@ class NominalBench:
         measured = self._drawn(effects if fitted else (), own_seed, undone)
         if fitted and effects:
             measured = self._of_measured_k(measured, bench, effects)
-        change = photon_transfer_change(bench, measured, effects, self.recordings)
+        change = photon_transfer_change(
+            bench, measured, effects, self.recordings, self.gain.neighbours
+        )
         measured = self._electronics(measured, seed, own_seed, change)
         camera = Camera(bench, rows, [measured, *effects])
         arrays = {

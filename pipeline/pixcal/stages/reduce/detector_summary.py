@@ -1,7 +1,7 @@
 """The detector as a whole: read noise, gain and linearity, from the statistics of all columns."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.detector.calibration import Linearity, linearity
 from pixcal.estimators.detector.emva import saturation, transfer_points
-from pixcal.kernels.photon_transfer import LADDER, GainFit, fit_gain
+from pixcal.kernels.photon_transfer import LADDER, GainFit, add_neighbours, fit_gain
 from pixcal.kernels.rounding import SHEPPARD, UNTOLD, noise_before_rounding
 from pixcal.model.acquisition import Detector
 from pixcal.model.errors import InputError
@@ -129,6 +129,12 @@ class Summary:
                 f"{self.gain.chi2_reduced:.3g}): do not rely on the gain measured; causes are a "
                 "nonlinear response, a lamp that flickers, or charge shared by neighbours"
             )
+        if self.gain is not None and self.gain.neighbours:
+            lags = ", ".join(f"({y}, {x})" for y, x in self.gain.neighbours)
+            found.append(
+                "neighbours share charge: their noise is correlated in the flats at (rows, "
+                f"columns) {lags}; the gain counts what they share"
+            )
         if self.gain is not None and self.gain.curved:
             found.append(
                 "the photon-transfer curve bends: variance over level changes by "
@@ -186,11 +192,7 @@ def summarise(job: Measuring, folder: Path, declared: Detector) -> Summary:
         raise InputError(
             f"frames.flat: the flats hold no light ({found}); take them again, or list none"
         )
-    tables = ArrayReader(folder / "pairs")
-    sums = np.zeros(tables.shape[2:])
-    # Added up in the order of the columns: the same sums whoever measured them.
-    for i, j in np.ndindex(grid(job.shape)):
-        sums += tables.read((i, i + 1), (j, j + 1))[0, 0]
+    sums = pair_sums(folder, job)
     levels, usable = _rungs(ArrayReader(folder / "levels").read(), job)
     # Pixels that are full saturate the flats though no sample of the converter does.
     well = saturation(transfer_points(sums[1]))
@@ -207,8 +209,18 @@ def summarise(job: Measuring, folder: Path, declared: Detector) -> Summary:
         noise = math.sqrt(read_variance[0])
         read_noise = (noise, read_variance[1] / (2 * noise) if noise else 0.0)
         own = _before_rounding(read_variance, folder, job) if job.quantum else read_noise
-    gain = _gain(sums[1], own, top, job)
+    gain = _gain(sums, own, top, job)
     return Summary(declared, medians, read_noise, own, gain, levels, usable, full, straight)
+
+
+def pair_sums(folder: Path, job: Measuring) -> F64:
+    """Sums (2, N_BINS, COLUMNS) over the pairs of frames without and with light."""
+    tables = ArrayReader(folder / "pairs")
+    sums = np.zeros(tables.shape[2:])
+    # Added up in the order of the columns: the same sums whoever measured them.
+    for i, j in np.ndindex(grid(job.shape)):
+        sums += tables.read((i, i + 1), (j, j + 1))[0, 0]
+    return sums
 
 
 def _before_rounding(
@@ -224,14 +236,14 @@ def _before_rounding(
 
 def _read_variance(sums: F64) -> tuple[float, float] | None:
     """Variance of a sample without light and its error (ADU²)."""
-    dof, _, square = sums.sum(axis=0)
+    dof, _, square = sums[:, :3].sum(axis=0)
     return (square / dof, square / dof * math.sqrt(2 / dof)) if dof > 0 else None
 
 
 def _gain(
     sums: F64, read_noise: tuple[float, float] | None, top: float, job: Measuring
 ) -> GainFit | None:
-    """Photon transfer below the level ``top`` (ADU above bias) of saturation.
+    """Photon transfer below the level ``top`` (ADU above bias) of saturation, neighbours added.
 
     None where the level above bias is unknown, or the error is too large.
     """
@@ -240,10 +252,14 @@ def _gain(
     noise, error = read_noise or (job.read_noise, _GUESS_ERROR * job.read_noise)
     # With light there is noise enough that rounding adds no more and no less than this.
     variance = noise**2 + SHEPPARD * job.quantum**2
-    fitted = fit_gain(
-        sums, variance, 2 * noise * error, _LINEAR_SHARE * top, straight=len(job.flat) < LADDER
-    )
-    return fitted if fitted is not None and fitted.error < _GAIN_ERROR * fitted.gain else None
+    highest = _LINEAR_SHARE * top
+    dark, lit = sums
+    lit = np.where(lit[:, 1:2] <= highest * lit[:, :1], lit, 0.0)
+    shared, added = add_neighbours(lit, dark)
+    fitted = fit_gain(shared, variance, 2 * noise * error, highest, straight=len(job.flat) < LADDER)
+    if fitted is None or not fitted.error < _GAIN_ERROR * fitted.gain:
+        return None
+    return replace(fitted, neighbours=tuple(added))
 
 
 def _rungs(tables: F64, job: Measuring) -> tuple[F64, NDArray[np.bool_]]:

@@ -24,7 +24,8 @@ from pixcal.estimators.detector.emva import (
     transfer_points,
     without_trend,
 )
-from pixcal.stages.reduce.detector_summary import Summary
+from pixcal.kernels.photon_transfer import add_neighbours
+from pixcal.stages.reduce.detector_summary import Summary, pair_sums
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.halves import Window, frames_of, middle_of, read_halves
 from pixcal.stages.reduce.ingested import Ingested
@@ -57,8 +58,8 @@ def characterise(
         For each figure ``title``, ``unit``, ``value``, ``error`` (null where unknown), ``note``.
     """
     gain = _gain(facts)
-    tables = ArrayReader(made.scratch / "statistics" / "pairs").read()
-    points = transfer_points(tables[:, :, 1].sum(axis=(0, 1)))
+    dark, lit = pair_sums(made.scratch / "statistics", job)
+    points = transfer_points(add_neighbours(lit, dark)[0])
     top, reached = _top(points, summary, job)
     middle = middle_of(source.shape)
     halves = read_halves(made, source, summary, top, middle, runtime)

@@ -25,7 +25,7 @@ from pixcal.estimators.detector.calibration import (
     usual_variance,
 )
 from pixcal.estimators.detector.full_wells import unsaturated
-from pixcal.kernels.photon_transfer import N_BINS, bin_pairs, pair_statistics
+from pixcal.kernels.photon_transfer import COLUMNS, N_BINS, bin_pairs, pair_statistics
 from pixcal.kernels.robust import BATCH, Combination, Combined
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.columns import Index, Strip, extent, grid
@@ -118,7 +118,7 @@ def statistics_writers(folder: Path, shape: tuple[int, int], flats: int) -> dict
     made = {}
     for name, whole, chunks, dtype in (
         ("maps", (n, *shape), (n, *CHUNK[1:]), np.float32),
-        ("pairs", (*tiles, 2, N_BINS, 3), (1, 1, 2, N_BINS, 3), np.float64),
+        ("pairs", (*tiles, 2, N_BINS, COLUMNS), (1, 1, 2, N_BINS, COLUMNS), np.float64),
         ("levels", (*tiles, rungs, 3), (1, 1, rungs, 3), np.float64),
     ):
         dims = [f"axis{axis}" for axis in range(len(whole))]
@@ -150,7 +150,9 @@ class _Column:
         (y0, y1), (x0, x1) = extent(job.shape, index)
         maps = {name: np.zeros((y1 - y0, x1 - x0)) for name in STATISTICS}
         levels = np.zeros(job.writers["levels"].shape[2:])
-        return cls(index, maps, np.zeros((2, N_BINS, 3)), levels, np.zeros((y1 - y0, x1 - x0)))
+        return cls(
+            index, maps, np.zeros((2, N_BINS, COLUMNS)), levels, np.zeros((y1 - y0, x1 - x0))
+        )
 
 
 def measure(job: Measuring, strip: Strip) -> None:
@@ -243,7 +245,7 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
 
 def _pair_sums(job: Measuring, frames: F32, levels: F32, lamp: bool) -> F64:
     """Photon transfer of frames 0 and 1, 2 and 3, …, each made as bright as the other."""
-    sums = np.zeros((N_BINS, 3))
+    sums = np.zeros((N_BINS, COLUMNS))
     for n in range(0, len(frames) - 1, 2):
         (a, b), (first, second) = levels[n : n + 2], frames[n : n + 2]
         if not np.isfinite(a + b):

@@ -243,6 +243,7 @@ def _report_noise(
             "error": fitted.error if fitted else None,
             "chi2_reduced": fitted.chi2_reduced if fitted else None,
             "levels_adu": list(fitted.levels) if fitted else None,
+            "neighbours": [list(lag) for lag in fitted.neighbours] if fitted else [],
             "used": gain,
             "used_from": config.gain,
         },
