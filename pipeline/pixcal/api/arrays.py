@@ -17,11 +17,10 @@ from pixcal.model.errors import InputError
 from pixcal.storage.fits_out import FrameWriter
 
 Frames = NDArray[Any]
+# frames (t, y, x) and their exposure time (s), by the name of the file that they go to
 Stacks = dict[str, tuple[Frames, float | None]]
-"""Frames (t, y, x) and their exposure time (s), by the name of the file that they go to."""
 
-EXACT = 1 << 24
-"""Whole numbers up to here are exact in float32."""
+EXACT = 1 << 24  # whole numbers up to here are exact in float32
 
 
 def calibrate(

@@ -5,8 +5,8 @@ from pathlib import Path
 from pixcal.model.errors import InputError
 
 PACKAGE = Path(__file__).parents[1]
+# where an installed package has it, and where a clone has it
 PLACES = (PACKAGE / "samples", PACKAGE.parents[1] / "data_samples")
-"""Where an installed package has it, and where a clone has it."""
 
 
 def sample_acquisition() -> Path:

@@ -26,14 +26,12 @@ from pixcal.engine.parcel import Job, RemoteTask, abandon, pack, versions
 from pixcal.model.errors import ClusterError, InputError
 
 CONNECT = "10s"
-AHEAD = 4
-"""Tasks handed to the scheduler for each thread: it takes a while to hear that one ended."""
+AHEAD = 4  # tasks handed to the scheduler for each thread: it takes a while to hear that one ended
+# tasks handed over however few threads there are: a cluster that grows does so by demand
 LEAST_AHEAD = 32
-"""Tasks handed over however few threads there are: a cluster that grows does so by demand."""
-LOOK_S = 5.0
-"""Time between two looks at how many threads there are."""
+LOOK_S = 5.0  # time between two looks at how many threads there are
+# by these a run directory that is worked on is known (`pixcal.storage.artefact`)
 HELD = (".lock", ".partial")
-"""By these a run directory that is worked on is known (`pixcal.storage.artefact`)."""
 
 Ended = Callable[[int, Any], None]
 

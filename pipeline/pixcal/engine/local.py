@@ -17,8 +17,7 @@ from dask.callbacks import Callback
 from pixcal.engine.parcel import Job, call, pack
 from pixcal.model.errors import ClusterError
 
-DEATHS = 3
-"""Deaths of workers in a row, without a task done in between, that are put up with."""
+DEATHS = 3  # deaths of workers in a row, without a task done in between, that are put up with
 
 Ended = Callable[[int, Any], None]
 

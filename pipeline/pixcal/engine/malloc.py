@@ -6,8 +6,7 @@ import os
 # From malloc.h, see mallopt(3).
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 
-OF_THE_NANNY = "65536"
-"""What Dask's nanny gives its workers as MALLOC_TRIM_THRESHOLD_."""
+OF_THE_NANNY = "65536"  # what Dask's nanny gives its workers as MALLOC_TRIM_THRESHOLD_
 
 
 def keep_freed_memory() -> None:

@@ -23,28 +23,20 @@ import pixcal
 from pixcal.engine.malloc import keep_freed_memory
 from pixcal.model.errors import ClusterError, InputError
 
-PATIENCE_S = 1.0
-"""Time in which a file made on one machine must show on the others."""
-KEPT = 2
-"""Functions that a worker keeps unpacked: those of so many runs at the same time."""
+PATIENCE_S = 1.0  # time in which a file made on one machine must show on the others
+KEPT = 2  # functions that a worker keeps unpacked: those of so many runs at the same time
+# libraries on which the last bit of a result may depend
 PACKAGES = ("numpy", "scipy", "numba", "numcodecs", "zarr", "astropy")
-"""Libraries on which the last bit of a result may depend."""
 CODE, MACHINE = "code of pixcal", "machine"
 
 
 @dataclass(frozen=True)
 class PickledArguments:
-    """An object for another process.
+    """An object for another process."""
 
-    Attributes
-    ----------
-    data : bytes
-        The object pickled, its paths made absolute: elsewhere the current folder is another one.
-    paths : tuple of Path
-        The files and folders among those paths that exist, which must exist there as well.
-    """
-
+    # the object pickled, its paths made absolute: elsewhere the current folder is another one
     data: bytes
+    # the files and folders among those paths that exist, which must exist there as well
     paths: tuple[Path, ...]
 
 
@@ -73,23 +65,14 @@ def pack(obj: Any) -> PickledArguments:
 
 @dataclass(frozen=True)
 class Job:
-    """What the tasks of one run have in common; unpacked once in every process.
+    """What the tasks of one run have in common; unpacked once in every process."""
 
-    Attributes
-    ----------
-    function : bytes
-        Pickled; called with the item of a task.
-    paths : tuple of Path
-        Files and folders that must exist where it is called.
-    at_once : int
-        Tasks that one process may do at the same time; 0 for as many as it likes.
-    versions : dict
-        What must be installed there (see `versions`).
-    """
-
-    function: bytes = field(compare=False)
+    function: bytes = field(compare=False)  # pickled; called with the item of a task
+    # files and folders that must exist where it is called
     paths: tuple[Path, ...] = field(compare=False)
+    # tasks that one process may do at the same time; 0 for as many as it likes
     at_once: int = field(default=0, compare=False)
+    # what must be installed there (see `versions`)
     versions: dict[str, str] = field(default_factory=dict, compare=False)
     name: str = field(default_factory=lambda: uuid4().hex)
 

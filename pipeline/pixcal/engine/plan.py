@@ -7,33 +7,21 @@ from functools import cache
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import PlanError
 
+# interpreter with all libraries loaded and kernels compiled (measured, see the tests)
 BASE_BYTES = 350 << 20
-"""Interpreter with all libraries loaded and kernels compiled (measured, see the tests)."""
 
-DASK_WORKER_BYTES = 420 << 20
-"""The same of a Dask worker, which lives on from stage to stage."""
+DASK_WORKER_BYTES = 420 << 20  # the same of a Dask worker, which lives on from stage to stage
 
-USABLE = 0.8
-"""Share of its memory limit above which a Dask worker starts no task (Dask's default)."""
+USABLE = 0.8  # share of its memory limit above which a Dask worker starts no task (Dask's default)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Memory that a stage will use.
+    """Memory that a stage will use."""
 
-    Attributes
-    ----------
-    bytes_per_task : int
-        Peak of one task; of its process, where each has its own.
-    shared_bytes : int
-        Held by the coordinating process during the whole stage.
-    workers : int
-        Tasks that run at the same time; on a Dask cluster, in each of its workers.
-    """
-
-    bytes_per_task: int
-    shared_bytes: int
-    workers: int
+    bytes_per_task: int  # peak of one task; of its process, where each has its own
+    shared_bytes: int  # held by the coordinating process during the whole stage
+    workers: int  # tasks that run at the same time; on a Dask cluster, in each of its workers
 
     @property
     def total(self) -> int:

@@ -9,10 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-MEMORY = Path("/dev/shm")
-"""Files in memory, on Linux; other systems have none."""
-ROOM = 2
-"""Times what is needed that must be free for every core: as many may write there at once."""
+MEMORY = Path("/dev/shm")  # files in memory, on Linux; other systems have none
+ROOM = 2  # times what is needed that must be free for every core: as many may write there at once
 _PREFIX = "pixcal-scratch-"
 _HELD = "held"
 _YOUNG_S = 60.0

@@ -11,8 +11,8 @@ from pixcal.model.errors import InputError
 
 SCHEMA = "pixcal/bench/1"
 
+# kinds of calibration frames; their folders, so no fringe set may have these names
 CALIBRATIONS = ("bias", "dark", "flat")
-"""Kinds of calibration frames; their folders, so no fringe set may have these names."""
 
 MAX_FRAMES = 10_000_000
 MAX_DURATION_S = 1e10

@@ -20,8 +20,7 @@ from pixcal.model.errors import InputError
 
 T = TypeVar("T")
 
-StrPath = str | PathLike[str]
-"""A path in any form; an opened `pixcal.Run` is one as well."""
+StrPath = str | PathLike[str]  # a path in any form; an opened `pixcal.Run` is one as well
 
 MAX_CONFIG_BYTES = 1_000_000
 

@@ -16,11 +16,10 @@ from typing import Any, Literal
 from pixcal.model.config import StrPath, quantity
 from pixcal.model.errors import InputError
 
+# limits (y0, y1, x0, x1) of a rectangle of pixels, ends excluded
 Region = tuple[int, int, int, int]
-"""Limits (y0, y1, x0, x1) of a rectangle of pixels, ends excluded."""
 
-MOST_ELECTRONS = 1e15
-"""The Poisson generator counts so far."""
+MOST_ELECTRONS = 1e15  # the Poisson generator counts so far
 
 
 def _overwrite() -> Any:

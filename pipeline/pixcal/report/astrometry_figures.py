@@ -22,39 +22,20 @@ COLOURS = {"perfect": PERFECT, "measured": MEASURED}
 
 @dataclass(frozen=True)
 class AstrometryView:
-    """What the picture shows.
+    """What the picture shows."""
 
-    Attributes
-    ----------
-    result : dict
-        ``astrometry.json``.
-    target_px : float
-        What the mission needs.
-    table : tuple of (str, str, str, str, str)
-        Rows: case, axis, error on a perfect grid, error with the maps, gain.
-    photons : (2, n) float64
-        Electrons, and the bound of a centroid from photon noise, px.
-    weights : (y, x) float64
-        What each pixel tells of the first axis of a star in the middle, sum 1.
-    detail : (grid, y, x) float64
-        Error along the first axis of a star in the middle of each pixel, px; NaN where none is.
-    detail_at : (int, int)
-        First row and column of it.
-    rms : (grid, y, x) float64
-        Of the errors, over blocks of the whole detector, px.
-    block : int
-        Side of the blocks, px.
-    """
-
-    result: Mapping[str, Any]
-    target_px: float
+    result: Mapping[str, Any]  # `astrometry.json`
+    target_px: float  # what the mission needs
+    # rows: case, axis, error on a perfect grid, error with the maps, gain
     table: tuple[tuple[str, ...], ...]
-    photons: F64
-    weights: F64
+    photons: F64  # (2, n) electrons, and the bound of a centroid from photon noise, px
+    weights: F64  # (y, x) what each pixel tells of the first axis of a star in the middle, sum 1
+    # (grid, y, x) error along the first axis of a star in the middle of each pixel, px; NaN
+    # where none is
     detail: F64
-    detail_at: tuple[int, int]
-    rms: F64
-    block: int
+    detail_at: tuple[int, int]  # first row and column of it
+    rms: F64  # (grid, y, x) of the errors, over blocks of the whole detector, px
+    block: int  # side of the blocks, px
 
     @property
     def first(self) -> Mapping[str, Any]:

@@ -20,49 +20,26 @@ COLOURS = (BLUE, GREEN, *MARKS)
 
 @dataclass(frozen=True)
 class Line:
-    """Precision against frames: one over their root.
-
-    Attributes
-    ----------
-    label : str
-    median, worst : float
-        After one frame, px, of the median and of the worst pixel.
-    planned : int
-        Frames of the bench.
-    """
+    """Precision against frames: one over their root."""
 
     label: str
-    median: float
+    median: float  # median, worst: after one frame, px, of the median and of the worst pixel
     worst: float
-    planned: int
+    planned: int  # frames of the bench
 
 
 @dataclass(frozen=True)
 class BudgetView:
-    """What the figure shows.
+    """What the figure shows."""
 
-    Attributes
-    ----------
-    name : str
-        Of the bench file.
-    sets, joined : tuple of Line
-        Of each set; of the components of all sets, against the frames of all.
-    precision : float or None
-        Wanted, px.
-    frames : int or None
-        Given, of each set.
-    period_s : float
-        From frame to frame.
-    levers : tuple of (str, float, float)
-        Name, variance of one frame (px²) and period (s) of each change.
-    """
-
-    name: str
+    name: str  # of the bench file
+    # sets, joined: of each set; of the components of all sets, against the frames of all
     sets: tuple[Line, ...]
     joined: tuple[Line, ...]
-    precision: float | None
-    frames: int | None
-    period_s: float
+    precision: float | None  # wanted, px
+    frames: int | None  # given, of each set
+    period_s: float  # from frame to frame
+    # name, variance of one frame (px²) and period (s) of each change
     levers: tuple[tuple[str, float, float], ...]
 
 

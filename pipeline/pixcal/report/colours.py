@@ -7,32 +7,31 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 
-LEVELS = 81
-"""Steps of a colour scale: with all others they fit the 256 colours of a small PNG."""
+LEVELS = 81  # steps of a colour scale: with all others they fit the 256 colours of a small PNG
 
+# where there is no value
 MASKED = "#9b9b9b"
-"""Where there is no value."""
 
 INK = "#1d2733"
 BLUE = "#2667b0"
 RED = "#c1431f"
 GREEN = "#1b8a5a"
 GREY = "#7d8896"
+# bars of histograms
 BAR = "#b9cbe4"
-"""Bars of histograms."""
+# what chance allows
 BAND = "#dfe3e9"
-"""What chance allows."""
 UNFLAGGED = "#eef1f5"
 SEVERAL = "#000080"
 
+# the fringe frequencies of each set, on the spectrum and on paper
 MARKS = ("#ff3d1f", "#00a7e1", "#ff3dc8", "#39c24a")
-"""The fringe frequencies of each set, on the spectrum and on paper."""
 
+# one colour for each bit of the flags
 FLAGS = {
     1: "#d7301f", 2: "#54278f", 4: "#fdae33", 8: "#1f9ed1", 16: "#e377c2", 32: "#111111",
     64: "#2ca25f", 128: "#8c510a",
 }  # fmt: skip
-"""One colour for each bit of the flags."""
 
 # Björn Ottosson's OKLab (2020): a space whose distances are those that the eye sees.
 _LMS_FROM_LAB = np.array(

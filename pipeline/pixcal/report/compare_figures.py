@@ -18,53 +18,31 @@ from pixcal.report.text import SYMBOLS
 
 F64 = NDArray[np.float64]
 
-SHIFT_SPAN = 5.0
-"""Sigma at which the colours of the map of differences end."""
-MARKED = 200
-"""Most disagreeing pixels that are marked."""
-LINES = 1500
-"""Most means of a profile that are drawn with an error each."""
+SHIFT_SPAN = 5.0  # sigma at which the colours of the map of differences end
+MARKED = 200  # most disagreeing pixels that are marked
+LINES = 1500  # most means of a profile that are drawn with an error each
 
 
 @dataclass(frozen=True)
 class ComponentView:
-    """What the figure shows of one component.
-
-    Attributes
-    ----------
-    name : str
-    window : (int, int)
-        (y, x), px.
-    picture : (bin, bin) int64
-        Pixels by the second map (y) and the first (x).
-    reach : float
-        Half width of the picture, px.
-    slope : float or None
-        Of the second against the first.
-    scales : tuple of mapping
-        ``side_px``, ``common``, ``difference_px``, ``expected_px`` and so on.
-    side : int
-        Of the blocks, px.
-    shift, scatter : (y, x) float64
-        Sigma of each block: of its mean difference, and of its pixels' scatter.
-    columns, rows : (n,), (n,) float64
-        Mean difference of each and its error, px.
-    far : tuple of (int, int)
-        (y, x) of pixels that disagree.
-    """
+    """What the figure shows of one component."""
 
     name: str
-    window: tuple[int, int]
-    picture: NDArray[np.int64]
-    reach: float
-    slope: float | None
+    window: tuple[int, int]  # (y, x), px
+    picture: NDArray[np.int64]  # (bin, bin) pixels by the second map (y) and the first (x)
+    reach: float  # half width of the picture, px
+    slope: float | None  # of the second against the first
+    # `side_px`, `common`, `difference_px`, `expected_px` and so on
     scales: tuple[Mapping[str, Any], ...]
-    side: int
+    side: int  # of the blocks, px
+    # shift, scatter: (y, x) sigma of each block: of its mean difference, and of its pixels'
+    # scatter
     shift: F64
     scatter: F64
+    # columns, rows: (n,), (n,) float64: mean difference of each and its error, px
     columns: tuple[F64, F64]
     rows: tuple[F64, F64]
-    far: tuple[tuple[int, int], ...]
+    far: tuple[tuple[int, int], ...]  # (y, x) of pixels that disagree
 
 
 @dataclass(frozen=True)

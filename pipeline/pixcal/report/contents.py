@@ -14,15 +14,9 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Detail:
-    """The middle of a map, pixel by pixel.
+    """The middle of a map, pixel by pixel."""
 
-    Attributes
-    ----------
-    start : (int, int)
-        First row and column.
-    """
-
-    start: tuple[int, int]
+    start: tuple[int, int]  # first row and column
     delta: MapSummary
     sigma: MapSummary
 
@@ -89,60 +83,36 @@ class FringeSet:
 
 @dataclass(frozen=True)
 class Detector:
-    """What the reduction found.
+    """What the reduction found."""
 
-    Attributes
-    ----------
-    facts : dict
-        ``reduce.json``; empty where there is none.
-    curves : dict
-        ``figures_of_merit.json``; empty where there is none.
-    maps : dict
-        ``bias`` (ADU), ``dark_rate`` (e-/s), ``flat``, ``read_noise`` (e-), those that exist.
-    """
-
-    facts: dict[str, Any] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)  # `reduce.json`; empty where there is none
+    # `bias` (ADU), `dark_rate` (e-/s), `flat`, `read_noise` (e-), those that exist
     maps: dict[str, MapSummary] = field(default_factory=dict)
+    # `figures_of_merit.json`; empty where there is none
     curves: dict[str, Any] = field(default_factory=dict)
     flags: FlagSummary | None = None
 
 
 @dataclass(frozen=True)
 class EffectWords:
-    """What an effect is, for people.
+    """What an effect is, for people."""
 
-    Attributes
-    ----------
-    title, about : str
-        In a few words, and in a sentence.
-    parameters : mapping
-        Unit and meaning of each parameter.
-    """
-
-    title: str
+    title: str  # title, about: in a few words, and in a sentence
     about: str = ""
+    # unit and meaning of each parameter
     parameters: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What ``pixcal diagnose`` found.
+    """What ``pixcal diagnose`` found."""
 
-    Attributes
-    ----------
-    facts : dict
-        ``diagnosis.json``.
-    curves : sequence of dict
-        ``curves.json``: each statistic as measured, as simulated, and with the effects.
-    effects : mapping
-        Words for effects, by name; of those that are not known there are none.
-    noticed : float
-        Significance (sigma) from which a statistic counts as different, all being looked at.
-    """
-
-    facts: dict[str, Any]
+    facts: dict[str, Any]  # `diagnosis.json`
+    # `curves.json`: each statistic as measured, as simulated, and with the effects
     curves: Sequence[dict[str, Any]]
+    # words for effects, by name; of those that are not known there are none
     effects: Mapping[str, EffectWords]
+    # significance (sigma) from which a statistic counts as different, all being looked at
     noticed: float
 
 
@@ -175,38 +145,21 @@ class ArrayRecord:
 
 @dataclass(frozen=True)
 class Contents:
-    """A whole run.
+    """A whole run."""
 
-    Attributes
-    ----------
-    acquisition : dict
-        As in ``acquisition.json``.
-    fit : dict, optional
-        ``fit.json``.
-    flags : FlagSummary, optional
-        Of the products.
-    diagnosis : Diagnosis, optional
-        Where the run was diagnosed.
-    warnings : tuple of str
-        Sentences that the stages left.
-    advice : tuple of str
-        Which map to use, and what limits it.
-    causes : tuple of tuple of str
-        What each cause does to the map, and what is done about it; the header first.
-    """
-
-    acquisition: dict[str, Any]
+    acquisition: dict[str, Any]  # as in `acquisition.json`
     stages: tuple[StageRecord, ...]
     arrays: tuple[ArrayRecord, ...] = ()
     detector: Detector = field(default_factory=Detector)
-    fit: dict[str, Any] | None = None
+    fit: dict[str, Any] | None = None  # `fit.json`
     offsets: tuple[OffsetMap, ...] = ()
     sets: tuple[FringeSet, ...] = ()
-    flags: FlagSummary | None = None
+    flags: FlagSummary | None = None  # of the products
     allan_measured: bool = False
-    diagnosis: Diagnosis | None = None
-    warnings: tuple[str, ...] = ()
-    advice: tuple[str, ...] = ()
+    diagnosis: Diagnosis | None = None  # where the run was diagnosed
+    warnings: tuple[str, ...] = ()  # sentences that the stages left
+    advice: tuple[str, ...] = ()  # which map to use, and what limits it
+    # what each cause does to the map, and what is done about it; the header first
     causes: tuple[tuple[str, ...], ...] = ()
 
     @property

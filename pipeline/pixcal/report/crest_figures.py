@@ -14,10 +14,8 @@ from pixcal.report.drawing import WIDE, finish, new_figure
 
 F64 = NDArray[np.float64]
 
-SHOWN_PATHS = 4
-"""Paths of each end (paper, figure 16)."""
-LONG_TITLE = 10
-"""Points, so that numbers of many digits stay within their panel."""
+SHOWN_PATHS = 4  # paths of each end (paper, figure 16)
+LONG_TITLE = 10  # points, so that numbers of many digits stay within their panel
 CREST, VALLEY = RED, BLUE
 
 
@@ -31,61 +29,34 @@ class Extract:
 
 @dataclass(frozen=True)
 class CrestView:
-    """What the figure shows of one fringe set.
-
-    Attributes
-    ----------
-    frame : (int, int)
-        (y, x) size, px.
-    direction : (float, float)
-        Along the fringe vector (x, y), any length.
-    x, y : (point,) float64
-        Points, px.
-    k : (point,) int
-        Paths they are on: crests even, valleys odd.
-    used : (point,) bool
-        No outliers.
-    sigma_px, residual_px : (point,) float64
-        Errors, and fit minus path, across the fringes, px.
-    fibres : (2,) float64, (2,) float64
-        (x, y) of fibres A and B projected on the detector, px.
-    extracts : tuple of Extract
-        About the first and the last path.
-    distance, baseline, ratio : (n,) float64
-        Axes of the maps: mm, mm, 1.
-    cost_baseline, cost_ratio : (distance, other) float64
-        Maps of the cost: the other parameters those of the minimum, and fitted again.
-    valley_ratio, valley_cost : (distance,) float64
-        The best ratio at each distance, and its cost.
-    best : (float, float)
-        Distance and baseline of the minimum, mm.
-    distance_sigma : float
-        mm.
-    distance_from_prior : bool
-        Whether that is mostly the error of the bench's nominal value.
-    """
+    """What the figure shows of one fringe set."""
 
     name: str
-    frame: tuple[int, int]
-    direction: tuple[float, float]
-    x: F64
+    frame: tuple[int, int]  # (y, x) size, px
+    direction: tuple[float, float]  # along the fringe vector (x, y), any length
+    x: F64  # x, y: (point,) points, px
     y: F64
-    k: NDArray[np.int64]
-    used: NDArray[np.bool_]
+    k: NDArray[np.int64]  # (point,) paths they are on: crests even, valleys odd
+    used: NDArray[np.bool_]  # (point,) no outliers
+    # sigma_px, residual_px: (point,) errors, and fit minus path, across the fringes, px
     sigma_px: F64
     residual_px: F64
+    # (2,) float64, (2,) float64: (x, y) of fibres A and B projected on the detector, px
     fibres: tuple[F64, F64]
-    extracts: tuple[Extract, ...]
-    distance: F64
+    extracts: tuple[Extract, ...]  # about the first and the last path
+    distance: F64  # distance, baseline, ratio: (n,) axes of the maps: mm, mm, 1
     baseline: F64
     ratio: F64
+    # cost_baseline, cost_ratio: (distance, other) maps of the cost: the other parameters those
+    # of the minimum, and fitted again
     cost_baseline: F64
     cost_ratio: F64
+    # valley_ratio, valley_cost: (distance,) the best ratio at each distance, and its cost
     valley_ratio: F64
     valley_cost: F64
-    best: tuple[float, float]
-    distance_sigma: float
-    distance_from_prior: bool
+    best: tuple[float, float]  # distance and baseline of the minimum, mm
+    distance_sigma: float  # mm
+    distance_from_prior: bool  # whether that is mostly the error of the bench's nominal value
 
     @property
     def across(self) -> F64:

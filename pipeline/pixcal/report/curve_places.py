@@ -18,6 +18,7 @@ class _Axis:
     names: tuple[str, ...] = ()
 
 
+# by `x_label` of `curves.json`, where numbers alone would say little
 _AXES = {
     "neighbour": _Axis("neighbour", "neighbour {}", _STEPS),
     "row of four, down then right": _Axis(
@@ -49,7 +50,6 @@ _AXES = {
     "harmonic (cosine, sine)": _Axis("harmonic", "{}"),
     "batches averaged": _Axis("batches averaged", "batches averaged: {}"),
 }
-"""By ``x_label`` of ``curves.json``, where numbers alone would say little."""
 
 
 def axis_label(curve: Mapping[str, Any]) -> str:

@@ -8,13 +8,13 @@ from pixcal.report.contents import Contents, Detector
 from pixcal.report.tables import Table, is_table, merit_table, reduction_tables
 from pixcal.report.text import number
 
+# title and unit of each map of the reduction
 DETECTOR_MAPS = {
     "bias": ("bias", "ADU"),
     "dark_rate": ("dark current", "e⁻/s"),
     "flat": ("flat", "relative response"),
     "read_noise": ("read noise", "e⁻"),
 }
-"""Title and unit of each map of the reduction."""
 
 
 def detector(contents: Contents) -> Section:

@@ -27,15 +27,11 @@ from pixcal.report.text import exact, number, with_error
 
 Facts = Mapping[str, Any]
 
-SHOWN = 12
-"""Rows of a table that are not folded."""
-PLOTS = 3
-"""Statistics that are drawn for each cause, and of what remains."""
-LISTED = 8
-"""Numbers of a list that are shown one by one."""
+SHOWN = 12  # rows of a table that are not folded
+PLOTS = 3  # statistics that are drawn for each cause, and of what remains
+LISTED = 8  # numbers of a list that are shown one by one
 NEW = "introduced by the causes"
-LAW_DIFFERS = 0.02
-"""Difference of the shares closed by a cause and by its law alone that is shown."""
+LAW_DIFFERS = 0.02  # difference of the shares closed by a cause and by its law alone that is shown
 
 _READ = (
     "Top: data (dots) and simulations (squares or lines); error bars are ±1σ of the simulations. "

@@ -19,15 +19,11 @@ from pixcal.report.drawing import TITLE, WIDE, Unit, axes_grid, finish, unit_for
 
 F64 = NDArray[np.float64]
 
-ROOM = 50
-"""Letters that fit below a panel; where names of places have more, they are turned."""
-SPAN = 12.0
-"""Ratio of values from which an axis is logarithmic."""
-QUIET = 5.0
-"""Least half height of the axis of deviations, sigma."""
+ROOM = 50  # letters that fit below a panel; where names of places have more, they are turned
+SPAN = 12.0  # ratio of values from which an axis is logarithmic
+QUIET = 5.0  # least half height of the axis of deviations, sigma
 ORDER = ("measured", "nominal simulation", "with the causes")
-BESIDE = 0.2
-"""How far simulations are drawn from the data's place, where places are not numbers."""
+BESIDE = 0.2  # how far simulations are drawn from the data's place, where places are not numbers
 
 
 @dataclass(frozen=True)

@@ -17,34 +17,22 @@ from pixcal.report.drawing import TITLE, WIDE, axes_grid
 
 F64 = NDArray[np.float64]
 
-CELLS = "cell of 4 × 4"
-"""``x_label`` of curves whose values are cells of the window."""
-ASIDE = 3.0
-"""Standard deviations below which a map is not worth looking at."""
-MOST = 3
-"""Maps side by side."""
+CELLS = "cell of 4 × 4"  # `x_label` of curves whose values are cells of the window
+ASIDE = 3.0  # standard deviations below which a map is not worth looking at
+MOST = 3  # maps side by side
 COLOURS = "RdBu_r"
-LARGEST = 12.0
-"""Standard deviations at which colours end."""
+LARGEST = 12.0  # standard deviations at which colours end
+# least side of a window in the picture, share of the detector's: real ones would be dots
 SMALLEST = 0.17
-"""Least side of a window in the picture, share of the detector's: real ones would be dots."""
 
 
 @dataclass(frozen=True)
 class Spot:
-    """A part of the detector and how far it is off.
+    """A part of the detector and how far it is off."""
 
-    Attributes
-    ----------
-    rows, columns : (float, float)
-        Ends.
-    sigmas : (float, float)
-        Before and after.
-    """
-
-    rows: tuple[float, float]
+    rows: tuple[float, float]  # rows, columns: ends
     columns: tuple[float, float]
-    sigmas: tuple[float, float]
+    sigmas: tuple[float, float]  # before and after
 
 
 @dataclass(frozen=True)

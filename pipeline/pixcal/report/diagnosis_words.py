@@ -6,8 +6,8 @@ from typing import Any
 from pixcal.report.contents import Diagnosis
 from pixcal.report.text import number
 
+# what `curves.json` has for the name of a set where a curve is of no single set
 DETECTOR = "detector"
-"""What ``curves.json`` has for the name of a set where a curve is of no single set."""
 
 _UNITS = {"sigma": "σ", "2 √count": "2 √number", "": "", "h^-0.5": "1/√h"}
 

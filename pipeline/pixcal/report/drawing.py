@@ -21,27 +21,18 @@ from PIL import Image
 from pixcal.report.colours import DIVERGING, INK, PALETTE, SEQUENTIAL
 from pixcal.report.summary import MapSummary, robust_spread
 
-WIDE = 10.4
-"""Width of a figure that takes the whole page, inches."""
+WIDE = 10.4  # width of a figure that takes the whole page, inches
 DPI = 130
+# of titles at a fixed height: the labels around them need not be measured
 TITLE: dict[str, Any] = {"fontsize": 11, "y": 1.0}
-"""Of titles at a fixed height: the labels around them need not be measured."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """A unit with its power of ten, for axes whose numbers stay short.
+    """A unit with its power of ten, for axes whose numbers stay short."""
 
-    Attributes
-    ----------
-    factor : float
-        What values are multiplied by.
-    label : str
-        E.g. ``10⁻³ px``.
-    """
-
-    factor: float
-    label: str
+    factor: float  # what values are multiplied by
+    label: str  # E.g. `10⁻³ px`
 
 
 def unit_for(values: Any, name: str) -> Unit:

@@ -52,10 +52,9 @@ from pixcal.report.text import SYMBOLS, flag_name
 
 F64 = NDArray[np.float64]
 
+# room between a map and what is beside it, for a colour bar, its numbers and labels, inches
 BESIDE_BAR = 1.95
-"""Room between a map and what is beside it, for a colour bar, its numbers and labels, inches."""
-MEANS_DRAWN = 800
-"""Most means of a profile that are drawn one by one."""
+MEANS_DRAWN = 800  # most means of a profile that are drawn one by one
 
 
 def offsets(

@@ -28,8 +28,7 @@ from pixcal.report.text import with_error
 
 F64 = NDArray[np.float64]
 
-POINTS = 6000
-"""Most frames that are drawn one by one; of longer runs, every n-th."""
+POINTS = 6000  # most frames that are drawn one by one; of longer runs, every n-th
 
 
 def temporal(fringes: FringeSet) -> Figure:

@@ -15,18 +15,12 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-SHOWN_PIXELS = 400
-"""Most blocks along the longer side of a map on the page."""
-SAMPLE = 1_000_000
-"""Most pixels of a histogram."""
-BAND_ROWS = 128
-"""Rows read at a time: one row of chunks."""
-SEGMENT = 256
-"""Longest side of the windows whose power spectra are averaged."""
-SEGMENTS_A_SIDE = 6
-"""Most windows along each axis."""
-DETAIL = 96
-"""Side of the window that is shown pixel by pixel when the whole map cannot be."""
+SHOWN_PIXELS = 400  # most blocks along the longer side of a map on the page
+SAMPLE = 1_000_000  # most pixels of a histogram
+BAND_ROWS = 128  # rows read at a time: one row of chunks
+SEGMENT = 256  # longest side of the windows whose power spectra are averaged
+SEGMENTS_A_SIDE = 6  # most windows along each axis
+DETAIL = 96  # side of the window that is shown pixel by pixel when the whole map cannot be
 
 
 class Source(Protocol):
@@ -77,21 +71,11 @@ class RatioSource:
 
 @dataclass(frozen=True)
 class Profile:
-    """Means of a map along one axis.
+    """Means of a map along one axis."""
 
-    Attributes
-    ----------
-    mean : (n,) float64
-        NaN where no pixel is good.
-    scatter : (n,) float64
-        Standard deviation of the pixels that were averaged.
-    count : (n,) int64
-        How many they were.
-    """
-
-    mean: F64
-    scatter: F64
-    count: NDArray[np.int64]
+    mean: F64  # (n,) NaN where no pixel is good
+    scatter: F64  # (n,) standard deviation of the pixels that were averaged
+    count: NDArray[np.int64]  # (n,) how many they were
 
     @property
     def error(self) -> F64:
@@ -101,34 +85,17 @@ class Profile:
 
 @dataclass(frozen=True)
 class MapSummary:
-    """What is shown of a map.
+    """What is shown of a map."""
 
-    Attributes
-    ----------
-    shape : (int, int)
-        Of the map, pixels.
-    block : int
-        Side of the blocks of pixels that ``image`` averages.
-    image : (y, x) float32
-        Mean of the finite pixels of each block; NaN where there are none.
-    columns, rows : Profile
-        Mean of each column (over y) and of each row (over x), in whole resolution.
-    sample : (n,) float32
-        Finite pixels at regular steps: all of them up to `SAMPLE`.
-    good : int
-        Finite pixels.
-    mean, std : float
-        Of all finite pixels.
-    """
-
-    shape: tuple[int, int]
-    block: int
-    image: F32
+    shape: tuple[int, int]  # of the map, pixels
+    block: int  # side of the blocks of pixels that `image` averages
+    image: F32  # (y, x) mean of the finite pixels of each block; NaN where there are none
+    # columns, rows: mean of each column (over y) and of each row (over x), in whole resolution
     columns: Profile
     rows: Profile
-    sample: F32
-    good: int
-    mean: float
+    sample: F32  # (n,) finite pixels at regular steps: all of them up to `SAMPLE`
+    good: int  # finite pixels
+    mean: float  # mean, std: of all finite pixels
     std: float
 
     @property
@@ -260,21 +227,12 @@ def _profile(sums: F64, origin: float) -> Profile:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Power spectral density of a map.
+    """Power spectral density of a map."""
 
-    Attributes
-    ----------
-    power : (my, mx) float64
-        px² per (cycle/px)², zero frequency in the middle; its mean is the map's variance.
-    white : float
-        What the map's errors alone would give, at every frequency.
-    windows : int
-        Windows averaged.
-    """
-
+    # (my, mx) px² per (cycle/px)², zero frequency in the middle; its mean is the map's variance
     power: F64
-    white: float
-    windows: int
+    white: float  # what the map's errors alone would give, at every frequency
+    windows: int  # windows averaged
 
     @property
     def frequencies(self) -> tuple[F64, F64]:
@@ -349,26 +307,14 @@ def detail(source: Source) -> tuple[MapSummary, tuple[int, int]]:
 
 @dataclass(frozen=True)
 class FlagSummary:
-    """What is shown of a map of flags.
-
-    Attributes
-    ----------
-    image : (y, x) uint8
-        Flags of any pixel of each block.
-    share : (y, x) float32
-        Share of each block's pixels that have any flag.
-    counts : dict
-        Pixels that have each bit set.
-    masked : int
-        Pixels with any flag.
-    """
+    """What is shown of a map of flags."""
 
     shape: tuple[int, int]
     block: int
-    image: NDArray[np.uint8]
-    share: F32
-    masked: int
-    counts: dict[int, int] = field(default_factory=dict)
+    image: NDArray[np.uint8]  # (y, x) flags of any pixel of each block
+    share: F32  # (y, x) share of each block's pixels that have any flag
+    masked: int  # pixels with any flag
+    counts: dict[int, int] = field(default_factory=dict)  # pixels that have each bit set
 
 
 def summarise_flags(source: Source, most: int = SHOWN_PIXELS) -> FlagSummary:

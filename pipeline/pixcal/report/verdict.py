@@ -10,11 +10,10 @@ from pixcal.report.contents import Contents, Diagnosis, FringeSet
 from pixcal.report.diagnosis_words import level, residual_gap
 from pixcal.report.text import NAMES, duration, number, share, with_error
 
-TARGET_PX = 5e-5
-"""Target precision of a calibration (paper, section 4.2)."""
+TARGET_PX = 5e-5  # target precision of a calibration (paper, section 4.2)
 
+# a place of the fibres that a laboratory would notice: twice its 2 cm (paper, section 5.2)
 FAR_MM = 40.0
-"""A place of the fibres that a laboratory would notice: twice its 2 cm (paper, section 5.2)."""
 
 GOOD, CHECK, BAD = "good", "check", "bad"
 

@@ -30,40 +30,28 @@ from pixcal.kernels.crosstalk import Coupling
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-MIN_CHARGE = 0.1
-"""Charge (10⁴ e-) of the least light whose noise can tell."""
+MIN_CHARGE = 0.1  # charge (10⁴ e-) of the least light whose noise can tell
 
 TINY = np.float32(1e-20)
-TERMS = 5
-"""D, D', 1, D D', D² + D'²."""
+TERMS = 5  # D, D', 1, D D', D² + D'²
+# place of each normal sum; terms 2 and 3 meet in the same sum as 0 and 1
 NORMAL = {(0, 0): 0, (0, 1): 1, (1, 1): 2, (0, 2): 3, (1, 2): 4, (2, 2): 5, (0, 3): 6,
           (1, 3): 7, (3, 3): 8, (2, 3): 1, (0, 4): 9, (1, 4): 10, (2, 4): 11, (3, 4): 12,
           (4, 4): 13}  # fmt: skip
-"""Place of each normal sum; terms 2 and 3 meet in the same sum as 0 and 1."""
 NORMALS = 14
 
 
 @dataclass(frozen=True)
 class Products:
-    """Sums over frames for each link and pixel (zero where the partner is out of the window).
+    """Sums over frames for each link and pixel (zero where the partner is out of the window)."""
 
-    Attributes
-    ----------
-    right : (link, 5, y, x) float64
-        Products of residuals with each of the `TERMS`; charge in 10⁴ e-.
-    normal : (link, 14, y, x) float64
-        Of the terms with each other, in the order of `NORMAL`.
-    shot, shot_error : float
-        Variance of a pixel over what its charge gives, as measured: 1 for the right gain.
-    read : float
-        Variance of a pixel without light.
-    """
-
-    right: F64
-    normal: F64
+    right: F64  # (link, 5, y, x) products of residuals with each of the `TERMS`; charge in 10⁴ e-
+    normal: F64  # (link, 14, y, x) of the terms with each other, in the order of `NORMAL`
+    # shot, shot_error: variance of a pixel over what its charge gives, as measured: 1 for the
+    # right gain
     shot: float
     shot_error: float
-    read: float
+    read: float  # variance of a pixel without light
 
 
 def products(
@@ -103,10 +91,8 @@ def products(
 
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
-_LONG = 128
-"""Frames of sequences that are gathered."""
-_COLUMNS = 16
-"""Columns that are gone through at once: with their partners they stay in the cache."""
+_LONG = 128  # frames of sequences that are gathered
+_COLUMNS = 16  # columns that are gone through at once: with their partners they stay in the cache
 
 
 def _gathered(parts: Iterable[Residuals]) -> Iterator[list[Residuals]]:

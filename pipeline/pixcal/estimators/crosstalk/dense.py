@@ -26,34 +26,21 @@ from pixcal.kernels.crosstalk import Coupling, outflow
 F64 = NDArray[np.float64]
 Sums = tuple[F64, F64]
 
-WITHIN = 2
-"""Rows and columns of the kernel about its middle."""
-ROUNDS = 3
-"""Of the shares, each with the second order of those before."""
-MOST_SHARES = 480
-"""That are measured together: time goes with the third power of their number."""
-NEGLIGIBLE = 1e-4
-"""Share whose products with others do not count."""
+WITHIN = 2  # rows and columns of the kernel about its middle
+ROUNDS = 3  # of the shares, each with the second order of those before
+MOST_SHARES = 480  # that are measured together: time goes with the third power of their number
+NEGLIGIBLE = 1e-4  # share whose products with others do not count
 
 
 @dataclass(frozen=True)
 class Dense:
-    """A kernel with all its couplings.
-
-    Attributes
-    ----------
-    couplings : tuple of Coupling
-    covariance : (n, n) float64
-        Of their shares.
-    pattern_px : float
-        Rms of the true pattern of offsets that the data ask for beside the couplings.
-    ways : mapping of str to ((n, n), (n,) float64)
-        Least-squares sums of each way of measuring.
-    """
+    """A kernel with all its couplings."""
 
     couplings: tuple[Coupling, ...]
-    covariance: F64
+    covariance: F64  # (n, n) of their shares
+    # rms of the true pattern of offsets that the data ask for beside the couplings
     pattern_px: float
+    # mapping of str to ((n, n), (n,) float64) least-squares sums of each way of measuring
     ways: Mapping[str, Sums]
 
     @property
@@ -64,15 +51,7 @@ class Dense:
 
 @dataclass(frozen=True)
 class Frames:
-    """What frames tell of the couplings of some steps, before it is joined to classes.
-
-    Attributes
-    ----------
-    evidence : Evidence
-    noise : Products or None
-    hot : HotPixels or None
-    steps : tuple of (int, int)
-    """
+    """What frames tell of the couplings of some steps, before it is joined to classes."""
 
     evidence: Evidence
     noise: Products | None

@@ -22,49 +22,31 @@ from pixcal.kernels.crosstalk import Coupling, couple, outflow
 
 F64 = NDArray[np.float64]
 
-MIN_SIGMAS = 40.0
-"""Dark signal of a hot pixel over the noise of the others."""
-OVERLAP = 0.01
-"""Another hot pixel near the receiver, of this share of the source, spoils it."""
-OVERLAP_KNOWN = 0.5
-"""The same where what it gives is known and taken off."""
-UNSURE = 0.3
-"""Error of what is taken off, as a share of it."""
-OWN_RING = 0.1
-"""A pixel below this share of a neighbour may be read from it: no source."""
+MIN_SIGMAS = 40.0  # dark signal of a hot pixel over the noise of the others
+OVERLAP = 0.01  # another hot pixel near the receiver, of this share of the source, spoils it
+OVERLAP_KNOWN = 0.5  # the same where what it gives is known and taken off
+UNSURE = 0.3  # error of what is taken off, as a share of it
+OWN_RING = 0.1  # a pixel below this share of a neighbour may be read from it: no source
+# values beyond so many errors from the median of their class are left out, if they are few
 CLIP = 5.0
-"""Values beyond so many errors from the median of their class are left out, if they are few."""
-RISE = 1e-4
-"""How much brighter-fatter may well make a share rise with the charge, 1/ke-."""
-ENOUGH = 4
-"""Values beyond the first that tell a rise with the charge from disagreement."""
-MIN_LEVELS = 3
-"""Hot pixels of a coupling that tell whether its share changes with the signal."""
-MOST = 4000
-"""Hot pixels used, the brightest."""
+RISE = 1e-4  # how much brighter-fatter may well make a share rise with the charge, 1/ke-
+ENOUGH = 4  # values beyond the first that tell a rise with the charge from disagreement
+MIN_LEVELS = 3  # hot pixels of a coupling that tell whether its share changes with the signal
+MOST = 4000  # hot pixels used, the brightest
 
 
 @dataclass(frozen=True)
 class HotPixels:
-    """What each hot pixel shows of each link, both ways.
+    """What each hot pixel shows of each link, both ways."""
 
-    Attributes
-    ----------
-    y, x : (h,) int
-    charge : (h,) float64
-        10³ e- at the longest dark exposure, less the background.
-    value, sigma : (h, link, 2) float64
-        Share read at ``+step`` and at ``-step``, and its error (infinite where spoilt).
-    shape : (int, int)
-        Rows and columns of the maps.
-    """
-
-    y: NDArray[np.intp]
+    y: NDArray[np.intp]  # y, x: (h,)
     x: NDArray[np.intp]
-    charge: F64
+    charge: F64  # (h,) 10³ e- at the longest dark exposure, less the background
+    # value, sigma: (h, link, 2) share read at `+step` and at `-step`, and its error (infinite
+    # where spoilt)
     value: F64
     sigma: F64
-    shape: Place
+    shape: Place  # rows and columns of the maps
 
     def corrected(self, outflow: F64, per_ke: float) -> "HotPixels":
         """Shares of what a hot pixel had, at small signals; they were measured of what it kept.
@@ -128,24 +110,18 @@ class HotPixels:
 
 @dataclass(frozen=True)
 class ClassShares:
-    """Shares that hot pixels show, (link, class, 2) each: there and back.
+    """Shares that hot pixels show, (link, class, 2) each: there and back."""
 
-    Attributes
-    ----------
-    weight, value, charge
-        Information (1 / sigma²), weighted means of the share and of the charge (10³ e-).
-    square, product
-        Weighted sums, about the means, of the charge squared and of charge times share.
-    count
-        Hot pixels used.
-    """
-
+    # weight, value, charge: information (1 / sigma²), weighted means of the share and of the
+    # charge (10³ e-)
     weight: F64
     value: F64
     charge: F64
+    # square, product: weighted sums, about the means, of the charge squared and of charge times
+    # share
     square: F64
     product: F64
-    count: F64
+    count: F64  # hot pixels used
 
     def without(self, some: NDArray[np.bool_]) -> "ClassShares":
         """The same with some of no weight."""

@@ -17,31 +17,23 @@ from pixcal.estimators.crosstalk.residuals import UNIT
 
 F64 = NDArray[np.float64]
 
+# how large the covariance of neighbours over the square of their charge may well be, 1/e-
 BRIGHTER_FATTER = 1e-6
-"""How large the covariance of neighbours over the square of their charge may well be, 1/e-."""
-ONE_WAY = 0.01
-"""How much the shares there and back may well differ."""
-LARGEST = 0.1
-"""How large a share may well be."""
+ONE_WAY = 0.01  # how much the shares there and back may well differ
+LARGEST = 0.1  # how large a share may well be
+# error of what a single hot pixel shows, as a share of it: a neighbour may be warm by itself
 DOUBT = 0.25
-"""Error of what a single hot pixel shows, as a share of it: a neighbour may be warm by itself."""
-MARKED = 4.0
-"""Sigmas beyond which two numbers differ, or one is not zero."""
-BACKED = 2.5
-"""Sigmas of the noise's own share that back a single hot pixel."""
+MARKED = 4.0  # sigmas beyond which two numbers differ, or one is not zero
+BACKED = 2.5  # sigmas of the noise's own share that back a single hot pixel
 
 
 @dataclass(frozen=True)
 class Information:
-    """Least-squares sums of shares, by way of measuring.
+    """Least-squares sums of shares, by way of measuring."""
 
-    Attributes
-    ----------
-    normal, right : mapping of str to (..., u, u), (..., u) float64
-        Unknown ``2 c`` is what pixels of class c give over the link, ``2 c + 1`` what their
-        partners give back. With a leading axis for many links.
-    """
-
+    # normal, right: mapping of str to (..., u, u), (..., u) float64: unknown `2 c` is what
+    # pixels of class c give over the link, `2 c + 1` what their partners give back. With a
+    # leading axis for many links
     normal: dict[str, F64]
     right: dict[str, F64]
 
@@ -68,21 +60,12 @@ class Information:
 
 @dataclass(frozen=True)
 class Measured:
-    """What was measured of some links, freed of what is known already (second order).
-
-    Attributes
-    ----------
-    products : Products or None
-    hot : HotPixels or None
-    links : tuple of (int, int)
-    shape, first : (int, int)
-        Rows and columns of the arrays; their first in the window.
-    """
+    """What was measured of some links, freed of what is known already (second order)."""
 
     products: Products | None
     hot: HotPixels | None
     links: tuple[Place, ...]
-    shape: Place
+    shape: Place  # shape, first: rows and columns of the arrays; their first in the window
     first: Place
 
     def of(self, numbers: Sequence[int]) -> "Measured":

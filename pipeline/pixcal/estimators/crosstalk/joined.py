@@ -16,43 +16,27 @@ from pixcal.model.errors import InputError
 
 F64 = NDArray[np.float64]
 
-LEVEL_STEPS = 10
-"""Steps of a level dependence."""
-LARGEST = 0.1
-"""How large a share may well be."""
-CERTAIN = 5.0
-"""Sigmas beyond which a level dependence is taken."""
+LEVEL_STEPS = 10  # steps of a level dependence
+LARGEST = 0.1  # how large a share may well be
+CERTAIN = 5.0  # sigmas beyond which a level dependence is taken
+# sigmas beyond which a coupling is told of: of a hundred that are none, one in twenty kernels
 THERE = 3.5
-"""Sigmas beyond which a coupling is told of: of a hundred that are none, one in twenty kernels."""
-ALIKE = 0.05
-"""Chance from which shares of all classes are taken to be one."""
+ALIKE = 0.05  # chance from which shares of all classes are taken to be one
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """Couplings as measured.
-
-    Attributes
-    ----------
-    couplings : tuple of Coupling
-    covariance : (n, n) float64
-        Of their shares.
-    significance : float
-        Of the strongest, in sigmas, corrected for all that was tried.
-    by : mapping of str to ((n,), (n,) float64)
-        Shares and errors of each way of measuring by itself.
-    hot_pixels : int
-        Used.
-    per_ke, per_ke_error : float
-        Relative change of the shares with the source's signal as hot pixels show it, 1/ke-, where
-        they fall; the error infinite where they cannot tell.
-    """
+    """Couplings as measured."""
 
     couplings: tuple[Coupling, ...]
-    covariance: F64
-    significance: float
+    covariance: F64  # (n, n) of their shares
+    significance: float  # of the strongest, in sigmas, corrected for all that was tried
+    # mapping of str to ((n,), (n,) float64) shares and errors of each way of measuring by
+    # itself
     by: Mapping[str, tuple[F64, F64]]
-    hot_pixels: int
+    hot_pixels: int  # used
+    # per_ke, per_ke_error: relative change of the shares with the source's signal as hot pixels
+    # show it, 1/ke-, where they fall; the error infinite where they cannot tell
     per_ke: float
     per_ke_error: float
 

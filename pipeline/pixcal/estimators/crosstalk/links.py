@@ -11,14 +11,10 @@ from pixcal.kernels.crosstalk import Coupling
 F64 = NDArray[np.float64]
 Place = tuple[int, int]
 
-REACH = 5
-"""Rows and columns within which couplings are looked for."""
-MAX_PERIOD = 8
-"""Longest period of a kernel that is looked for, rows and columns."""
-MAX_CLASSES = 16
-"""Most classes of pixels that a period in both directions may make."""
-MIN_REPEATS = 4
-"""Periods that the window must hold at least."""
+REACH = 5  # rows and columns within which couplings are looked for
+MAX_PERIOD = 8  # longest period of a kernel that is looked for, rows and columns
+MAX_CLASSES = 16  # most classes of pixels that a period in both directions may make
+MIN_REPEATS = 4  # periods that the window must hold at least
 
 
 def links(shape: Place, reach: int = REACH) -> tuple[Place, ...]:
@@ -34,19 +30,11 @@ def links(shape: Place, reach: int = REACH) -> tuple[Place, ...]:
 
 @dataclass(frozen=True)
 class Classes:
-    """Pixels whose row and column leave the same rest by the period.
+    """Pixels whose row and column leave the same rest by the period."""
 
-    Attributes
-    ----------
-    rows, columns : int
-        Period.
-    first : (int, int)
-        First row and column of the arrays, in the window.
-    """
-
-    rows: int
+    rows: int  # rows, columns: period
     columns: int
-    first: Place
+    first: Place  # first row and column of the arrays, in the window
 
     @property
     def count(self) -> int:

@@ -25,13 +25,10 @@ F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
 Mask = NDArray[np.bool_]
 
-WIDTH = 0.01
-"""How much the pixels of a class may well be wider than others, px."""
-DEGREE = 3
-"""Of the polynomial that takes up what is smooth."""
+WIDTH = 0.01  # how much the pixels of a class may well be wider than others, px
+DEGREE = 3  # of the polynomial that takes up what is smooth
 MIN_PIXELS = 100
-ALIGNED = 0.05
-"""Fringe vectors that differ in direction by less (rad/px) lie on one axis."""
+ALIGNED = 0.05  # fringe vectors that differ in direction by less (rad/px) lie on one axis
 
 
 def good_in_all(evidence: Evidence) -> Mask:

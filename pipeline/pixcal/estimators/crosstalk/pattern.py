@@ -30,36 +30,25 @@ from pixcal.kernels.crosstalk import Coupling, filled, uncouple_fringes
 F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
 
-CLIP = 5.0
-"""Offsets and visibilities beyond so many robust deviations do not count."""
+CLIP = 5.0  # offsets and visibilities beyond so many robust deviations do not count
 
 
 @dataclass(frozen=True)
 class _Pattern:
-    """A set's maps by class, smooth modes taken off.
+    """A set's maps by class, smooth modes taken off."""
 
-    Attributes
-    ----------
-    axis : (2,) float64
-        That the offsets are along.
-    delta, visibility : (class,) float64
-        Sums of the offsets (px) and of the logarithm of the visibility, without the couplings.
-    noise, scatter, spread : float
-        Error of an offset, px; scatter of the offsets and of the visibilities of pixels.
-    slopes : (coupling, class) complex128
-        Change of the log of the fringe over the light by each share.
-    k : float
-        rad/px.
-    """
-
-    axis: F64
+    axis: F64  # (2,) that the offsets are along
+    # delta, visibility: (class,) sums of the offsets (px) and of the logarithm of the
+    # visibility, without the couplings
     delta: F64
     visibility: F64
+    # noise, scatter, spread: error of an offset, px; scatter of the offsets and of the
+    # visibilities of pixels
     noise: float
     scatter: float
     spread: float
-    slopes: C128
-    k: float
+    slopes: C128  # (coupling, class) change of the log of the fringe over the light by each share
+    k: float  # rad/px
 
 
 def pattern_information(

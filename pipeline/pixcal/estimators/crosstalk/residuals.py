@@ -20,44 +20,27 @@ from pixcal.kernels.crosstalk import Coupling, filled, noise_shares, uncouple, u
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-UNIT = 1e4
-"""Electrons that charge is counted in; variances are in 10⁴ e-²."""
-CLIP = 6.0
-"""Residuals beyond so many sigmas (particles, telegraph noise) do not count."""
+UNIT = 1e4  # electrons that charge is counted in; variances are in 10⁴ e-²
+CLIP = 6.0  # residuals beyond so many sigmas (particles, telegraph noise) do not count
+# samples of one sequence that are used at most; of longer ones frames spread over it
 MOST = 6_000_000
-"""Samples of one sequence that are used at most; of longer ones frames spread over it."""
-MIN_FRAMES = 16
-"""Fewest frames of a fringe set that leave residuals."""
+MIN_FRAMES = 16  # fewest frames of a fringe set that leave residuals
+# every so many frames the modes are kept; they change little, and only their products count
 STRIDE = 16
-"""Every so many frames the modes are kept; they change little, and only their products count."""
-STEPS = 3
-"""Times that what is common to pixels and to frames is taken off in turn, till it is both."""
-LEAST = 0.1
-"""Least share of a sample's noise that is left, of those that count."""
+STEPS = 3  # times that what is common to pixels and to frames is taken off in turn, till it is both
+LEAST = 0.1  # least share of a sample's noise that is left, of those that count
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Some frames in units of their noise; zero where a sample has no weight.
+    """Some frames in units of their noise; zero where a sample has no weight."""
 
-    Attributes
-    ----------
-    e : (t, y, x) float32
-        Residual over its sigma.
-    charge : (t, y, x) float32
-        Mean charge as collected, which is its variance, over sigma (10⁴ e-).
-    shot : (t, y, x) float32
-        Variance that charge gives after the couplings, over sigma.
-    one : (t, y, x) float32
-        One over sigma.
-    modes : (m, s, y, x) float32
-        What was taken off every `STRIDE`-th frame, orthonormal, and grown to stand for all.
-    """
-
-    e: F32
-    charge: F32
-    shot: F32
-    one: F32
+    e: F32  # (t, y, x) residual over its sigma
+    charge: F32  # (t, y, x) mean charge as collected, which is its variance, over sigma (10⁴ e-)
+    shot: F32  # (t, y, x) variance that charge gives after the couplings, over sigma
+    one: F32  # (t, y, x) one over sigma
+    # (m, s, y, x) what was taken off every `STRIDE`-th frame, orthonormal, and grown to stand
+    # for all
     modes: F32
 
     @property
@@ -201,20 +184,12 @@ class _FrameModes:
     """What is free in each frame: some frames times some functions of place.
 
     They are made anew whenever they are needed: all at once they would be many times the samples.
-
-    Attributes
-    ----------
-    common : sequence of (t, y, x) float32
-    places : (place, y, x) float32
-        As in `_noise`.
-    one : (t, y, x) float32
-    to_orthonormal : (t, m, m) float32
     """
 
-    common: Sequence[F32]
-    places: F32
-    one: F32
-    to_orthonormal: F32
+    common: Sequence[F32]  # sequence of (t, y, x) float32
+    places: F32  # (place, y, x) as in `_noise`
+    one: F32  # (t, y, x)
+    to_orthonormal: F32  # (t, m, m)
 
     @classmethod
     def of(cls, common: Sequence[F32], places: Sequence[F32], one: F32) -> "_FrameModes":
@@ -248,19 +223,11 @@ class _FrameModes:
 
 @dataclass(frozen=True)
 class _PixelModes:
-    """What is free in each pixel: modes over the frames, weighted with one over sigma.
+    """What is free in each pixel: modes over the frames, weighted with one over sigma."""
 
-    Attributes
-    ----------
-    modes : (t, m) float32
-        Orthonormal without weights.
-    one : (t, pixel) float32
-    covariance : (pixel, m, m) float64
-    """
-
-    modes: F32
-    one: F32
-    covariance: F64
+    modes: F32  # (t, m) orthonormal without weights
+    one: F32  # (t, pixel)
+    covariance: F64  # (pixel, m, m)
 
     @classmethod
     def of(cls, modes: F64, one: F32) -> "_PixelModes":

@@ -17,28 +17,18 @@ from pixcal.estimators.crosstalk.links import Place
 
 F64 = NDArray[np.float64]
 
-TURNS = 60
-"""Of expectation and maximisation."""
+TURNS = 60  # of expectation and maximisation
+# size of a part of a share, and of a true pattern (px), that one value more is taken to have
 USUAL, PATTERN = 4e-4, 1e-4
-"""Size of a part of a share, and of a true pattern (px), that one value more is taken to have."""
-START = (1e-2, 1e-3)
-"""Sizes of these to start from."""
+START = (1e-2, 1e-3)  # sizes of these to start from
 
 
 @dataclass(frozen=True)
 class Shrinkage:
-    """Parts of shares, and which of them are of one size.
+    """Parts of shares, and which of them are of one size."""
 
-    Attributes
-    ----------
-    basis : (share, part) float64
-        Shares are this times their parts.
-    group : (part,) int
-    classes : int
-    """
-
-    basis: F64
-    group: NDArray[np.intp]
+    basis: F64  # (share, part) shares are this times their parts
+    group: NDArray[np.intp]  # (part,)
     classes: int
 
     @classmethod

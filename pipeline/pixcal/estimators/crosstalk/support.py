@@ -20,39 +20,23 @@ from pixcal.model.errors import InputError
 
 F64 = NDArray[np.float64]
 
-FALSE_ALARM = 0.01
-"""Chance that noise alone gives any coupling."""
+FALSE_ALARM = 0.01  # chance that noise alone gives any coupling
+# Share of the looks that are as good as independent: periods have pixels in common. Measured: it
+# makes the median significance of acquisitions without couplings about zero.
 INDEPENDENT = 0.35
-"""Share of the looks that are as good as independent: periods have pixels in common. Measured: it
-makes the median significance of acquisitions without couplings about zero."""
-WORTH = 16.0
-"""Fall in chi-square for which another share is taken, once a link is known to couple."""
-NEAR, MOST_FAR = 2, 12
-"""Of a kernel few couplings reach over more pixels than that."""
-NOTHING = 1e-6
-"""Weight of a share below which it is not measured at all."""
+WORTH = 16.0  # fall in chi-square for which another share is taken, once a link is known to couple
+NEAR, MOST_FAR = 2, 12  # of a kernel few couplings reach over more pixels than that
+NOTHING = 1e-6  # weight of a share below which it is not measured at all
 
 
 @dataclass(frozen=True)
 class Choice:
-    """All that is taken, and how far the best of it is from chance.
+    """All that is taken, and how far the best of it is from chance."""
 
-    Attributes
-    ----------
-    links : tuple of int
-        That stand out.
-    classes : Classes
-        Of the period.
-    best : float
-        Largest chi-square of one number.
-    looks : int
-        Numbers that were tried.
-    """
-
-    links: tuple[int, ...]
-    classes: Classes
-    best: float
-    looks: int
+    links: tuple[int, ...]  # that stand out
+    classes: Classes  # of the period
+    best: float  # largest chi-square of one number
+    looks: int  # numbers that were tried
 
     @property
     def critical(self) -> float:

@@ -13,14 +13,10 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-MOST = 7
-"""Boundaries that are looked for along each axis."""
-NARROWEST = 8
-"""Rows or columns of an amplifier at least."""
-SIGNIFICANT = 6.0
-"""Standard deviations of a step of the flat."""
-SMOOTH = 2
-"""Degree of what the lamp does beside the steps."""
+MOST = 7  # boundaries that are looked for along each axis
+NARROWEST = 8  # rows or columns of an amplifier at least
+SIGNIFICANT = 6.0  # standard deviations of a step of the flat
+SMOOTH = 2  # degree of what the lamp does beside the steps
 
 
 def relative_gain(flat: F64, noise: F64, good: Mask) -> F64:

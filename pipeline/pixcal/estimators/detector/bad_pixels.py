@@ -15,8 +15,7 @@ from pixcal.estimators.detector.calibration import MIN_RUNGS, Rung, median_and_s
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-NEIGHBOURS = 16
-"""Pixels along each side of the blocks whose median a response is compared with."""
+NEIGHBOURS = 16  # pixels along each side of the blocks whose median a response is compared with
 
 _FALSE_ALARM = 1e-6
 _SIGNIFICANT = 5.0

@@ -10,29 +10,19 @@ from scipy.stats import chi2
 
 F64 = NDArray[np.float64]
 
-MIN_RUNGS = 3
-"""Fewest exposure times that tell a straight line from a bent one."""
+MIN_RUNGS = 3  # fewest exposure times that tell a straight line from a bent one
 
 
 @dataclass(frozen=True)
 class DarkLine:
-    """Signal without light against exposure time, for each pixel; all (y, x) float64.
+    """Signal without light against exposure time, for each pixel; all (y, x) float64."""
 
-    Attributes
-    ----------
-    bias : ndarray
-        At exposure zero (ADU); with a single exposure time, the signal at that time.
-    rate : ndarray
-        Dark signal (ADU/s); zero with a single exposure time.
-    mean_time : ndarray
-        Weighted mean of the exposure times (s).
-    per_mean, per_rate : ndarray
-        Variance of the signal at ``mean_time``, and of the rate (s⁻²), for frames of unit variance.
-    """
-
+    # ndarray: at exposure zero (ADU); with a single exposure time, the signal at that time
     bias: F64
-    rate: F64
-    mean_time: F64
+    rate: F64  # ndarray: dark signal (ADU/s); zero with a single exposure time
+    mean_time: F64  # ndarray: weighted mean of the exposure times (s)
+    # per_mean, per_rate: ndarray: variance of the signal at `mean_time`, and of the rate (s⁻²),
+    # for frames of unit variance
     per_mean: F64
     per_rate: F64
 
@@ -82,24 +72,12 @@ def dark_line(means: Sequence[F64], counts: Sequence[F64], exptimes: Sequence[fl
 
 @dataclass(frozen=True)
 class Rung:
-    """Combined flats of one exposure time, bias and dark subtracted; maps are (y, x) float64.
+    """Combined flats of one exposure time, bias and dark subtracted; maps are (y, x) float64."""
 
-    Attributes
-    ----------
-    exptime : float
-        Seconds; any number above zero when there is a single rung.
-    frames : int
-        How many were combined.
-    signal : ndarray
-        Mean (ADU); NaN where any of the frames is saturated or not finite.
-    variance : ndarray
-        Of ``signal`` (ADU²).
-    """
-
-    exptime: float
-    frames: int
-    signal: F64
-    variance: F64
+    exptime: float  # seconds; any number above zero when there is a single rung
+    frames: int  # how many were combined
+    signal: F64  # ndarray: mean (ADU); NaN where any of the frames is saturated or not finite
+    variance: F64  # ndarray: of `signal` (ADU²)
 
 
 def usual_variance(variance: NDArray[Any], dof: int) -> float:
@@ -135,20 +113,13 @@ def response_rate(rungs: Sequence[Rung]) -> tuple[F64, F64]:
 
 @dataclass(frozen=True)
 class Linearity:
-    """How straight the signal of flats is over their exposure times.
+    """How straight the signal of flats is over their exposure times."""
 
-    Attributes
-    ----------
-    max_deviation : float
-        Largest relative distance from the straight line.
-    deviation : (rung,) float64
-        Relative distance of each level from the line; NaN for one that is not used.
-    slope, intercept : float
-        Of the line (ADU/s; ADU). The intercept takes up an error that all exposure times share.
-    """
-
-    max_deviation: float
+    max_deviation: float  # largest relative distance from the straight line
+    # (rung,) relative distance of each level from the line; NaN for one that is not used
     deviation: F64
+    # slope, intercept: of the line (ADU/s; ADU). The intercept takes up an error that all
+    # exposure times share
     slope: float
     intercept: float
 

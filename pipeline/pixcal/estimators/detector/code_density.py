@@ -18,27 +18,22 @@ from scipy.special import log_ndtr
 F64 = NDArray[np.float64]
 
 MAX_CODES = 1 << 17
-FEWEST_COUNTS = 5.0
-"""Expected counts of a code that counts."""
+FEWEST_COUNTS = 5.0  # expected counts of a code that counts
 FEWEST_CODES = 24
-POPULATED = 20.0
-"""Counts of codes around from which an empty one is a gap."""
-NEAR = 0.1
-"""How far the share of codes that come up may be from one over the step."""
+POPULATED = 20.0  # counts of codes around from which an empty one is a gap
+NEAR = 0.1  # how far the share of codes that come up may be from one over the step
 LEAST_AGREEMENT = 0.5
-TIE = 0.01
-"""Of a code: multiples of the step this near half-way may be rounded up or down."""
+TIE = 0.01  # of a code: multiples of the step this near half-way may be rounded up or down
 _ORDER = 3
 _LEAST_HALF, _MOST_HALF = 4, 12
 _CALM = 101
 _NO_CHANGE = 1e-6
 _MISSED = 3.0
+# scatter of counts that light brings about: levels of pixels do not lie evenly on codes
 _UNEVEN = 2e-3
-"""Scatter of counts that light brings about: levels of pixels do not lie evenly on codes."""
+# codes of noise below which the peak of dark frames is too narrow for a local fit
 LEAST_NOISE = 1.4
-"""Codes of noise below which the peak of dark frames is too narrow for a local fit."""
-LOWEST_RIPPLE = 1 / 16
-"""Turns a code."""
+LOWEST_RIPPLE = 1 / 16  # turns a code
 
 
 def histogram(frames: Iterable[NDArray[np.generic]], good: NDArray[np.bool_]) -> F64 | None:
@@ -137,45 +132,23 @@ def _agreement(codes: NDArray[np.int64], there: NDArray[np.bool_], step: float) 
 
 @dataclass(frozen=True)
 class Ripple:
-    """The strongest line in the widths.
+    """The strongest line in the widths."""
 
-    Attributes
-    ----------
-    period : float
-        Codes.
-    amplitude, amplitude_error : float
-    phase : float
-        At code zero, rad.
-    log_chance : float
-        Logarithm of the chance of one as strong anywhere.
-    """
-
-    period: float
+    period: float  # codes
     amplitude: float
     amplitude_error: float
-    phase: float
-    log_chance: float
+    phase: float  # at code zero, rad
+    log_chance: float  # logarithm of the chance of one as strong anywhere
 
 
 @dataclass(frozen=True)
 class CodeWidths:
-    """Relative widths of codes, less one and less what a local fit takes.
+    """Relative widths of codes, less one and less what a local fit takes."""
 
-    Attributes
-    ----------
-    number : (n,) int
-        Of the converter's codes.
-    width : (n,) float64
-    variance : (n,) float64
-        Of the counts by chance, relative.
-    kernel : (m,) float64
-        What multiplies the true widths: one less the local fit.
-    """
-
-    number: NDArray[np.int64]
-    width: F64
-    variance: F64
-    kernel: F64
+    number: NDArray[np.int64]  # (n,) of the converter's codes
+    width: F64  # (n,)
+    variance: F64  # (n,) of the counts by chance, relative
+    kernel: F64  # (m,) what multiplies the true widths: one less the local fit
 
     def kept(self, frequency: float) -> float:
         """Share of a line's amplitude that the local fit leaves; frequency in turns a code."""

@@ -13,25 +13,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
-Measure = tuple[float, float]
-"""A value and its 1-sigma error."""
+Measure = tuple[float, float]  # a value and its 1-sigma error
 
+# variance over its maximum below which samples saturate: noise alone does not fall so far
 _FALL = 0.8
-"""Variance over its maximum below which samples saturate: noise alone does not fall so far."""
 _BLOCKS = 16
 
 
 @dataclass(frozen=True)
 class Nonuniformity:
-    """Standard deviations over the detector, each with its error.
+    """Standard deviations over the detector, each with its error."""
 
-    Attributes
-    ----------
-    total, row, column, pixel : (float, float)
-        Of the map; of what all pixels of a row share, those of a column; of the rest. Zero where
-        the variance comes out below zero by chance, with the standard deviation that would show.
-    """
-
+    # total, row, column, pixel: of the map; of what all pixels of a row share, those of a
+    # column; of the rest. Zero where the variance comes out below zero by chance, with the
+    # standard deviation that would show
     total: Measure
     row: Measure
     column: Measure
@@ -142,21 +137,12 @@ def without_trend(values: F64, good: NDArray[np.bool_]) -> F64:
 
 @dataclass(frozen=True)
 class Spectrogram:
-    """Spectrum of a map along its rows or its columns.
+    """Spectrum of a map along its rows or its columns."""
 
-    Attributes
-    ----------
-    frequency : (n,) float64
-        Cycles per pixel, zero left out.
-    amplitude : (n,) float64
-        Root of the mean power of all rows (columns); white noise of s has s everywhere.
-    noise : float
-        The same of the noise in the map.
-    """
-
-    frequency: F64
+    frequency: F64  # (n,) cycles per pixel, zero left out
+    # (n,) root of the mean power of all rows (columns); white noise of s has s everywhere
     amplitude: F64
-    noise: float
+    noise: float  # the same of the noise in the map
 
 
 def spectrogram(first: F64, second: F64, good: NDArray[np.bool_], *, axis: int) -> Spectrogram:

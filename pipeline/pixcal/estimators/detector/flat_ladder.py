@@ -7,8 +7,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 
 F64 = NDArray[np.float64]
 
-MIN_RUNGS = 3
-"""Fewest levels of flats that tell a curve from a line through nothing."""
+MIN_RUNGS = 3  # fewest levels of flats that tell a curve from a line through nothing
 
 _TURNS = 30
 

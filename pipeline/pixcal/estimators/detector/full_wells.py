@@ -11,11 +11,10 @@ import numpy as np
 
 from pixcal.estimators.detector.calibration import Rung, median_and_sigma
 
+# Variance over the signal, in units of the least at lower levels, below which pixels are full. A
+# response that bends by a fifth lessens it to 0.64.
 COLLAPSED = 0.25
-"""Variance over the signal, in units of the least at lower levels, below which pixels are full. A
-response that bends by a fifth lessens it to 0.64."""
-NEARLY = 0.02
-"""Relative distance from a pixel's own full well within which its signal is not used."""
+NEARLY = 0.02  # relative distance from a pixel's own full well within which its signal is not used
 
 
 def unsaturated(rungs: Sequence[Rung]) -> list[Rung]:

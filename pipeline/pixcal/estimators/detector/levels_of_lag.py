@@ -17,11 +17,10 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-BANDS = (0.0, 0.125, 0.25, 0.5)
-"""Where bands of the level begin, over the full scale."""
+BANDS = (0.0, 0.125, 0.25, 0.5)  # where bands of the level begin, over the full scale
 
+# of the mean share, which the contrast tells far better than its dependence on the level
 EXACT = 1e-3
-"""Of the mean share, which the contrast tells far better than its dependence on the level."""
 
 
 def in_bands(level: F32, level_e: float) -> list[F32]:

@@ -27,12 +27,10 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
-"""Rows and columns from a pixel to its neighbours."""
+DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows and columns from a pixel to its neighbours
 
 HARMONICS = 5
-BLOCK = 64
-"""Frames that are taken together."""
+BLOCK = 64  # frames that are taken together
 
 _CLIP = 6.0
 _MIN_FRAMES = 4
@@ -56,15 +54,9 @@ class _Noise:
 
 @dataclass(frozen=True)
 class SharedCharge:
-    """Size of the brighter-fatter effect as the covariance of neighbours shows it.
+    """Size of the brighter-fatter effect as the covariance of neighbours shows it."""
 
-    Attributes
-    ----------
-    size, variance : float
-        Of the shift by an electron, px.
-    """
-
-    size: float
+    size: float  # size, variance: of the shift by an electron, px
     variance: float
 
 

@@ -9,8 +9,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 
 F32 = NDArray[np.float32]
 
-_CLIP = 25.0
-"""Squares of residuals, over their variance, that are left to particles and the like."""
+_CLIP = 25.0  # squares of residuals, over their variance, that are left to particles and the like
 
 
 def missing_noise(

@@ -17,22 +17,15 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-FEWEST = 8
-"""Frames that tell pixels apart."""
-OUTLIER = 4.0
-"""Standard deviations of all pixels beyond which a pixel's own variance is believed."""
+FEWEST = 8  # frames that tell pixels apart
+OUTLIER = 4.0  # standard deviations of all pixels beyond which a pixel's own variance is believed
 
 
 @dataclass(frozen=True)
 class PixelNoise:
-    """Relative read noise of the pixels: what is known of it.
+    """Relative read noise of the pixels: what is known of it."""
 
-    Attributes
-    ----------
-    mean, scatter : (y, x) float64
-        Of the logarithm of the variance over its mean in the detector.
-    """
-
+    # mean, scatter: (y, x) of the logarithm of the variance over its mean in the detector
     mean: F64
     scatter: F64
 

@@ -18,13 +18,11 @@ from pixcal.kernels.boundaries import REACH, boundary_shifts, moved_charge
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-UNIT = 1e-7
-"""Shift of boundaries (px per electron) that is fitted as one."""
+UNIT = 1e-7  # shift of boundaries (px per electron) that is fitted as one
+# in equal steps of the logarithm, nearly; what the boundaries' shift may fall by is looked for
+# among these
 FALLOFFS_PX = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
-"""In equal steps of the logarithm, nearly; what the boundaries' shift may fall by is looked for
-among these."""
-TOLD = 0.5
-"""Error of the falloff's logarithm with which it is told from others."""
+TOLD = 0.5  # error of the falloff's logarithm with which it is told from others
 
 
 def fit_response(
@@ -96,29 +94,18 @@ def fit_response(
 
 @dataclass(frozen=True)
 class Boundaries:
-    """Moving boundaries without a bent response, as the second harmonics of all sets show them.
+    """Moving boundaries without a bent response, as the second harmonics of all sets show them."""
 
-    Attributes
-    ----------
-    falloff_px, falloff_error : float
-        The error infinite where one falloff does about as well as another.
-    shift, shift_error : float
-        By an electron, px, for this falloff.
-    with_falloff : float
-        By how much the shift changes with the falloff's error, px.
-    against : float
-        Chi-square by which a bent response beside them would fit better.
-    along_y, along_y_error : float
-        Shift of boundaries between rows over that between columns; the error is zero where it was
-        held.
-    """
-
+    # falloff_px, falloff_error: the error infinite where one falloff does about as well as
+    # another
     falloff_px: float
     falloff_error: float
-    shift: float
+    shift: float  # shift, shift_error: by an electron, px, for this falloff
     shift_error: float
-    with_falloff: float
-    against: float
+    with_falloff: float  # by how much the shift changes with the falloff's error, px
+    against: float  # chi-square by which a bent response beside them would fit better
+    # along_y, along_y_error: shift of boundaries between rows over that between columns; the
+    # error is zero where it was held
     along_y: float = 1.0
     along_y_error: float = 0.0
 
@@ -182,22 +169,14 @@ def _boundary_sums(evidence: Evidence, level_e: float, powers: int) -> list[tupl
 
 @dataclass(frozen=True)
 class Beside:
-    """Moving boundaries with a bent response that is free beside them.
+    """Moving boundaries with a bent response that is free beside them."""
 
-    Attributes
-    ----------
-    shift, variance : float
-        By an electron, px; on the mean of boundaries between columns and between rows.
-    gain : float
-        Chi-square that they explain beyond the response.
-    axes : int
-        Of boundaries, each with a shift of its own: one or two.
-    """
-
+    # shift, variance: by an electron, px; on the mean of boundaries between columns and between
+    # rows
     shift: float
     variance: float
-    gain: float
-    axes: int
+    gain: float  # chi-square that they explain beyond the response
+    axes: int  # of boundaries, each with a shift of its own: one or two
 
 
 def boundaries_beside(

@@ -7,36 +7,20 @@ import numpy as np
 
 from pixcal.estimators.frame_series.variance_components import Components
 
-FIRST, TRIALS = 0.3, 8
-"""Shortest time constant that is tried, in frames, and how many at first."""
-FARTHEST = 3.0
-"""Largest error of the logarithm of a time constant: beyond, it is not known."""
+FIRST, TRIALS = 0.3, 8  # shortest time constant that is tried, in frames, and how many at first
+FARTHEST = 3.0  # largest error of the logarithm of a time constant: beyond, it is not known
 
 
 @dataclass(frozen=True)
 class Damping:
-    """Time constant of a damped walk.
+    """Time constant of a damped walk."""
 
-    Attributes
-    ----------
-    time : float
-        In frames.
-    log_time_error : float
-        Of its logarithm.
-    components : Components
-    rms, rms_error : float
-        Of the damped walk; the error with that of the time constant.
-    growth : float
-        Of the log-likelihood over ``white``, where the walk is white.
-    white : Components
-    """
-
-    time: float
-    log_time_error: float
+    time: float  # in frames
+    log_time_error: float  # of its logarithm
     components: Components
-    rms: float
+    rms: float  # rms, rms_error: of the damped walk; the error with that of the time constant
     rms_error: float
-    growth: float
+    growth: float  # of the log-likelihood over `white`, where the walk is white
     white: Components
 
 

@@ -26,59 +26,32 @@ from pixcal.estimators.frame_series.variance_components import (
 F64 = NDArray[np.float64]
 Shapes = Callable[[FrameSeries], F64]
 
-CROSSED = 0.5
-"""Sine of the angle between fringes from which they count as different."""
-HOP_WINDOWS = (2, 4, 8, 16, 32)
-"""Frames before and after, of which the means are compared."""
+CROSSED = 0.5  # sine of the angle between fringes from which they count as different
+HOP_WINDOWS = (2, 4, 8, 16, 32)  # frames before and after, of which the means are compared
 SURE_HOP = 6.5
-SURE_STEP = 2.5
-"""Standard deviations of a hop beside a slope, which tells half as well."""
+SURE_STEP = 2.5  # standard deviations of a hop beside a slope, which tells half as well
 MOST_HOPS = 64
 
 
 @dataclass(frozen=True)
 class Hop:
-    """A jump of the wavelength.
+    """A jump of the wavelength."""
 
-    Attributes
-    ----------
-    frame : int
-        First after it, among the usable ones.
-    size, error : float
-        Relative change of the wavelength.
-    sigmas : float
-        Over the scatter of such differences in the same series.
-    """
-
-    frame: int
-    size: float
+    frame: int  # first after it, among the usable ones
+    size: float  # size, error: relative change of the wavelength
     error: float
-    sigmas: float
+    sigmas: float  # over the scatter of such differences in the same series
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Changes of the fringe vectors of all sets.
+    """Changes of the fringe vectors of all sets."""
 
-    Attributes
-    ----------
-    series : tuple of FrameSeries
-        Without hops and a sure line.
-    raw : tuple of FrameSeries
-        With them.
-    hops : mapping of str to tuple of Hop
-        Of each set.
-    line : Line, optional
-        The strongest, sure or not.
-    crossed : bool
-        Whether there are fringes of different directions.
-    """
-
-    series: tuple[FrameSeries, ...]
-    raw: tuple[FrameSeries, ...]
-    hops: dict[str, tuple[Hop, ...]]
-    line: Line | None
-    crossed: bool
+    series: tuple[FrameSeries, ...]  # without hops and a sure line
+    raw: tuple[FrameSeries, ...]  # with them
+    hops: dict[str, tuple[Hop, ...]]  # of each set
+    line: Line | None  # the strongest, sure or not
+    crossed: bool  # whether there are fringes of different directions
 
     def components(
         self,

@@ -17,34 +17,23 @@ from pixcal.kernels.two_states import likely_states
 F64 = NDArray[np.float64]
 
 ROUNDS = 200
-SETTLED = 1e-4
-"""Growth of the log-likelihood at which they end."""
-BASES = 33
-"""Levels tried for the base of each series, to begin with."""
+SETTLED = 1e-4  # growth of the log-likelihood at which they end
+BASES = 33  # levels tried for the base of each series, to begin with
+# of the size, and in all of the time: what is smaller counts as this
 LEAST_NOISE, FEWEST_HOPS = 1e-3, 0.01
-"""Of the size, and in all of the time: what is smaller counts as this."""
+# of the rate's logarithm, and of the size over the noise, over which the likelihood bends
 STEP = 0.2
-"""Of the rate's logarithm, and of the size over the noise, over which the likelihood bends."""
 
 
 @dataclass(frozen=True)
 class Hopping:
-    """Two levels and the hops between them.
+    """Two levels and the hops between them."""
 
-    Attributes
-    ----------
-    size, error : float
-        Of a hop, in the series' unit.
-    rate, rate_error : float
-        Of hops, 1/s.
-    noise : tuple of float
-        Standard deviation of each series about its levels, where these were looked at.
-    """
-
-    size: float
+    size: float  # size, error: of a hop, in the series' unit
     error: float
-    rate: float
+    rate: float  # rate, rate_error: of hops, 1/s
     rate_error: float
+    # standard deviation of each series about its levels, where these were looked at
     noise: tuple[float, ...] = ()
 
 

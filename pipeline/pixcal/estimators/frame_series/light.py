@@ -26,8 +26,7 @@ from pixcal.estimators.frame_series.variance_components import (
 
 F64 = NDArray[np.float64]
 
-FEWEST_DARK = 12
-"""Frames without light from which their offset is learnt."""
+FEWEST_DARK = 12  # frames without light from which their offset is learnt
 OFFSETS = ("offset", "offset_walk")
 PATTERNS = {
     # What moves (B, log A/B), as the covariance of the two.
@@ -39,24 +38,12 @@ PATTERNS = {
 
 @dataclass(frozen=True)
 class FrameLight:
-    """Light of the frames of all sets.
+    """Light of the frames of all sets."""
 
-    Attributes
-    ----------
-    sets : tuple of FrameSeries
-        (B over its mean less one, log A/B), without a sure line.
-    dark : tuple of FrameSeries
-        Mean level of frames without light (e-), and nothing.
-    level : mapping of str to float
-        Mean signal of each set, e-.
-    line : Line, optional
-        The strongest in B, sure or not.
-    """
-
-    sets: tuple[FrameSeries, ...]
-    dark: tuple[FrameSeries, ...]
-    level: dict[str, float]
-    line: Line | None = None
+    sets: tuple[FrameSeries, ...]  # (B over its mean less one, log A/B), without a sure line
+    dark: tuple[FrameSeries, ...]  # mean level of frames without light (e-), and nothing
+    level: dict[str, float]  # mean signal of each set, e-
+    line: Line | None = None  # the strongest in B, sure or not
 
     def components(
         self,

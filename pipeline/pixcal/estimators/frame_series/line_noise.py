@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-BLOCKS, LEAST_BLOCK = 16, 4
-"""Blocks of a row at most, and pixels of a block at least."""
+BLOCKS, LEAST_BLOCK = 16, 4  # blocks of a row at most, and pixels of a block at least
 FEWEST_BLOCKS = 4
 FEWEST_FRAMES = 8
 FEWEST_LINES = 8
@@ -25,27 +24,13 @@ _ROUNDS = 4
 
 @dataclass(frozen=True)
 class LineSpectrum:
-    """Variance that rows have in common, by mode across the rows.
+    """Variance that rows have in common, by mode across the rows."""
 
-    Attributes
-    ----------
-    lines : int
-        Rows that were transformed, an even number.
-    power : (n,) float64
-        Of modes 1 to ``lines / 2``, e-²; noise of single pixels does not add to it.
-    dof : (n,) float64
-        Degrees of freedom of each.
-    noise : float
-        Variance of a row's mean by the noise of its pixels, e-².
-    pair_noise : float
-        The same, as products of distant blocks see it, e-².
-    """
-
-    lines: int
-    power: F64
-    dof: F64
-    noise: float
-    pair_noise: float
+    lines: int  # rows that were transformed, an even number
+    power: F64  # (n,) of modes 1 to `lines / 2`, e-²; noise of single pixels does not add to it
+    dof: F64  # (n,) degrees of freedom of each
+    noise: float  # variance of a row's mean by the noise of its pixels, e-²
+    pair_noise: float  # the same, as products of distant blocks see it, e-²
 
     @property
     def modes(self) -> NDArray[np.int64]:
@@ -104,20 +89,11 @@ def line_spectrum(residual: F32, good: NDArray[np.bool_], fitted: int = 1) -> Li
 
 @dataclass(frozen=True)
 class LineNoise:
-    """Variances of several kinds of noise of rows.
+    """Variances of several kinds of noise of rows."""
 
-    Attributes
-    ----------
-    size : (m,) float64
-        e-²; of nothing zero on average, so some come out below.
-    covariance : (m, m) float64
-    sigmas : (m,) float64
-        Significance of each where it is the only one.
-    """
-
-    size: F64
-    covariance: F64
-    sigmas: F64
+    size: F64  # (m,) e-²; of nothing zero on average, so some come out below
+    covariance: F64  # (m, m)
+    sigmas: F64  # (m,) significance of each where it is the only one
 
     @property
     def roots(self) -> tuple[F64, F64]:

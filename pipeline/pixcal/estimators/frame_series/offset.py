@@ -19,45 +19,28 @@ from pixcal.estimators.frame_series.variance_components import Modes, cosine_mod
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-FEWEST = 8
-"""Frames from which something is learnt; of fewer, chance is not what it is taken for."""
-FEWEST_PIXELS = 16
-"""In each quarter."""
+FEWEST = 8  # frames from which something is learnt; of fewer, chance is not what it is taken for
+FEWEST_PIXELS = 16  # in each quarter
+# R, C, K of the quarters
 CONTRASTS = np.array([[1, 1, -1, -1], [1, -1, 1, -1], [1, -1, -1, 1]]) / 4
-"""R, C, K of the quarters."""
+# where noise of pixels, rows and columns shows among W, R, C, K
 NOISES = np.array([[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 1, 0]])
-"""Where noise of pixels, rows and columns shows among W, R, C, K."""
+# lowest size of the noise of pixels, of what is predicted; other parts may go as far below zero as
+# `BELOW` of it
 LEAST_NOISE = 0.05
-"""Lowest size of the noise of pixels, of what is predicted; other parts may go as far below zero
-as `BELOW` of it."""
 BELOW = 0.3
 
 
 @dataclass(frozen=True)
 class OffsetSeries:
-    """Offsets of frames that were taken one after the other.
-
-    Attributes
-    ----------
-    name : str
-    time_s : (t,) float64
-        After the first frame of the acquisition where that is known.
-    step_s : float
-        Mean time from frame to frame.
-    values : (t, 4) float64
-        W, R, C, K, e-.
-    noise : (4,) float64
-        Variance that the noise of the pixels gives them, e-².
-    nuisance : (t, p) float64
-        Shapes that are no offsets.
-    """
+    """Offsets of frames that were taken one after the other."""
 
     name: str
-    time_s: F64
-    step_s: float
-    values: F64
-    noise: F64
-    nuisance: F64
+    time_s: F64  # (t,) after the first frame of the acquisition where that is known
+    step_s: float  # mean time from frame to frame
+    values: F64  # (t, 4) W, R, C, K, e-
+    noise: F64  # (4,) variance that the noise of the pixels gives them, e-²
+    nuisance: F64  # (t, p) shapes that are no offsets
 
     def __len__(self) -> int:
         return len(self.values)

@@ -15,12 +15,10 @@ F64 = NDArray[np.float64]
 
 _MIN_FRAMES = 12
 _MIN_PIXELS = 80
-_KNEES = 24
-"""Places of the row from which the next step is seen that are tried."""
+_KNEES = 24  # places of the row from which the next step is seen that are tried
 _TURNS = 3
 _SMALL = 1e-3
-_BENT = 16.0
-"""Chi-square that a knee inside the window must gain."""
+_BENT = 16.0  # chi-square that a knee inside the window must gain
 
 
 @dataclass(frozen=True)
@@ -124,8 +122,7 @@ def _rows(found: FringeEvidence, way: int, share: F64) -> tuple[F64, F64, F64]:
     return rows_of(found, other, mean)
 
 
-INSIDE = slice(1, -1)
-"""Frames that have one before and one after."""
+INSIDE = slice(1, -1)  # frames that have one before and one after
 
 
 def _maps(found: FringeEvidence) -> F64:

@@ -17,37 +17,26 @@ from pixcal.kernels.significance import sigmas_of_chi2
 
 F64 = NDArray[np.float64]
 
-KNOTS = 9
-"""Rows at equal distances at which the profile is given."""
-ORIGINS = 8
-"""Phases tried as the one where the modulator's range begins."""
+KNOTS = 9  # rows at equal distances at which the profile is given
+ORIGINS = 8  # phases tried as the one where the modulator's range begins
+# standard deviations from which that phase is sought more finely, and how finely, rad
 CLEAR, FINEST = 4.0, 0.01
-"""Standard deviations from which that phase is sought more finely, and how finely, rad."""
+# columns of the window that are enough to tell the steps' way and origin; of wide ones one in
+# `MOST_APART` at most
 COLUMNS = 24
-"""Columns of the window that are enough to tell the steps' way and origin; of wide ones one in
-`MOST_APART` at most."""
 MOST_APART = 4
-OWN_ORDERS = 4
-"""Harmonics of a frame's own phase that a step must not be taken for."""
+OWN_ORDERS = 4  # harmonics of a frame's own phase that a step must not be taken for
 
 
 @dataclass(frozen=True)
 class Settling:
-    """Share of a step by which the phase of a row is off.
+    """Share of a step by which the phase of a row is off."""
 
-    Attributes
-    ----------
-    way : int
-        -1: of the step from the last frame; 1: of the step to the next one.
-    origin_rad : float or None
-        Where the modulator's range of one turn begins; None: it goes the shorter way.
-    share, error : (KNOTS,) float64
-        At rows at equal distances from first to last, mean zero; 1-sigma errors.
-    significance : float
-    """
-
-    way: int
+    way: int  # -1: of the step from the last frame; 1: of the step to the next one
+    # where the modulator's range of one turn begins; None: it goes the shorter way
     origin_rad: float | None
+    # share, error: (KNOTS,) at rows at equal distances from first to last, mean zero; 1-sigma
+    # errors
     share: F64
     error: F64
     significance: float

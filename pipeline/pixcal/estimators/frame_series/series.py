@@ -18,62 +18,37 @@ from pixcal.estimators.frame_series.variance_components import Modes, cosine_mod
 
 F64 = NDArray[np.float64]
 
-FEWEST = 32
-"""Frames of a set from which something is learnt."""
-HARMONICS = 10
-"""Of the phase, that are no noise."""
-SPENT = 0.25
-"""Share of the frames' freedom that shapes which follow the phase may take."""
-SLOW = 12
-"""Cosine modes that are drift."""
+FEWEST = 32  # frames of a set from which something is learnt
+HARMONICS = 10  # of the phase, that are no noise
+SPENT = 0.25  # share of the frames' freedom that shapes which follow the phase may take
+SLOW = 12  # cosine modes that are drift
+# modes whose power is the level of the one in their middle; median of chi-square
 AROUND, MEDIAN = 15, 0.455
-"""Modes whose power is the level of the one in their middle; median of chi-square."""
-OUTLIER = 9.0
-"""Power over the level from which a mode counts less."""
-DARK = 0.05
-"""Share of the mean light below which a frame tells nothing."""
-LEAST_NOISE = 0.05
-"""Lowest size of the noise, of what is predicted."""
-BELOW = 0.15
-"""How far below zero a size may come out, of the noise."""
+OUTLIER = 9.0  # power over the level from which a mode counts less
+DARK = 0.05  # share of the mean light below which a frame tells nothing
+LEAST_NOISE = 0.05  # lowest size of the noise, of what is predicted
+BELOW = 0.15  # how far below zero a size may come out, of the noise
 
 
 @dataclass(frozen=True)
 class FrameSeries:
-    """Two quantities of every usable frame of a set.
+    """Two quantities of every usable frame of a set."""
 
-    Attributes
-    ----------
-    name : str
-        Of the set.
-    k : (float, float)
-        Fringe vector (kx, ky), rad/px.
-    time_s : (t,) float64
-    step_s : float
-        Mean time from frame to frame.
-    exptime_s : float
-        nan when unknown.
-    values, apart : (t, 2) float64
-        The quantities, and the half difference of theirs from two halves of the pixels.
-    shapes : (t, p) float64
-        What follows the phase of the fringes, which is no noise.
-    noise, apart_noise : (2, 2) float64
-        Covariance that the noise model predicts of them, mean over frames.
-    share : float
-        Of the frames' freedom that is left.
-    """
-
-    name: str
-    k: tuple[float, float]
-    time_s: F64
-    step_s: float
-    exptime_s: float
+    name: str  # of the set
+    k: tuple[float, float]  # fringe vector (kx, ky), rad/px
+    time_s: F64  # (t,)
+    step_s: float  # mean time from frame to frame
+    exptime_s: float  # nan when unknown
+    # values, apart: (t, 2) the quantities, and the half difference of theirs from two halves of
+    # the pixels
     values: F64
     apart: F64
-    shapes: F64
+    shapes: F64  # (t, p) what follows the phase of the fringes, which is no noise
+    # noise, apart_noise: (2, 2) covariance that the noise model predicts of them, mean over
+    # frames
     noise: F64
     apart_noise: F64
-    share: float = 1.0
+    share: float = 1.0  # of the frames' freedom that is left
 
     def __len__(self) -> int:
         return len(self.values)

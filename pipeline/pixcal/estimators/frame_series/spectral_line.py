@@ -13,32 +13,23 @@ from pixcal.kernels.significance import SIGNIFICANT
 
 F64 = NDArray[np.float64]
 
-FINER = 8
-"""Frequencies looked at for each that a series tells apart."""
-SLOWEST = 4.0
-"""Fewest swings of a line within a run; what is slower is drift."""
+FINER = 8  # frequencies looked at for each that a series tells apart
+SLOWEST = 4.0  # fewest swings of a line within a run; what is slower is drift
+# looks for each frequency that a series tells apart: the highest place lies between any two
 TRIALS = 4.0
-"""Looks for each frequency that a series tells apart: the highest place lies between any two."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of one frequency in the series of all sets.
+    """A line of one frequency in the series of all sets."""
 
-    Attributes
-    ----------
-    hz, hz_error : float
-        As the frames see it: above half their rate it is folded below.
-    amplitude, amplitude_error : (2,) float64
-        Of each channel; mean square over the sets, less that of the noise.
-    log_chance : float
-        Logarithm of the chance that noise makes such a line anywhere in the spectrum.
-    """
-
-    hz: float
+    hz: float  # hz, hz_error: as the frames see it: above half their rate it is folded below
     hz_error: float
+    # amplitude, amplitude_error: (2,) of each channel; mean square over the sets, less that of
+    # the noise
     amplitude: F64
     amplitude_error: F64
+    # logarithm of the chance that noise makes such a line anywhere in the spectrum
     log_chance: float
 
     @property

@@ -22,8 +22,7 @@ from pixcal.kernels.variance_sums import gram, sandwich, trace_products
 F64 = NDArray[np.float64]
 
 MAX_STEPS = 60
-CONVERGED = 1e-5
-"""Growth of the log-likelihood at which scoring ends."""
+CONVERGED = 1e-5  # growth of the log-likelihood at which scoring ends
 
 
 def cosine_modes(series: F64) -> F64:
@@ -52,28 +51,16 @@ def damped_power(frames: int, keep: float) -> F64:
 
 @dataclass(frozen=True)
 class Modes:
-    """Cosine modes of one series or more of ``c`` channels, and what their covariance is made of.
+    """Cosine modes of one series or more of ``c`` channels, and what their covariance is made of."""
 
-    Attributes
-    ----------
-    values : (n, c) float64
-    known : (n, c, p) float64
-        Shapes that are fitted, each by a coefficient.
-    parts : (m, n, c, c) float64
-        What unit sizes add to the covariance of each mode.
-    start, least : (m,) float64
-        Sizes to begin with and lowest ones; below zero, so that what is not there may come out
-        either side of nothing.
-    share : float
-        Of the modes that are independent: the likelihood counts no more.
-    """
-
-    values: F64
-    known: F64
-    parts: F64
+    values: F64  # (n, c)
+    known: F64  # (n, c, p) shapes that are fitted, each by a coefficient
+    parts: F64  # (m, n, c, c) what unit sizes add to the covariance of each mode
+    # start, least: (m,) sizes to begin with and lowest ones; below zero, so that what is not
+    # there may come out either side of nothing
     start: F64
     least: F64
-    share: float = 1.0
+    share: float = 1.0  # of the modes that are independent: the likelihood counts no more
 
     @property
     def flat(self) -> F64:
@@ -83,30 +70,15 @@ class Modes:
 
 @dataclass(frozen=True)
 class Components:
-    """Sizes found, and how well.
+    """Sizes found, and how well."""
 
-    Attributes
-    ----------
-    size : (m,) float64
-    covariance : (m, m) float64
-        Of ``size``; zero for those that were held.
-    beta, beta_covariance : (p,), (p, p) float64
-        Coefficients of the known shapes.
-    likelihood : float
-        Logarithm, restricted; comparable where the known shapes are the same.
-    profile : float
-        Logarithm, not restricted; comparable whatever the known shapes.
-    modes : Modes
-        That it is of.
-    """
-
-    size: F64
-    covariance: F64
-    beta: F64
+    size: F64  # (m,)
+    covariance: F64  # (m, m) of `size`; zero for those that were held
+    beta: F64  # beta, beta_covariance: (p,), (p, p) float64: coefficients of the known shapes
     beta_covariance: F64
-    likelihood: float
-    profile: float
-    modes: Modes
+    likelihood: float  # logarithm, restricted; comparable where the known shapes are the same
+    profile: float  # logarithm, not restricted; comparable whatever the known shapes
+    modes: Modes  # that it is of
 
     def above(self, part: int) -> float:
         """1-sigma error of a size, upwards: where the likelihood has fallen by exp(-1/2).

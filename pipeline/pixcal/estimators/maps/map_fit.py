@@ -17,33 +17,20 @@ from pixcal.estimators.fringe_fit.gauge import fringe_modes
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-BLOCK = 8
-"""Pixels along the side of a block."""
+BLOCK = 8  # pixels along the side of a block
 
 _CLIP = 5.0
-_LEAST = 1e-30
-"""Variance of a map that its signals fit exactly."""
+_LEAST = 1e-30  # variance of a map that its signals fit exactly
 
 
 @dataclass(frozen=True)
 class MapPart:
-    """One map as a fit sees it; over its good pixels.
+    """One map as a fit sees it; over its good pixels."""
 
-    Attributes
-    ----------
-    signals : (pixel, n) float64
-        What one unit of each parameter does to the map.
-    data : (pixel,) float64
-    block : (pixel,) int
-        Number of the block that a pixel lies in.
-    dof : int
-        Pixels less the terms that were taken off.
-    """
-
-    signals: F64
-    data: F64
-    block: NDArray[np.intp]
-    dof: int
+    signals: F64  # (pixel, n) what one unit of each parameter does to the map
+    data: F64  # (pixel,)
+    block: NDArray[np.intp]  # (pixel,) number of the block that a pixel lies in
+    dof: int  # pixels less the terms that were taken off
 
     @classmethod
     def of(cls, signals: F64, data: F64, free: F64, good: Mask) -> "MapPart":

@@ -29,22 +29,17 @@ from pixcal.kernels.significance import sigmas_of_chi2
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+# periods in the window: no wave is looked for closer than that to what the fit leaves open
 NEAR = 1.5
-"""Periods in the window: no wave is looked for closer than that to what the fit leaves open."""
-HARMONICS = 4
-"""Of the fringes: a response that is not linear leaves waves there."""
-MOST = 3
-"""Waves of one set."""
-SIGNIFICANT = 5.0
-"""Standard deviations of a further wave."""
-APART = 30.0
-"""Chi-square by which vectors of their own must fit the sets better than a common one."""
+HARMONICS = 4  # of the fringes: a response that is not linear leaves waves there
+MOST = 3  # waves of one set
+SIGNIFICANT = 5.0  # standard deviations of a further wave
+APART = 30.0  # chi-square by which vectors of their own must fit the sets better than a common one
 
 _MIN_PIXELS = 200
 _CLIP = 6.0
 _ITERATIONS = 4
-_SMOOTH = 3
-"""Degree of what beams and lamp do to the maps."""
+_SMOOTH = 3  # degree of what beams and lamp do to the maps
 
 LIGHT = "the mean light"
 STATIC, FORWARD, BACKWARD = slice(0, 2), slice(2, 4), slice(4, 6)
@@ -52,67 +47,39 @@ STATIC, FORWARD, BACKWARD = slice(0, 2), slice(2, 4), slice(4, 6)
 
 @dataclass(frozen=True)
 class WaveFit:
-    """One wave of one set.
-
-    Attributes
-    ----------
-    set : str
-    q : (float, float)
-        Along x and y, rad/px.
-    static, forward, backward : complex
-        s, f and b, counted from the middle of the part.
-    errors : (5,) float
-        Of s, f, b (each of real and imaginary part) and of q.
-    """
+    """One wave of one set."""
 
     set: str
-    q: tuple[float, float]
-    static: complex
+    q: tuple[float, float]  # along x and y, rad/px
+    static: complex  # static, forward, backward: s, f and b, counted from the middle of the part
     forward: complex
     backward: complex
+    # (5,) float: of s, f, b (each of real and imaginary part) and of q
     errors: tuple[float, float, float, float, float]
 
 
 @dataclass(frozen=True)
 class Waves:
-    """Waves of all sets.
-
-    Attributes
-    ----------
-    waves : tuple of WaveFit
-    in_flats : bool
-        Whether the flats have the static pattern, and not the light over the flat.
-    significance : float
-        Of the map that shows the strongest wave second best, or of the mean light if that shows it
-        best; in standard deviations.
-    seen_in : tuple of str
-        Maps that show it.
-    by_map : mapping
-        Standard deviations in each map.
-    """
+    """Waves of all sets."""
 
     waves: tuple[WaveFit, ...]
-    in_flats: bool
+    in_flats: bool  # whether the flats have the static pattern, and not the light over the flat
+    # of the map that shows the strongest wave second best, or of the mean light if that shows
+    # it best; in standard deviations
     significance: float
-    seen_in: tuple[str, ...]
-    by_map: Mapping[str, float]
+    seen_in: tuple[str, ...]  # maps that show it
+    by_map: Mapping[str, float]  # standard deviations in each map
 
 
 @dataclass(frozen=True)
 class _Map:
-    """A map (y, x), its free terms (n, y, x), and how the wave's six numbers show in it.
-
-    Attributes
-    ----------
-    kind : str
-    row : (3,) complex
-        The map holds ``Re(row · (s e, f e, b / e))``.
-    """
+    """A map (y, x), its free terms (n, y, x), and how the wave's six numbers show in it."""
 
     kind: str
     data: F64
     free: F64
     good: Mask
+    # (3,) complex: the map holds `Re(row · (s e, f e, b / e))`
     row: tuple[complex, complex, complex]
 
     def rest(self) -> tuple[F64, float]:
@@ -132,8 +99,7 @@ class _Map:
         return np.stack([part for w in waves for part in (w.real, -w.imag)])
 
 
-Maps = Mapping[str, Sequence[_Map]]
-"""Of each set, by its name."""
+Maps = Mapping[str, Sequence[_Map]]  # of each set, by its name
 
 
 def find_waves(evidence: Evidence) -> Waves | None:

@@ -17,38 +17,29 @@ from pixcal.estimators.maps.map_fit import polynomial, without
 
 F64 = NDArray[np.float64]
 
-SHORTEST = 1.25
-"""Scale, px: a shorter wave is no more than two or three pixels from crest to crest."""
+SHORTEST = 1.25  # scale, px: a shorter wave is no more than two or three pixels from crest to crest
+# windows are this many times as wide as the longest scale: longer waves are parabolas there
 WIDEST = 4
-"""Windows are this many times as wide as the longest scale: longer waves are parabolas there."""
-STEP = 0.1
-"""Of the logarithm of the scales that are tried."""
+STEP = 0.1  # of the logarithm of the scales that are tried
+# windows are this many times as wide as scales of which a parabola takes nothing that matters
 NARROW = 12
-"""Windows are this many times as wide as scales of which a parabola takes nothing that matters."""
-DIRECTIONS = 16
-"""Of longer waves, whose ring has no more places."""
-EDGE = 0.02
-"""Of the template's highest power, beyond which the ring ends."""
+DIRECTIONS = 16  # of longer waves, whose ring has no more places
+EDGE = 0.02  # of the template's highest power, beyond which the ring ends
 _PARABOLA = 2
 
 
 @dataclass(frozen=True)
 class Ring:
-    """Waves of one length that two maps share.
+    """Waves of one length that two maps share."""
 
-    Attributes
-    ----------
-    variance, noise : float
-        Of the waves in this window, whatever a parabola takes of them, and its error.
-    error : float
-        Of the same as that of all waves of the kind, of which few beat with each other in a window.
-    scale, scale_error : float
-        Wavelength over 2 pi, px; the error is infinite where nothing is there.
-    """
-
+    # variance, noise: of the waves in this window, whatever a parabola takes of them, and its
+    # error
     variance: float
     noise: float
+    # of the same as that of all waves of the kind, of which few beat with each other in a
+    # window
     error: float
+    # scale, scale_error: wavelength over 2 pi, px; the error is infinite where nothing is there
     scale: float
     scale_error: float
 

@@ -11,12 +11,9 @@ F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
 Mask = NDArray[np.bool_]
 
-DEGREE = 3
-"""Of a smooth surface."""
-PERIODS = (2, 3, 4, 5, 6, 8)
-"""Of rows and columns: those of readout circuits."""
-AROUND = 5
-"""Pixels along the side of a pixel's surroundings."""
+DEGREE = 3  # of a smooth surface
+PERIODS = (2, 3, 4, 5, 6, 8)  # of rows and columns: those of readout circuits
+AROUND = 5  # pixels along the side of a pixel's surroundings
 _CLIP = 6.0
 
 
@@ -93,8 +90,8 @@ def repeats(values: F64, axis: int) -> C128:
     )
 
 
+# pixels along the sides of cells, whose means show how red a map is; and a quarter of the map
 CELLS = (8, 16)
-"""Pixels along the sides of cells, whose means show how red a map is; and a quarter of the map."""
 
 
 def redness(values: F64) -> float:
@@ -119,20 +116,14 @@ def redness(values: F64) -> float:
 
 @dataclass(frozen=True)
 class Offsets:
-    """Offsets as true ones can be: the part of a map that is kept, and how the rest scatters.
+    """Offsets as true ones can be: the part of a map that is kept, and how the rest scatters."""
 
-    Attributes
-    ----------
-    kept : (y, x) float64
-        Without bending, repeating rows and columns, and fringes; px.
-    terms : (term, y, x) float64
-        What was taken out: all that an effect of the bench or the readout would bring about.
-    scatter : (term,) float64
-        Of the coefficients of the terms, by chance, in offsets such as those that were kept.
-    """
-
-    kept: F64
+    kept: F64  # (y, x) without bending, repeating rows and columns, and fringes; px
+    # (term, y, x) what was taken out: all that an effect of the bench or the readout would
+    # bring about
     terms: F64
+    # (term,) of the coefficients of the terms, by chance, in offsets such as those that were
+    # kept
     scatter: F64
 
     def drawn(self, rng: np.random.Generator) -> F64:

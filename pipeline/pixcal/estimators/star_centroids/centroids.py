@@ -21,32 +21,19 @@ from pixcal.kernels.psf import Psf, expected_windows, fit_windows
 F64 = NDArray[np.float64]
 Good = NDArray[np.bool_]
 
+# least variance of a pixel, as a share of the star's electrons: dark rings weigh no more
 TINY = 1e-9
-"""Least variance of a pixel, as a share of the star's electrons: dark rings weigh no more."""
 
 
 @dataclass(frozen=True)
 class Star:
-    """A star as it is observed and fitted.
-
-    Attributes
-    ----------
-    psf : Psf
-    half : int
-        The window has 2 half + 1 pixels a side, the middle one nearest to the star.
-    electrons : float
-        Photo-electrons of the star, N.
-    background : float
-        Of each pixel, e-, B.
-    read_variance : float
-        Of each pixel, all read-outs together, e-², r².
-    """
+    """A star as it is observed and fitted."""
 
     psf: Psf
-    half: int
-    electrons: float
-    background: float = 0.0
-    read_variance: float = 0.0
+    half: int  # the window has 2 half + 1 pixels a side, the middle one nearest to the star
+    electrons: float  # photo-electrons of the star, N
+    background: float = 0.0  # of each pixel, e-, B
+    read_variance: float = 0.0  # of each pixel, all read-outs together, e-², r²
 
     @property
     def side(self) -> int:

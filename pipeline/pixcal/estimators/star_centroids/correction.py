@@ -19,12 +19,11 @@ from pixcal.kernels.psf import MARGIN, Psf
 
 F64 = NDArray[np.float64]
 
+# share of a star's weights on pixels without an offset beyond which it is not corrected
 MOST_UNKNOWN = 0.1
-"""Share of a star's weights on pixels without an offset beyond which it is not corrected."""
 _SIGMA_OF_FWHM = 1 / math.sqrt(8 * math.log(2))
 _KNOTS = 24
-_FAINT = 1e12
-"""Variance of a pixel beside which that of the star's own light does not count, e-²."""
+_FAINT = 1e12  # variance of a pixel beside which that of the star's own light does not count, e-²
 
 
 def gaussian_star(fwhm: float, electrons: float | None, read_noise: float) -> Star:
@@ -56,18 +55,12 @@ def gaussian_star(fwhm: float, electrons: float | None, read_noise: float) -> St
 
 @dataclass(frozen=True)
 class Corrected:
-    """Places of stars.
+    """Places of stars."""
 
-    Attributes
-    ----------
-    place : (n, 2) float64
-        (x, y), px, the first pixel's centre being 0; NaN where too little is known of the pixels.
-    error : (n, 2) float64
-        What the errors of the map leave in it, px, 1 sigma.
-    """
-
+    # (n, 2) (x, y), px, the first pixel's centre being 0; NaN where too little is known of the
+    # pixels
     place: F64
-    error: F64
+    error: F64  # (n, 2) what the errors of the map leave in it, px, 1 sigma
 
 
 def correct_centroids(

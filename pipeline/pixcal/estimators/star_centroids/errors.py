@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 
 RESAMPLES = 300
-SEEN = 2.0
-"""What is left of a mean square is seen when it is so many of its errors above nothing."""
+SEEN = 2.0  # what is left of a mean square is seen when it is so many of its errors above nothing
 
 
 @dataclass(frozen=True)
@@ -29,16 +28,10 @@ class Value:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Root mean square errors of centroids, px, and how many times the maps make them smaller.
+    """Root mean square errors of centroids, px, and how many times the maps make them smaller."""
 
-    Attributes
-    ----------
-    perfect, measured : Value
-        Pixels taken for a perfect grid, and where the maps say. ``perfect`` is NaN where the
-        offsets' own scatter is not seen above the maps' errors.
-    gain : Value
-    """
-
+    # perfect, measured: pixels taken for a perfect grid, and where the maps say. `perfect` is
+    # NaN where the offsets' own scatter is not seen above the maps' errors
     perfect: Value
     measured: Value
     gain: Value

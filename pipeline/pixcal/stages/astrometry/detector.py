@@ -22,10 +22,8 @@ from pixcal.storage.fits_map import FitsMap
 F64 = NDArray[np.float64]
 Range = tuple[int, int]
 
-DRAW_TILE = 64
-"""Side of the tiles of pixels that share a generator of errors, px."""
-LARGEST = 1.0
-"""An offset beyond is no offset; such a pixel is left out, px."""
+DRAW_TILE = 64  # side of the tiles of pixels that share a generator of errors, px
+LARGEST = 1.0  # an offset beyond is no offset; such a pixel is left out, px
 AXES = {"delta_x": ("x", (1.0, 0.0)), "delta_y": ("y", (0.0, 1.0))}
 
 
@@ -36,29 +34,16 @@ def generator(seed: int, *key: int) -> np.random.Generator:
 
 @dataclass(frozen=True)
 class Component:
-    """The offsets along one axis.
+    """The offsets along one axis."""
 
-    Attributes
-    ----------
-    name : str
-        ``x``, ``y`` or ``fringe``.
-    axis : (float, float)
-        Unit vector (x, y).
-    delta, sigma, mask : FitsMap
-        Product of the fit.
-    truth : tuple of (float, FitsMap)
-        The true offset is the sum of the maps times the numbers; empty where it is not known.
-    modes : Modes, optional
-        What the truth is freed from.
-    """
-
-    name: str
-    axis: tuple[float, float]
-    delta: FitsMap
+    name: str  # `x`, `y` or `fringe`
+    axis: tuple[float, float]  # unit vector (x, y)
+    delta: FitsMap  # delta, sigma, mask: product of the fit
     sigma: FitsMap
     mask: FitsMap
+    # the true offset is the sum of the maps times the numbers; empty where it is not known
     truth: tuple[tuple[float, FitsMap], ...] = ()
-    modes: Modes | None = None
+    modes: Modes | None = None  # what the truth is freed from
 
     def true(self, y: Range, x: Range) -> F64:
         """The true offset along the axis, modes included, px."""
@@ -69,19 +54,13 @@ class Component:
 
 @dataclass(frozen=True)
 class Patch:
-    """A part of the detector.
+    """A part of the detector."""
 
-    Attributes
-    ----------
-    true, known : (component, y, x) float64
-        Where pixels lie and where the maps say, px; zero where not ``good``.
-    good : (y, x) bool
-        Pixels whose offset is known.
-    """
-
+    # true, known: (component, y, x) where pixels lie and where the maps say, px; zero where not
+    # `good`
     true: F64
     known: F64
-    good: NDArray[np.bool_]
+    good: NDArray[np.bool_]  # (y, x) pixels whose offset is known
 
 
 @dataclass(frozen=True)

@@ -22,32 +22,22 @@ from pixcal.storage.cube import ArrayWriter, create_array, create_group
 
 F64 = NDArray[np.float64]
 
-TILE = 512
-"""Side of a task's part of the map, about, px."""
-SHOWN = 96
-"""Most blocks along the longer side of the pictures of the whole detector."""
+TILE = 512  # side of a task's part of the map, about, px
+SHOWN = 96  # most blocks along the longer side of the pictures of the whole detector
+# least side of such a block, px: a few independent places, for its rms to mean something
 LEAST_BLOCK = 8
-"""Least side of such a block, px: a few independent places, for its rms to mean something."""
 GRIDS = ("perfect", "measured")
 
 
 @dataclass(frozen=True)
 class ErrorMaps:
-    """Error of a star in the middle of every pixel whose window lies on the detector.
+    """Error of a star in the middle of every pixel whose window lies on the detector."""
 
-    Attributes
-    ----------
-    squares : (grid, component, y, x) float64
-        Sum of squares over blocks, px²: pixels taken for a perfect grid, or where the maps say.
-    places : (y, x) float64
-        Pixels of the blocks that count.
-    block : int
-        Side of the blocks, px.
-    """
-
+    # (grid, component, y, x) sum of squares over blocks, px²: pixels taken for a perfect grid,
+    # or where the maps say
     squares: F64
-    places: F64
-    block: int
+    places: F64  # (y, x) pixels of the blocks that count
+    block: int  # side of the blocks, px
 
     @property
     def mean_square(self) -> F64:

@@ -21,21 +21,11 @@ Range = tuple[int, int]
 
 @dataclass(frozen=True)
 class SetModes:
-    """Modes of one fringe set, beside a plane.
+    """Modes of one fringe set, beside a plane."""
 
-    Attributes
-    ----------
-    middle : (float, float)
-        Of the detector, (x, y), px.
-    k : (float, float)
-        Fringe vector (x, y), rad/px.
-    geometry : Geometry, optional
-        Of exact fringes.
-    """
-
-    middle: tuple[float, float]
-    k: tuple[float, float]
-    geometry: Geometry | None
+    middle: tuple[float, float]  # of the detector, (x, y), px
+    k: tuple[float, float]  # fringe vector (x, y), rad/px
+    geometry: Geometry | None  # of exact fringes
 
     @classmethod
     def of_fit(
@@ -69,20 +59,11 @@ class SetModes:
 
 @dataclass(frozen=True)
 class Modes:
-    """A combination of the modes of all sets.
+    """A combination of the modes of all sets."""
 
-    Attributes
-    ----------
-    shape : (int, int)
-        Of the detector, (y, x).
-    sets : tuple of SetModes
-    coefficients : tuple of float
-        px each; the smooth modes first.
-    """
-
-    shape: tuple[int, int]
+    shape: tuple[int, int]  # of the detector, (y, x)
     sets: tuple[SetModes, ...]
-    coefficients: tuple[float, ...] = ()
+    coefficients: tuple[float, ...] = ()  # px each; the smooth modes first
 
     @property
     def n_smooth(self) -> int:

@@ -12,33 +12,22 @@ from pixcal.stages.astrometry.detector import Detector, Patch, generator
 
 F64 = NDArray[np.float64]
 
-BATCH = 16
-"""Stars of a task."""
+BATCH = 16  # stars of a task
+# a place is not used where masked pixels would tell more than so much of the position
 MOST_LOST = 0.1
-"""A place is not used where masked pixels would tell more than so much of the position."""
+# errors of a star at a place: pixels taken for a perfect grid, or where the maps say; without and
+# with photon noise; and the first two as `centroids.Star.weights` predicts them
 KINDS = ("perfect", "measured", "perfect_photons", "measured_photons", "linear", "linear_measured")
-"""Errors of a star at a place: pixels taken for a perfect grid, or where the maps say; without and
-with photon noise; and the first two as `centroids.Star.weights` predicts them."""
 
 
 @dataclass(frozen=True)
 class Observation:
-    """What is observed.
-
-    Attributes
-    ----------
-    star : Star
-    stars : int
-    positions : int
-        Places of each star.
-    dither : float
-        They lie within so many px of the first, along x and y.
-    """
+    """What is observed."""
 
     star: Star
     stars: int
-    positions: int
-    dither: float
+    positions: int  # places of each star
+    dither: float  # they lie within so many px of the first, along x and y
 
 
 def observe(detector: Detector, plan: Observation, runtime: Runtime) -> F64:

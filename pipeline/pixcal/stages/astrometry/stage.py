@@ -50,20 +50,15 @@ from pixcal.storage.stage import copy_products, make, read_acquisition, working
 
 SCHEMA = "pixcal/astrometry/1"
 
-CURVE = np.geomspace(1e4, 1e12, 49)
-"""Electrons of the curve of errors."""
-DETAIL = 128
-"""Side of the part of the error maps that is shown place by place, px."""
-FIGURE_BYTES = 160 << 20
-"""Matplotlib and one figure."""
-_BYTES_PER_PIXEL = 180
-"""Peak of a task for each pixel that it looks at (measured)."""
-_BYTES_PER_PIXEL_AND_MODE = 13
-"""What each mode adds where there is a truth (measured)."""
+CURVE = np.geomspace(1e4, 1e12, 49)  # electrons of the curve of errors
+DETAIL = 128  # side of the part of the error maps that is shown place by place, px
+FIGURE_BYTES = 160 << 20  # Matplotlib and one figure
+_BYTES_PER_PIXEL = 180  # peak of a task for each pixel that it looks at (measured)
+_BYTES_PER_PIXEL_AND_MODE = 13  # what each mode adds where there is a truth (measured)
+# peak of a task of the fit of the modes, for each pixel and mode (measured)
 _BYTES_PER_FITTED_MODE = 28
-"""Peak of a task of the fit of the modes, for each pixel and mode (measured)."""
+# peak of a task of the stars, for each pixel of a star's windows (measured)
 _BYTES_PER_WINDOW_PIXEL = 200
-"""Peak of a task of the stars, for each pixel of a star's windows (measured)."""
 
 F64 = NDArray[np.float64]
 

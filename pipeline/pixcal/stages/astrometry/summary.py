@@ -13,8 +13,7 @@ from pixcal.stages.astrometry.simulation import KINDS
 
 F64 = NDArray[np.float64]
 
-TARGET_PX = 5e-5
-"""What a mission to Earth-like planets needs (paper, section 1)."""
+TARGET_PX = 5e-5  # what a mission to Earth-like planets needs (paper, section 1)
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,9 @@ from pixcal.kernels.psf import Psf, diffraction_psf
 from pixcal.model.acquisition import Detector as Declared
 from pixcal.model.errors import InputError
 
-FULL_WELL_E = 50_000.0
-"""Where the acquisition declares none (paper, table 1)."""
-WINDOW = 4.0
-"""Half of the default window, in lambda / D: three dark rings."""
-SAMPLINGS = (0.4, 40.0)
-"""Pixels in lambda / D that the table of the pattern is made for."""
+FULL_WELL_E = 50_000.0  # where the acquisition declares none (paper, table 1)
+WINDOW = 4.0  # half of the default window, in lambda / D: three dark rings
+SAMPLINGS = (0.4, 40.0)  # pixels in lambda / D that the table of the pattern is made for
 MICROARCSECONDS = 180 / np.pi * 3600e6
 
 

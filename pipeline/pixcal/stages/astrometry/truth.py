@@ -13,10 +13,8 @@ from pixcal.stages.astrometry.modes import Modes, SetModes
 
 F64 = NDArray[np.float64]
 
-ENOUGH = 4_000_000
-"""Pixels that tell the modes; of larger detectors some bands are left out."""
-BAND = 16
-"""Rows of a task."""
+ENOUGH = 4_000_000  # pixels that tell the modes; of larger detectors some bands are left out
+BAND = 16  # rows of a task
 
 
 def free_from_modes(

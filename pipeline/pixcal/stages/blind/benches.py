@@ -16,43 +16,30 @@ from pixcal.model.bench import (
 
 PITCH_UM, WAVELENGTH_NM, DISTANCE_MM = 4.4, 632.8, 400.0
 LAMP_E_S = 1.2e6
+# of a ramp of the phase: near the golden angle, so that the phases of any run of frames spread
 STEP_RAD = (2.37, 2.43)
-"""Of a ramp of the phase: near the golden angle, so that the phases of any run of frames spread."""
 
 
 @dataclass(frozen=True)
 class Layout:
-    """What is recorded in every case of an examination.
+    """What is recorded in every case of an examination."""
 
-    Attributes
-    ----------
-    shape : (int, int)
-        Rows and columns.
-    frames : int
-        Of each fringe set.
-    bias, dark, flat : int
-        Frames; of flats those of each level.
-    second : float
-        Share of the cases with a second baseline along one axis.
-    """
-
-    shape: tuple[int, int]
-    frames: int
-    bias: int
+    shape: tuple[int, int]  # rows and columns
+    frames: int  # of each fringe set
+    bias: int  # bias, dark, flat: frames; of flats those of each level
     dark: int
     flat: int
-    second: float
+    second: float  # share of the cases with a second baseline along one axis
 
 
+# by the name of the size; `tiny` is for tests of the procedure, too small to find much
 LAYOUTS = {
     "tiny": Layout((33, 35), 60, 12, 8, 8, 0.0),
     "small": Layout((61, 67), 300, 60, 20, 20, 0.0),
     "standard": Layout((128, 128), 600, 100, 24, 24, 0.3),
 }
-"""By the name of the size; ``tiny`` is for tests of the procedure, too small to find much."""
 
-MOST_SETS = 3
-"""Fringe sets of a case at most."""
+MOST_SETS = 3  # fringe sets of a case at most
 FLATS_S = (0.006, 0.014, 0.022, 0.03)
 
 

@@ -30,8 +30,7 @@ from pixcal.stages.blind.second import record_second
 from pixcal.stages.simulate import acquire
 from pixcal.storage.artefact import digest, lock
 
-MOMENT = datetime(2026, 1, 1, tzinfo=UTC).timestamp()
-"""Time of every file."""
+MOMENT = datetime(2026, 1, 1, tzinfo=UTC).timestamp()  # time of every file
 MOST_SEED = 10**17
 
 

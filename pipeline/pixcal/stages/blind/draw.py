@@ -13,6 +13,7 @@ from pixcal.stages.blind.second import SecondCase, SecondLaw, catalogue
 from pixcal.stages.blind.strengths import STRONGEST, Way, ways_of
 
 ONE, NOTHING, SEVERAL, LEFT_OUT, SECOND_ONE, SECOND_NOTHING, SECOND_PAIR, SECOND_OTHER = range(1, 9)
+# in the order of the table
 PARTS = {
     SECOND_ONE: "second bench: one effect",
     SECOND_NOTHING: "second bench: an ordinary bench",
@@ -23,59 +24,39 @@ PARTS = {
     SEVERAL: "self-check: two or three effects",
     LEFT_OUT: "self-check: the effect is no candidate",
 }
-"""In the order of the table."""
 SECOND = (SECOND_ONE, SECOND_NOTHING, SECOND_PAIR, SECOND_OTHER)
+# of the cases of each bench; both have as many
 SHARES = {
     "second": {SECOND_ONE: 0.55, SECOND_NOTHING: 0.25, SECOND_PAIR: 0.1, SECOND_OTHER: 0.1},
     "own": {ONE: 0.5, NOTHING: 0.16, SEVERAL: 0.17, LEFT_OUT: 0.17},
 }
-"""Of the cases of each bench; both have as many."""
-VISIBLE = 0.3
-"""Least strength of the second bench's effects; 0 is barely visible."""
+VISIBLE = 0.3  # least strength of the second bench's effects; 0 is barely visible
+# times the threshold that effects are at least, but for part 1, which begins at the threshold
 CLEAR = 2.0
-"""Times the threshold that effects are at least, but for part 1, which begins at the threshold."""
 
 _TRUTH, _BENCH = 1, 2
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """An effect in a case.
-
-    Attributes
-    ----------
-    effect, way : str
-    strength : float
-    times : float or None
-        How many times the threshold that is; nobody knows that of the second bench.
-    parameters : dict
-        Of the library's effect.
-    """
+    """An effect in a case."""
 
     effect: str
     way: str
     strength: float
+    # how many times the threshold that is; nobody knows that of the second bench
     times: float | None
-    parameters: dict[str, Any]
+    parameters: dict[str, Any]  # of the library's effect
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What is in a case, and what a diagnosis may not consider.
-
-    Attributes
-    ----------
-    part : int
-    left_out : str
-        Effect that is no candidate.
-    drawn : tuple of Drawn
-    second : SecondCase, optional
-        What the second bench is asked for, where it makes the frames.
-    """
+    """What is in a case, and what a diagnosis may not consider."""
 
     part: int
-    left_out: str
+    left_out: str  # effect that is no candidate
     drawn: tuple[Drawn, ...] = ()
+    # what the second bench is asked for, where it makes the frames
     second: SecondCase | None = None
 
     @property
@@ -86,15 +67,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Examination:
-    """Cases in the order of their numbers.
-
-    Attributes
-    ----------
-    seed : int
-    size : str
-    truths : tuple of Truth
-    notes : tuple of str
-    """
+    """Cases in the order of their numbers."""
 
     seed: int
     size: str

@@ -19,69 +19,40 @@ from pixcal.stages.blind.draw import (
 from pixcal.stages.blind.offsets import AxisError
 from pixcal.stages.blind.parameters import held
 
-BLAMED = 0.5
-"""Share of the gap from which an absent effect is blamed for most of it."""
-WITHIN = (1, 2, 3)
-"""Errors that a parameter may be off."""
-WORST = 3
-"""Statistics among which the place of an effect is looked for."""
+BLAMED = 0.5  # share of the gap from which an absent effect is blamed for most of it
+WITHIN = (1, 2, 3)  # errors that a parameter may be off
+WORST = 3  # statistics among which the place of an effect is looked for
 
 Diagnosis = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Grade:
-    """How a case was answered.
-
-    Attributes
-    ----------
-    case : str
-    part : int
-    truth : tuple of str
-        Effects in the case.
-    way : str
-        How they come.
-    times : float or None
-        Threshold times of the weakest.
-    left_out : str
-    verdict : str
-        Of the diagnosis; ``failed`` without one.
-    named : tuple of str
-        Causes in their order.
-    marks : dict
-        Questions of the part, answered right or not.
-    why : str
-        What went wrong; empty where nothing did.
-    claims : tuple of dict
-        What was claimed of each cause: significance of its estimate, share of the gap closed,
-        chance.
-    worst : tuple of dict
-        Where data and simulation differ most: domain, statistic, set, place.
-    parameters : tuple of dict
-        Of true effects that were found: name, true, found, error, and whether it is within one,
-        two and three errors.
-    closed, oracle : float or None
-        Share of the gap closed by the causes named, and by the true effects as they are.
-    offsets : tuple of AxisError
-        Errors of the offsets along x and y.
-    """
+    """How a case was answered."""
 
     case: str
     part: int
-    truth: tuple[str, ...]
-    way: str
-    times: float | None
+    truth: tuple[str, ...]  # effects in the case
+    way: str  # how they come
+    times: float | None  # threshold times of the weakest
     left_out: str
-    verdict: str
-    named: tuple[str, ...]
-    marks: dict[str, bool]
-    why: str
+    verdict: str  # of the diagnosis; `failed` without one
+    named: tuple[str, ...]  # causes in their order
+    marks: dict[str, bool]  # questions of the part, answered right or not
+    why: str  # what went wrong; empty where nothing did
+    # what was claimed of each cause: significance of its estimate, share of the gap closed,
+    # chance
     claims: tuple[dict[str, Any], ...] = ()
+    # where data and simulation differ most: domain, statistic, set, place
     worst: tuple[dict[str, str], ...] = ()
+    # of true effects that were found: name, true, found, error, and whether it is within one,
+    # two and three errors
     parameters: tuple[dict[str, Any], ...] = ()
+    # closed, oracle: share of the gap closed by the causes named, and by the true effects as
+    # they are
     closed: float | None = None
     oracle: float | None = None
-    offsets: tuple[AxisError, ...] = ()
+    offsets: tuple[AxisError, ...] = ()  # errors of the offsets along x and y
 
     @property
     def right(self) -> bool:
@@ -89,6 +60,7 @@ class Grade:
         return next(iter(self.marks.values()))
 
 
+# of each part; the first one decides
 QUESTIONS = {
     SECOND_ONE: ("named first", "nothing else named", "explained"),
     SECOND_NOTHING: ("no gap", "no cause claimed"),
@@ -99,7 +71,6 @@ QUESTIONS = {
     SEVERAL: ("all found, none invented", "all found", "none invented"),
     LEFT_OUT: ("honest", "not called explained", "nobody blamed for most", "right domain"),
 }
-"""Of each part; the first one decides."""
 
 
 def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "") -> Grade:

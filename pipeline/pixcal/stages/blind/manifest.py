@@ -11,29 +11,18 @@ from pixcal.storage.artefact import read_json, write_json
 SCHEMA = "pixcal/blind/1"
 FILE = "blind.json"
 RUNS = "runs"
-EXAMINATION = 1000
-"""Seeds from here on are for examinations, those below for development."""
+EXAMINATION = 1000  # seeds from here on are for examinations, those below for development
 
 
 @dataclass(frozen=True)
 class Manifest:
-    """What an examination consists of, without the truth.
+    """What an examination consists of, without the truth."""
 
-    Attributes
-    ----------
-    schema, purpose, size : str
-        ``purpose``: examination or development.
-    commitment : str
-        To the truth.
-    without : tuple of str
-        Of each case, the effect that is no candidate.
-    """
-
-    schema: str
+    schema: str  # schema, purpose, size: `purpose`: examination or development
     purpose: str
     size: str
-    commitment: str
-    without: tuple[str, ...]
+    commitment: str  # to the truth
+    without: tuple[str, ...]  # of each case, the effect that is no candidate
 
     @property
     def cases(self) -> tuple[str, ...]:

@@ -28,32 +28,20 @@ F64 = NDArray[np.float64]
 Sets = Mapping[str, Mapping[str, Any]]
 
 AXES = ("x", "y")
-BIASED = 1.1
-"""Bounds from which the error of a map as fitted is more than noise."""
+BIASED = 1.1  # bounds from which the error of a map as fitted is more than noise
 
 
 @dataclass(frozen=True)
 class AxisError:
-    """Error of the offsets along one axis.
+    """Error of the offsets along one axis."""
 
-    Attributes
-    ----------
-    axis : str
-        ``x`` or ``y``.
-    bound_px : float
-        Cramér-Rao bound of an offset, that of the ordinary fit.
-    before, after : float
-        Root mean square of the error over the bound, of the maps as fitted and as corrected; the
-        same where nothing was corrected.
-    pull : float
-        Root mean square of the error over ``SIGMA``, as fitted.
-    """
-
-    axis: str
-    bound_px: float
+    axis: str  # `x` or `y`
+    bound_px: float  # Cramér-Rao bound of an offset, that of the ordinary fit
+    # before, after: root mean square of the error over the bound, of the maps as fitted and as
+    # corrected; the same where nothing was corrected
     before: float
     after: float
-    pull: float
+    pull: float  # root mean square of the error over `SIGMA`, as fitted
 
     @property
     def biased(self) -> bool:

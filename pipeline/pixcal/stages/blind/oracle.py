@@ -27,24 +27,15 @@ from pixcal.stages.diagnose.shrinkage import Trial, differing, shrinkage
 from pixcal.stages.diagnose.trial import Trials
 from pixcal.storage.artefact import read_json
 
-EXPLAINS = 0.5
-"""Share of a statistic's gap that the true effects leave at most where they cause it."""
+EXPLAINS = 0.5  # share of a statistic's gap that the true effects leave at most where they cause it
 
 
 @dataclass(frozen=True)
 class Oracle:
-    """What the true effects do to the gap.
+    """What the true effects do to the gap."""
 
-    Attributes
-    ----------
-    closed : float
-        Share of the gap that they close.
-    causes : frozenset of (str, str)
-        Statistics, of sets, that differ because of them.
-    """
-
-    closed: float
-    causes: frozenset[tuple[str, str]]
+    closed: float  # share of the gap that they close
+    causes: frozenset[tuple[str, str]]  # statistics, of sets, that differ because of them
 
 
 def ask_oracle(

@@ -13,13 +13,7 @@ Plain = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Held:
-    """A parameter held against the truth.
-
-    Attributes
-    ----------
-    name : str
-    true, found, error : float
-    """
+    """A parameter held against the truth."""
 
     name: str
     true: float

@@ -28,14 +28,12 @@ from pixcal.storage.artefact import read_json, write_json
 PRODUCTS = "products"
 DIAGNOSIS = Path(PRODUCTS) / "diagnosis.json"
 FAILED = "failed.json"
+# of a case that is done: by which code, in how many seconds, and why there are no maps
 DONE = "sat.json"
-"""Of a case that is done: by which code, in how many seconds, and why there are no maps."""
-BEGUN = "begun.json"
-"""Of a case: by which code."""
-LEAST_BYTES = 1 << 30
-"""Of a case on a cluster, whose workers have limits of their own."""
+BEGUN = "begun.json"  # of a case: by which code
+LEAST_BYTES = 1 << 30  # of a case on a cluster, whose workers have limits of their own
+# artefacts that are removed once a case is diagnosed
 LARGE = ("ingest", "reduce", "sweep", "fit", "corrected")
-"""Artefacts that are removed once a case is diagnosed."""
 
 
 def run(folder: Path, config: RunConfig, runtime: Runtime) -> tuple[int, int]:

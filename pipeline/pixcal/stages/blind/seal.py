@@ -22,20 +22,12 @@ SCHEMA = "pixcal/blind-truth/2"
 
 @dataclass(frozen=True)
 class Sealed:
-    """Contents of a sealed file.
-
-    Attributes
-    ----------
-    schema, salt : str
-    examination : Examination
-    benches : tuple of Bench
-        Of the cases.
-    """
+    """Contents of a sealed file."""
 
     schema: str
     salt: str
     examination: Examination
-    benches: tuple[Bench, ...]
+    benches: tuple[Bench, ...]  # of the cases
 
 
 def write_seal(path: Path, examination: Examination, benches: tuple[Bench, ...]) -> str:

@@ -22,34 +22,22 @@ F64 = NDArray[np.float64]
 
 PROGRAM = "second_bench"
 NEEDED = ("hcipy", "galsim")
-BIAS, FLATS = 40, 40
-"""Frames of a case, but for the smallest sizes, which have fewer."""
+BIAS, FLATS = 40, 40  # frames of a case, but for the smallest sizes, which have fewer
 INSTALL = "install them with 'pip install pixcal[second-bench]'"
 
 
 @dataclass(frozen=True)
 class SecondLaw:
-    """A law of an effect, as the second bench lists it.
-
-    Attributes
-    ----------
-    effect, name, unit : str
-    weak, strong : float
-        Sizes at strengths 0 and 1.
-    known, decidable : bool
-        Whether pixcal has the effect, and whether frames can show it.
-    needs : str
-        A package.
-    """
+    """A law of an effect, as the second bench lists it."""
 
     effect: str
     name: str
-    weak: float
+    weak: float  # weak, strong: sizes at strengths 0 and 1
     strong: float
     unit: str
-    known: bool
+    known: bool  # known, decidable: whether pixcal has the effect, and whether frames can show it
     decidable: bool
-    needs: str
+    needs: str  # a package
 
     def size(self, strength: float) -> float:
         """Size of the effect, in its unit."""
@@ -58,19 +46,11 @@ class SecondLaw:
 
 @dataclass(frozen=True)
 class SecondCase:
-    """What the second bench is asked for.
-
-    Attributes
-    ----------
-    case : str
-    seed : int
-    strength : float
-        From 0 to 1.
-    """
+    """What the second bench is asked for."""
 
     case: str
     seed: int
-    strength: float
+    strength: float  # from 0 to 1
 
 
 def _there(package: str) -> bool:

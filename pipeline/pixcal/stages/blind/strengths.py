@@ -14,24 +14,15 @@ Make = Callable[[float, np.random.Generator], Plain]
 
 @dataclass(frozen=True)
 class Way:
-    """One of the ways in which an effect comes.
-
-    Attributes
-    ----------
-    effect : str
-    strength : str
-        What its strength is, for people.
-    small, standard : float
-        Threshold: strength that an estimate on half of the frames sees with about four sigmas, on
-        the middle bench of each size.
-    make : callable
-        Parameters of the effect, from a strength and random numbers for all that is left open.
-    """
+    """One of the ways in which an effect comes."""
 
     effect: str
-    strength: str
+    strength: str  # what its strength is, for people
+    # small, standard: threshold: strength that an estimate on half of the frames sees with
+    # about four sigmas, on the middle bench of each size
     small: float
     standard: float
+    # parameters of the effect, from a strength and random numbers for all that is left open
     make: Make
 
     def threshold(self, size: str) -> float:
@@ -172,5 +163,4 @@ def ways_of() -> Mapping[str, tuple[Way, ...]]:
     return {name: tuple(w for w in WAYS if w.effect == name) for name in names}
 
 
-STRONGEST = 10.0
-"""Times the threshold that an effect is at most."""
+STRONGEST = 10.0  # times the threshold that an effect is at most

@@ -24,8 +24,8 @@ NOBODY = "nothing"
 TWICE = 2.0
 FROM_TWICE = "named first, from twice the threshold"
 PLACE = "right place, by the true effect"
-NEAR = 0.05
-"""By which the share closed may differ from the oracle's."""
+NEAR = 0.05  # by which the share closed may differ from the oracle's
+# shares that the diagnosis is to reach
 TARGETS = {
     (SECOND_ONE, "named first"): 0.95,
     (SECOND_ONE, "nothing else named"): 0.95,
@@ -37,10 +37,9 @@ TARGETS = {
     (SEVERAL, "pairs: both found"): 0.85,
     (LEFT_OUT, "honest"): 0.9,
 }
-"""Shares that the diagnosis is to reach."""
+# Cramér-Rao bounds that the median error of corrected maps is to be at most, where an effect biases
+# them
 BOUNDS = 1.3
-"""Cramér-Rao bounds that the median error of corrected maps is to be at most, where an effect
-biases them."""
 
 
 def summary(grades: Sequence[Grade]) -> dict[str, Any]:

@@ -17,27 +17,17 @@ from numpy.typing import ArrayLike, NDArray
 
 F64 = NDArray[np.float64]
 
-NODES = 9
-"""Places of the quadrature over the changes from frame to frame."""
-TURN = 720
-"""Steps of a turn where a mean over the phase has no closed form."""
+NODES = 9  # places of the quadrature over the changes from frame to frame
+TURN = 720  # steps of a turn where a mean over the phase has no closed form
 
 
 @dataclass(frozen=True)
 class FrameSpread:
-    """How light and contrast change from frame to frame, as places and weights of a quadrature.
+    """How light and contrast change from frame to frame, as places and weights of a quadrature."""
 
-    Attributes
-    ----------
-    level, amplitude : (n,) float64
-        B and A, mean about 1.
-    weight : (n,) float64
-        Sum 1.
-    """
-
-    level: F64
+    level: F64  # level, amplitude: (n,) B and A, mean about 1
     amplitude: F64
-    weight: F64
+    weight: F64  # (n,) sum 1
 
     @classmethod
     def steady(cls) -> "FrameSpread":
@@ -144,17 +134,11 @@ class WeightErrors:
 
     Weights ``(1 + e(u)) / variance`` raise the variance of the estimate by the variance of e over
     the phases, each phase counting with its information (second order; the first vanishes).
-
-    Attributes
-    ----------
-    offset : float
-        For each e-² of a constant error of a sample's variance: a wrong bias or read noise.
-    scale : float
-        For a relative error of the light, squared: a wrong flat.
     """
 
+    # for each e-² of a constant error of a sample's variance: a wrong bias or read noise
     offset: float
-    scale: float
+    scale: float  # for a relative error of the light, squared: a wrong flat
 
     @classmethod
     def of(cls, iota: float, alpha: float, variance: float) -> "WeightErrors":

@@ -29,16 +29,13 @@ from pixcal.stages.budget.bound import (
 F64 = NDArray[np.float64]
 Shares = Sequence[float] | F64
 
-SAMPLES = 96
-"""Pixels along each side of the grid: light changes little from one to the next."""
+SAMPLES = 96  # pixels along each side of the grid: light changes little from one to the next
+# frames of a ramp that are looked at: it repeats itself, or fills the turn evenly by then
 MAX_PHASES = 2000
-"""Frames of a ramp that are looked at: it repeats itself, or fills the turn evenly by then."""
-DARKNESS = 1e-12
-"""Least information of one frame, 1/rad²."""
-NEGLIGIBLE = 1e-3
-"""Share of the frames that the noise of calibration frames may cost."""
+DARKNESS = 1e-12  # least information of one frame, 1/rad²
+NEGLIGIBLE = 1e-3  # share of the frames that the noise of calibration frames may cost
+# interfringes that a longer baseline is tried for; the paper keeps to 5 px (section 4.2)
 FINER_PX = (5.0, 4.0, 3.0)
-"""Interfringes that a longer baseline is tried for; the paper keeps to 5 px (section 4.2)."""
 
 
 def sample_variance(bench: Bench) -> float:
@@ -50,27 +47,15 @@ def sample_variance(bench: Bench) -> float:
 
 @dataclass(frozen=True)
 class SetBound:
-    """Bound of a fringe set on the grid of pixels.
+    """Bound of a fringe set on the grid of pixels."""
 
-    Attributes
-    ----------
-    iota, alpha : (n,) float64
-        Mean and amplitude, e-.
-    kx, ky : (n,) float64
-        Local fringe vector, rad/px.
-    variance : float
-        Of a sample without light, e-².
-    frames : FrameSpread
-    loss : (float, float)
-        What the choice of phases costs, of the frames: median and worst fringe phase.
-    """
-
-    iota: F64
+    iota: F64  # iota, alpha: (n,) mean and amplitude, e-
     alpha: F64
-    kx: F64
+    kx: F64  # kx, ky: (n,) local fringe vector, rad/px
     ky: F64
-    variance: float
+    variance: float  # of a sample without light, e-²
     frames: FrameSpread
+    # what the choice of phases costs, of the frames: median and worst fringe phase
     loss: tuple[float, float]
 
     @classmethod
@@ -200,15 +185,9 @@ def grid(shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 @dataclass(frozen=True)
 class JoinedBound:
-    """Fringe sets joined by weighted least squares.
+    """Fringe sets joined by weighted least squares."""
 
-    Attributes
-    ----------
-    sets : tuple of SetBound
-        On the same grid.
-    """
-
-    sets: tuple[SetBound, ...]
+    sets: tuple[SetBound, ...]  # on the same grid
 
     @property
     def components(self) -> tuple[str, ...]:
@@ -277,23 +256,13 @@ def frames_needed(variance: float, precision: float) -> int:
 
 @dataclass(frozen=True)
 class Lever:
-    """A change of the bench, and what it does to the variance of one frame of all sets joined.
-
-    Attributes
-    ----------
-    name : str
-    variance : float
-        Of the worse component at the median pixel, px², for one frame shared by the sets.
-    period_s : float
-        From frame to frame.
-    note : str
-        What it assumes, or "".
-    """
+    """A change of the bench, and what it does to the variance of one frame of all sets joined."""
 
     name: str
+    # of the worse component at the median pixel, px², for one frame shared by the sets
     variance: float
-    period_s: float
-    note: str = ""
+    period_s: float  # from frame to frame
+    note: str = ""  # what it assumes, or ""
 
 
 def levers(bench: Bench, now: JoinedBound) -> list[Lever]:

@@ -43,14 +43,10 @@ from pixcal.stages.budget.expected import (
 from pixcal.storage.artefact import digest, write_json
 
 SCHEMA = "pixcal/budget/1"
-PRECISION_PX = 5e-5
-"""What the paper asks for (section 1)."""
-SAMPLE_BYTES = 2
-"""Of a sample as a camera writes it."""
-MARGIN = 4.0
-"""Standard deviations that the brightest fringe should keep below the end of the range."""
-DOMINANT = 1.5
-"""A factor of the frames below this does not limit a set: photons do."""
+PRECISION_PX = 5e-5  # what the paper asks for (section 1)
+SAMPLE_BYTES = 2  # of a sample as a camera writes it
+MARGIN = 4.0  # standard deviations that the brightest fringe should keep below the end of the range
+DOMINANT = 1.5  # a factor of the frames below this does not limit a set: photons do
 
 F64 = NDArray[np.float64]
 

@@ -22,30 +22,19 @@ from scipy.stats import norm
 
 F64 = NDArray[np.float64]
 
-RCOND = 1e-8
-"""Modes of the two sides that are alike to this (in their squares) count as one."""
+RCOND = 1e-8  # modes of the two sides that are alike to this (in their squares) count as one
+# relative error of the maps' own errors that a difference is allowed before it counts
 SIGMA_ACCURACY = 0.02
-"""Relative error of the maps' own errors that a difference is allowed before it counts."""
 UPPER = float(norm.ppf(0.95))
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """Sums over blocks of equal side.
+    """Sums over blocks of equal side."""
 
-    Attributes
-    ----------
-    values : (k, y, x) float64
-        Sums of the maps and of the modes.
-    noise : (2, y, x) float64
-        Sums of the variances of the two maps.
-    count : (y, x) float64
-        Good pixels.
-    """
-
-    values: F64
-    noise: F64
-    count: F64
+    values: F64  # (k, y, x) sums of the maps and of the modes
+    noise: F64  # (2, y, x) sums of the variances of the two maps
+    count: F64  # (y, x) good pixels
 
     def coarser(self) -> "Blocks":
         """Blocks of twice the side; those at the far edges may be smaller."""
@@ -80,21 +69,11 @@ def halve(sums: F64) -> F64:
 
 @dataclass(frozen=True)
 class Grouping:
-    """A way to group pixels, and what the groups' means hold.
+    """A way to group pixels, and what the groups' means hold."""
 
-    Attributes
-    ----------
-    groups : int
-        Those with a good pixel.
-    products : (k, k) float64
-        Sum over groups of products of means, each times its pixels.
-    noise : (2,) float64
-        What the variances of the maps let expect of their squares.
-    """
-
-    groups: int
-    products: F64
-    noise: F64
+    groups: int  # those with a good pixel
+    products: F64  # (k, k) sum over groups of products of means, each times its pixels
+    noise: F64  # (2,) what the variances of the maps let expect of their squares
 
     def __add__(self, other: "Grouping") -> "Grouping":
         """Together with the groups of another part of the window."""
@@ -105,17 +84,10 @@ class Grouping:
 
 @dataclass(frozen=True)
 class Projection:
-    """The modes taken off both maps.
+    """The modes taken off both maps."""
 
-    Attributes
-    ----------
-    coefficients : (mode, 2) float64
-        To take off the maps.
-    inverse : (mode, mode) float64
-        Inverse of the modes' normal matrix; of modes that are alike, one counts.
-    """
-
-    coefficients: F64
+    coefficients: F64  # (mode, 2) to take off the maps
+    # (mode, mode) inverse of the modes' normal matrix; of modes that are alike, one counts
     inverse: F64
 
     @classmethod
@@ -150,26 +122,14 @@ class Projection:
 
 @dataclass(frozen=True)
 class Part:
-    """The two maps at one scale, as sums of squares over the window's good pixels (px²).
+    """The two maps at one scale, as sums of squares over the window's good pixels (px²)."""
 
-    Attributes
-    ----------
-    pixels : int
-        Good pixels of the window.
-    freedom : float
-        Degrees of freedom, those of the modes taken off.
-    first, second, both : float
-        Squares of the maps, and their product.
-    noise : (float, float)
-        Squares that their errors let expect.
-    """
-
-    pixels: int
-    freedom: float
-    first: float
+    pixels: int  # good pixels of the window
+    freedom: float  # degrees of freedom, those of the modes taken off
+    first: float  # first, second, both: squares of the maps, and their product
     second: float
     both: float
-    noise: tuple[float, float]
+    noise: tuple[float, float]  # squares that their errors let expect
 
     @property
     def difference(self) -> float:
@@ -267,24 +227,16 @@ def significance(p: Part, accuracy: float = SIGMA_ACCURACY) -> float:
 
 @dataclass(frozen=True)
 class Line:
-    """The second map against the first, errors in both.
+    """The second map against the first, errors in both."""
 
-    Attributes
-    ----------
-    slope, error : float or None
-        None where there is nothing in common to draw a line through.
-    correlation, correlation_error : float
-        Of the maps as they are.
-    """
-
+    # slope, error: None where there is nothing in common to draw a line through
     slope: float | None
     error: float | None
-    correlation: float
+    correlation: float  # correlation, correlation_error: of the maps as they are
     correlation_error: float
 
 
-SEEN = 5.0
-"""Sigma at which a covariance is a signal that a line can be drawn through."""
+SEEN = 5.0  # sigma at which a covariance is a signal that a line can be drawn through
 
 
 def straight_line(p: Part) -> Line:
@@ -308,21 +260,11 @@ def straight_line(p: Part) -> Line:
 
 @dataclass(frozen=True)
 class Period:
-    """The strongest wave of a profile.
+    """The strongest wave of a profile."""
 
-    Attributes
-    ----------
-    px : float
-        Its period.
-    amplitude : float
-        px.
-    chance : float
-        Of noise making one as strong, anywhere in the spectrum.
-    """
-
-    px: float
-    amplitude: float
-    chance: float
+    px: float  # its period
+    amplitude: float  # px
+    chance: float  # of noise making one as strong, anywhere in the spectrum
 
 
 def strongest_period(difference: F64, sigma: F64) -> Period | None:

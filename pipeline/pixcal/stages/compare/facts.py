@@ -17,12 +17,10 @@ from pixcal.stages.compare.agreement import (
 )
 from pixcal.stages.compare.pair import Pair, Pixels, Places, Sums
 
-CLAIM = 1e-3
-"""Chance of a false claim of a difference, of all that is looked at together."""
+CLAIM = 1e-3  # chance of a false claim of a difference, of all that is looked at together
+# kinds of evidence: scales, columns, rows, means of blocks, scatter in blocks, single pixels
 FAMILIES = 6
-"""Kinds of evidence: scales, columns, rows, means of blocks, scatter in blocks, single pixels."""
-LISTED = 10
-"""Most blocks, and most pixels, that are named."""
+LISTED = 10  # most blocks, and most pixels, that are named
 
 
 def describe(

@@ -15,42 +15,24 @@ from pixcal.stages.compare.sides import Side, SideTile, Tile, Vector
 
 F64 = NDArray[np.float64]
 
-COARSE = 256
-"""Most blocks along the longer side that are kept in memory."""
-SHOWN_BLOCKS = 16
-"""Blocks along the longer side of the map of differences, or up to twice as many."""
-LEAST_BLOCK = 4
-"""Least side of its blocks, px."""
-DISAGREE = 5.0
-"""Sigma beyond which a pixel is listed."""
-LISTED = 1000
-"""Most pixels of a tile that are listed."""
-PULLS = np.linspace(-50, 50, 2001)
-"""Edges of the histogram of differences over their errors."""
-PICTURE = 96
-"""Bins a side of the histogram of one map against the other."""
-REACH = 4.5
-"""Its half width, in rms of the maps."""
+COARSE = 256  # most blocks along the longer side that are kept in memory
+SHOWN_BLOCKS = 16  # blocks along the longer side of the map of differences, or up to twice as many
+LEAST_BLOCK = 4  # least side of its blocks, px
+DISAGREE = 5.0  # sigma beyond which a pixel is listed
+LISTED = 1000  # most pixels of a tile that are listed
+PULLS = np.linspace(-50, 50, 2001)  # edges of the histogram of differences over their errors
+PICTURE = 96  # bins a side of the histogram of one map against the other
+REACH = 4.5  # its half width, in rms of the maps
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Two sides along one direction.
+    """Two sides along one direction."""
 
-    Attributes
-    ----------
-    first, second : Side
-        Of the same window.
-    name : str
-        ``delta_x``, ``delta_y`` or ``delta_fringe``.
-    direction : (float, float)
-        Unit vector (x, y).
-    """
-
-    first: Side
+    first: Side  # first, second: of the same window
     second: Side
-    name: str
-    direction: Vector
+    name: str  # `delta_x`, `delta_y` or `delta_fringe`
+    direction: Vector  # unit vector (x, y)
 
     @property
     def window(self) -> tuple[int, int]:
@@ -121,17 +103,10 @@ def _batches(side: Side) -> int:
 
 @dataclass(frozen=True)
 class Outlying:
-    """Which pixels to leave out: those whose difference is far off.
-
-    Attributes
-    ----------
-    projection : Projection
-    limit : float
-        Of the difference over its error.
-    """
+    """Which pixels to leave out: those whose difference is far off."""
 
     projection: Projection
-    limit: float
+    limit: float  # of the difference over its error
 
     def keep(self, values: F64, variance: F64) -> NDArray[np.bool_]:
         """Pixels to keep, from maps and modes (k, y, x) and the difference's variance."""
@@ -157,25 +132,13 @@ def _values(pair: Pair, tile: Tile) -> tuple[F64, F64]:
 
 @dataclass(frozen=True)
 class Sums:
-    """What one reading of both sides leaves.
+    """What one reading of both sides leaves."""
 
-    Attributes
-    ----------
-    fine : tuple of Grouping
-        Blocks of 1, 2, 4, ... pixels, up to the coarse ones.
-    coarse : Blocks
-        Of the whole window.
-    columns, rows : Blocks
-        Of one column or row each.
-    levels : int
-        Times that blocks are doubled in all.
-    """
-
-    fine: tuple[Grouping, ...]
-    coarse: Blocks
-    columns: Blocks
+    fine: tuple[Grouping, ...]  # blocks of 1, 2, 4, ... pixels, up to the coarse ones
+    coarse: Blocks  # of the whole window
+    columns: Blocks  # columns, rows: of one column or row each
     rows: Blocks
-    levels: int
+    levels: int  # times that blocks are doubled in all
 
     @property
     def pixels(self) -> int:
@@ -279,29 +242,15 @@ def _sums_task(
 
 @dataclass(frozen=True)
 class Pixels:
-    """The pixels one by one.
+    """The pixels one by one."""
 
-    Attributes
-    ----------
-    pulls : (bin,) int64
-        Histogram of differences over their errors, `PULLS`.
-    picture : (bin, bin) int64
-        Second map (y) against the first (x), within ``reach``.
-    reach : float
-        px.
-    far : tuple of (y, x, difference px, error px)
-        Pixels beyond `DISAGREE`, farthest first.
-    beyond : int
-        How many there are.
-    squares, count : (y, x) float64
-        Sum of squared pulls of each coarse block and its pixels, those beyond left out.
-    """
-
-    pulls: NDArray[np.int64]
-    picture: NDArray[np.int64]
-    reach: float
-    far: tuple[tuple[int, int, float, float], ...]
-    beyond: int
+    pulls: NDArray[np.int64]  # (bin,) histogram of differences over their errors, `PULLS`
+    picture: NDArray[np.int64]  # (bin, bin) second map (y) against the first (x), within `reach`
+    reach: float  # px
+    far: tuple[tuple[int, int, float, float], ...]  # pixels beyond `DISAGREE`, farthest first
+    beyond: int  # how many there are
+    # squares, count: (y, x) sum of squared pulls of each coarse block and its pixels, those
+    # beyond left out
     squares: F64
     count: F64
 
@@ -363,22 +312,13 @@ def _pixels_task(pair: Pair, projection: Projection, reach: float, tile: Tile) -
 
 @dataclass(frozen=True)
 class Places:
-    """Where the sides differ: blocks of the window.
+    """Where the sides differ: blocks of the window."""
 
-    Attributes
-    ----------
-    side : int
-        Of a block, px.
-    mean, error : (y, x) float64
-        Mean difference of a block's pixels and its error, px; NaN where empty.
-    squares, count : (y, x) float64
-        Sum of squared pulls and pixels.
-    """
-
-    side: int
+    side: int  # of a block, px
+    # mean, error: (y, x) mean difference of a block's pixels and its error, px; NaN where empty
     mean: F64
     error: F64
-    squares: F64
+    squares: F64  # squares, count: (y, x) sum of squared pulls and pixels
     count: F64
 
     @classmethod

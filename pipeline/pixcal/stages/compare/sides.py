@@ -29,29 +29,17 @@ Range = tuple[int, int]
 Tile = tuple[Range, Range]
 Vector = tuple[float, float]
 
-PART_OF = 1e-3
-"""A set whose share in a direction is below this brings no modes of its own there."""
+PART_OF = 1e-3  # a set whose share in a direction is below this brings no modes of its own there
 
 
 @dataclass(frozen=True)
 class FittedSet:
-    """One fringe set of a fitted run.
-
-    Attributes
-    ----------
-    name : str
-    folder : Path
-        ``fit.zarr/<set name>``.
-    shape : FringeShape
-        Of the fringes, as fitted.
-    batches : tuple of int or None
-        Those that count; None for the whole run.
-    """
+    """One fringe set of a fitted run."""
 
     name: str
-    folder: Path
-    shape: FringeShape
-    batches: tuple[int, ...] | None = None
+    folder: Path  # `fit.zarr/<set name>`
+    shape: FringeShape  # of the fringes, as fitted
+    batches: tuple[int, ...] | None = None  # those that count; None for the whole run
 
     def vector(self, tile: Tile) -> Vector:
         """Fringe vector (kx, ky) at the middle of a tile, rad/px."""
@@ -99,46 +87,24 @@ class FittedSet:
 
 @dataclass(frozen=True)
 class SideTile:
-    """A part of one side along one direction.
+    """A part of one side along one direction."""
 
-    Attributes
-    ----------
-    delta, variance : (y, x) float64
-        px and px²; NaN where there is none.
-    modes : (mode, y, x) float64
-    """
-
-    delta: F64
+    delta: F64  # delta, variance: (y, x) px and px²; NaN where there is none
     variance: F64
-    modes: F64
+    modes: F64  # (mode, y, x)
 
 
 @dataclass(frozen=True)
 class Side:
-    """One side of a comparison.
-
-    Attributes
-    ----------
-    label : str
-    run : Path
-    key : str
-        Of its fit.
-    sets : tuple of FittedSet
-    window : (int, int)
-        (y, x), px.
-    chunk : (int, int)
-        Of its maps on disk.
-    facts : dict
-        What to say of it.
-    """
+    """One side of a comparison."""
 
     label: str
     run: Path
-    key: str
+    key: str  # of its fit
     sets: tuple[FittedSet, ...]
-    window: tuple[int, int]
-    chunk: tuple[int, int]
-    facts: dict[str, Any]
+    window: tuple[int, int]  # (y, x), px
+    chunk: tuple[int, int]  # of its maps on disk
+    facts: dict[str, Any]  # what to say of it
 
     @property
     def whole(self) -> Tile:

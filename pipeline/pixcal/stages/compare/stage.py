@@ -51,14 +51,10 @@ from pixcal.storage.formats import STAGES
 STAGE = STAGES["compare"]
 SCHEMA = "pixcal/compare/1"
 RESULT = "compare.json"
-STRAY = 0.05
-"""Pixels of a window that may be left out by chance."""
-FEWEST = 50
-"""Pixels in common that are needed."""
-PARALLEL_DEG = 10.0
-"""Axes of single sets that differ by more have nothing in common."""
-NOTED_DEG = 0.5
-"""From here on it is said that the axes differ."""
+STRAY = 0.05  # pixels of a window that may be left out by chance
+FEWEST = 50  # pixels in common that are needed
+PARALLEL_DEG = 10.0  # axes of single sets that differ by more have nothing in common
+NOTED_DEG = 0.5  # from here on it is said that the axes differ
 
 
 Config = Compare

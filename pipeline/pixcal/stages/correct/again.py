@@ -18,10 +18,8 @@ from pixcal.stages.evidence import Part, load_evidence
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.treatment import Treatment, Treatments
 
-SAMPLES = 5_000_000
-"""Of each fringe set that are in memory at a time."""
-MOST_PARTS = 4
-"""Times that many at most."""
+SAMPLES = 5_000_000  # of each fringe set that are in memory at a time
+MOST_PARTS = 4  # times that many at most
 
 
 def measured_again(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatments:

@@ -23,39 +23,21 @@ from pixcal.storage.cube import ArrayReader
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-PERIOD = 4
-"""Rows or columns after which patterns repeat (paper, section 5.1: period of four rows)."""
-ALIGNED = 0.985
-"""Cosine between the axes of sets that see the same offsets (10 degrees)."""
+PERIOD = 4  # rows or columns after which patterns repeat (paper, section 5.1: period of four rows)
+ALIGNED = 0.985  # cosine between the axes of sets that see the same offsets (10 degrees)
 
 
 @dataclass(frozen=True)
 class Maps:
-    """Maps of the sets before and after.
+    """Maps of the sets before and after."""
 
-    Attributes
-    ----------
-    before, after : Path
-        ``fit.zarr`` and ``corrected.zarr``.
-    source : ReducedSet
-        For the tiles.
-    names : tuple of str
-        Of the sets.
-    axes : mapping
-        Unit vector (x, y) that each measures along.
-    has_halves : mapping
-        Which sets have maps of both halves of the frames.
-    effects : int
-        Undone on maps: the variants that follow the halves.
-    """
-
-    before: Path
+    before: Path  # before, after: `fit.zarr` and `corrected.zarr`
     after: Path
-    source: ReducedSet
-    names: tuple[str, ...]
-    axes: Mapping[str, tuple[float, float]]
-    has_halves: Mapping[str, bool]
-    effects: int
+    source: ReducedSet  # for the tiles
+    names: tuple[str, ...]  # of the sets
+    axes: Mapping[str, tuple[float, float]]  # unit vector (x, y) that each measures along
+    has_halves: Mapping[str, bool]  # which sets have maps of both halves of the frames
+    effects: int  # undone on maps: the variants that follow the halves
 
     @property
     def pairs(self) -> list[tuple[str, str, float]]:
@@ -74,28 +56,20 @@ class Maps:
 
 @dataclass
 class Sums:
-    """Sums over pixels of one set.
-
-    Attributes
-    ----------
-    count : int
-    moved : (1 + effect, 2) float64
-        Sum of squares and largest of the change of offsets: of all, then of each effect on maps;
-        last of those on samples.
-    rows, columns : (3, n) float64
-        Sums over each row and column of the offsets before and after, and the count.
-    halves : (2, 3) float64
-        Before and after: squares of half the difference, what errors let expect of them, count.
-    square : float
-        Sum of the squared offsets after.
-    """
+    """Sums over pixels of one set."""
 
     count: int
+    # (1 + effect, 2) sum of squares and largest of the change of offsets: of all, then of each
+    # effect on maps; last of those on samples
     moved: F64
+    # rows, columns: (3, n) sums over each row and column of the offsets before and after, and
+    # the count
     rows: F64
     columns: F64
+    # (2, 3) before and after: squares of half the difference, what errors let expect of them,
+    # count
     halves: F64
-    square: float
+    square: float  # sum of the squared offsets after
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ import numpy as np
 from pixcal.stages.correct.surroundings import DEPTH, Sides, border_misfit, decided
 from pixcal.stages.correct.swept import Swept, free_of_samples, undone
 
-ALONG = 1024
-"""Pixels along a side that tell whether it is open."""
+ALONG = 1024  # pixels along a side that tell whether it is open
 
 
 def sides_of(sets: Sequence[Swept]) -> Sides:

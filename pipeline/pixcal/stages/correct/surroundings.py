@@ -16,20 +16,19 @@ from pixcal.simulation.effect import FringeMaps
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
+# top, bottom, left and right of the window, rows counted from the top
 Sides = tuple[bool, bool, bool, bool]
-"""Top, bottom, left and right of the window, rows counted from the top."""
 
 CLOSED: Sides = (False, False, False, False)
-BEYOND = 8
-"""Pixels beyond an open side that are taken to be there."""
+BEYOND = 8  # pixels beyond an open side that are taken to be there
+# flags of pixels whose fit tells nothing of their light
 UNKNOWN = int(PixelFlag.SATURATED | PixelFlag.NO_DATA)
-"""Flags of pixels whose fit tells nothing of their light."""
+# lines of pixels that tell what the one at the border should be; those beside it do not count
 DEPTH, SKIPPED = 24, 4
-"""Lines of pixels that tell what the one at the border should be; those beside it do not count."""
+# difference of chi-square by which one side is told by itself; others go by all together
 CLEAR = 9.0
-"""Difference of chi-square by which one side is told by itself; others go by all together."""
+# of neighbours, so that the errors of any two of them add up in squares on average
 SIGNS = ((0, 0), (0, 1), (1, 0), (1, 1))
-"""Of neighbours, so that the errors of any two of them add up in squares on average."""
 
 
 def scatter_of(phase: F64) -> float:

@@ -23,50 +23,27 @@ from pixcal.storage.cube import ArrayReader
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-HALVES = 2
-"""Parts of the frames that are corrected each for itself."""
+HALVES = 2  # parts of the frames that are corrected each for itself
 
 
 @dataclass(frozen=True)
 class Swept:
-    """A set as swept, and what its maps are to be freed of.
+    """A set as swept, and what its maps are to be freed of."""
 
-    Attributes
-    ----------
-    folder : Path
-        ``sweep.zarr/<set name>``.
-    source : ReducedSet
-        For the tiles.
-    effects : tuple of Effect
-        In the order in which they are undone.
-    k : (float, float)
-        Fringe vector at the centre, rad/px.
-    flat : Path, optional
-        Map that samples were divided by.
-    read_noise : float
-        e-.
-    samples : tuple of Effect
-        That were undone on samples, as if nothing were beyond the window.
-    raw : Path, optional
-        The sweep before that.
-    errors : mapping
-        Of the parameters of each effect, 1-sigma: by effect, then by parameter.
-    covariances : mapping
-        By effect: of all its parameters, where they were measured together.
-    open_sides : (bool, bool, bool, bool)
-        Where the detector goes on beyond the window: top, bottom, left, right.
-    """
-
-    folder: Path
-    source: ReducedSet
-    effects: tuple[Effect, ...]
-    k: tuple[float, float]
-    flat: Path | None
-    read_noise: float
+    folder: Path  # `sweep.zarr/<set name>`
+    source: ReducedSet  # for the tiles
+    effects: tuple[Effect, ...]  # in the order in which they are undone
+    k: tuple[float, float]  # fringe vector at the centre, rad/px
+    flat: Path | None  # map that samples were divided by
+    read_noise: float  # e-
+    # that were undone on samples, as if nothing were beyond the window
     samples: tuple[Effect, ...] = ()
-    raw: Path | None = None
+    raw: Path | None = None  # the sweep before that
+    # of the parameters of each effect, 1-sigma: by effect, then by parameter
     errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    # mapping: by effect: of all its parameters, where they were measured together
     covariances: Mapping[str, F64] = field(default_factory=dict)
+    # where the detector goes on beyond the window: top, bottom, left, right
     open_sides: Sides = CLOSED
 
     @property

@@ -22,14 +22,11 @@ from pixcal.stages.fit.scouting import scout_tiles
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+# peak of a tile's task for each of its pixels, those around it included (measured),
 PIXEL_BYTES = 500
-"""Peak of a tile's task for each of its pixels, those around it included (measured),"""
-EFFECT_BYTES = 40
-"""for each effect,"""
-SLOPE_BYTES = 24
-"""and for each parameter whose slope is taken."""
-TILES = 9
-"""Tiles, spread over the window, that tell for all: errors of parameters repeat over it."""
+EFFECT_BYTES = 40  # for each effect,
+SLOPE_BYTES = 24  # and for each parameter whose slope is taken
+TILES = 9  # tiles, spread over the window, that tell for all: errors of parameters repeat over it
 
 
 def moved(effect: Effect, errors: Mapping[str, float]) -> list[Effect]:

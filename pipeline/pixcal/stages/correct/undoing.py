@@ -36,8 +36,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-SAME = ("chi2", "mask", "g", "dk", "time")
-"""Arrays of a sweep that stay."""
+SAME = ("chi2", "mask", "g", "dk", "time")  # arrays of a sweep that stay
 
 
 def undo_on_maps(swept: Swept, target: Path, runtime: Runtime, name: str) -> None:

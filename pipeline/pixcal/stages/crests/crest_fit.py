@@ -18,24 +18,17 @@ from pixcal.stages.crests.crests import CrestPaths
 
 F64 = NDArray[np.float64]
 
-OUTLIER = 5.0
-"""Points farther from the fit, in robust standard deviations, are left out."""
-MAP_POINTS = 400
-"""Points that a cost map is computed with; its numbers are scaled to all of them."""
+OUTLIER = 5.0  # points farther from the fit, in robust standard deviations, are left out
+MAP_POINTS = 400  # points that a cost map is computed with; its numbers are scaled to all of them
 
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the geometry beforehand.
-
-    Attributes
-    ----------
-    nominal : Geometry
-    sigma : (6,) float64
-        1-sigma errors, mm, in the order of `PARAMETERS`; 0 holds a parameter, infinity frees it.
-    """
+    """What is known of the geometry beforehand."""
 
     nominal: Geometry
+    # (6,) 1-sigma errors, mm, in the order of `PARAMETERS`; 0 holds a parameter, infinity frees
+    # it
     sigma: F64
 
     @classmethod
@@ -59,40 +52,20 @@ class Prior:
 
 @dataclass(frozen=True)
 class CrestFit:
-    """Geometry fitted to crests and valleys.
-
-    Attributes
-    ----------
-    geometry : Geometry
-    phase0 : float
-        Phase at the frame's centre, rad.
-    covariance : (6, 6) float64
-        mm², in the order of `PARAMETERS`, scaled by the spread; zero for what was held.
-    used : (point,) bool
-        Points that are no outliers.
-    residual : (point,) float64
-        Phase of the fit minus k pi, rad.
-    cost : float
-        Equation 7: sum of the squared residuals of the points used, rad².
-    chi2_reduced : float
-        The same weighted, for each degree of freedom.
-    spread : float
-        ``max(1, chi2_reduced)``: squares of errors are scaled by it, since true offsets of the
-        pixels scatter the points too.
-    evaluations : int
-        Of the model, in the last fit.
-    prior : Prior
-    """
+    """Geometry fitted to crests and valleys."""
 
     geometry: Geometry
-    phase0: float
+    phase0: float  # phase at the frame's centre, rad
+    # (6, 6) mm², in the order of `PARAMETERS`, scaled by the spread; zero for what was held
     covariance: F64
-    used: NDArray[np.bool_]
-    residual: F64
-    cost: float
-    chi2_reduced: float
+    used: NDArray[np.bool_]  # (point,) points that are no outliers
+    residual: F64  # (point,) phase of the fit minus k pi, rad
+    cost: float  # equation 7: sum of the squared residuals of the points used, rad²
+    chi2_reduced: float  # the same weighted, for each degree of freedom
+    # `max(1, chi2_reduced)`: squares of errors are scaled by it, since true offsets of the
+    # pixels scatter the points too
     spread: float
-    evaluations: int
+    evaluations: int  # of the model, in the last fit
     prior: Prior
 
     @property
@@ -207,24 +180,13 @@ def _minimise(
 
 @dataclass(frozen=True)
 class CostMap:
-    """Cost of equation 7 around its minimum (paper, figure 17).
+    """Cost of equation 7 around its minimum (paper, figure 17)."""
 
-    Attributes
-    ----------
-    distance : (d,) float64
-        mm.
-    second : (s,) float64
-        Length of the baseline (mm), or its ratio to the distance.
-    cost : (d, s) float64
-        Sum of ``(residual / sigma)²``, priors of the re-fitted parameters included.
-    refitted : bool
-        Whether centre, direction and tilt of the baseline were fitted again at each place, as the
-        phase always is; else they are those of the minimum.
-    """
-
-    distance: F64
-    second: F64
-    cost: F64
+    distance: F64  # (d,) mm
+    second: F64  # (s,) length of the baseline (mm), or its ratio to the distance
+    cost: F64  # (d, s) sum of `(residual / sigma)²`, priors of the re-fitted parameters included
+    # whether centre, direction and tilt of the baseline were fitted again at each place, as the
+    # phase always is; else they are those of the minimum
     refitted: bool
 
 

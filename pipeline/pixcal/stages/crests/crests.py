@@ -28,51 +28,32 @@ from pixcal.model.errors import InputError
 F64 = NDArray[np.float64]
 Vector = tuple[float, float]
 
+# Fewest across a window. Half an odd number: points of neighbours lie on crest and valley.
 FRINGES_A_WINDOW = 2.5
-"""Fewest across a window. Half an odd number: points of neighbours lie on crest and valley."""
+# fewest pixels across a window: where fringes run along the columns, the model's seven functions
+# across them need as many samples and more
 MIN_WIDTH = 12.0
-"""Fewest pixels across a window: where fringes run along the columns, the model's seven functions
-across them need as many samples and more."""
-MAX_SIGMA = 0.2
-"""Windows whose phase is known worse (rad) hold no fringes to speak of."""
-MIN_COVERAGE = 0.5
-"""Share of a window's pixels that must be there and good."""
-MIN_POINTS = 12
-"""Fewest windows with fringes: as many again as the geometry has parameters."""
+MAX_SIGMA = 0.2  # windows whose phase is known worse (rad) hold no fringes to speak of
+MIN_COVERAGE = 0.5  # share of a window's pixels that must be there and good
+MIN_POINTS = 12  # fewest windows with fringes: as many again as the geometry has parameters
+# a vector farther from the nominal one, as a share of it, is not the fringes' but the beam's
 MAX_AWAY = 0.5
-"""A vector farther from the nominal one, as a share of it, is not the fringes' but the beam's."""
-MAX_DEGREE = 5
-"""Of the polynomial that follows the phase."""
-SEED_PIXELS = 256
-"""Side of the patch where the fringe vector is first sought."""
+MAX_DEGREE = 5  # of the polynomial that follows the phase
+SEED_PIXELS = 256  # side of the patch where the fringe vector is first sought
+# passes over the first frame: curvature left by the second moves points by some 1e-6 rad
 SETTLING = 2
-"""Passes over the first frame: curvature left by the second moves points by some 1e-6 rad."""
 _SOLVED_AT_ONCE = 2048
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Rectangles that tile a frame, their sides across and along the fringes.
+    """Rectangles that tile a frame, their sides across and along the fringes."""
 
-    Attributes
-    ----------
-    frame : (int, int)
-        (y, x) size of the frame.
-    direction : (float, float)
-        Unit vector (x, y) across the fringes.
-    edge : (float, float)
-        First edge across and along, px.
-    size : (float, float)
-        Of a window across and along, px.
-    shape : (int, int)
-        Windows across and along.
-    """
-
-    frame: tuple[int, int]
-    direction: Vector
-    edge: Vector
-    size: Vector
-    shape: tuple[int, int]
+    frame: tuple[int, int]  # (y, x) size of the frame
+    direction: Vector  # unit vector (x, y) across the fringes
+    edge: Vector  # first edge across and along, px
+    size: Vector  # of a window across and along, px
+    shape: tuple[int, int]  # windows across and along
 
     @classmethod
     def lay(cls, frame: tuple[int, int], k: Vector, segment: int | None = None) -> Self:
@@ -133,20 +114,11 @@ class Windows:
 
 @dataclass(frozen=True)
 class Smooth:
-    """A polynomial ``sum c[i, j] Y^i X^j`` of scaled pixel coordinates.
+    """A polynomial ``sum c[i, j] Y^i X^j`` of scaled pixel coordinates."""
 
-    Attributes
-    ----------
-    coefficients : (n, n) float64
-    centre : (float, float)
-        (y, x) where X = Y = 0, px.
-    scale : float
-        Pixels to a unit of X and Y.
-    """
-
-    coefficients: F64
-    centre: Vector
-    scale: float
+    coefficients: F64  # (n, n)
+    centre: Vector  # (y, x) where X = Y = 0, px
+    scale: float  # pixels to a unit of X and Y
 
     @classmethod
     def plane(cls, slope: Vector, frame: tuple[int, int]) -> Self:
@@ -174,18 +146,10 @@ class Smooth:
 
 @dataclass(frozen=True)
 class Carrier:
-    """What a frame is demodulated with.
+    """What a frame is demodulated with."""
 
-    Attributes
-    ----------
-    phase : Smooth
-        rad.
-    light : Smooth
-        Natural logarithm of the illumination; coordinates scaled as those of ``phase``.
-    """
-
-    phase: Smooth
-    light: Smooth
+    phase: Smooth  # rad
+    light: Smooth  # natural logarithm of the illumination; coordinates scaled as those of `phase`
 
     @classmethod
     def straight(cls, k: Vector, frame: tuple[int, int]) -> Self:
@@ -193,43 +157,25 @@ class Carrier:
         return cls(Smooth.plane(k, frame), Smooth.plane((0.0, 0.0), frame))
 
 
+# (number of a frame, windows, carrier) -> sums (across, along, N_SUMS) of the whole frame
 Accumulate = Callable[[int, Windows, Carrier], F64]
-"""(number of a frame, windows, carrier) -> sums (across, along, N_SUMS) of the whole frame."""
 
 
 @dataclass(frozen=True)
 class CrestPaths:
-    """Points on crests (k even) and valleys (k odd).
+    """Points on crests (k even) and valleys (k odd)."""
 
-    Attributes
-    ----------
-    x, y : (point,) float64
-        r_jk, pixel coordinates.
-    k : (point,) int64
-        Number of the path, consistent over the frame; grows along the fringe vector.
-    sigma : (point,) float64
-        1-sigma error of the phase there, rad, from the scatter of the samples.
-    slope : (point,) float64
-        Length of the local fringe vector, rad/px.
-    phi : (frame,) float64
-        Phase of each frame relative to the first, rad; NaN where a frame has no fringes.
-    vector : (float, float)
-        Fringe vector (kx, ky) at the frame's centre, rad/px.
-    frame : (int, int)
-        (y, x) size.
-    segment : float
-        Length of the windows along the fringes, px.
-    """
-
-    x: F64
+    x: F64  # x, y: (point,) r_jk, pixel coordinates
     y: F64
+    # (point,) number of the path, consistent over the frame; grows along the fringe vector
     k: NDArray[np.int64]
-    sigma: F64
-    slope: F64
+    sigma: F64  # (point,) 1-sigma error of the phase there, rad, from the scatter of the samples
+    slope: F64  # (point,) length of the local fringe vector, rad/px
+    # (frame,) phase of each frame relative to the first, rad; NaN where a frame has no fringes
     phi: F64
-    vector: Vector
-    frame: tuple[int, int]
-    segment: float
+    vector: Vector  # fringe vector (kx, ky) at the frame's centre, rad/px
+    frame: tuple[int, int]  # (y, x) size
+    segment: float  # length of the windows along the fringes, px
 
     def __len__(self) -> int:
         return len(self.x)
@@ -325,17 +271,10 @@ def tile_sums(
 
 @dataclass(frozen=True)
 class ArrayFrames:
-    """Frames in memory, as an `Accumulate`.
+    """Frames in memory, as an `Accumulate`."""
 
-    Attributes
-    ----------
-    frames : (t, y, x) float
-        Electrons; not finite: no sample.
-    good : (y, x) bool
-    """
-
-    frames: NDArray[Any]
-    good: NDArray[np.bool_]
+    frames: NDArray[Any]  # (t, y, x) float: electrons; not finite: no sample
+    good: NDArray[np.bool_]  # (y, x)
 
     def __call__(self, frame: int, windows: Windows, carrier: Carrier) -> F64:
         """Sums of a frame."""

@@ -58,14 +58,10 @@ from pixcal.storage.stage import copy_products, make, require, working
 
 STAGE = STAGES["crests"]
 SCHEMA = "pixcal/crests/1"
-MAP_SIDE = 21
-"""Places along each side of a cost map; odd, so that the minimum is one of them."""
-MAP_REACH = 0.04
-"""How far the maps go from the minimum, as a share of distance and baseline."""
-NOTABLE_CHI2 = 3.0
-"""From here on the reduced chi-square of the points is pointed out."""
-FIGURE_BYTES = 128 << 20
-"""Matplotlib and one figure."""
+MAP_SIDE = 21  # places along each side of a cost map; odd, so that the minimum is one of them
+MAP_REACH = 0.04  # how far the maps go from the minimum, as a share of distance and baseline
+NOTABLE_CHI2 = 3.0  # from here on the reduced chi-square of the points is pointed out
+FIGURE_BYTES = 128 << 20  # Matplotlib and one figure
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]

@@ -16,8 +16,7 @@ from pixcal.estimators.detector.telegraph.moments import Moments
 
 F64 = NDArray[np.float64]
 
-AMPLITUDES = np.geomspace(0.1, 300, 90)
-"""Amplitudes over the common noise that are looked at."""
+AMPLITUDES = np.geomspace(0.1, 300, 90)  # amplitudes over the common noise that are looked at
 
 _DRAWN = 600
 _UNDERFLOW = 1e-200
@@ -25,24 +24,12 @@ _UNDERFLOW = 1e-200
 
 @dataclass(frozen=True)
 class Classes:
-    """Pixels of a series, for each amplitude that they may have.
+    """Pixels of a series, for each amplitude that they may have."""
 
-    Attributes
-    ----------
-    likely : (n, class) float64
-        Likelihood of each pixel's variance over the largest of its own.
-    largest : (n, 1) float64
-        The logarithm of that, over the likelihood of a quiet pixel.
-    added : (class,) float64
-        Variance that an amplitude adds, over the common one.
-    chances, products : (level, class) float64
-        From `_levels`.
-    """
-
-    likely: F64
-    largest: F64
-    added: F64
-    chances: F64
+    likely: F64  # (n, class) likelihood of each pixel's variance over the largest of its own
+    largest: F64  # (n, 1) the logarithm of that, over the likelihood of a quiet pixel
+    added: F64  # (class,) variance that an amplitude adds, over the common one
+    chances: F64  # chances, products: (level, class) from `_levels`
     products: F64
 
     @classmethod

@@ -7,31 +7,17 @@ from pixcal.estimators.detector.telegraph.moments import Series, moments_of, sig
 from pixcal.estimators.detector.telegraph.population import find_population, find_switching
 from pixcal.kernels.significance import sigmas_of_best
 
-ROUNDS = 3
-"""Most, in which population and time are found, each with the other known."""
+ROUNDS = 3  # most, in which population and time are found, each with the other known
 
-SETTLED = 0.5
-"""Change of the time, over its error, after which no other round is needed."""
+SETTLED = 0.5  # change of the time, over its error, after which no other round is needed
 
 
 @dataclass(frozen=True)
 class Telegraph:
-    """What was found.
+    """What was found."""
 
-    Attributes
-    ----------
-    share, amplitude, shape, switching_s : float
-        Of the pixels; mean, e-; of the amplitudes' gamma distribution; mean stay in a level, s
-        (0: no longer than a frame).
-    share_error, amplitude_error, shape_error, switching_error : float
-    significance : float
-        That noisy pixels jump.
-    flat_top, staying : float
-        Its two signs, in sigmas.
-    noisy : int
-        Pixels that stand out.
-    """
-
+    # share, amplitude, shape, switching_s: of the pixels; mean, e-; of the amplitudes' gamma
+    # distribution; mean stay in a level, s (0: no longer than a frame)
     share: float
     amplitude: float
     shape: float
@@ -40,10 +26,10 @@ class Telegraph:
     amplitude_error: float
     shape_error: float
     switching_error: float
-    significance: float
-    flat_top: float
+    significance: float  # that noisy pixels jump
+    flat_top: float  # flat_top, staying: its two signs, in sigmas
     staying: float
-    noisy: int
+    noisy: int  # pixels that stand out
 
 
 def find_telegraph(series: Sequence[Series]) -> Telegraph | None:

@@ -14,8 +14,7 @@ from scipy.stats import chi2
 
 F64 = NDArray[np.float64]
 
-NOISY = 3.0
-"""Excess of the variance, in its own sigmas, from which a pixel's noise is looked at."""
+NOISY = 3.0  # excess of the variance, in its own sigmas, from which a pixel's noise is looked at
 
 _OUTLIER = 5.0
 _LEAST = 8
@@ -23,24 +22,12 @@ _LEAST = 8
 
 @dataclass(frozen=True)
 class Series:
-    """Noise of pixels in frames that follow one another.
+    """Noise of pixels in frames that follow one another."""
 
-    Attributes
-    ----------
-    noise : (t, n) float64
-        Over the common noise, about the pixel's mean; NaN where there is none.
-    pixel : (n,) int
-        Which pixels.
-    sigma : float
-        The common noise, e-.
-    period_s : float
-        From frame to frame; nan when unknown.
-    """
-
-    noise: F64
-    pixel: NDArray[np.intp]
-    sigma: float
-    period_s: float
+    noise: F64  # (t, n) over the common noise, about the pixel's mean; NaN where there is none
+    pixel: NDArray[np.intp]  # (n,) which pixels
+    sigma: float  # the common noise, e-
+    period_s: float  # from frame to frame; nan when unknown
 
 
 @dataclass(frozen=True)

@@ -20,42 +20,28 @@ from pixcal.estimators.detector.telegraph.moments import Moments
 
 F64 = NDArray[np.float64]
 
-_USUAL, _MOST = 1.5, 4.0
-"""Logarithm of the shape: what is usual, and the most that is tried."""
-_CLEAR = 8.0
-"""By which another shape than the exponential's must be likelier."""
+_USUAL, _MOST = 1.5, 4.0  # logarithm of the shape: what is usual, and the most that is tried
+_CLEAR = 8.0  # by which another shape than the exponential's must be likelier
+# chance of telegraph noise from which a pixel's frames are looked at for how long it stays
 LIKELY = 0.1
-"""Chance of telegraph noise from which a pixel's frames are looked at for how long it stays."""
 
 
 @dataclass(frozen=True)
 class Population:
-    """Pixels with telegraph noise.
+    """Pixels with telegraph noise."""
 
-    Attributes
-    ----------
-    share, amplitude, shape, share_error, amplitude_error, shape_error : float
-        Of the pixels; mean, e-; of the amplitudes' gamma distribution.
-    unit : float
-        Noise that `AMPLITUDES` are over, e-.
-    weight : (class,) float64
-        Share of the pixels in each class of amplitudes.
-    pixels : (n,) int
-        All that there are.
-    chance : (n,) float64
-        That each is one of them.
-    """
-
+    # share, amplitude, shape, share_error, amplitude_error, shape_error: of the pixels; mean,
+    # e-; of the amplitudes' gamma distribution
     share: float
     amplitude: float
     shape: float
     share_error: float
     amplitude_error: float
     shape_error: float
-    unit: float
-    weight: F64
-    pixels: NDArray[np.intp]
-    chance: F64
+    unit: float  # noise that `AMPLITUDES` are over, e-
+    weight: F64  # (class,) share of the pixels in each class of amplitudes
+    pixels: NDArray[np.intp]  # (n,) all that there are
+    chance: F64  # (n,) that each is one of them
 
 
 def find_population(parts: Sequence[Moments], switching_s: float) -> Population:
