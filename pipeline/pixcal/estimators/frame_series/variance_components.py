@@ -51,7 +51,7 @@ def damped_power(frames: int, keep: float) -> F64:
 
 @dataclass(frozen=True)
 class Modes:
-    """Cosine modes of one series or more of ``c`` channels, and what their covariance is made of."""
+    """Cosine modes of one or more series of ``c`` channels, and the parts of their covariance."""
 
     values: F64  # (n, c)
     known: F64  # (n, c, p) shapes that are fitted, each by a coefficient
