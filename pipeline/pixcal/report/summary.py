@@ -128,7 +128,6 @@ def block_mean(values: NDArray[Any], side: int) -> F32:
     Parameters
     ----------
     values : (y, x)
-    side : int
 
     Returns
     -------

@@ -61,7 +61,6 @@ def products(
 
     Parameters
     ----------
-    evidence : Evidence
     links : sequence of (int, int)
     known : sequence of Coupling
         What is known of the couplings, by which the charge collected follows from what is read.

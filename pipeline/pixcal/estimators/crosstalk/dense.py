@@ -87,7 +87,6 @@ class Frames:
 
         Parameters
         ----------
-        classes : Classes
         known : sequence of Coupling
             To start from.
         per_ke : float

@@ -157,7 +157,6 @@ def hot_pixels(
 
     Parameters
     ----------
-    evidence : Evidence
     links : sequence of (int, int)
     known : sequence of Coupling
         What is known of the couplings: with it a receiver is freed of what other hot pixels give,

@@ -103,7 +103,6 @@ def response_slopes(
         Fringe vector (kx, ky), rad/px.
     couplings : sequence of Coupling
         Of the period of the classes.
-    classes : Classes
     """
     reach = max(max(abs(c.dy), abs(c.dx)) for c in couplings)
     rows, columns = (period * -(-reach // period) for period in (classes.rows, classes.columns))

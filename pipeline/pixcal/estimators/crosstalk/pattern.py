@@ -58,7 +58,6 @@ def pattern_information(
 
     Parameters
     ----------
-    evidence : Evidence
     couplings : sequence of Coupling
         As known; the sums are linear about them.
     classes : Classes

@@ -62,7 +62,6 @@ def all_residuals(evidence: Evidence, known: Sequence[Coupling]) -> Iterator[Res
 
     Parameters
     ----------
-    evidence : Evidence
     known : sequence of Coupling
         What is known of the couplings, by which the charge collected follows from what is read.
     """

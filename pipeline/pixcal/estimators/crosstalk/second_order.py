@@ -25,7 +25,6 @@ def to_first_order(
 
     Parameters
     ----------
-    found : Products
     couplings : sequence of Coupling
         As known.
     links : sequence of (int, int)

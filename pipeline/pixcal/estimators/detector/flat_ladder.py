@@ -17,7 +17,6 @@ def ladder_response(evidence: Evidence, level_e: float) -> tuple[F64, F64] | Non
 
     Parameters
     ----------
-    evidence : Evidence
     level_e : float
         Where the deviations are given, e-.
 

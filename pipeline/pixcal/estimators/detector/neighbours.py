@@ -65,7 +65,6 @@ def shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
 
     Parameters
     ----------
-    evidence : Evidence
     shifts : float64 array
         `pixcal.kernels.boundaries.boundary_shifts`, of size one.
 

@@ -60,7 +60,6 @@ def noiseless_level(evidence: Evidence, fringes: FringeEvidence) -> tuple[float,
 
     Parameters
     ----------
-    evidence : Evidence
     fringes : FringeEvidence
         One of its sets.
 

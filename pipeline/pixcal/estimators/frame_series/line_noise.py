@@ -108,7 +108,6 @@ def fit_lines(spectra: Sequence[LineSpectrum], shapes: Sequence[F64]) -> LineNoi
 
     Parameters
     ----------
-    spectra : sequence of LineSpectrum
     shapes : sequence of (m, n) float64
         Of each spectrum, power of unit sizes.
     """

@@ -90,7 +90,6 @@ def offset_modes(every: Sequence[OffsetSeries], shapes: Sequence[F64]) -> Modes:
 
     Parameters
     ----------
-    every : sequence of OffsetSeries
     shapes : sequence of (t, q) float64
         Of each series, known changes of the offset; their coefficients, common to all, come first.
     """

@@ -136,7 +136,6 @@ def rows_of(
 
     Parameters
     ----------
-    found : FringeEvidence
     other : (t - 2, 3) float64
         Parameters of the light in every frame but the first and the last, as in `FringeEvidence.g`.
     mean : (3, y, x) float64, optional

@@ -192,7 +192,6 @@ def assemble(
 
     Parameters
     ----------
-    every : sequence of FrameSeries
     parts : callable
         Of a series, the covariance (m, t - 1, 2, 2) of its modes for unit sizes; the sizes are
         common to all sets and come first in the result, three of the noise of each set after them.

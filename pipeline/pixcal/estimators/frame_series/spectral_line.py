@@ -47,7 +47,6 @@ def find_line(
 
     Parameters
     ----------
-    every : sequence of FrameSeries
     level : callable
         Of a series, the variance (t - 1, 2) of its cosine modes without a line.
     channels : sequence of int

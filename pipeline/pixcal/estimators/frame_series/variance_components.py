@@ -41,7 +41,6 @@ def damped_power(frames: int, keep: float) -> F64:
 
     Parameters
     ----------
-    frames : int
     keep : float
         Correlation of neighbours, 0 to below 1.
     """
@@ -125,7 +124,6 @@ def estimate_components(
 
     Parameters
     ----------
-    modes : Modes
     absent : sequence of int
         Parts that are held at zero.
     start : Components, optional
@@ -242,7 +240,6 @@ def signed_sigmas(growth: float, size: float) -> float:
     ----------
     growth : float
         Of the log-likelihood when the part is let in.
-    size : float
     """
     return float(np.copysign(np.sqrt(max(2 * growth, 0.0)), size))
 

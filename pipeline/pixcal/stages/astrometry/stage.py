@@ -175,7 +175,6 @@ def planned(shape: tuple[int, int], modes: int, side: int, config: Config) -> tu
         That a truth is freed from; 0 without one.
     side : int
         Of a star's window, px.
-    config : Config
     """
     per_pixel = _BYTES_PER_PIXEL + _BYTES_PER_PIXEL_AND_MODE * modes
     reach = min(int(2 * config.dither_px) + 1, max(shape)) + side

@@ -51,7 +51,6 @@ def draw_bench(layout: Layout, rng: np.random.Generator) -> Bench:
 
     Parameters
     ----------
-    layout : Layout
     rng : numpy.random.Generator
         Of the case's layout, which is not that of its truth.
     """

@@ -43,8 +43,6 @@ def make(out: Path, sealed: Path, config: MakeConfig, runtime: Runtime) -> Exami
         Directory of the cases; it appears when all are complete.
     sealed : Path
         File of the truth.
-    config : MakeConfig
-    runtime : Runtime
 
     Raises
     ------

@@ -85,8 +85,6 @@ def draw_examination(cases: int, seed: int, size: str, bench: str = "both") -> E
 
     Parameters
     ----------
-    cases : int
-    seed : int
     size : str
         One of `LAYOUTS`.
     bench : str

@@ -78,8 +78,6 @@ def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "")
 
     Parameters
     ----------
-    case : str
-    truth : Truth
     diagnosis : mapping, optional
         ``diagnosis.json``; None where the case could not be diagnosed.
     error : str

@@ -39,8 +39,6 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
         Of the cases.
     sealed : Path
         The truth.
-    config : ScoreConfig
-    runtime : Runtime
 
     Returns
     -------

@@ -68,7 +68,6 @@ def offset_errors(
         Folder of the maps, as ``pixcal fit --with-diagnosis`` leaves it.
     acquisition : Path
         Of the case.
-    truth : Truth
     bench : Bench
         Of the case.
     layout : Layout

@@ -53,7 +53,6 @@ def ask_oracle(
         Of the library's own effects.
     bench : Bench
         Of the case.
-    runtime : Runtime
 
     Raises
     ------

@@ -30,7 +30,6 @@ def held(effect: str, true: Plain, found: Plain, errors: Mapping[str, float]) ->
 
     Parameters
     ----------
-    effect : str
     true : mapping
         Parameters as in a bench file; those that are missing have their defaults.
     found : mapping

@@ -81,8 +81,6 @@ def share(what: str, size: str, cases: int, runtime: Runtime) -> tuple[Runtime, 
         Is done, for messages.
     size : str
         Of the examination.
-    cases : int
-    runtime : Runtime
 
     Returns
     -------

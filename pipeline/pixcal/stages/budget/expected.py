@@ -64,7 +64,6 @@ class SetBound:
 
         Parameters
         ----------
-        bench : Bench
         number : int
             Of the set.
         contrast : float

@@ -61,7 +61,6 @@ def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, 
     ----------
     bench_file : Path
         As ``pixcal simulate`` takes it.
-    config : Config
     out : Path, optional
         Directory for ``budget.json`` and ``budget.png``.
 

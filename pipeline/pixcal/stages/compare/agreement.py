@@ -197,7 +197,6 @@ def beyond_noise(p: Part, accuracy: float = SIGMA_ACCURACY) -> Estimate:
 
     Parameters
     ----------
-    p : Part
     accuracy : float
         Relative error of the maps' own errors.
     """

@@ -30,11 +30,8 @@ def describe(
 
     Parameters
     ----------
-    pair : Pair
     sums : Sums
         Without the outlying pixels.
-    pixels : Pixels
-    places : Places
     limit : float
         Sigma beyond which pixels were left out.
     accuracy : float

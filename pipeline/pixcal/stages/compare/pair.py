@@ -189,10 +189,8 @@ def read_sums(pair: Pair, outlying: Outlying | None, runtime: Runtime) -> Sums:
 
     Parameters
     ----------
-    pair : Pair
     outlying : Outlying or None
         Pixels to leave out.
-    runtime : Runtime
     """
     tiles = pair.tiles()
     found = run_tasks(

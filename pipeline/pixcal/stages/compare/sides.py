@@ -206,7 +206,6 @@ def fitted_shape(
         For messages.
     facts : mapping
         What ``fit.json`` says of the set.
-    acquisition : Acquisition
     window : (int, int)
         (y, x), px.
 

@@ -69,8 +69,6 @@ def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Ma
         Fitted runs of windows of the same shape, whose pixels are taken to be the same.
     out : Path
         Directory for ``compare.json`` and the pictures.
-    config : Config
-    runtime : Runtime
 
     Raises
     ------

@@ -27,8 +27,6 @@ def measured_again(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatme
 
     Parameters
     ----------
-    run_dir : Path
-    plan : Treatments
     runtime : Runtime
         Its memory: where it does not suffice, effects stay as the diagnosis found them.
     """

@@ -83,11 +83,6 @@ class Told:
 def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
     """What ``correction.json`` says of the sets and of pairs of them.
 
-    Parameters
-    ----------
-    maps : Maps
-    runtime : Runtime
-
     Returns
     -------
     dict

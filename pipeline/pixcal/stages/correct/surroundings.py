@@ -43,7 +43,6 @@ def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, scatter: float) -> 
 
     Parameters
     ----------
-    maps : FringeMaps
     unknown : (y, x) bool
         Inside the window: their light may be anything from none to twice that around them.
     beyond : (y, x) bool

@@ -34,7 +34,6 @@ def moved(effect: Effect, errors: Mapping[str, float]) -> list[Effect]:
 
     Parameters
     ----------
-    effect : Effect
     errors : mapping
         1-sigma errors by the parameters' names, such as ``couplings[0].share``.
     """
@@ -63,11 +62,6 @@ def _add(plain: Any, path: Sequence[str], step: float) -> None:
 
 def parameter_errors(swept: Swept, runtime: Runtime) -> dict[str, float | None]:
     """Rms (px) of what the errors of each effect's parameters leave in the offsets of a set.
-
-    Parameters
-    ----------
-    swept : Swept
-    runtime : Runtime
 
     Returns
     -------
@@ -118,7 +112,6 @@ def left_over(swept: Swept, maps: FringeMaps, good: Mask, inside: tuple[slice, s
 
     Parameters
     ----------
-    swept : Swept
     maps : FringeMaps
         Of a tile and its surroundings, with the effects.
     good : (y, x) bool

@@ -44,10 +44,8 @@ def undo_on_maps(swept: Swept, target: Path, runtime: Runtime, name: str) -> Non
 
     Parameters
     ----------
-    swept : Swept
     target : Path
         Folder to make.
-    runtime : Runtime
     name : str
         Of the set.
 

@@ -91,7 +91,6 @@ def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -
 
     Parameters
     ----------
-    paths : CrestPaths
     start : Geometry
         Where to begin; far is near enough (tested: 10 mm of distance, 18 mm of offset, 5 % of
         the baseline).
@@ -197,7 +196,6 @@ def cost_map(
 
     Parameters
     ----------
-    paths : CrestPaths
     fit : CrestFit
         The minimum, whose errors, outliers and priors are taken over. Priors of distance and
         length do not count: the map shows what the points say of these.

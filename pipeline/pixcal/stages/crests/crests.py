@@ -333,7 +333,6 @@ def find_crests(
     ----------
     accumulate : callable
         Makes the sums of a frame; called once for each frame, and twice more for the first.
-    n_frames : int
     frame : (int, int)
         (y, x) size.
     k : (float, float)
