@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 
+# series whose running sums are held at the same time: they stay in the processor's cache
 PIXELS_AT_ONCE = 128
-"""Series whose running sums are held at the same time: they stay in the processor's cache."""
 
 
 def averaging_lengths(n_batches: int) -> tuple[int, ...]:

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+# sums kept for each pixel: 6 normal, 3 right-hand, weighted square of the residual, samples
 N_SUMS = 11
-"""Sums kept for each pixel: 6 normal, 3 right-hand, weighted square of the residual, samples."""
 
+# determinant over the product of the diagonal: without three phases it is zero up to rounding
 SINGULAR = 1e-9
-"""Determinant over the product of the diagonal: without three phases it is zero up to rounding."""
 
 _FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
 
@@ -132,8 +132,7 @@ def sweep_block(
                 sums[k, row, i] += p[k, i]
 
 
-GROUP = 1024
-"""Pixels summed at a time: what is kept of them stays in the first cache."""
+GROUP = 1024  # pixels summed at a time: what is kept of them stays in the first cache
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

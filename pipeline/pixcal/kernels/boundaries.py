@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-REACH = 2
-"""Pixels on either side of a boundary whose charge acts on it."""
+REACH = 2  # pixels on either side of a boundary whose charge acts on it
 
 
 def boundary_shifts(falloff_px: float) -> F64:
@@ -169,7 +168,6 @@ def shared_noise(charge: F32, pushes: tuple[F32, F32], shifts: F64, dy: int, dx:
         From `boundary_pushes`.
     shifts
         As in `moved_charge`.
-    dy, dx : int
 
     Returns
     -------

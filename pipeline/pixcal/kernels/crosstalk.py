@@ -22,13 +22,11 @@ from pixcal.model.errors import InputError
 F64 = NDArray[np.float64]
 Place = tuple[slice, slice]
 
+# most steps of the inverse; each gains a factor of one over the shares that leave a pixel
 STEPS = 60
-"""Most steps of the inverse; each gains a factor of one over the shares that leave a pixel."""
 CONVERGED = 1e-13
-FILL_PX = 2.0
-"""Radius of the neighbourhood that stands in for a pixel without data, px,"""
-FILL_REACH = 16
-"""and how far it goes."""
+FILL_PX = 2.0  # radius of the neighbourhood that stands in for a pixel without data, px,
+FILL_REACH = 16  # and how far it goes
 
 
 @dataclass(frozen=True)
@@ -102,7 +100,6 @@ def couple(
     ----------
     signal : (..., y, x) float
         Electrons (where shares change with the signal; else any unit).
-    couplings : sequence of Coupling
     first : (int, int)
         First row and column of the array in the window.
     """
@@ -131,7 +128,6 @@ def couple_fringes(
     ----------
     theta : (3, y, x) float64
         (iota, alpha sin psi, alpha cos psi), e-, as collected: not divided by a flat.
-    couplings : sequence of Coupling
     first : (int, int)
         First row and column of the maps in the window.
     """

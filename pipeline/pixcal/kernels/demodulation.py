@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 
 N_TERMS = 12
+# where the terms of cos P and sin P begin; the first of each is that of the window's centre
 COSINE, SINE = 6, 9
-"""Where the terms of cos P and sin P begin; the first of each is that of the window's centre."""
+# upper triangle of the normal matrix, right-hand side, sum of squares, number of samples
 N_SUMS = N_TERMS * (N_TERMS + 1) // 2 + N_TERMS + 2
-"""Upper triangle of the normal matrix, right-hand side, sum of squares, number of samples."""
 
 
 @njit(cache=True, nogil=True, inline="always")  # type: ignore[untyped-decorator]

@@ -5,8 +5,7 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 
-SPAN = 4
-"""Periods up to so many lengths of the line are there."""
+SPAN = 4  # periods up to so many lengths of the line are there
 
 
 def flicker(rng: np.random.Generator, count: int) -> F64:

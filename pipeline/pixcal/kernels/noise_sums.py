@@ -10,8 +10,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-N_SUMS = 7
-"""For each step: number, normal matrix (11, 12, 22), right-hand side (1, 2), square."""
+N_SUMS = 7  # for each step: number, normal matrix (11, 12, 22), right-hand side (1, 2), square
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz", "arcp"})  # type: ignore[untyped-decorator]

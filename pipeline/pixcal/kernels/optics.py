@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+# parameters of `phase_jacobian`, in its order; all in mm
 PARAMETERS = ("centre_x", "centre_y", "distance", "baseline_x", "baseline_y", "baseline_z")
-"""Parameters of `phase_jacobian`, in its order; all in mm."""
 
 
 @dataclass(frozen=True)
@@ -26,24 +26,16 @@ class Geometry:
 
     Centre, separation and distance are the parameters, not the two points, because those are
     what the data tell apart (physics note, section 4).
-
-    Attributes
-    ----------
-    wavelength, pitch : float
-        Laser wavelength and pixel pitch.
-    centre_x, centre_y : float
-        Foot of the fibres' midpoint on the detector plane, from pixel (0, 0).
-    distance : float
-        From the midpoint to the detector plane.
-    baseline_x, baseline_y, baseline_z : float
-        Fibre B minus fibre A; z is the tilt of the baseline, positive away from the detector.
     """
 
-    wavelength: float
+    wavelength: float  # wavelength, pitch: laser wavelength and pixel pitch
     pitch: float
+    # centre_x, centre_y: foot of the fibres' midpoint on the detector plane, from pixel (0, 0)
     centre_x: float
     centre_y: float
-    distance: float
+    distance: float  # from the midpoint to the detector plane
+    # baseline_x, baseline_y, baseline_z: fibre B minus fibre A; z is the tilt of the baseline,
+    # positive away from the detector
     baseline_x: float
     baseline_y: float
     baseline_z: float = 0.0

@@ -26,41 +26,36 @@ from pixcal.kernels.robust import clipped_variance_factor
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-BLOCK = 16
-"""Pixels along each side of a block."""
+BLOCK = 16  # pixels along each side of a block
 
-LADDER = 4
-"""Groups of flats from which the curve may bend."""
+LADDER = 4  # groups of flats from which the curve may bend
 
-N_BINS = 512
-"""Bins of level: bin n holds ``n² / 4`` to ``(n + 1)² / 4`` ADU, the last one all above."""
+N_BINS = 512  # bins of level: bin n holds `n² / 4` to `(n + 1)² / 4` ADU, the last one all above
 
-REACH = 2
-"""Pixels between neighbours whose covariance is measured, along each axis."""
+REACH = 2  # pixels between neighbours whose covariance is measured, along each axis
 
+# rows and columns from a pixel to its neighbours, each pair of pixels once
 LAGS = np.array(
     [(y, x) for y in range(REACH + 1) for x in range(-REACH, REACH + 1) if (y, x) > (0, 0)]
 )
-"""Rows and columns from a pixel to its neighbours, each pair of pixels once."""
 
+# of the sums: degrees of freedom, level, variance and the covariance of each of `LAGS`
 COLUMNS = 3 + len(LAGS)
-"""Of the sums: degrees of freedom, level, variance and the covariance of each of `LAGS`."""
 
+# errors beyond which neighbours share noise, and beyond which others do where some do
 _SHARED, _ALSO = 4.0, 2.0
-"""Errors beyond which neighbours share noise, and beyond which others do where some do."""
+# least share of a block's pixels, along each axis, that have a neighbour at a lag in it
 _PAIRED = 1 - REACH / BLOCK
-"""Least share of a block's pixels, along each axis, that have a neighbour at a lag in it."""
 _CLIP = 5.0
 _MIN_PIXELS = 32  # fewer do not tell outliers from noise
 _SIGMA_OF_MAD = 1.482602218505602
 _ITERATIONS = 4
-_TERMS = 3
-"""Of the polynomial of the slope, at most: a response that bends by 12 % needs three."""
+_TERMS = 3  # of the polynomial of the slope, at most: a response that bends by 12 % needs three
+# errors that its last term has at least: one left out biases the gain by hardly more than that
 _CURVED = 2.0
-"""Errors that its last term has at least: one left out biases the gain by hardly more than that."""
 _ALIKE = 1e12
+# points more than terms, and range of levels, that tell a curve from points off a line
 _SPARE, _RANGE = 3, 3.0
-"""Points more than terms, and range of levels, that tell a curve from points off a line."""
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -246,31 +241,18 @@ def add_neighbours(lit: F64, dark: F64) -> tuple[F64, list[tuple[int, int]]]:
 
 @dataclass(frozen=True)
 class GainFit:
-    """Gain by photon transfer.
+    """Gain by photon transfer."""
 
-    Attributes
-    ----------
-    gain : float
-        e-/ADU.
-    error : float
-        1 sigma, e-/ADU; widened where the points leave the line by more than their noise, and by
-        what a curvature would change that is neither significant nor absent.
-    chi2_reduced : float
-        Of the points about the line.
-    levels : (float, float)
-        Lowest and highest level used, ADU.
-    curved : float
-        Slope at the highest level (variance over level) relative to that at zero, less one; zero
-        where a straight line fits.
-    neighbours : tuple of (int, int)
-        Lags whose covariances were added to the variance: see `add_neighbours`.
-    """
-
-    gain: float
+    gain: float  # e-/ADU
+    # 1 sigma, e-/ADU; widened where the points leave the line by more than their noise, and by
+    # what a curvature would change that is neither significant nor absent
     error: float
-    chi2_reduced: float
-    levels: tuple[float, float]
+    chi2_reduced: float  # of the points about the line
+    levels: tuple[float, float]  # lowest and highest level used, ADU
+    # slope at the highest level (variance over level) relative to that at zero, less one; zero
+    # where a straight line fits
     curved: float = 0.0
+    # lags whose covariances were added to the variance: see `add_neighbours`
     neighbours: tuple[tuple[int, int], ...] = ()
 
 

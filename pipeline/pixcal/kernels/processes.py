@@ -8,8 +8,8 @@ from scipy.signal import lfilter
 
 F64 = NDArray[np.float64]
 
+# longest time of `brownian`, s (half a year), and its halvings (to 16 ms)
 HORIZON, LEVELS = 2.0**24, 30
-"""Longest time of `brownian`, s (half a year), and its halvings (to 16 ms)."""
 
 
 def damped_walk(normals: F64, keep: float) -> F64:
@@ -37,7 +37,6 @@ def swing(time_s: F64, hz: float, phase: float, exptime_s: float = 0.0) -> F64:
     time_s : (t,) float64
     hz, phase : float
         Frequency, and phase at time zero, rad.
-    exptime_s : float
     """
     middle = 2 * np.pi * hz * (time_s + exptime_s / 2) + phase
     return np.asarray(np.sinc(hz * exptime_s) * np.sin(middle))
@@ -51,7 +50,6 @@ def brownian(time: float, normal: Callable[[int, int], float]) -> float:
 
     Parameters
     ----------
-    time : float
     normal : callable
         Standard normal of a level and a place in it, the same whenever it is asked for.
     """
@@ -65,8 +63,7 @@ def brownian(time: float, normal: Callable[[int, int], float]) -> float:
     return float(np.sqrt(HORIZON) * value)
 
 
-RAMP = 0.8
-"""Mean of exp(i step) from which phases are a ramp; of random phases it is near zero."""
+RAMP = 0.8  # mean of exp(i step) from which phases are a ramp; of random phases it is near zero
 
 
 def ramp_step(phase: F64) -> float:

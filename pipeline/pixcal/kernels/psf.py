@@ -23,29 +23,20 @@ from scipy.special import j1
 
 F64 = NDArray[np.float64]
 
+# knots of the spline in lambda / D: the table is good to 1e-6 of its peak (see the tests)
 KNOTS = 24
-"""Knots of the spline in lambda / D: the table is good to 1e-6 of its peak (see the tests)."""
 MAX_STEPS = 50
-PRECISION = 1e-9
-"""A fit has ended when its last step is shorter, px."""
+PRECISION = 1e-9  # a fit has ended when its last step is shorter, px
+# what the table goes beyond the window, px: a star off the middle, pixels off the grid
 MARGIN = 2.0
-"""What the table goes beyond the window, px: a star off the middle, pixels off the grid."""
 
 
 @dataclass(frozen=True)
 class Psf:
-    """Share of a star's light that a pixel receives, against its centre's place from the star.
+    """Share of a star's light that a pixel receives, against its centre's place from the star."""
 
-    Attributes
-    ----------
-    coefficients : (n, n) float64
-        Of the cubic B-spline, (y, x); the middle one is at the star.
-    step : float
-        From knot to knot, px.
-    """
-
-    coefficients: F64
-    step: float
+    coefficients: F64  # (n, n) of the cubic B-spline, (y, x); the middle one is at the star
+    step: float  # from knot to knot, px
 
     @property
     def reach(self) -> float:

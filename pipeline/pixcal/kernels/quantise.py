@@ -15,23 +15,16 @@ from numpy.typing import NDArray
 
 F32 = NDArray[np.float32]
 
-FILL = 65535
-"""Code of a sample without weight."""
+FILL = 65535  # code of a sample without weight
 
 _DIGITS = 7
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Codes 0 to 65534 cover ``offset`` to ``offset + 65534 step`` electrons.
+    """Codes 0 to 65534 cover ``offset`` to ``offset + 65534 step`` electrons."""
 
-    Attributes
-    ----------
-    step, offset : float
-        In electrons; ``scale_factor`` and ``add_offset`` of CF.
-    """
-
-    step: float
+    step: float  # step, offset: in electrons; `scale_factor` and `add_offset` of CF
     offset: float
 
     @property

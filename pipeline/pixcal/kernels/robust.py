@@ -25,8 +25,7 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-BATCH = 64
-"""Frames that are looked at together."""
+BATCH = 64  # frames that are looked at together
 
 _LEVEL_PIXELS = 4096
 _ROUNDING = np.float32(1e-6)
@@ -153,24 +152,16 @@ def _add_frames(
 
 @dataclass(frozen=True)
 class Combined:
-    """What many frames of one scene say of each pixel; all (y, x) float64.
+    """What many frames of one scene say of each pixel; all (y, x) float64."""
 
-    Attributes
-    ----------
-    mean : ndarray
-        Of the samples within the limits; NaN where there is none.
-    variance : ndarray
-        Of one sample, unbiased, corrected for the clipping; NaN with fewer than two samples.
-    excess_kurtosis : ndarray
-        0 for Gaussian noise, negative for noise with two levels; NaN with fewer than four samples.
-    seen, kept : ndarray
-        Samples that were not NaN, and those of them within the limits.
-    """
-
-    mean: F64
+    mean: F64  # ndarray: of the samples within the limits; NaN where there is none
+    # ndarray: of one sample, unbiased, corrected for the clipping; NaN with fewer than two
+    # samples
     variance: F64
+    # ndarray: 0 for Gaussian noise, negative for noise with two levels; NaN with fewer than
+    # four samples
     excess_kurtosis: F64
-    seen: F64
+    seen: F64  # seen, kept: ndarray: samples that were not NaN, and those of them within the limits
     kept: F64
 
 

@@ -14,19 +14,15 @@ from scipy.special import ndtr
 
 F64 = NDArray[np.float64]
 
-SHEPPARD = 1 / 12
-"""Variance that rounding adds to noise of a step or more."""
-UNTOLD = 0.35
-"""Noise below which levels that are all alike do not tell it."""
-SMOOTH = 1.0
-"""Noise from which mean and variance no longer depend on the level, to 1e-7."""
+SHEPPARD = 1 / 12  # variance that rounding adds to noise of a step or more
+UNTOLD = 0.35  # noise below which levels that are all alike do not tell it
+SMOOTH = 1.0  # noise from which mean and variance no longer depend on the level, to 1e-7
 
 _FRACTIONS = 256
 _REACH = 9.0
 _HARMONICS = 8
 _LEAST = 1e-3
-_EVERYWHERE = 0.5
-"""Scatter of the levels from which they lie evenly between codes."""
+_EVERYWHERE = 0.5  # scatter of the levels from which they lie evenly between codes
 _LEAST_KNOWN = 0.05
 _SLOPE_STEP = 1e-3
 

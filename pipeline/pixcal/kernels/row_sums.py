@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-MODES = 5
-"""Light, cosine, sine, and the turns of the fringe vector along x and y."""
+MODES = 5  # light, cosine, sine, and the turns of the fringe vector along x and y
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 

@@ -13,8 +13,8 @@ from pixcal.kernels.synthesis import BLOCK_ROWS, Float32, Stream, fill_normal, g
 from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.model.flags import PixelFlag
 
+# Rows and columns of the chip that share a generator. Another number would be another chip.
 TILE = (64, 256)
-"""Rows and columns of the chip that share a generator. Another number would be another chip."""
 
 Rows = tuple[int, int]
 
@@ -76,8 +76,6 @@ def chip_map(
 
     Parameters
     ----------
-    detector : SimulatedDetector
-    rows : tuple of int
     effect : str
         Whose random numbers.
     draw : callable
@@ -216,7 +214,6 @@ def light_maps(
 
     Parameters
     ----------
-    bench : Bench
     number : int
         Of the fringe set.
     rows : tuple of int

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.special import log_ndtr, ndtri_exp
 from scipy.stats import chi2, poisson
 
+# standard deviations from which an estimate or a part of its law is taken for real
 SIGNIFICANT = 4.0
-"""Standard deviations from which an estimate or a part of its law is taken for real."""
 _LARGE = 1000.0
 
 
@@ -30,7 +30,6 @@ def sigmas_of_count(count: int, expected: float) -> float:
 
     Parameters
     ----------
-    count : int
     expected : float
         Mean of the Poisson distribution, above zero.
     """

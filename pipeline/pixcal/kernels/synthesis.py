@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
 
+# Rows of the window that share a noise generator. Another number would be other noise.
 BLOCK_ROWS = 64
-"""Rows of the window that share a noise generator. Another number would be other noise."""
 
+# mean (e-) below which the Poisson quantile is found by summing the distribution
 EXACT_BELOW = 16.0
-"""Mean (e-) below which the Poisson quantile is found by summing the distribution."""
 
 
 class Stream(IntEnum):

@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-STEPS_PER_PX = 4
-"""Points of a track that stand for a pixel of its length."""
+STEPS_PER_PX = 4  # points of a track that stand for a pixel of its length
 
-GRAZING = 0.02
-"""Least cosine to the layer's normal: no track is longer than 50 times the depth."""
+GRAZING = 0.02  # least cosine to the layer's normal: no track is longer than 50 times the depth
 
 _RANGE = 4.0
 
@@ -82,8 +80,6 @@ def draw_tracks(
 
     Parameters
     ----------
-    rng : Generator
-    count : int
     area_px, margin_px : (int, int), int
         Rows and columns that tracks begin in, and how far beside them.
     depth_px : float

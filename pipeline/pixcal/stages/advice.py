@@ -15,26 +15,17 @@ from pixcal.storage.stage import require
 Json = Mapping[str, Any]
 
 HEADER = ("effect", "size", "on the map (rms, maximum)", "action")
+# in the place of `on_map` where a diagnosis has none
 NOT_MEASURED = {"rms_px": 0.0, "max_px": 0.0, "action": "not measured"}
-"""In the place of ``on_map`` where a diagnosis has none."""
-MATTERS = 0.3
-"""Share of SIGMA from which an error that SIGMA does not hold limits a map."""
+MATTERS = 0.3  # share of SIGMA from which an error that SIGMA does not hold limits a map
 
 
 @dataclass(frozen=True)
 class Advice:
-    """What a reader of the maps must know first.
+    """What a reader of the maps must know first."""
 
-    Attributes
-    ----------
-    sentences : tuple of str
-        Which maps to use, and what limits them.
-    rows : tuple of (str, str, str, str)
-        A row for each cause, under `HEADER`.
-    """
-
-    sentences: tuple[str, ...]
-    rows: tuple[tuple[str, str, str, str], ...]
+    sentences: tuple[str, ...]  # which maps to use, and what limits them
+    rows: tuple[tuple[str, str, str, str], ...]  # a row for each cause, under `HEADER`
 
 
 def advice(run_dir: Path) -> Advice | None:

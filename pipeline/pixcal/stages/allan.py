@@ -44,12 +44,11 @@ from pixcal.storage.stage import copy_products, make, working
 STAGE = STAGES["allan"]
 SCHEMA = "pixcal/allan/1"
 MIN_BATCHES = 3
+# a task takes a square of as many of the fit's chunks a side: one file of each length
 TILES_A_SIDE = 4
-"""A task takes a square of as many of the fit's chunks a side: one file of each length."""
-DIFFERENCES = 32
-"""Differences in time whose products show what pixels share."""
+DIFFERENCES = 32  # differences in time whose products show what pixels share
+# levels of the quantiles that describe the noise over a region
 NOISE_LEVELS = (np.arange(64) + 0.5) / 64
-"""Levels of the quantiles that describe the noise over a region."""
 
 Range = tuple[int, int]
 Tile = tuple[Range, Range]

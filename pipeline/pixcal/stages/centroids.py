@@ -28,20 +28,12 @@ FWHMS = (0.5, 50.0)
 
 @dataclass(frozen=True)
 class Offsets:
-    """Offsets of the pixels along x and y, and their errors, (2, y, x), px; NaN where unknown.
-
-    Attributes
-    ----------
-    files : tuple of str
-        The products that they come from.
-    read_noise : float
-        e-, as declared.
-    """
+    """Offsets of the pixels along x and y, and their errors, (2, y, x), px; NaN where unknown."""
 
     delta: F32
     sigma: F32
-    files: tuple[str, ...]
-    read_noise: float
+    files: tuple[str, ...]  # the products that they come from
+    read_noise: float  # e-, as declared
 
 
 def read_offsets(run_dir: Path) -> Offsets:
@@ -96,25 +88,14 @@ def correct(run_dir: Path, place: F64, *, fwhm_px: float, electrons: float | Non
 
 @dataclass(frozen=True)
 class TableJob:
-    """Which columns of which table to correct.
-
-    Attributes
-    ----------
-    table, out : Path
-    x, y : str
-        Names of the columns.
-    origin : int
-        Coordinate of the centre of the first pixel: 0 or 1.
-    overwrite : bool
-        Whether ``out`` may be replaced.
-    """
+    """Which columns of which table to correct."""
 
     table: Path
     out: Path
-    x: str = "x"
+    x: str = "x"  # x, y: names of the columns
     y: str = "y"
-    origin: int = 0
-    overwrite: bool = False
+    origin: int = 0  # coordinate of the centre of the first pixel: 0 or 1
+    overwrite: bool = False  # whether `out` may be replaced
 
 
 def correct_table(

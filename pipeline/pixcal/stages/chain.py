@@ -12,8 +12,8 @@ from pixcal.model.errors import InputError
 from pixcal.stages import allan, correct, diagnose, fit, ingest, reduce, report
 
 Config = options.Run
+# called with a step's name and its folder; the step runs inside the context
 Step = Callable[[str, Path], AbstractContextManager[None]]
-"""Called with a step's name and its folder; the step runs inside the context."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,6 @@ def run(
     ----------
     acquisition, out : Path
         As of ingest.
-    config : Config
-    runtime : Runtime
     step : callable
         Each step runs inside its context.
     note : callable

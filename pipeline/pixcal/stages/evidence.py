@@ -16,13 +16,12 @@ from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.stage import read_acquisition, require
 
+# rows and columns of the window: ((y0, y1), (x0, x1))
 Part = tuple[tuple[int, int], tuple[int, int]]
-"""Rows and columns of the window: ((y0, y1), (x0, x1))."""
 
 F64 = NDArray[np.float64]
 
-MAX_SAMPLES = 1 << 26
-"""Samples of a set that are taken into memory (some ten bytes each)."""
+MAX_SAMPLES = 1 << 26  # samples of a set that are taken into memory (some ten bytes each)
 
 
 def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice(None)) -> Evidence:

@@ -53,10 +53,9 @@ from pixcal.storage.folder import INDEX
 from pixcal.storage.formats import STAGES
 from pixcal.storage.stage import copy_products, make, require, working
 
+# stages whose artefacts are read
 SHOWN_STAGES = ("ingest", "reduce", "sweep", "fit", "allan", "diagnose", "corrected")
-"""Stages whose artefacts are read."""
-FIGURE_BYTES = 192 << 20
-"""Matplotlib, one figure and the page."""
+FIGURE_BYTES = 192 << 20  # Matplotlib, one figure and the page
 
 
 STAGE = STAGES["report"]

@@ -47,21 +47,20 @@ from pixcal.storage.fits_map import content_digest
 from pixcal.storage.fits_out import COMPRESSED, FrameWriter
 from pixcal.storage.formats import STAGES, Stage
 
+# maps that are told; read noise and gain of a simulated detector are the same in all pixels
 TRUTH_MAPS = tuple(f for f in fields(DetectorMaps) if f.name not in ("read_noise", "adu_per_e"))
-"""Maps that are told; read noise and gain of a simulated detector are the same in all pixels."""
 TRUTH_SCHEMA = "pixcal/truth/1"
 
-FRAMES_PER_TASK = 128
-"""The maps of some rows are made once for so many frames."""
+FRAMES_PER_TASK = 128  # the maps of some rows are made once for so many frames
 
+# peak of a task for each pixel of its rows: maps, phases in float64, one frame (measured)
 _BYTES_PER_PIXEL = 160
-"""Peak of a task for each pixel of its rows: maps, phases in float64, one frame (measured)."""
 
+# for each pixel and frame that an effect looks back to: charge before and after, and its noise
 _BYTES_PER_FRAME_BACK = 12
-"""For each pixel and frame that an effect looks back to: charge before and after, and its noise."""
 
+# peak of a task for each sample of a file that is compressed (measured)
 _BYTES_PER_COMPRESSED_SAMPLE = 10
-"""Peak of a task for each sample of a file that is compressed (measured)."""
 
 _MJD_EPOCH = datetime(1858, 11, 17)
 
@@ -83,8 +82,8 @@ class Exposes(Protocol):
 
 Cameras = Callable[[Bench, Rows, Effects], Exposes]
 
+# some frames of a recording, and the files (by number) that they go to
 Span = tuple[Recording, range, dict[int, FrameWriter]]
-"""Some frames of a recording, and the files (by number) that they go to."""
 
 
 def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -96,8 +95,6 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
         Bench file (schema ``pixcal/bench/1``).
     out : Path
         Directory of the acquisition. It appears when it is complete.
-    config : Config
-    runtime : Runtime
 
     Returns
     -------
@@ -148,12 +145,10 @@ def acquire(
 
     Parameters
     ----------
-    bench : Bench
     effects : tuple of Effect
         Of the camera; those named in the bench are not looked at.
     folder : Path
         Empty.
-    runtime : Runtime
     camera : callable
         Makes the frames of some rows, called with bench, rows and effects.
     """

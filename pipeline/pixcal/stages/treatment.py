@@ -15,40 +15,26 @@ from pixcal.simulation.effect import Effect
 
 F64 = NDArray[np.float64]
 
+# the shape of fringes (`pixcal.estimators.fringe_fit.models`) beside straight ones
 HYPERBOLIC = "hyperbolic"
-"""The shape of fringes (`pixcal.estimators.fringe_fit.models`) beside straight ones."""
-SUFFIX = "_corrected"
-"""Of the names of the corrected products."""
+SUFFIX = "_corrected"  # of the names of the corrected products
 IN_CORRECTED = "in the corrected fit"
+# treatments after which the corrected maps are free of an effect
 CORRECTED = ("undone on maps", "undone on samples", IN_CORRECTED)
-"""Treatments after which the corrected maps are free of an effect."""
 
 
 @dataclass(frozen=True)
 class Treatment:
-    """An effect and what is done about it.
-
-    Attributes
-    ----------
-    effect : Effect
-    origin : str
-        ``diagnosis``, or ``nominal``: known to be there before the diagnosis.
-    errors : mapping
-        Of its parameters, 1-sigma, by name.
-    how : str
-        ``undone on samples``, ``undone on maps``, ``in the fit``, ``in the corrected fit``,
-        ``absorbed by the fit`` or ``not undone``.
-    why : str
-    covariance : (n, n) float64, optional
-        Of the parameters, where they were measured together.
-    """
+    """An effect and what is done about it."""
 
     effect: Effect
-    origin: str
-    errors: Mapping[str, float]
+    origin: str  # `diagnosis`, or `nominal`: known to be there before the diagnosis
+    errors: Mapping[str, float]  # of its parameters, 1-sigma, by name
+    # `undone on samples`, `undone on maps`, `in the fit`, `in the corrected fit`, `absorbed by
+    # the fit` or `not undone`
     how: str
     why: str
-    covariance: F64 | None = None
+    covariance: F64 | None = None  # (n, n) of the parameters, where they were measured together
 
     @property
     def corrects(self) -> bool:
@@ -79,15 +65,9 @@ class Treatment:
 
 @dataclass(frozen=True)
 class Treatments:
-    """All effects of a diagnosis.
+    """All effects of a diagnosis."""
 
-    Attributes
-    ----------
-    every : tuple of Treatment
-        In the order of the diagnosis.
-    """
-
-    every: tuple[Treatment, ...]
+    every: tuple[Treatment, ...]  # in the order of the diagnosis
 
     def _those(self, how: str) -> tuple[Effect, ...]:
         """Effects of a treatment, the last that acted first."""

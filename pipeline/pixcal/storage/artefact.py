@@ -69,24 +69,13 @@ _KEY_IN_NAME = 16
 
 @dataclass
 class Build:
-    """An artefact in the making.
+    """An artefact in the making."""
 
-    Attributes
-    ----------
-    folder : Path
-        Where to write; becomes ``RUN/<stage>`` when complete.
-    cubes : Path or UrlPath
-        Where to write cubes: ``folder``, unless they go elsewhere.
-    key : str
-        Digest of everything the result depends on.
-    summary : dict
-        Facts to keep in the manifest; fill before the build ends.
-    """
-
-    folder: Path
-    cubes: Place
-    key: str
+    folder: Path  # where to write; becomes `RUN/<stage>` when complete
+    cubes: Place  # where to write cubes: `folder`, unless they go elsewhere
+    key: str  # digest of everything the result depends on
     resumed: bool
+    # facts to keep in the manifest; fill before the build ends
     summary: dict[str, Any] = field(default_factory=dict)
 
     @property

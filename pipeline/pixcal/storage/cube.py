@@ -33,13 +33,11 @@ from pixcal.storage.links import copy_files, link_files
 from pixcal.storage.place import Place, UrlPath
 from pixcal.storage.read_ahead import AHEAD, ReadAhead
 
-CHUNK = (64, 128, 128)
-"""Samples of a chunk along (time, y, x): 2 MiB of uint16."""
+CHUNK = (64, 128, 128)  # samples of a chunk along (time, y, x): 2 MiB of uint16
 
+# errors of the system that mean that a file is damaged; others may pass
 _LOST = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EIO)
-"""Errors of the system that mean that a file is damaged; others may pass."""
-_RESIDUE = 0x48674BC7
-"""CRC-32C of anything that ends with its own CRC-32C, least byte first."""
+_RESIDUE = 0x48674BC7  # CRC-32C of anything that ends with its own CRC-32C, least byte first
 _INDEX_DTYPE = np.dtype([("size", "<u4"), ("crc", "<u4")])
 
 # Threads belong to the engine: Blosc must not start its own, nor share a global context.

@@ -20,8 +20,7 @@ from pixcal.storage.folder import open_folder
 from pixcal.storage.place import Place, parse_place
 
 POINTER = "cubes.json"
-NOTE = "pixcal.json"
-"""File beside the cubes that tells whoever finds them what they are."""
+NOTE = "pixcal.json"  # file beside the cubes that tells whoever finds them what they are
 
 log = logging.getLogger(__name__)
 

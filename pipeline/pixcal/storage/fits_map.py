@@ -17,23 +17,12 @@ _PIECE = 8 << 20
 
 @dataclass(frozen=True)
 class FitsMap:
-    """One image of a FITS file.
-
-    Attributes
-    ----------
-    path : Path
-    shape : (int, int)
-        (y, x).
-    dtype : str
-        As stored.
-    data_at : int
-        Byte where the image begins.
-    """
+    """One image of a FITS file."""
 
     path: Path
-    shape: tuple[int, int]
-    dtype: str
-    data_at: int
+    shape: tuple[int, int]  # (y, x)
+    dtype: str  # as stored
+    data_at: int  # byte where the image begins
 
     @classmethod
     def open(cls, path: Path, extension: str | int = 0) -> "FitsMap":

@@ -14,8 +14,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
-Cards = Mapping[str, Any]
-"""Header keywords: a value, or (value, comment)."""
+Cards = Mapping[str, Any]  # header keywords: a value, or (value, comment)
 
 BLOCK = 2880
 COMPRESSED = ".fits.fz"
@@ -24,24 +23,12 @@ _SIGN = np.uint16(0x8000)
 
 @dataclass(frozen=True)
 class FrameWriter:
-    """A FITS image that is written in pieces, from any thread or process that sees the folder.
+    """A FITS image that is written in pieces, from any thread or process that sees the folder."""
 
-    Attributes
-    ----------
-    path : Path
-        Name of the file once it is complete.
-    shape : tuple of int
-        (y, x), or (time, y, x) for a cube.
-    dtype : str
-        ``uint16`` (through BZERO), ``uint8`` or ``float32``.
-    data_at : int
-        Byte where the data begin.
-    """
-
-    path: Path
-    shape: tuple[int, ...]
-    dtype: str
-    data_at: int
+    path: Path  # name of the file once it is complete
+    shape: tuple[int, ...]  # (y, x), or (time, y, x) for a cube
+    dtype: str  # `uint16` (through BZERO), `uint8` or `float32`
+    data_at: int  # byte where the data begin
 
     @classmethod
     def create(

@@ -23,8 +23,7 @@ from pixcal.storage.fits_in import Coding, FrameFile, damaged_gzip
 from pixcal.storage.pictures import picture_bytes, unpack_picture
 from pixcal.storage.sources import SourceFile, unreadable
 
-BAND = CHUNK[1]
-"""Rows that have a checksum in common: those of a chunk."""
+BAND = CHUNK[1]  # rows that have a checksum in common: those of a chunk
 
 _PIECE = 1 << 20
 _TILE_PIECE = 8 << 20

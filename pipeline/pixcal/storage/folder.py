@@ -10,16 +10,15 @@ from typing import Any, Protocol
 
 from pixcal.storage.place import Place, UrlPath, explained
 
+# file that an array has beside its metadata: sizes and checksums of its chunks
 INDEX = "chunks.npy"
-"""File that an array has beside its metadata: sizes and checksums of its chunks."""
-DISK_FULL = (errno.ENOSPC, errno.EDQUOT)
-"""Errors of the system that are no fault of the file."""
+DISK_FULL = (errno.ENOSPC, errno.EDQUOT)  # errors of the system that are no fault of the file
+# bytes that one task sends to a URL at the same time, and more than it reads ahead
 BATCH_BYTES = 16 << 20
-"""Bytes that one task sends to a URL at the same time, and more than it reads ahead."""
 
 
+# name of a file below a folder, such as `c/0/1/2`, and its content in parts
 File = tuple[str, Sequence[bytes]]
-"""Name of a file below a folder, such as ``c/0/1/2``, and its content in parts."""
 
 
 class Folder(Protocol):
@@ -115,7 +114,6 @@ def read_file(path: str, size: int, later: str | None = None) -> bytes:
 
     Parameters
     ----------
-    path : str
     size : int
         Bytes expected.
     later : str, optional

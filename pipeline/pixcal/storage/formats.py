@@ -9,26 +9,13 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Stage:
-    """What makes one kind of artefact, ``RUN/<name>``.
-
-    Attributes
-    ----------
-    name : str
-    format : int
-        That is written, and read.
-    command : str
-        What the user types to have it made, ``RUN`` standing for the run directory.
-    earlier : tuple of int
-        Formats that are read as well.
-    of_fringes : bool
-        Whether there is none of an acquisition without fringes.
-    """
+    """What makes one kind of artefact, ``RUN/<name>``."""
 
     name: str
-    format: int
-    command: str
-    earlier: tuple[int, ...] = ()
-    of_fringes: bool = True
+    format: int  # that is written, and read
+    command: str  # what the user types to have it made, `RUN` standing for the run directory
+    earlier: tuple[int, ...] = ()  # formats that are read as well
+    of_fringes: bool = True  # whether there is none of an acquisition without fringes
 
     def typed(self, run: Path) -> str:
         """The command for a run."""

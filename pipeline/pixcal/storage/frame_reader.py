@@ -18,8 +18,8 @@ from pixcal.storage.fits_in import Coding, FrameFile
 from pixcal.storage.fits_rows import BAND, read_rows
 from pixcal.storage.sources import SourceFile
 
+# what `files.json` holds of the files of an array, in columns of equal length
 Columns = Mapping[str, Sequence[Any]]
-"""What ``files.json`` holds of the files of an array, in columns of equal length."""
 
 
 def describe(files: Sequence[FrameFile]) -> dict[str, list[Any]]:
@@ -128,5 +128,4 @@ class FrameReader:
             )
 
 
-Reader = ArrayReader | FrameReader
-"""What frames (time, y, x) are read with, wherever they are."""
+Reader = ArrayReader | FrameReader  # what frames (time, y, x) are read with, wherever they are

@@ -15,26 +15,13 @@ _SECONDS_A_DAY = 86400.0
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame of an array.
+    """One frame of an array."""
 
-    Attributes
-    ----------
-    file : FrameFile
-        Where it is.
-    plane : int
-        Its number in a cube, else 0.
-    mjd : float or None
-        Modified Julian date (days), None when unknown.
-    time_s : float
-        Seconds since the array's first frame (its number where no time is known).
-    time_source : str
-        ``header``; ``frame_period_s`` or ``exptime_s``: added up from there; ``number``.
-    """
-
-    file: FrameFile
-    plane: int
-    mjd: float | None
-    time_s: float
+    file: FrameFile  # where it is
+    plane: int  # its number in a cube, else 0
+    mjd: float | None  # modified Julian date (days), None when unknown
+    time_s: float  # seconds since the array's first frame (its number where no time is known)
+    # `header`; `frame_period_s` or `exptime_s`: added up from there; `number`
     time_source: TimeSource
 
 

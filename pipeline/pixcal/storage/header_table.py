@@ -16,8 +16,7 @@ NAME = "headers.csv"
 KEYWORDS = ("EXPTIME", "MJD-OBS", "DATE-OBS", "CCD-TEMP")
 _NUMBERS = ("EXPTIME", "MJD-OBS", "CCD-TEMP")
 
-Header = tuple[tuple[str, str | float], ...]
-"""Keywords and values."""
+Header = tuple[tuple[str, str | float], ...]  # keywords and values
 
 
 def read_headers(folder: Path, names: Iterable[str]) -> dict[str, Header]:

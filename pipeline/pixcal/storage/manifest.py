@@ -19,8 +19,8 @@ from pixcal.storage.folder import INDEX
 MANIFEST = "manifest.json"
 JOURNAL = "journal.jsonl"
 SCRATCH = "scratch"
+# names of the files of an artefact that turned out to be damaged, found when they were read
 DAMAGE = "damage.json"
-"""Names of the files of an artefact that turned out to be damaged, found when they were read."""
 _NOT_LISTED = (MANIFEST, JOURNAL, DAMAGE)
 
 

@@ -21,6 +21,7 @@ from pixcal.storage.sources import SourceFile
 
 # PNG; TIFF and BigTIFF in both byte orders.
 _MAGIC = (b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+# modes of Pillow that hold one sample a pixel, and how `unpack_picture` writes them
 _CODINGS = {
     "L": Coding(8),
     "I;16": Coding(16, bzero=1 << 15),
@@ -29,7 +30,6 @@ _CODINGS = {
     "I": Coding(32),
     "F": Coding(-32),
 }
-"""Modes of Pillow that hold one sample a pixel, and how `unpack_picture` writes them."""
 
 
 def is_picture(start: bytes) -> bool:

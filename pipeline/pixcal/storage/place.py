@@ -12,8 +12,8 @@ from urllib.parse import urlsplit
 
 from pixcal.model.errors import InputError, PixcalError, RemoteError
 
+# what to install for a protocol, where its name does not tell
 _EXTRAS = {"s3": "pixcal[s3]", "s3a": "pixcal[s3]", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs"}
-"""What to install for a protocol, where its name does not tell."""
 
 
 @dataclass(frozen=True)
@@ -22,14 +22,9 @@ class UrlPath:
 
     It holds nothing but the URL, so that it can be sent to other processes and machines. The
     settings (endpoint, credentials) are those of the environment of whoever opens it.
-
-    Attributes
-    ----------
-    url : str
-        Such as ``s3://bucket/prefix``, without a slash at its end.
     """
 
-    url: str
+    url: str  # such as `s3://bucket/prefix`, without a slash at its end
 
     def __str__(self) -> str:
         return self.url
@@ -91,8 +86,7 @@ class UrlPath:
         return True
 
 
-Place = Path | UrlPath
-"""A file or folder, here or at a URL."""
+Place = Path | UrlPath  # a file or folder, here or at a URL
 
 
 @contextmanager

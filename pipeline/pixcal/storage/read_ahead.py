@@ -7,14 +7,12 @@ from threading import local
 
 from pixcal.storage.place import UrlPath, explained
 
-File = tuple[str, int]
-"""Name and size (bytes)."""
+File = tuple[str, int]  # name and size (bytes)
 
-AHEAD = 4
-"""Files on their way while one is decoded."""
+AHEAD = 4  # files on their way while one is decoded
 
+# files that may wait for each thread; nobody asks for those of a column that was left
 _KEPT = 2 * AHEAD
-"""Files that may wait for each thread; nobody asks for those of a column that was left."""
 
 
 class ReadAhead:

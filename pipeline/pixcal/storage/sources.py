@@ -16,31 +16,17 @@ from pixcal.storage.header_table import Header, read_headers
 
 @dataclass(frozen=True)
 class SourceFile:
-    """A file as it was found.
-
-    Attributes
-    ----------
-    path : Path
-        Where it is.
-    name : str
-        Relative to the acquisition's folder, with ``/``.
-    size : int
-        Bytes.
-    mtime_ns : int
-        Time of the last change (ns since 1970).
-    header : tuple of (str, value)
-        What ``headers.csv`` says of it.
-    """
+    """A file as it was found."""
 
     CHANGED: ClassVar[str] = (
         "changed while it was being read; wait until the acquisition is complete and run again"
     )
 
-    path: Path
-    name: str
-    size: int
-    mtime_ns: int
-    header: Header = ()
+    path: Path  # where it is
+    name: str  # relative to the acquisition's folder, with `/`
+    size: int  # bytes
+    mtime_ns: int  # time of the last change (ns since 1970)
+    header: Header = ()  # what `headers.csv` says of it
 
     def open(self) -> io.FileIO:
         """Open the file for unbuffered reading, if it is still the one that was found.

@@ -95,8 +95,6 @@ def make(
 
     Parameters
     ----------
-    run : Path
-    stage : Stage
     config : dict
         Plain data of the options that the result depends on.
     inputs : mapping

@@ -6,39 +6,23 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-DEFAULT_FRAMES = 500
-"""Frames of a batch in a long run (paper, section 4.3)."""
+DEFAULT_FRAMES = 500  # frames of a batch in a long run (paper, section 4.3)
 
-MIN_FRAMES = 16
-"""Fewest frames of a batch: each pixel has three unknowns of its own there."""
+MIN_FRAMES = 16  # fewest frames of a batch: each pixel has three unknowns of its own there
 
-WANTED = 24
-"""Batches wanted of a run too short for `DEFAULT_FRAMES`."""
+WANTED = 24  # batches wanted of a run too short for `DEFAULT_FRAMES`
 
 
 @dataclass(frozen=True)
 class Batches:
-    """Batches of equal duration.
+    """Batches of equal duration."""
 
-    Attributes
-    ----------
-    frames : int
-        Frames of a full batch.
-    period_s : float
-        Time from frame to frame.
-    ranges : tuple of (int, int)
-        First frame and the one after the last of each batch; empty for a gap.
-    time : (batch,) float64
-        Centre of each batch, seconds from the first frame.
-    note : str
-        What a reader should know, or "".
-    """
-
-    frames: int
-    period_s: float
+    frames: int  # frames of a full batch
+    period_s: float  # time from frame to frame
+    # first frame and the one after the last of each batch; empty for a gap
     ranges: tuple[tuple[int, int], ...]
-    time: NDArray[np.float64]
-    note: str = ""
+    time: NDArray[np.float64]  # (batch,) centre of each batch, seconds from the first frame
+    note: str = ""  # what a reader should know, or ""
 
     @property
     def count(self) -> NDArray[np.int32]:

@@ -7,14 +7,13 @@ from pixcal.model.flags import PixelFlag
 
 F32 = NDArray[np.float32]
 
+# largest error of a phase: beyond it errors are no longer Gaussian, and 6 sigma are seen (with 0.3
+# rad one pixel in 500 was further from the truth)
 MAX_SIGMA_RAD = 0.2
-"""Largest error of a phase: beyond it errors are no longer Gaussian, and 6 sigma are seen (with
-0.3 rad one pixel in 500 was further from the truth)."""
+# light is never below zero: fringes that go there by more have the wrong bias, and the variance of
+# their samples is not known
 MAX_VISIBILITY = 1.05
-"""Light is never below zero: fringes that go there by more have the wrong bias, and the variance of
-their samples is not known."""
-CHANCE = 6.0
-"""Errors by which a visibility may be larger still by chance."""
+CHANCE = 6.0  # errors by which a visibility may be larger still by chance
 
 
 def fit_flags(

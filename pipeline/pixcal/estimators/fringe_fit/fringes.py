@@ -17,38 +17,27 @@ F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
 Phases = TypeVar("Phases", NDArray[np.float32], NDArray[np.float64])
 
-MIN_FRINGES = 1.5
-"""Fewest fringes across a window for a peak to be looked for."""
+MIN_FRINGES = 1.5  # fewest fringes across a window for a peak to be looked for
+# fewest fringes for maps with honest errors: with 1.3 to 1.8 the gauge takes true offsets for
+# fringes, and errors were 2 to 4 times what SIGMA says (measured on 80 x 80 px)
 HONEST_FRINGES = 1.95
-"""Fewest fringes for maps with honest errors: with 1.3 to 1.8 the gauge takes true offsets for
-fringes, and errors were 2 to 4 times what SIGMA says (measured on 80 x 80 px)."""
+# shortest period along x and y: below 2 px fringes look like wider ones of another direction, and
+# nominal vectors are good to some 10 %
 SHORTEST_PX = 2.2
-"""Shortest period along x and y: below 2 px fringes look like wider ones of another direction, and
-nominal vectors are good to some 10 %."""
+# least cosine between the fringes' axis and the nominal one: the nominal vector gives the sign
 MOST_TURNED = 0.5
-"""Least cosine between the fringes' axis and the nominal one: the nominal vector gives the sign."""
+# pixels that a smooth phasor is fitted to, about: ten terms are then known to 4 % of the noise of
+# one pixel
 MOST_PIXELS = 6000
-"""Pixels that a smooth phasor is fitted to, about: ten terms are then known to 4 % of the noise of
-one pixel."""
 
 
 @dataclass(frozen=True)
 class FrameParameters:
-    """What changes from frame to frame.
+    """What changes from frame to frame."""
 
-    Attributes
-    ----------
-    g : (t, 3) float64
-        (B, A cos phi, A sin phi) at the reference point.
-    dk : (t, 2) float64
-        Change of the fringe vector along x and y (rad/px); all zero when it is held.
-    reference : (float, float)
-        Point (y, x) where ``g`` holds, in pixels.
-    """
-
-    g: F64
-    dk: F64
-    reference: tuple[float, float]
+    g: F64  # (t, 3) (B, A cos phi, A sin phi) at the reference point
+    dk: F64  # (t, 2) change of the fringe vector along x and y (rad/px); all zero when it is held
+    reference: tuple[float, float]  # point (y, x) where `g` holds, in pixels
 
     @cached_property
     def moving(self) -> bool:
@@ -205,18 +194,10 @@ def polynomial_basis(shape: tuple[int, int], degree: int, step: int = 1) -> F64:
 
 @dataclass(frozen=True)
 class SmoothPhasor:
-    """A smooth phasor over a tile.
+    """A smooth phasor over a tile."""
 
-    Attributes
-    ----------
-    map : (y, x) complex128
-        Visibility times exp(i psi), on every pixel.
-    k : (float, float)
-        Fringe vector (kx, ky), the mean over the tile, rad/px.
-    """
-
-    map: C128
-    k: tuple[float, float]
+    map: C128  # (y, x) visibility times exp(i psi), on every pixel
+    k: tuple[float, float]  # fringe vector (kx, ky), the mean over the tile, rad/px
 
 
 def smooth_phasor(

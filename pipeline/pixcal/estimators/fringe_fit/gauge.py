@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
 
+# modes of the phase map that a free intensity and amplitude in each frame leave open
 FRINGE_MODES = ("cos(psi)*iota/alpha", "sin(psi)*iota/alpha", "cos(2*psi)", "sin(2*psi)")
-"""Modes of the phase map that a free intensity and amplitude in each frame leave open."""
 
 
 def fringe_modes(psi: F64, ratio: F64) -> list[F64]:

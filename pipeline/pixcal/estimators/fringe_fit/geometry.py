@@ -11,34 +11,19 @@ from pixcal.estimators.fringe_fit.fringes import grid
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-MAX_PIXELS = 1024
-"""Pixels that a tile's plane is laid through."""
+MAX_PIXELS = 1024  # pixels that a tile's plane is laid through
 
 
 @dataclass(frozen=True)
 class TilePlane:
-    """Smooth phase of a tile: ``phase + kx * (x - cx) + ky * (y - cy)``.
+    """Smooth phase of a tile: ``phase + kx * (x - cx) + ky * (y - cy)``."""
 
-    Attributes
-    ----------
-    centre : (float, float)
-        (cy, cx) in pixels of the window.
-    phase : float
-        At the centre, rad, relative to the carrier; known up to turns until unwrapped.
-    kx, ky : float
-        Local fringe vector minus the carrier, rad/px.
-    sigma : float
-        1-sigma error of ``phase``; infinite without good pixels.
-    ratio : float
-        Median of iota / alpha.
-    """
-
-    centre: tuple[float, float]
-    phase: float
-    kx: float
+    centre: tuple[float, float]  # (cy, cx) in pixels of the window
+    phase: float  # at the centre, rad, relative to the carrier; known up to turns until unwrapped
+    kx: float  # kx, ky: local fringe vector minus the carrier, rad/px
     ky: float
-    sigma: float
-    ratio: float
+    sigma: float  # 1-sigma error of `phase`; infinite without good pixels
+    ratio: float  # median of iota / alpha
 
     def on(self, shape: tuple[int, int]) -> F64:
         """The plane on the tile's pixels."""

@@ -17,14 +17,13 @@ from pixcal.kernels.fringe_sums import frame_moments, interpolate_periodic
 F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
 
+# smallest read variance over level in the weights: below, their series becomes too long, and they
+# gain nothing that matters
 MIN_RHO = 0.005
-"""Smallest read variance over level in the weights: below, their series becomes too long, and they
-gain nothing that matters."""
-ORDERS = 192
-"""Terms kept: the series falls as 0.905^k at V = 1 and `MIN_RHO`, to 5e-9 here."""
+ORDERS = 192  # terms kept: the series falls as 0.905^k at V = 1 and `MIN_RHO`, to 5e-9 here
+# Phases at which normal matrices are tabulated; linear in between. Errors are under 8e-5 for w and
+# 2e-4 for its square at the limits, and act on the step from the start model only.
 TABLE = 4096
-"""Phases at which normal matrices are tabulated; linear in between. Errors are under 8e-5
-for w and 2e-4 for its square at the limits, and act on the step from the start model only."""
 
 
 @dataclass(frozen=True)
@@ -71,18 +70,10 @@ def moments(g: F64) -> C128:
 
 @dataclass
 class FrameMoments:
-    """Frames at a point, as the sums want them, and the moments of those that follow one another.
+    """Frames at a point, as the sums want them, and moments of those that follow one another."""
 
-    Attributes
-    ----------
-    exact : (t, 3) float64
-        (B, A cos phi, A sin phi).
-    rows : (t, 5) float32
-        (B, A, cos phi, sin phi, f), f the frame's own weight.
-    """
-
-    exact: F64
-    rows: NDArray[np.float32]
+    exact: F64  # (t, 3) (B, A cos phi, A sin phi)
+    rows: NDArray[np.float32]  # (t, 5) (B, A, cos phi, sin phi, f), f the frame's own weight
     kept: dict[tuple[int, int], C128] = field(default_factory=dict)
 
     @classmethod

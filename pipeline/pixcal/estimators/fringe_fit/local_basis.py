@@ -15,12 +15,10 @@ from pixcal.estimators.fringe_fit.fringes import grid
 
 F64 = NDArray[np.float64]
 
+# as the polynomial that shapes are judged by, which a window of one tile must hold as well
 DEGREE = 5
-"""As the polynomial that shapes are judged by, which a window of one tile must hold as well."""
-SCALE_PX = 64.0
-"""Coordinates from the tile's centre are counted in these: half a tile."""
-NODES = 6
-"""Points along each axis at which functions are looked at."""
+SCALE_PX = 64.0  # coordinates from the tile's centre are counted in these: half a tile
+NODES = 6  # points along each axis at which functions are looked at
 
 
 def powers() -> list[tuple[int, int]]:

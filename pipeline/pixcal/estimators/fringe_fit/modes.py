@@ -17,24 +17,15 @@ from pixcal.estimators.fringe_fit.tile_sums import N_LOCAL, Carrier, TileSums
 
 F64 = NDArray[np.float64]
 
-TILES_AT_ONCE = 256
-"""Tiles whose modes are held together."""
+TILES_AT_ONCE = 256  # tiles whose modes are held together
 
 
 @dataclass(frozen=True)
 class ModeBasis:
-    """The modes of a set's phase map: those of the fringes' shape, then those of the gauge.
+    """The modes of a set's phase map: those of the fringes' shape, then those of the gauge."""
 
-    Attributes
-    ----------
-    shape : FringeShape
-        Present shape of the fringes.
-    carrier : Carrier
-        That measured phases are relative to.
-    """
-
-    shape: FringeShape
-    carrier: Carrier
+    shape: FringeShape  # present shape of the fringes
+    carrier: Carrier  # that measured phases are relative to
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -87,7 +78,6 @@ class ModeBasis:
 
         Parameters
         ----------
-        planes : list of TilePlane
         coefficients : (mode, 1 + batch) float64
             Of the run's phases relative to the shape, and of the batches' relative to the run's.
 

@@ -31,32 +31,29 @@ from pixcal.model.errors import InputError
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Pixels = NDArray[np.intp] | slice
+# flat numbers of pixels of a tile, and their codes (t, p)
 Samples = tuple[NDArray[np.intp], NDArray[np.uint16]]
-"""Flat numbers of pixels of a tile, and their codes (t, p)."""
 Each = Callable[[Callable[[int], Any], Sequence[int]], list[Any]]
 
+# pixels that frames are solved with: their noise then adds some 2e-4 to a map's variance
 MAX_PIXELS = 20_000
-"""Pixels that frames are solved with: their noise then adds some 2e-4 to a map's variance."""
+# of so many of these one is enough to start with: that only gives weights, and the point about
+# which a moving phase is linear
 FEW = 4
-"""Of so many of these one is enough to start with: that only gives weights, and the point about
-which a moving phase is linear."""
-MIN_FRAMES = 6
-"""Three unknowns a pixel, and as many again to tell whether they fit."""
+MIN_FRAMES = 6  # three unknowns a pixel, and as many again to tell whether they fit
+# departure from the visibility of a tile's pixels, over the usual one, of a pixel not to learn
+# from; some 8 standard deviations
 ODD_VISIBILITY = 12.0
-"""Departure from the visibility of a tile's pixels, over the usual one, of a pixel not to learn
-from; some 8 standard deviations."""
-MANY = 3.0
-"""Mean light over that of most pixels, or the reverse, of pixels not to learn from."""
+MANY = 3.0  # mean light over that of most pixels, or the reverse, of pixels not to learn from
+# most of the usual distance of the pixels' phases from smooth ones; random ones have 1.57
 FOLLOWS_RAD = 0.8
-"""Most of the usual distance of the pixels' phases from smooth ones; random ones have 1.57."""
-TURNS, TURNS_MOVING = 3, 8
-"""Most turns of pixels from frames and frames from pixels."""
+TURNS, TURNS_MOVING = 3, 8  # most turns of pixels from frames and frames from pixels
+# Change of the frames by a turn, over their errors, after which no other is needed. Each turn
+# halves it: what is left is less than this share of the frames' noise, which is little itself.
 SETTLED = 0.02
-"""Change of the frames by a turn, over their errors, after which no other is needed. Each turn
-halves it: what is left is less than this share of the frames' noise, which is little itself."""
+# least power of the weakest of three components over the next, which is noise: frames of two phases
+# only have no third component, and noise in its place would pass for the fringes' shape
 ABOVE_NOISE = 1.5
-"""Least power of the weakest of three components over the next, which is noise: frames of two
-phases only have no third component, and noise in its place would pass for the fringes' shape."""
 
 
 def in_turn(function: Callable[[int], Any], numbers: Sequence[int]) -> list[Any]:
@@ -80,17 +77,6 @@ class Scout:
         Point (y, x) at which the frame parameters hold.
     each : callable
         Does what is to be done for every tile: as `in_turn`, or several at a time.
-
-    Attributes
-    ----------
-    k : (float, float)
-        Fringe vector of the first tile, rad/px.
-    moving, moving_significance : bool, float
-        Whether the fringe vector changes from frame to frame, and the test's statistic.
-    noise : float
-        Usual reduced chi-square of the pixels.
-    theta : list of (3, y, x) float64
-        Of each tile.
     """
 
     tiles: Sequence[Tile]
@@ -98,11 +84,13 @@ class Scout:
     nominal: tuple[float, float]
     reference: tuple[float, float]
     each: Each = field(default=in_turn, repr=False)
-    k: tuple[float, float] = (0.0, 0.0)
+    k: tuple[float, float] = (0.0, 0.0)  # fringe vector of the first tile, rad/px
+    # moving, moving_significance: whether the fringe vector changes from frame to frame, and
+    # the test's statistic
     moving: bool = False
     moving_significance: float = 0.0
-    noise: float = 1.0
-    theta: list[F64] = field(default_factory=list)
+    noise: float = 1.0  # usual reduced chi-square of the pixels
+    theta: list[F64] = field(default_factory=list)  # list of (3, y, x) float64: of each tile
 
     def prime(self, codes: Sequence[NDArray[np.uint16]]) -> FrameParameters:
         """Learn the pixels of the tiles from frames spread over the run.

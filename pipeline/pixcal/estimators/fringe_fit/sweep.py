@@ -15,44 +15,26 @@ from pixcal.estimators.fringe_fit.tile_fit import start_model
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+# pixels of a tile for which the Cramér-Rao bound is worked out, where there are few tiles
 BOUND_PIXELS = 128
-"""Pixels of a tile for which the Cramér-Rao bound is worked out, where there are few tiles."""
 
 
 @dataclass(frozen=True)
 class TileMaps:
-    """What the sweep of a tile gives.
+    """What the sweep of a tile gives."""
 
-    Attributes
-    ----------
-    iota, alpha : (y, x) float32
-        Mean and amplitude (e-) at B = A = 1.
-    phase : (y, x) float32
-        Phase (rad, in ±pi) relative to the carrier ``k . (r - reference)``.
-    sigma : (y, x) float32
-        1-sigma error of the phase (rad) that the noise model predicts.
-    chi2 : (y, x) float32
-        Reduced chi-square.
-    count : (y, x) float32
-        Samples with weight.
-    smooth : SmoothPhasor
-        Of the start model.
-    batch_phase, batch_sigma : (batch, y, x) float32
-        Phase of each batch relative to that of all frames, and its error (rad); NaN in gaps.
-    bound : (n,) float64
-        Cramér-Rao bound of the phase (rad) for some of the good pixels.
-    """
-
-    iota: F32
+    iota: F32  # iota, alpha: (y, x) mean and amplitude (e-) at B = A = 1
     alpha: F32
-    phase: F32
-    sigma: F32
-    chi2: F32
-    count: F32
-    smooth: SmoothPhasor
+    phase: F32  # (y, x) phase (rad, in ±pi) relative to the carrier `k . (r - reference)`
+    sigma: F32  # (y, x) 1-sigma error of the phase (rad) that the noise model predicts
+    chi2: F32  # (y, x) reduced chi-square
+    count: F32  # (y, x) samples with weight
+    smooth: SmoothPhasor  # of the start model
+    # batch_phase, batch_sigma: (batch, y, x) phase of each batch relative to that of all
+    # frames, and its error (rad); NaN in gaps
     batch_phase: F32
     batch_sigma: F32
-    bound: F64
+    bound: F64  # (n,) Cramér-Rao bound of the phase (rad) for some of the good pixels
 
 
 def frames_to_prime(frames: FrameParameters, block: int) -> int:
@@ -80,15 +62,11 @@ def sweep_tile(
 
     Parameters
     ----------
-    tile : Tile
     blocks : iterable of (t, y, x) arrays
         Stored codes in the order of time; together as many frames as ``frames`` holds. The first
         ``prime`` frames are held until the start model is made from them.
-    coding : Coding
-    frames : FrameParameters
     k : (float, float)
         Carrier (kx, ky), rad/px.
-    batches : Batches
     prime : int
         From `frames_to_prime`.
     bound_pixels : int

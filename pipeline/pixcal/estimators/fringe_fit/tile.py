@@ -19,23 +19,13 @@ class Coding:
 
 @dataclass
 class Tile:
-    """A part of the window.
+    """A part of the window."""
 
-    Attributes
-    ----------
-    y, x : (int, int)
-        First pixel and the one after the last, along each axis.
-    read, shot : (y, x) float32
-        Variance of a sample: ``shot * model + read`` (e-²).
-    good : (y, x) bool
-        Pixels to learn from.
-    """
-
-    y: tuple[int, int]
+    y: tuple[int, int]  # y, x: first pixel and the one after the last, along each axis
     x: tuple[int, int]
-    read: F32
+    read: F32  # read, shot: (y, x) variance of a sample: `shot * model + read` (e-²)
     shot: F32
-    good: NDArray[np.bool_]
+    good: NDArray[np.bool_]  # (y, x) pixels to learn from
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -42,11 +42,8 @@ def accumulate(
 
     Parameters
     ----------
-    tile : Tile
     blocks : sequence of (t, y, x) arrays
         Stored codes; together as many frames as ``frames`` holds.
-    coding : Coding
-    frames : FrameParameters
     theta : (3, y, x) float32
         Start model.
     sums : (N_SUMS, y, x) float64, optional

@@ -14,25 +14,17 @@ from pixcal.estimators.fringe_fit.local_basis import polynomials, powers
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+# modes of a tile: the polynomials, then the fringes that free intensities leave open
 N_LOCAL = len(powers()) + len(FRINGE_MODES)
-"""Modes of a tile: the polynomials, then the fringes that free intensities leave open."""
 _PLANE = 7
 
 
 @dataclass(frozen=True)
 class Carrier:
-    """The plane wave that phases are relative to: ``k . (r - reference)``.
+    """The plane wave that phases are relative to: ``k . (r - reference)``."""
 
-    Attributes
-    ----------
-    k : (float, float)
-        (kx, ky), rad/px.
-    reference : (float, float)
-        (y, x), px.
-    """
-
-    k: tuple[float, float]
-    reference: tuple[float, float]
+    k: tuple[float, float]  # (kx, ky), rad/px
+    reference: tuple[float, float]  # (y, x), px
 
     def phase(self, y: F64, x: F64) -> F64:
         """Phase (rad) at coordinates that broadcast."""
@@ -42,25 +34,14 @@ class Carrier:
 
 @dataclass(frozen=True)
 class TileSums:
-    """Least squares of the modes of tiles, one entry a tile; phases are relative to the planes.
-
-    Attributes
-    ----------
-    planes : list of TilePlane
-    normal : (tile, mode, mode) float64
-    right : (tile, mode, 1 + batch) float64
-        Of the whole run's phases, then of the batches' relative to it.
-    square : (tile,) float64
-        Weighted square of the whole run's phases.
-    pixels : (tile,) float64
-        With weight.
-    """
+    """Least squares of the modes of tiles, one entry a tile; phases are relative to the planes."""
 
     planes: list[TilePlane]
-    normal: F64
+    normal: F64  # (tile, mode, mode)
+    # (tile, mode, 1 + batch) of the whole run's phases, then of the batches' relative to it
     right: F64
-    square: F64
-    pixels: F64
+    square: F64  # (tile,) weighted square of the whole run's phases
+    pixels: F64  # (tile,) with weight
 
     @classmethod
     def width(cls, n_batches: int) -> int:
@@ -117,7 +98,6 @@ def sum_row(
         Pixels that count.
     batches : (batch, y, x) float32
         Phases of the batches relative to the whole run's, rad; NaN in gaps.
-    carrier : Carrier
     plane : TilePlane
         Smooth phase of the tile.
     """

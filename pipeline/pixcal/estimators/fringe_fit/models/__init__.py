@@ -19,44 +19,24 @@ F64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Start:
-    """What a shape starts from.
+    """What a shape starts from."""
 
-    Attributes
-    ----------
-    k : (float, float)
-        Measured fringe vector (kx, ky) at the reference, rad/px.
-    reference : (float, float)
-        Point (y, x), px.
-    scale : float
-        Half the window's size, px.
-    planes : sequence
-        Unwrapped `geometry.TilePlane` of every tile, relative to the carrier
-        ``k . (r - reference)``.
-    wavelength_mm, pitch_mm, distance_mm : float
-        Nominal optics.
-    baseline_mm : (float, float)
-        Nominal baseline (x, y).
-    """
-
-    k: tuple[float, float]
-    reference: tuple[float, float]
-    scale: float
+    k: tuple[float, float]  # measured fringe vector (kx, ky) at the reference, rad/px
+    reference: tuple[float, float]  # point (y, x), px
+    scale: float  # half the window's size, px
+    # unwrapped `geometry.TilePlane` of every tile, relative to the carrier `k . (r -
+    # reference)`
     planes: Sequence[Any]
-    wavelength_mm: float
+    wavelength_mm: float  # wavelength_mm, pitch_mm, distance_mm: nominal optics
     pitch_mm: float
     distance_mm: float
-    baseline_mm: tuple[float, float]
+    baseline_mm: tuple[float, float]  # nominal baseline (x, y)
 
 
 class FringeShape(Protocol):
-    """A shape with its present parameters.
+    """A shape with its present parameters."""
 
-    Attributes
-    ----------
-    linear : bool
-        Whether the phase is linear in the coefficients, so that one step is all.
-    """
-
+    # whether the phase is linear in the coefficients, so that one step is all
     linear: ClassVar[bool]
 
     @classmethod

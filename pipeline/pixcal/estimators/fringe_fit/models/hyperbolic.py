@@ -13,40 +13,27 @@ from scipy.optimize import least_squares
 from pixcal.estimators.fringe_fit.models import F64, Start
 from pixcal.kernels.optics import PARAMETERS, Geometry, fringe_vector, phase, phase_jacobian
 
+# the foot of the fibres' centre: the laboratory places it to less than 2 cm (paper, 5.2)
 PRIOR_CENTRE_MM = 20.0
-"""The foot of the fibres' centre: the laboratory places it to less than 2 cm (paper, 5.2)."""
-PRIOR_DISTANCE = 0.025
-"""The distance, as a share: 10 mm of 400 mm."""
-PRIOR_BASELINE = 0.05
-"""Length and direction of the baseline, as a share of its length."""
-PRIOR_TILT = 0.02
-"""The baseline's tilt out of the detector's plane, as a share of its length."""
+PRIOR_DISTANCE = 0.025  # the distance, as a share: 10 mm of 400 mm
+PRIOR_BASELINE = 0.05  # length and direction of the baseline, as a share of its length
+PRIOR_TILT = 0.02  # the baseline's tilt out of the detector's plane, as a share of its length
 
 
 @dataclass(frozen=True)
 class Hyperbolic:
-    """Phase ``phase0 + 2 pi / lambda (|r - s_A| - |r - s_B|)``.
-
-    Attributes
-    ----------
-    geometry : Geometry
-        Present positions, from pixel (0, 0) of the window.
-    nominal : (6,) float64
-        Nominal values of the geometry's parameters, mm, in the order of
-        `pixcal.kernels.optics.PARAMETERS`.
-    sigma : (6,) float64
-        Their prior errors, mm; coefficients are counted in these.
-    reference : (float, float)
-        Point (y, x) where the phase is ``phase0``, px.
-    """
+    """Phase ``phase0 + 2 pi / lambda (|r - s_A| - |r - s_B|)``."""
 
     linear: ClassVar[bool] = False
 
     phase0: float
-    geometry: Geometry
+    geometry: Geometry  # present positions, from pixel (0, 0) of the window
+    # (6,) float64: nominal values of the geometry's parameters, mm, in the order of
+    # `pixcal.kernels.optics.PARAMETERS`
     nominal: tuple[float, ...]
+    # (6,) float64: their prior errors, mm; coefficients are counted in these
     sigma: tuple[float, ...]
-    reference: tuple[float, float]
+    reference: tuple[float, float]  # point (y, x) where the phase is `phase0`, px
 
     @classmethod
     def start(cls, start: Start) -> Self:
