@@ -1,4 +1,4 @@
-"""Fringe drift: ramps, settlings, walks and a vibration, told apart and from their like."""
+"""Fringe drift: ramps, settlings and walks, told apart and from their like."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from pixcal.simulation.recording import recordings
 
 Benches = Callable[..., Bench]
 Acquired = Callable[..., Evidence]
-OFF: dict[str, Any] = {"ramp": [0, 0], "settle": [0, 0], "walk": [0, 0], "vibration": [0, 0]}
+OFF: dict[str, Any] = {"ramp": [0, 0], "settle": [0, 0], "walk": [0, 0]}
 NONE = FringeDrift().scaled(0.0)
 
 
@@ -40,11 +40,6 @@ def test_each_part_does_what_it_says(make_effect_bench: Benches) -> None:
     _, walk = changes(bench, walk=(1e-5, 3e-5))
     hourly = np.diff(walk, axis=0).std(axis=0) * np.sqrt(3600 / 0.14)
     assert hourly == pytest.approx([1e-5, 3e-5], rel=0.02)
-    _, swung = changes(bench, vibration=(1e-5, 2e-5), vibration_hz=11.0)
-    # Mean over an exposure of 20 ms.
-    assert swung.std(axis=0) * np.sqrt(2) == pytest.approx(
-        np.array([1e-5, 2e-5]) * np.sinc(11.0 * 0.02), rel=0.01
-    )
 
 
 def test_what_is_not_random_is_told_for_a_fit_that_holds_the_vector(
@@ -64,7 +59,6 @@ def test_what_is_not_random_is_told_for_a_fit_that_holds_the_vector(
         {"ramp": [1e-2, -5e-3]},
         {"walk": [3e-4, 2e-4]},
         {"settle": [1e-4, 0.0], "settle_s": 5.0},
-        {"vibration": [6e-6, 8e-6], "vibration_hz": 1.7},
     ],
 )
 def test_its_parameters_are_found(acquired: Acquired, parameters: dict[str, Any]) -> None:
@@ -83,7 +77,6 @@ def test_its_parameters_are_found(acquired: Acquired, parameters: dict[str, Any]
             assert abs(got - value) < 4 * found.errors[key]
     # No part is named that is not there.
     assert (found.effect.settle != (0.0, 0.0)) == ("settle" in parameters)
-    assert (found.effect.vibration != (0.0, 0.0)) == ("vibration" in parameters)
 
 
 def test_errors_mean_something(acquired: Acquired) -> None:
@@ -93,22 +86,11 @@ def test_errors_mean_something(acquired: Acquired) -> None:
     assert 5e-5 < found.errors["ramp[0]"] < 3e-4
 
 
-def test_a_vibration_is_seen_folded_below_half_the_frame_rate(acquired: Acquired) -> None:
-    found = FringeDrift.estimate(
-        acquired(None, {"fringe_drift": OFF | {"vibration": [3e-5, 1e-5], "vibration_hz": 20.3}})
-    )
-    assert found is not None
-    assert isinstance(found.effect, FringeDrift)
-    folded = abs(20.3 - 3 / 0.14)
-    assert found.effect.vibration_hz == pytest.approx(folded, abs=4 * found.errors["vibration_hz"])
-    smeared = 3e-5 * np.sinc(20.3 * 0.02) / np.sinc(folded * 0.02)
-    assert abs(found.effect.vibration[0] - smeared) < 4 * found.errors["vibration[0]"]
-
-
 @pytest.mark.parametrize(
     "alike",
     [
         {"fringe_jitter": {"rms": [2.5e-5, 2.5e-5]}},
+        {"fringe_jitter": {"rms": [0.0, 0.0], "vibration": [3e-5, 1e-5]}},
         {"wavelength_drift": {"ramp": 1e-2, "walk": 0.0, "hop": 0.0}},
         {"wavelength_drift": {"ramp": 0.0, "walk": 3e-4, "hop": 0.0}},
         {"wavelength_drift": {"ramp": 0.0, "walk": 0.0, "hop": 3e-4, "hops_per_h": 250.0}},
@@ -135,7 +117,7 @@ def test_with_one_direction_of_fringes_it_says_what_it_cannot_tell(acquired: Acq
 
 def test_what_frames_did_is_replayed(acquired: Callable[..., Evidence]) -> None:
     """The slow vectors of the frames, whatever their law; what is white is left out."""
-    on = {"ramp": [0.02, 0.0], "settle": [0.0, 0.0], "walk": [0.0, 0.0], "vibration": [0.0, 0.0]}
+    on = {"ramp": [0.02, 0.0], "settle": [0.0, 0.0], "walk": [0.0, 0.0]}
     evidence = acquired(None, {"fringe_drift": on})
     again = FringeDrift().replayed(evidence)
     assert again is not None

@@ -15,7 +15,7 @@ from pixcal.simulation.recording import recordings
 
 Benches = Callable[..., Bench]
 Acquired = Callable[..., Evidence]
-OFF: dict[str, Any] = {"ramp": [0, 0], "settle": [0, 0], "walk": [0, 0], "vibration": [0, 0]}
+OFF: dict[str, Any] = {"ramp": [0, 0], "settle": [0, 0], "walk": [0, 0]}
 
 
 def test_the_vector_has_the_size_given_and_no_memory_whatever_the_window(
@@ -34,6 +34,16 @@ def test_the_vector_has_the_size_given_and_no_memory_whatever_the_window(
     assert found[0].std(axis=1) == pytest.approx([3e-5, 1e-5], rel=0.03)
     assert abs(np.corrcoef(found[0])[0, 1]) < 0.03
     assert abs(np.corrcoef(found[0][0, 1:], found[0][0, :-1])[0, 1]) < 0.03
+
+
+def test_a_vibration_is_the_mean_over_the_exposure(make_effect_bench: Benches) -> None:
+    bench = make_effect_bench({"frames.fringes.0.count": 20_000})
+    frames = next(r for r in recordings(bench) if r.kind == "fringes")
+    states = states_of(frames, (FringeJitter((0.0, 0.0), (1e-5, 2e-5), 11.0),))
+    swung = np.array([states.dkx, states.dky])
+    assert swung.std(axis=1) * np.sqrt(2) == pytest.approx(
+        np.array([1e-5, 2e-5]) * np.sinc(11.0 * 0.02), rel=0.01
+    )
 
 
 def test_frames_turn_about_the_middle_of_the_window(make_effect_bench: Benches) -> None:
@@ -65,11 +75,29 @@ def test_its_size_is_found(acquired: Acquired, rms: tuple[float, float]) -> None
 
 
 @pytest.mark.parametrize(
+    ("size", "hz", "folded"), [((6e-6, 8e-6), 1.7, 1.7), ((3e-5, 1e-5), 20.3, abs(20.3 - 3 / 0.14))]
+)
+def test_a_vibration_is_found_folded_below_half_the_frame_rate(
+    acquired: Acquired, size: tuple[float, float], hz: float, folded: float
+) -> None:
+    on = {"rms": [0.0, 0.0], "vibration": list(size), "vibration_hz": hz}
+    found = FringeJitter.estimate(acquired(None, {"fringe_jitter": on}))
+    assert found is not None
+    assert found.significance > 6
+    assert isinstance(found.effect, FringeJitter)
+    assert found.effect.vibration_hz == pytest.approx(folded, abs=4 * found.errors["vibration_hz"])
+    smeared = np.array(size) * np.sinc(hz * 0.02) / np.sinc(folded * 0.02)
+    for axis in range(2):
+        error = found.errors[f"vibration[{axis}]"]
+        assert abs(found.effect.vibration[axis] - smeared[axis]) < 4 * error
+        assert abs(found.effect.rms[axis]) < 4 * found.errors[f"rms[{axis}]"]
+
+
+@pytest.mark.parametrize(
     "alike",
     [
         {"fringe_drift": OFF | {"ramp": [1e-2, -5e-3]}},
         {"fringe_drift": OFF | {"walk": [3e-4, 2e-4]}},
-        {"fringe_drift": OFF | {"vibration": [3e-5, 1e-5], "vibration_hz": 20.3}},
         {"wavelength_drift": {"ramp": 0.0, "walk": 0.0, "hop": 3e-4, "hops_per_h": 250.0}},
         {"rolling_shutter": {}},
         {"lag": {"share": 0.01}},

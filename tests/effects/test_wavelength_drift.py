@@ -16,7 +16,7 @@ from pixcal.simulation.recording import recordings
 
 Benches = Callable[..., Bench]
 Acquired = Callable[..., Evidence]
-STILL = {"ramp": [0, 0], "settle": [0, 0], "walk": [0, 0], "vibration": [0, 0]}
+STILL = {"ramp": [0, 0], "settle": [0, 0], "walk": [0, 0]}
 
 
 def drift(**parameters: float) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""A bench that warms, creeps and swings: a fringe vector that changes in the course of a run."""
+"""A bench that warms and creeps: a fringe vector that changes in the course of a run."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,6 @@ from pixcal.estimators.frame_series.fringe_motion import (
     slow_vectors,
 )
 from pixcal.estimators.frame_series.series import FrameSeries
-from pixcal.estimators.frame_series.spectral_line import Line
 from pixcal.estimators.frame_series.variance_components import (
     MAX_STEPS,
     Components,
@@ -27,7 +26,6 @@ from pixcal.estimators.frame_series.variance_components import (
     log_chance_of_any,
     sigmas,
 )
-from pixcal.kernels.processes import swing
 from pixcal.kernels.scene import FrameStates
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.config import quantity
@@ -49,7 +47,7 @@ TRACKS = ("along_x", "along_y")
 
 @dataclass(frozen=True)
 class FringeDrift(Effect):
-    """Slow change of the fringe vector: a ramp, a settling, a random walk; and one vibration.
+    """Slow change of the fringe vector: a ramp, a settling, a random walk.
 
     The time of each fringe set runs from its first frame: fibres are moved between sets, and the
     mean vector of a set is fitted anyway. A slow change of the phase has no parameter: every frame
@@ -59,20 +57,18 @@ class FringeDrift(Effect):
     """
 
     name = "fringe_drift"
-    title = "fringe vector changing slowly, or swinging"
+    title = "fringe vector changing slowly"
     acts_at = Stage.LIGHT
     domains = ("time", "space")
-    strengths = ("ramp", "settle", "walk", "vibration", *TRACKS)
+    strengths = ("ramp", "settle", "walk", *TRACKS)
     absorbed_because = "the fit has a free fringe vector in each frame where it moves"
     frames_needed = ()
     sources = (
-        "Rousset et al., sections 4.2, 4.3 and 5.2: thermal deformations and low-frequency "
-        "vibrations move Kx, Ky; one of two data sets drifts after 30 minutes",
+        "Rousset et al., sections 4.2, 4.3 and 5.2: thermal deformations move Kx, Ky; one of two "
+        "data sets drifts after 30 minutes",
         "thermal expansion of aluminium 23e-6/K (CRC Handbook of Chemistry and Physics): two posts "
         "of 100 mm that differ by 0.1 K move the fibres against each other by 0.23 um, 2.5e-5 "
         "rad/px",
-        "C. G. Gordon 1992, Proc. SPIE 1619, 71: laboratory floors of 12 um/s rms (curve VC-C), "
-        "0.1 um at 20 Hz",
     )
 
     ramp: tuple[float, float] = quantity(
@@ -85,13 +81,6 @@ class FringeDrift(Effect):
     walk: tuple[float, float] = quantity(
         (1e-5, 1e-5), unit="rad/px/h^0.5", low=0, high=10, doc="random walk along x and y"
     )
-    vibration: tuple[float, float] = quantity(
-        (1e-5, 1e-5), unit="rad/px", low=0, high=0.1, doc="amplitude along x and y"
-    )
-    vibration_hz: float = quantity(
-        20.3, unit="Hz", low=0, high=1e4, doc="its frequency; frames see it folded below half "
-        "their rate"
-    )  # fmt: skip
     along_x: tuple[Track, ...] = quantity((), doc="slow change of kx as measured, rad/px")
     along_y: tuple[Track, ...] = quantity((), doc="slow change of ky as measured, rad/px")
 
@@ -129,9 +118,7 @@ class FringeDrift(Effect):
         time = np.arange(recording.count, dtype=float) * recording.period_s
         steps = recording.rng(self.name).standard_normal((recording.count, 2))
         walk = np.cumsum(steps, axis=0) * np.sqrt(recording.period_s / HOUR_S)
-        phase = 2 * np.pi * recording.rng(self.name, 1).random()
-        swung = swing(time, self.vibration_hz, phase, recording.exptime_s)
-        change = self.vector_change(time) + walk * self.walk + np.outer(swung, self.vibration)
+        change = self.vector_change(time) + walk * self.walk
         name = recording.bench.frames.fringes[recording.number].name
         change += np.stack([at(self.along_x, name, time), at(self.along_y, name, time)], axis=1)
         return replace(states, dkx=states.dkx + change[:, 0], dky=states.dky + change[:, 1])
@@ -143,12 +130,11 @@ class FringeDrift(Effect):
             tuple(Track.of(name, time, vector[:, axis]) for name, time, vector in courses)
             for axis in (0, 1)
         )
-        calm = replace(self.scaled(0.0), vibration=self.vibration)
-        return replace(calm, along_x=x, along_y=y)
+        return replace(self.scaled(0.0), along_x=x, along_y=y)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Ramp, settling and walk of the frames' own vectors, and the line in their spectrum.
+        """Ramp, settling and walk of the frames' own vectors.
 
         Where sets have fringes of different directions, a change of wavelength is told apart and
         does not count here; with one direction it cannot be.
@@ -161,14 +147,10 @@ class FringeDrift(Effect):
         steady = motion.components(parts, absent=PARTS[2:])
         walks = joint_log_chance(slow, steady, slow.size[2:4])
         values, errors, ramped = _slow_parameters(motion, parts)
-        line = 0.0 if motion.line is None else motion.line.log_chance
-        if motion.line is not None and motion.line.sure:
-            swung = _vibration(motion.line, motion.series[0].exptime_s)
-            values, errors = values | swung[0], errors | swung[1]
         return Estimate(
             replace(cls().scaled(0.0), **values),
             errors,
-            sigmas(log_chance_of_any([walks, ramped, line])),
+            sigmas(log_chance_of_any([walks, ramped])),
             "slow change of the fringe vector beyond its white noise"
             + (
                 "" if motion.crossed else "; along the fringe axis, wavelength drift looks the same"
@@ -176,7 +158,6 @@ class FringeDrift(Effect):
             {
                 "walk_sigmas": sigmas(walks),
                 "ramp_sigmas": sigmas(ramped),
-                "vibration_sigmas": sigmas(line),
             },
         )
 
@@ -256,15 +237,6 @@ def _shapes(
             slope = fade * series.time_s / tau**2
             shapes.append(slope[:, None, None] * np.array(size)[:, None])
     return np.concatenate(shapes, axis=2)
-
-
-def _vibration(line: Line, exptime_s: float) -> tuple[dict[str, Any], dict[str, float]]:
-    """Values and errors by field, the smear of the exposure taken off."""
-    smear = float(np.sinc(line.hz * (exptime_s if np.isfinite(exptime_s) else 0.0)))
-    size, error = line.amplitude / smear, line.amplitude_error / smear
-    errors = {"vibration_hz": line.hz_error}
-    errors |= {f"vibration[{i}]": float(error[i]) for i in range(2)}
-    return {"vibration": _pair(size), "vibration_hz": line.hz}, errors
 
 
 def _pair(values: F64) -> tuple[float, float]:

@@ -1,12 +1,19 @@
-"""Fibres that shake from one frame to the next: a fringe vector of its own in every frame."""
+"""Fibres that shake: a fringe vector of its own in every frame."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.fringe_motion import motion_of, ramps
-from pixcal.estimators.frame_series.variance_components import joint_log_chance, sigmas
+from pixcal.estimators.frame_series.spectral_line import Line
+from pixcal.estimators.frame_series.variance_components import (
+    joint_log_chance,
+    log_chance_of_any,
+    sigmas,
+)
+from pixcal.kernels.processes import swing
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
@@ -15,7 +22,7 @@ from pixcal.simulation.recording import Recording
 
 @dataclass(frozen=True)
 class FringeJitter(Effect):
-    """A random change of the fringe vector in every frame, white, of its own along x and y.
+    """A random change of the fringe vector in every frame, white, along x and y; and a vibration.
 
     Two fibre tips that move against each other by d change the vector by ``2 pi pitch d /
     (wavelength distance)``, whatever the baseline and the window: 1.1e-4 rad/px a micrometre on the
@@ -28,11 +35,12 @@ class FringeJitter(Effect):
     title = "fringe vector changing from frame to frame"
     acts_at = Stage.LIGHT
     domains = ("time", "space")
-    strengths = ("rms",)
+    strengths = ("rms", "vibration")
     absorbed_because = "the fit has a free fringe vector in each frame where it moves"
     frames_needed = ()
     sources = (
-        "Rousset et al., sections 4.2 and 5.2: fringe residuals are laid to changing Kx, Ky",
+        "Rousset et al., sections 4.2 and 5.2: fringe residuals are laid to changing Kx, Ky, and "
+        "these to low-frequency vibrations",
         "C. G. Gordon 1992, Proc. SPIE 1619, 71: laboratory floors of 12 to 50 um/s rms (curves "
         "VC-C to VC-A), which at 30 Hz is 0.07 to 0.27 um",
     )
@@ -40,16 +48,26 @@ class FringeJitter(Effect):
     rms: tuple[float, float] = quantity(
         (2.5e-5, 2.5e-5), unit="rad/px", low=0, high=0.1, doc="of the vector along x and y"
     )
+    vibration: tuple[float, float] = quantity(
+        (0.0, 0.0), unit="rad/px", low=0, high=0.1, doc="amplitude along x and y"
+    )
+    vibration_hz: float = quantity(
+        20.3, unit="Hz", low=0, high=1e4, doc="its frequency; frames see it folded below half "
+        "their rate"
+    )  # fmt: skip
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         """As in `Effect.states`."""
         drawn = recording.rng(self.name).standard_normal((recording.count, 2))
-        change = drawn * np.array(self.rms)
+        time = np.arange(recording.count, dtype=float) * recording.period_s
+        phase = 2 * np.pi * recording.rng(self.name, 1).random()
+        swung = swing(time, self.vibration_hz, phase, recording.exptime_s)
+        change = drawn * np.array(self.rms) + np.outer(swung, self.vibration)
         return replace(states, dkx=states.dkx + change[:, 0], dky=states.dky + change[:, 1])
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """White part of the frames' own vectors beyond the noise, beside what drifts or swings.
+        """White part of the frames' own vectors beyond the noise, and the line in their spectrum.
 
         The noise is measured, from two halves of the pixels (`FringeEvidence.halves`).
         """
@@ -60,11 +78,31 @@ class FringeJitter(Effect):
         full = motion.components(parts, ramps)
         less = motion.components(parts, ramps, absent=("jitter_x", "jitter_y"))
         (x, x_error), (y, y_error) = full.root(0), full.root(1)
+        white = joint_log_chance(full, less, full.size[:2])
+        line = 0.0 if motion.line is None else motion.line.log_chance
+        values: dict[str, Any] = {"rms": (min(x, 0.1), min(y, 0.1))}
+        errors = {"rms[0]": x_error, "rms[1]": y_error}
+        if motion.line is not None and motion.line.sure:
+            swung = _vibration(motion.line, motion.series[0].exptime_s)
+            values, errors = values | swung[0], errors | swung[1]
         return Estimate(
-            cls((min(x, 0.1), min(y, 0.1))),
-            {"rms[0]": x_error, "rms[1]": y_error},
-            sigmas(joint_log_chance(full, less, full.size[:2])),
+            replace(cls().scaled(0.0), **values),
+            errors,
+            sigmas(log_chance_of_any([white, line])),
             "scatter of the fringe vector from frame to frame beyond drift, correlated between two "
             "halves of the pixels",
-            {"frames": sum(map(len, motion.series))},
+            {
+                "frames": sum(map(len, motion.series)),
+                "white_sigmas": sigmas(white),
+                "vibration_sigmas": sigmas(line),
+            },
         )
+
+
+def _vibration(line: Line, exptime_s: float) -> tuple[dict[str, Any], dict[str, float]]:
+    """Values and errors by field, the smear of the exposure taken off."""
+    smear = float(np.sinc(line.hz * (exptime_s if np.isfinite(exptime_s) else 0.0)))
+    size, error = line.amplitude / smear, line.amplitude_error / smear
+    errors = {"vibration_hz": line.hz_error}
+    errors |= {f"vibration[{i}]": float(error[i]) for i in range(2)}
+    return {"vibration": (float(size[0]), float(size[1])), "vibration_hz": line.hz}, errors

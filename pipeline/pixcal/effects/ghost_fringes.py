@@ -18,6 +18,11 @@ F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
 
 PARENTS = ("modulated", "fixed", "both", "crossed")
+BOTH = "ghosts of both fibres"
+UNTIED = 0.5
+"""Share of the chi-square of the waves that the law of a beam may leave."""
+ALIKE, ALIKE_SIGMAS = 0.1, 5.0
+"""Differences between sets, relative and in errors, of a pattern that is the flat's."""
 
 
 @dataclass(frozen=True)
@@ -178,11 +183,14 @@ class GhostFringes(Effect):
                                ("backward", one.errors[2])):  # fmt: skip
                 errors |= {f"waves[{n}].{key}[{part}]": error for part in (0, 1)}
             errors |= {f"waves[{n}].beat_rad_px[{axis}]": one.errors[3 + axis] for axis in (0, 1)}
-        law, tied = _law(found.waves, middle)
+        law, tied, left = _law(found.waves, middle)
+        # Beams interfere with each other: fringes alone, or a static pattern that is not theirs,
+        # is no reflection. What multiplies both alike, in all sets, is the flat's.
+        a_beam = left < UNTIED and not (law == BOTH and _of_the_flat(found.waves, evidence))
         return Estimate(
             cls(0.0, waves[0].beat_rad_px, in_flats=found.in_flats, waves=tuple(waves)),
             errors,
-            found.significance,
+            found.significance if a_beam else 0.0,
             "fringes of a common vector in " + " and ".join(found.seen_in),
             {"sigmas_by_map": found.by_map},
             law=law,
@@ -209,13 +217,14 @@ def _pair(value: complex) -> tuple[float, float]:
 
 def _law(
     waves: Sequence[WaveFit], middle: tuple[float, float]
-) -> tuple[str, tuple[GhostWave, ...]]:
-    """What ties the amplitudes of the waves: the law, and the waves that follow it."""
+) -> tuple[str, tuple[GhostWave, ...], float]:
+    """What ties the amplitudes of the waves: the law, the waves that follow it, and the share of
+    their chi-square that it leaves."""
     laws = {
         "static pattern alone: a ghost crossed in polarisation with the other fibre": (1, 0, 0),
         "ghost of the modulated fibre: static pattern and fringes that follow": (1, 1, 0),
         "ghost of the fixed fibre: static pattern and fringes that follow": (1, 0, 1),
-        "ghosts of both fibres": (2, 1, 1),
+        BOTH: (2, 1, 1),
     }
     best = None
     for law, (s, f, b) in laws.items():
@@ -234,4 +243,24 @@ def _law(
         if best is None or misfit < best[0]:
             best = misfit, law, tuple(tied)
     assert best is not None
-    return best[1], best[2]
+    total = sum(
+        abs(v) ** 2 / e**2
+        for w in waves
+        for v, e in zip((w.static, w.forward, w.backward), w.errors, strict=False)
+    )
+    return best[1], best[2], best[0] / total
+
+
+def _of_the_flat(waves: Sequence[WaveFit], evidence: Evidence) -> bool:
+    """Whether the waves of all sets are one pattern, as an error of the flats makes."""
+    first = waves[0]
+    same = [w for w in waves if w.q == first.q]
+    return (
+        any(evidence.of_kind("flat"))
+        and len(same) == len(evidence.fringes)
+        and all(
+            abs(w.static - first.static)
+            < ALIKE * abs(first.static) + ALIKE_SIGMAS * np.hypot(w.errors[0], first.errors[0])
+            for w in same
+        )
+    )

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.fft import idct
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.series import MEDIAN, SLOW, FrameSeries, assemble, motion_series
+from pixcal.estimators.frame_series.series import MEDIAN, FrameSeries, assemble, motion_series
 from pixcal.estimators.frame_series.spectral_line import Line, find_line, without_line
 from pixcal.estimators.frame_series.variance_components import (
     MAX_STEPS,
@@ -31,6 +31,10 @@ HOP_WINDOWS = (2, 4, 8, 16, 32)  # frames before and after, of which the means a
 SURE_HOP = 6.5
 SURE_STEP = 2.5  # standard deviations of a hop beside a slope, which tells half as well
 MOST_HOPS = 64
+OCTAVE = 1.4
+"""Ratio of frequencies over which the power of a slow change hardly differs."""
+SLOW_SIGMAS = 3.0
+"""Excess of the power over that of white noise, in errors, that is a slow change's."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +116,8 @@ def motion_of(evidence: Evidence) -> Motion | None:
 def slow_vectors(evidence: Evidence) -> list[tuple[str, F64, F64]]:
     """Of every set: name, times (t,), and slow change (t, 2) of the fringe vector, rad/px.
 
-    The first cosine modes, each smaller than it was seen by the share that is noise (Wiener).
+    Cosine modes, each smaller than it was seen by the share of white noise in those of about its
+    frequency (Wiener); a walk has many of them, a ramp few.
     """
     found = []
     for fringes in evidence.fringes.values():
@@ -120,10 +125,16 @@ def slow_vectors(evidence: Evidence) -> list[tuple[str, F64, F64]]:
         if series is None:
             continue
         modes = cosine_modes(series.values)
-        noise = np.median(modes[SLOW:] ** 2, axis=0) / MEDIAN
-        kept = modes[:SLOW] * np.maximum(1 - noise / np.maximum(modes[:SLOW] ** 2, 1e-300), 0)
+        noise = np.median(modes[len(modes) // 2 :] ** 2, axis=0) / MEDIAN
+        order = np.arange(len(modes))
+        first = np.floor((order + 1) / OCTAVE).astype(int)
+        last = np.minimum(np.ceil((order + 1) * OCTAVE).astype(int), len(modes))
+        sums = np.concatenate([np.zeros((1, 2)), np.cumsum(modes**2, axis=0)])
+        count = (last - first)[:, None]
+        power = (sums[last] - sums[first]) / count
+        slow = power > noise * (1 + SLOW_SIGMAS * np.sqrt(2 / count))
         every = np.zeros_like(series.values)
-        every[1 : len(kept) + 1] = kept
+        every[1 : len(modes) + 1] = modes * np.where(slow, 1 - noise / power, 0)
         found.append((series.name, series.time_s, idct(every, type=2, norm="ortho", axis=0)))
     return found
 

@@ -62,8 +62,7 @@ def _walk(s: float, rng: np.random.Generator) -> Plain:
 
 def _vibration(s: float, rng: np.random.Generator) -> Plain:
     along = [abs(part) for part in _around(s, rng)]
-    more = {"vibration": along, "vibration_hz": float(rng.uniform(0.3, 3.0))}
-    return {name: [0.0, 0.0] for name in _DRIFT} | more
+    return {"rms": [0.0, 0.0], "vibration": along, "vibration_hz": float(rng.uniform(0.3, 3.0))}
 
 
 def _jitter(s: float, rng: np.random.Generator) -> Plain:
@@ -98,7 +97,7 @@ def _bent(s: float, rng: np.random.Generator) -> Plain:
 
 
 _BIAS = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e")
-_DRIFT = ("ramp", "settle", "walk", "vibration")
+_DRIFT = ("ramp", "settle", "walk")
 _ROWS = ("row_rms", "flicker_rms", "interlace_rms", "column_rms")
 _CODES = ("coarse_adu", "dnl_rms", "ripple")
 _WAVE = ("ramp", "walk", "hop")
@@ -120,8 +119,8 @@ WAYS = (
         lambda s, rng: {"pixel_rms": 0.0, "smooth_rms": s, "scale_px": _between(3, 12, rng)}),
     Way("fringe_drift", "random walk, rad/(px h^0.5)", 1.9e-4, 2.5e-5, _walk),
     Way("fringe_drift", "ramp, rad/(px h)", 0.0018, 1.4e-4, _ramp),
-    Way("fringe_drift", "vibration, rad/px", 4.7e-6, 1.1e-6, _vibration),
     Way("fringe_jitter", "vector, rad/px", 7.5e-6, 1.3e-6, _jitter),
+    Way("fringe_jitter", "vibration, rad/px", 4.7e-6, 1.1e-6, _vibration),
     Way("gain_error", "relative", 0.024, 0.0085, lambda s, rng: {"relative": _either(s, rng)}),
     Way("ghost_fringes", "share", 2.7e-4, 1.3e-4, _ghost),
     Way("hyperbolic_fringes", "foot, mm", 12, 1.1, lambda s, rng: {"foot_mm": _around(s, rng)}),
