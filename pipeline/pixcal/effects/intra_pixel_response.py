@@ -111,8 +111,9 @@ class IntraPixelResponse(Effect):
                 "width_px[1]": float(width_error),
                 "width_rms_px": float(its_error / (2 * max(rms, np.sqrt(its_error)))),
             },
-            float(max(square / error, scatter / its_error)),
-            "visibility that falls with closer fringes, and its scatter from pixel to pixel",
+            # Pairs of fibres of other powers have another visibility, which is nominal.
+            float(scatter / its_error),
+            "visibility that scatters from pixel to pixel, the more the closer the fringes",
             {"of_width": float(square / error), "of_scatter": float(scatter / its_error)},
         )
 
