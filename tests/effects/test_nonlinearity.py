@@ -7,7 +7,7 @@ import galsim
 import numpy as np
 import pytest
 
-from pixcal.effects.nonlinearity import Nonlinearity
+from pixcal.effects.nonlinearity import Bend, Nonlinearity
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
@@ -47,7 +47,13 @@ def test_the_response_is_the_published_polynomial() -> None:
 
 @pytest.mark.parametrize(
     "effect",
-    [Nonlinearity(), Nonlinearity(-0.1, 0.05), Nonlinearity(0.2, 0.1), Nonlinearity(0.0, -0.3)],
+    [
+        Nonlinearity(),
+        Nonlinearity(-0.1, 0.05),
+        Nonlinearity(0.2, 0.1),
+        Nonlinearity(0.0, -0.3),
+        Nonlinearity(0.01, 0.0, bends=(Bend(0.0, 0.0), Bend(900.0, 40.0), Bend(50_000.0, -30.0))),
+    ],
 )
 def test_the_inverse_gives_the_charge_back(effect: Nonlinearity) -> None:
     charge = np.linspace(-200, 60_000, 999, dtype=np.float32)
@@ -103,6 +109,32 @@ def test_its_coefficients_are_found(acquired: Callable[..., Evidence], truth: No
     assert found is not None
     assert max(found.errors.values()) < 3e-4
     assert found.significance > 15
+
+
+def test_another_response_is_measured_beside_the_polynomial(
+    acquired: Callable[..., Evidence],
+) -> None:
+    """The first electrons are lost: no polynomial of third order, and seen in dark fringes only."""
+    levels = np.concatenate([np.geomspace(30, 6_000, 40), [60_000]])
+    lost = -150 * (1 - np.exp(-levels / 1200))
+    points = [{"level_e": 0.0, "change_e": 0.0}]
+    points += [
+        {"level_e": float(a), "change_e": float(b)} for a, b in zip(levels, lost, strict=True)
+    ]
+    on = {"quadratic": 0.0, "cubic": 0.0, "bends": points}
+    found = Nonlinearity.estimate(acquired(None, {"nonlinearity": on}))
+    assert found is not None
+    assert isinstance(found.effect, Nonlinearity)
+    assert isinstance(found.by_law, Nonlinearity)
+    assert found.by_law.bends == ()
+    lit = np.linspace(2_000, 44_000, 200, dtype=np.float32)
+    truth = np.interp(lit, levels, lost)
+    # Without what fringes do not tell: an offset and a factor.
+    for one, most in ((found.effect, 4.0), (found.by_law, np.inf)):
+        rest = one.response(lit) - lit - truth
+        rest -= np.polyval(np.polyfit(lit, rest, 1), lit)
+        assert rest.std() < most
+    assert rest.std() > 8.0
 
 
 def test_bad_samples_do_not_matter(acquired: Callable[..., Evidence]) -> None:

@@ -1,6 +1,8 @@
 """Response of the pixel and its amplifier that is not a straight line."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +10,11 @@ from numpy.typing import NDArray
 from pixcal.effects.gain_error import transfer_curve
 from pixcal.estimators.detector.flat_ladder import ladder_response
 from pixcal.estimators.detector.neighbours import shared_charge
-from pixcal.estimators.detector.response import fit_response
+from pixcal.estimators.detector.response import fit_curve, fit_response
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.middle import middle
 from pixcal.kernels.boundaries import boundary_shifts
-from pixcal.kernels.significance import sigmas_of_chi2
+from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
@@ -25,15 +27,31 @@ F64 = NDArray[np.float64]
 FALLOFF_PX = 0.5
 """Of the shift of boundaries by the brighter-fatter effect beside the response."""
 
-_TURNS = 30
+KNOTS = np.array([0, 1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 3 / 4, 7 / 8, 1])
+"""Levels, as shares of the brightest, between which a measured response is a straight line."""
+
+BESIDE = 0.05
+"""Chi-square of a measured response beside a polynomial, over that of the polynomial, from which it
+is told."""
+
+_INVERSE = 1 << 14
 _NOT_TOLD = 1e-3
 _OTHER_ORDER = 4
+
+
+@dataclass(frozen=True)
+class Bend:
+    """A point of a measured response."""
+
+    level_e: float = quantity(unit="e-", low=0, high=1e8, doc="charge")
+    change_e: float = quantity(unit="e-", low=-1e7, high=1e7, doc="signal beyond the polynomial")
 
 
 @dataclass(frozen=True)
 class Nonlinearity(Effect):
     """Signal ``S (1 + quadratic u + cubic u²)`` of a charge S, with ``u = S / level_e``.
 
+    ``bends`` is what a measured response has beside the polynomial, straight between its points.
     It is not linear in the intensity, so maps alone tell neither what it does nor what would be
     without it (the offsets hardly change; harmonics of the phase are left in the residuals);
     `linearised` undoes it on samples.
@@ -43,7 +61,7 @@ class Nonlinearity(Effect):
     title = "response that is not a straight line"
     acts_at = Stage.SIGNAL
     domains = ("intensity",)
-    strengths = ("quadratic", "cubic")
+    strengths = ("quadratic", "cubic", "bends")
     frames_needed = ("ladder",)
     quick = False
     sources = (
@@ -61,6 +79,19 @@ class Nonlinearity(Effect):
     level_e: float = quantity(
         50_000.0, unit="e-", above=0, high=1e7, doc="where the deviations are given: the full well"
     )
+    bends: tuple[Bend, ...] = quantity((), doc="points of the response as measured, rising")
+
+    def scaled(self, factor: float) -> Self:
+        """As in `Effect.scaled`."""
+        bends = tuple(replace(bend, change_e=factor * bend.change_e) for bend in self.bends)
+        return replace(
+            self, quadratic=factor * self.quadratic, cubic=factor * self.cubic, bends=bends
+        )
+
+    @property
+    def is_null(self) -> bool:
+        """As in `Effect.is_null`."""
+        return not (self.quadratic or self.cubic or any(bend.change_e for bend in self.bends))
 
     @property
     def turns_at(self) -> float:
@@ -83,25 +114,24 @@ class Nonlinearity(Effect):
         """Signal of a charge, e-; where the polynomial would fall again it stays at its top."""
         u = np.minimum(charge / np.float32(self.level_e), np.float32(self.turns_at))
         bent = u * (1 + u * (np.float32(self.quadratic) + np.float32(self.cubic) * u))
-        return np.asarray(bent * np.float32(self.level_e), np.float32)
+        signal = np.asarray(bent * np.float32(self.level_e), np.float32)
+        if self.bends:
+            levels = [bend.level_e for bend in self.bends]
+            changes = [bend.change_e for bend in self.bends]
+            signal += np.interp(charge, levels, changes).astype(np.float32)
+        return signal
 
     def linearised(self, signal: F32) -> F32:
-        """Charge that gives a signal, e-: the inverse of `response`, by Newton's method.
+        """Charge that gives a signal, e-: the inverse of `response`, from a table.
 
         Signals beyond the top of the response give the charge at the top; NaN stays NaN.
         """
-        top = min(self.turns_at, 1e3)
-        wanted = np.asarray(signal, float) / self.level_e
-        wanted = np.minimum(wanted, top * (1 + top * (self.quadratic + top * self.cubic)))
-        u = np.minimum(wanted, top)
-        for _ in range(_TURNS):
-            value = u * (1 + u * (self.quadratic + u * self.cubic))
-            slope = 1 + u * (2 * self.quadratic + 3 * u * self.cubic)
-            step = (value - wanted) / np.maximum(slope, 1e-3)
-            u = np.minimum(u - step, top)
-            if not np.any(np.abs(step) > 1e-9):
-                break
-        return np.asarray(u * self.level_e, np.float32)
+        wanted = np.asarray(signal, float)
+        brightest = float(np.nanmax(wanted, initial=self.level_e, where=np.isfinite(wanted)))
+        top = min(self.turns_at * self.level_e, 2 * brightest)
+        charge = np.linspace(2 * float(np.nanmin(wanted, initial=0.0)), top, _INVERSE)
+        given = np.maximum.accumulate(self.response(charge.astype(np.float32)).astype(float))
+        return np.asarray(np.interp(wanted, given, charge), np.float32)
 
     def undo_samples(self, charge: F32) -> F32:
         """As in `Effect.undo_samples`."""
@@ -147,13 +177,33 @@ class Nonlinearity(Effect):
         found = sizes[:2] @ np.linalg.solve(covariance[:2, :2], sizes[:2])
         quadratic, cubic = (float(np.clip(v, -0.3, 0.3)) for v in sizes[:2])
         errors = np.sqrt(np.diag(covariance))
+        effect, significance = cls(quadratic, cubic, level), sigmas_of_chi2(float(found), 2)
+        more = None
+        if evidence.fringes and significance > SIGNIFICANT:
+            more = _bends(part, effect.response, float(found))
+        named = {"quadratic": float(errors[0]), "cubic": float(errors[1])}
+        if more is None:
+            return Estimate(effect, named, significance, why, details)
+        named |= {f"bends[{n}].change_e": error for n, error in enumerate(more[1])}
         return Estimate(
-            cls(quadratic, cubic, level),
-            {"quadratic": float(errors[0]), "cubic": float(errors[1])},
-            sigmas_of_chi2(float(found), 2),
-            why,
-            details,
-        )
+            replace(effect, bends=more[0]), named, significance, why, details,
+            law="response curve of second and third order", by_law=effect,
+        )  # fmt: skip
+
+
+def _bends(
+    evidence: Evidence, response: Callable[[F32], F32], chi2_of_polynomial: float
+) -> tuple[tuple[Bend, ...], list[float]] | None:
+    """Points of the response beside a polynomial, and their errors; None where it has none."""
+    top = max(float(np.nanquantile(f.electrons[::7], 0.999)) for f in evidence.fringes.values())
+    knots = KNOTS * top
+    change, covariance = fit_curve(evidence, response, knots)
+    chi2 = float(change @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ change)
+    told = sigmas_of_chi2(chi2, len(change) - 2) > SIGNIFICANT
+    if not told or chi2 < BESIDE * chi2_of_polynomial:
+        return None
+    bends = tuple(Bend(float(k), float(c)) for k, c in zip(knots, [0.0, *change], strict=True))
+    return bends, [0.0, *map(float, np.sqrt(np.diag(covariance)))]
 
 
 def _full_scale(evidence: Evidence, usual: float) -> float:

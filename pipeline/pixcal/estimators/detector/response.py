@@ -5,7 +5,7 @@ the phase: a response the same for all fringes, moving boundaries (brighter-fatt
 on the fringes' spacing.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +22,7 @@ UNIT = 1e-7  # shift of boundaries (px per electron) that is fitted as one
 # in equal steps of the logarithm, nearly; what the boundaries' shift may fall by is looked for
 # among these
 FALLOFFS_PX = (0.25, 0.35, 0.5, 0.7, 1.0, 1.4, 2.0)
+LOOSE = 0.02  # departure from a response, of full scale, that is unlikely without data
 TOLD = 0.5  # error of the falloff's logarithm with which it is told from others
 
 
@@ -90,6 +91,46 @@ def fit_response(
     scale = np.ones(powers + 1)
     scale[-1] = UNIT
     return sizes * scale, covariance * np.outer(scale, scale)
+
+
+def fit_curve(evidence: Evidence, response: Callable[[F32], F32], knots_e: F64) -> tuple[F64, F64]:
+    """What the signal departs from a response, straight between knots, from all fringe sets.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        With fringes.
+    response : callable
+        Signal (t, y, x) of a charge of that shape, e-.
+    knots_e : (n,) float64
+        Levels, rising, e-, the first zero, where there is no departure.
+
+    Returns
+    -------
+    change_e : (n - 1,) float64
+        At the other knots, e-. Fringes tell neither an offset nor a factor: the departure has
+        none, from the third knot on.
+    covariance : (n - 1, n - 1) float64
+    """
+    unit = np.eye(len(knots_e))[1:-1]
+
+    def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> tuple[F32, Iterable[F32]]:
+        level = evidence.level(fringes, signal)
+        flat = evidence.flat.astype(np.float32)
+        change = response(level) - level + np.interp(level, knots_e, sizes @ unit)
+        slopes = (np.interp(level, knots_e, one).astype(np.float32) / flat for one in unit)
+        return np.asarray(change / flat, np.float32), slopes
+
+    prior = np.zeros(len(unit)), np.full(len(unit), (LOOSE * knots_e[-1]) ** -2)
+    sizes, covariance = fit_distortions(
+        tuple(evidence.fringes.values()), distortion, len(unit), prior=prior
+    )
+    straight = np.stack([np.ones(len(unit) + 1), knots_e[1:]], axis=1)
+    straight /= np.abs(straight).max(axis=0)
+    taken = straight @ np.linalg.pinv(straight[1:])
+    rest = np.eye(len(unit) + 1) - np.pad(taken, ((0, 0), (1, 0)))
+    rest = rest[:, :-1]  # nothing at the last knot
+    return rest @ sizes, rest @ covariance @ rest.T
 
 
 @dataclass(frozen=True)
