@@ -191,3 +191,16 @@ def test_uneven_codes_are_as_uneven_where_float32_is_coarse() -> None:
         codes = ripple.converted(adu, 1, 65535.0, normals).astype(int)
         found.append(2 * np.mean(codes % 2 == 0) - 1)
     assert np.mean(found) == pytest.approx(0.007, abs=4 / 2e3)
+
+
+def test_bits_that_leave_codes_out_are_no_coarse_step(acquired: Callable[..., Evidence]) -> None:
+    """A code in 256 that never comes is a wrong bit, though a step of 1 + 1/256 makes such too."""
+    bits = (0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.4, -1.4, -1.5, 0.1, 3.9)
+    on = {"coarse_adu": 0.0, "dnl_rms": 0.0, "ripple": 0.0, "bits": list(bits)}
+    evidence = acquired({"detector.gain_e_per_adu": 25.0}, {"quantisation": on})
+    found = Quantisation.estimate(evidence)
+    assert found is not None
+    assert isinstance(found.effect, Quantisation)
+    assert found.effect.coarse_adu == 0
+    assert found.effect.bits[8] < -0.5
+    assert found.significance > 6

@@ -28,6 +28,7 @@ F64 = NDArray[np.float64]
 
 FARTHEST = 0.98
 """A step between codes moves by less than a code, so that only its neighbours need be asked."""
+FEW_MISSING = 1.1  # step up to which wrong bits may be why codes never come, every so often
 _KEY = 997
 
 
@@ -175,9 +176,11 @@ class Quantisation(Effect):
             shot = LEAST_NOISE**2 - noise**2
             first = float(np.median(evidence.bias)) / step + shot * step * evidence.gain
             noise = LEAST_NOISE
-        widths = (
-            None if counts is None else code_widths(converter_counts(counts, step), noise, first)
-        )
+        widths = None
+        if counts is not None:
+            if 1 < step < FEW_MISSING and _has_wrong_bits(code_widths(counts, noise, first)):
+                step = 1.0
+            widths = code_widths(converter_counts(counts, step), noise, first)
         values: dict[str, Any] = {"coarse_adu": step - 1, "dnl_rms": 0.0, "ripple": 0.0}
         errors = {"coarse_adu": step_error}
         found = [-1.0 if step == 1 else min((step - 1) / step_error, 1e6)]
@@ -207,6 +210,11 @@ def _reached(effect: Quantisation, specimen: int, codes: int) -> F64:
     """From where on a sample is given a code or a higher one: a bit is taken if it fits."""
     begins = effect.thresholds(specimen, codes)
     return np.asarray(np.minimum.accumulate(begins[::-1])[::-1])
+
+
+def _has_wrong_bits(widths: CodeWidths | None) -> bool:
+    """Whether codes are wide or narrow where some bit changes, beyond their scatter."""
+    return widths is not None and "bits" in _uneven(widths)[0]
 
 
 def _uneven(widths: CodeWidths) -> tuple[dict[str, Any], dict[str, float], list[float]]:
