@@ -1,6 +1,7 @@
 """Crests and valleys: where they are, how well, and the fibres that they give."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,17 +21,51 @@ from pixcal.stages.crests.crest_fit import (
     valley,
 )
 from pixcal.stages.crests.crests import (
-    ArrayFrames,
+    SEED_PIXELS,
     Carrier,
     CrestPaths,
     Windows,
-    crests_of_frames,
+    find_crests,
+    seed_vector,
     tile_sums,
 )
 
 F64 = NDArray[np.float64]
 WIDE_PITCH = 40e-3
 """mm: a window of a few hundred such pixels spans the angles of a whole large detector."""
+
+
+@dataclass(frozen=True)
+class ArrayFrames:
+    """Frames in memory, as an `Accumulate`."""
+
+    frames: NDArray[Any]  # (t, y, x) electrons; not finite: no sample
+    good: NDArray[np.bool_]  # (y, x)
+
+    def __call__(self, frame: int, windows: Windows, carrier: Carrier) -> F64:
+        sums = np.zeros((*windows.shape, N_SUMS))
+        signal = self.frames[frame]
+        for y in range(0, signal.shape[0], 512):
+            band = signal[y : y + 512]
+            good = self.good[y : y + 512] & np.isfinite(band)
+            (i, j), part = tile_sums(band, good, (y, 0), windows, carrier)
+            sums[i : i + part.shape[0], j : j + part.shape[1]] += part
+        return sums
+
+
+def crests_of_frames(
+    frames: NDArray[Any],
+    nominal: tuple[float, float],
+    good: NDArray[np.bool_] | None = None,
+    segment: int | None = None,
+) -> CrestPaths:
+    """Crests and valleys of a frame (y, x), or of several (t, y, x) of the same fringes."""
+    frames = frames if frames.ndim == 3 else frames[None]
+    shape = (frames.shape[1], frames.shape[2])
+    good = np.ones(shape, bool) if good is None else good
+    y, x = (slice(max(0, (n - SEED_PIXELS) // 2), (n + SEED_PIXELS) // 2) for n in shape)
+    k = seed_vector(frames[0, y, x], good[y, x] & np.isfinite(frames[0, y, x]), nominal)
+    return find_crests(ArrayFrames(frames, good), len(frames), shape, k, segment)
 
 
 def fibres(

@@ -1,5 +1,6 @@
 """A run as arrays: maps of offsets, fringe sets, the detector, and what the stages measured."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -100,9 +101,10 @@ class Run:
     def __fspath__(self) -> str:
         return str(self.path)
 
-    def _read(self, stage: str) -> Any:
+    def _read(self, stage: str, file: str | None = None) -> dict[str, Any]:
         require(self.path, stage)
-        return read_json(self.path / stage / f"{stage}.json")
+        found: dict[str, Any] = read_json(self.path / stage / f"{file or stage}.json")
+        return found
 
     @cached_property
     def acquisition(self) -> Acquisition:
@@ -116,34 +118,27 @@ class Run:
 
         The arrays are ``bias``, ``dark``, ``flat`` and ``fringes/<name of the set>``.
         """
-        require(self.path, "ingest")
-        found: dict[str, dict[str, list[Any]]] = read_json(self.path / "ingest" / "frames.json")
-        return found
+        return self._read("ingest", "frames")
 
     @cached_property
     def reduction(self) -> dict[str, Any]:
         """Contents of ``reduce.json``: gain, read noise, linearity, counts of flags, warnings."""
-        found: dict[str, Any] = self._read("reduce")
-        return found
+        return self._read("reduce")
 
     @cached_property
     def fit(self) -> dict[str, Any]:
         """Contents of ``fit.json``."""
-        found: dict[str, Any] = self._read("fit")
-        return found
+        return self._read("fit")
 
     @cached_property
     def allan(self) -> dict[str, Any]:
         """Contents of ``allan.json``."""
-        found: dict[str, Any] = self._read("allan")
-        return found
+        return self._read("allan")
 
     @cached_property
     def diagnosis(self) -> dict[str, Any]:
         """Contents of ``diagnosis.json``: verdict, causes, what is left of the gap."""
-        require(self.path, "diagnose")
-        found: dict[str, Any] = read_json(self.path / "diagnose" / "diagnosis.json")
-        return found
+        return self._read("diagnose", "diagnosis")
 
     @cached_property
     def detector(self) -> dict[str, NDArray[Any]]:
@@ -160,29 +155,22 @@ class Run:
     @cached_property
     def maps(self) -> dict[str, OffsetMap]:
         """The maps of offsets: ``delta_x`` and ``delta_y``, or ``delta_fringe`` alone."""
-        folder = self.path / "products"
-        with damage_noted(self.path):
-            return {
-                name: OffsetMap(name, *read_map(folder / f"{name}.fits"))
-                for name in self.fit["outputs"]
-            }
+        return self._maps(self.fit["outputs"], "")
 
     @cached_property
     def correction(self) -> dict[str, Any]:
         """Contents of ``correction.json``: what was done about each effect that was found."""
-        require(self.path, "corrected")
-        found: dict[str, Any] = read_json(self.path / "corrected" / "correction.json")
-        return found
+        return self._read("corrected", "correction")
 
     @cached_property
     def corrected(self) -> dict[str, OffsetMap]:
         """The maps without the effects that were found; none where nothing was to be undone."""
+        return self._maps(self.correction["outputs"], "_corrected")
+
+    def _maps(self, names: Sequence[str], suffix: str) -> dict[str, OffsetMap]:
         folder = self.path / "products"
         with damage_noted(self.path):
-            return {
-                name: OffsetMap(name, *read_map(folder / f"{name}_corrected.fits"))
-                for name in self.correction["outputs"]
-            }
+            return {n: OffsetMap(n, *read_map(folder / f"{n}{suffix}.fits")) for n in names}
 
     def _map(self, name: str) -> OffsetMap:
         if name not in self.maps:
@@ -235,14 +223,12 @@ class FringeSet:
     @property
     def facts(self) -> dict[str, Any]:
         """Its entry in ``fit.json``: geometry, errors, bound, chi-square, removed modes."""
-        found: dict[str, Any] = self.run.fit["sets"][self.name]
-        return found
+        return dict(self.run.fit["sets"][self.name])
 
     @property
     def allan(self) -> dict[str, Any]:
         """Its entry in ``allan.json``: the Allan deviation against averaging length."""
-        found: dict[str, Any] = self.run.allan["sets"][self.name]
-        return found
+        return dict(self.run.allan["sets"][self.name])
 
     def _array(self, name: str) -> NDArray[Any]:
         with damage_noted(self.run.path):

@@ -163,17 +163,23 @@ def _see(paths: tuple[Path, ...]) -> None:
 
 
 @lru_cache(maxsize=1)
-def versions() -> dict[str, str]:
-    """What must be the same wherever tasks run, lest results differ."""
+def code_digest() -> str:
+    """Of the program's own files: whether two processes or results are of the same code."""
     code = hashlib.sha256()
     root = Path(pixcal.__file__).parent
     for file in sorted(root.rglob("[a-z_]*.py")):
-        code.update(f"{file.relative_to(root)}\0".encode() + file.read_bytes())
+        code.update(f"{file.relative_to(root).as_posix()}\0".encode() + file.read_bytes())
+    return code.hexdigest()[:16]
+
+
+@lru_cache(maxsize=1)
+def versions() -> dict[str, str]:
+    """What must be the same wherever tasks run, lest results differ."""
     return {
         "Python": ".".join(platform.python_version_tuple()[:2]),
         "pixcal": pixcal.__version__,
         **{package: version(package) for package in PACKAGES},
-        CODE: code.hexdigest()[:8],
+        CODE: code_digest()[:8],
         MACHINE: platform.node(),
     }
 

@@ -155,7 +155,6 @@ class Contents:
     offsets: tuple[OffsetMap, ...] = ()
     sets: tuple[FringeSet, ...] = ()
     flags: FlagSummary | None = None  # of the products
-    allan_measured: bool = False
     diagnosis: Diagnosis | None = None  # where the run was diagnosed
     warnings: tuple[str, ...] = ()  # sentences that the stages left
     advice: tuple[str, ...] = ()  # which map to use, and what limits it

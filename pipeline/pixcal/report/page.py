@@ -1,6 +1,6 @@
 """The page: contents in, one HTML document out."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib.resources import files
 
 from jinja2 import Environment, StrictUndefined
@@ -94,6 +94,11 @@ def _missing(what: str, stage: str) -> str:
     return f"{NOT_MEASURED}: {what}; run 'pixcal {stage}' and make the report again."
 
 
+def _of_fit(name: str, title: str, lead: str, blocks: Sequence[Block]) -> Section:
+    """A section that is empty only where there is no fit, and then says so."""
+    return Section(name, title, lead if blocks else _missing("there is no fit", "fit"), blocks)
+
+
 # Sections
 
 
@@ -105,9 +110,7 @@ def _maps(contents: Contents) -> Section:
     blocks: list[Block] = []
     for offset in contents.offsets:
         blocks += _offset_plates(offset, contents)
-    if not blocks:
-        lead = _missing("there is no fit", "fit")
-    return Section("maps", "Maps of the offsets", lead, blocks)
+    return _of_fit("maps", "Maps of the offsets", lead, blocks)
 
 
 def _offset_plates(offset: OffsetMap, contents: Contents) -> Iterator[Plate]:
@@ -170,9 +173,7 @@ def _levels(contents: Contents) -> Section:
         )
         for s in contents.sets
     ]
-    if not blocks:
-        lead = _missing("there is no fit", "fit")
-    return Section("levels", "Level and visibility", lead, blocks)
+    return _of_fit("levels", "Level and visibility", lead, blocks)
 
 
 def _temporal(contents: Contents) -> Section:
@@ -196,9 +197,7 @@ def _temporal(contents: Contents) -> Section:
         )
         for s in contents.sets
     ]
-    if not blocks:
-        lead = _missing("there is no fit", "fit")
-    return Section("temporal", "Frame by frame", lead, blocks)
+    return _of_fit("temporal", "Frame by frame", lead, blocks)
 
 
 def _residuals(contents: Contents) -> Section:
@@ -215,9 +214,7 @@ def _residuals(contents: Contents) -> Section:
         )
         for s in contents.sets
     ]
-    if not blocks:
-        lead = _missing("there is no fit", "fit")
-    return Section("noise", "Residuals", lead, blocks)
+    return _of_fit("noise", "Residuals", lead, blocks)
 
 
 def _allan(contents: Contents) -> Section:

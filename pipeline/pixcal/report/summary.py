@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import median_abs_deviation
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -110,11 +111,9 @@ class MapSummary:
 
 
 def robust_spread(values: NDArray[Any]) -> float:
-    """1.4826 times the median absolute deviation of the finite values; NaN without any."""
+    """Standard deviation by the median absolute deviation of finite values; NaN without any."""
     finite = values[np.isfinite(values)].astype(float)
-    if not len(finite):
-        return float("nan")
-    return float(1.482602218505602 * np.median(np.abs(finite - np.median(finite))))
+    return float(median_abs_deviation(finite, scale="normal")) if len(finite) else float("nan")
 
 
 def block_side(shape: tuple[int, ...], most: int = SHOWN_PIXELS) -> int:

@@ -68,13 +68,11 @@ def detector_headline(facts: dict[str, Any]) -> str:
         )
         if key in figures and not figures[key]["note"]
     ]
+    if parts:
+        return f"The detector: {', '.join(parts)}."
     for key, name, unit in (
-        (
-            ("gain_e_per_adu", "gain", "e⁻/ADU"),
-            ("read_noise_e", "read noise", "e⁻"),
-        )
-        if not parts
-        else ()
+        ("gain_e_per_adu", "gain", "e⁻/ADU"),
+        ("read_noise_e", "read noise", "e⁻"),
     ):
         entry = facts.get(key, {})
         if entry.get("measured") is not None:

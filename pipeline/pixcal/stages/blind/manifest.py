@@ -18,8 +18,8 @@ EXAMINATION = 1000  # seeds from here on are for examinations, those below for d
 class Manifest:
     """What an examination consists of, without the truth."""
 
-    schema: str  # schema, purpose, size: `purpose`: examination or development
-    purpose: str
+    schema: str
+    purpose: str  # examination or development
     size: str
     commitment: str  # to the truth
     without: tuple[str, ...]  # of each case, the effect that is no candidate

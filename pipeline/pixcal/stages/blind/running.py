@@ -4,7 +4,6 @@ Its offset maps are fitted, and corrected by what was diagnosed: the products st
 large goes.
 """
 
-import hashlib
 import math
 import shutil
 import time
@@ -14,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import pixcal
+from pixcal.engine.parcel import code_digest
 from pixcal.engine.plan import BASE_BYTES, make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.blind_options import RunConfig
@@ -61,15 +60,6 @@ def run(folder: Path, config: RunConfig, runtime: Runtime) -> tuple[int, int]:
     sit = partial(_case, folder, config, code_digest(), each)
     failed = run_tasks(sit, pending, over, label="diagnose")
     return len(pending), sum(failed)
-
-
-def code_digest() -> str:
-    """Of the program's own files: whether two cases were diagnosed by the same code."""
-    package = Path(pixcal.__file__).parent
-    told = hashlib.sha256()
-    for file in sorted(package.rglob("*.py")):
-        told.update(file.relative_to(package).as_posix().encode() + b"\0" + file.read_bytes())
-    return told.hexdigest()[:16]
 
 
 def share(what: str, size: str, cases: int, runtime: Runtime) -> tuple[Runtime, Runtime]:

@@ -9,6 +9,8 @@ from pixcal.stages.blind.draw import PARTS, SECOND
 
 Plain = Mapping[str, Any]
 
+BY_STRENGTH = {"below_twice": "named first below twice the threshold", "from_twice": "from there"}
+
 
 def as_markdown(score: Plain) -> str:
     """Tables of a score: the second bench, then pixcal's own draws, confusion, failures."""
@@ -21,7 +23,7 @@ def as_markdown(score: Plain) -> str:
             "**The second bench**, which shares no code with pixcal:",
             _parts(second),
             _maps(score["second"]["maps"]),
-            _second_effects(score["second"]["effects"]),
+            _effects(score["second"]["effects"], {"right": "named first"}),
         ]
     if own:
         blocks += [
@@ -29,7 +31,7 @@ def as_markdown(score: Plain) -> str:
             _parts(own),
             _medians(score["medians"]),
             _maps(score["maps"]),
-            _effects(score["effects"]),
+            _effects(score["effects"], BY_STRENGTH),
         ]
     blocks += [
         "Named first, by what was in the data (alone in it, and a candidate):",
@@ -122,33 +124,17 @@ def _maps(maps: Plain) -> str:
     return _table(header, rows)
 
 
-def _effects(effects: Mapping[str, Plain]) -> str:
+def _effects(effects: Mapping[str, Plain], right: Mapping[str, str]) -> str:
+    """A row for each effect that was alone; ``right`` gives the header of each count."""
     if not effects:
         return ""
     rows = []
     for name, own in effects.items():
-        counts = [f"{own[k]['right']} of {own[k]['of']}" for k in ("below_twice", "from_twice")]
+        counts = [f"{own[k]['right']} of {own[k]['of']}" for k in right]
         closed = "" if own["closed"] is None else f"{own['closed']:.2f}"
         rows.append((name, *counts, closed, *(_before_after(o) for o in own["offsets"].values())))
-    header = (
-        "one effect", "named first below twice the threshold", "from there", "gap closed, median",
-        "error along x, bounds", "along y",
-    )  # fmt: skip
-    return _table(header, rows)
-
-
-def _second_effects(effects: Mapping[str, Plain]) -> str:
-    if not effects:
-        return ""
-    rows = []
-    for name, own in effects.items():
-        right = f"{own['right']['right']} of {own['right']['of']}"
-        closed = "" if own["closed"] is None else f"{own['closed']:.2f}"
-        rows.append((name, right, closed, *(_before_after(o) for o in own["offsets"].values())))
-    header = (
-        "one effect", "named first", "gap closed, median", "error along x, bounds", "along y",
-    )  # fmt: skip
-    return _table(header, rows)
+    more = ("gap closed, median", "error along x, bounds", "along y")
+    return _table(("one effect", *right.values(), *more), rows)
 
 
 def _before_after(own: Mapping[str, float | None]) -> str:

@@ -15,7 +15,6 @@ from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.cube import ArrayReader
 
 F32 = NDArray[np.float32]
-Ranges = tuple[tuple[int, int], tuple[int, int]]
 
 STRETCH = 1.25  # range of the codes over that of the set: undoing may take samples beyond it
 FRAME_BYTES = 40  # arrays of a frame while effects are undone on it

@@ -13,7 +13,7 @@ that neither curved fringes nor the shape of the beam move a point.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Self
 
@@ -197,10 +197,8 @@ class CrestPaths:
 
     def take(self, use: NDArray[Any]) -> "CrestPaths":
         """The points that a mask or a list of numbers chooses."""
-        return CrestPaths(
-            self.x[use], self.y[use], self.k[use], self.sigma[use], self.slope[use],
-            self.phi, self.vector, self.frame, self.segment,
-        )  # fmt: skip
+        some = {n: getattr(self, n)[use] for n in ("x", "y", "k", "sigma", "slope")}
+        return replace(self, **some)
 
     def outermost(self, paths: int) -> "CrestPaths":
         """So many paths of each end only, the most informative ones (paper, figure 16)."""
@@ -267,57 +265,6 @@ def tile_sums(
         np.array([phase.centre[1], phase.centre[0], phase.scale]), sums,
     )  # fmt: skip
     return (i0, j0), sums
-
-
-@dataclass(frozen=True)
-class ArrayFrames:
-    """Frames in memory, as an `Accumulate`."""
-
-    frames: NDArray[Any]  # (t, y, x) float: electrons; not finite: no sample
-    good: NDArray[np.bool_]  # (y, x)
-
-    def __call__(self, frame: int, windows: Windows, carrier: Carrier) -> F64:
-        """Sums of a frame."""
-        sums = np.zeros((*windows.shape, N_SUMS))
-        signal = self.frames[frame]
-        for y in range(0, signal.shape[0], 512):
-            band = signal[y : y + 512]
-            good = self.good[y : y + 512] & np.isfinite(band)
-            (i, j), part = tile_sums(band, good, (y, 0), windows, carrier)
-            sums[i : i + part.shape[0], j : j + part.shape[1]] += part
-        return sums
-
-
-def crests_of_frames(
-    frames: NDArray[Any],
-    nominal: Vector,
-    good: NDArray[np.bool_] | None = None,
-    segment: int | None = None,
-) -> CrestPaths:
-    """Crests and valleys of one frame, or of several of the same fringes.
-
-    Parameters
-    ----------
-    frames : (y, x) or (t, y, x) float
-        Electrons; each frame may have its own phase.
-    nominal : (float, float)
-        Nominal fringe vector (kx, ky), rad/px.
-    good : (y, x) bool, optional
-        Pixels to use; all by default.
-    segment : int, optional
-        Pixels along the fringes that share a point.
-
-    Raises
-    ------
-    InputError
-        If the frames hold no fringes, or too few.
-    """
-    frames = frames if frames.ndim == 3 else frames[None]
-    shape = (frames.shape[1], frames.shape[2])
-    good = np.ones(shape, bool) if good is None else good
-    y, x = (slice(max(0, (n - SEED_PIXELS) // 2), (n + SEED_PIXELS) // 2) for n in shape)
-    k = seed_vector(frames[0, y, x], good[y, x] & np.isfinite(frames[0, y, x]), nominal)
-    return find_crests(ArrayFrames(frames, good), len(frames), shape, k, segment)
 
 
 def find_crests(
