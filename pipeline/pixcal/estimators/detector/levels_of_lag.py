@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.distortions import distortion_sums
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.kernels.normal_matrix import inverse_normal
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -84,10 +85,8 @@ def shares_by_level(
     error = EXACT * max(abs(share), 1e-9)
     normal[:n, :n] += np.outer(slopes, slopes) / error**2
     right[:n] += slopes * share / error**2
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-30))
-    inverse = np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-9, hermitian=True)
-    covariance = (inverse * np.outer(scale, scale))[:n, :n]
-    shares = (inverse * np.outer(scale, scale) @ right)[:n]
+    inverse = inverse_normal(normal)
+    covariance, shares = inverse[:n, :n], (inverse @ right)[:n]
     away = shares - share
     against = float(away @ np.linalg.pinv(covariance, hermitian=True) @ away)
     return shares, covariance, against

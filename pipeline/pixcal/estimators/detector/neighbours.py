@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.boundaries import REACH, boundary_pushes, shared_noise
+from pixcal.kernels.normal_matrix import inverse_normal
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -90,9 +91,7 @@ def _shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
             right[at] += more_right
     if not normal[-1, -1]:
         return None
-    scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-9, hermitian=True)
-    covariance = inverse / np.outer(scale, scale)
+    covariance = inverse_normal(normal)
     return SharedCharge(float(covariance[-1] @ right), float(covariance[-1, -1]))
 
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.kernels.normal_matrix import inverse_normal
 
 F32 = NDArray[np.float32]
 
@@ -46,9 +47,7 @@ def missing_noise(
             for j in range(i, 3):
                 normal[i, j] += float(np.vdot(weight * one, terms[j]))
     normal = np.triu(normal) + np.triu(normal, 1).T
-    scale = 1 / np.sqrt(np.diag(normal))
-    inverse = np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-9, hermitian=True)
-    covariance = inverse * np.outer(scale, scale)
+    covariance = inverse_normal(normal)
     return float(covariance[2] @ right), float(np.sqrt(covariance[2, 2]))
 
 

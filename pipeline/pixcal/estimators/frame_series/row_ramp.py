@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.maps.map_fit import centred
+from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.row_sums import MODES, row_sums
 
 F32 = NDArray[np.float32]
@@ -157,7 +158,7 @@ def rows_of(
         found.g[inside].astype(np.float32), theta.astype(np.float32), y, x,
     )  # fmt: skip
     free = MODES if np.any(found.dk) else 3
-    covariance = _inverse(inner[:, :free, :free])
+    covariance = inverse_normal(inner[:, :free, :free], 1e-10)
     # What the modes of each frame absorb, (y, t modes).
     across = across[:, :, :free]
     taken = across @ covariance
@@ -165,13 +166,6 @@ def rows_of(
     normal = np.diag(sums[:, 0]) - taken @ beside.T
     vector = sums[:, 1] - taken @ of_rest[:, :free].ravel()
     return found.origin[0] + np.arange(len(y), dtype=float), normal, vector
-
-
-def _inverse(inner: F64) -> F64:
-    """Of normal matrices (t, m, m) of modes of any size."""
-    size = np.sqrt(np.maximum(np.diagonal(inner, axis1=1, axis2=2), 1e-300))
-    scale = size[:, :, None] * size[:, None, :]
-    return np.asarray(np.linalg.pinv(inner / scale, rcond=1e-10, hermitian=True) / scale)
 
 
 def _apart(other: F64, maps: F64, g: F64, weight: F32) -> F32:

@@ -17,6 +17,7 @@ from scipy.fft import dct
 from scipy.optimize import brentq
 from scipy.special import ndtri_exp
 
+from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
 from pixcal.kernels.variance_sums import gram, sandwich, trace_products
 
 F64 = NDArray[np.float64]
@@ -145,7 +146,7 @@ def estimate_components(
         score, information = state.score(), state.information()
         held = ~free | ((size <= modes.least) & (score <= 0))
         step = np.zeros(len(size))
-        step[~held] = _solve(information[np.ix_(~held, ~held)], score[~held])
+        step[~held] = inverse_normal(information[np.ix_(~held, ~held)]) @ score[~held]
         moved = state
         for _ in range(12):
             try:
@@ -163,7 +164,7 @@ def estimate_components(
             break
     covariance = np.zeros((len(size), len(size)))
     inside = np.ix_(free, free)
-    covariance[inside] = _inverse(state.information()[inside])
+    covariance[inside] = inverse_normal(state.information()[inside])
     return Components(
         size, covariance, state.beta, state.spread, state.likelihood, state.profile, modes
     )
@@ -183,7 +184,7 @@ class _State:
         self.weight = np.einsum("nba,nbc->nac", inverse, inverse)
         self.weighted = np.einsum("nab,nbp->nap", self.weight, modes.known)
         normal = gram(modes.known, self.weighted)
-        self.spread = _inverse(normal)
+        self.spread = inverse_normal(normal)
         self.beta = self.spread @ np.einsum("nap,na->p", self.weighted, modes.values)
         rest = modes.values - np.einsum("nap,p->na", modes.known, self.beta)
         self.pull = np.einsum("nab,nb->na", self.weight, rest)
@@ -209,25 +210,9 @@ class _State:
         return np.asarray(self.modes.share * trace_products(self.weight, self.modes.parts) / 2)
 
 
-def _scale(matrix: F64) -> F64:
-    scale = np.sqrt(np.maximum(np.diag(matrix), 0.0))
-    return np.where(scale > 0, scale, 1.0)
-
-
-def _inverse(matrix: F64) -> F64:
-    """Inverse of a symmetric matrix; zero along what it does not tell."""
-    scale = _scale(matrix)
-    both = np.outer(scale, scale)
-    return np.asarray(np.linalg.pinv(matrix / both, rcond=1e-9, hermitian=True) / both)
-
-
-def _solve(matrix: F64, right: F64) -> F64:
-    return np.asarray(_inverse(matrix) @ right)
-
-
 def _log_determinant(matrix: F64) -> float:
-    """Logarithm of the determinant, without what `_inverse` leaves out."""
-    scale = _scale(matrix)
+    """Logarithm of the determinant, without what `inverse_normal` leaves out."""
+    scale = root_diagonal(matrix)
     values = np.linalg.eigvalsh(matrix / np.outer(scale, scale))
     kept = values > 1e-9 * values.max(initial=0.0)
     return float(np.log(values[kept]).sum() + 2 * np.log(scale).sum())

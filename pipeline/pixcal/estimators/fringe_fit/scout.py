@@ -26,6 +26,7 @@ from pixcal.estimators.fringe_fit.gauge import gauge_matrix
 from pixcal.estimators.fringe_fit.tile import Coding, Tile
 from pixcal.estimators.fringe_fit.tile_fit import fit_tile, residual_chi2
 from pixcal.kernels.bilinear import frame_sums
+from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.errors import InputError
 
 F32 = NDArray[np.float32]
@@ -365,7 +366,7 @@ class Scout:
         size = 5 if moving else 3
         step = np.zeros((n, 5))
         step[:, :size] = np.einsum(
-            "tij,tj->ti", _inverses(normal[:, :size, :size]), right[:, :size]
+            "tij,tj->ti", inverse_normal(normal[:, :size, :size], 1e-10), right[:, :size]
         )
         # The kernel saw float32 parameters: the step is from those.
         moved = FrameParameters(
@@ -379,10 +380,12 @@ class Scout:
         """Mean of dk' C^-1 dk / 2 over frames: that of the samples' noise without motion."""
         _, step, normal = self._frame_step(self._samples(codes), frames, moving=True)
         seen = normal[:, 0, 0] > 0
-        covariance = _inverses(normal[seen])[:, 3:, 3:]
+        covariance = inverse_normal(normal[seen], 1e-10)[:, 3:, 3:]
         dk = step[seen, 3:]
         dk = dk - dk.mean(axis=0)
-        return float(np.einsum("ti,tij,tj->t", dk, _inverses(covariance), dk).mean() / 2)
+        return float(
+            np.einsum("ti,tij,tj->t", dk, inverse_normal(covariance, 1e-10), dk).mean() / 2
+        )
 
     def _noise(self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters) -> float:
         """Usual reduced chi-square of the pixels."""
@@ -424,14 +427,3 @@ def _taken(codes: NDArray[np.uint16], picked: Pixels) -> NDArray[np.uint16]:
     if isinstance(picked, slice):
         return flat[:, picked]
     return flat if len(picked) == flat.shape[1] else np.take(flat, picked, axis=1)
-
-
-def _inverses(matrices: F64) -> F64:
-    """Inverses of symmetric matrices (t, n, n), zero where samples tell nothing.
-
-    A frame may have no sample with weight, and a window of one row tells nothing of ky.
-    """
-    scale = np.sqrt(np.einsum("tii->ti", matrices))
-    scale = np.where(scale > 0, scale, 1.0)
-    both = scale[:, :, None] * scale[:, None, :]
-    return np.asarray(np.linalg.pinv(matrices / both, rcond=1e-10, hermitian=True) / both)

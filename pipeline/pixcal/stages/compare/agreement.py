@@ -20,6 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from pixcal.kernels.normal_matrix import inverse_normal
+
 F64 = NDArray[np.float64]
 
 RCOND = 1e-8  # modes of the two sides that are alike to this (in their squares) count as one
@@ -100,10 +102,7 @@ class Projection:
             Blocks of one pixel; the first two values are the maps.
         """
         normal, right = pixels.products[2:, 2:], pixels.products[2:, :2]
-        scale = np.sqrt(np.diag(normal))
-        scale = np.where(scale > 0, scale, 1.0)
-        inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=RCOND, hermitian=True)
-        inverse = inverse / np.outer(scale, scale)
+        inverse = inverse_normal(normal, RCOND)
         return cls(inverse @ right, inverse)
 
     def residual(self, values: F64) -> F64:

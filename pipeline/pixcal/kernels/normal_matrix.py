@@ -1,0 +1,27 @@
+"""Inverses of normal matrices whose parameters have any units and may be undetermined."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+F64 = NDArray[np.float64]
+
+
+def root_diagonal(normal: NDArray[Any]) -> F64:
+    """Square root (..., n) of the diagonals of matrices (..., n, n); 1 where it is not positive."""
+    size = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), 0.0))
+    return np.where(size > 0, size, 1.0)
+
+
+def inverse_normal(normal: NDArray[Any], rcond: float = 1e-9) -> F64:
+    """Inverse (..., n, n) of symmetric matrices; zero along what they do not determine.
+
+    Parameters
+    ----------
+    rcond : float
+        Eigenvalues below this share of the largest, at unit diagonal, count as zero.
+    """
+    scale = root_diagonal(normal)
+    both = scale[..., :, None] * scale[..., None, :]
+    return np.asarray(np.linalg.pinv(normal / both, rcond=rcond, hermitian=True) / both)
