@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pixcal.effects.gain_error import transfer_curve
 from pixcal.estimators.detector.flat_ladder import ladder_response
 from pixcal.estimators.detector.neighbours import shared_charge
-from pixcal.estimators.detector.response import fit_curve, fit_response
+from pixcal.estimators.detector.response import departure, fit_curve, fit_response
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.middle import middle
 from pixcal.kernels.boundaries import boundary_shifts
@@ -28,7 +28,7 @@ FALLOFF_PX = 0.5
 """Of the shift of boundaries by the brighter-fatter effect beside the response."""
 
 KNOTS = np.array([0, 1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 3 / 4, 7 / 8, 1])
-"""Levels, as shares of the brightest, between which a measured response is a straight line."""
+"""Levels, as shares of the brightest, at which a response is measured."""
 
 BESIDE = 0.05
 """Chi-square of a measured response beside a polynomial, over that of the polynomial, from which it
@@ -51,7 +51,7 @@ class Bend:
 class Nonlinearity(Effect):
     """Signal ``S (1 + quadratic u + cubic u²)`` of a charge S, with ``u = S / level_e``.
 
-    ``bends`` is what a measured response has beside the polynomial, straight between its points.
+    ``bends`` are points of a measured response beside the polynomial, joined by a natural spline.
     It is not linear in the intensity, so maps alone tell neither what it does nor what would be
     without it (the offsets hardly change; harmonics of the phase are left in the residuals);
     `linearised` undoes it on samples.
@@ -116,9 +116,9 @@ class Nonlinearity(Effect):
         bent = u * (1 + u * (np.float32(self.quadratic) + np.float32(self.cubic) * u))
         signal = np.asarray(bent * np.float32(self.level_e), np.float32)
         if self.bends:
-            levels = [bend.level_e for bend in self.bends]
-            changes = [bend.change_e for bend in self.bends]
-            signal += np.interp(charge, levels, changes).astype(np.float32)
+            levels = np.array([bend.level_e for bend in self.bends])
+            changes = np.array([bend.change_e for bend in self.bends])
+            signal += departure(charge, levels, changes)
         return signal
 
     def linearised(self, signal: F32) -> F32:

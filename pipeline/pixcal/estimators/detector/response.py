@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from pixcal.estimators.diagnosis.distortions import distortion_sums, fit_distortions
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
@@ -93,8 +94,14 @@ def fit_response(
     return sizes * scale, covariance * np.outer(scale, scale)
 
 
+def departure(level: F32, knots_e: F64, change_e: F64) -> F32:
+    """Natural cubic spline through the changes at some levels; constant beyond them."""
+    spline = CubicSpline(knots_e, change_e, bc_type="natural")
+    return np.asarray(spline(np.clip(level, knots_e[0], knots_e[-1])), np.float32)
+
+
 def fit_curve(evidence: Evidence, response: Callable[[F32], F32], knots_e: F64) -> tuple[F64, F64]:
-    """What the signal departs from a response, straight between knots, from all fringe sets.
+    """What the signal departs from a response at some levels, from all fringe sets.
 
     Parameters
     ----------
@@ -117,8 +124,8 @@ def fit_curve(evidence: Evidence, response: Callable[[F32], F32], knots_e: F64) 
     def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> tuple[F32, Iterable[F32]]:
         level = evidence.level(fringes, signal)
         flat = evidence.flat.astype(np.float32)
-        change = response(level) - level + np.interp(level, knots_e, sizes @ unit)
-        slopes = (np.interp(level, knots_e, one).astype(np.float32) / flat for one in unit)
+        change = response(level) - level + departure(level, knots_e, sizes @ unit)
+        slopes = (departure(level, knots_e, one) / flat for one in unit)
         return np.asarray(change / flat, np.float32), slopes
 
     prior = np.zeros(len(unit)), np.full(len(unit), (LOOSE * knots_e[-1]) ** -2)
