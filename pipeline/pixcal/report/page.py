@@ -62,7 +62,7 @@ def render(contents: Contents) -> str:
         headline=headline(contents),
         advice=contents.advice,
         causes=_causes(contents),
-        cards=cards(contents),
+        cards=list(cards(contents)),
         findings=findings(contents),
         sections=[chapter(contents) for chapter in chapters],
         version=__version__,

@@ -82,38 +82,31 @@ def detector_headline(facts: dict[str, Any]) -> str:
     return f"The detector: {', '.join(parts)}." if parts else "The detector was not measured."
 
 
-def cards(contents: Contents) -> list[Card]:
+def cards(contents: Contents) -> Iterator[Card]:
     """Numbers for the top of the page."""
-    made = []
     for offset in contents.offsets:
-        sigma, found = offset.sigma.median, offset.delta
-        nm = sigma * contents.pitch_um * 1e3
-        made.append(
-            Card(
-                f"median σ of {NAMES[offset.name]}",
-                f"{number(sigma, 3)} px",
-                f"{number(nm, 3)} nm; rms of the offsets: {number(found.robust_std, 3)} px",
-                GOOD if np.isfinite(sigma) else BAD,
-            )
+        sigma, spread = offset.sigma.median, number(offset.delta.robust_std, 3)
+        yield Card(
+            f"median σ of {NAMES[offset.name]}",
+            f"{number(sigma, 3)} px",
+            f"{number(sigma * contents.pitch_um * 1e3, 3)} nm; rms of the offsets: {spread} px",
+            GOOD if np.isfinite(sigma) else BAD,
         )
     for fringes in contents.sets:
         ratio = _ratio(fringes.facts.get("sigma_median_px"), fringes.facts.get("crb_median_px"))
-        made.append(
-            Card(
-                f"σ / Cramér–Rao bound, {fringes.name}",
-                number(ratio, 4),
-                "1 is the best that an unbiased estimator can reach",
-                _level(ratio, 1.1, 1.5),
-            )
+        yield Card(
+            f"σ / Cramér–Rao bound, {fringes.name}",
+            number(ratio, 4),
+            "1 is the best that an unbiased estimator can reach",
+            _level(ratio, 1.1, 1.5),
         )
         if fringes.allan is not None and fringes.allan.get("slope") is not None:
-            made.append(_allan_card(fringes.name, fringes.allan))
+            yield _allan_card(fringes.name, fringes.allan)
     if not contents.has_fringes:
-        made += _detector_cards(contents.detector.facts)
+        yield from _detector_cards(contents.detector.facts)
     if contents.diagnosis is not None:
-        made.append(_diagnosis_card(contents.diagnosis))
-    made.append(_mask_card(contents))
-    return made
+        yield _diagnosis_card(contents.diagnosis)
+    yield _mask_card(contents)
 
 
 def _detector_cards(facts: dict[str, Any]) -> Iterator[Card]:
