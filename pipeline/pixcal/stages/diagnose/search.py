@@ -45,7 +45,9 @@ MOST = 5
 OPEN = 0.15
 """Share of the gap that is left where the cause is taken for unknown; then an effect that closes"""
 LITTLE = 0.1
-"""less than this share is not claimed."""
+"""less than this share is not claimed, nor one that closes less than"""
+BESIDE_OPEN = 0.25
+"""this part of what stays open."""
 EXPLAINED = 0.7
 """Share of a candidate's significance that another effect may bring about."""
 
@@ -439,7 +441,7 @@ class Search:
         mimicked = [n for n in gains if candidates[n].share < 1 - LAW_ERROR]
         among = list(gains) if open_still > OPEN else mimicked
         least = min(among, key=lambda n: gains[n], default=None)
-        if least is None or gains[least] >= LITTLE:
+        if least is None or gains[least] >= max(LITTLE, BESIDE_OPEN * open_still):
             return None
         closes = f"closes only {max(gains[least], 0):.1%} of the gap"
         if open_still > OPEN:
