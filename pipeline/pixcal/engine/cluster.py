@@ -6,7 +6,9 @@ it gives that worker's tasks to others (`distributed.scheduler.allowed-failures`
 
 import logging
 import pickle
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -16,6 +18,7 @@ from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
 from tempfile import NamedTemporaryFile
+from types import FrameType
 from typing import Any
 from uuid import uuid4
 
@@ -110,8 +113,11 @@ def run_on_cluster(
         job = Job(packed.data, packed.paths + witness, at_once, versions())
         tasks = _Tasks(client, address, job, items, f"{label}-{uuid4().hex[:8]}")
         try:
-            for number, result in tasks.results():
-                ended(number, result)
+            with _ctrl_c(tasks.interrupt):
+                for number, result in tasks.results():
+                    ended(number, result)
+                    tasks.stop_if_interrupted()
+                tasks.stop_if_interrupted()
         except (CommClosedError, CancelledError) as error:
             message = f"--cluster {address}: the connection to the scheduler was lost"
             raise ClusterError(message) from error
@@ -174,6 +180,25 @@ def _witness(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
         yield (Path(file.name),)
 
 
+@contextmanager
+def _ctrl_c(heard: Callable[[], None]) -> Iterator[None]:
+    """Tell of Ctrl-C beside raising it: what is raised in a callback of the library is lost."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield
+        return
+
+    def press(number: int, frame: FrameType | None) -> None:
+        heard()
+        before(number, frame)
+
+    signal.signal(signal.SIGINT, press)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 class _Tasks:
     """Tasks of a job on a cluster, some of them at a time."""
 
@@ -186,6 +211,16 @@ class _Tasks:
         self._waiting = iter(range(len(items)))
         self._running: set[Future] = set()
         self._room, self._look_again = 0, 0.0
+        self._interrupted = False
+
+    def interrupt(self) -> None:
+        """Stop as soon as possible."""
+        self._interrupted = True
+
+    def stop_if_interrupted(self) -> None:
+        """Raise KeyboardInterrupt if one was lost."""
+        if self._interrupted:
+            raise KeyboardInterrupt
 
     def results(self) -> Iterator[tuple[int, Any]]:
         """Number and result of every task, in the order in which they end."""
@@ -207,6 +242,7 @@ class _Tasks:
         while not ended.has_ready():
             if self._client.status != "running":
                 raise CommClosedError
+            self.stop_if_interrupted()
             with ended.thread_condition:
                 ended.thread_condition.wait(0.1)
         batch: list[Future] = ended.next_batch(block=False)
