@@ -91,7 +91,6 @@ def _default(value: object) -> str:
 
 def filled(text: str) -> str:
     """A page with its marked blocks and tables as they should be."""
-
     text = COMMANDS.sub(lambda found: found[1] + help_of_all(), text)
     text = FILES.sub(lambda found: found[1] + _content(found[2]) + found[3], text)
     return TABLES.sub(lambda found: found[1] + key_table(found[2]), text)

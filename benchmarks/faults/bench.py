@@ -44,8 +44,10 @@ class Bench:
     seconds: dict[str, float]
 
     def copy(self, name: str, *stages: str) -> Path:
-        """A new run with some stages of the reference, as hard links: replace files, do not write
-        into them."""
+        """A new run with some stages of the reference.
+
+        They are hard links: replace files, do not write into them.
+        """
         run = self.folder / name
         shutil.rmtree(run, ignore_errors=True)
         run.mkdir()

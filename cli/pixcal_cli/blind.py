@@ -15,11 +15,7 @@ if TYPE_CHECKING:
 
 cases_argument = click.argument("folder", metavar="DIR", type=PATH)
 sealed_option = click.option(
-    "--sealed",
-    metavar="FILE",
-    required=True,
-    type=PATH,
-    help="File of the truth; not inside DIR.",
+    "--sealed", metavar="FILE", required=True, type=PATH, help="File of the truth; not inside DIR."
 )
 out_option = click.option(
     "--out", "folder", metavar="DIR", required=True, type=PATH, help="Directory of the cases."
@@ -53,10 +49,7 @@ def make(folder: Path, sealed: Path, config: MakeConfig, runtime: "Runtime") -> 
 
 
 @command(
-    RunConfig,
-    "pixcal blind run exam",
-    "pixcal blind run exam --limit 20",
-    argument=cases_argument,
+    RunConfig, "pixcal blind run exam", "pixcal blind run exam --limit 20", argument=cases_argument
 )
 def run(folder: Path, config: RunConfig, runtime: "Runtime") -> None:
     """Diagnose every case of DIR that is not done yet."""

@@ -101,10 +101,7 @@ def fit(run: Path, config: options.Fit, runtime: "Runtime") -> None:
     from pixcal.stages import fit as stage
 
     if config.with_diagnosis:
-        with (
-            results.announce("corrected", run / "corrected"),
-            results.announce("fit", run / "fit"),
-        ):
+        with results.announce("corrected", run / "corrected"), results.announce("fit", run / "fit"):
             correct.run(run, config, runtime)
     else:
         if config.own:

@@ -218,8 +218,7 @@ def _pair(value: complex) -> tuple[float, float]:
 def _law(
     waves: Sequence[WaveFit], middle: tuple[float, float]
 ) -> tuple[str, tuple[GhostWave, ...], float]:
-    """What ties the amplitudes of the waves: the law, the waves that follow it, and the share of
-    their chi-square that it leaves."""
+    """Law of the amplitudes, the waves that follow it, and the share of chi-square it leaves."""
     laws = {
         "static pattern alone: a ghost crossed in polarisation with the other fibre": (1, 0, 0),
         "ghost of the modulated fibre: static pattern and fringes that follow": (1, 1, 0),

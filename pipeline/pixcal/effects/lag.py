@@ -403,10 +403,9 @@ def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
 def _squares_of_shares(
     fringes: FringeEvidence, freedom: Freedom, weighted: F32, steps: Sequence[int]
 ) -> list[tuple[float, float]]:
-    """Mean square of the pixels' shares of the frame some steps before, less that of their noise;
-    its error.
+    """Mean square, above noise, of the pixels' shares of an earlier frame, and its error.
 
-    From the residuals (t, n), times their weights.
+    One for each number of steps back, from the residuals (t, n) times their weights.
     """
     others = np.zeros((len(steps), *fringes.g.T.shape), np.float32)
     for other, step in zip(others, steps, strict=True):
@@ -462,8 +461,10 @@ def _mean(values: list[tuple[float, float]]) -> tuple[float, float]:
 
 
 def _of_flats(evidence: Evidence) -> Estimate | None:
-    """The first frame of each flat against the rest, over the level; any offset of first frames is
-    taken from stacks without light."""
+    """Deficit of the first frame of each flat, over the level.
+
+    Any offset of first frames is taken from stacks without light.
+    """
     levels, steps, errors = [], [], []
     for stack in evidence.stacks:
         found = _first_frame(stack, evidence)

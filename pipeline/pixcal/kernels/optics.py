@@ -50,7 +50,7 @@ class Geometry:
         return np.array([getattr(self, name) for name in PARAMETERS])
 
     def with_vector(self, values: ArrayLike) -> "Geometry":
-        """This geometry with other parameters, given in the order of `PARAMETERS`."""
+        """The same geometry with other parameters, given in the order of `PARAMETERS`."""
         numbers = np.asarray(values, float).tolist()
         return replace(self, **dict(zip(PARAMETERS, numbers, strict=True)))
 
@@ -161,8 +161,11 @@ def phase_jacobian(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
 
 
 class _Paths:
-    """OPD as a quotient ``2 b·q / (|q + b/2| + |q - b/2|)``, q from the fibres' centre, and the
-    unit vectors of both paths: what its derivatives are made of, free of cancellation."""
+    """Optical path difference and its derivatives, free of cancellation.
+
+    The quotient ``2 b·q / (|q + b/2| + |q - b/2|)``, q from the fibres' centre, and the unit
+    vectors of both paths.
+    """
 
     def __init__(self, x: ArrayLike, y: ArrayLike, geometry: Geometry) -> None:
         xs, ys = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))

@@ -23,11 +23,7 @@ class Detector:
     name: str = quantity("", doc="free text")
     full_well_e: float | None = quantity(None, unit="e-", low=1, high=1e12, doc="full well")
     saturation_adu: float | None = quantity(
-        None,
-        unit="ADU",
-        above=0,
-        high=1e12,
-        doc="samples at or above this level are saturated",
+        None, unit="ADU", above=0, high=1e12, doc="samples at or above this level are saturated"
     )
 
 
@@ -38,11 +34,7 @@ class Optics:
     wavelength_nm: float = quantity(unit="nm", low=1, high=1e6, doc="laser wavelength")
     distance_mm: float = quantity(unit="mm", low=0.1, high=1e7, doc="fibres to detector, nominal")
     frame_period_s: float | None = quantity(
-        None,
-        unit="s",
-        low=1e-9,
-        high=1e9,
-        doc="used where the headers hold no time stamps",
+        None, unit="s", low=1e-9, high=1e9, doc="used where the headers hold no time stamps"
     )
 
 

@@ -188,9 +188,7 @@ class Diagnose:
     without: tuple[str, ...] = _python((), doc="Effects to leave out.")
     own: tuple[Path, ...] = _own("Python file with an own effect")
     nominal: Path | None = quantity(
-        None,
-        metavar="BENCH.yaml",
-        doc="Bench file whose effects belong to the nominal simulation.",
+        None, metavar="BENCH.yaml", doc="Bench file whose effects belong to the nominal simulation."
     )
 
 
@@ -261,15 +259,10 @@ class Compare:
     """Options of ``compare``."""
 
     split: Literal["halves", "odd-even"] = quantity(
-        "halves",
-        doc="How to split a single run: first and second half, or alternating batches.",
+        "halves", doc="How to split a single run: first and second half, or alternating batches."
     )
     sigma_accuracy: float = quantity(
-        0.02,
-        low=0,
-        high=0.5,
-        metavar="SHARE",
-        doc="Relative error of SIGMA to tolerate.",
+        0.02, low=0, high=0.5, metavar="SHARE", doc="Relative error of SIGMA to tolerate."
     )
 
 
@@ -298,10 +291,7 @@ class Simulate:
     """Options of ``simulate``."""
 
     truth: Path | None = quantity(
-        None,
-        metavar="DIR",
-        shown="ACQ-truth",
-        doc="Directory of the truth.",
+        None, metavar="DIR", shown="ACQ-truth", doc="Directory of the truth."
     )
     own: tuple[Path, ...] = _own("Python file with an own effect that BENCH.yaml names")
 

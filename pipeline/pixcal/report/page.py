@@ -21,12 +21,7 @@ from pixcal.report.tables import (
     frames_table,
     stage_tables,
 )
-from pixcal.report.text import (
-    NAMES,
-    date_of_mjd,
-    mode_in_words,
-    number,
-)
+from pixcal.report.text import NAMES, date_of_mjd, mode_in_words, number
 from pixcal.report.verdict import cards, findings, headline
 
 NOT_MEASURED = "Not measured"

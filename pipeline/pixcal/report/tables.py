@@ -7,15 +7,7 @@ from typing import Any
 from pixcal.model.flags import PixelFlag
 from pixcal.report.contents import ArrayRecord, FringeSet, StageRecord
 from pixcal.report.summary import FlagSummary
-from pixcal.report.text import (
-    date_of_mjd,
-    duration,
-    exact,
-    flag_name,
-    number,
-    share,
-    with_error,
-)
+from pixcal.report.text import date_of_mjd, duration, exact, flag_name, number, share, with_error
 
 FLAG_WORDS = {
     PixelFlag.HOT: "dark signal far above that of the other pixels",

@@ -124,12 +124,7 @@ def _diagnosis_card(diagnosis: Diagnosis) -> Card:
     verdict, gap = diagnosis.facts["verdict"], diagnosis.facts["gap"]
     causes = ", ".join(c["effect"] for c in diagnosis.facts["causes"])
     detail = "no significant difference" if verdict == "no gap" else f"The {residual_gap(gap)}"
-    return Card(
-        "diagnosis",
-        verdict,
-        f"{causes}. {detail}" if causes else detail,
-        level(verdict),
-    )
+    return Card("diagnosis", verdict, f"{causes}. {detail}" if causes else detail, level(verdict))
 
 
 def _allan_card(name: str, measured: dict[str, Any]) -> Card:

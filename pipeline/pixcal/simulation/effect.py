@@ -108,7 +108,7 @@ class Estimate:
         return self.effect if pruned.is_null else pruned
 
     def scattered(self, effect: "Effect", seed: int) -> "Effect":
-        """This effect, as it is or in part, with its parameters moved by their errors.
+        """The effect, as it is or in part, with its parameters moved by their errors.
 
         What is zero in it stays so; beyond the range of a parameter nothing is moved.
         """

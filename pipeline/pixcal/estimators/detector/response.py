@@ -288,8 +288,10 @@ def _inverse(normal: F64) -> F64:
 def _alone(
     sums: Sequence[tuple[F64, F64]], powers: int, at: int
 ) -> tuple[float, float, float, float, float, float]:
-    """Shift, its variance, the chi-square explained, and what a bent response would beside it;
-    shift along y over that along x, and its error, of two sums."""
+    """Shift, its variance, the chi-square it explains, and that of a curved response beside it.
+
+    Then the shift along y over that along x, and its error, of two sums.
+    """
     information = np.array([normal[at, at] for normal, _ in sums])
     rights = np.array([right[at] for _, right in sums])
     sizes = rights / information

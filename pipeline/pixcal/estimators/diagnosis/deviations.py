@@ -150,8 +150,10 @@ class SetDeviations(_Deviations):
 
     @cached_property
     def frames(self) -> Deviation:
-        """Parameters (4, t) of the frames, with the noise of samples or more, as frames that follow
-        one another show it."""
+        """Parameters (4, t) of the frames and their noise.
+
+        The noise is that of the samples, or more where successive frames show it.
+        """
         series = self._series(self.found.free)
         steps = np.diff(series, axis=1)
         spread = (1.4826 * np.median(np.abs(steps), axis=1, keepdims=True)) ** 2 / 2

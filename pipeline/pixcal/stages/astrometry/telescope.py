@@ -52,10 +52,7 @@ class Telescope:
 
     def facts(self) -> dict[str, float]:
         """For the JSON."""
-        return asdict(self) | {
-            "uas_per_px": self.uas_per_px,
-            "px_per_lambda_over_d": self.sampling,
-        }
+        return asdict(self) | {"uas_per_px": self.uas_per_px, "px_per_lambda_over_d": self.sampling}
 
 
 def exposures(psf: Psf, electrons: float, detector: Declared) -> int:

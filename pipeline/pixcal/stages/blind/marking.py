@@ -188,11 +188,7 @@ def _sitting(file: Path) -> dict[str, Any]:
 
 
 def _with_oracle(
-    folder: Path,
-    opened: Sealed,
-    grades: Mapping[int, Grade],
-    config: ScoreConfig,
-    runtime: Runtime,
+    folder: Path, opened: Sealed, grades: Mapping[int, Grade], config: ScoreConfig, runtime: Runtime
 ) -> list[Grade]:
     """Grades with what the true effects close, and where; of some cases of parts 1 and 4."""
     numbers = [n for n, g in grades.items() if g.part in (ONE, LEFT_OUT) and g.verdict != "failed"][

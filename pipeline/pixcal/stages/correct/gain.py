@@ -132,10 +132,7 @@ def _tile(maps: Maps, at: tuple[int, int]) -> Told:
 
 
 def _of_set(
-    maps: Maps,
-    name: str,
-    delta: tuple[F64, F64],
-    part: tuple[tuple[int, int], tuple[int, int]],
+    maps: Maps, name: str, delta: tuple[F64, F64], part: tuple[tuple[int, int], tuple[int, int]]
 ) -> Sums:
     before, after = delta
     good = np.isfinite(before) & np.isfinite(after)
@@ -243,12 +240,7 @@ def _patterns(profile: F64, total: Sums) -> dict[str, Any] | None:
         means = np.where(count > 0, profile[:2] / count, np.nan)
     chance = np.sqrt(total.square * (PERIOD - 1)) / max(total.count, 1)
     before, after = (repeating(own) for own in means)
-    return {
-        "period_px": PERIOD,
-        "before_px": before,
-        "after_px": after,
-        "chance_px": float(chance),
-    }
+    return {"period_px": PERIOD, "before_px": before, "after_px": after, "chance_px": float(chance)}
 
 
 def repeating(profile: F64) -> float | None:

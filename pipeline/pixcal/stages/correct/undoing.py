@@ -213,13 +213,7 @@ def _noise_factors(swept: Swept, maps: FringeMaps) -> F64:
 
 
 def _sums(
-    swept: Swept,
-    at: tuple[int, int],
-    phase: F32,
-    sigma: F32,
-    ratio: F64,
-    good: Mask,
-    variants: F32,
+    swept: Swept, at: tuple[int, int], phase: F32, sigma: F32, ratio: F64, good: Mask, variants: F32
 ) -> F64:
     """What shapes are fitted to, as the sweep leaves it."""
     stored = ArrayReader(swept.folder / "sums").read((at[0], at[0] + 1), (at[1], at[1] + 1))

@@ -219,8 +219,9 @@ def _order(files: Sequence[FrameFile]) -> list[tuple[str, int]]:
 
 
 def take_over(made: Build, kept: Sequence[Kept], runtime: Runtime) -> dict[str, dict[str, Any]]:
-    """Link the chunks of earlier arrays into a build (from one place to another they are copied),
-    and hold them against their digests.
+    """Link the chunks of earlier arrays into a build, and verify their digests.
+
+    From one place to another they are copied.
 
     Returns
     -------

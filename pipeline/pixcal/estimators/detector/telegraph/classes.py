@@ -34,6 +34,7 @@ class Classes:
 
     @classmethod
     def of(cls, m: Moments, unit: float, switching_s: float) -> "Classes":
+        """Likelihoods of the moments of each pixel."""
         added = (AMPLITUDES * unit / m.sigma / 2) ** 2
         levels = m.variance[:, None] * (added / (1 + added))
         levels -= np.log1p(added)
@@ -117,6 +118,7 @@ class Mixture:
 
     @classmethod
     def of(cls, logarithms: F64) -> "Mixture":
+        """Mixture of classes with these log-likelihoods (pixel, class)."""
         largest = logarithms.max(axis=1)
         return cls(np.exp(logarithms - largest[:, None]), largest, logarithms)
 

@@ -63,6 +63,7 @@ class Moments:
 
 
 def moments_of(series: Series) -> Moments | None:
+    """Moments of the noise of each pixel; None where there are too few frames."""
     x = series.noise - np.nanmedian(series.noise, axis=0)
     # One wild sample is a particle's; noise of two levels has more of them, or none.
     wild = np.abs(x) > _OUTLIER

@@ -129,8 +129,10 @@ class Look:
 
     @cached_property
     def frames(self) -> dict[str, F64]:
-        """Per frame (t,): intensity and contrast (relative), turns of the fringe vector edge to
-        edge along and across it (rad)."""
+        """Per frame (t,): relative intensity and contrast, and changes of the fringe vector.
+
+        These are phases from edge to edge, along and across the vector, rad.
+        """
         b, a_cos, a_sin, dkx, dky = self.found.free.T
         contrast = np.hypot(a_cos, a_sin) / b
         ny, nx = self.good.shape

@@ -1,4 +1,4 @@
-"""Statistics across configurations: do fringe sets agree on what the detector has of its own?"""
+"""Statistics across configurations: how far fringe sets agree on the detector."""
 
 from collections.abc import Sequence
 from itertools import combinations
