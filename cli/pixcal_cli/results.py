@@ -274,14 +274,12 @@ def show_advice(run: Path) -> None:
     """Print which map to use, what limits it, and what each cause does to it."""
     from pixcal.stages.advice import HEADER, advice  # here: for a fast `pixcal --help`
 
-    found = advice(run)
-    if found is None:
-        return
+    told = advice(run)
     click.echo()
-    for sentence in found.sentences:
+    for sentence in told.sentences:
         click.echo(sentence)
-    if found.rows:
-        show_table(HEADER, found.rows)
+    if told.rows:
+        show_table(HEADER, told.rows)
 
 
 def show_run(run: Path, *, fitted: bool, diagnosed: bool) -> None:

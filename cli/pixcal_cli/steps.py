@@ -167,6 +167,7 @@ def diagnose(
     without = tuple(name[1:] for name in chosen or () if name.startswith("-"))
     with results.announce("diagnose", run / "diagnose"):
         stage.run(run, replace(config, only=only, without=without), runtime)
+    results.show_advice(run)
     results.show_diagnosis(run)
 
 

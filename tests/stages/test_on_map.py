@@ -62,5 +62,5 @@ def test_the_size_of_an_effect_is_told_in_its_units():
     assert size_of(cause) == "2 couplings, largest 3 %"
     wave = {"beat_rad_px": [0.7, 0.1], "static": [0.003, -0.004], "forward": [0.0, 0.001]}
     ghost = {"effect": "ghost_fringes", "parameters": {"share": 0.0, "waves": [wave]}}
-    assert size_of(ghost) == "1 waves, largest 0.5 %"
+    assert size_of(ghost) == "1 wave, largest 0.5 %"
     assert size_of({"effect": "one of your own", "parameters": {}}) == "-"

@@ -89,7 +89,7 @@ class BiasDrift(Effect):
     run_walk_e_h: float = quantity(
         0.0, unit="e-/h^0.5", low=0, high=1e6, doc="random walk that begins with each fringe run"
     )
-    tracks: tuple[Track, ...] = quantity((), doc="offsets of fringe runs as measured, e-")
+    tracks: tuple[Track, ...] = quantity((), unit="e-", doc="offsets of fringe runs as measured")
 
     def scaled(self, factor: float) -> Self:
         """As in `Effect.scaled`."""

@@ -81,8 +81,8 @@ class FringeDrift(Effect):
     walk: tuple[float, float] = quantity(
         (1e-5, 1e-5), unit="rad/px/h^0.5", low=0, high=10, doc="random walk along x and y"
     )
-    along_x: tuple[Track, ...] = quantity((), doc="slow change of kx as measured, rad/px")
-    along_y: tuple[Track, ...] = quantity((), doc="slow change of ky as measured, rad/px")
+    along_x: tuple[Track, ...] = quantity((), unit="rad/px", doc="slow change of kx as measured")
+    along_y: tuple[Track, ...] = quantity((), unit="rad/px", doc="slow change of ky as measured")
 
     def scaled(self, factor: float) -> Self:
         """As in `Effect.scaled`."""

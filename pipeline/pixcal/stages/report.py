@@ -122,8 +122,8 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
         flags=results.get("flags/products"),
         diagnosis=_diagnosis(run_dir / "diagnose") if "diagnose" in manifests else None,
         warnings=_warnings(manifests, facts),
-        advice=() if told is None else told.sentences,
-        causes=(HEADER, *told.rows) if told is not None and told.rows else (),
+        advice=told.sentences,
+        causes=(HEADER, *told.rows) if told.rows else (),
     )
 
 
