@@ -1,6 +1,7 @@
 """The parts of the crosstalk's measurement, by themselves."""
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from pixcal.estimators.crosstalk.covariance import NORMAL, NORMALS, TERMS, Produ
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels
 from pixcal.estimators.crosstalk.information import Measured
 from pixcal.estimators.crosstalk.links import Classes, class_sums, links, periods, sums_of
+from pixcal.estimators.crosstalk.pattern import visibility_pattern
 from pixcal.estimators.crosstalk.support import Choice, choose
 from pixcal.estimators.fringe_fit.modes import solve_modes
 from pixcal.estimators.maps.corrected import (
@@ -88,11 +90,50 @@ def noise_shared(steps, alike):
 def test_noise_that_far_pixels_share_is_refused_at_once():
     steps = links((24, 24))
     near = [s for s in steps if max(map(abs, s)) < 3]
-    found = choose(noise_shared(steps, near))
+    found = choose(noise_shared(steps, near), lambda classes: 0.0)
     assert [steps[n] for n in found.links] == near
     assert found.classes.count == 1
     with pytest.raises(InputError, match=r"^not decided: .* 48 of them more than 2 pixels apart"):
-        choose(noise_shared(steps, steps))
+        choose(noise_shared(steps, steps), lambda classes: 0.0)
+
+
+def test_a_period_that_only_the_visibility_shows_is_taken_once_there_is_crosstalk():
+    steps = links((24, 24))
+
+    def pattern(classes):
+        return 500.0 if classes.rows % 3 == 0 else 0.0
+
+    found = choose(noise_shared(steps, [(1, 0)]), pattern)
+    assert (found.classes.rows, found.classes.columns) == (3, 1)
+    assert choose(noise_shared(steps, []), pattern).classes.count == 1
+
+
+def striped(rng, period, depth):
+    """Maps of fringes of 7.3 px whose contrast is lower in one row of each period."""
+    shape = (61, 67)
+    y, x = np.indices(shape)
+    psi, lower = 2 * np.pi * x / 7.3, depth * (y % period == period - 1)
+    alpha = 0.9 * (1 - lower + 2e-3 * rng.standard_normal(shape))
+    theta = np.stack([np.ones(shape), alpha * np.sin(psi), alpha * np.cos(psi)])
+    good = np.ones(shape, bool)
+    one = SimpleNamespace(
+        good=good, delta=np.zeros(shape), theta=theta, k=(2 * np.pi / 7.3, 0.0), origin=(0, 0)
+    )
+    return SimpleNamespace(good=good, fringes={"vertical": one})
+
+
+def test_visibility_of_rows_has_the_chi_square_of_its_period():
+    """Noise alone gives one a class; one row in three with 0.2 % less contrast gives more."""
+    falls = []
+    for depth in (0.0, 2e-3):
+        gain = visibility_pattern(striped(np.random.default_rng(5), period=3, depth=depth))
+        alone = gain(Classes(1, 1, (0, 0)))
+        falls.append([gain(Classes(n, 1, (0, 0))) - alone for n in (2, 3, 5)])
+    noise, with_pattern = falls
+    assert max(noise) < 25
+    # Pixels scatter by 0.2 % too: 2/9 a pixel, less what the pattern adds to the scatter.
+    assert with_pattern[1] == pytest.approx(2 / 9 * 51 * 57, rel=0.3)
+    assert max(with_pattern[0], with_pattern[2]) < 0.1 * with_pattern[1]
 
 
 def hot(value, charge=None, sigma=2e-4):

@@ -169,6 +169,8 @@ class Ipc(Effect):
                 "per_ke": kernel.per_ke,
                 "map_periods": map_periods(evidence),
             },
+            law=f"a kernel of {len(kernel.couplings)} couplings, all significant",
+            in_full=cls(_worth_it(kernel.whole)) if kernel.whole else None,
         )  # fmt: skip
 
     def predict(self, maps: FringeMaps) -> FringeMaps:
@@ -209,10 +211,7 @@ class Ipc(Effect):
             return None
         sigma = np.sqrt(np.diag(found.covariance))
         return Estimate(
-            type(self)(
-                # Those that are zero cost nothing, and their errors hang together with the others'.
-                tuple(c if abs(c.share) > LEAST_SHARE else c.scaled(0.0) for c in found.couplings)
-            ),
+            type(self)(_worth_it(found.couplings)),
             {f"couplings[{n}].share": float(s) for n, s in enumerate(sigma)},
             float("nan"),
             "every coupling within two pixels, measured on all frames",
@@ -269,6 +268,14 @@ def _couplings_of(kernel: F64) -> list[Coupling]:
         for y, x in np.argwhere(kernel)
         if (y, x) != (rows // 2, columns // 2)
     ]
+
+
+def _worth_it(couplings: Sequence[Coupling]) -> tuple[Coupling, ...]:
+    """The couplings, with zero for those too small to matter: they cost nothing then.
+
+    They stay in the list, for their errors hang together with the others'.
+    """
+    return tuple(c if abs(c.share) > LEAST_SHARE else c.scaled(0.0) for c in couplings)
 
 
 def _on_charge(

@@ -83,6 +83,9 @@ class Estimate:
         The effect as that law has it.
     again : Again, optional
         The score test of just this effect, where its forward model told of it.
+    in_full : Effect, optional
+        The effect with everything that was measured of it, significant or not; None where that is
+        the effect itself.
     """
 
     effect: "Effect"
@@ -94,6 +97,7 @@ class Estimate:
     law: str = ""
     by_law: "Effect | None" = None
     again: "Again | None" = None
+    in_full: "Effect | None" = None
 
     @property
     def sure(self) -> "Effect":

@@ -1,6 +1,6 @@
 """The kernel: what darks, noise and maps say together, and each by itself."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +9,7 @@ from scipy.stats import chi2
 
 from pixcal.estimators.crosstalk.dense import Dense, Frames, frames_of, within
 from pixcal.estimators.crosstalk.links import links
+from pixcal.estimators.crosstalk.pattern import visibility_pattern
 from pixcal.estimators.crosstalk.support import Choice, choose
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling
@@ -39,6 +40,7 @@ class Kernel:
     # show it, 1/ke-, where they fall; the error infinite where they cannot tell
     per_ke: float
     per_ke_error: float
+    whole: tuple[Coupling, ...] = ()  # all that were measured, significant or not
 
 
 def measure(evidence: Evidence) -> Kernel | None:
@@ -57,7 +59,7 @@ def measure(evidence: Evidence) -> Kernel | None:
     frames = frames_of([evidence], every) if every else None
     if frames is None:
         return None
-    found = choose(frames.measured(()))
+    found = choose(frames.measured(()), visibility_pattern(evidence))
     pixels = 0 if frames.hot is None else len(frames.hot.y)
     none = Kernel((), np.zeros((0, 0)), found.significance, {}, pixels, 0.0, np.inf)
     if not found.links:
@@ -129,30 +131,59 @@ def _told(dense: Dense, about: Kernel) -> Kernel:
         couplings=tuple(replace(c, share=float(k)) for c, k in zip(couplings, shares, strict=True)),
         covariance=covariance,
         by=by,
+        whole=dense.couplings,
     )
 
 
 def _plain(dense: Dense) -> tuple[F64, list[Coupling]]:
-    """Basis (share, number) of what is told of a kernel, and the couplings."""
-    sigma = np.sqrt(np.diag(dense.covariance))
+    """Basis (share, number) of the significant couplings of a kernel, and these couplings.
+
+    Where noise alone tells, it tells the sum of the shares there and back: a pair of pixels whose
+    sum is significant has both, even if neither is by itself.
+    """
+    columns: list[F64] = []
+    couplings: list[Coupling] = []
     steps = dict.fromkeys((c.dy, c.dx) for c in dense.couplings)
-    columns, couplings = [], []
-    for step in steps:
-        at = np.array([n for n, c in enumerate(dense.couplings) if (c.dy, c.dx) == step])
-        precision = np.linalg.inv(dense.covariance[np.ix_(at, at)])
-        shares, weight = dense.shares[at], float(precision.sum())
-        mean = float(precision.sum(0) @ shares) / weight
-        apart = shares - mean
-        alike = chi2.sf(float(apart @ precision @ apart), len(at) - 1) > ALIKE
-        if len(at) > 1 and alike:
-            if abs(mean) > THERE * weight**-0.5:
-                columns.append(np.isin(np.arange(len(sigma)), at).astype(float))
-                one = dense.couplings[at[0]]
-                couplings.append(
-                    replace(one, every_rows=1, row=0, every_columns=1, column=0, share=mean)
-                )
-            continue
-        for n in at[np.abs(shares) > THERE * sigma[at]]:
-            columns.append(np.eye(len(sigma))[n])
-            couplings.append(dense.couplings[n])
+    for step in (s for s in steps if s > (0, 0)):
+        both = [_of_step(dense, one) for one in (step, (-step[0], -step[1]))]
+        directed = [part for group in both for part in _significant(dense, group)]
+        if not directed:
+            together = np.sum([column for group in both for column, _ in group], axis=0)
+            if _sigmas(dense, together) > THERE:
+                directed = [_alike(dense, group) for group in both]
+        columns += [column for column, _ in directed]
+        couplings += [coupling for _, coupling in directed]
     return np.array(columns).T, couplings
+
+
+Part = tuple[F64, Coupling]
+"""Which shares of a kernel are one number, and the coupling that they are."""
+
+
+def _of_step(dense: Dense, step: tuple[int, int]) -> list[Part]:
+    """The shares of all classes over a step, each by itself."""
+    every = np.eye(len(dense.couplings))
+    return [(every[n], c) for n, c in enumerate(dense.couplings) if (c.dy, c.dx) == step]
+
+
+def _alike(dense: Dense, group: Sequence[Part]) -> Part:
+    """The shares of all classes as one."""
+    column = np.sum([own for own, _ in group], axis=0)
+    return column, replace(group[0][1], every_rows=1, row=0, every_columns=1, column=0)
+
+
+def _significant(dense: Dense, group: Sequence[Part]) -> list[Part]:
+    """Of the classes' shares over a step those that are significant; one, where all are alike."""
+    at = np.flatnonzero(np.sum([column for column, _ in group], axis=0))
+    precision = np.linalg.inv(dense.covariance[np.ix_(at, at)])
+    shares, weight = dense.shares[at], float(precision.sum())
+    mean = float(precision.sum(0) @ shares) / weight
+    apart = shares - mean
+    if len(at) > 1 and chi2.sf(float(apart @ precision @ apart), len(at) - 1) > ALIKE:
+        return [_alike(dense, group)] if abs(mean) > THERE * weight**-0.5 else []
+    return [part for part in group if _sigmas(dense, part[0]) > THERE]
+
+
+def _sigmas(dense: Dense, column: F64) -> float:
+    """Significance of the sum of some shares."""
+    return abs(float(column @ dense.shares)) / float(np.sqrt(column @ dense.covariance @ column))

@@ -6,7 +6,7 @@ pixels are drawn so, a real one, whose size is free here and learnt beside the c
 (`pixcal.estimators.crosstalk.dense`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,6 +88,32 @@ def pattern_information(
     total_right[:size] += right
     known = np.array([c.share for c in couplings])
     return total, total_right + total[:, :size] @ known
+
+
+def visibility_pattern(evidence: Evidence) -> Callable[[Classes], float]:
+    """How well a period describes the visibility of the pixels.
+
+    Returns
+    -------
+    callable
+        Fall in chi-square, of all sets together, if each class of a period has its own mean of
+        the logarithm of the visibility.
+    """
+    good = good_in_all(evidence)
+    sets = list(evidence.fringes.values())
+    if good.sum() < MIN_PIXELS:
+        return lambda classes: 0.0
+    y, x = np.nonzero(good)
+    smooth = smooth_modes(sets, good)
+    maps = [_clipped(without(log_visibility(one.theta, good), smooth)) for one in sets]
+
+    def gain(classes: Classes) -> float:
+        number = classes.of(y, x)
+        count = np.maximum(np.bincount(number, minlength=classes.count), 1)
+        sums = [np.bincount(number, values / sigma, classes.count) for values, sigma in maps]
+        return float(sum(np.sum(own**2 / count) for own in sums))
+
+    return gain
 
 
 def _of_set(

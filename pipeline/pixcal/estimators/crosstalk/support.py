@@ -6,6 +6,7 @@ one acquisition of a hundred. A capacitance couples both ways alike, and a kerne
 there and back, and of many classes, are one number until the data tell them apart.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,11 +56,18 @@ class Choice:
         return float(-ndtri_exp(np.log(-np.expm1(none)) if none < -1e-9 else one + np.log(looks)))
 
 
-def choose(measured: Measured) -> Choice:
+def choose(measured: Measured, pattern: Callable[[Classes], float]) -> Choice:
     """Take what stands out.
 
-    First the links that do, at any period; then the one period that serves all of them best, the
-    shortest that is good enough.
+    First the links that do, at any period; then the one period that serves all of them and the maps
+    best, the shortest that is good enough.
+
+    Parameters
+    ----------
+    measured : Measured
+    pattern : callable
+        Fall in chi-square of the maps where pixels of each class of a period have a visibility of
+        their own (`pixcal.estimators.crosstalk.pattern.visibility_pattern`).
 
     Raises
     ------
@@ -78,7 +86,7 @@ def choose(measured: Measured) -> Choice:
             "kernel"
         )
     none = Classes(1, 1, measured.first)
-    classes = _period(measured.of(there), critical) if there else none
+    classes = _period(measured.of(there), pattern, critical) if there else none
     return Choice(there, classes, max(float(gains.max()), 1e-9), looks)
 
 
@@ -86,12 +94,12 @@ def _critical(looks: int) -> float:
     return float(norm.isf(FALSE_ALARM / looks / 2) ** 2)
 
 
-def _period(present: Measured, critical: float) -> Classes:
-    """The shortest period that is good enough for all links together."""
+def _period(present: Measured, pattern: Callable[[Classes], float], critical: float) -> Classes:
+    """The shortest period that is good enough for all links together, and for the maps."""
     scores = []
     for classes, information in present.every_period():
         directions = _directions(classes)
-        score = 0.0
+        score = pattern(classes) - WORTH * (classes.count - 1)
         for n in range(len(present.links)):
             basis, gain = _greedy(*information.of(n).total, directions)
             score += gain - WORTH * basis.shape[1]

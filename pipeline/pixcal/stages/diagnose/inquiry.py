@@ -191,10 +191,15 @@ def _needs(kind: type[Effect], facts: Mapping[str, Any]) -> str:
 
 
 def _replayed(candidate: Candidate, unseen: Evidence) -> Effect | None:
-    """The effect as the unseen frames have it one by one; None where its law says all."""
+    """The effect as measured, whatever its law; None where its law says all.
+
+    In full, or as the unseen frames have it one by one.
+    """
     found = candidate.estimate
     if found is None or found.significance < SIGNIFICANT:
         return None
+    if found.in_full is not None:
+        return found.in_full
     try:
         replay = found.effect.replayed(unseen)
     except (InputError, np.linalg.LinAlgError, ValueError, ArithmeticError):

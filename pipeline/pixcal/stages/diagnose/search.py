@@ -433,13 +433,17 @@ class Search:
         """An effect that closes little of the gap and may stand in for another.
 
         For an unknown one, if much of the gap stays open; for another law of those taken before
-        it, if their law as it is brings about a good part of its significance.
+        it, if their law as it is brings about a good part of its significance, or if it has none.
         """
         where = differing(self.nominal, current, self.data)
         open_still = self._left(current, where)
         gains = {name: self._left(trial, where) - open_still for name, trial in without.items()}
-        mimicked = [n for n in gains if candidates[n].share < 1 - LAW_ERROR]
-        among = list(gains) if open_still > OPEN else mimicked
+        sizes = {n: e.significance for n in gains if (e := candidates[n].estimate) is not None}
+        among = [
+            n
+            for n in gains
+            if open_still > OPEN or candidates[n].share < 1 - LAW_ERROR or sizes[n] < SIGNIFICANT
+        ]
         least = min(among, key=lambda n: gains[n], default=None)
         if least is None or gains[least] >= max(LITTLE, BESIDE_OPEN * open_still):
             return None
@@ -449,10 +453,13 @@ class Search:
                 f"{closes} while {open_still:.0%} stays unexplained; it may stand in for an "
                 "unknown cause"
             )
-        return least, (
-            f"{closes}, and the other causes bring about {1 - candidates[least].share:.0%} of its "
-            "significance; it may stand in for what their laws do not describe"
+        mimicked = f"the other causes bring about {1 - candidates[least].share:.0%} of its"
+        why = (
+            f"is not significant ({sizes[least]:.1f} sigma) in the frames that it was fitted to"
+            if sizes[least] < SIGNIFICANT
+            else f"{mimicked} significance"
         )
+        return least, f"{closes}, and {why}; it may stand in for what their laws do not describe"
 
     def _each_left_out(
         self, taken: Sequence[str], effects: Mapping[str, Effect]
