@@ -213,14 +213,12 @@ def test_a_bent_ladder_of_flats_is_a_gap_and_its_response_closes_it(
     assert "flat_ladder" in {entry["statistic"] for entry in found["gap"]["where"]}
 
 
-def test_a_saturated_rung_of_the_ladder_is_left_out(
-    reduced: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_a_saturated_rung_of_the_ladder_is_left_out(reduced: Callable[..., Path]) -> None:
     """Whether or not its level is declared; the rest is looked at as before."""
     rungs = [{"exptime_s": t, "count": 20} for t in (0.01, 0.02, 0.03, 0.08)]
     short = {"frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
-    look = look_at(reduced(None, short | {"frames.flats": rungs}), tmp_path, SYNC)
-    again = measure(look.first.evidence(look.first.test, (), 3, tmp_path))
+    look = look_at(reduced(None, short | {"frames.flats": rungs}), SYNC)
+    again = measure(look.first.evidence(look.first.test, (), 3))
     for found in (look.measured, again):
         for name in ("flat_ladder", "photon_transfer"):
             assert len(found[name, DETECTOR].value) == 3
@@ -228,19 +226,19 @@ def test_a_saturated_rung_of_the_ladder_is_left_out(
 
 
 def test_a_part_of_a_large_detector_is_enough_without_fringes(
-    reduced: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    reduced: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(windows, "LARGEST", 60)
     monkeypatch.setattr(windows, "SIDE", 40)
     run = reduced(None, {"detector.shape": [131, 127], "frames.fringes": []})
-    look = look_at(run, tmp_path, SYNC)
+    look = look_at(run, SYNC)
     assert len(look.windows) == 4
-    again = measure(look.first.evidence(look.first.test, (), 3, tmp_path))
+    again = measure(look.first.evidence(look.first.test, (), 3))
     assert look.measured.keys() <= again.keys()
 
 
 def test_a_corner_without_light_is_left_out(
-    reduced: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    reduced: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(windows, "LARGEST", 60)
     monkeypatch.setattr(windows, "SIDE", 40)
@@ -253,7 +251,7 @@ def test_a_corner_without_light_is_left_out(
     other = run.parent / "other"
     ingest.run(acquisition, other, ingest.Config(), SYNC)
     reduce.run(other, reduce.Config(), SYNC)
-    look = look_at(other, tmp_path, SYNC)
+    look = look_at(other, SYNC)
     (left,) = look.facts["left_out"]
     assert left["window"] == [[9, 49], [9, 49]]
     assert left["reason"]
@@ -263,9 +261,9 @@ def test_a_corner_without_light_is_left_out(
     assert min(levels) > 0.5 * max(levels) > 1000
 
 
-def test_frames_too_few_to_part_are_named(reduced: Callable[..., Path], tmp_path: Path) -> None:
+def test_frames_too_few_to_part_are_named(reduced: Callable[..., Path]) -> None:
     changes = {"frames.bias": 3, "frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
-    assert look_at(reduced(None, changes), tmp_path, SYNC).facts["shared"] == ["bias"]
+    assert look_at(reduced(None, changes), SYNC).facts["shared"] == ["bias"]
 
 
 OWN = '''
@@ -426,15 +424,15 @@ def test_windows_that_are_tried_do_not_overlap(shape: tuple[int, int]) -> None:
     ],
 )
 def test_what_an_effect_takes_from_the_fringes_is_not_taken_twice(
-    effect: Effect, reduced: Callable[..., Path], tmp_path: Path
+    effect: Effect, reduced: Callable[..., Path]
 ) -> None:
     """The bench was measured with the effect in it: with the effect it looks as it was measured."""
     changes = {"frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
     run = reduced({effect.name: to_plain(effect)}, changes)
-    window = look_at(run, tmp_path, SYNC).first
+    window = look_at(run, SYNC).first
 
     def seen(on: tuple[Effect, ...]) -> dict[str, tuple[float, float, float]]:
-        evidence = window.evidence(window.test, on, 3, tmp_path)
+        evidence = window.evidence(window.test, on, 3)
         return {
             name: (
                 float(np.median(f.theta[0][f.good]) * f.g[:, 0].mean()),
@@ -453,12 +451,12 @@ def test_what_an_effect_takes_from_the_fringes_is_not_taken_twice(
 
 
 def test_every_acquisition_is_held_against_random_numbers_of_its_own(
-    reduced: Callable[..., Path], tmp_path: Path
+    reduced: Callable[..., Path],
 ) -> None:
     """Of its frames; a fault of chance in sixteen simulations is not that of all nights."""
     short = {"frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
     first, again, other = (
-        look_at(reduced(None, short | {"seed": seed}), tmp_path, SYNC).first for seed in (3, 3, 4)
+        look_at(reduced(None, short | {"seed": seed}), SYNC).first for seed in (3, 3, 4)
     )
     assert first.seed == again.seed != other.seed
 
@@ -479,7 +477,7 @@ def test_windows_are_exposed_together(
     monkeypatch.setattr(windows, "LARGEST", 40)
     monkeypatch.setattr(windows, "SIDE", 30)
     changes = {"frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
-    look = look_at(reduced(None, changes | {"detector.shape": [85, 89]}), tmp_path, SYNC)
+    look = look_at(reduced(None, changes | {"detector.shape": [85, 89]}), SYNC)
     assert len(look.windows) == 4
     assert len({window.seed for window in look.windows}) == 1
     for number in (0, 1):

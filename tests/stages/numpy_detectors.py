@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from on_disk import evidence_on_disk
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.gap import Difference, Reference, compare, expect_nominal
@@ -88,7 +89,7 @@ def reduced(detector: Detector, seed: int, folder: Path) -> tuple[Evidence, dict
     """Evidence of a recording, and its ``reduce.json``."""
     arrays, tables = detector.frames(seed)
     raw = Raw(detector.described(), arrays, tables, reduce.Config())
-    evidence = evidence_of(raw, folder, whole_of(detector.shape), detector.shape)
+    evidence = evidence_on_disk(raw, folder)
     report: dict[str, Any] = read_json(folder / "reduce" / "reduce.json")
     return evidence, report
 
@@ -103,14 +104,14 @@ class Nominal:
     differences: Mapping[Key, Difference]
 
 
-def held_against_nominal(detector: Detector, seed: int, folder: Path, count: int = 12) -> Nominal:
+def held_against_nominal(detector: Detector, seed: int, count: int = 12) -> Nominal:
     """Measure the nominal bench of a recording, and hold its second half against simulations."""
     arrays, tables = detector.frames(seed)
     acquisition, part = detector.described(), whole_of(detector.shape)
-    own, folders = split(tables, detector.shape[0] * detector.shape[1]), iter(range(1000))
+    own = split(tables, detector.shape[0] * detector.shape[1])
 
     def look(raw: Raw) -> Evidence:
-        return evidence_of(raw, folder / str(next(folders)), part, detector.shape)
+        return evidence_of(raw, part, detector.shape)
 
     halves = [
         look(

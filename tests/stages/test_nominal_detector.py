@@ -1,7 +1,5 @@
 """Without fringes: the nominal bench of a plain camera makes frames like those of the camera."""
 
-from pathlib import Path
-
 import pytest
 from numpy_detectors import Detector, held_against_nominal
 
@@ -20,16 +18,16 @@ from pixcal.estimators.diagnosis.gap import flagged
     ],
     ids=lambda d: f"{d.gain:g} e-/ADU, {d.noise:g} e-, {d.bias:g} ADU",
 )
-def test_a_plain_camera_shows_no_gap(detector: Detector, tmp_path: Path) -> None:
-    found = held_against_nominal(detector, 1, tmp_path)
+def test_a_plain_camera_shows_no_gap(detector: Detector) -> None:
+    found = held_against_nominal(detector, 1)
     assert found.evidence.amplifier_noise == pytest.approx(detector.noise, rel=0.012)
     assert flagged(found.differences) == set()
     seen = Quantisation.estimate(found.evidence)
     assert seen is None or seen.significance < 4
 
 
-def test_frames_without_light_get_none(tmp_path: Path) -> None:
+def test_frames_without_light_get_none() -> None:
     detector = Detector(gain=1.0, noise=8.0, dark=0.0)
-    found = held_against_nominal(detector, 2, tmp_path, count=2)
+    found = held_against_nominal(detector, 2, count=2)
     frames = found.bench.simulate(found.split.test, (), 5).arrays["bias"]
     assert frames.mean() == pytest.approx(detector.bias, abs=0.1)

@@ -104,9 +104,7 @@ def test_a_curve_that_all_pixels_share_is_no_defect(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("gain", [1.0, 1.06])
 @pytest.mark.parametrize("quadratic", [0.0, -0.02])
-def test_gain_is_told_by_noise_and_response_by_levels(
-    gain: float, quadratic: float, tmp_path: Path
-) -> None:
+def test_gain_is_told_by_noise_and_response_by_levels(gain: float, quadratic: float) -> None:
     camera = Detector(
         **(CAMERA | {"gain": 2.3 * gain, "shape": (128, 128)}),
         flats=[*ladder([(t, 1) for t in LEVELS], 6), (0.52, 60, 1)],
@@ -115,7 +113,7 @@ def test_gain_is_told_by_noise_and_response_by_levels(
     arrays, tables = camera.frames(7)
     declared = replace(camera, gain=2.3).described()
     raw = Raw(declared, arrays, tables, reduce.Config())
-    evidence = evidence_of(raw, tmp_path, whole_of(camera.shape), camera.shape)
+    evidence = evidence_of(raw, whole_of(camera.shape), camera.shape)
     of_gain, response = GainError.estimate(evidence), Nonlinearity.estimate(evidence)
     assert of_gain is not None
     assert response is not None

@@ -14,6 +14,7 @@ from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.place import Local
 from pixcal.storage.stage import read_acquisition, require
 
 # rows and columns of the window: ((y0, y1), (x0, x1))
@@ -42,6 +43,13 @@ def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice
         If a stage is missing, or the part holds more than `MAX_SAMPLES` samples.
     """
     require(run_dir, "reduce")
+    if read_acquisition(run_dir).frames.fringes:
+        require(run_dir, "fit")
+    return evidence_of(run_dir, part, frames)
+
+
+def evidence_of(run_dir: Local, part: Part | None = None, frames: slice = slice(None)) -> Evidence:
+    """The same of a run that is known to be whole, or is in memory."""
     acquisition = read_acquisition(run_dir)
     ingested = Ingested(run_dir / "ingest")
     ny, nx = ingested.shape
@@ -51,12 +59,10 @@ def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice
         for name in ("bias", "dark_rate", "flat", "mask")
     }
     fringes = {}
-    if acquisition.frames.fringes:
-        require(run_dir, "fit")
-        for listed in acquisition.frames.fringes:
-            fringes[listed.name] = _fringes(
-                run_dir, ingested, listed.name, listed.baseline_mm, (y, x), frames
-            )
+    for listed in acquisition.frames.fringes:
+        fringes[listed.name] = _fringes(
+            run_dir, ingested, listed.name, listed.baseline_mm, (y, x), frames
+        )
     used = read_json(run_dir / "reduce" / "reduce.json")
     return Evidence(
         fringes=fringes,
@@ -86,7 +92,7 @@ def _photon_transfer(gain: dict[str, Any]) -> tuple[float, float, float]:
 
 
 def _fringes(
-    run_dir: Path,
+    run_dir: Local,
     ingested: Ingested,
     name: str,
     baseline: tuple[float, float],
@@ -113,7 +119,7 @@ def _fringes(
     g, dk = found.at(*centre)[frames], found.dk[frames]
     facts = read_json(run_dir / "fit" / "fit.json")["sets"][name]
     theta = fitted_theta(swept, part, found.reference)
-    mask = ArrayReader(fitted / "mask").read(y, x)
+    mask = ArrayReader(swept / "mask").read(y, x)
     good = (mask == 0) & np.isfinite(theta).all(axis=0)
     read = ArrayReader(source.folder / "read_variance").read(y, x).astype(float)
     shot = ArrayReader(source.folder / "shot_factor").read(y, x).astype(float)
@@ -144,7 +150,7 @@ def _fringes(
     )
 
 
-def fitted_theta(swept: Path, part: Part, reference: tuple[float, float]) -> F64:
+def fitted_theta(swept: Local, part: Part, reference: tuple[float, float]) -> F64:
     """Maps (iota, alpha sin psi, alpha cos psi) of a part, from those of the sweep."""
     y, x = part
     iota, alpha, phase = (

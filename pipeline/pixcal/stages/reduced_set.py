@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.fringe_fit.tile import Coding, Tile
 from pixcal.storage.cube import ArrayReader, CachedReader
 from pixcal.storage.cube_place import cubes_of
-from pixcal.storage.place import Place
+from pixcal.storage.place import Local, Place
 
 
 @dataclass
@@ -20,11 +19,11 @@ class ReducedSet:
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or MemoryPath
         ``RUN/reduce/reduced.zarr/<set name>``.
     """
 
-    folder: Path
+    folder: Local
 
     @property
     def more_bytes(self) -> int:

@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.storage.cube_place import POINTER, cubes_of, remove_cubes, settle, settled
@@ -41,7 +41,7 @@ from pixcal.storage.manifest import (
     write_json,
     write_manifest,
 )
-from pixcal.storage.place import Place
+from pixcal.storage.place import Local, Place
 
 __all__ = [
     "DAMAGE",
@@ -50,6 +50,7 @@ __all__ = [
     "SCRATCH",
     "Build",
     "Manifest",
+    "Workspace",
     "artefact_key",
     "build",
     "damage_noted",
@@ -65,6 +66,28 @@ __all__ = [
 ]
 
 _KEY_IN_NAME = 16
+
+
+class Workspace(Protocol):
+    """Where a stage writes: a `Build`, or a `pixcal.storage.memory.MemoryBuild`."""
+
+    @property
+    def folder(self) -> Local:
+        """Of what it makes."""
+
+    @property
+    def cubes(self) -> Place:
+        """Of its cubes."""
+
+    @property
+    def scratch(self) -> Local:
+        """Of what only the stage itself needs."""
+
+    def journal(self) -> set[str]:
+        """Steps noted as done."""
+
+    def note(self, step: str) -> None:
+        """Note a step as done."""
 
 
 @dataclass

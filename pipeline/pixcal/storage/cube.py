@@ -30,6 +30,7 @@ from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec
 from pixcal.model.errors import DamagedError
 from pixcal.storage.folder import INDEX, File, open_folder, read_file
 from pixcal.storage.links import copy_files, link_files
+from pixcal.storage.memory import MemoryArray, MemoryPath
 from pixcal.storage.place import Place, UrlPath
 from pixcal.storage.read_ahead import AHEAD, ReadAhead
 
@@ -69,6 +70,9 @@ def create_array(
     """
     shape, chunks = tuple(map(int, shape)), tuple(map(int, chunks))
     dtype = np.dtype(dtype).newbyteorder("<")
+    if isinstance(path, MemoryPath):
+        path.keep(MemoryArray(np.full(shape, fill_value, dtype), chunks, fill_value, attrs or {}))
+        return ArrayWriter(path, shape, chunks, dtype, fill_value, b"")
     text = json.dumps(attrs or {})
     metadata = _array_metadata(shape, chunks, dtype.str, fill_value, tuple(dims), text)
     _write_metadata(path, metadata)
@@ -110,6 +114,8 @@ def _array_metadata(
 
 def create_group(path: Place, attrs: dict[str, Any] | None = None) -> None:
     """Create a Zarr group (a folder that xarray opens as a dataset) if it is not there."""
+    if isinstance(path, MemoryPath):
+        return
     _write_metadata(path, _group_metadata(json.dumps(attrs or {})))
 
 
@@ -188,6 +194,9 @@ class ArrayWriter:
                 block_at = f"block {tuple(start)} + {data.shape}"
                 raise ValueError(f"{block_at} is not on chunks {self.chunks}")
             first.append(s // c)
+        if isinstance(self.path, MemoryPath):
+            self.path.array.write(start, data)
+            return
         open_folder(self.path).write(self._encode(first, data))
 
     def _encode(self, first: Sequence[int], data: NDArray[Any]) -> Iterator[File]:
@@ -233,6 +242,8 @@ class ArrayWriter:
         """
         grid = _grid(self.shape, self.chunks)
         index = np.zeros(grid, _INDEX_DTYPE)
+        if isinstance(self.path, MemoryPath):
+            return index
         folder = open_folder(self.path)
         for first, names in enumerate(_names(grid)):
             rows = []
@@ -306,6 +317,16 @@ class ArrayReader:
 
     def __init__(self, path: Place) -> None:
         self.path = path
+        self.chunks_read = 0
+        self.shape: tuple[int, ...]
+        self.chunks: tuple[int, ...]
+        self.dtype: np.dtype[Any]
+        self.attrs: dict[str, Any]
+        self._memory = path.array if isinstance(path, MemoryPath) else None
+        if self._memory is not None:
+            self.shape, self.chunks = self._memory.values.shape, self._memory.chunks
+            self.dtype, self.attrs = self._memory.values.dtype, self._memory.attrs
+            return
         try:
             body = (path / INDEX).read_bytes()
             metadata = (path / "zarr.json").read_bytes()
@@ -327,19 +348,17 @@ class ArrayReader:
             raise DamagedError(
                 f"{path}: not a complete array ({reason})", path / "zarr.json"
             ) from error
-        self.shape: tuple[int, ...] = tuple(meta["shape"])
-        self.chunks: tuple[int, ...] = tuple(meta["chunk_grid"]["configuration"]["chunk_shape"])
-        self.dtype: np.dtype[Any] = np.dtype(meta["data_type"])
-        self.attrs: dict[str, Any] = meta["attributes"]
+        self.shape = tuple(meta["shape"])
+        self.chunks = tuple(meta["chunk_grid"]["configuration"]["chunk_shape"])
+        self.dtype, self.attrs = np.dtype(meta["data_type"]), meta["attributes"]
         self._ahead = ReadAhead(path) if isinstance(path, UrlPath) else None
         # Absolute: a reader may be sent to a process that works in another folder.
-        self._folder = f"{path if isinstance(path, UrlPath) else path.absolute()}/"
-        self.chunks_read = 0
+        self._folder = f"{path.absolute() if isinstance(path, Path) else path}/"
 
     @property
     def n_chunks(self) -> int:
         """Number of chunks of the array."""
-        return int(self._index.size)
+        return math.prod(_grid(self.shape, self.chunks))
 
     def read_chunk(self, index: Sequence[int], out: NDArray[Any] | None = None) -> NDArray[Any]:
         """One whole chunk (edge chunks too, padded with the fill value).
@@ -356,6 +375,8 @@ class ArrayReader:
         DamagedError
             Naming the chunk's file when it is missing, cut or altered.
         """
+        if self._memory is not None:
+            return self._memory.chunk(index)
         name = _chunk_name(index)
         size, crc = self._index[tuple(index)].item()
 
@@ -411,6 +432,9 @@ class ArrayReader:
         full[: len(ranges)] = [(max(0, a), min(b, n)) for (a, b), (_, n) in zip(ranges, full)]  # noqa: B905
         shape = tuple(b - a for a, b in full)
         block = np.empty(shape, self.dtype) if out is None else out
+        if self._memory is not None:
+            block[...] = self._memory.values[tuple(slice(*ends) for ends in full)]
+            return block
         scratch = np.empty(self.chunks, self.dtype)
         spans = [range(a // c, -(-b // c)) for (a, b), c in zip(full, self.chunks, strict=True)]
         for index in product(*spans):

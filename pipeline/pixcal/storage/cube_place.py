@@ -17,7 +17,7 @@ from pixcal import __version__
 from pixcal.model.config import StrPath
 from pixcal.model.errors import DamagedError, InputError, RemoteError
 from pixcal.storage.folder import open_folder
-from pixcal.storage.place import Place, parse_place
+from pixcal.storage.place import Local, Place, parse_place
 
 POINTER = "cubes.json"
 NOTE = "pixcal.json"  # file beside the cubes that tells whoever finds them what they are
@@ -25,7 +25,7 @@ NOTE = "pixcal.json"  # file beside the cubes that tells whoever finds them what
 log = logging.getLogger(__name__)
 
 
-def cubes_of(artefact: Path) -> Place:
+def cubes_of(artefact: Local) -> Place:
     """The folder in which an artefact keeps its cubes (``raw.zarr``, ``reduced.zarr``).
 
     Raises
@@ -116,7 +116,7 @@ def _owns(run: Path, pointer: Mapping[str, Any]) -> bool:
     return bool(pointer["owner"] == run.stat().st_ino)
 
 
-def _read(artefact: Path) -> Mapping[str, Any] | None:
+def _read(artefact: Local) -> Mapping[str, Any] | None:
     file = artefact / POINTER
     try:
         pointer = json.loads(file.read_bytes())
@@ -129,7 +129,7 @@ def _read(artefact: Path) -> Mapping[str, Any] | None:
     return pointer
 
 
-def _damaged(file: Path, reason: str) -> DamagedError:
+def _damaged(file: Local, reason: str) -> DamagedError:
     error = DamagedError(f"{file}: damaged{reason}", file)
     error.advice = "say where cubes go with --cubes (--cubes RUN: in RUN), and they are made again"
     return error

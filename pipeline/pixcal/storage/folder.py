@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from pixcal.storage.memory import MemoryPath
 from pixcal.storage.place import Place, UrlPath, explained
 
 # file that an array has beside its metadata: sizes and checksums of its chunks
@@ -53,6 +54,7 @@ class Folder(Protocol):
 
 def open_folder(place: Place) -> Folder:
     """The files of a folder."""
+    assert not isinstance(place, MemoryPath)  # It holds arrays, not files of their chunks.
     return UrlFolder(place) if isinstance(place, UrlPath) else LocalFolder(place)
 
 

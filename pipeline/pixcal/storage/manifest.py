@@ -15,6 +15,8 @@ from typing import Any
 from pixcal import __version__
 from pixcal.model.errors import DamagedError
 from pixcal.storage.folder import INDEX
+from pixcal.storage.memory import MemoryPath
+from pixcal.storage.place import Local
 
 MANIFEST = "manifest.json"
 JOURNAL = "journal.jsonl"
@@ -46,7 +48,7 @@ def digest(*parts: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
-def file_digest(path: Path) -> str:
+def file_digest(path: Local) -> str:
     """SHA-256 (hex, 32 characters) of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:32]
@@ -56,8 +58,11 @@ def _json(data: Any) -> str:
     return json.dumps(data, indent=2, allow_nan=False) + "\n"
 
 
-def write_json(path: Path, data: Any) -> None:
+def write_json(path: Local, data: Any) -> None:
     """Write JSON aside, flush it to the disk, and rename it into place."""
+    if isinstance(path, MemoryPath):
+        path.keep(_json(data).encode())
+        return
     aside = path.with_name(f".{path.name}.aside")
     text = _json(data)
     with aside.open("w", encoding="utf-8") as file:
@@ -67,7 +72,7 @@ def write_json(path: Path, data: Any) -> None:
     aside.replace(path)
 
 
-def read_json(path: Path) -> Any:
+def read_json(path: Local) -> Any:
     """Read JSON that pixcal wrote.
 
     Raises
@@ -78,7 +83,7 @@ def read_json(path: Path) -> Any:
     return _parse(path, _text(path))
 
 
-def _text(path: Path) -> str:
+def _text(path: Local) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except OSError as error:
@@ -87,7 +92,7 @@ def _text(path: Path) -> str:
         raise DamagedError(f"{path}: damaged ({error})", path) from error
 
 
-def _parse(path: Path, text: str) -> Any:
+def _parse(path: Local, text: str) -> Any:
     try:
         return json.loads(text)
     except ValueError as error:
@@ -101,7 +106,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     write_json(folder / MANIFEST, data | {"seal": digest(data)})
 
 
-def read_manifest(folder: Path) -> Manifest | None:
+def read_manifest(folder: Local) -> Manifest | None:
     """Manifest of an artefact, or None when there is no artefact.
 
     Raises

@@ -11,6 +11,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from pixcal.model.errors import InputError, PixcalError, RemoteError
+from pixcal.storage.memory import MemoryPath
 
 # what to install for a protocol, where its name does not tell
 _EXTRAS = {"s3": "pixcal[s3]", "s3a": "pixcal[s3]", "gs": "gcsfs", "gcs": "gcsfs", "az": "adlfs"}
@@ -86,7 +87,8 @@ class UrlPath:
         return True
 
 
-Place = Path | UrlPath  # a file or folder, here or at a URL
+Local = Path | MemoryPath  # a file or folder of this process or machine
+Place = Local | UrlPath  # a file or folder, here or at a URL
 
 
 @contextmanager

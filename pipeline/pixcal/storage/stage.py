@@ -13,7 +13,7 @@ from pixcal.model.errors import DamagedError, InputError
 from pixcal.storage.artefact import Build, artefact_key, build, lock, up_to_date
 from pixcal.storage.formats import STAGES, Stage
 from pixcal.storage.manifest import Manifest, check_intact, read_json, read_manifest
-from pixcal.storage.place import Place
+from pixcal.storage.place import Local, Place
 
 
 def require(run: Path, name: str) -> Manifest:
@@ -49,7 +49,7 @@ def require(run: Path, name: str) -> Manifest:
     return manifest
 
 
-def read_acquisition(run: Path) -> Acquisition:
+def read_acquisition(run: Local) -> Acquisition:
     """The acquisition that was ingested."""
     file = run / "ingest" / "acquisition.json"
     return parse(Acquisition, read_json(file), str(file))

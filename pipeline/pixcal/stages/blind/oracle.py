@@ -64,7 +64,7 @@ def ask_oracle(
         ingest.run(acquisition, scratch / "run", ingest.Config(), runtime)
         reduce.run(scratch / "run", reduce.Config(), runtime)
         seen = _signatures(diagnosed)
-        look = look_at(scratch / "run", scratch, runtime, lambda *_: seen)
+        look = look_at(scratch / "run", runtime, lambda *_: seen)
         trials = Trials(look.windows, scratch, look.runtime, seen)
         true = effects_of(truth, bench)
         (nominal,) = trials.curves([()], REFERENCES, "nominal bench")

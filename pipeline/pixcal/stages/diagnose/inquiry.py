@@ -94,7 +94,7 @@ def inquire(
         signatures = weakly_seen(candidates, kinds)
         return signatures
 
-    look = look_at(run_dir, scratch, runtime, learnt)
+    look = look_at(run_dir, runtime, learnt)
     for name, candidate in candidates.items():
         if candidate.estimate is None and not candidate.reason:
             candidate.reason = _needs(kinds[name], look.facts)
@@ -112,7 +112,7 @@ def inquire(
         laws = {c.replay: c.estimate.effect for c in candidates.values() if c.replay and c.estimate}
         try:
             by_law = tuple(laws.get(effect, effect) for effect in on)
-            evidence = window.evidence(window.learn, (*base, *by_law), LEARN_SEED, scratch)
+            evidence = window.evidence(window.learn, (*base, *by_law), LEARN_SEED)
         except InputError:
             return {}  # These frames do not tell what the effects look like.
         asked = {n: _again(candidates[n]) or kinds[n] for n in names}

@@ -1,6 +1,5 @@
 """What a diagnosis looks at: windows of a reduced run, their nominal bench, their statistics."""
 
-import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -72,7 +71,6 @@ class DiagnosisInput:
 
 def look_at(
     run_dir: Path,
-    scratch: Path,
     runtime: Runtime,
     learnt: Callable[[Evidence, Evidence, Runtime], Sequence[Signature]] = lambda *_: (),
 ) -> DiagnosisInput:
@@ -80,7 +78,7 @@ def look_at(
 
     Parameters
     ----------
-    run_dir, scratch : Path
+    run_dir : Path
     runtime : Runtime
     learnt : callable
         Is given the evidence that effects are fitted on and that they are tried on, and how to run
@@ -134,7 +132,7 @@ def look_at(
         seed = raws[0].checksum if seed is None else seed
         try:
             halves = run_tasks(
-                partial(_evidence, run_dir, scratch, part, shape),
+                partial(_evidence, run_dir, part, shape),
                 list(enumerate(raws)),
                 runtime.here,
                 label=f"window {len(windows) + len(left_out) + 1}",
@@ -182,20 +180,13 @@ def look_at(
     )
 
 
-def _evidence(
-    run_dir: Path, scratch: Path, part: Part, shape: tuple[int, int], item: tuple[int, Raw]
-) -> Evidence:
+def _evidence(run_dir: Path, part: Part, shape: tuple[int, int], item: tuple[int, Raw]) -> Evidence:
     number, raw = item
-    folder = scratch / f"data-{number}"
     try:
-        return evidence_of(raw, folder, part, shape)
+        return evidence_of(raw, part, shape)
     except InputError as error:
         which = ("first", "second")[number]
-        reason = str(error).replace(f"{folder}: ", "")
-        raise InputError(f"{run_dir}: in the {which} half of the frames, {reason}") from error
-    finally:
-        # Stages would take what is left of one window for up to date in the next.
-        shutil.rmtree(folder, ignore_errors=True)
+        raise InputError(f"{run_dir}: in the {which} half of the frames, {error}") from error
 
 
 def _samples(half: Half, pixels: int) -> tuple[int, int]:

@@ -6,22 +6,18 @@ them is not in how they were looked at.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.engine.run import Runtime
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.config import to_plain
-from pixcal.stages import fit, reduce
-from pixcal.stages.evidence import Part, load_evidence
-from pixcal.stages.ingest.arrays import create, finish
+from pixcal.stages import evidence, reduce
+from pixcal.stages.evidence import Part
+from pixcal.stages.in_memory import run_in_memory
 from pixcal.stages.reduce.ingested import Ingested
-from pixcal.storage.artefact import build, write_json
 
 Frames = NDArray[Any]
 Table = Mapping[str, list[Any]]
@@ -100,14 +96,12 @@ def select(tables: Mapping[str, Table], half: Half) -> dict[str, Table]:
     }
 
 
-def evidence_of(raw: Raw, folder: Path, part: Part, window: tuple[int, int]) -> Evidence:
-    """Reduce and fit a part, with straight fringes, and load what it tells.
+def evidence_of(raw: Raw, part: Part, window: tuple[int, int]) -> Evidence:
+    """Reduce and fit a part, with straight fringes: what it tells.
 
     Parameters
     ----------
     raw : Raw
-    folder : Path
-        Empty; the run is made there.
     part : ((int, int), (int, int))
         Rows and columns of the window that the frames hold.
     window : (int, int)
@@ -118,20 +112,8 @@ def evidence_of(raw: Raw, folder: Path, part: Part, window: tuple[int, int]) -> 
     InputError
         If the part cannot be reduced or fitted.
     """
-    runtime = Runtime(cluster="sync")
-    with build(folder, "ingest", 1, {}, {}) as made:
-        facts = {}
-        for name, frames in raw.arrays.items():
-            writer = create(made.cubes, name, frames.shape, frames.dtype)
-            writer.write((0, 0, 0), frames)
-            facts[name] = finish(writer) | {"files": 1}
-        write_json(made.folder / "acquisition.json", to_plain(raw.acquisition))
-        write_json(made.folder / "frames.json", raw.tables)
-        made.summary.update(arrays=facts, warnings=[])
-    reduce.run(folder, raw.reduction, runtime)
-    if raw.acquisition.frames.fringes:
-        fit.run(folder, fit.Config(model="paraxial"), runtime, products=False)
-    found = load_evidence(folder)
+    run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction)
+    found = evidence.evidence_of(run)
     origin = (part[0][0], part[1][0])
     return replace(
         found,

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.engine.scratch import scratch_folder
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.test_statistics import Curve, Key, measure
 from pixcal.estimators.diagnosis.test_statistics.signature import signature_curve, signature_key
@@ -21,9 +20,6 @@ from pixcal.stages.diagnose.parts import Half, evidence_of
 from pixcal.stages.evidence import Part
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.manifest import digest
-
-RUN_SHARE = 3
-"""Times the raw frames that a run made of them may take."""
 
 Curves = dict[Key, Curve]
 Signature = type[Effect] | Again
@@ -62,7 +58,6 @@ class Window:
         half: Half,
         effects: Effects,
         seed: int,
-        otherwise: Path,
         *,
         fitted: bool = True,
         number: int = 0,
@@ -70,9 +65,7 @@ class Window:
         """A half of the frames, taken again with some effects (`NominalBench.simulate`)."""
         own = self.seed + seed
         raw = self.bench.simulate(half, effects, own, fitted=fitted, window=number)
-        need = RUN_SHARE * sum(frames.nbytes for frames in raw.arrays.values())
-        with scratch_folder(need, otherwise) as folder:
-            return evidence_of(raw, folder / "run", self.part, self.whole)
+        return evidence_of(raw, self.part, self.whole)
 
 
 @dataclass(frozen=True)
@@ -201,7 +194,7 @@ def _kept_or_made(
             (key, of): Curve(np.array(x, float), np.array(value, float))
             for key, of, x, value in plain["curves"]
         }
-    made = _made(windows, scratch, signatures, item)
+    made = _made(windows, signatures, item)
     if isinstance(made, str):
         plain = {"refused": made}
     else:
@@ -221,14 +214,13 @@ def _kept(file: Path) -> dict[str, Any] | None:
 
 def _made(
     windows: tuple[Window, ...],
-    scratch: Path,
     signatures: tuple[Signature, ...],
     item: tuple[Effects, int, int],
 ) -> Curves | str:
     effects, seed, number = item
     window = windows[number]
     try:
-        evidence = window.evidence(window.test, effects, seed, scratch, number=number)
+        evidence = window.evidence(window.test, effects, seed, number=number)
         return looked_at(evidence, signatures)
     except InputError as error:
         return str(error)

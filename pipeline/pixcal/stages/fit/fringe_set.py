@@ -1,7 +1,7 @@
 """One fringe set: the shape of its fringes, from the sums that the sweep left of every tile."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.errors import InputError
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.place import Local
 
 F64 = NDArray[np.float64]
 
@@ -73,7 +74,7 @@ class FittedSet:
     ----------
     name : str
     source : ReducedSet
-    swept : Path
+    swept : Path or MemoryPath
         ``sweep.zarr/<set name>``.
     facts : dict
         Summary of the set's sweep.
@@ -90,7 +91,7 @@ class FittedSet:
 
     name: str
     source: ReducedSet
-    swept: Path
+    swept: Local
     facts: dict[str, Any]
     planes: list[TilePlane]
     fit: SetFit
@@ -105,13 +106,46 @@ class FittedSet:
         return self.fit.basis.carrier
 
     @property
+    def vector(self) -> tuple[float, float]:
+        """Fringe vector (kx, ky) at the centre of the window, rad/px."""
+        ny, nx = self.source.shape
+        return self.shape.vector((ny - 1) / 2, (nx - 1) / 2)
+
+    @property
     def n_batches(self) -> int:
         """Batches of the run."""
         return int(self.fit.coefficients.shape[1]) - 1
 
 
+def fit_sets(
+    sweep: Local,
+    reduced: Local,
+    facts: Mapping[str, dict[str, Any]],
+    acquisition: Acquisition,
+    model: str,
+) -> list[FittedSet]:
+    """Fit the shape of the fringes of every set, see `fit_set`.
+
+    Parameters
+    ----------
+    sweep : Path or MemoryPath
+        Folder of ``sweep.zarr``.
+    reduced : Path or MemoryPath
+        ``reduced.zarr``.
+    facts : mapping
+        Summaries of the sweep, by name of the set.
+    """
+    return [
+        fit_set(
+            sweep / "sweep.zarr" / name, ReducedSet(reduced / name), facts[name], acquisition,
+            name, model,
+        )
+        for name in (listed.name for listed in acquisition.frames.fringes)
+    ]  # fmt: skip
+
+
 def fit_set(
-    swept: Path,
+    swept: Local,
     source: ReducedSet,
     facts: dict[str, Any],
     acquisition: Acquisition,
@@ -122,7 +156,7 @@ def fit_set(
 
     Parameters
     ----------
-    swept : Path
+    swept : Path or MemoryPath
         ``sweep.zarr/<set name>``.
     source : ReducedSet
     facts : dict
@@ -244,7 +278,7 @@ def describe(fitted: FittedSet, masked: int, sigma_px: float) -> dict[str, Any]:
     """
     source, facts, shape, fit = fitted.source, fitted.facts, fitted.shape, fitted.fit
     ny, nx = source.shape
-    kx, ky = shape.vector((ny - 1) / 2, (nx - 1) / 2)
+    kx, ky = fitted.vector
     k = float(np.hypot(kx, ky))
     ratio = np.median([p.ratio for p in fitted.planes if np.isfinite(p.sigma)])
     own = len(shape.names)

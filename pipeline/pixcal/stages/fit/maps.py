@@ -1,6 +1,7 @@
 """The maps of all sets and what they give together: one pass over the sweep's maps."""
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from pixcal.stages.fit.fringe_set import FittedSet
 from pixcal.stages.fit.scouting import read_frames
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
 from pixcal.storage.links import link_files
+from pixcal.storage.place import Local
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -105,6 +107,28 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
     return Totals(sets, outputs, square / freedom if freedom else None)
 
 
+def write_offsets(group: Local, fitted: list[FittedSet]) -> None:
+    """Write the offsets of each set alone, as `write_maps` has them."""
+    for f in fitted:
+        writer = _map_writers(group / f.name, f, ("delta",))["delta"]
+        removed = f.fit.basis.removed(f.planes, f.fit.coefficients)
+        for n, at in enumerate(f.source.tiles()):
+            y, x = f.source.ranges(at)
+            writer.write((y[0], x[0]), offsets(f, at, removed[n]).delta)
+        writer.finish()
+
+
+def _map_writers(group: Local, fitted: FittedSet, names: Sequence[str]) -> dict[str, ArrayWriter]:
+    """Maps (y, x) in pixels."""
+    return {
+        name: create_array(
+            group / name, fitted.source.shape, "<f4", dims=("y", "x"),
+            chunks=fitted.source.signal.chunks[1:], fill_value=np.nan, attrs={"units": "pixel"},
+        )
+        for name in names
+    }  # fmt: skip
+
+
 @dataclass(frozen=True)
 class _Told:
     """Of one tile: good pixels and some errors (px) of each set, and how the sets disagree."""
@@ -128,8 +152,10 @@ def _tile_task(
         for name in SAME_AS_SWEPT:
             ArrayReader(f.swept / name).read_chunk(at)  # linked: damage would be there for good
     found = [_write_set(f, at, removed[f.name], writers[f.name]) for f in fitted]
-    delta, sigma = (np.stack([m[n] for m in found]).astype(float) for n in (0, 1))
-    masks = np.stack([m[2] for m in found])
+    delta, sigma = (
+        np.stack([getattr(m, name) for m in found]).astype(float) for name in ("delta", "sigma")
+    )
+    masks = np.stack([m.flags for m in found])
     # Hyperbolic fringes turn over the window: each tile has its own axes.
     axes = [axis(f.shape, (y[0] + y[1] - 1) / 2, (x[0] + x[1] - 1) / 2) for f in fitted]
     value, error, chi2 = (combine_sets if both else combine_parallel)(axes, delta, sigma)
@@ -153,41 +179,71 @@ def _tile_task(
     )
 
 
-def _write_set(
-    fitted: FittedSet, at: tuple[int, int], removed: F64, writers: dict[str, ArrayWriter]
-) -> tuple[F32, F32, NDArray[np.uint8]]:
-    """Write a set's own maps of a tile; its offsets and errors (px, NaN where masked), its mask."""
+@dataclass(frozen=True)
+class SetOffsets:
+    """Of one set in one tile.
+
+    Attributes
+    ----------
+    delta, sigma : (y, x) float32
+        Offset and its error, px; NaN where masked.
+    flags : (y, x) uint8
+    modes : (mode, y * x) float64
+        Of the shape and the gauge.
+    k : float
+        Length of the fringe vector, rad/px.
+    scale : float32
+        Errors (px) over those of the sweep (rad).
+    """
+
+    delta: F32
+    sigma: F32
+    flags: NDArray[np.uint8]
+    modes: F64
+    k: float
+    scale: np.float32
+
+
+def offsets(fitted: FittedSet, at: tuple[int, int], removed: F64) -> SetOffsets:
+    """Offsets of a set in a tile, the modes that were removed from its phases."""
     source = fitted.source
     y, x = source.ranges(at)
     plane = fitted.planes[at[0] * source.grid[1] + at[1]]
     flags: NDArray[np.uint8] = ArrayReader(fitted.swept / "mask").read(y, x)
-    bad = flags != 0
     phase = ArrayReader(fitted.swept / "phase").read(y, x)
     shape = (phase.shape[0], phase.shape[1])
     modes = local_modes(fitted.carrier, plane, shape)
     surface = (removed[:, 0] @ modes).reshape(shape)
     k = float(np.hypot(*fitted.shape.vector(*plane.centre)))
     scale = np.float32(np.sqrt(fitted.noise) / k)
-    start = (y[0], x[0])
     delta = ((wrapped(phase - plane.on(shape)) - surface) / k).astype(np.float32)
     sigma = np.asarray(ArrayReader(fitted.swept / "sigma").read(y, x) * scale)
-    delta[bad] = sigma[bad] = np.nan
-    writers["delta"].write(start, delta)
-    writers["sigma"].write(start, sigma)
+    delta[flags != 0] = sigma[flags != 0] = np.nan
+    return SetOffsets(delta, sigma, flags, modes, k, scale)
+
+
+def _write_set(
+    fitted: FittedSet, at: tuple[int, int], removed: F64, writers: dict[str, ArrayWriter]
+) -> SetOffsets:
+    """Write a set's own maps of a tile."""
+    y, x = fitted.source.ranges(at)
+    start, found = (y[0], x[0]), offsets(fitted, at, removed)
+    writers["delta"].write(start, found.delta)
+    writers["sigma"].write(start, found.sigma)
     if fitted.n_batches:
         everything = (0, fitted.n_batches)
         for name, array in (("batch_delta", "batch_phase"), ("batch_sigma", "batch_sigma")):
             maps = ArrayReader(fitted.swept / array).read(everything, y, x).astype(np.float32)
             if name == "batch_delta":
-                surfaces = removed[:, 1:].T.astype(np.float32) @ modes.astype(np.float32)
+                surfaces = removed[:, 1:].T.astype(np.float32) @ found.modes.astype(np.float32)
                 maps -= surfaces.reshape(maps.shape)
-                maps *= np.float32(1 / k)
-                maps += delta
+                maps *= np.float32(1 / found.k)
+                maps += found.delta
             else:
-                maps *= scale
-            maps[:, bad] = np.nan
+                maps *= found.scale
+            maps[:, found.flags != 0] = np.nan
             writers[name].write((0, *start), _rounded(maps))
-    return delta, sigma, flags
+    return found
 
 
 def _create_set(folder: Path, fitted: FittedSet) -> dict[str, ArrayWriter]:
@@ -196,22 +252,17 @@ def _create_set(folder: Path, fitted: FittedSet) -> dict[str, ArrayWriter]:
     for name in SAME_AS_SWEPT:
         # Those that a killed fit has linked may be of a sweep that was damaged.
         shutil.rmtree(folder / name, ignore_errors=True)
-        link_files(fitted.swept / name, folder / name)
+        swept = fitted.swept / name
+        assert isinstance(swept, Path)
+        link_files(swept, folder / name)
     _write_frames(folder, fitted.swept)
+    writers = _map_writers(folder, fitted, ("delta", "sigma"))
     (cy, cx), shape = fitted.source.signal.chunks[1:], fitted.source.shape
-    attrs = {"units": "pixel"}
-    writers = {
-        name: create_array(
-            folder / name, shape, "<f4", dims=("y", "x"), chunks=(cy, cx), fill_value=np.nan,
-            attrs=attrs,
-        )
-        for name in ("delta", "sigma")
-    }  # fmt: skip
     n = fitted.n_batches
     for name in ("batch_delta", "batch_sigma") if n else ():
         writers[name] = create_array(
             folder / name, (n, *shape), "<f4", dims=("batch", "y", "x"), chunks=(n, cy, cx),
-            fill_value=np.nan, attrs=attrs,
+            fill_value=np.nan, attrs={"units": "pixel"},
         )  # fmt: skip
     return writers
 
@@ -221,18 +272,12 @@ def _create_joint(
 ) -> dict[str, ArrayWriter]:
     (cy, cx), shape = fitted.source.signal.chunks[1:], fitted.source.shape
     names = [array for name in outputs for array in (name, f"{name}_sigma")]
-    writers = {
-        name: create_array(
-            group / name, shape, "<f4", dims=("y", "x"), chunks=(cy, cx), fill_value=np.nan,
-            attrs={"units": "pixel"},
-        )
-        for name in names
-    }  # fmt: skip
+    writers = _map_writers(group, fitted, names)
     writers["mask"] = create_array(group / "mask", shape, "u1", dims=("y", "x"), chunks=(cy, cx))
     return writers
 
 
-def _write_frames(folder: Path, maps: Path) -> None:
+def _write_frames(folder: Path, maps: Local) -> None:
     """Parameters of every frame and the times of the batches, for those who read the fit."""
     frames = read_frames(maps)
     for array, data in (

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from pixcal.estimators.fringe_fit.scout import Scout, in_turn
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader, write_array
+from pixcal.storage.place import Local
 
 SCOUT_SHARE = 0.01
 """Share of the tiles that the scout reads (of large windows)."""
@@ -55,7 +55,7 @@ def scout_tiles(grid: tuple[int, int], number: int) -> list[tuple[int, int]]:
 
 
 def scout_set(
-    source: ReducedSet, nominal: tuple[float, float], folder: Path, runtime: Runtime, name: str
+    source: ReducedSet, nominal: tuple[float, float], folder: Local, runtime: Runtime, name: str
 ) -> None:
     """Find the frame parameters of a set and write them, and ``scout.json`` last.
 
@@ -64,7 +64,7 @@ def scout_set(
     source : ReducedSet
     nominal : (float, float)
         Nominal fringe vector (kx, ky), rad/px.
-    folder : Path
+    folder : Path or MemoryPath
         ``sweep.zarr/<set name>``.
     runtime : Runtime
     name : str
@@ -157,7 +157,7 @@ def _first_look(source: ReducedSet, blocks: int) -> list[tuple[int, NDArray[np.i
     return looks
 
 
-def read_frames(folder: Path) -> FrameParameters:
+def read_frames(folder: Local) -> FrameParameters:
     """Frame parameters that the scout left in ``sweep.zarr/<set name>``."""
     y, x = read_json(folder / "scout.json")["reference"]
     return FrameParameters(

@@ -8,11 +8,10 @@ from pixcal.engine.run import Runtime
 from pixcal.model.config import result_options
 from pixcal.model.options import Fit
 from pixcal.stages.fit import sweep
-from pixcal.stages.fit.fringe_set import describe, fit_set
+from pixcal.stages.fit.fringe_set import describe, fit_sets
 from pixcal.stages.fit.maps import write_maps
 from pixcal.stages.fit.products import plan_products, publish, published
 from pixcal.stages.fit.sweep import load_run
-from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import Build, Manifest, write_json
 from pixcal.storage.formats import STAGES
 from pixcal.storage.stage import make, require, working
@@ -51,17 +50,8 @@ def run(run_dir: Path, config: Config, runtime: Runtime, *, products: bool = Tru
 
 def _fit_all(run_dir: Path, swept: Manifest, config: Config, runtime: Runtime, made: Build) -> None:
     acquisition = load_run(run_dir)
-    fitted = [
-        fit_set(
-            run_dir / "sweep" / "sweep.zarr" / listed.name,
-            ReducedSet(run_dir / "reduce" / "reduced.zarr" / listed.name),
-            swept.summary["sets"][listed.name],
-            acquisition,
-            listed.name,
-            config.model,
-        )
-        for listed in acquisition.frames.fringes
-    ]
+    cubes = run_dir / "reduce" / "reduced.zarr"
+    fitted = fit_sets(run_dir / "sweep", cubes, swept.summary["sets"], acquisition, config.model)
     totals = write_maps(made.folder / "fit.zarr", fitted, runtime)
     result = {
         "schema": "pixcal/fit/1",

@@ -27,9 +27,17 @@ from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Sweep
 from pixcal.stages.fit.scouting import CACHE_BYTES, read_frames, scout_set
 from pixcal.stages.reduced_set import ReducedSet
-from pixcal.storage.artefact import Build, Manifest, file_digest, read_json, write_json
+from pixcal.storage.artefact import (
+    Build,
+    Manifest,
+    Workspace,
+    file_digest,
+    read_json,
+    write_json,
+)
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
 from pixcal.storage.formats import STAGES
+from pixcal.storage.place import Local
 from pixcal.storage.stage import make, read_acquisition, require
 
 CHI2_SAMPLES = 4096
@@ -76,24 +84,41 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         )
 
     def body(made: Build) -> None:
-        create_group(made.folder / "sweep.zarr")
-        sets = {}
-        for fringe_set in acquisition.frames.fringes:
-            nominal = nominal_vector(acquisition, fringe_set.name)
-            source = ReducedSet(run_dir / "reduce" / "reduced.zarr" / fringe_set.name)
-            try:
-                sets[fringe_set.name] = sweep_set(
-                    made, source, fringe_set.name, nominal, config, runtime
-                )
-            except DamagedError:
-                raise
-            except InputError as error:
-                raise InputError(f"{run_dir}: fringe set {fringe_set.name!r}: {error}") from error
+        try:
+            cubes = run_dir / "reduce" / "reduced.zarr"
+            sets = sweep_sets(made, cubes, acquisition, config, runtime)
+        except DamagedError:
+            raise
+        except InputError as error:
+            raise InputError(f"{run_dir}: {error}") from error
         made.summary = {"sets": sets}
         write_json(made.folder / "sweep.json", made.summary)
 
     inputs = {"reduce": require(run_dir, "reduce").key}
     return make(run_dir, STAGES["sweep"], result_options(config, Config), inputs, body)
+
+
+def sweep_sets(
+    made: Workspace, reduced: Local, acquisition: Acquisition, config: Config, runtime: Runtime
+) -> dict[str, dict[str, Any]]:
+    """Sweep every set of ``reduced.zarr`` into ``sweep.zarr``; their summaries by name.
+
+    Raises
+    ------
+    InputError
+        If a set has no fringes that can be fitted; it is named.
+    """
+    create_group(made.folder / "sweep.zarr")
+    sets = {}
+    for name in (listed.name for listed in acquisition.frames.fringes):
+        nominal = nominal_vector(acquisition, name)
+        try:
+            sets[name] = sweep_set(made, ReducedSet(reduced / name), name, nominal, config, runtime)
+        except DamagedError:
+            raise
+        except InputError as error:
+            raise InputError(f"fringe set {name!r}: {error}") from error
+    return sets
 
 
 @dataclass(frozen=True)
@@ -111,7 +136,7 @@ class _Job:
 
 
 def sweep_set(
-    made: Build,
+    made: Workspace,
     source: ReducedSet,
     name: str,
     nominal: tuple[float, float],
@@ -174,7 +199,7 @@ def sweep_set(
     }
 
 
-def _create_maps(folder: Path, source: ReducedSet, n_batches: int) -> dict[str, ArrayWriter]:
+def _create_maps(folder: Local, source: ReducedSet, n_batches: int) -> dict[str, ArrayWriter]:
     """Arrays that the tasks write, one chunk a tile."""
     ny, nx = source.shape
     cy, cx = source.signal.chunks[1:]

@@ -6,7 +6,6 @@ and the flags of the pixels that are not usual.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.columns import Index, extent, indices
 from pixcal.stages.reduce.frame_statistics import STATISTICS, Limits
 from pixcal.storage.cube import CHUNK, ArrayReader, ArrayWriter, create_array, create_group
+from pixcal.storage.place import Place
 
 F64 = NDArray[np.float64]
 
@@ -68,12 +68,12 @@ class Usual:
     bias: float
 
 
-def on_grid(folder: Path, shape: tuple[int, int], names: Sequence[str]) -> F64:
+def on_grid(folder: Place, shape: tuple[int, int], names: Sequence[str]) -> F64:
     """Maps that `measure` wrote, (name, pixel), of at most a million pixels on a regular grid.
 
     Parameters
     ----------
-    folder : Path
+    folder : Place
         Where the maps are.
     shape : (int, int)
         Of the detector's window (y, x).
@@ -92,7 +92,7 @@ def on_grid(folder: Path, shape: tuple[int, int], names: Sequence[str]) -> F64:
     return np.concatenate(parts, axis=1).astype(float)
 
 
-def usual(folder: Path, shape: tuple[int, int], gain: float) -> Usual:
+def usual(folder: Place, shape: tuple[int, int], gain: float) -> Usual:
     """Medians of the maps that `measure` wrote.
 
     Parameters
@@ -122,7 +122,7 @@ class Finishing:
 
     Attributes
     ----------
-    statistics : Path
+    statistics : Place
         What `measure` wrote.
     shape : (int, int)
         Of the detector's window (y, x).
@@ -144,7 +144,7 @@ class Finishing:
         Arrays for the maps.
     """
 
-    statistics: Path
+    statistics: Place
     shape: tuple[int, int]
     usual: Usual
     gain: float
@@ -157,7 +157,7 @@ class Finishing:
     writers: Mapping[str, ArrayWriter]
 
 
-def calibration_writers(folder: Path, shape: tuple[int, int]) -> dict[str, ArrayWriter]:
+def calibration_writers(folder: Place, shape: tuple[int, int]) -> dict[str, ArrayWriter]:
     """Make the arrays of ``calibration.zarr``."""
     create_group(folder, {"Conventions": "CF-1.11", "title": "calibration of the detector"})
     return {

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pixcal.engine.plan import Plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.storage.artefact import Build
+from pixcal.storage.artefact import Workspace
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import UrlPath
@@ -92,7 +92,7 @@ def blocks(reader: Reader, strip: Strip) -> Iterator[tuple[int, Iterator[NDArray
 
 
 def run_noted(
-    made: Build,
+    made: Workspace,
     task: Callable[[Strip], None],
     todo: Sequence[Index],
     width: int,
@@ -103,7 +103,7 @@ def run_noted(
 
     Parameters
     ----------
-    made : Build
+    made : Workspace
         Whose journal to use.
     task : callable
         All that it leaves is written when it returns.

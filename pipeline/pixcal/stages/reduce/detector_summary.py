@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from pixcal.stages.reduce.calibration import Usual, on_grid, usual
 from pixcal.stages.reduce.columns import grid
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.place import Place
 
 F64 = NDArray[np.float64]
 
@@ -167,14 +167,14 @@ class Summary:
         return found
 
 
-def summarise(job: Measuring, folder: Path, declared: Detector) -> Summary:
+def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     """Put the statistics of all columns together.
 
     Parameters
     ----------
     job : Measuring
         What they were measured with.
-    folder : Path
+    folder : Place
         Where they are.
     declared : Detector
         What its owner says.
@@ -213,7 +213,7 @@ def summarise(job: Measuring, folder: Path, declared: Detector) -> Summary:
     return Summary(declared, medians, read_noise, own, gain, levels, usable, full, straight)
 
 
-def pair_sums(folder: Path, job: Measuring) -> F64:
+def pair_sums(folder: Place, job: Measuring) -> F64:
     """Sums (2, N_BINS, COLUMNS) over the pairs of frames without and with light."""
     tables = ArrayReader(folder / "pairs")
     sums = np.zeros(tables.shape[2:])
@@ -224,7 +224,7 @@ def pair_sums(folder: Path, job: Measuring) -> F64:
 
 
 def _before_rounding(
-    variance: tuple[float, float], folder: Path, job: Measuring
+    variance: tuple[float, float], folder: Place, job: Measuring
 ) -> tuple[float, float] | None:
     """Noise of the amplifier and its error (ADU), by where the levels lie between codes."""
     assert job.read_series is not None

@@ -1,7 +1,6 @@
 """Fringe frames in electrons: from FITS files, or ``raw.zarr``, to ``reduced.zarr``."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,7 +40,7 @@ class FringeSet:
         As in ``acquisition.yaml``.
     raw : Reader
         Of the frames.
-    calibration : Path
+    calibration : Place
         ``calibration.zarr``.
     exptime : (t,) float32
         Exposure times for the dark signal (s).
@@ -53,7 +52,7 @@ class FringeSet:
 
     name: str
     raw: Reader
-    calibration: Path
+    calibration: Place
     exptime: F32
     saturation: float
     gain: float
@@ -117,7 +116,7 @@ class Converting:
 
 
 def set_writers(
-    folder: Place, scratch: Path, frames: int, shape: tuple[int, int], scale: Scale
+    folder: Place, scratch: Place, frames: int, shape: tuple[int, int], scale: Scale
 ) -> dict[str, ArrayWriter]:
     """Make the arrays of a dataset that `convert` writes, and one for its counts."""
     signal = {

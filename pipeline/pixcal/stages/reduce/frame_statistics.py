@@ -9,7 +9,6 @@ that was cut short goes on with the columns that are missing.
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,6 +32,7 @@ from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.ingested import MOST_ADU
 from pixcal.storage.cube import CHUNK, ArrayWriter, create_array, create_group
 from pixcal.storage.frame_reader import Reader
+from pixcal.storage.place import Place
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -111,7 +111,7 @@ class Measuring:
     writers: Mapping[str, ArrayWriter]
 
 
-def statistics_writers(folder: Path, shape: tuple[int, int], flats: int) -> dict[str, ArrayWriter]:
+def statistics_writers(folder: Place, shape: tuple[int, int], flats: int) -> dict[str, ArrayWriter]:
     """Make the arrays that `measure` writes: one chunk of each for a column."""
     tiles, n, rungs = grid(shape), len(STATISTICS), max(flats, 1)
     create_group(folder)

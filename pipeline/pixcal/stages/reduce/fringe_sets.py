@@ -21,7 +21,7 @@ from pixcal.stages.reduce.electrons import (
     write_coordinates,
 )
 from pixcal.stages.reduce.ingested import Ingested
-from pixcal.storage.artefact import Build
+from pixcal.storage.artefact import Workspace
 from pixcal.storage.cube import ArrayReader
 
 F64 = NDArray[np.float64]
@@ -55,7 +55,7 @@ class Bounds:
 
 
 def write_set(
-    made: Build,
+    made: Workspace,
     source: Ingested,
     name: str,
     *,
@@ -68,7 +68,7 @@ def write_set(
 
     Parameters
     ----------
-    made : Build
+    made : Workspace
         With ``calibration.zarr``, and scratch for the counts.
     source : Ingested
         With the raw frames.

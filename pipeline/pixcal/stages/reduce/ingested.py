@@ -17,7 +17,7 @@ from pixcal.storage.artefact import read_json, read_manifest
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.frame_reader import FrameReader, Reader
-from pixcal.storage.place import Place
+from pixcal.storage.place import Local, Place
 from pixcal.storage.stage import read_acquisition
 
 MOST_ADU = 2.0**32
@@ -30,11 +30,11 @@ class Ingested:
 
     Parameters
     ----------
-    folder : Path
+    folder : Path or MemoryPath
         ``RUN/ingest``.
     """
 
-    folder: Path
+    folder: Local
 
     @cached_property
     def raw(self) -> Place:
@@ -97,13 +97,14 @@ class Ingested:
 
     def _files_folder(self, noted: Mapping[str, str], file: str) -> Path:
         """The folder that holds the files: where it was, or as far from the run as it was."""
-        folder = Path(noted["folder"])
-        for found in (folder, self.folder.absolute().parent / noted["from_run"]):
+        folder, run = Path(noted["folder"]), self.folder.parent
+        assert isinstance(run, Path)
+        for found in (folder, run.absolute() / noted["from_run"]):
             if (found / file).exists():
                 return found
         raise InputError(
             f"{folder}: the frames of {self.folder} are not there any more; run 'pixcal ingest ACQ "
-            f"--out {self.folder.parent}' with ACQ where they are (and --copy, to remove them then)"
+            f"--out {run}' with ACQ where they are (and --copy, to remove them then)"
         )
 
     @cached_property

@@ -6,7 +6,7 @@ not copied, and holds them against their checksums.
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ from pixcal.stages.reduce.frame_statistics import (
 )
 from pixcal.stages.reduce.fringe_sets import Bounds, set_warnings, share_at_mean, write_set
 from pixcal.stages.reduce.ingested import Ingested
-from pixcal.storage.artefact import Build, Manifest, write_json
+from pixcal.storage.artefact import Build, Manifest, Workspace, write_json
 from pixcal.storage.cube import ArrayReader, create_group
 from pixcal.storage.cube_place import base_of, chosen_base
 from pixcal.storage.folder import transit_bytes
@@ -77,12 +77,8 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
         def body(made: Build) -> None:
             source = Ingested(run_dir / "ingest")
-            if config.gain == "measured" and len(source.tables.get("flat", {}).get("file", ())) < 2:
-                raise InputError(
-                    "gain: 'measured' needs two flat frames or more; list them under frames.flat "
-                    "of acquisition.yaml, or use gain: declared"
-                )
-            _reduce(made, source, config, runtime)
+            found = reduce_frames(made, source, config, runtime)
+            _report(made, source, config, found, runtime)
 
         def keep(_ready: Manifest) -> bool:
             return config.cubes is None or base_of(run_dir / "reduce") == base
@@ -91,7 +87,48 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         return make(run_dir, STAGES["reduce"], options, inputs, body, cubes=base, keep=keep)
 
 
-def _reduce(made: Build, source: Ingested, config: Config, runtime: Runtime) -> None:
+@dataclass(frozen=True)
+class Reduction:
+    """What is known of frames that were reduced, beside their cubes and maps.
+
+    Attributes
+    ----------
+    job : Measuring
+        How the calibration frames were measured.
+    summary : Summary
+        What they say of the detector.
+    gain : float
+        That is used, e-/ADU.
+    bounds : Bounds
+        Extremes over the good pixels.
+    sets : dict
+        What ``reduce.json`` says of each fringe set.
+    """
+
+    job: Measuring
+    summary: Summary
+    gain: float
+    bounds: Bounds
+    sets: dict[str, dict[str, Any]]
+
+    def noise(self, config: Config) -> dict[str, dict[str, Any]]:
+        """What ``reduce.json`` says of gain and read noise."""
+        return _report_noise(self.summary, config, self.gain, self.bounds)
+
+
+def reduce_frames(made: Workspace, source: Ingested, config: Config, runtime: Runtime) -> Reduction:
+    """Write ``calibration.zarr`` and ``reduced.zarr``.
+
+    Raises
+    ------
+    InputError
+        If the gain is to be measured and cannot be.
+    """
+    if config.gain == "measured" and len(source.tables.get("flat", {}).get("file", ())) < 2:
+        raise InputError(
+            "gain: 'measured' needs two flat frames or more; list them under frames.flat of "
+            "acquisition.yaml, or use gain: declared"
+        )
     exposures = source.exposures
     transit = transit_bytes(source.raw, made.cubes)
 
@@ -115,10 +152,10 @@ def _reduce(made: Build, source: Ingested, config: Config, runtime: Runtime) -> 
             made, source, name,
             gain=gain, bounds=bounds, share=config.rounding_share, runtime=runtime,
         )  # fmt: skip
-    _report(made, source, config, job, summary, gain, bounds, sets, runtime)
+    return Reduction(job, summary, gain, bounds, sets)
 
 
-def _measuring(source: Ingested, config: Config, folder: Path) -> Measuring:
+def _measuring(source: Ingested, config: Config, folder: Place) -> Measuring:
     exposures, detector = source.exposures, source.detector
     return Measuring(
         frames={
@@ -151,7 +188,7 @@ def _limits(config: Config) -> Limits:
 
 
 def _calibrate(
-    made: Build,
+    made: Workspace,
     source: Ingested,
     summary: Summary,
     gain: float,
@@ -192,24 +229,21 @@ def _report(
     made: Build,
     source: Ingested,
     config: Config,
-    job: Measuring,
-    summary: Summary,
-    gain: float,
-    bounds: Bounds,
-    sets: Mapping[str, dict[str, Any]],
+    found: Reduction,
     runtime: Runtime,
 ) -> None:
+    job, summary, sets = found.job, found.summary, found.sets
     piled = source.saturation_found if source.detector.saturation_adu is None else None
-    warnings = [*source.exposures.warnings, *summary.warnings(gain, piled)]
+    warnings = [*source.exposures.warnings, *summary.warnings(found.gain, piled)]
     declared = source.detector.saturation_adu is not None
-    for name, found in sets.items():
-        warnings += set_warnings(name, found, declared, config.rounding_share)
-        found["quantisation"]["share_at_mean"] = share_at_mean(found, bounds)
-        found["flags"] = _count_flags(made.cubes / "reduced.zarr" / name / "mask", source.shape)
+    for name, facts in sets.items():
+        warnings += set_warnings(name, facts, declared, config.rounding_share)
+        facts["quantisation"]["share_at_mean"] = share_at_mean(facts, found.bounds)
+        facts["flags"] = _count_flags(made.cubes / "reduced.zarr" / name / "mask", source.shape)
     report = {
         "schema": SCHEMA,
-        **_report_noise(summary, config, gain, bounds),
-        "linearity": linearity_report(summary, job, gain),
+        **found.noise(config),
+        "linearity": linearity_report(summary, job, found.gain),
         "saturation_adu": {
             "declared": source.detector.saturation_adu,
             "found": source.saturation_found,
@@ -223,7 +257,7 @@ def _report(
             ),
         },
         "flags": _count_flags(made.folder / "calibration.zarr" / "mask", source.shape),
-        "quantisation": {name: found.pop("quantisation") for name, found in sets.items()},
+        "quantisation": {name: facts.pop("quantisation") for name, facts in sets.items()},
         "sets": sets,
         "warnings": warnings,
     }

@@ -1,0 +1,79 @@
+"""Frames in memory: reduced and fitted without a file, with what the stages find in files."""
+
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from on_disk import evidence_on_disk
+
+from pixcal.engine.run import Runtime
+from pixcal.model.bench import Bench
+from pixcal.model.config import to_plain
+from pixcal.stages import ingest, reduce, simulate
+from pixcal.stages.diagnose.parts import Half, Raw, take
+from pixcal.stages.diagnose.windows import whole_of
+from pixcal.stages.evidence import evidence_of
+from pixcal.stages.fit.sweep import Config as Sweep
+from pixcal.stages.in_memory import NO_BATCHES, run_in_memory
+from pixcal.stages.reduce.ingested import Ingested
+from pixcal.storage.stage import read_acquisition
+
+SYNC = Runtime(cluster="sync")
+
+ROUNDING_RAD = float(np.spacing(np.float32(np.pi)))
+"""Phases are float32: with batches and without they are summed in another order."""
+ROUNDED = ("delta", "sigma", "free", "theta", "k", "free_covariance")
+"""What follows from phases."""
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory: pytest.TempPathFactory, make_effect_bench: Callable[..., Bench]) -> Raw:
+    """Frames of a window of more than one chunk that is no multiple of any."""
+    changes = {"frames.fringes.0.count": 71, "frames.fringes.1.count": 67}
+    bench = make_effect_bench(changes | {"detector.shape": [133, 61]})
+    folder = tmp_path_factory.mktemp("frames")
+    (folder / "bench.yaml").write_text(yaml.safe_dump(to_plain(bench)))
+    simulate.run(folder / "bench.yaml", folder / "acq", simulate.Config(), SYNC)
+    run = folder / "run"
+    ingest.run(folder / "acq", run, ingest.Config(), SYNC)
+    ingested = Ingested(run / "ingest")
+    half = Half({name: np.arange(3, a.shape[0]) for name, a in ingested.arrays.items()})
+    part = whole_of(ingested.shape)
+    return take(ingested, read_acquisition(run), half, part, reduce.Config())
+
+
+@pytest.mark.parametrize("sweep", [Sweep(), NO_BATCHES], ids=["with batches", "without"])
+def test_frames_in_memory_are_reduced_and_fitted_as_those_in_files(
+    raw: Raw, sweep: Sweep, tmp_path: Path
+) -> None:
+    expected = evidence_on_disk(raw, tmp_path)
+    run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction, sweep)
+    found = evidence_of(run)
+    for name in ("bias", "dark_rate", "flat", "good"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    for name in ("gain", "read_noise", "amplifier_noise", "neighbours", "saturation_adu"):
+        assert getattr(found, name) == getattr(expected, name)
+    for own, other in zip(found.stacks, expected.stacks, strict=True):
+        np.testing.assert_array_equal(own.adu, other.adu)
+    assert len(found.fringes) == 2
+    for name, own_set in found.fringes.items():
+        other_set = expected.fringes[name]
+        for field in (f.name for f in fields(own_set)):
+            one, other = getattr(own_set, field), getattr(other_set, field)
+            if sweep == NO_BATCHES and field in ROUNDED:
+                scale = np.hypot(*own_set.k) if field == "delta" else 1.0
+                if field in ("delta", "sigma", "free"):
+                    np.testing.assert_allclose(one, other, rtol=0, atol=ROUNDING_RAD / scale)
+            else:
+                np.testing.assert_array_equal(one, other, err_msg=field)
+
+
+def test_nothing_is_written(raw: Raw, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nor are the frames copied: those that are read are those that were given."""
+    monkeypatch.chdir(tmp_path)
+    run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction)
+    assert list(tmp_path.iterdir()) == []
+    assert (run / "ingest" / "raw.zarr" / "bias").array.values is raw.arrays["bias"]

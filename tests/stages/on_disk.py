@@ -1,0 +1,30 @@
+"""A run directory of frames in memory, by the stages, as if they had been ingested."""
+
+from pathlib import Path
+
+from pixcal.engine.run import Runtime
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.model.config import to_plain
+from pixcal.stages import fit, reduce
+from pixcal.stages.diagnose.parts import Raw
+from pixcal.stages.evidence import load_evidence
+from pixcal.stages.ingest.arrays import create, finish
+from pixcal.storage.artefact import build, write_json
+
+
+def evidence_on_disk(raw: Raw, folder: Path) -> Evidence:
+    """Reduce and fit frames in a run directory, and load what they tell."""
+    runtime = Runtime(cluster="sync")
+    with build(folder, "ingest", 1, {}, {}) as made:
+        facts = {}
+        for name, frames in raw.arrays.items():
+            writer = create(made.cubes, name, frames.shape, frames.dtype)
+            writer.write((0, 0, 0), frames)
+            facts[name] = finish(writer) | {"files": 1}
+        write_json(made.folder / "acquisition.json", to_plain(raw.acquisition))
+        write_json(made.folder / "frames.json", raw.tables)
+        made.summary.update(arrays=facts, warnings=[])
+    reduce.run(folder, raw.reduction, runtime)
+    if raw.acquisition.frames.fringes:
+        fit.run(folder, fit.Config(model="paraxial"), runtime, products=False)
+    return load_evidence(folder)
