@@ -257,10 +257,10 @@ def test_a_small_remainder_of_what_another_cause_brings_about_is_not_claimed() -
 
 
 def test_a_small_remainder_that_only_the_held_out_frames_show_is_not_claimed() -> None:
-    truth = {"left": 0.03, "right": 0.03, "little": 0.004}
-    strong = [candidate("left", 0.03), candidate("right", 0.03), candidate("little", 0.004)]
+    truth = {"left": 0.03, "right": 0.03, "little": 0.0048}
+    strong = [candidate("left", 0.03), candidate("right", 0.03), candidate("little", 0.0048)]
     assert set(search(truth, strong)[0].taken) == {"left", "right", "little"}
-    weak, left = search(truth, [*strong[:2], candidate("little", 0.004, sigmas=2.8)])
+    weak, left = search(truth, [*strong[:2], candidate("little", 0.0048, sigmas=2.8)])
     assert set(weak.taken) == {"left", "right"}
     assert left < 0.15
     assert "not significant (2.8 sigma) in" in weak.candidates["little"].reason
