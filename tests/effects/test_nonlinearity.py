@@ -165,10 +165,13 @@ def test_one_set_tells_less(acquired: Callable[..., Evidence]) -> None:
 def test_flats_tell_where_there_are_no_fringes(acquired: Callable[..., Evidence]) -> None:
     evidence = replace(acquired(None, {"nonlinearity": {}}), fringes={})
     found = Nonlinearity.estimate(evidence)
-    assert_recovered(found, Nonlinearity())
     assert found is not None
-    assert max(found.errors.values()) < 1e-3
-    assert found.significance > 15
+    assert isinstance(found.effect, Nonlinearity)
+    # Few levels tell one power of the response; the lamp is known to a thousandth.
+    top = np.array([found.effect.level_e], np.float32)
+    off = (found.effect.response(top) - Nonlinearity().response(top))[0] / top[0]
+    assert abs(off) < 4 * found.errors["quadratic"] < 0.012
+    assert found.significance > 6
     nominal = Nonlinearity.estimate(replace(acquired(), fringes={}))
     assert nominal is not None
     assert nominal.significance < 4

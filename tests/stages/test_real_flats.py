@@ -10,6 +10,7 @@ from numpy_detectors import Detector, reduced
 
 from pixcal.effects.gain_error import GainError
 from pixcal.effects.nonlinearity import Nonlinearity
+from pixcal.estimators.detector.flat_ladder import ladder as ladder_of
 from pixcal.estimators.diagnosis.test_statistics import DETECTOR, measure
 from pixcal.estimators.diagnosis.test_statistics.look import STEPS
 from pixcal.stages import reduce
@@ -48,8 +49,47 @@ def test_levels_of_one_exposure_time_are_told_apart(tmp_path: Path) -> None:
     flats = ladder([(0.5, lamp) for lamp in (0.2, 0.6, 1.0)], 4)
     evidence, report = reduced(Detector(**CAMERA, flats=flats), 2, tmp_path)
     assert [len(stack.adu) for stack in evidence.of_kind("flat")] == [4, 4, 4]
-    assert not evidence.steady_lamp
+    assert ladder_of(evidence) is None
     assert report["linearity"] is None
+
+
+@pytest.mark.parametrize(
+    ("lamp", "quadratic", "told"),
+    [(0.0, 0.0, True), (0.0, -0.05, True), (0.05, 0.0, False)],
+    ids=["steady", "bent response", "lamp that fades"],
+)
+def test_levels_that_bend_without_their_noise_are_the_lamp(
+    lamp: float, quadratic: float, told: bool, tmp_path: Path
+) -> None:
+    flats = ladder([(t, 1 - lamp * t) for t in LEVELS], 4)
+    camera = Detector(
+        **(CAMERA | {"shape": (160, 160)}), flats=flats,
+        response=lambda e: e * (1 + quadratic * e / 8000),
+    )  # fmt: skip
+    evidence, _ = reduced(camera, 11, tmp_path)
+    found = Nonlinearity.estimate(evidence)
+    assert found is not None
+    assert (ladder_of(evidence) is not None) == told
+    assert (found.significance > 5) == (quadratic != 0)
+
+
+def test_a_lamp_that_scatters_from_level_to_level_is_no_response(tmp_path: Path) -> None:
+    lamps = 1 + 0.004 * np.random.default_rng(5).standard_normal(len(LEVELS))
+    flats = ladder(list(zip(LEVELS, lamps, strict=True)))
+    evidence, _ = reduced(Detector(**CAMERA, flats=flats), 12, tmp_path)
+    levels, found = ladder_of(evidence), Nonlinearity.estimate(evidence)
+    assert levels is not None
+    assert found is not None
+    assert 0.002 < levels.wander < 0.008
+    assert found.significance < 3
+
+
+def test_exposures_that_all_last_longer_are_no_response(tmp_path: Path) -> None:
+    flats = ladder([(t, 1 + 0.004 / t) for t in LEVELS], 4)
+    evidence, _ = reduced(Detector(**CAMERA, flats=flats), 13, tmp_path)
+    found = Nonlinearity.estimate(evidence)
+    assert found is not None
+    assert found.significance < 3
 
 
 def test_saturation_is_found_and_what_is_below_it_used(tmp_path: Path) -> None:

@@ -7,10 +7,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.effects.gain_error import transfer_curve
 from pixcal.estimators.detector.flat_ladder import ladder_response
 from pixcal.estimators.detector.neighbours import shared_charge
 from pixcal.estimators.detector.response import departure, fit_curve, fit_response
+from pixcal.estimators.detector.transfer_curve import transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.middle import middle
 from pixcal.kernels.boundaries import boundary_shifts
@@ -207,12 +207,13 @@ def _bends(
 
 
 def _full_scale(evidence: Evidence, usual: float) -> float:
-    """Where to give the deviations: the usual level, unless the light is of another order."""
+    """Where to give the deviations: the usual level, unless fringes are of another order."""
     brightest = [float(np.nanquantile(f.electrons[::7], 0.99)) for f in evidence.fringes.values()]
     for stack in evidence.of_kind("flat"):
         brightest.append(float(np.median(stack.adu[0] - evidence.bias)) * evidence.gain)
     top = max(brightest, default=usual)
-    return usual if usual / _OTHER_ORDER < top < usual * _OTHER_ORDER else float(f"{top:.1g}")
+    alike = evidence.fringes and usual / _OTHER_ORDER < top < usual * _OTHER_ORDER
+    return usual if alike else float(f"{top:.1g}")
 
 
 def _of_noise(evidence: Evidence, level_e: float) -> tuple[F64, F64] | None:

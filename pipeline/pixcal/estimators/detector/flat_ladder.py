@@ -1,15 +1,161 @@
-"""The response of a detector by the levels of flats of several exposure times and one lamp."""
+"""Levels of flats against exposure time: a lamp's steadiness, and the detector's response.
+
+No lamp repeats its light exactly, exposure times have an offset, and black levels move: levels lie
+about a line that need not go through nothing. A curve through them is the detector's only if the
+noise of the flats bends with it, as far as that is precise enough to tell; else it is the lamp's.
+"""
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 
 F64 = NDArray[np.float64]
 
-MIN_RUNGS = 3  # fewest levels of flats that tell a curve from a line through nothing
+MIN_RUNGS = 3  # fewest levels of flats that tell a curve from a line
+LAMP = 1e-3  # relative error of the light of a flat at least, its exposure time included
+STEADY = 0.1  # rms of the levels about a curve beyond which the lamp was changed between them
+RATES = 1.3  # largest over least light a second of few levels of one lamp
+DISAGREE = 4.0  # errors between the curve of the levels and that of their noise
 
+_WITH_OFFSET, _WITH_CUBIC = 5, 6  # fewest levels for these terms
 _TURNS = 30
+_SMALL = 1e-4
+_NOT_TOLD = 1e-2  # error of a power that few levels do not tell; it is taken as zero
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """Flats of several exposure times and one lamp."""
+
+    times: F64  # (n,) s
+    levels: F64  # (n,) e-, without bias and dark signal
+    sizes: F64  # (2,) response S (1 + sizes[0] u + sizes[1] u²), u the level over the highest
+    covariance: F64  # (2, 2); the scatter of the levels about the curve is in it
+    wander: float  # relative rms of the levels about the curve
+
+    @property
+    def top(self) -> float:
+        """Highest level, e-."""
+        return float(self.levels.max())
+
+
+def light_of(evidence: Evidence, stack: Stack) -> F64:
+    """Mean (t,) of the good pixels in each frame without bias and dark signal, e-."""
+    good = evidence.good
+    dark = evidence.gain * evidence.bias[good].mean()
+    if np.isfinite(stack.exptime_s):
+        dark += evidence.dark_rate[good].mean() * stack.exptime_s
+    return np.asarray(stack.adu[:, good].mean(axis=1, dtype=float) * evidence.gain - dark)
+
+
+def flicker(evidence: Evidence) -> float:
+    """Relative change of the lamp from frame to frame, rms.
+
+    The first frame of a series may lack what stayed behind of the frame before: of pairs, what
+    their steps have in common is left out.
+    """
+    steps: list[float] = []
+    firsts: list[float] = []
+    for stack in evidence.ladder:
+        light = light_of(evidence, stack)
+        if len(light) > 1 and light.mean() > 0:
+            own = np.diff(light) / light.mean()
+            firsts.append(float(own[0]))
+            steps += own[1:].tolist()
+    pairs = np.array(firsts) - (np.median(firsts) if firsts else 0.0)
+    every = np.concatenate([steps, pairs if len(pairs) > 2 else []])
+    if not len(every):
+        return 0.0
+    return 1.4826 * float(np.median(np.abs(every))) / float(np.sqrt(2))
+
+
+def straight_line(times: F64, levels: F64, at: F64) -> F64:
+    """Levels at some times on the line that makes the relative distances least."""
+    terms = 1 + (len(times) >= _WITH_OFFSET)
+    design = np.stack([times, np.ones_like(times)][:terms], axis=1)
+    found = np.linalg.lstsq(design / levels[:, None], np.ones(len(levels)))[0]
+    return np.asarray(np.stack([at, np.ones_like(at)][:terms], axis=1) @ found)
+
+
+def ladder(evidence: Evidence) -> Ladder | None:
+    """The ladder of an acquisition; None with too few levels, or a lamp that was changed."""
+    return evidence.once("ladder", make=lambda: _ladder(evidence))
+
+
+def _ladder(evidence: Evidence) -> Ladder | None:
+    stacks = [s for s in evidence.ladder if s.exptime_s > 0]
+    light = [light_of(evidence, s) for s in stacks]
+    times = np.array([s.exptime_s for s in stacks])
+    levels = np.array([one.mean() for one in light])
+    if len(times) < MIN_RUNGS or len(set(times)) < len(times) or not levels.min() > 0:
+        return None
+    if not evidence.dithered:
+        return None
+    if len(times) < _WITH_OFFSET and (levels / times).max() > RATES * (levels / times).min():
+        return None
+    counts = np.array([len(one) for one in light])
+    # Photons hardly matter in the mean of a frame; the lamp does.
+    error = np.hypot(LAMP, flicker(evidence) / np.sqrt(counts))
+    # Where the flat varies, bright pixels bend more than the mean does.
+    flat = evidence.flat[evidence.good] / evidence.flat[evidence.good].mean()
+    moments = float((flat**2).mean()), float((flat**3).mean())
+    found = _bent(times, levels, error, moments)
+    if found is None or found.wander > STEADY:
+        return None
+    curve = transfer_curve(evidence)
+    return found if curve is None or _agree(found, curve) else None
+
+
+def _bent(times: F64, levels: F64, error: F64, moments: tuple[float, float]) -> Ladder | None:
+    n, top = len(times), float(levels.max())
+    terms = [True, n >= _WITH_OFFSET, True, n >= _WITH_CUBIC]
+    lit = straight_line(times, levels, times)
+    rate, sizes = 1.0, np.zeros(2)
+    offset, unit = 0.0, float(levels.min())
+    for _ in range(_TURNS):
+        linear = rate * lit + offset * unit
+        u = np.stack([linear * moments[0] / top, (linear / top) ** 2 * moments[1]])
+        bent = linear * (1 + sizes @ u)
+        slope = 1 + (2 * sizes[0] * u[0] + 3 * sizes[1] * u[1])
+        design = np.stack([lit * slope, unit * slope, linear * u[0], linear * u[1]]) / bent / error
+        design = design[terms]
+        normal = design @ design.T
+        if not np.isfinite(normal).all() or np.linalg.cond(normal) > 1e14:
+            return None
+        covariance = np.linalg.inv(normal)
+        rest = (levels / bent - 1) / error
+        step = np.zeros(4)
+        step[terms] = covariance @ (design @ rest)
+        rate, offset = rate + step[0], offset + step[1]
+        sizes = np.clip(sizes + step[2:], -0.3, 0.3)
+        if np.abs(step).max() < _SMALL:
+            break
+    freedom = n - sum(terms)
+    chi2 = float(rest @ rest) / freedom if freedom else 1.0
+    whole = _NOT_TOLD**2 * np.eye(4)
+    whole[np.ix_(terms, terms)] = covariance * max(chi2, 1.0)
+    wander = float(np.sqrt(max(chi2, 1.0)) * error.mean())
+    return Ladder(times, levels, sizes, whole[2:, 2:], wander)
+
+
+def _agree(found: Ladder, curve: TransferCurve) -> bool:
+    """Whether the noise bends with the levels: variance over level goes with the slope squared."""
+    u = curve.levels / found.top
+
+    def slope(sizes: F64) -> float:
+        rise = 1 + 2 * sizes[0] * u + 3 * sizes[1] * u**2
+        share = rise**2 / (1 + sizes[0] * u + sizes[1] * u**2)
+        line = np.polyfit(curve.levels / curve.top, share, 1, w=1 / curve.errors)
+        return float(line[0] / line[1])
+
+    expected = slope(found.sizes)
+    change = np.array([slope(found.sizes + _SMALL * one) - expected for one in np.eye(2)]) / _SMALL
+    error = np.hypot(curve.slope_error / curve.share, np.sqrt(change @ found.covariance @ change))
+    return bool(abs(curve.slope / curve.share - expected) < DISAGREE * error)
 
 
 def ladder_response(evidence: Evidence, level_e: float) -> tuple[F64, F64] | None:
@@ -23,37 +169,10 @@ def ladder_response(evidence: Evidence, level_e: float) -> tuple[F64, F64] | Non
     Returns
     -------
     sizes, covariance : (2,), (2, 2) float64
-        From the first and the second power of the level; None with too few levels, or several
-        lamps.
+        From the first and the second power of the level; None without a ladder.
     """
-    if not evidence.steady_lamp or not evidence.dithered:
+    found = ladder(evidence)
+    if found is None:
         return None
-    times, means, counts, scatter = [], [], [], []
-    for stack in evidence.ladder:
-        light = (stack.adu - evidence.bias) * evidence.gain
-        light -= evidence.dark_rate * stack.exptime_s
-        levels = light[:, evidence.good].mean(axis=1)
-        times.append(stack.exptime_s)
-        means.append(levels.mean())
-        counts.append(len(levels))
-        scatter.append(((levels / levels.mean() - 1) ** 2).sum())
-    freedom = sum(counts) - len(counts)
-    if len(times) < MIN_RUNGS or min(means) <= 0 or freedom < 1:
-        return None
-    time, mean, count = np.array(times), np.array(means), np.array(counts)
-    # The scatter of few frames is known from all levels together, never below that of photons.
-    photons = (mean + evidence.read_noise**2) / mean**2 / np.count_nonzero(evidence.good)
-    information = count / np.maximum(sum(scatter) / freedom, photons)
-    # Where the flat varies, bright pixels bend more than the mean does.
-    flat = evidence.flat[evidence.good] / evidence.flat[evidence.good].mean()
-    square, cube = (flat**2).mean() / level_e, (flat**3).mean() / level_e**2
-    rate, sizes = float((mean / time).mean()), np.zeros(2)
-    for _ in range(_TURNS):
-        linear = rate * time
-        terms = np.stack([linear * square, linear**2 * cube])
-        bent = 1 + sizes @ terms
-        design = np.stack([np.ones_like(time), *(terms / bent)])
-        covariance = np.linalg.inv((design * information) @ design.T)
-        step = covariance @ (design @ (information * (mean / (linear * bent) - 1)))
-        rate, sizes = rate * (1 + step[0]), sizes + step[1:]
-    return sizes, covariance[1:, 1:]
+    scale = (level_e / found.top) ** np.arange(1, 3)
+    return found.sizes * scale, found.covariance * np.outer(scale, scale)

@@ -34,7 +34,7 @@ HARMONICS = 5
 BLOCK = 64  # frames that are taken together
 
 _CLIP = 6.0
-_MIN_FRAMES = 4
+_MIN_FRAMES = 2
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,6 @@ STRIPE = 4
 """Rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves."""
 SATURATED = 1e-3
 """Share of saturated samples from which flats tell nothing of levels and noise."""
-STEADY = 0.3
-"""Relative change of the light a second of flats beyond which it is the lamp that was changed."""
 DITHER = 0.38
 """Noise over a code from which means of rounded samples are right to 2 % of a code."""
 NO_SAMPLE = -(1 << 30)
@@ -257,18 +255,6 @@ class Evidence:
     def dithered(self) -> bool:
         """Whether the read noise spans so much of a code that means of dark samples are right."""
         return self.amplifier_noise > DITHER * self.gain
-
-    @property
-    def steady_lamp(self) -> bool:
-        """Whether flats of different exposure times can be of one lamp."""
-        times = [s.exptime_s for s in self.ladder]
-        if not times or not min(times) > 0 or len(set(times)) < len(times):
-            return False
-        good = self.good
-        rates = [
-            float((s.adu.mean(axis=0) - self.bias)[good].mean()) / s.exptime_s for s in self.ladder
-        ]
-        return min(rates) > 0 and max(rates) < (1 + STEADY) * min(rates)
 
     @property
     def ladder(self) -> tuple[Stack, ...]:

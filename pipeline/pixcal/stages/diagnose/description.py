@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.estimators.detector.flat_ladder import light_of
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.bench import (
     SCHEMA,
@@ -20,7 +21,9 @@ from pixcal.model.bench import (
 from pixcal.model.errors import InputError
 from pixcal.simulation.recording import Recording
 from pixcal.stages.diagnose.nominal import SetTruth
-from pixcal.stages.diagnose.parts import Table, groups
+from pixcal.stages.diagnose.parts import Half, Table, groups
+
+F64 = NDArray[np.float64]
 
 
 def bench_of(
@@ -86,12 +89,19 @@ def bench_of(
 
 
 def recordings_of(
-    bench: Bench, acquisition: Acquisition, tables: Mapping[str, Table], evidence: Evidence
-) -> tuple[list[Recording], list[tuple[str, NDArray[np.intp]]]]:
-    """Recordings, and where their frames are."""
-    start, lamp = _start(tables), _lamp(evidence)
+    bench: Bench,
+    acquisition: Acquisition,
+    tables: Mapping[str, Table],
+    evidence: Sequence[Evidence],
+    halves: Sequence[Half],
+) -> tuple[list[Recording], list[tuple[str, NDArray[np.intp]]], dict[int, F64]]:
+    """Recordings, where their frames are, and the light of the frames of flats by their number.
+
+    In electrons for unit response; NaN in frames that are not looked at.
+    """
+    start = _start(tables)
     listed = {f"fringes/{s.name}": n for n, s in enumerate(acquisition.frames.fringes)}
-    recordings, places = [], []
+    recordings, places, light = [], [], {}
     for name, table in tables.items():
         exposures = np.array([np.nan if t is None else t for t in table["exptime_s"]], float)
         times = np.array(table["time_s"], float)
@@ -104,7 +114,9 @@ def recordings_of(
             electrons = 1.0 if name in listed else 0.0
             if kind == "flat":
                 step = int(table["step"][numbers[0]]) if "step" in table else 0
-                electrons = lamp * exposure if lamp else _level(evidence, exposure, step)
+                light[n] = _light(evidence, halves, name, numbers, (exposure, step))
+                lit = np.isfinite(light[n])
+                electrons = float(light[n][lit].mean()) if lit.any() else 1.0
             recordings.append(
                 Recording(
                     bench, kind, listed.get(name, n), name, name, len(numbers), exposure,
@@ -112,7 +124,7 @@ def recordings_of(
                 )
             )  # fmt: skip
             places.append((name, numbers))
-    return recordings, places
+    return recordings, places, light
 
 
 def _start(tables: Mapping[str, Table]) -> dict[str, float]:
@@ -128,35 +140,24 @@ def _start(tables: Mapping[str, Table]) -> dict[str, float]:
     return found
 
 
-def _lamp(evidence: Evidence) -> float:
-    """Electrons a second of the flats, for unit response: a linear detector shows one rate.
-
-    Zero where the lamp was changed between flats, or none of a known exposure time is there that is
-    not saturated.
-    """
-    if not evidence.steady_lamp:
-        return 0.0
-    rates = [_light(evidence, s) / s.exptime_s for s in evidence.ladder if s.exptime_s > 0]
-    return max(float(np.mean(rates)), 0.0) if rates else 0.0
-
-
-def _level(evidence: Evidence, exposure: float, step: int) -> float:
-    """Electrons of the flats of an exposure time and a lamp, for unit response."""
-    for stack in evidence.of_kind("flat"):
-        if stack.step != step:
-            continue
-        known = np.isfinite(stack.exptime_s)
-        if (not known and exposure == 0) or (known and np.isclose(stack.exptime_s, exposure)):
-            return _light(evidence, stack)
-    return 1.0
-
-
-def _light(evidence: Evidence, stack: Stack) -> float:
-    """Electrons of a stack, for unit response, without dark current."""
-    good = evidence.good & (evidence.flat > 0)
-    light = (stack.adu.mean(axis=0) - evidence.bias)[good] * evidence.gain
-    light = light - evidence.dark_rate[good] * np.nan_to_num(stack.exptime_s)
-    return float(light.mean() / evidence.flat[good].mean())
+def _light(
+    evidence: Sequence[Evidence],
+    halves: Sequence[Half],
+    name: str,
+    numbers: NDArray[np.intp],
+    exposure_and_step: tuple[float, int],
+) -> F64:
+    """Light (t,) of flats of an exposure time (s; zero: unknown) and a step of the lamp."""
+    exposure, step = exposure_and_step
+    light = np.full(len(numbers), np.nan)
+    for one, half in zip(evidence, halves, strict=True):
+        own = np.flatnonzero(np.isin(numbers, half.frames[name]))
+        for stack in one.of_kind("flat"):
+            known = np.isfinite(stack.exptime_s)
+            same = np.isclose(stack.exptime_s, exposure) if known else exposure == 0
+            if same and stack.step == step and len(stack.adu) == len(own):
+                light[own] = light_of(one, stack) / one.flat[one.good].mean()
+    return light
 
 
 def _top(

@@ -91,7 +91,7 @@ def inquire(
         candidates.update(_candidates(evidence, kinds, base, few))
         for candidate in candidates.values():
             candidate.replay = _replayed(candidate, unseen)
-        signatures = weakly_seen(candidates, kinds)
+        signatures = weakly_seen(candidates, kinds, slow=bool(evidence.fringes))
         return signatures
 
     look = look_at(run_dir, runtime, learnt)
@@ -212,9 +212,12 @@ def _again(candidate: Candidate) -> Again | None:
 
 
 def weakly_seen(
-    candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]]
+    candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]], *, slow: bool = True
 ) -> tuple[Signature, ...]:
-    """Candidates seen in the fitted frames; a slow one only if it is weak and none is stronger."""
+    """Candidates seen in the fitted frames; a slow one only if it is weak and none is stronger.
+
+    Flats and darks tell by themselves what slow estimates look for in fringes.
+    """
     seen = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
     most = max((e.significance for e in seen.values()), default=0.0)
     # By name: the order of candidates is none of curves.
@@ -222,7 +225,7 @@ def weakly_seen(
         estimate.again or kinds[name]
         for name, estimate in sorted(seen.items())
         if estimate.significance >= SIGNIFICANT
-        and (kinds[name].quick or estimate.significance == most < CLEAR)
+        and (kinds[name].quick or (slow and estimate.significance == most < CLEAR))
     )
 
 

@@ -18,6 +18,7 @@ from pixcal.kernels.scene import DetectorMaps
 from pixcal.model.acquisition import Acquisition
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.description import bench_of, recordings_of
+from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain
 from pixcal.stages.diagnose.nominal import (
     FittedSet,
@@ -104,14 +105,14 @@ def nominal_bench(
     # Where frames are too few to part, every part holds the same ones.
     parts = evidence if parted("bias", halves) else evidence[:1]
     bench = bench_of(acquisition, tables, one, whole, sets, dtypes)
-    recordings, places = recordings_of(bench, acquisition, tables, one)
+    recordings, places, light = recordings_of(bench, acquisition, tables, evidence, halves)
     return NominalBench(
         acquisition,
         tables,
         reduction,
         dtypes,
         bench,
-        Measured(maps, sets),
+        Measured(maps, sets, FlatLight.of(evidence, light)),
         PixelNoise.of([s.adu for e in parts for s in e.of_kind("bias")], good)
         if one.dithered
         else None,

@@ -28,7 +28,9 @@ from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, FringeMaps, Stage
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import SEEDS_APART, Recording
+from pixcal.simulation.shot import Shot
 from pixcal.stages import reduce
+from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
 from pixcal.stages.diagnose.undone import IntensityBeforeEffects
@@ -89,6 +91,7 @@ class Measured(Effect):
 
     maps: DetectorMaps
     sets: tuple[SetTruth, ...]
+    lamp: FlatLight = FlatLight()
 
     @property
     def is_null(self) -> bool:
@@ -118,6 +121,12 @@ class Measured(Effect):
             (alpha * np.sin(psi)).astype(np.float32),
             (alpha * np.cos(psi)).astype(np.float32),
         )
+
+    def photons(self, mean: F32, shot: Shot) -> F32:
+        """As in `Effect.photons`."""
+        if shot.recording.kind != "flat":
+            return mean
+        return mean * np.float32(self.lamp.factor(shot.recording, shot.frame))
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         """As in `Effect.states`."""
@@ -293,11 +302,12 @@ class NominalBench:
             name: np.empty((len(frames), *bench.detector.shape), self.dtypes[name])
             for name, frames in half.frames.items()
         }
+        levels = measured.lamp.levels(self.recordings, undone)
         for recording, (name, numbers) in zip(self.recordings, self.places, strict=True):
             wanted = np.flatnonzero(np.isin(numbers, half.frames[name]))
             electrons = recording.electrons
             if recording.kind == "flat":
-                electrons *= undone.lamp(self.recordings)
+                electrons = levels.get(recording.number, electrons)
             own = replace(recording, bench=bench, window=window, electrons=electrons)
             for first, after in _runs(wanted):
                 for frame, samples in camera.expose(own, range(first, after)):

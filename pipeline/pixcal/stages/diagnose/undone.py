@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from pixcal.model.bench import SimulatedDetector
 from pixcal.simulation.effect import Effect
-from pixcal.simulation.recording import Recording
 
 PHASES = 16
 """Of a fringe that is undone sample by sample."""
@@ -36,7 +35,7 @@ class IntensityBeforeEffects:
         """
         cosine = np.cos(2 * np.pi * np.arange(PHASES) / PHASES)
         measured = light * (1 + contrast * cosine)
-        samples = self._before(measured)
+        samples = self.levels(measured)
         if samples is measured or not contrast > 0:
             return 1.0, 1.0
         weight = (np.maximum(measured, 0) + self.detector.read_noise_e**2 + 1) ** -0.5
@@ -44,17 +43,7 @@ class IntensityBeforeEffects:
         mean, amplitude = np.linalg.lstsq(design, samples * weight, rcond=None)[0]
         return mean / light, amplitude / mean / contrast
 
-    def lamp(self, recordings: Sequence[Recording]) -> float:
-        """Of the lamp of the flats; of those below saturation, or all."""
-        d = self.detector
-        levels = np.array([r.electrons for r in recordings if r.kind == "flat" and r.electrons > 0])
-        if not levels.size:
-            return 1.0
-        below = levels < (d.top_adu - d.bias_adu) * d.gain_e_per_adu
-        levels = levels[below] if below.any() else levels
-        return float(np.mean(self._before(levels) / levels))
-
-    def _before(self, levels: F64) -> F64:
+    def levels(self, levels: F64) -> F64:
         """Even frames of these levels (e-) without the effects."""
         frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
         found = start = np.asarray(frames, np.float32)

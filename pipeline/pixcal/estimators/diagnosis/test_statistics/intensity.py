@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from pixcal.estimators.detector.flat_ladder import ladder, straight_line
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.test_statistics import Curve, statistic
 from pixcal.estimators.diagnosis.test_statistics.look import CODES, LEVELS, Look
@@ -57,20 +58,14 @@ def photon_transfer(evidence: Evidence) -> Curve | None:
     return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None
 
 
-@statistic("intensity", "linearity: signal of flats against exposure time", x="flat", sets=False)
+@statistic("intensity", "linearity: flats off a line over exposure time", x="flat", sets=False)
 def flat_ladder(evidence: Evidence) -> Curve | None:
-    """Electrons a second of each level, over their mean."""
-    levels, times = [], []
-    for stack in evidence.ladder:
-        if np.isfinite(stack.exptime_s) and stack.exptime_s > 0:
-            light = (stack.adu.mean(axis=0) - evidence.bias)[evidence.good] * evidence.gain
-            dark = evidence.dark_rate[evidence.good] * stack.exptime_s
-            levels.append(float(np.mean(light - dark)))
-            times.append(stack.exptime_s)
-    if len(levels) < 2 or not evidence.dithered or not evidence.steady_lamp:
+    """Departure of each level of one lamp from the line over exposure time."""
+    found = ladder(evidence)
+    if found is None:
         return None
-    rate = np.array(levels) / np.array(times)
-    return Curve(np.array(times), rate / rate.mean() - 1)
+    line = straight_line(found.times, found.levels, found.times)
+    return Curve(found.times, found.levels / line - 1)
 
 
 @statistic("intensity", "frequency of each bit in the samples", x="bit")

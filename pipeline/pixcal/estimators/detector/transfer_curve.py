@@ -1,0 +1,161 @@
+"""Photon transfer of flats, level by level, over that of the gain used.
+
+Noise that neighbours share counts with that of the pixels themselves: crosstalk and brighter-fatter
+move it from one to the other and leave the sum, as far as `STEPS` reach.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.kernels.noise_sums import product_sums
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+STEPS = np.array([(0, 0), (0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)])
+"""Rows and columns from a pixel to itself and to those that it may share its noise with."""
+FLOOR = 5e-3
+"""Error of a share of the variance that is left however many samples there are: no owner knows the
+gain of a detector better than this, and amplifiers differ by as much."""
+MIN_PIXELS = 200
+"""Fewest pixels that tell a noise."""
+
+_CLIP = 6.0
+_MIN_LEVELS = 3
+_ALIKE = 1e4
+_READ_KNOWN = 0.3
+"""Relative error of the read noise's variance as it was used."""
+
+
+@dataclass(frozen=True)
+class TransferCurve:
+    """Photon transfer of flats over that of the gain used, as a line over the level.
+
+    Attributes
+    ----------
+    share, error : float
+        At level zero.
+    slope, slope_error : float
+        Change up to the top.
+    top : float
+        Highest level, e-.
+    levels, shares, errors : (n,) float64
+        Of each level (e-).
+    """
+
+    share: float
+    error: float
+    slope: float
+    slope_error: float
+    top: float
+    levels: F64
+    shares: F64
+    errors: F64
+
+
+def transfer_curve(evidence: Evidence) -> TransferCurve | None:
+    """Photon transfer of each level of flats; None with fewer than three levels."""
+    return evidence.once("transfer curve", make=lambda: _transfer_curve(evidence))
+
+
+def _transfer_curve(evidence: Evidence) -> TransferCurve | None:
+    darks = [
+        s for stack in evidence.stacks
+        if stack.kind != "flat" and _is_enough(stack)
+        and (s := _of_stack(stack, evidence)) is not None
+    ]  # fmt: skip
+    points = []
+    for stack in filter(_is_enough, evidence.ladder):
+        sums = _of_stack(stack, evidence)
+        share = None if sums is None else shot_share([sums, *darks])
+        level = float((stack.adu.mean(axis=0) - evidence.bias)[evidence.good].mean())
+        if share is not None and level > 0:
+            points.append((level * evidence.gain, *share))
+    if len(points) < _MIN_LEVELS:
+        return None
+    level, share, error = np.array(points).T
+    top = float(level.max())
+    design = np.stack([np.ones_like(level), level / top]) / error
+    normal = design @ design.T
+    if np.linalg.cond(normal) > _ALIKE:
+        return None
+    covariance = np.linalg.inv(normal)
+    found = covariance @ (design @ (share / error))
+    errors = np.sqrt(np.diag(covariance))
+    at_zero, rise = zip(found.tolist(), errors.tolist(), strict=True)
+    return TransferCurve(*at_zero, *rise, top, level, share, error)
+
+
+def shot_share(sums: Iterable[F64]) -> tuple[float, float] | None:
+    """Noise that grows with the level over that expected, with its error; None without samples."""
+    total = sum(sums, np.zeros((len(STEPS), 7)))
+    if not total[0, 0]:
+        return None
+    share = variance = 0.0
+    for number, (n, s11, s12, s22, p1, p2, square) in enumerate(total):
+        own = number == 0
+        normal, right = np.array([[s11, s12], [s12, s22]]), np.array([p1, p2])
+        scatter = square / n - own
+        known = scatter / _READ_KNOWN**2
+        normal[1, 1] += known
+        right[1] += known * own
+        inverse = np.linalg.inv(normal)
+        times = 1 if own else 2
+        share += times * (inverse @ right)[0]
+        variance += times**2 * scatter * inverse[0, 0]
+    if share <= 0.1 or not np.isfinite(variance):
+        return None
+    return float(share), float(np.sqrt(variance + FLOOR**2))
+
+
+def sums_of_stacks(evidence: Evidence) -> Iterable[F64]:
+    """The same of flats, and of frames without light, which tell the noise at no level."""
+    if any(s.kind == "flat" and _is_enough(s) for s in evidence.stacks):
+        for stack in filter(_is_enough, evidence.stacks):
+            sums = _of_stack(stack, evidence)
+            if sums is not None:
+                yield sums
+
+
+def _is_enough(stack: Stack) -> bool:
+    return len(stack.adu) >= 2
+
+
+def _of_stack(stack: Stack, evidence: Evidence) -> F64 | None:
+    good = evidence.good & (stack.adu < evidence.saturation_adu).all(axis=0)
+    pixels = np.count_nonzero(good)
+    if pixels < MIN_PIXELS:
+        return None
+    frames = (stack.adu - evidence.bias.astype(np.float32)) * np.float32(evidence.gain)
+    level = frames.mean(axis=0)
+    noise = np.maximum(level, 0) + np.float32(evidence.read_noise**2)
+    # What a frame has more: of light, or of bias.
+    pattern = np.where(good, level if stack.kind == "flat" else 1, 0).astype(np.float32)
+    more = (frames - level) * (pattern / noise)
+    change = more[:, good].sum(axis=1) / (pattern**2 / noise).sum()
+    model = level + change[:, None, None] * pattern
+    ones = np.ones(level.shape)
+    return residual_sums(
+        frames - model, model, ones, evidence.read_noise**2 * ones, good,
+        np.ones((len(frames), 1)), (noise / len(frames))[None], np.full(len(STEPS), 1 / pixels),
+    )  # fmt: skip
+
+
+def residual_sums(
+    rest: F32, model: F32, shot_factor: F64, read: F64,
+    good: NDArray[np.bool_], of_time: NDArray[np.floating], of_pixels: NDArray[np.floating],
+    taken: F64,
+) -> F64:  # fmt: skip
+    """Sums of `product_sums` of residuals (t, y, x), e-, for each of `STEPS`."""
+    single = (np.ascontiguousarray(a, np.float32) for a in (rest, model, shot_factor, read))
+    return np.asarray(
+        product_sums(
+            *single, np.ascontiguousarray(good),
+            np.ascontiguousarray(of_time, np.float32), np.ascontiguousarray(of_pixels, np.float32),
+            STEPS, taken.astype(np.float32), _CLIP,
+        )
+    )  # fmt: skip

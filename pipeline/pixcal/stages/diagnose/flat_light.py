@@ -1,0 +1,83 @@
+"""The light of the flats as it was: a lamp is no part of the detector, and none is quite steady."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.detector.flat_ladder import LAMP, flicker, ladder, straight_line
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.simulation.recording import Recording
+from pixcal.stages.diagnose.undone import IntensityBeforeEffects
+
+F64 = NDArray[np.float64]
+
+SERIES = 8
+"""Frames of a series whose light is taken as it was in each; of fewer it is drawn."""
+
+
+@dataclass(frozen=True)
+class FlatLight:
+    """Light of the flats.
+
+    Attributes
+    ----------
+    flicker, wander : float
+        Relative rms from frame to frame, and of levels about the line over exposure time.
+    one_lamp : bool
+        Whether the levels are those of one lamp; else they are taken as measured.
+    frames : mapping
+        By the number of a recording, the light (t,) of each frame over the mean; NaN for frames
+        that are drawn: the first, which may lack what stayed behind, and those not looked at.
+    """
+
+    flicker: float = 0.0
+    wander: float = 0.0
+    one_lamp: bool = False
+    frames: Mapping[int, F64] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, evidence: Sequence[Evidence], light: Mapping[int, F64]) -> "FlatLight":
+        """As several parts of the frames show it; of the frames (t,) by recording, NaN unseen."""
+        found = [ladder(one) for one in evidence]
+        frames = {}
+        for number, own in light.items():
+            if np.isfinite(own).sum() >= SERIES:
+                frames[number] = own / np.nanmean(own)
+                frames[number][0] = np.nan
+        return cls(
+            float(np.mean([flicker(one) for one in evidence])),
+            float(np.mean([LAMP if one is None else one.wander for one in found])),
+            all(one is not None for one in found),
+            frames,
+        )
+
+    def factor(self, recording: Recording, frame: int) -> float:
+        """Of the light of a frame, over its recording's."""
+        known = self.frames.get(recording.number)
+        if known is not None and np.isfinite(known[frame]):
+            return float(known[frame])
+        of_frame = 1 + self.flicker * recording.rng("lamp", frame).standard_normal()
+        if known is not None or not self.one_lamp:
+            return float(of_frame)
+        return float(of_frame * (1 + self.wander * recording.rng("lamp").standard_normal()))
+
+    def levels(
+        self, recordings: Sequence[Recording], before: IntensityBeforeEffects
+    ) -> dict[int, float]:
+        """Electrons of the flats, by number, before some effects acted.
+
+        Of one lamp they lie on a line over exposure time.
+        """
+        flats = [r for r in recordings if r.kind == "flat" and r.electrons > 0]
+        if not flats:
+            return {}
+        times = np.array([r.exptime_s for r in flats])
+        levels = before.levels(np.array([r.electrons for r in flats]))
+        if self.one_lamp:
+            d = before.detector
+            below = levels < (d.top_adu - d.bias_adu) * d.gain_e_per_adu
+            below = below if below.any() else np.ones(len(levels), np.bool_)
+            levels = straight_line(times[below], levels[below], times)
+        return {r.number: float(level) for r, level in zip(flats, levels, strict=True)}
