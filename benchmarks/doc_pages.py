@@ -6,8 +6,12 @@ A page names what follows: ``<!-- commands -->`` the help of all commands, to it
 ``<!-- file: examples/glow.py -->`` a fenced block; ``<!-- keys: SimulatedOptics -->`` a table.
 """
 
+import contextlib
 import dataclasses
+import json
 import re
+import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -19,6 +23,8 @@ from documentation import readme_picture
 from documentation.layers import picture
 from documentation.stub import STUB, stub
 from pixcal.model import acquisition, bench
+from pixcal.report.drawing import png
+from pixcal.report.emva_figures import nonuniformity, photon_transfer
 from pixcal_cli.main import cli
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -109,6 +115,27 @@ def draw_sample(folder: Path) -> None:
         run.sets["vertical"].allan_picture().save(folder / "demo-allan.png")
 
 
+def draw_ccd(folder: Path) -> None:
+    """Pictures of the real camera, by the first blocks of its page."""
+    page = (DOCS / "tutorials" / "real-ccd.md").read_text(encoding="utf-8")
+    copy, described = (
+        re.search(rf"```{kind}\n(.*?)```", page, re.DOTALL) for kind in ("python", "yaml.*?")
+    )
+    assert copy
+    assert described
+    with tempfile.TemporaryDirectory() as scratch, contextlib.chdir(scratch):
+        subprocess.run([sys.executable, "-c", copy[1]], check=True)
+        Path("ccd/acquisition.yaml").write_text(described[1], encoding="utf-8")
+        pixcal.ingest("ccd", "ccd-run")
+        pixcal.reduce("ccd-run")
+        curves = json.loads(Path("ccd-run/reduce/figures_of_merit.json").read_text())
+    for name, figure in (
+        ("ccd-photon-transfer", photon_transfer(curves["photon_transfer"], None)),
+        ("ccd-dsnu", nonuniformity(curves["dsnu"], "DSNU")),
+    ):
+        (folder / f"{name}.png").write_bytes(png(figure))
+
+
 def main() -> None:
     """Write everything."""
     LAYERS.parent.mkdir(exist_ok=True)
@@ -120,6 +147,7 @@ def main() -> None:
             page.write_text(after, encoding="utf-8")
             print(page)
     draw_sample(LAYERS.parent)
+    draw_ccd(LAYERS.parent)
 
 
 if __name__ == "__main__":

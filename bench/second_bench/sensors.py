@@ -232,6 +232,56 @@ def _rows(sensor: Sensor, size_e: float, coefficients: F64, apart: int) -> None:
     sensor.amplified.append(adds)
 
 
+@kind()
+def fading_lamp(sensor: Sensor) -> Drawn:
+    """A lamp that warms up along the ladder, repeats its levels badly, and exposures with a lag."""
+    rng, flats = sensor.rng, [one for one in sensor.series if one.kind == "flat"]
+    drift, scatter = float(rng.uniform(-0.05, 0.05)), float(rng.uniform(0.001, 0.005))
+    late = float(rng.uniform(0, 0.05)) * min(one.exptime_s for one in flats)
+    for n, one in enumerate(flats):
+        lamp = 1 + drift * n / len(flats) + scatter * rng.standard_normal()
+        one.light_e *= lamp * (1 + late / one.exptime_s)
+    return {"drift": drift, "scatter": scatter, "late_s": late}
+
+
+@kind()
+def amplifiers(sensor: Sensor) -> Drawn:
+    """Two halves with amplifiers of their own, and converters of their own for columns."""
+    rng, nx = sensor.rng, sensor.shape[1]
+    apart, columns = float(rng.uniform(-0.03, 0.03)), float(rng.uniform(0.001, 0.01))
+    gains = 1 + columns * rng.standard_normal(nx) + apart * (np.arange(nx) >= nx // 2)
+    sensor.amplified.append(lambda e, _: e * gains)
+    offsets = rng.uniform(0.2, 3) * rng.standard_normal(nx) + 5 * (np.arange(nx) >= nx // 2)
+    sensor.bias_adu = np.maximum(sensor.bias_adu + offsets, 8)
+    # Electrons are counted with the mean.
+    sensor.amplified.append(lambda e, _: np.asarray(e / gains.mean()))
+    return {"apart": apart, "columns": columns}
+
+
+@kind()
+def vignetted(sensor: Sensor) -> Drawn:
+    """Dark corners, dust, pixels with dark current of a long tail, exposure times with jitter."""
+    rng, (ny, nx) = sensor.rng, sensor.shape
+    y, x = np.mgrid[:ny, :nx] / np.array([ny, nx])[:, None, None] - 0.5
+    shade = np.exp(-rng.uniform(0.5, 3) * (x**2 + y**2))
+    for _ in range(6):
+        at, size = rng.uniform(-0.5, 0.5, 2), rng.uniform(0.01, 0.04)
+        ring = np.hypot(y - at[0], x - at[1]) / size
+        shade *= 1 - rng.uniform(0.02, 0.15) * np.exp(-(ring**4))
+    sensor.response = sensor.response * shade
+    tail = rng.pareto(1.5, sensor.shape) * np.median(sensor.dark_e_s)
+    sensor.dark_e_s = sensor.dark_e_s + np.minimum(tail, 20 * sensor.read_noise_e.mean())
+    return {"corner": float(shade.min())}
+
+
+@kind()
+def clipped(sensor: Sensor) -> Drawn:
+    """A black level so low that the noise of bias frames is cut at code zero."""
+    size = float(sensor.rng.uniform(0.0, 1.5) * sensor.read_noise_e.mean() / sensor.gain)
+    sensor.bias_adu = np.full(sensor.shape, size)
+    return {"bias_adu": size}
+
+
 @kind("row_noise")
 def rows(sensor: Sensor) -> Drawn:
     """Every row of every frame has an offset."""

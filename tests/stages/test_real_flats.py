@@ -92,6 +92,14 @@ def test_exposures_that_all_last_longer_are_no_response(tmp_path: Path) -> None:
     assert found.significance < 3
 
 
+def test_noise_that_is_cut_off_at_code_zero_is_told_of(tmp_path: Path) -> None:
+    flats = ladder([(t, 1) for t in LEVELS])
+    _, report = reduced(Detector(**(CAMERA | {"bias": 2.0}), flats=flats), 14, tmp_path)
+    cut = [warning for warning in report["warnings"] if "cut off at code 0" in warning]
+    assert len(cut) == 2
+    assert "raise the black level" in cut[0]
+
+
 def test_saturation_is_found_and_what_is_below_it_used(tmp_path: Path) -> None:
     camera = Detector(**CAMERA, flats=ladder([(2.4 * t, 1) for t in LEVELS]))
     evidence, report = reduced(camera, 3, tmp_path)

@@ -77,6 +77,12 @@ class FlatSurvey:
         return [int(step) for step in found]
 
 
+def share_at_zero(frames: Reader) -> float:
+    """Share of the samples of the first frame that are zero, where no sample is below."""
+    samples = _rows(frames, 0, 1)
+    return 0.0 if samples.min() < 0 else float((samples == 0).mean())
+
+
 def _rows(frames: Reader, begin: int, end: int) -> NDArray[Any]:
     count, ny, nx = frames.shape
     first = max((ny - ROWS) // 2, 0)

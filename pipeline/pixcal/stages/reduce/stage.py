@@ -24,6 +24,7 @@ from pixcal.stages.reduce.columns import extent, indices, run_noted, strip_width
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
 from pixcal.stages.reduce.electrons import convert_bytes
 from pixcal.stages.reduce.figures_of_merit import characterise
+from pixcal.stages.reduce.flat_survey import share_at_zero
 from pixcal.stages.reduce.frame_statistics import (
     Limits,
     Measuring,
@@ -45,6 +46,8 @@ SCHEMA = "pixcal/reduce/1"
 
 _MIN_READ_FRAMES = 8  # fewer do not tell the noise of each pixel
 _SHARED_BYTES = 64 << 20
+_CUT_OFF = 1e-3
+"""Share of samples at code zero from which noise is cut off."""
 
 
 Config = Reduce
@@ -234,7 +237,7 @@ def _report(
 ) -> None:
     job, summary, sets = found.job, found.summary, found.sets
     piled = source.saturation_found if source.detector.saturation_adu is None else None
-    warnings = [*source.exposures.warnings, *summary.warnings(found.gain, piled)]
+    warnings = [*source.exposures.warnings, *_cut_off(source), *summary.warnings(found.gain, piled)]
     declared = source.detector.saturation_adu is not None
     for name, facts in sets.items():
         warnings += set_warnings(name, facts, declared, config.rounding_share)
@@ -264,6 +267,16 @@ def _report(
     report["figures_of_merit"] = characterise(made, source, job, summary, report, runtime)
     write_json(made.folder / "reduce.json", report)
     made.summary.update({key: report[key] for key in ("gain_e_per_adu", "flags", "warnings")})
+
+
+def _cut_off(source: Ingested) -> list[str]:
+    """What to say where the black level is so low that noise is cut off at code zero."""
+    return [
+        f"{name} frames are cut off at code 0, where {100 * share:.2g} % of their samples lie: "
+        "bias, read noise and gain come out wrong; raise the black level (offset) of the camera"
+        for name in ("bias", "dark")
+        if name in source.arrays and (share := share_at_zero(source.arrays[name])) > _CUT_OFF
+    ]
 
 
 def _report_noise(
