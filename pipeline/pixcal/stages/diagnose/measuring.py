@@ -1,16 +1,18 @@
 """The nominal bench is measured: on a part of an acquisition, or several, of the same pixels."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
+from scipy.stats import median_abs_deviation
 
 from pixcal.estimators.detector.amplifiers import relative_gain
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
-from pixcal.estimators.maps.structure import smooth_surface
+from pixcal.estimators.maps.structure import flattened, smooth_surface
 from pixcal.kernels.processes import ramp_step
 from pixcal.kernels.rounding import level_before_rounding
 from pixcal.kernels.sample_sums import calm_residuals, pixel_moments
@@ -174,6 +176,7 @@ def _fitted(
     theta = np.stack([np.mean([f.theta[0] for f in found], axis=0), z.imag, z.real])
     delta = np.mean([f.delta for f in found], axis=0)
     sigma = np.sqrt(np.sum([f.sigma**2 for f in found], axis=0)) / len(found) / k
+    sigma *= excess_scatter(found, good)
     bad = ~good
     return FittedSet(
         np.where(bad, np.nan, theta),
@@ -184,6 +187,21 @@ def _fitted(
         flat,
         one.name,
     )
+
+
+def excess_scatter(found: Sequence[FringeEvidence], good: NDArray[np.bool_]) -> float:
+    """By how much offsets of independent frames differ over what their errors allow; at least 1.
+
+    Effects that differ from frame to frame add to the errors of the offsets. Taken for true ones,
+    that part would be in the simulation twice: as offsets, and by the effect.
+    """
+    k = float(np.hypot(*found[0].k))
+    most = 1.0
+    for one, other in itertools.pairwise(found):
+        apart = flattened(np.where(good, one.delta - other.delta, np.nan))
+        error = np.hypot(one.sigma, other.sigma)[good] / k
+        most = max(most, float(median_abs_deviation(apart[good] / error, scale="normal")))
+    return most
 
 
 def _dark_rate(evidence: Sequence[Evidence], halves: Sequence[Half]) -> F32:
