@@ -36,3 +36,37 @@ def test_buffers_are_reused_where_only_the_nanny_has_chosen(setting: str, kept: 
     if before < 1000:
         pytest.skip("this C library keeps what was freed, or pages are huge")
     assert (after < before / 10) == kept
+
+
+ARRAYS = """
+from threading import Thread
+import numpy as np
+from pixcal.engine.malloc import keep_arrays
+
+def resident():
+    return int(open("/proc/self/statm").read().split()[1]) * 4096
+
+def simulation():
+    made = [np.ones(50 << 20, np.uint8) for _ in range(3)]
+    used.append(resident())
+
+used = []
+{first}
+for _ in range(2):
+    task = Thread(target=simulation)
+    task.start()
+    task.join()
+print(resident() - used[0], used[1] - used[0])
+"""
+
+
+@pytest.mark.parametrize(("first", "kept"), [("keep_arrays()", True), ("", False)])
+def test_arrays_of_simulations_serve_the_next_whichever_thread_made_them(
+    first: str, kept: bool
+) -> None:
+    env = {k: v for k, v in os.environ.items() if not k.startswith(("MALLOC_", "LD_PRELOAD"))}
+    code = ARRAYS.replace("{first}", first)
+    told = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, check=True)
+    after, more = map(int, told.stdout.split())
+    assert (after > -(50 << 20)) == kept
+    assert more < 50 << 20

@@ -109,10 +109,11 @@ def _fringes(
         raise ValueError("frames that follow one another are needed")
     if (last - first) * (y[1] - y[0]) * (x[1] - x[0]) > MAX_SAMPLES:
         raise InputError(f"fringe set {name!r}: more than {MAX_SAMPLES} samples; take a part")
-    codes = source.signal.read((first, last), y, x).astype(np.uint16)
+    codes = source.signal.read((first, last), y, x).astype(np.uint16, copy=False)
     coding = source.coding
-    electrons = codes * np.float32(coding.scale) + np.float32(coding.offset)
-    electrons[codes == coding.fill] = np.nan
+    electrons = codes * np.float32(coding.scale)
+    electrons += np.float32(coding.offset)
+    np.copyto(electrons, np.float32(np.nan), where=codes == coding.fill)
 
     found = read_frames(swept)
     centre = ((y[0] + y[1] - 1) / 2, (x[0] + x[1] - 1) / 2)

@@ -23,7 +23,7 @@ from typing import Any, Protocol
 
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.storage.cube_place import POINTER, cubes_of, remove_cubes, settle, settled
-from pixcal.storage.folder import DISK_FULL
+from pixcal.storage.folder import DISK_FULL, flush
 from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import (
     DAMAGE,
@@ -200,7 +200,9 @@ def build(
     made = Build(folder, cubes_of(folder), key, resumed)
     yield made
     # What is called complete must be on the disk, not on its way to it.
-    os.sync()
+    flush(folder)
+    if isinstance(made.cubes, Path) and made.cubes != folder:
+        flush(made.cubes)
     manifest = Manifest(
         stage, format, key, config, inputs, summary=made.summary, files=list_files(folder)
     )

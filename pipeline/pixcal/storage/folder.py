@@ -16,6 +16,7 @@ INDEX = "chunks.npy"
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)  # errors of the system that are no fault of the file
 # bytes that one task sends to a URL at the same time, and more than it reads ahead
 BATCH_BYTES = 16 << 20
+MANY_FILES = 1000  # that are not flushed one by one
 
 
 # name of a file below a folder, such as `c/0/1/2`, and its content in parts
@@ -109,6 +110,22 @@ class LocalFolder:
         for folder in sorted(folders, reverse=True):
             with suppress(OSError):
                 folder.rmdir()
+
+
+def flush(folder: Path) -> None:
+    """See to it that all files below a folder are on the disk, and the folders that name them."""
+    files = [(at, names) for at, _, names in os.walk(folder)]
+    if sum(len(names) for _, names in files) > MANY_FILES:
+        os.sync()  # One by one they would take longer than all that other programs write.
+        return
+    for at, names in files:
+        for path in (*(f"{at}/{name}" for name in names), at):
+            with suppress(FileNotFoundError):
+                handle = os.open(path, os.O_RDONLY)
+                try:
+                    os.fsync(handle)
+                finally:
+                    os.close(handle)
 
 
 def read_file(path: str, size: int, later: str | None = None) -> bytes:

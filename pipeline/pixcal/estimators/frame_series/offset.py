@@ -71,10 +71,15 @@ def fringe_offsets(found: FringeEvidence, flat: F64) -> OffsetSeries | None:
         return None
     good = found.good
     pattern = np.concatenate([found.theta[:, good], 1 / flat[None, good]]).astype(np.float32)
-    residual = found.residual[:, good]
-    weight = np.where(np.isfinite(residual), 1 / found.variance[:, good], np.float32(0))
-    residual = np.nan_to_num(residual)
-    fits = [_constant(pattern, weight, residual, mask[good]) for mask in (good, *masks)]
+    used = np.flatnonzero(good)
+    residual, variance = (
+        np.take(a.reshape(len(a), -1), used, axis=1) for a in (found.residual, found.variance)
+    )
+    weight = np.where(np.isfinite(residual), 1 / variance, np.float32(0))
+    np.nan_to_num(residual, copy=False)
+    quarters = [_sums(pattern, weight, residual, mask[good]) for mask in masks]
+    whole = tuple(np.sum(part, axis=0) for part in zip(*quarters, strict=True))
+    fits = [_constant(*sums) for sums in (whole, *quarters)]
     if not all(np.isfinite(f).all() for f in fits):
         return None
     means = np.stack([value for value, _ in fits])
@@ -134,12 +139,17 @@ def _half(count: int) -> NDArray[np.bool_]:
     return np.asarray(np.bitwise_count(np.arange(count) // STRIPE) % 2 == 0)
 
 
-def _constant(pattern: F32, weight: F32, residual: F32, mask: NDArray[np.bool_]) -> tuple[F64, F64]:
-    """Last coefficient (t,) of a weighted fit of patterns to the residual, and its variance."""
-    own, w = pattern[:, mask], weight[:, mask]
+def _sums(pattern: F32, weight: F32, residual: F32, mask: NDArray[np.bool_]) -> tuple[F64, F64]:
+    """Normal matrices (t, n, n) and right sides (t, n) of a fit of patterns to the residual."""
+    used = np.flatnonzero(mask)
+    own, w, rest = (np.take(a, used, axis=1) for a in (pattern, weight, residual))
     n = len(own)
     normal = (w @ (own[:, None] * own).reshape(n * n, -1).T).reshape(-1, n, n).astype(float)
-    right = ((w * residual[:, mask]) @ own.T).astype(float)
+    return normal, ((w * rest) @ own.T).astype(float)
+
+
+def _constant(normal: F64, right: F64) -> tuple[F64, F64]:
+    """Last coefficient (t,) of a weighted fit of patterns, and its variance."""
     scale = np.sqrt(np.maximum(np.einsum("tii->ti", normal), 1e-30))
     inverse = np.linalg.pinv(normal / (scale[:, :, None] * scale[:, None]), hermitian=True)
     last = inverse[:, -1] / (scale * scale[:, -1:])

@@ -1,7 +1,7 @@
 """A reduced run is looked at, its nominal bench simulated, and causes of the gap are searched."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from pixcal.stages.diagnose.deciding import MORE
 from pixcal.stages.diagnose.look import DiagnosisInput, look_at, plain_part
 from pixcal.stages.diagnose.result import by_domain
 from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Candidate, Found, Search
-from pixcal.stages.diagnose.trial import Curves, Effects, Signature, Trials, estimate
+from pixcal.stages.diagnose.trial import OF_ESTIMATE, Curves, Effects, Signature, Trials, estimate
 from pixcal.stages.diagnose.windows import whole_of
 
 F64 = NDArray[np.float64]
@@ -233,6 +233,9 @@ def _estimates(
     evidence: Evidence, kinds: Mapping[str, Signature], runtime: Runtime, label: str
 ) -> dict[str, Estimate | str | None]:
     results = run_tasks(
-        partial(estimate, evidence), list(kinds.values()), runtime.here, label=label
+        partial(estimate, evidence, bound=replace(OF_ESTIMATE, memory=runtime.memory)),
+        list(kinds.values()),
+        runtime.here,
+        label=label,
     )
     return dict(zip(kinds, results, strict=True))

@@ -5,12 +5,12 @@ data and every simulation of them are reduced and fitted by the same stages.
 """
 
 import hashlib
-import shutil
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
 from pixcal.effects import known_effects, parse_effects
+from pixcal.engine.malloc import keep_arrays
 from pixcal.engine.run import Runtime
 from pixcal.model.bench import load_bench
 from pixcal.model.config import to_plain
@@ -58,8 +58,7 @@ def _diagnose(
 ) -> None:
     """Write ``diagnosis.json`` and ``curves.json``."""
     made.scratch.mkdir(exist_ok=True)
-    for unfinished in (p for p in made.scratch.iterdir() if p.is_dir()):
-        shutil.rmtree(unfinished, ignore_errors=True)
+    keep_arrays()
     own = inquire(run_dir, kinds, base, made.scratch, runtime)
     diagnosis, curves = describe(
         own.found, own.data, own.look.measured, own.reference, own.look.facts, places(own)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pixcal.engine.bounds import Bound, Exceeded
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.test_statistics import Curve, Key, measure
@@ -20,6 +21,9 @@ from pixcal.stages.diagnose.parts import Half, evidence_of
 from pixcal.stages.evidence import Part
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.manifest import digest
+
+OF_ESTIMATE = Bound(seconds=45.0)
+"""Of which the slowest takes 6 s for as many samples as there are at most (`windows.SAMPLES`)."""
 
 Curves = dict[Key, Curve]
 Signature = type[Effect] | Again
@@ -250,10 +254,15 @@ def averaged(curves: Sequence[Curves]) -> Curves:
     return found
 
 
-def estimate(evidence: Evidence, kind: Signature) -> Estimate | str | None:
+def estimate(
+    evidence: Evidence, kind: Signature, bound: Bound = OF_ESTIMATE
+) -> Estimate | str | None:
     """Parameters of an effect; None without evidence, a sentence where the estimate failed."""
     try:
-        found = kind.estimate(evidence)
+        with bound.kept():
+            found = kind.estimate(evidence)
+    except Exceeded:
+        return f"not decided: an estimate may use {bound.told()}, this one would need more"
     except NotImplementedError as error:
         return str(error)
     except np.linalg.LinAlgError:

@@ -1,0 +1,68 @@
+"""What takes more time or memory than was planned for it is ended; what comes after is not."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from pixcal.engine.bounds import Bound, Exceeded
+
+ALL = 1 << 60
+
+
+def busy(seconds: float) -> int:
+    """Work of this thread's processor time, in small steps."""
+    end, steps = time.thread_time() + seconds, 0
+    while time.thread_time() < end:
+        steps += 1
+    return steps
+
+
+def test_work_within_its_bound_is_left_alone() -> None:
+    with Bound(5.0, ALL).kept():
+        assert busy(0.05)
+    # Nor is what follows, of which nothing is watched any more.
+    assert busy(0.5)
+
+
+def test_work_that_goes_on_for_long_is_ended() -> None:
+    begin = time.thread_time()
+    with pytest.raises(Exceeded), Bound(0.1, ALL).kept():
+        busy(20.0)
+    assert time.thread_time() - begin < 5.0
+    assert busy(0.3)
+
+
+def test_waiting_is_no_work() -> None:
+    """Nor is what other threads do: a busy machine changes no answer."""
+    other = threading.Thread(target=busy, args=(0.6,))
+    other.start()
+    with Bound(0.3, ALL).kept():
+        time.sleep(0.6)
+    other.join()
+
+
+def test_work_that_fills_the_memory_is_ended() -> None:
+    held = []
+
+    def fill() -> None:
+        for _ in range(40):
+            held.append(np.ones(32 << 20, np.uint8))
+            busy(0.1)
+
+    with pytest.raises(Exceeded), Bound(60.0, 600 << 20).kept():
+        fill()
+    assert len(held) < 40
+
+
+def test_others_who_try_several_ways_do_not_go_on() -> None:
+    def stubborn() -> None:
+        while True:
+            try:
+                busy(10.0)
+            except Exception:
+                continue
+
+    with pytest.raises(Exceeded), Bound(0.1, ALL).kept():
+        stubborn()
