@@ -33,7 +33,7 @@ from pixcal.model.bench import SCHEMA
 from pixcal.model.config import to_plain
 from pixcal.simulation.effect import Effect
 from pixcal.stages import diagnose, ingest, reduce, simulate
-from pixcal.stages.blind.strengths import ways_of
+from pixcal.stages.blind.strengths import variants_of
 from pixcal.stages.diagnose.inquiry import REFERENCES, Inquiry, inquire
 from pixcal.stages.diagnose.search import looks_like
 from pixcal.stages.diagnose.shrinkage import differing, shrinkage
@@ -96,7 +96,7 @@ def record(bench: dict[str, Any], folder: Path, run: Path) -> None:
 
 def truth_of(name: str, strength: float, seed: int) -> tuple[Effect, ...]:
     """An effect in one of its ways, so many times as strong as its threshold."""
-    ways = ways_of()[name]
+    ways = variants_of()[name]
     way = ways[(seed // SEEDS_APART + STRENGTHS.index(strength)) % len(ways)]
     drawn = way.make(strength * way.threshold("small"), np.random.default_rng(seed))
     return tuple(parse_effects({name: drawn}, name))

@@ -43,9 +43,9 @@ def make(folder: Path, sealed: Path, config: MakeConfig, runtime: "Runtime") -> 
     """Simulate cases with no, one or several effects, and seal the truth."""
     from pixcal.stages import blind as stage  # here: for a fast `pixcal --help`
 
-    found = stage.make(folder, sealed, config, runtime)
+    examination = stage.make(folder, sealed, config, runtime)
     click.echo(f"cases in {folder}: {config.cases}; their truth in {sealed}")
-    results.show_notes(found.notes)
+    results.show_notes(examination.notes)
 
 
 @command(
@@ -71,8 +71,8 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: "Runtime") -
     """Compare every diagnosis with its truth."""
     from pixcal.stages import blind as stage  # here: for a fast `pixcal --help`
 
-    found = stage.score(folder, sealed, config, runtime)
-    _show(found)
+    result = stage.score(folder, sealed, config, runtime)
+    _show(result)
     for file in (folder / "score.json", folder / "score.md"):
         click.echo(f"  {file}")
 
@@ -81,9 +81,9 @@ for each in (make, run, score):
     blind.add_command(each)
 
 
-def _show(found: Mapping[str, Any]) -> None:
+def _show(result: Mapping[str, Any]) -> None:
     rows = []
-    for part, facts in found["parts"].items():
+    for part, facts in result["parts"].items():
         for question, count in facts["questions"].items():
             limits = count["interval"]
             interval = "" if limits is None else f"{limits[0]:.2f} to {limits[1]:.2f}"
@@ -91,6 +91,6 @@ def _show(found: Mapping[str, Any]) -> None:
                 (part, facts["title"], question, f"{count['right']}/{count['of']}", interval)
             )
     results.show_table(("part", "", "question", "right", "95 % interval"), rows)
-    wrong = [f"{c['case']}: {c['why']}" for c in found["cases"] if not c["right"]]
-    missing = [f"not diagnosed yet: {len(found['missing'])} of {found['made']} cases"]
-    results.show_notes([*wrong, *(missing if found["missing"] else []), *found["notes"]])
+    wrong = [f"{c['case']}: {c['why']}" for c in result["cases"] if not c["right"]]
+    missing = [f"not diagnosed yet: {len(result['missing'])} of {result['made']} cases"]
+    results.show_notes([*wrong, *(missing if result["missing"] else []), *result["notes"]])

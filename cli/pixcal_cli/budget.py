@@ -40,33 +40,31 @@ def budget(bench: Path, config: Budget, out: Path | None, as_json: bool) -> None
     """
     from pixcal.stages import budget as stage  # here: for a fast `pixcal --help`
 
-    found = stage.run(bench, config, out)
+    plan = stage.run(bench, config, out)
     if as_json:
-        click.echo(json.dumps(found, indent=2))
+        click.echo(json.dumps(plan, indent=2))
         return
-    _show(found)
+    _show(plan)
     for name in ("budget.json", "budget.png") if out is not None else ():
         click.echo(f"  {(out or Path()) / name}")
 
 
-def _show(found: Mapping[str, Any]) -> None:
-    ny, nx = found["window"]
-    noise = sum(found["variance_e2"].values()) ** 0.5
-    click.echo(
-        f"budget: {found['bench']['file']}, {nx} × {ny} px, {noise:.3g} e- rms without light"
-    )
-    _show_sets(found)
-    if found["precision_px"] is not None:
-        _show_wanted(found)
-    if found["frames"] is not None:
-        _show_given(found)
-    _show_shares(found)
-    _show_calibration(found)
-    _show_levers(found)
-    show_notes([*found["warnings"], *(f"left out: {what}" for what in found["left_out"])])
+def _show(plan: Mapping[str, Any]) -> None:
+    ny, nx = plan["window"]
+    noise = sum(plan["variance_e2"].values()) ** 0.5
+    click.echo(f"budget: {plan['bench']['file']}, {nx} × {ny} px, {noise:.3g} e- rms without light")
+    _show_sets(plan)
+    if plan["precision_px"] is not None:
+        _show_wanted(plan)
+    if plan["frames"] is not None:
+        _show_given(plan)
+    _show_shares(plan)
+    _show_calibration(plan)
+    _show_levers(plan)
+    show_notes([*plan["warnings"], *(f"left out: {what}" for what in plan["left_out"])])
 
 
-def _show_sets(found: Mapping[str, Any]) -> None:
+def _show_sets(plan: Mapping[str, Any]) -> None:
     click.echo("\nfringe sets as planned")
     rows = [
         (
@@ -80,7 +78,7 @@ def _show_sets(found: Mapping[str, Any]) -> None:
             f"{s['planned']['median_px']:.3g}",
             f"{s['planned']['worst_px']:.3g}",
         )
-        for name, s in found["sets"].items()
+        for name, s in plan["sets"].items()
     ]
     header = (
         "set", "interfringe px", "mean e-", "visibility", "one frame px", "worst px", "frames",
@@ -89,11 +87,11 @@ def _show_sets(found: Mapping[str, Any]) -> None:
     show_table(header, rows)
 
 
-def _show_wanted(found: Mapping[str, Any]) -> None:
-    click.echo(f"\nfor {found['precision_px']:g} px on each axis")
-    joint = found["joined"]
-    entries = [(f"{name} alone", s["wanted"]) for name, s in found["sets"].items()]
-    if len(found["sets"]) > 1:
+def _show_wanted(plan: Mapping[str, Any]) -> None:
+    click.echo(f"\nfor {plan['precision_px']:g} px on each axis")
+    joint = plan["joined"]
+    entries = [(f"{name} alone", s["wanted"]) for name, s in plan["sets"].items()]
+    if len(plan["sets"]) > 1:
         entries += [(f"{name}, all sets", c["wanted"]) for name, c in joint["components"].items()]
     rows = [
         (name, w["frames"], _hours(w["hours"]), _size(w["bytes"]), w["frames_worst"])
@@ -102,18 +100,18 @@ def _show_wanted(found: Mapping[str, Any]) -> None:
     show_table(("", "frames", "time", "data", "frames, worst px"), rows)
 
 
-def _show_given(found: Mapping[str, Any]) -> None:
-    click.echo(f"\nwith {found['frames']} frames of each set")
-    parts = [(f"{name} alone", s["given"]) for name, s in found["sets"].items()]
-    if len(found["sets"]) > 1:
+def _show_given(plan: Mapping[str, Any]) -> None:
+    click.echo(f"\nwith {plan['frames']} frames of each set")
+    parts = [(f"{name} alone", s["given"]) for name, s in plan["sets"].items()]
+    if len(plan["sets"]) > 1:
         parts += [
-            (f"{name}, all sets", c["given"]) for name, c in found["joined"]["components"].items()
+            (f"{name}, all sets", c["given"]) for name, c in plan["joined"]["components"].items()
         ]
     rows = [(name, f"{g['median_px']:.3g}", f"{g['worst_px']:.3g}") for name, g in parts]
     show_table(("", "median px", "worst px"), rows)
 
 
-def _show_shares(found: Mapping[str, Any]) -> None:
+def _show_shares(plan: Mapping[str, Any]) -> None:
     click.echo("\nwhat the frames are for: photons alone, and the factors that raise them")
     rows = [
         (
@@ -122,7 +120,7 @@ def _show_shares(found: Mapping[str, Any]) -> None:
             *(f"× {s['shares'][key]:.3g}" for key in list(LIMITS)[1:]),
             LIMITS[s["limited_by"]],
         )
-        for name, s in found["sets"].items()
+        for name, s in plan["sets"].items()
     ]
     header = (
         "set", "photons", "uneven light", "visibility", "read noise", "phases", "limited by",
@@ -130,10 +128,10 @@ def _show_shares(found: Mapping[str, Any]) -> None:
     show_table(header, rows)
 
 
-def _show_calibration(found: Mapping[str, Any]) -> None:
+def _show_calibration(plan: Mapping[str, Any]) -> None:
     click.echo("\ncalibration frames, so that their noise costs less than 0.1 % of the frames")
     rows = []
-    for name, s in found["sets"].items():
+    for name, s in plan["sets"].items():
         c = s["calibration"]
         flat = "-" if c["flat_error"] is None else f"{100 * c['flat_error']:.2g} %"
         rows.append(
@@ -148,11 +146,11 @@ def _show_calibration(found: Mapping[str, Any]) -> None:
     show_table(("set", "bias", "flat", "noise of the flats", "which costs"), rows)
 
 
-def _show_levers(found: Mapping[str, Any]) -> None:
+def _show_levers(plan: Mapping[str, Any]) -> None:
     click.echo("\nwhat if (all sets, the worse axis)")
-    planned = next(v for v in found["levers"] if v["name"] == "as planned")
+    planned = next(v for v in plan["levers"] if v["name"] == "as planned")
     rows = []
-    for lever in found["levers"]:
+    for lever in plan["levers"]:
         ratio = planned["variance"] * planned["period_s"] / (lever["variance"] * lever["period_s"])
         frames = "-" if lever["frames"] is None else lever["frames"]
         time = "-" if lever["hours"] is None else _hours(lever["hours"])

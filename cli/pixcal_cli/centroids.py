@@ -68,11 +68,11 @@ def centroids(
     from pixcal.stages import centroids as stage
 
     job = stage.TableJob(table, out, x, y, int(origin), overwrite)
-    found = stage.correct_table(run, job, fwhm_px=fwhm, electrons=electrons)
-    good = np.isfinite(found.place[:, 0])
+    corrected = stage.correct_table(run, job, fwhm_px=fwhm, electrons=electrons)
+    good = np.isfinite(corrected.place[:, 0])
     click.echo(f"{out}: {int(good.sum())} of {len(good)} centroids corrected")
     if good.any():
-        left = np.sqrt((found.error[good] ** 2).mean(axis=0))
+        left = np.sqrt((corrected.error[good] ** 2).mean(axis=0))
         click.echo(f"  errors of the maps leave {left[0]:.2g} px in x, {left[1]:.2g} px in y")
     if not good.all():
         click.echo("  note: the others lie off the detector, or too near to masked pixels: NaN")

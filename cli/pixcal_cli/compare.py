@@ -49,9 +49,9 @@ def compare(runs: tuple[Path, ...], out: Path, config: Compare, runtime: "Runtim
         click.echo(f"  {file}")
 
 
-def _show(found: Mapping[str, Any]) -> None:
-    labels = [side["label"] for side in found["sides"]]
-    for pair in found["pairs"]:
+def _show(result: Mapping[str, Any]) -> None:
+    labels = [side["label"] for side in result["sides"]]
+    for pair in result["pairs"]:
         first, second = pair["sides"]
         click.echo(f"\n{labels[first]} | {labels[second]}")
         _show_totals(pair["components"])
@@ -59,19 +59,21 @@ def _show(found: Mapping[str, Any]) -> None:
             click.echo(f"\n  {name} by scale")
             _show_scales(facts)
         results.show_notes(_sentences(pair["components"]))
-    if found["summary"] is not None:
-        _show_summary(found["summary"], labels)
-    results.show_notes(found["warnings"])
+    if result["summary"] is not None:
+        _show_summary(result["summary"], labels)
+    results.show_notes(result["warnings"])
 
 
 def _sentences(components: Mapping[str, Any]) -> list[str]:
-    found = []
+    sentences = []
     for name, facts in components.items():
         evidence = "; ".join(facts["evidence"])
-        found.append(f"{name}: {f'beyond noise: {evidence}' if evidence else 'noise explains all'}")
+        sentences.append(
+            f"{name}: {f'beyond noise: {evidence}' if evidence else 'noise explains all'}"
+        )
         if facts["suspicion"] is not None:
-            found.append(f"{name}: {facts['suspicion']}")
-    return found
+            sentences.append(f"{name}: {facts['suspicion']}")
+    return sentences
 
 
 def _show_totals(components: Mapping[str, Any]) -> None:

@@ -21,18 +21,18 @@ def crests(run: Path, config: Crests, runtime: "Runtime") -> None:
 
     with results.announce("crests", run / "crests"):
         stage.run(run, config, runtime)
-    for name, found in read_json(run / "crests" / "crests.json")["sets"].items():
-        _show(name, found)
+    for name, facts in read_json(run / "crests" / "crests.json")["sets"].items():
+        _show(name, facts)
         click.echo(f"  {run / 'products' / f'crests-{name}.png'}")
 
 
-def _show(name: str, found: dict[str, Any]) -> None:
+def _show(name: str, facts: dict[str, Any]) -> None:
     """The points, the fibres, and the difference to the fit's."""
     click.echo(
-        f"  {name}: {found['points_used']} of {found['points']} points, error per point "
-        f"{found['point_sigma_median_px']:.2g} px, chi2 {found['chi2_reduced']:.3g}"
+        f"  {name}: {facts['points_used']} of {facts['points']} points, error per point "
+        f"{facts['point_sigma_median_px']:.2g} px, chi2 {facts['chi2_reduced']:.3g}"
     )
-    geometry, agreement = found["geometry"], found["agreement"]
+    geometry, agreement = facts["geometry"], facts["agreement"]
     for parameter in ("centre_x", "centre_y", "distance", "baseline_x", "baseline_y", "baseline_z"):
         value, sigma = geometry[f"{parameter}_mm"], geometry[f"{parameter}_sigma_mm"]
         line = f"    {parameter:10s} {value:.6g} ± {sigma:.2g} mm"
@@ -42,11 +42,11 @@ def _show(name: str, found: dict[str, Any]) -> None:
             line += f", {other['difference_sigma']:+.2f} sigma from the fit{origin}"
         click.echo(line)
     if agreement is None:
-        click.echo(f"    not compared: {found['agreement_note']}")
+        click.echo(f"    not compared: {facts['agreement_note']}")
     else:
         click.echo(
             f"    phases of both: {agreement['phase_rms_px']:.2g} px rms apart, "
             f"{agreement['phase_sigma_px']:.2g} px expected"
         )
-    for sentence in found["warnings"]:
+    for sentence in facts["warnings"]:
         click.echo(f"    note: {sentence}")

@@ -18,10 +18,10 @@ Command = Callable[..., Any]
 
 def memory_size(text: str) -> int:
     """Bytes of a size written ``512MiB``, ``2GiB``, ``2G`` or plainly; ``GB`` is decimal."""
-    found = re.fullmatch(r"(\d{1,15}(?:\.\d{1,9})?) ?([kmgt]?)(i?b)?", text.strip().lower())
-    if found is None or (found[3] == "ib" and not found[2]):
+    match = re.fullmatch(r"(\d{1,15}(?:\.\d{1,9})?) ?([kmgt]?)(i?b)?", text.strip().lower())
+    if match is None or (match[3] == "ib" and not match[2]):
         raise click.BadParameter(f"{text!r:.40} is not a size; write for example 512MiB or 2GiB")
-    number, prefix, suffix = found.groups()
+    number, prefix, suffix = match.groups()
     base = 1000 if suffix == "b" else 1024
     size = int(float(number) * base ** " kmgt".index(prefix or " "))
     if size < 1 << 20:
@@ -31,10 +31,10 @@ def memory_size(text: str) -> int:
 
 def region(text: str) -> Region:
     """Limits (y0, y1, x0, x1) of a rectangle written ``y0:y1,x0:x1``, ends excluded."""
-    found = re.fullmatch(r"(\d{1,6}):(\d{1,6}),(\d{1,6}):(\d{1,6})", text.strip())
-    if found is None:
+    match = re.fullmatch(r"(\d{1,6}):(\d{1,6}),(\d{1,6}):(\d{1,6})", text.strip())
+    if match is None:
         raise click.BadParameter(f"{text!r:.40} is not y0:y1,x0:x1, for example 0:128,0:256")
-    y0, y1, x0, x1 = map(int, found.groups())
+    y0, y1, x0, x1 = map(int, match.groups())
     if y0 >= y1 or x0 >= x1:
         raise click.BadParameter(f"{text!r:.40} is empty: the ends are excluded")
     return y0, y1, x0, x1
@@ -84,10 +84,10 @@ def config_options(kind: type, name: str = "config") -> Callable[[Command], Comm
             config = kind(**{f.name: values.pop(f.name) for f in offered})
             return command(*args, **{name: config}, **values)
 
-        found: Command = with_config
+        wrapped: Command = with_config
         for field in reversed(offered):
-            found = _option(field, hints[field.name])(found)
-        return found
+            wrapped = _option(field, hints[field.name])(wrapped)
+        return wrapped
 
     return decorate
 
@@ -105,7 +105,7 @@ def _option(field: Field[Any], hint: Any) -> Callable[[Command], Command]:
     shown: Any = meta.get("shown")
     if meta["unit"] == "bytes":
         default, shown = shown, None  # as it is typed
-    told = not (default in (None, (), MISSING) or (hint is bool and not flag))
+    shows_default = not (default in (None, (), MISSING) or (hint is bool and not flag))
     number = (unit.upper() or "N") if hint in (int, float) else None
     return click.option(
         flag or f"--{plain}",
@@ -115,7 +115,7 @@ def _option(field: Field[Any], hint: Any) -> Callable[[Command], Command]:
         is_flag=hint is bool,
         required=default is MISSING,
         default=None if default is MISSING or multiple else default,
-        show_default=shown or told,
+        show_default=shown or shows_default,
         metavar=meta.get("metavar", number),
         help=meta["doc"],
     )

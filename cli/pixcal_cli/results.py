@@ -45,12 +45,12 @@ def show_ingest(run: Path) -> None:
     rows = [
         (
             name,
-            found["shape"][0],
-            f"{found['shape'][2]} × {found['shape'][1]}",
-            found["dtype"],
-            "copied" if found["copied"] else "in their files",
+            array["shape"][0],
+            f"{array['shape'][2]} × {array['shape'][1]}",
+            array["dtype"],
+            "copied" if array["copied"] else "in their files",
         )
-        for name, found in summary["arrays"].items()
+        for name, array in summary["arrays"].items()
     ]
     show_table(("array", "frames", "x × y", "type", "samples"), rows)
     show_notes(summary["warnings"])
@@ -92,15 +92,15 @@ def show_fit(run: Path) -> None:
     rows = [
         (
             name,
-            found["model"],
-            found["frames"],
-            _number(found["interfringe_px"], 5),
-            _number(found["sigma_median_px"], 3),
-            _number(found["crb_median_px"], 3),
-            _number(_ratio(found["sigma_median_px"], found["crb_median_px"]), 3),
-            _number(found["chi2_reduced"], 4),
+            fitted["model"],
+            fitted["frames"],
+            _number(fitted["interfringe_px"], 5),
+            _number(fitted["sigma_median_px"], 3),
+            _number(fitted["crb_median_px"], 3),
+            _number(_ratio(fitted["sigma_median_px"], fitted["crb_median_px"]), 3),
+            _number(fitted["chi2_reduced"], 4),
         )
-        for name, found in sets.items()
+        for name, fitted in sets.items()
     ]
     header = [
         "set",
@@ -114,19 +114,21 @@ def show_fit(run: Path) -> None:
     ]
     show_table(header, rows)
     # Fits of earlier versions have no such note.
-    notes = {name: found.get("period_note") for name, found in sets.items()}
+    notes = {name: fitted.get("period_note") for name, fitted in sets.items()}
     show_notes([f"{name}: {note}" for name, note in notes.items() if note])
 
 
 def show_correction(run: Path) -> None:
     """Print how each effect of a diagnosis was treated, and how the maps changed."""
-    found = read_json(run / "corrected" / "correction.json")
-    if not found["effects"]:
-        click.echo(f"  {found['verdict']}: the diagnosis found no effect; use the maps of the fit")
+    correction = read_json(run / "corrected" / "correction.json")
+    if not correction["effects"]:
+        click.echo(
+            f"  {correction['verdict']}: the diagnosis found no effect; use the maps of the fit"
+        )
         return
-    rows = [(e["effect"], e["treatment"], e["why"]) for e in found["effects"]]
+    rows = [(e["effect"], e["treatment"], e["why"]) for e in correction["effects"]]
     show_table(("effect", "treatment", "why"), rows)
-    if not found["outputs"]:
+    if not correction["outputs"]:
         click.echo("  nothing to correct: use the maps of the fit")
         return
     header = (
@@ -138,30 +140,30 @@ def show_correction(run: Path) -> None:
         "chi2",
         "4-row period px",
     )
-    show_table(header, [_gain_row(name, own) for name, own in found["sets"].items()])
+    show_table(header, [_gain_row(name, facts) for name, facts in correction["sets"].items()])
     show_notes(
         ["residual px: error of the offsets from the uncertainty of the effects' parameters"]
     )
-    for pair in found["pairs"]:
+    for pair in correction["pairs"]:
         expected = _number(pair["after_expected_px"], 3)
         apart = _before_after(pair["before_px"], pair["after_px"])
         sets = " and ".join(pair["sets"])
         click.echo(f"  difference between {sets}: {apart} px ({expected} px expected from noise)")
-    if not found["pairs"]:
+    if not correction["pairs"]:
         show_notes(["one set along each axis: a second baseline would verify the correction"])
 
 
-def _gain_row(name: str, own: Mapping[str, Any]) -> tuple[str, ...]:
+def _gain_row(name: str, facts: Mapping[str, Any]) -> tuple[str, ...]:
     """Change of the offsets of a set, and its figures before and after."""
-    left = [error for error in own["parameter_error_px"].values() if error is not None]
-    rows = own["rows"]
+    left = [error for error in facts["parameter_error_px"].values() if error is not None]
+    rows = facts["rows"]
     return (
         name,
-        _number(own["change"]["rms_px"], 3),
-        _number(own["change"]["max_px"], 3),
+        _number(facts["change"]["rms_px"], 3),
+        _number(facts["change"]["max_px"], 3),
         _number(math.hypot(*left) if left else None, 3),
-        _before_after(own["sigma_median_px"]["before"], own["sigma_median_px"]["after"]),
-        _before_after(own["chi2_reduced"]["before"], own["chi2_reduced"]["after"], 4),
+        _before_after(facts["sigma_median_px"]["before"], facts["sigma_median_px"]["after"]),
+        _before_after(facts["chi2_reduced"]["before"], facts["chi2_reduced"]["after"], 4),
         "-" if rows is None else _before_after(rows["before_px"], rows["after_px"]),
     )
 
@@ -173,10 +175,10 @@ def _before_after(before: float | None, after: float | None, digits: int = 3) ->
 def show_allan(run: Path) -> None:
     """Print one row for each fringe set and region: how the error falls with more frames."""
     rows, notes = [], []
-    for name, found in read_json(run / "allan" / "allan.json")["sets"].items():
-        for region, curve in ({"all": found} | found["regions"]).items():
+    for name, curves in read_json(run / "allan" / "allan.json")["sets"].items():
+        for region, curve in ({"all": curves} | curves["regions"]).items():
             rows.append((name, region, *_allan_row(curve)))
-        notes += [f"{name}: {sentence}" for sentence in found["warnings"]]
+        notes += [f"{name}: {sentence}" for sentence in curves["warnings"]]
     show_table(("set", "region", "slope", "knee", "frames", "deviation px", "if white px"), rows)
     show_notes(notes)
 
@@ -197,11 +199,11 @@ def _allan_row(curve: Mapping[str, Any]) -> tuple[str, ...]:
 
 def show_diagnosis(run: Path) -> None:
     """Print the verdict, the causes, the largest differences and the recommended frames."""
-    found = read_json(run / "diagnose" / "diagnosis.json")
-    gap = found["gap"]
+    diagnosis = read_json(run / "diagnose" / "diagnosis.json")
+    gap = diagnosis["gap"]
     low, high = (100 * end for end in gap["interval"])
     click.echo(
-        f"  {found['verdict']}; residual gap: {100 * gap['after']:.0f} % "
+        f"  {diagnosis['verdict']}; residual gap: {100 * gap['after']:.0f} % "
         f"(90 % interval {low:.0f} to {high:.0f} %)"
     )
     causes = [
@@ -214,12 +216,12 @@ def show_diagnosis(run: Path) -> None:
             _chance(cause["p_value"]),
             ", ".join(cause["not_told_apart_from"]) or "-",
         )
-        for cause in found["causes"]
+        for cause in diagnosis["causes"]
     ]
     if causes:
         header = ("cause", "gap closed", "unique share", "p-value", "indistinguishable from")
         show_table(header, causes)
-    for cause in found["causes"]:
+    for cause in diagnosis["causes"]:
         _show_cause(cause)
     rows = [
         (
@@ -236,8 +238,8 @@ def show_diagnosis(run: Path) -> None:
         show_table(("statistic", "where", "measured", "nominal", "with causes", "sigma"), rows)
         if len(gap["where"]) > MOST_ROWS:
             click.echo(f"  and {len(gap['where']) - MOST_ROWS} more in diagnosis.json")
-    if found["more_would_tell"]:
-        click.echo(f"  recommended frames: {'; '.join(found['more_would_tell'])}")
+    if diagnosis["more_would_tell"]:
+        click.echo(f"  recommended frames: {'; '.join(diagnosis['more_would_tell'])}")
 
 
 def _show_cause(cause: Mapping[str, Any]) -> None:
@@ -274,12 +276,12 @@ def show_advice(run: Path) -> None:
     """Print which map to use, what limits it, and what each cause does to it."""
     from pixcal.stages.advice import HEADER, advice  # here: for a fast `pixcal --help`
 
-    told = advice(run)
+    summary = advice(run)
     click.echo()
-    for sentence in told.sentences:
+    for sentence in summary.sentences:
         click.echo(sentence)
-    if told.rows:
-        show_table(HEADER, told.rows)
+    if summary.rows:
+        show_table(HEADER, summary.rows)
 
 
 def show_run(run: Path, *, fitted: bool, diagnosed: bool) -> None:

@@ -40,11 +40,11 @@ from pixcal.stages.blind.draw import (
 from pixcal.stages.blind.grade import grade
 from pixcal.stages.blind.manifest import read_manifest
 from pixcal.stages.blind.offsets import offset_errors
-from pixcal.stages.blind.parameters import held
+from pixcal.stages.blind.parameters import check_parameters
 from pixcal.stages.blind.running import share
 from pixcal.stages.blind.seal import read_seal
 from pixcal.stages.blind.second import SecondCase, catalogue, second_offsets
-from pixcal.stages.blind.strengths import STRONGEST, WAYS, Way
+from pixcal.stages.blind.strengths import STRONGEST, VARIANTS, Variant
 from pixcal.stages.blind.summary import summary
 from pixcal.stages.blind.table import as_markdown, write_between
 from pixcal.stages.diagnose import look
@@ -62,15 +62,15 @@ BLOCK = 2880
 
 
 def test_every_effect_has_its_ways_and_its_turn() -> None:
-    assert {way.effect for way in WAYS} == set(effects())
+    assert {way.effect for way in VARIANTS} == set(effects())
     examination = draw_examination(3 * len(effects()), 17, "small", "own")
     turns = Counter(t.names[0] for t in examination.truths if t.part == ONE)
     assert set(turns) == set(effects())
     assert max(turns.values()) - min(turns.values()) <= 1
 
 
-@pytest.mark.parametrize("way", WAYS, ids=lambda way: f"{way.effect}: {way.strength}")
-def test_a_way_is_an_effect_at_any_strength(way: Way) -> None:
+@pytest.mark.parametrize("way", VARIANTS, ids=lambda way: f"{way.effect}: {way.strength}")
+def test_a_way_is_an_effect_at_any_strength(way: Variant) -> None:
     for seed in range(12):
         rng = np.random.default_rng(seed)
         strength = way.threshold(("small", "standard")[seed % 2]) * STRONGEST ** (seed / 11)
@@ -164,7 +164,7 @@ def test_some_standard_cases_have_a_second_baseline() -> None:
 
 
 def drawn(effect: str, strength: float, number: int = 0) -> Drawn:
-    way = [w for w in WAYS if w.effect == effect][number]
+    way = [w for w in VARIANTS if w.effect == effect][number]
     made = way.make(strength, np.random.default_rng(1))
     return Drawn(effect, way.strength, strength, 3.0, made)
 
@@ -453,14 +453,14 @@ def test_the_domain_is_that_of_the_effect() -> None:
 
 
 def test_parameters_are_held_against_their_errors() -> None:
-    found = held(
+    found = check_parameters(
         "lag",
         {"share": 1e-3},
         {"share": 1.4e-3, "decay_frames": 0.5, "spread": 0.1},
         {"share": 1e-4, "decay_frames": 0.2},
     )
     assert [(p.name, p.within(3)) for p in found] == [("share", False), ("decay_frames", True)]
-    turned = held(
+    turned = check_parameters(
         "ghost_fringes",
         {"phase_rad": 3.1},
         {"share": 0.005, "beat_rad_px": [0.35, 0.2], "phase_rad": -3.1},
@@ -478,10 +478,10 @@ def test_couplings_are_the_same_in_any_period() -> None:
     true = {"couplings": [coupling(0.01, 2, 1)]}
     found = {"couplings": [coupling(0.0101, 4, 3), coupling(0.5, 4, 2), coupling(0.5, 2, 1, 1)]}
     errors = {f"couplings[{n}].share": 1e-4 for n in range(3)}
-    (one,) = held("ipc", true, found, errors)
+    (one,) = check_parameters("ipc", true, found, errors)
     assert one.within(3)
     assert one.found == 0.0101
-    (missing,) = held("ipc", {"couplings": [coupling(0.01, 2, 0, 1)]}, found, errors)
+    (missing,) = check_parameters("ipc", {"couplings": [coupling(0.01, 2, 0, 1)]}, found, errors)
     assert not missing.within(3)
 
 

@@ -49,8 +49,8 @@ def correct_centroids(
     if columns[0].ndim != 1 or columns[0].shape != columns[1].shape:
         raise InputError(f"x, y: shapes {columns[0].shape} and {columns[1].shape}; give (n,) each")
     place = np.stack(columns, axis=1)
-    found = stage.correct(Path(run), place, fwhm_px=fwhm_px, electrons=electrons)
-    return (*found.place.T, *found.error.T)
+    corrected = stage.correct(Path(run), place, fwhm_px=fwhm_px, electrons=electrons)
+    return (*corrected.place.T, *corrected.error.T)
 
 
 def distortion_wcs(run: StrPath, *, fwhm_px: float | None = None) -> "WCS":

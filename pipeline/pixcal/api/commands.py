@@ -22,8 +22,8 @@ Json = dict[str, Any]
 
 
 def _json(file: Path) -> Json:
-    found: Json = read_json(file)
-    return found
+    contents: Json = read_json(file)
+    return contents
 
 
 @function_of(of.Run)

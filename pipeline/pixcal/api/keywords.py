@@ -37,9 +37,9 @@ def function_of(kind: type) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """
 
     def decorate(body: Callable[..., T]) -> Callable[..., T]:
-        own = inspect.signature(body)
+        declared = inspect.signature(body)
         hints = get_type_hints(kind)
-        given = [p for p in own.parameters.values() if p.name != "options"]
+        given = [p for p in declared.parameters.values() if p.name != "options"]
         keywords = [
             inspect.Parameter(
                 field.name,
@@ -50,14 +50,14 @@ def function_of(kind: type) -> Callable[[Callable[..., T]], Callable[..., T]]:
             for field in fields(kind)
         ]
         before = [p for p in given if p.kind is not inspect.Parameter.KEYWORD_ONLY]
-        signature = own.replace(parameters=[*before, *keywords, *given[len(before) :]])
+        signature = declared.replace(parameters=[*before, *keywords, *given[len(before) :]])
 
         @functools.wraps(body)
         def function(*args: Any, **values: Any) -> T:
-            found = signature.bind(*args, **values).arguments
-            chosen = {p.name: found.pop(p.name) for p in keywords if p.name in found}
+            bound = signature.bind(*args, **values).arguments
+            chosen = {p.name: bound.pop(p.name) for p in keywords if p.name in bound}
             options: Any = parse(kind, chosen, f"pixcal.{body.__name__}")
-            return body(**found, options=options)
+            return body(**bound, options=options)
 
         function.__signature__ = signature  # type: ignore[attr-defined]
         function.__doc__ = _with_parameters(body.__doc__ or "", fields(kind), signature)
@@ -80,14 +80,14 @@ def accepted(hint: Any) -> Any:
 
 def _with_parameters(text: str, options: Sequence[Field[Any]], signature: inspect.Signature) -> str:
     """A docstring with its parameters, before what it says of results and errors."""
-    told = {field.name: field for field in options}
+    fields_by_name = {field.name: field for field in options}
     lines = ["Parameters", "----------"]
     for parameter in signature.parameters.values():
         name = parameter.name
-        if name not in told:
+        if name not in fields_by_name:
             lines.append(f"{name} : {_ARGUMENTS[name]}")
             continue
-        lines += [f"{name} : {_words(parameter)}", f"    {told[name].metadata['doc']}"]
+        lines += [f"{name} : {_words(parameter)}", f"    {fields_by_name[name].metadata['doc']}"]
     summary, _, rest = inspect.cleandoc(text).partition("\n\n")
     return "\n".join([summary, "", *lines, "", rest])
 
@@ -95,12 +95,12 @@ def _with_parameters(text: str, options: Sequence[Field[Any]], signature: inspec
 def _words(parameter: inspect.Parameter) -> str:
     """Type of a parameter as docstrings write it."""
     hint, optional = parameter.annotation, ""
-    kinds = [kind for kind in get_args(hint) if kind is not type(None)]
-    if len(kinds) < len(get_args(hint)):
+    hints = [kind for kind in get_args(hint) if kind is not type(None)]
+    if len(hints) < len(get_args(hint)):
         optional = ", optional"
-        hint = kinds[0]
+        hint = hints[0]
     if get_origin(hint) is Literal:
         return "{" + ", ".join(f'"{word}"' for word in get_args(hint)) + "}"
-    if any(get_origin(kind) is PathLike for kind in kinds):
+    if any(get_origin(kind) is PathLike for kind in hints):
         return f"str or path{optional}"
     return inspect.formatannotation(hint).rpartition("abc.")[2] + optional

@@ -103,8 +103,8 @@ class Run:
 
     def _read(self, stage: str, file: str | None = None) -> dict[str, Any]:
         require(self.path, stage)
-        found: dict[str, Any] = read_json(self.path / stage / f"{file or stage}.json")
-        return found
+        contents: dict[str, Any] = read_json(self.path / stage / f"{file or stage}.json")
+        return contents
 
     @cached_property
     def acquisition(self) -> Acquisition:

@@ -234,12 +234,12 @@ def _value(hint: Any, value: Any, where: str, key: str, meta: Any) -> Any:
     place = f"{where}: {key}"
     origin = get_origin(hint)
     if origin in (typing.Union, types.UnionType):
-        kinds = get_args(hint)
-        if value is None and type(None) in kinds:
+        hints = get_args(hint)
+        if value is None and type(None) in hints:
             return None
-        if isinstance(value, PathLike) and any(get_origin(k) is PathLike for k in kinds):
+        if isinstance(value, PathLike) and any(get_origin(k) is PathLike for k in hints):
             return fspath(value)
-        return _value(next(k for k in kinds if k is not type(None)), value, where, key, meta)
+        return _value(next(k for k in hints if k is not type(None)), value, where, key, meta)
     if isinstance(hint, type) and dataclasses.is_dataclass(hint):
         return parse(hint, value, where, key=key)
     if origin is dict:

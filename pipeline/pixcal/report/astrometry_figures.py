@@ -106,10 +106,10 @@ def _against_electrons(axes: Axes, view: AstrometryView) -> None:
             electrons, np.hypot(floor, photons), color=COLOURS[grid], linewidth=1.6,
             label=LABELS[grid],
         )  # fmt: skip
-        found = view.first["photons"][grid]
-        if found["px"] is not None:
+        errors = view.first["photons"][grid]
+        if errors["px"] is not None:
             axes.errorbar(
-                view.result["stars"]["electrons"], found["px"], yerr=found["err_px"], fmt="o",
+                view.result["stars"]["electrons"], errors["px"], yerr=errors["err_px"], fmt="o",
                 color=COLOURS[grid], markersize=5,
             )  # fmt: skip
     axes.axhline(view.target_px, color=GREEN, linewidth=1, label=f"target, {view.target_px:g} px")
@@ -123,12 +123,12 @@ def _against_electrons(axes: Axes, view: AstrometryView) -> None:
 
 
 def _against_positions(axes: Axes, view: AstrometryView) -> None:
-    found = view.first["averaging"]
-    positions = np.array(found["positions"], dtype=float)
+    averaging = view.first["averaging"]
+    positions = np.array(averaging["positions"], dtype=float)
     values: list[float] = [view.target_px]
     for grid, label in LABELS.items():
-        px = np.array(found[f"{grid}_px"], dtype=float)
-        error = np.nan_to_num(np.array(found[f"{grid}_err_px"], dtype=float))
+        px = np.array(averaging[f"{grid}_px"], dtype=float)
+        error = np.nan_to_num(np.array(averaging[f"{grid}_err_px"], dtype=float))
         known = np.isfinite(px)
         if not known.any():
             continue

@@ -98,8 +98,8 @@ def _against(axes: Axes, view: ComponentView) -> None:
 
 def _scales(axes: Axes, view: ComponentView) -> None:
     """What is common, what differs, and what noise lets expect, at each scale."""
-    every = [s[key] for s in view.scales for key in ("difference_px", "expected_px")]
-    unit = unit_for(every, "px")
+    sizes = [s[key] for s in view.scales for key in ("difference_px", "expected_px")]
+    unit = unit_for(sizes, "px")
     at = np.arange(len(view.scales), dtype=float)
 
     def line(values: Sequence[float]) -> F64:
@@ -115,16 +115,22 @@ def _scales(axes: Axes, view: ComponentView) -> None:
         at, line([s["difference_px"] for s in view.scales]), "o-", color=BLUE, markersize=6,
         linewidth=1.2, label="difference",
     )  # fmt: skip
-    seen = [_seen(s["common"]) for s in view.scales]
+    significant = [_seen(s["common"]) for s in view.scales]
     common = line([s["common"]["px"] for s in view.scales])
     errors = line([s["common"]["error_px"] for s in view.scales])
     axes.errorbar(
-        at[seen], common[seen], errors[seen], fmt="s", color=INK, markersize=6, label="common"
+        at[significant],
+        common[significant],
+        errors[significant],
+        fmt="s",
+        color=INK,
+        markersize=6,
+        label="common",
     )
     _limits(axes, at, view.scales, "common", INK, unit)
     _beyond(axes, at, view.scales, unit)
     axes.set_yscale("log")
-    _round_off(axes, np.concatenate([expected, common[seen], line([s["difference_px"]
+    _round_off(axes, np.concatenate([expected, common[significant], line([s["difference_px"]
                for s in view.scales])]))  # fmt: skip
     names = [str(s["side_px"]) for s in view.scales]
     names[-1] = f"≥{names[-1]}"
@@ -150,10 +156,10 @@ def _limits(
 
 
 def _beyond(axes: Axes, at: F64, scales: Sequence[Mapping[str, Any]], unit: Unit) -> None:
-    found = [(x, s["beyond_noise"]) for x, s in zip(at, scales, strict=True)
+    significant = [(x, s["beyond_noise"]) for x, s in zip(at, scales, strict=True)
              if s["significance"] > 3]  # fmt: skip
-    if found:
-        places, values = zip(*found, strict=True)
+    if significant:
+        places, values = zip(*significant, strict=True)
         axes.errorbar(
             places, [v["px"] * unit.factor for v in values],
             [v["error_px"] * unit.factor for v in values], fmt="D", color=RED, markersize=6,

@@ -19,14 +19,14 @@ DETECTOR_MAPS = {
 
 def detector(contents: Contents) -> Section:
     """What the bias, dark and flat frames show."""
-    found = contents.detector
+    measured = contents.detector
     panels = [
-        (title, unit, found.maps[key])
+        (title, unit, measured.maps[key])
         for key, (title, unit) in DETECTOR_MAPS.items()
         # A map of one value is what the reduction takes where there are no frames.
-        if key in found.maps and found.maps[key].std > 0
+        if key in measured.maps and measured.maps[key].std > 0
     ]
-    blocks: list[Block] = [*merit_table(found.facts), *_merit_plates(found)]
+    blocks: list[Block] = [*merit_table(measured.facts), *_merit_plates(measured)]
     if panels:
         blocks.append(
             plate(
@@ -43,7 +43,7 @@ def detector(contents: Contents) -> Section:
         ]
         header = ["map", "unit", "median", "robust σ", "mean", "σ"]
         blocks.append(Table("Calibration maps in numbers", header, rows))
-    linearity = found.facts.get("linearity") or {}
+    linearity = measured.facts.get("linearity") or {}
     if is_table(linearity.get("levels")):
         blocks.append(
             plate(
@@ -54,16 +54,16 @@ def detector(contents: Contents) -> Section:
                 detector_figures.linearity(linearity["levels"]),
             )
         )
-    blocks += reduction_tables(found.facts)
+    blocks += reduction_tables(measured.facts)
     lead = "Bias, dark current, flat, read noise and linearity."
     if not blocks:
         lead = "Not measured: the reduction left no calibration maps."
     return Section("detector", "Detector", lead, blocks)
 
 
-def _merit_plates(found: Detector) -> Iterator[Plate]:
+def _merit_plates(measured: Detector) -> Iterator[Plate]:
     """Photon transfer, and what is not uniform, in the dark and in light."""
-    figures, curves = found.facts.get("figures_of_merit") or {}, found.curves
+    figures, curves = measured.facts.get("figures_of_merit") or {}, measured.curves
     transfer = curves.get("photon_transfer") or {}
     if len(transfer.get("level", ())) > 1:
         full = figures.get("saturation")

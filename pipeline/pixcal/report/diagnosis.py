@@ -41,24 +41,24 @@ _READ = (
 
 def diagnosis(contents: Contents) -> Section:
     """All that ``pixcal diagnose`` found; one line where it was not run."""
-    found = contents.diagnosis
+    result = contents.diagnosis
     title = "Diagnosis: data compared with simulation"
-    if found is None:
+    if result is None:
         lead = "Not run: run 'pixcal diagnose RUN' and then 'pixcal report RUN'."
         return Section("diagnosis", title, lead, [])
-    verdict = found.facts["verdict"]
-    blocks: list[Block] = [Words(answer(found), "answer", level(verdict))]
+    verdict = result.facts["verdict"]
+    blocks: list[Block] = [Words(answer(result), "answer", level(verdict))]
     if verdict == "no gap":
-        blocks += _largest(found)
+        blocks += _largest(result)
     else:
-        blocks += _overview(found)
-        for rank, cause in enumerate(found.facts["causes"], 1):
-            blocks += _cause(rank, cause, found)
-        blocks += _where(found)
-        blocks += _absolute(found)
-        blocks += _remainder(found)
-    blocks += _candidates(found)
-    blocks += _looked_at(found)
+        blocks += _overview(result)
+        for rank, cause in enumerate(result.facts["causes"], 1):
+            blocks += _cause(rank, cause, result)
+        blocks += _where(result)
+        blocks += _absolute(result)
+        blocks += _remainder(result)
+    blocks += _candidates(result)
+    blocks += _frames_used(result)
     return Section("diagnosis", title, _lead(contents), blocks)
 
 
@@ -82,11 +82,11 @@ def _heading(text: str) -> Words:
 # Overview
 
 
-def _overview(found: Diagnosis) -> Iterator[Block]:
-    gap, causes = found.facts["gap"], found.facts["causes"]
+def _overview(result: Diagnosis) -> Iterator[Block]:
+    gap, causes = result.facts["gap"], result.facts["causes"]
     closed = [
         figures.Closed(
-            effect_title(found, c["effect"]),
+            effect_title(result, c["effect"]),
             c["gap_closed"],
             tuple(c["gap_closed_interval"]),
             c["gain_over_rest"],
@@ -104,7 +104,7 @@ def _overview(found: Diagnosis) -> Iterator[Block]:
         )
     yield plate("The gap", caption, figures.gap_figure(_bars(gap, bool(causes)), closed))
     if causes:
-        yield _causes_table(found)
+        yield _causes_table(result)
 
 
 def _bars(gap: Facts, with_causes: bool) -> list[figures.Bar]:
@@ -119,13 +119,13 @@ def _bars(gap: Facts, with_causes: bool) -> list[figures.Bar]:
     return [whole, *sorted(parts, key=lambda b: -b.before)]
 
 
-def _causes_table(found: Diagnosis) -> Table:
+def _causes_table(result: Diagnosis) -> Table:
     rows = []
-    for rank, cause in enumerate(found.facts["causes"], 1):
+    for rank, cause in enumerate(result.facts["causes"], 1):
         alike = cause["not_told_apart_from"]
         rows.append(
             [
-                f"{rank}. {effect_title(found, cause['effect'])}",
+                f"{rank}. {effect_title(result, cause['effect'])}",
                 with_interval(cause["gap_closed"], cause["gap_closed_interval"]),
                 percent(cause["gain_over_rest"]),
                 chance(cause["p_value"]),
@@ -145,26 +145,28 @@ def _causes_table(found: Diagnosis) -> Table:
 # A cause
 
 
-def _cause(rank: int, cause: Facts, found: Diagnosis) -> Iterator[Block]:
+def _cause(rank: int, cause: Facts, result: Diagnosis) -> Iterator[Block]:
     name = cause["effect"]
-    words = found.effects.get(name, EffectWords(""))
-    yield _heading(f"Cause {rank}: {effect_title(found, name)}")
-    told = f"Evidence: {cause['why'].rstrip('.')}." if cause.get("why") else ""
+    words = result.effects.get(name, EffectWords(""))
+    yield _heading(f"Cause {rank}: {effect_title(result, name)}")
+    evidence = f"Evidence: {cause['why'].rstrip('.')}." if cause.get("why") else ""
     size = cause.get("sigmas")
-    sure = f"Detection significance in the fitted frames: {number(size, 2)}σ." if size else ""
-    yield Words(" ".join(filter(None, (words.about, told, sure, _law(cause)))))
+    significance = (
+        f"Detection significance in the fitted frames: {number(size, 2)}σ." if size else ""
+    )
+    yield Words(" ".join(filter(None, (words.about, evidence, significance, _law(cause)))))
     alike = cause["not_told_apart_from"]
     if alike:
-        others = listed((effect_title(found, other) for other in alike), "or")
+        others = listed((effect_title(result, other) for other in alike), "or")
         yield Words(
             f"The data cannot distinguish it from {others}."
             + _advice("Recommended frames", cause.get("would_decide")),
             "advice",
         )
-    shown = _named(found, cause.get("given_away_by", ()))
+    shown = _named(result, cause.get("given_away_by", ()))
     if shown:
         yield plate(
-            f"Evidence for {effect_title(found, name)}",
+            f"Evidence for {effect_title(result, name)}",
             _READ + "These are the statistics whose likelihood improves most with this cause.",
             figures.curves_figure(shown),
         )
@@ -185,8 +187,8 @@ def _advice(words: str, frames: Sequence[str] | None) -> str:
     return f" {words}: {listed(frames)}." if frames else ""
 
 
-def _named(found: Diagnosis, names: Sequence[Facts]) -> list[Facts]:
-    curves = {(c["statistic"], c["set"]): c for c in found.curves}
+def _named(result: Diagnosis, names: Sequence[Facts]) -> list[Facts]:
+    curves = {(c["statistic"], c["set"]): c for c in result.curves}
     keys = [(n["statistic"], n["set"]) for n in names[:PLOTS]]
     return [curves[key] for key in keys if key in curves]
 
@@ -267,12 +269,12 @@ def _in_short(value: Any) -> str:
 # Where
 
 
-def _where(found: Diagnosis) -> Iterator[Block]:
-    curves = sorted((c for c in found.curves if c["in_gap"]), key=lambda c: -c["significance"])
+def _where(result: Diagnosis) -> Iterator[Block]:
+    curves = sorted((c for c in result.curves if c["in_gap"]), key=lambda c: -c["significance"])
     if not curves:
         return
     yield _heading("Where data and simulation differ")
-    causes = bool(found.facts["causes"])
+    causes = bool(result.facts["causes"])
     first, rest = _worst_of_each_domain(curves)
     if len(rest) <= 2:
         first, rest = _by_domain(curves), []
@@ -285,7 +287,7 @@ def _where(found: Diagnosis) -> Iterator[Block]:
             f"{len(rest)} more statistics that differ",
             [Table("Other statistics that differ", header, rows)],
         )
-    yield from _maps(found)
+    yield from _maps(result)
     if not causes:
         yield plate(
             "The largest differences",
@@ -294,11 +296,11 @@ def _where(found: Diagnosis) -> Iterator[Block]:
         )
 
 
-def _maps(found: Diagnosis) -> Iterator[Block]:
+def _maps(result: Diagnosis) -> Iterator[Block]:
     """The map of where, if the differences are of some places more than of others."""
-    shape = found.facts.get("looked_at", {}).get("shape")
-    places = found.facts["gap"].get("places", ())
-    panels = maps.panels(shape, places, found.curves) if shape else []
+    shape = result.facts.get("looked_at", {}).get("shape")
+    places = result.facts["gap"].get("places", ())
+    panels = maps.panels(shape, places, result.curves) if shape else []
     if not panels:
         where = "window" if places else "cell of the window"
         yield Words(f"No single {where} deviates by more than {maps.ASIDE:g} σ.")
@@ -308,7 +310,7 @@ def _maps(found: Diagnosis) -> Iterator[Block]:
             if places
             else "Cells of the window, by statistic"
         )
-        figure = maps.where_figure(shape, panels, with_after=bool(found.facts["causes"]))
+        figure = maps.where_figure(shape, panels, with_after=bool(result.facts["causes"]))
         yield plate("Where on the detector", f"{what}. Numbers are deviations in σ.", figure)
 
 
@@ -369,11 +371,11 @@ def _sigma(value: float) -> str:
     return "0.0" if text in ("+0.0", "-0.0") else text.replace("-", "−")
 
 
-def _absolute(found: Diagnosis) -> Iterator[Block]:
-    causes = [cause["effect"] for cause in found.facts["causes"]]
+def _absolute(result: Diagnosis) -> Iterator[Block]:
+    causes = [cause["effect"] for cause in result.facts["causes"]]
     each = causes if len(causes) > 1 else []
     rows = []
-    for entry in found.facts["gap"]["absolute"]:
+    for entry in result.facts["gap"]["absolute"]:
         digits = _digits(entry["measured"], entry["simulated"])
         row = [entry["quantity"], unit(entry["unit"]), number(entry["measured"], digits)]
         for key in ("simulated", "after") if causes else ("simulated",):
@@ -392,14 +394,14 @@ def _absolute(found: Diagnosis) -> Iterator[Block]:
 # Residual
 
 
-def _remainder(found: Diagnosis) -> Iterator[Block]:
-    if more := _advice("Recommended frames", found.facts.get("more_would_tell")):
+def _remainder(result: Diagnosis) -> Iterator[Block]:
+    if more := _advice("Recommended frames", result.facts.get("more_would_tell")):
         yield Words(more.strip(), "advice")
-    if not found.facts["causes"]:
+    if not result.facts["causes"]:
         return
-    gap = found.facts["gap"]
+    gap = result.facts["gap"]
     left = sorted(
-        (c for c in found.curves if c["significance_after"] > found.noticed),
+        (c for c in result.curves if c["significance_after"] > result.noticed),
         key=lambda c: -c["significance_after"],
     )
     yield _heading("Residual gap")
@@ -431,9 +433,9 @@ def _remainder(found: Diagnosis) -> Iterator[Block]:
     yield plate("Largest residual differences", _READ, figures.curves_figure(left[:PLOTS]))
 
 
-def _largest(found: Diagnosis) -> Iterator[Block]:
+def _largest(result: Diagnosis) -> Iterator[Block]:
     """Where there is no gap: how far off the worst statistics are all the same."""
-    curves = sorted(found.curves, key=lambda c: -c["significance"])[:PLOTS]
+    curves = sorted(result.curves, key=lambda c: -c["significance"])[:PLOTS]
     if not curves:
         return
     yield Table(
@@ -442,23 +444,23 @@ def _largest(found: Diagnosis) -> Iterator[Block]:
         [_row(c, False) for c in curves],
     )
     yield plate("The largest deviations", _READ, figures.curves_figure(curves, with_effects=False))
-    yield from _absolute(found)
+    yield from _absolute(result)
 
 
 # Candidates
 
 
-def _candidates(found: Diagnosis) -> Iterator[Block]:
-    causes = {c["effect"] for c in found.facts["causes"]}
+def _candidates(result: Diagnosis) -> Iterator[Block]:
+    causes = {c["effect"] for c in result.facts["causes"]}
     tried = sorted(
-        (c for c in found.facts["candidates"] if c["effect"] not in causes),
+        (c for c in result.facts["candidates"] if c["effect"] not in causes),
         key=lambda c: (-c["gap_closed"], -(c.get("sigmas") or 0.0)),
     )
     if not tried:
         return
     rows = [
         [
-            effect_title(found, c["effect"]),
+            effect_title(result, c["effect"]),
             _sigma(c["sigmas"]) if "sigmas" in c else "–",
             percent(c["gap_closed"]) if c.get("tried_on_unseen_frames") else "–",
             c["rejected_because"],
@@ -466,14 +468,14 @@ def _candidates(found: Diagnosis) -> Iterator[Block]:
         for c in tried
     ]
     header = ["effect", "significance (σ)", "gap closed alone", "reason"]
-    other = " other" if found.facts["causes"] else ""
+    other = " other" if result.facts["causes"] else ""
     title = f"{len(tried)}{other} effects were considered and rejected"
     yield Fold(title, [Table("Rejected effects", header, rows)])
 
 
-def _looked_at(found: Diagnosis) -> Iterator[Block]:
+def _frames_used(result: Diagnosis) -> Iterator[Block]:
     """Frames and windows that were fitted and held out."""
-    facts = found.facts.get("looked_at")
+    facts = result.facts.get("looked_at")
     if not facts:
         return
     one, other = facts["fitted_on"], facts["tried_on"]

@@ -170,8 +170,8 @@ def _panel(top: Axes, below: Axes, curve: Mapping[str, Any], with_effects: bool)
     measured = _numbers(curve["measured"])
     simulated = {"nominal": RED} | ({"with_effects": BLUE} if with_effects else {})
     bands = {key: {k: _numbers(v) for k, v in curve[key].items()} for key in simulated}
-    every = np.concatenate([measured, *(b["value"] for b in bands.values())])
-    scale = unit_for(every, unit(str(curve["unit"])))
+    drawn = np.concatenate([measured, *(b["value"] for b in bands.values())])
+    scale = unit_for(drawn, unit(str(curve["unit"])))
     for side, (key, colour) in zip((-1, 1), simulated.items(), strict=False):
         band = {k: v * scale.factor for k, v in bands[key].items()}
         label = ORDER[1 if key == "nominal" else 2]
@@ -182,7 +182,7 @@ def _panel(top: Axes, below: Axes, curve: Mapping[str, Any], with_effects: bool)
         x, measured * scale.factor, "o" if named else "o-", color=INK, markersize=5, linewidth=1,
         label=ORDER[0], zorder=5,
     )  # fmt: skip
-    _value_axis(top, curve, every * scale.factor, scale)
+    _value_axis(top, curve, drawn * scale.factor, scale)
     _sigma_axis(below, [_numbers(curve[k]) for k in ("z", "z_after")])
     _place_axis(below, curve, x, named)
     top.set_title(_title(curve), **TITLE)
@@ -237,8 +237,8 @@ def _value_axis(axes: Axes, curve: Mapping[str, Any], values: F64, scale: Unit) 
 
 
 def _sigma_axis(axes: Axes, sigmas: Sequence[F64]) -> None:
-    every = np.concatenate(sigmas)
-    top = 1.15 * max(QUIET, float(np.max(np.abs(every[np.isfinite(every)]), initial=0.0)))
+    finite = np.concatenate(sigmas)
+    top = 1.15 * max(QUIET, float(np.max(np.abs(finite[np.isfinite(finite)]), initial=0.0)))
     axes.axhspan(-2, 2, color=BAND, linewidth=0, zorder=0)
     axes.axhline(0, color=GREY, linewidth=0.8)
     axes.set_ylim(-top, top)

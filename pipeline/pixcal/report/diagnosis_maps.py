@@ -62,9 +62,9 @@ def panels(
     curves : sequence of mapping
         Of ``curves.json``; those by cells are maps.
     """
-    found = _of_windows(places) if places else _of_cells(shape, curves)
-    found = [panel for panel in found if panel.largest > ASIDE]
-    return sorted(found, key=lambda panel: -panel.largest)[:MOST]
+    maps = _of_windows(places) if places else _of_cells(shape, curves)
+    maps = [panel for panel in maps if panel.largest > ASIDE]
+    return sorted(maps, key=lambda panel: -panel.largest)[:MOST]
 
 
 def _of_windows(places: Sequence[Mapping[str, Any]]) -> list[Panel]:
@@ -82,7 +82,7 @@ def _of_windows(places: Sequence[Mapping[str, Any]]) -> list[Panel]:
 
 
 def _of_cells(shape: tuple[int, int], curves: Sequence[Mapping[str, Any]]) -> list[Panel]:
-    found = []
+    maps = []
     for curve in curves:
         if curve["x_label"] != CELLS:
             continue
@@ -93,8 +93,8 @@ def _of_cells(shape: tuple[int, int], curves: Sequence[Mapping[str, Any]]) -> li
             row, column = divmod(n, count)
             rows, columns = edges[0][row : row + 2], edges[1][column : column + 2]
             spots.append(Spot((rows[0], rows[1]), (columns[0], columns[1]), sigmas))
-        found.append(Panel(f"{curve['title']}\nset {curve['set']}", tuple(spots)))
-    return found
+        maps.append(Panel(f"{curve['title']}\nset {curve['set']}", tuple(spots)))
+    return maps
 
 
 def where_figure(shape: tuple[int, int], maps: Sequence[Panel], *, with_after: bool) -> Figure:

@@ -204,11 +204,11 @@ def finish(axes: Axes, *, grid: bool = True) -> None:
 
 def limits(values: Sequence[Any], share: float = 0.002) -> tuple[float, float]:
     """Limits that hold all but few of the values, with a margin."""
-    every = np.concatenate([np.ravel(np.asarray(v, dtype=float)) for v in values])
-    every = every[np.isfinite(every)]
-    if not len(every):
+    finite = np.concatenate([np.ravel(np.asarray(v, dtype=float)) for v in values])
+    finite = finite[np.isfinite(finite)]
+    if not len(finite):
         return -1.0, 1.0
-    low, high = np.quantile(every, [share, 1 - share])
+    low, high = np.quantile(finite, [share, 1 - share])
     margin = 0.12 * (high - low) or max(abs(high), 1e-12) * 0.1
     return float(low - margin), float(high + margin)
 

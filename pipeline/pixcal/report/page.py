@@ -68,7 +68,7 @@ def _causes(contents: Contents) -> list[Block]:
     if not contents.causes:
         return []
     header, *rows = contents.causes
-    return [Table("What each cause does to the map", header, rows)]
+    return [Table("Causes, and what to do about them", header, rows)]
 
 
 def _subtitle(contents: Contents) -> str:

@@ -111,11 +111,11 @@ def cards(contents: Contents) -> Iterator[Card]:
 
 def _detector_cards(facts: dict[str, Any]) -> Iterator[Card]:
     """What a data sheet begins with."""
-    found = facts.get("figures_of_merit") or {}
+    figures = facts.get("figures_of_merit") or {}
     for key in ("conversion_gain", "read_noise", "full_well", "dynamic_range", "dsnu", "prnu",
                 "dark_current"):  # fmt: skip
-        if key in found:
-            f = found[key]
+        if key in figures:
+            f = figures[key]
             unit = f["unit"].replace("e-", "e⁻")
             yield Card(f["title"], f"{with_error(f['value'], f['error'])} {unit}", f["note"], GOOD)
 

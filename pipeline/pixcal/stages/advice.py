@@ -167,15 +167,15 @@ def _action(cause: Json, correction: Json | None) -> str:
     why = treated["why"] if treated else _reason(cause)
     if action == "corrected":
         done = treated is not None and _corrects(treated["treatment"])
-        told = "maps corrected" if done else "NOT corrected: run 'pixcal fit RUN --with-diagnosis'"
+        text = "maps corrected" if done else "NOT corrected: run 'pixcal fit RUN --with-diagnosis'"
     elif action == "unaffected":
-        told = f"maps unaffected: {why}"
+        text = f"maps unaffected: {why}"
     else:
-        told = f"{action.replace('fix the', 'fix on the')}: {why}" if why else str(action)
+        text = f"{action.replace('fix the', 'fix on the')}: {why}" if why else str(action)
     if cause.get("would_decide"):
         others = " or ".join(cause["not_told_apart_from"])
-        told += f"; to tell it from {others}, retake with {', '.join(cause['would_decide'])}"
-    return told
+        text += f"; to tell it from {others}, retake with {', '.join(cause['would_decide'])}"
+    return text
 
 
 def _reason(cause: Json) -> str:

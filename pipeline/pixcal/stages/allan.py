@@ -259,15 +259,15 @@ def _measure_region(
     filled = int(present.sum())
     common = {"n_batches": batches.n, "gaps": batches.n - filled}
     usable = [n for n, m in enumerate(lengths) if _has_difference(present, m)]
-    found, pixels = _quantiles(folder / "adev", region, usable)
-    if filled < MIN_BATCHES or not found:
+    quantiles, pixels = _quantiles(folder / "adev", region, usable)
+    if filled < MIN_BATCHES or not quantiles:
         reason = f"{filled} of {batches.n} batches have data: too few for an Allan deviation"
         return _as_json(batches, [], NO_CURVE, [], [reason]) | common | {"pixels": 0}
-    chosen = [lengths[n] for n in found]
-    low, median, high = np.array(list(found.values())).T
+    chosen = [lengths[n] for n in quantiles]
+    low, median, high = np.array(list(quantiles.values())).T
     noise = _noise_levels(folder / "expected", region)
     white = white_population(present, chosen, noise if pixels > 1 else None)
-    shared = shared_noise([grams[n] for n in found], pixels)
+    shared = shared_noise([grams[n] for n in quantiles], pixels)
     curve = fit_curve(chosen, median, np.log(high / low) / 2, pixels, shared, white)
     warnings = []
     if curve.knee is not None and curve.knee > batches.n / 2:
@@ -275,8 +275,8 @@ def _measure_region(
                     "beyond what the run can show, is not given"]  # fmt: skip
         curve = replace(curve, knee=None)
     expected = float(np.median(noise)) / np.sqrt(chosen)
-    own = _as_json(batches, chosen, curve, expected.tolist(), warnings)
-    return own | common | {"pixels": pixels}
+    facts = _as_json(batches, chosen, curve, expected.tolist(), warnings)
+    return facts | common | {"pixels": pixels}
 
 
 def _sums(
@@ -321,7 +321,7 @@ def _quantiles(
     path: Path, region: Region, usable: Sequence[int]
 ) -> tuple[dict[int, tuple[float, float, float]], int]:
     """Central 68 % and median over a region for each length's number, and how many pixels."""
-    found, pixels = {}, 0
+    quantiles, pixels = {}, 0
     for n in usable:
         values = ArrayReader(path).read((n, n + 1), region[:2], region[2:])
         values = values[values > 0]  # not NaN; nor zero, which no noise gives
@@ -329,8 +329,8 @@ def _quantiles(
         if len(values):
             levels = (ONE_SIGMA[0], 0.5, ONE_SIGMA[1])
             low, median, high = np.quantile(values, levels, overwrite_input=True).tolist()
-            found[n] = (low, median, high)
-    return found, pixels
+            quantiles[n] = (low, median, high)
+    return quantiles, pixels
 
 
 def _noise_levels(path: Path, region: Region) -> F64:

@@ -107,12 +107,12 @@ def correct_table(
     measured = np.stack(
         [column(table, n, job.table, f"--{o}") for n, o in zip(names, "xy", strict=True)], axis=1
     )
-    found = correct(run_dir, measured - job.origin, fwhm_px=fwhm_px, electrons=electrons)
+    corrected = correct(run_dir, measured - job.origin, fwhm_px=fwhm_px, electrons=electrons)
     for n, name in enumerate(names):
-        table[f"{name}_corrected"] = found.place[:, n] + job.origin
-        table[f"{name}_map_error"] = found.error[:, n]
+        table[f"{name}_corrected"] = corrected.place[:, n] + job.origin
+        table[f"{name}_map_error"] = corrected.error[:, n]
     write_table(table, job.out, overwrite=job.overwrite)
-    return found
+    return corrected
 
 
 def wcs_of(run_dir: Path, *, fwhm_px: float | None) -> WCS:

@@ -98,7 +98,7 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
     jobs = _jobs(run_dir, fit)
     results = _summaries(jobs, runtime)
     sets = _sets(run_dir, fit, measured, results)
-    told = advice(run_dir)
+    summary = advice(run_dir)
     return Contents(
         acquisition=read_json(run_dir / "ingest" / "acquisition.json"),
         stages=tuple(
@@ -122,8 +122,8 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
         flags=results.get("flags/products"),
         diagnosis=_diagnosis(run_dir / "diagnose") if "diagnose" in manifests else None,
         warnings=_warnings(manifests, facts),
-        advice=told.sentences,
-        causes=(HEADER, *told.rows) if told.rows else (),
+        advice=summary.sentences,
+        causes=(HEADER, *summary.rows) if summary.rows else (),
     )
 
 
@@ -259,25 +259,25 @@ def _effect_words(kind: type[Effect]) -> EffectWords:
 
 
 def _optional_json(path: Path) -> dict[str, Any]:
-    found: dict[str, Any] = read_json(path) if path.exists() else {}
-    return found
+    contents: dict[str, Any] = read_json(path) if path.exists() else {}
+    return contents
 
 
 def _warnings(manifests: Mapping[str, Manifest], facts: Mapping[str, Any]) -> tuple[str, ...]:
     """Sentences of the stages, and stages that were made from what is no longer there."""
-    found = []
+    sentences = []
     for stage, manifest in manifests.items():
         for made_from, key in manifest.inputs.items():
             present = manifests.get(made_from)
             if present is not None and present.key != key:
                 command = STAGES[stage].command.replace(" RUN", "")
-                found.append(
+                sentences.append(
                     f"{stage} was made from an earlier {made_from}: run 'pixcal {command}' again."
                 )
     if "ingest" in manifests:
-        found += [str(text) for text in manifests["ingest"].summary.get("warnings", ())]
-    found += [str(text) for text in facts.get("warnings", ())]
-    return tuple(found)
+        sentences += [str(text) for text in manifests["ingest"].summary.get("warnings", ())]
+    sentences += [str(text) for text in facts.get("warnings", ())]
+    return tuple(sentences)
 
 
 def _arrays(run_dir: Path, manifests: Mapping[str, Manifest]) -> tuple[ArrayRecord, ...]:

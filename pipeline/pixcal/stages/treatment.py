@@ -71,8 +71,8 @@ class Treatments:
 
     def _those(self, how: str) -> tuple[Effect, ...]:
         """Effects of a treatment, the last that acted first."""
-        own = [t.effect for t in self.every if t.how == how]
-        return tuple(sorted(own, key=lambda e: (e.acts_at, e.name), reverse=True))
+        matching = [t.effect for t in self.every if t.how == how]
+        return tuple(sorted(matching, key=lambda e: (e.acts_at, e.name), reverse=True))
 
     @property
     def on_samples(self) -> tuple[Effect, ...]:
@@ -113,7 +113,7 @@ class Treatments:
 def treatments(
     causes: Sequence[Mapping[str, Any]],
     nominal: Mapping[str, Any],
-    asked: str,
+    model: str,
     models: Mapping[str, str],
     own: Sequence[Path],
     where: Path,
@@ -126,7 +126,7 @@ def treatments(
         Of ``diagnosis.json``.
     nominal : mapping
         Parameters of the effects that the nominal bench had, by name.
-    asked : str
+    model : str
         Shape of the fringes that the fit was asked for.
     models : mapping
         The one that was fitted, by fringe set.
@@ -141,47 +141,47 @@ def treatments(
         If an effect is not known: it is of the user's own, and its file has not been given.
     """
     known = known_effects(own)
-    found: list[tuple[str, str, Any, Mapping[str, float]]]
-    found = [("nominal", name, parameters, {}) for name, parameters in nominal.items()]
-    found += [
+    entries: list[tuple[str, str, Any, Mapping[str, float]]]
+    entries = [("nominal", name, parameters, {}) for name, parameters in nominal.items()]
+    entries += [
         ("diagnosis", str(c["effect"]), c["parameters"], c.get("uncertainty", {})) for c in causes
     ]
-    for _, name, _, _ in found:
+    for _, name, _, _ in entries:
         if name not in known:
             raise InputError(
                 f"{where}: {name!r:.80} is an effect of your own; give its file again with "
                 "--own FILE"
             )
-    every = []
-    for origin, name, parameters, errors in found:
+    effects = []
+    for origin, name, parameters, errors in entries:
         (effect,) = parse_effects({name: parameters}, str(where), known)
-        every.append(Treatment(effect, origin, errors, *_treated(effect, asked, models)))
-    return Treatments(tuple(every))
+        effects.append(Treatment(effect, origin, errors, *_treated(effect, model, models)))
+    return Treatments(tuple(effects))
 
 
-def treatment_of(effect: Effect, asked: str, models: Mapping[str, str]) -> Treatment:
+def treatment_of(effect: Effect, model: str, models: Mapping[str, str]) -> Treatment:
     """What to do about an effect that a diagnosis found; parameters as in `treatments`."""
-    return Treatment(effect, "diagnosis", {}, *_treated(effect, asked, models))
+    return Treatment(effect, "diagnosis", {}, *_treated(effect, model, models))
 
 
-def _treated(effect: Effect, asked: str, models: Mapping[str, str]) -> tuple[str, str]:
+def _treated(effect: Effect, model: str, models: Mapping[str, str]) -> tuple[str, str]:
     kind = type(effect)
     if kind.undo is not Effect.undo:
         return "undone on maps", "it acts on the three maps of a fit alike"
     if kind.undo_samples is not Effect.undo_samples:
         return "undone on samples", "it depends on the light of each frame: swept again without it"
     if kind.fit_model == HYPERBOLIC:
-        return _of_bent_fringes(asked, models)
+        return _of_bent_fringes(model, models)
     if kind.absorbed_because:
         return "absorbed by the fit", kind.absorbed_because
     return "not undone", kind.left_because or "its file does not say how to undo it"
 
 
-def _of_bent_fringes(asked: str, models: Mapping[str, str]) -> tuple[str, str]:
+def _of_bent_fringes(requested: str, models: Mapping[str, str]) -> tuple[str, str]:
     straight = [name for name, model in models.items() if model != HYPERBOLIC]
     if not straight:
         return "in the fit", "the shape that was fitted to the fringes is hyperbolic"
-    if asked == "auto":
+    if requested == "auto":
         return (
             IN_CORRECTED,
             f"the fit took straight fringes ({', '.join(straight)}); the corrected maps do not",

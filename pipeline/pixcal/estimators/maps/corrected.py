@@ -56,9 +56,9 @@ def phase_sums(modes: F64, delta: F64, sigma: F64, change: F64, k: float) -> tup
         Length of the fringe vector, rad/px.
     """
     good = np.isfinite(delta) & np.isfinite(change) & (sigma > 0)
-    own = modes[:, good]
-    weighted = own / (sigma[good] * k) ** 2
-    return weighted @ own.T, (weighted @ (delta[good] * k + change[good]))[:, None]
+    good_modes = modes[:, good]
+    weighted = good_modes / (sigma[good] * k) ** 2
+    return weighted @ good_modes.T, (weighted @ (delta[good] * k + change[good]))[:, None]
 
 
 def offsets(modes: F64, coefficients: F64, delta: F64, change: F64, k: float) -> F64:

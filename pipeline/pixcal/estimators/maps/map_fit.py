@@ -99,25 +99,25 @@ def fit_maps(parts: Sequence[MapPart]) -> MapFit:
     )
 
 
-def phase_map(found: FringeEvidence) -> F64:
+def phase_map(fringes: FringeEvidence) -> F64:
     """Phase (y, x) of a set less the plane of its fringe vector, about its mean, rad; NaN masked.
 
     In ±pi: the bending of the fringes across the part must stay below half a fringe.
     """
-    y, x = centred(found.good.shape)
-    kx, ky = found.k
-    phasor = (found.theta[2] + 1j * found.theta[1]) * np.exp(-1j * (kx * x + ky * y))
-    phasor = np.where(found.good, phasor, 0)
+    y, x = centred(fringes.good.shape)
+    kx, ky = fringes.k
+    phasor = (fringes.theta[2] + 1j * fringes.theta[1]) * np.exp(-1j * (kx * x + ky * y))
+    phasor = np.where(fringes.good, phasor, 0)
     total = phasor.sum()
     rest = np.angle(phasor * np.conj(total if total else 1.0))
-    return np.where(found.good, rest, np.nan)
+    return np.where(fringes.good, rest, np.nan)
 
 
-def gauge_terms(found: FringeEvidence) -> F64:
+def gauge_terms(fringes: FringeEvidence) -> F64:
     """Fringe modes (4, y, x) that the fit leaves open in the maps of a set."""
-    alpha = np.maximum(np.hypot(found.theta[1], found.theta[2]), 1e-9)
-    psi = np.arctan2(found.theta[1], found.theta[2])
-    return np.stack(fringe_modes(psi, found.theta[0] / alpha))
+    alpha = np.maximum(np.hypot(fringes.theta[1], fringes.theta[2]), 1e-9)
+    psi = np.arctan2(fringes.theta[1], fringes.theta[2])
+    return np.stack(fringe_modes(psi, fringes.theta[0] / alpha))
 
 
 def polynomial(shape: tuple[int, ...], degree: int) -> F64:
@@ -140,10 +140,10 @@ def without(columns: F64, free: F64) -> F64:
     return np.asarray(columns - unit @ (inverse @ (unit.T @ columns)))
 
 
-def half_theta(found: FringeEvidence, half: int, good: Mask) -> F64:
+def half_theta(fringes: FringeEvidence, half: int, good: Mask) -> F64:
     """Maps (3, pixel) of a set on some pixels, from every other frame (half 0 or 1) alone."""
-    rest = np.nan_to_num(found.residual[half::2][:, good])
-    return np.asarray(found.theta[:, good] + np.linalg.pinv(found.g[half::2]) @ rest)
+    rest = np.nan_to_num(fringes.residual[half::2][:, good])
+    return np.asarray(fringes.theta[:, good] + np.linalg.pinv(fringes.g[half::2]) @ rest)
 
 
 def neighbour_products(one: F64, other: F64, good: Mask) -> F64:

@@ -127,19 +127,19 @@ def find_waves(evidence: Evidence) -> Waves | None:
     return Waves(tuple(waves), best.in_flats, best.significance, best.seen_in, best.by_map)
 
 
-def _maps(found: FringeEvidence, evidence: Evidence, in_flats: bool) -> list[_Map]:
-    alpha = np.hypot(found.theta[1], found.theta[2])
-    good = found.good & (alpha > 0) & (found.theta[0] > 0) & (evidence.flat > 0)
-    iota = np.where(good, found.theta[0], 1.0)
+def _maps(fringes: FringeEvidence, evidence: Evidence, in_flats: bool) -> list[_Map]:
+    alpha = np.hypot(fringes.theta[1], fringes.theta[2])
+    good = fringes.good & (alpha > 0) & (fringes.theta[0] > 0) & (evidence.flat > 0)
+    iota = np.where(good, fringes.theta[0], 1.0)
     visibility = np.log(np.where(good, alpha, 1.0) / iota)
-    terms = np.concatenate([polynomial(good.shape, _SMOOTH), gauge_terms(found)])
+    terms = np.concatenate([polynomial(good.shape, _SMOOTH), gauge_terms(fringes)])
     light = evidence.flat if in_flats else iota
     light = np.log(np.where(good, light, 1.0))
     free = polynomial(good.shape, _SMOOTH) if in_flats else terms
     return [
         _Map("the flats" if in_flats else LIGHT, light, free, good, (1, 0, 0)),
         _Map("the visibility", visibility, terms, good, (-1, 1, 1)),
-        _Map("the phase", np.nan_to_num(phase_map(found)), terms, good, (0, -1j, -1j)),
+        _Map("the phase", np.nan_to_num(phase_map(fringes)), terms, good, (0, -1j, -1j)),
     ]
 
 
@@ -191,17 +191,17 @@ def _strongest(maps: Maps, sets: Sequence[FringeEvidence], allowed: Mask, in_fla
 
 def _less(maps: Maps, waves: Sequence[WaveFit]) -> Maps:
     """Maps without some waves."""
-    found: dict[str, list[_Map]] = {}
+    remaining: dict[str, list[_Map]] = {}
     for name, own in maps.items():
-        found[name] = []
+        remaining[name] = []
         for m in own:
             data = m.data
             for w in waves:
                 if w.set == name:
                     six = [p for v in (w.static, w.forward, w.backward) for p in (v.real, v.imag)]
                     data = data - np.tensordot(six, m.signals(np.array(w.q)), 1)
-            found[name].append(_Map(m.kind, data, m.free, m.good, m.row))
-    return found
+            remaining[name].append(_Map(m.kind, data, m.free, m.good, m.row))
+    return remaining
 
 
 def _power(maps: Sequence[_Map], allowed: Mask) -> F64:
@@ -236,13 +236,13 @@ def _vector(power: F64) -> F64:
 
 def _of_lines(fx: F64, fy: F64, shape: tuple[int, ...]) -> Mask:
     """Frequencies (cycles/px) of rows or columns that repeat: those are circuits, and not glass."""
-    found = np.zeros(fx.shape, bool)
+    marked = np.zeros(fx.shape, bool)
     for across, along, n, m in ((fx, fy, shape[1], shape[0]), (fy, fx, shape[0], shape[1])):
         level = np.abs(across) * n < NEAR
         for period in PERIODS:
             harmonic = np.abs(along * period - np.rint(along * period)) / period * m < NEAR
-            found |= level & harmonic & (np.abs(along) * m >= NEAR)
-    return found
+            marked |= level & harmonic & (np.abs(along) * m >= NEAR)
+    return marked
 
 
 def _fitted(

@@ -70,11 +70,11 @@ def ring_power(power: F64) -> Ring:
     design = np.stack([white, templates[best], float(fits[best][1]) * slope], axis=1)
     unit = np.sqrt((design**2).sum(axis=0)) + 1e-300
     rows = np.linalg.pinv(design / unit, rcond=1e-8) / unit[:, None]
-    found = rows @ data
+    projected = rows @ data
     # Waves fill the ring unevenly: their scatter about it counts (Huber's sandwich), and no wave
     # is longer or shorter than the window tells.
-    width = float(np.sqrt(2 * ((rows[2] * (data - design @ found)) ** 2).sum()))
-    scale = float(scales[best] * np.exp(np.clip(found[2], -STEP, STEP)))
+    width = float(np.sqrt(2 * ((rows[2] * (data - design @ projected)) ** 2).sum()))
+    scale = float(scales[best] * np.exp(np.clip(projected[2], -STEP, STEP)))
     width = float(np.hypot(width, scale / (2 * min(shape))))
     # Of the variance that there should be, and that may well be the larger.
     draws = min(float(np.sqrt(2 / modes)), 0.75)

@@ -104,14 +104,14 @@ def redness(values: F64) -> float:
     good = np.isfinite(values)
     filled = np.where(good, values, 0)
     variance = max(float(np.nanvar(values)), 1e-300)
-    found = 1.0
+    factor = 1.0
     for side in {*CELLS, max(1, min(ny, nx) // 4)}:
         if min(ny, nx) < 2 * side:
             continue
         rows, columns = ny // side, nx // side
         inside = filled[: rows * side, : columns * side].reshape(rows, side, columns, side)
-        found = max(found, float(inside.mean(axis=(1, 3)).var()) * side**2 / variance)
-    return found
+        factor = max(factor, float(inside.mean(axis=(1, 3)).var()) * side**2 / variance)
+    return factor
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ def correct_centroids(
         How stars look, and with what weights they were fitted.
     """
     _, ny, nx = offsets.shape
-    found = np.full(place.shape, np.nan)
+    corrected = np.full(place.shape, np.nan)
     error = np.full(place.shape, np.nan)
     inside = np.isfinite(place).all(axis=1)
     # Far from the detector, and beyond what integers hold.
@@ -100,9 +100,9 @@ def correct_centroids(
         if lost > MOST_UNKNOWN:
             continue
         delta, spread = np.where(known, window, 0.0)
-        found[n] = place[n] - np.einsum("acyx,cyx->a", weights, delta)
+        corrected[n] = place[n] - np.einsum("acyx,cyx->a", weights, delta)
         error[n] = np.sqrt(np.einsum("acyx,cyx->a", weights**2, spread**2))
-    return Corrected(found, error)
+    return Corrected(corrected, error)
 
 
 def correction_map(offsets: NDArray[np.floating], star: Star | None) -> NDArray[np.float32]:

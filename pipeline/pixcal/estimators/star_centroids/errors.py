@@ -53,16 +53,16 @@ def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -
     columns = (perfect**2, measured**2, noise**2)
     good = np.isfinite(perfect) & np.isfinite(measured)
     sums = np.stack([np.where(good, c, 0.0).sum(axis=1) for c in columns] + [good.sum(axis=1)])
-    found = _roots(sums.sum(axis=1))
+    rms = _roots(sums.sum(axis=1))
     stars = sums.shape[1]
     picks = (np.bincount(rng.integers(0, stars, stars), minlength=stars) for _ in range(RESAMPLES))
     again = np.array([_roots(sums @ pick) for pick in picks])
     # Squares: their errors are meaningful where the root of one does not exist.
     square_error = np.std(again[:, 3])
-    if not found[3] > SEEN * square_error:
-        found[0] = found[2] = np.nan
+    if not rms[3] > SEEN * square_error:
+        rms[0] = rms[2] = np.nan
     with np.errstate(invalid="ignore"):
-        return Comparison(*(Value(float(found[n]), _spread(again[:, n])) for n in range(3)))
+        return Comparison(*(Value(float(rms[n]), _spread(again[:, n])) for n in range(3)))
 
 
 def _roots(sums: F64) -> F64:

@@ -89,14 +89,14 @@ class Detector:
         """A part, (start, stop) of rows and of columns; beyond the detector no pixel is good."""
         ny, nx = self.shape
         shape = (len(self.components), y[1] - y[0], x[1] - x[0])
-        found = Patch(np.zeros(shape), np.zeros(shape), np.zeros(shape[1:], bool))
+        part = Patch(np.zeros(shape), np.zeros(shape), np.zeros(shape[1:], bool))
         here, across = (max(0, y[0]), min(ny, y[1])), (max(0, x[0]), min(nx, x[1]))
         if here[0] >= here[1] or across[0] >= across[1]:
-            return found
+            return part
         at = tuple(slice(a - o, b - o) for (a, b), o in ((here, y[0]), (across, x[0])))
         true, known, good = self._inside(here, across)
-        found.true[:, *at], found.known[:, *at], found.good[at] = true, known, good
-        return found
+        part.true[:, *at], part.known[:, *at], part.good[at] = true, known, good
+        return part
 
     def _inside(self, y: Range, x: Range) -> tuple[F64, F64, NDArray[np.bool_]]:
         known = np.stack([c.delta.read(y, x).astype(float) for c in self.components])
@@ -140,7 +140,7 @@ def open_components(run_dir: Path, fit: dict[str, Any], truth: Path | None) -> l
         If a map is missing or damaged, or the truth is not one of this detector.
     """
     true = _open_truth(truth) if truth is not None else {}
-    found = []
+    components = []
     for output in fit["outputs"]:
         file = run_dir / "products" / f"{output}.fits"
         if not file.exists():
@@ -155,8 +155,8 @@ def open_components(run_dir: Path, fit: dict[str, Any], truth: Path | None) -> l
                     f"{image.path}: {image.shape} pixels (y, x), the run's maps have "
                     f"{delta.shape}; give the truth of this acquisition"
                 )
-        found.append(Component(name, axis, delta, sigma, mask, shares))
-    return found
+        components.append(Component(name, axis, delta, sigma, mask, shares))
+    return components
 
 
 def _open_truth(folder: Path) -> dict[str, FitsMap]:

@@ -124,12 +124,14 @@ def place_errors(detector: Detector, star: Star, y: tuple[int, int], x: tuple[in
         spectrum = np.einsum("kl...,l...->k...", kernel, rfft2(values, size))
         return np.asarray(irfft2(spectrum, size)[:, : shape[0], : shape[1]])
 
-    errors = np.stack([sums(kernels, away) for away in (patch.true, patch.true - patch.known)])
+    errors = np.stack(
+        [sums(kernels, displacement) for displacement in (patch.true, patch.true - patch.known)]
+    )
     rows, columns = np.arange(*y)[:, None], np.arange(*x)[None, :]
     counts = (rows >= half) & (rows < ny - half) & (columns >= half) & (columns < nx - half)
     if not patch.good.all():
-        own = np.stack([[kernels[k, k]] for k in range(len(axes))])
-        kept = -sums(own, patch.good.astype(float)[None])
+        diagonal = np.stack([[kernels[k, k]] for k in range(len(axes))])
+        kept = -sums(diagonal, patch.good.astype(float)[None])
         counts = counts & (kept >= 1 - MOST_LOST).all(axis=0)
         errors /= np.maximum(kept, 1 - MOST_LOST)
     return np.where(counts, errors, np.nan)

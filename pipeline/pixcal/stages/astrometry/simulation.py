@@ -40,8 +40,8 @@ def observe(detector: Detector, plan: Observation, runtime: Runtime) -> F64:
         and where a fit has failed.
     """
     batches = [range(n, min(n + BATCH, plan.stars)) for n in range(0, plan.stars, BATCH)]
-    found = run_tasks(partial(_batch, detector, plan), batches, runtime, label="stars")
-    return np.concatenate(found)
+    errors = run_tasks(partial(_batch, detector, plan), batches, runtime, label="stars")
+    return np.concatenate(errors)
 
 
 def core_weights(star: Star, axes: F64) -> F64:
@@ -100,5 +100,7 @@ def _errors(star: Star, place: F64, windows: Patch, axes: F64, rng: np.random.Ge
         for grid in (np.zeros_like(known), known)
     ]
     weights = np.stack([star.weights(p, g) for p, g in zip(place, windows.good, strict=True)])
-    errors += [np.einsum("nabyx,nbyx->na", weights, away) for away in (true, true - known)]
+    errors += [
+        np.einsum("nabyx,nbyx->na", weights, displacement) for displacement in (true, true - known)
+    ]
     return np.asarray(np.einsum("jna,ka->njk", np.stack(errors), axes))

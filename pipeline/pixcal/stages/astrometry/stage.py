@@ -114,29 +114,29 @@ def _measure(
 ) -> None:
     """Everything; writes the artefact's files."""
     psf, half = telescope.psf(config.window)
-    seen = star(psf, half, config.electrons, config.background_e, acquisition.detector)
+    observed = star(psf, half, config.electrons, config.background_e, acquisition.detector)
     shape = components[0].delta.shape
-    if seen.side > min(shape):
+    if observed.side > min(shape):
         by_itself = "" if config.window else ", which a star of --wavelength and --diameter takes,"
         raise InputError(
-            f"--window: {seen.side} px{by_itself} do not fit maps of {shape[1]} × {shape[0]} px "
-            f"(x × y); give an odd number up to {min(shape)}"
+            f"--window: {observed.side} px{by_itself} do not fit maps of {shape[1]} × {shape[0]} "
+            f"px (x × y); give an odd number up to {min(shape)}"
         )
     sets = [SetModes.of_fit(shape, facts, acquisition) for facts in fit["sets"].values()]
     modes = Modes(shape, tuple(sets)).number if config.truth is not None else 0
-    need = planned(shape, modes, seen.side, config)
+    need = planned(shape, modes, observed.side, config)
     runtime = runtime.with_workers(make_plan("astrometry", *need, runtime).workers)
     removed = None
     if config.truth is not None:
         components, removed = free_from_modes(components, sets, runtime)
     detector = Detector(tuple(components), config.seed)
-    maps = error_maps(made.folder / "astrometry.zarr", detector, seen, runtime)
+    maps = error_maps(made.folder / "astrometry.zarr", detector, observed, runtime)
     if not maps.places.any():
         raise InputError(
             f"{components[0].delta.path}: masked pixels leave no place for a star and its window "
-            f"of {seen.side} px; try a smaller --window"
+            f"of {observed.side} px; try a smaller --window"
         )
-    plan = Observation(seen, config.stars, config.positions, config.dither_px)
+    plan = Observation(observed, config.stars, config.positions, config.dither_px)
     errors = observe(detector, plan, runtime)
     result = {
         "schema": SCHEMA,
@@ -152,14 +152,14 @@ def _measure(
             "exposures": exposures(psf, config.electrons, acquisition.detector),
             "background_e": config.background_e,
             "read_noise_e": acquisition.detector.read_noise_e,
-            "window_px": seen.side,
+            "window_px": observed.side,
             "seed": config.seed,
         },
-        "axes": _axes(detector, seen, errors, maps, telescope),
+        "axes": _axes(detector, observed, errors, maps, telescope),
     }
     result["warnings"] = _warnings(result)
     write_json(made.folder / "astrometry.json", result)
-    view = _view(result, detector, seen, maps, _curve(psf, half, acquisition, config))
+    view = _view(result, detector, observed, maps, _curve(psf, half, acquisition, config))
     (made.folder / "astrometry.png").write_bytes(png(astrometry_figure(view)))
     made.summary = {"warnings": result["warnings"]}
 
@@ -200,9 +200,9 @@ def _detector_facts(
 
 
 def _axes(
-    detector: Detector, seen: Star, errors: F64, maps: ErrorMaps, telescope: Telescope
+    detector: Detector, observed: Star, errors: F64, maps: ErrorMaps, telescope: Telescope
 ) -> dict[str, Any]:
-    bounds = np.sqrt((detector.axes**2) @ seen.bound() ** 2)
+    bounds = np.sqrt((detector.axes**2) @ observed.bound() ** 2)
     facts = {}
     for n, component in enumerate(detector.components):
         rng = generator(detector.seed, 3, n)
@@ -219,32 +219,32 @@ def _axes(
 
 
 def _warnings(result: Mapping[str, Any]) -> list[str]:
-    found = []
+    sentences = []
     stars = result["stars"]
     lost = stars["number"] * stars["positions"] - stars["positions_used"]
     if lost:
-        found.append(f"{lost} positions are too near to masked pixels and were left out")
+        sentences.append(f"{lost} positions are too near to masked pixels and were left out")
     for name, axis in result["axes"].items():
         gain = axis["floor"]["gain"]["value"]
         if axis["floor"]["perfect"]["px"] is None:
-            found.append(
+            sentences.append(
                 f"{name}: the pixels' own offsets are not seen above the maps' errors; these maps "
                 "do stars no good, more frames are needed"
             )
         elif gain is not None and gain < 1:
-            found.append(
+            sentences.append(
                 f"{name}: the maps' errors exceed the offsets themselves; these maps do stars harm"
             )
     if "fringe" in result["axes"]:
-        found.append(
+        sentences.append(
             "offsets are known along one axis only: those across it, taken as zero here, move "
             "stars along it too"
         )
     if result["detector"]["modes_removed_px"] is None:
-        found.append(
+        sentences.append(
             "without a truth, errors of the maps are what SIGMA says: systematic ones are not seen"
         )
-    return found
+    return sentences
 
 
 def _curve(psf: Psf, half: int, acquisition: Acquisition, config: Config) -> F64:
@@ -257,7 +257,7 @@ def _curve(psf: Psf, half: int, acquisition: Acquisition, config: Config) -> F64
 
 
 def _view(
-    result: dict[str, Any], detector: Detector, seen: Star, maps: ErrorMaps, photons: F64
+    result: dict[str, Any], detector: Detector, observed: Star, maps: ErrorMaps, photons: F64
 ) -> AstrometryView:
     """What the picture shows."""
     ny, nx = detector.shape
@@ -267,8 +267,8 @@ def _view(
         target_px=TARGET_PX,
         table=tuple(astuple(row) for row in table(result)),
         photons=photons,
-        weights=core_weights(seen, detector.axes)[0],
-        detail=place_errors(detector, seen, y, x)[:, 0],
+        weights=core_weights(observed, detector.axes)[0],
+        detail=place_errors(detector, observed, y, x)[:, 0],
         detail_at=(y[0], x[0]),
         rms=np.sqrt(np.mean(maps.rms**2, axis=1)),
         block=maps.block,

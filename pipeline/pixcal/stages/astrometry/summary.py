@@ -67,7 +67,7 @@ def axis_facts(
             "positions": lengths,
             **{
                 f"{grid}{suffix}_px": [
-                    _finite(getattr(getattr(found, grid), field)) for found in averaged
+                    _finite(getattr(getattr(comparison, grid), field)) for comparison in averaged
                 ]
                 for grid in ("perfect", "measured")
                 for suffix, field in (("", "value"), ("_err", "error"))
@@ -115,11 +115,11 @@ def number(value: Value, uas_per_px: float) -> dict[str, float | None]:
     }
 
 
-def _facts(found: Comparison, uas_per_px: float) -> dict[str, Any]:
+def _facts(comparison: Comparison, uas_per_px: float) -> dict[str, Any]:
     return {
-        "perfect": number(found.perfect, uas_per_px),
-        "measured": number(found.measured, uas_per_px),
-        "gain": {"value": _finite(found.gain.value), "err": _finite(found.gain.error)},
+        "perfect": number(comparison.perfect, uas_per_px),
+        "measured": number(comparison.measured, uas_per_px),
+        "gain": {"value": _finite(comparison.gain.value), "err": _finite(comparison.gain.error)},
     }
 
 

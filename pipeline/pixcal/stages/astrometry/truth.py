@@ -41,12 +41,18 @@ def free_from_modes(
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         # Modes of two sets overlap: of all combinations that do, the least.
         scaled = np.asarray(normal) / np.outer(scale, scale)
-        found = np.linalg.lstsq(scaled, right / scale, rcond=1e-10)[0] / scale
-        freed.append(replace(component, modes=replace(modes, coefficients=tuple(found.tolist()))))
-        kinds = {"smooth": slice(modes.n_smooth), "fringe": slice(modes.n_smooth, None)}
+        coefficients = np.linalg.lstsq(scaled, right / scale, rcond=1e-10)[0] / scale
+        freed.append(
+            replace(component, modes=replace(modes, coefficients=tuple(coefficients.tolist())))
+        )
+        groups = {"smooth": slice(modes.n_smooth), "fringe": slice(modes.n_smooth, None)}
         removed[component.name] = {
-            kind: float(np.sqrt(found[p] @ np.asarray(normal)[p, p] @ found[p] / max(count, 1)))
-            for kind, p in kinds.items()
+            kind: float(
+                np.sqrt(
+                    coefficients[p] @ np.asarray(normal)[p, p] @ coefficients[p] / max(count, 1)
+                )
+            )
+            for kind, p in groups.items()
         }
     return freed, removed
 
@@ -58,8 +64,8 @@ def _sums(
     x = (0, modes.shape[1])
     basis, sums = modes.basis(y, x), []
     for component in components:
-        away = component.true(y, x) - component.delta.read(y, x)
-        good = np.isfinite(away) & (component.mask.read(y, x) == 0)
+        difference = component.true(y, x) - component.delta.read(y, x)
+        good = np.isfinite(difference) & (component.mask.read(y, x) == 0)
         chosen = basis[:, good]
-        sums.append((chosen @ chosen.T, chosen @ away[good], int(good.sum())))
+        sums.append((chosen @ chosen.T, chosen @ difference[good], int(good.sum())))
     return sums

@@ -110,13 +110,13 @@ def _sets(layout: Layout, rng: np.random.Generator) -> tuple[SimulatedSet, ...]:
             phase_step_rad=step if ramped else 0.0,
         )
 
-    found = [
+    sets = [
         scan(name, axis, spacings[axis], axis == ramp)
         for axis, name in enumerate(("vertical", "horizontal"))
     ]
     if third[0]:
-        found.append(scan("second", third[1], third[2], False))
-    return tuple(found)
+        sets.append(scan("second", third[1], third[2], False))
+    return tuple(sets)
 
 
 def _round(value: float) -> float:

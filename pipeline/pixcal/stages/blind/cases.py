@@ -104,10 +104,10 @@ def _case(folder: Path, size: str, item: tuple[int, Bench, Truth]) -> None:
 def effects_of(truth: Truth, bench: Bench) -> tuple[Effect, ...]:
     """The library's effects of a case, which go together with its bench."""
     plain = {d.effect: d.parameters for d in truth.drawn}
-    found = parse_effects(plain, "blind")
-    for effect in found:
+    effects = parse_effects(plain, "blind")
+    for effect in effects:
         effect.check(replace(bench, effects=plain))
-    return found
+    return effects
 
 
 def _copied(aside: Path, names: Sequence[str]) -> Path:

@@ -10,7 +10,7 @@ from pixcal.effects import effects
 from pixcal.model.bench import Bench
 from pixcal.stages.blind.benches import LAYOUTS, draw_bench
 from pixcal.stages.blind.second import SecondCase, SecondLaw, catalogue
-from pixcal.stages.blind.strengths import STRONGEST, Way, ways_of
+from pixcal.stages.blind.strengths import STRONGEST, Variant, variants_of
 
 ONE, NOTHING, SEVERAL, LEFT_OUT, SECOND_ONE, SECOND_NOTHING, SECOND_PAIR, SECOND_OTHER = range(1, 9)
 # in the order of the table
@@ -123,16 +123,16 @@ def _counts(cases: int, shares: dict[int, float]) -> dict[int, int]:
 
 
 def _part(part: int, count: int, size: str, rng: np.random.Generator) -> Iterator[Truth]:
-    turns = _turns(list(ways_of()), rng)
+    turns = _turns(list(variants_of()), rng)
     for number in range(count):
         if part == NOTHING:
-            yield Truth(part, _innocent((), rng))
+            yield Truth(part, _absent((), rng))
             continue
         many = 1 if part != SEVERAL else 3 if number % 3 == 2 else 2
         chosen = _distinct(turns, many)
         least = 1.0 if part == ONE else CLEAR
-        drawn = [_drawn(_any(ways_of()[name], rng), size, least, rng) for name in chosen]
-        left_out = chosen[0] if part == LEFT_OUT else _innocent(chosen, rng)
+        drawn = [_drawn(_any(variants_of()[name], rng), size, least, rng) for name in chosen]
+        left_out = chosen[0] if part == LEFT_OUT else _absent(chosen, rng)
         yield Truth(part, left_out, tuple(drawn))
 
 
@@ -149,16 +149,16 @@ def _second(part: int, count: int, _size: str, rng: np.random.Generator) -> Iter
         if part == SECOND_NOTHING:
             # Half of them differ in everything at once.
             case = next(others) if number % 2 else "ordinary"
-            yield Truth(part, _innocent((), rng), second=SecondCase(case, seed, strength))
+            yield Truth(part, _absent((), rng), second=SecondCase(case, seed, strength))
             continue
         chosen = _distinct(turns, 2 if part == SECOND_PAIR else 1)
-        own = [of[name][int(rng.integers(len(of[name])))] for name in chosen]
+        laws_drawn = [of[name][int(rng.integers(len(of[name])))] for name in chosen]
         drawn = tuple(
             Drawn(one.effect, f"{one.name}, {one.unit}", one.size(strength), None, {})
-            for one in own
+            for one in laws_drawn
         )
-        case = "+".join(f"{one.effect}/{one.name}" for one in own)
-        yield Truth(part, _innocent(chosen, rng), drawn, SecondCase(case, seed, strength))
+        case = "+".join(f"{one.effect}/{one.name}" for one in laws_drawn)
+        yield Truth(part, _absent(chosen, rng), drawn, SecondCase(case, seed, strength))
 
 
 def _turns(names: list[str], rng: np.random.Generator) -> Iterator[str]:
@@ -176,15 +176,15 @@ def _distinct(turns: Iterator[str], count: int) -> list[str]:
     return chosen
 
 
-def _innocent(guilty: Sequence[str], rng: np.random.Generator) -> str:
-    return str(rng.choice([name for name in effects() if name not in guilty]))
+def _absent(present: Sequence[str], rng: np.random.Generator) -> str:
+    return str(rng.choice([name for name in effects() if name not in present]))
 
 
-def _any(ways: Sequence[Way], rng: np.random.Generator) -> Way:
-    return ways[int(rng.integers(len(ways)))]
+def _any(variants: Sequence[Variant], rng: np.random.Generator) -> Variant:
+    return variants[int(rng.integers(len(variants)))]
 
 
-def _drawn(way: Way, size: str, least: float, rng: np.random.Generator) -> Drawn:
+def _drawn(way: Variant, size: str, least: float, rng: np.random.Generator) -> Drawn:
     times = float(np.exp(rng.uniform(np.log(least), np.log(STRONGEST))))
     strength = times * way.threshold(size)
     made = way.make(strength, rng)

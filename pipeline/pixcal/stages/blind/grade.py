@@ -17,7 +17,7 @@ from pixcal.stages.blind.draw import (
     Truth,
 )
 from pixcal.stages.blind.offsets import AxisError
-from pixcal.stages.blind.parameters import held
+from pixcal.stages.blind.parameters import check_parameters
 
 BLAMED = 0.5  # share of the gap from which an absent effect is blamed for most of it
 WITHIN = (1, 2, 3)  # errors that a parameter may be off
@@ -122,12 +122,12 @@ def _answers(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> tuple[
     if truth.part == SECOND_NOTHING:
         return verdict == "no gap", not named
     if truth.part in (SEVERAL, SECOND_PAIR):
-        found, invented = set(truth.names) <= set(named), set(named) - set(truth.names)
-        return found and not invented, found, not invented
+        complete, invented = set(truth.names) <= set(named), set(named) - set(truth.names)
+        return complete and not invented, complete, not invented
     honest = verdict in ("unexplained", "partly explained")
     blamed = any(cause["gap_closed"] > BLAMED for cause in diagnosis["causes"])
-    asked = honest and not blamed, honest, not blamed
-    return asked if truth.part == SECOND_OTHER else (*asked, _domain_seen(truth, diagnosis))
+    answers = honest and not blamed, honest, not blamed
+    return answers if truth.part == SECOND_OTHER else (*answers, _domain_seen(truth, diagnosis))
 
 
 def _domain_seen(truth: Truth, diagnosis: Diagnosis) -> bool:
@@ -140,13 +140,15 @@ def _domain_seen(truth: Truth, diagnosis: Diagnosis) -> bool:
 
 def _parameters(truth: Truth, diagnosis: Diagnosis) -> list[dict[str, Any]]:
     causes = {cause["effect"]: cause for cause in diagnosis["causes"]}
-    found = []
+    rows = []
     for drawn in truth.drawn:
         cause = causes.get(drawn.effect)
         if cause is None:
             continue
-        for one in held(drawn.effect, drawn.parameters, cause["parameters"], cause["uncertainty"]):
-            found.append(
+        for one in check_parameters(
+            drawn.effect, drawn.parameters, cause["parameters"], cause["uncertainty"]
+        ):
+            rows.append(
                 {
                     "effect": drawn.effect,
                     "name": one.name,
@@ -156,7 +158,7 @@ def _parameters(truth: Truth, diagnosis: Diagnosis) -> list[dict[str, Any]]:
                     "within": [one.within(errors) for errors in WITHIN],
                 }
             )
-    return found
+    return rows
 
 
 def _why(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> str:
@@ -178,8 +180,10 @@ def _why(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> str:
     for name in truth.names:
         if name not in named:
             tried = about.get(name, {})
-            seen = f" ({tried['sigmas']:.1f} sigmas)" if "sigmas" in tried else ""
-            reasons.append(f"{name}{seen}: {tried.get('rejected_because', 'not a candidate')}")
+            significance = f" ({tried['sigmas']:.1f} sigmas)" if "sigmas" in tried else ""
+            reasons.append(
+                f"{name}{significance}: {tried.get('rejected_because', 'not a candidate')}"
+            )
         elif len(truth.names) == 1 and named[0] != name:
             reasons.append(f"{name}: named after {named[0]}")
     invented = [name for name in named if name not in truth.names]

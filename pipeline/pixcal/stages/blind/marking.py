@@ -59,7 +59,7 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
     missing = [case for _, own in named for case in own]
     seeds = [one.opened.examination.seed for one in marked]
     purposes = {purpose_of(seed) for seed in seeds}
-    found = summary([g for grades, _ in named for g in grades]) | {
+    result = summary([g for grades, _ in named for g in grades]) | {
         "schema": SCHEMA,
         "purpose": "development" if "development" in purposes else "examination",
         # Who has it can draw the cases that are still to be run.
@@ -67,15 +67,17 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
         "size": first.manifest.size,
         "made": sum(len(one.manifest.cases) for one in marked),
         "missing": missing,
-        "sittings": _sittings([one.folder / RUNS / g.case for one in marked for g in one.grades]),
+        "sittings": _summary_of_runs(
+            [one.folder / RUNS / g.case for one in marked for g in one.grades]
+        ),
         "notes": list(dict.fromkeys(n for one in marked for n in one.opened.examination.notes)),
     }
-    write_json(folder / PRODUCT, found)
-    text = as_markdown(found)
+    write_json(folder / PRODUCT, result)
+    text = as_markdown(result)
     (folder / TABLE).write_text(text, encoding="utf-8")
     if config.write is not None:
         write_between(config.write, first.manifest.size, text)
-    return found
+    return result
 
 
 def _require_alike(folders: Sequence[Path]) -> None:
@@ -142,8 +144,8 @@ def _understood(file: Path) -> Iterator[None]:
     try:
         yield
     except (AttributeError, LookupError, TypeError, ValueError) as error:
-        told = " ".join(f"{type(error).__name__}: {error}".split())
-        damaged = DamagedError(f"{file}: damaged ({told:.200})", file)
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        damaged = DamagedError(f"{file}: damaged ({reason:.200})", file)
         case = next(up for up in file.parents if up.parent.name == RUNS)
         damaged.advice = f"remove {case} and say 'pixcal blind run {case.parents[1]}'"
         raise damaged from error
@@ -156,31 +158,31 @@ def _graded(folder: Path, manifest: Manifest, opened: Sealed, number: int) -> Gr
         with _understood(run_dir / FAILED):
             return grade(name, truth, None, str(read_json(run_dir / FAILED)["error"]))
     with _understood(run_dir / DIAGNOSIS):
-        found = grade(name, truth, read_json(run_dir / DIAGNOSIS))
+        graded = grade(name, truth, read_json(run_dir / DIAGNOSIS))
     if not (run_dir / PRODUCTS / "correction.json").is_file():
-        return found
+        return graded
     with _understood(run_dir / PRODUCTS / "correction.json"):
         errors = offset_errors(
             run_dir / PRODUCTS, folder / name, truth, opened.benches[number], LAYOUTS[manifest.size]
         )  # fmt: skip
-    return replace(found, offsets=errors)
+    return replace(graded, offsets=errors)
 
 
-def _sittings(cases: Sequence[Path]) -> dict[str, Any]:
+def _summary_of_runs(cases: Sequence[Path]) -> dict[str, Any]:
     """By how many versions of the code the cases were diagnosed, how long that took, what failed.
 
     One is right: what was changed after a part of the seal was opened is no blind examination.
     """
     files = [case / DONE for case in cases]
-    told = [_sitting(file) for file in files if file.is_file()]
+    runs = [_case_run(file) for file in files if file.is_file()]
     return {
-        "codes": sorted({one["code"] for one in told}),
-        "median_seconds": {what: median(one[what] for one in told) for what in _TIMED},
-        "without_maps": sum(one["no_maps"] for one in told),
+        "codes": sorted({one["code"] for one in runs}),
+        "median_seconds": {what: median(one[what] for one in runs) for what in _TIMED},
+        "without_maps": sum(one["no_maps"] for one in runs),
     }
 
 
-def _sitting(file: Path) -> dict[str, Any]:
+def _case_run(file: Path) -> dict[str, Any]:
     with _understood(file):
         one = read_json(file)
         seconds = {what: float(one["seconds"][what]) for what in _TIMED}
@@ -198,19 +200,19 @@ def _with_oracle(
     over, each = share("simulating the true effects", size, len(numbers), runtime)
     ask = partial(_oracle, folder, opened, {n: grades[n].case for n in numbers}, each)
     answers = run_tasks(ask, numbers, over, label="true effects")
-    found = dict(grades)
+    by_number = dict(grades)
     for number, answer in zip(numbers, answers, strict=True):
         if answer is not None:
-            found[number] = _beside(found[number], answer)
-    return list(found.values())
+            by_number[number] = _beside(by_number[number], answer)
+    return list(by_number.values())
 
 
-def _beside(own: Grade, answer: Oracle) -> Grade:
-    if own.part == ONE:
-        return replace(own, oracle=answer.closed)
-    first = own.worst[0] if own.worst else {"statistic": "", "set": ""}
+def _beside(graded: Grade, answer: Oracle) -> Grade:
+    if graded.part == ONE:
+        return replace(graded, oracle=answer.closed)
+    first = graded.worst[0] if graded.worst else {"statistic": "", "set": ""}
     right = (first["statistic"], first["set"]) in answer.causes
-    return replace(own, oracle=answer.closed, marks=own.marks | {PLACE: right})
+    return replace(graded, oracle=answer.closed, marks=graded.marks | {PLACE: right})
 
 
 def _oracle(

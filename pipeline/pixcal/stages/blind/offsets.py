@@ -84,7 +84,7 @@ def offset_errors(
     correction = read_json(products / "correction.json")
     described = load_acquisition(acquisition)
     corrected: Sets = {name: facts["fit"] for name, facts in correction["sets"].items()}
-    found = []
+    errors = []
     for n, (axis, true) in enumerate(zip(AXES, true_offsets(truth, bench, layout), strict=True)):
         product = products / f"delta_{axis}.fits"
         if not product.is_file():
@@ -100,8 +100,8 @@ def offset_errors(
         good = np.isfinite(off) & np.isfinite(rest) & (sigma > 0)
         if good.any():
             sizes = (off[good] / bound, rest[good] / bound, off[good] / sigma[good])
-            found.append(AxisError(axis, bound, *(float(np.sqrt((s**2).mean())) for s in sizes)))
-    return tuple(found)
+            errors.append(AxisError(axis, bound, *(float(np.sqrt((s**2).mean())) for s in sizes)))
+    return tuple(errors)
 
 
 def _bound(sets: Sets, axis: int) -> float:
@@ -117,18 +117,18 @@ def _modes(
 ) -> F64:
     """What the fit took off the maps of the sets that are felt along an axis, (mode, y, x)."""
     y, x = np.arange(shape[0], dtype=float)[:, None], np.arange(shape[1], dtype=float)[None, :]
-    found = []
+    modes = []
     for facts in sets.values():
         if abs(facts["axis"][axis]) > PART_OF:
             fringes = fitted_shape(products, facts, acquisition, shape)
             ratio = np.asarray(1 / facts["visibility"])
-            found += [fringes.modes(y, x), np.stack(fringe_modes(fringes.phase(y, x), ratio))]
-    return np.concatenate(found)
+            modes += [fringes.modes(y, x), np.stack(fringe_modes(fringes.phase(y, x), ratio))]
+    return np.concatenate(modes)
 
 
 def _less_modes(error: F64, modes: F64) -> F64:
     """An error map (y, x) less the modes; NaN stay NaN."""
     good = np.isfinite(error)
-    own = modes / np.sqrt((modes**2).mean(axis=(1, 2)))[:, None, None]
-    taken = np.linalg.lstsq(own[:, good].T, error[good], rcond=None)[0]
-    return np.asarray(error - np.tensordot(taken, own, 1))
+    scaled = modes / np.sqrt((modes**2).mean(axis=(1, 2)))[:, None, None]
+    taken = np.linalg.lstsq(scaled[:, good].T, error[good], rcond=None)[0]
+    return np.asarray(error - np.tensordot(taken, scaled, 1))

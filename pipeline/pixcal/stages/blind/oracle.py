@@ -63,9 +63,9 @@ def ask_oracle(
     try:
         ingest.run(acquisition, scratch / "run", ingest.Config(), runtime)
         reduce.run(scratch / "run", reduce.Config(), runtime)
-        seen = _signatures(diagnosed)
-        look = look_at(scratch / "run", runtime, lambda *_: seen)
-        trials = Trials(look.windows, scratch, look.runtime, seen)
+        signatures = _signatures(diagnosed)
+        look = look_at(scratch / "run", runtime, lambda *_: signatures)
+        trials = Trials(look.windows, scratch, look.runtime, signatures)
         true = effects_of(truth, bench)
         (nominal,) = trials.curves([()], REFERENCES, "nominal bench")
         (with_effects,) = trials.curves([true], CONFIRM, "true effects")

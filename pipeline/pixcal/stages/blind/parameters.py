@@ -12,7 +12,7 @@ Plain = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Held:
+class ParameterCheck:
     """A parameter held against the truth."""
 
     name: str
@@ -25,29 +25,31 @@ class Held:
         return abs(self.found - self.true) <= errors * self.error
 
 
-def held(effect: str, true: Plain, found: Plain, errors: Mapping[str, float]) -> list[Held]:
+def check_parameters(
+    effect: str, true: Plain, estimated: Plain, errors: Mapping[str, float]
+) -> list[ParameterCheck]:
     """Every parameter that the diagnosis gives an error of.
 
     Parameters
     ----------
     true : mapping
         Parameters as in a bench file; those that are missing have their defaults.
-    found : mapping
+    estimated : mapping
         All parameters.
     errors : mapping
         By name of the parameter, as in ``uncertainty`` of the diagnosis.
     """
     whole = to_plain(parse_effects({effect: dict(true)}, "truth")[0])
     if "couplings" in whole:
-        return list(_couplings(whole["couplings"], found["couplings"], errors))
-    values, others = dict(_flat(whole)), dict(_flat(found))
+        return list(_couplings(whole["couplings"], estimated["couplings"], errors))
+    values, others = dict(_flat(whole)), dict(_flat(estimated))
     pairs = []
     for name, error in errors.items():
         if name in values and name in others and math.isfinite(error):
             value = others[name]
             if name == "phase_rad":
                 value = values[name] + math.remainder(value - values[name], 2 * math.pi)
-            pairs.append(Held(name, values[name], value, error))
+            pairs.append(ParameterCheck(name, values[name], value, error))
     return pairs
 
 
@@ -63,15 +65,15 @@ def _flat(plain: Plain, prefix: str = "") -> Iterator[tuple[str, float]]:
 
 
 def _couplings(
-    true: Sequence[Plain], found: Sequence[Plain], errors: Mapping[str, float]
-) -> Iterator[Held]:
+    true: Sequence[Plain], estimated: Sequence[Plain], errors: Mapping[str, float]
+) -> Iterator[ParameterCheck]:
     """Share of every true coupling: that of all found ones with its way whose rows meet its own."""
     for one in true:
-        own = [n for n, other in enumerate(found) if _meet(one, other)]
-        share = sum(float(found[n]["share"]) for n in own)
-        error = math.hypot(*(errors.get(f"couplings[{n}].share", 0.0) for n in own))
+        matching = [n for n, other in enumerate(estimated) if _meet(one, other)]
+        share = sum(float(estimated[n]["share"]) for n in matching)
+        error = math.hypot(*(errors.get(f"couplings[{n}].share", 0.0) for n in matching))
         name = f"share from rows {one['row']} of {one['every_rows']} by ({one['dy']}, {one['dx']})"
-        yield Held(name, float(one["share"]), share, error)
+        yield ParameterCheck(name, float(one["share"]), share, error)
 
 
 def _meet(one: Plain, other: Plain) -> bool:

@@ -57,8 +57,8 @@ def run(folder: Path, config: RunConfig, runtime: Runtime) -> tuple[int, int]:
         if config.again or not (folder / RUNS / name / DONE).is_file()
     ][: config.limit]
     over, each = share("diagnosing a case", manifest.size, len(pending), runtime)
-    sit = partial(_case, folder, config, code_digest(), each)
-    failed = run_tasks(sit, pending, over, label="diagnose")
+    diagnose_case = partial(_case, folder, config, code_digest(), each)
+    failed = run_tasks(diagnose_case, pending, over, label="diagnose")
     return len(pending), sum(failed)
 
 
@@ -91,9 +91,9 @@ def share(what: str, size: str, cases: int, runtime: Runtime) -> tuple[Runtime, 
         return over, Runtime("sync", memory=BASE_BYTES + max(need, LEAST_BYTES))
     if min(cases, plan.workers) <= 1:
         return over, replace(runtime, quiet=True)
-    own = (runtime.memory - BASE_BYTES) // min(cases, plan.workers)
+    memory = (runtime.memory - BASE_BYTES) // min(cases, plan.workers)
     # Processes have an interpreter each; threads share theirs.
-    return over, Runtime("sync", memory=own + BASE_BYTES * (runtime.cluster == "threads"))
+    return over, Runtime("sync", memory=memory + BASE_BYTES * (runtime.cluster == "threads"))
 
 
 def _case(
@@ -121,14 +121,14 @@ def _case(
         facts = {"error": f"{type(error).__name__}: {error}", "where": traceback.format_exc()}
         write_json(run_dir / FAILED, facts)
         seconds = {"diagnosis": time.perf_counter() - start, "maps": 0.0}
-        _say_sat(run_dir, code, seconds, "not diagnosed")
+        _write_done(run_dir, code, seconds, "not diagnosed")
         return True
     diagnosed = time.perf_counter()
     without_maps = _fit_maps(run_dir, runtime)
     if not config.keep:
         _clear(run_dir, LARGE)
     seconds = {"diagnosis": diagnosed - start, "maps": time.perf_counter() - diagnosed}
-    _say_sat(run_dir, code, seconds, without_maps)
+    _write_done(run_dir, code, seconds, without_maps)
     return False
 
 
@@ -140,7 +140,7 @@ def _begun_by(run_dir: Path) -> str | None:
         return None
 
 
-def _say_sat(run_dir: Path, code: str, seconds: Mapping[str, float], no_maps: str) -> None:
+def _write_done(run_dir: Path, code: str, seconds: Mapping[str, float], no_maps: str) -> None:
     rounded = {what: round(value, 1) for what, value in seconds.items()}
     write_json(run_dir / DONE, {"code": code, "seconds": rounded, "no_maps": no_maps})
 

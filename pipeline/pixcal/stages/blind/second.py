@@ -75,10 +75,14 @@ def catalogue() -> tuple[tuple[str, ...], tuple[SecondLaw, ...], tuple[str, ...]
         raise InputError(
             f"the second bench needs {', '.join(missing())}; {INSTALL}, or say --bench own"
         )
-    told = json.loads(_asked("--list", "--json"))
-    laws = [SecondLaw(**facts) for facts in told["laws"]]
+    listing = json.loads(_asked("--list", "--json"))
+    laws = [SecondLaw(**facts) for facts in listing["laws"]]
     absent = sorted({law.needs for law in laws if not _there(law.needs)})
-    return tuple(told["variations"]), tuple(n for n in laws if n.needs not in absent), tuple(absent)
+    return (
+        tuple(listing["variations"]),
+        tuple(n for n in laws if n.needs not in absent),
+        tuple(absent),
+    )
 
 
 def _asked(*line: str | Path) -> str:
@@ -86,8 +90,8 @@ def _asked(*line: str | Path) -> str:
     command = [sys.executable, "-m", PROGRAM, *map(str, line)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        told = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise InputError(f"the second bench failed: {told}")
+        reason = (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise InputError(f"the second bench failed: {reason}")
     return done.stdout
 
 
@@ -115,5 +119,5 @@ def second_offsets(case: SecondCase, layout: Layout) -> tuple[F64, F64]:
     with tempfile.TemporaryDirectory(prefix="pixcal-second-") as scratch:
         truth = Path(scratch) / "truth.json"
         _asked(*_options(case, layout), "--truth", truth)
-        told: dict[str, Any] = json.loads(truth.read_text())
-    return np.asarray(told["delta_x"], float), np.asarray(told["delta_y"], float)
+        contents: dict[str, Any] = json.loads(truth.read_text())
+    return np.asarray(contents["delta_x"], float), np.asarray(contents["delta_y"], float)

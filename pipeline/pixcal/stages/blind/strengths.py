@@ -13,7 +13,7 @@ Make = Callable[[float, np.random.Generator], Plain]
 
 
 @dataclass(frozen=True)
-class Way:
+class Variant:
     """One of the ways in which an effect comes."""
 
     effect: str
@@ -103,63 +103,63 @@ _CODES = ("coarse_adu", "dnl_rms", "ripple")
 _WAVE = ("ramp", "walk", "hop")
 
 # fmt: off
-WAYS = (
-    Way("bias_drift", "jitter, e-", 0.6, 0.2, _only("jitter_rms", _BIAS)),
-    Way("bias_drift", "random walk, e-/h^0.5", 32, 11, _only("walk_e_h", _BIAS)),
-    Way("brighter_fatter", "shift, px/e-", 1.1e-8, 3.8e-9,
+VARIANTS = (
+    Variant("bias_drift", "jitter, e-", 0.6, 0.2, _only("jitter_rms", _BIAS)),
+    Variant("bias_drift", "random walk, e-/h^0.5", 32, 11, _only("walk_e_h", _BIAS)),
+    Variant("brighter_fatter", "shift, px/e-", 1.1e-8, 3.8e-9,
         lambda s, rng: {"shift_px_per_e": s, "falloff_px": float(rng.uniform(0.4, 1.0))}),
-    Way("contrast_noise", "vibration, rad", 0.015, 0.0095,
+    Variant("contrast_noise", "vibration, rad", 0.015, 0.0095,
         _only("vibration_rad", ("polarisation",))),
-    Way("contrast_noise", "polarisation", 1.2e-4, 3.5e-5,
+    Variant("contrast_noise", "polarisation", 1.2e-4, 3.5e-5,
         lambda s, rng: {"vibration_rad": 0.0, "polarisation": s,
                         "polarisation_s": _between(0.5, 10, rng)}),
-    Way("cosmic_hits", "rate, /(cm² s)", 180, 30, lambda s, rng: {"rate_cm2_s": s}),
-    Way("flat_error", "from pixel to pixel", 5e-4, 3.5e-4, _only("pixel_rms", ("smooth_rms",))),
-    Way("flat_error", "smooth", 4.2e-4, 2.8e-4,
+    Variant("cosmic_hits", "rate, /(cm² s)", 180, 30, lambda s, rng: {"rate_cm2_s": s}),
+    Variant("flat_error", "from pixel to pixel", 5e-4, 3.5e-4, _only("pixel_rms", ("smooth_rms",))),
+    Variant("flat_error", "smooth", 4.2e-4, 2.8e-4,
         lambda s, rng: {"pixel_rms": 0.0, "smooth_rms": s, "scale_px": _between(3, 12, rng)}),
-    Way("fringe_drift", "random walk, rad/(px h^0.5)", 1.9e-4, 2.5e-5, _walk),
-    Way("fringe_drift", "ramp, rad/(px h)", 0.0018, 1.4e-4, _ramp),
-    Way("fringe_jitter", "vector, rad/px", 7.5e-6, 1.3e-6, _jitter),
-    Way("fringe_jitter", "vibration, rad/px", 4.7e-6, 1.1e-6, _vibration),
-    Way("gain_error", "relative", 0.024, 0.0085, lambda s, rng: {"relative": _either(s, rng)}),
-    Way("ghost_fringes", "share", 2.7e-4, 1.3e-4, _ghost),
-    Way("hyperbolic_fringes", "foot, mm", 12, 1.1, lambda s, rng: {"foot_mm": _around(s, rng)}),
-    Way("intensity_noise", "white, relative", 8e-5, 4.7e-5, _only("rms", ("line",))),
-    Way("intensity_noise", "slow, relative", 9e-5, 3.1e-5,
+    Variant("fringe_drift", "random walk, rad/(px h^0.5)", 1.9e-4, 2.5e-5, _walk),
+    Variant("fringe_drift", "ramp, rad/(px h)", 0.0018, 1.4e-4, _ramp),
+    Variant("fringe_jitter", "vector, rad/px", 7.5e-6, 1.3e-6, _jitter),
+    Variant("fringe_jitter", "vibration, rad/px", 4.7e-6, 1.1e-6, _vibration),
+    Variant("gain_error", "relative", 0.024, 0.0085, lambda s, rng: {"relative": _either(s, rng)}),
+    Variant("ghost_fringes", "share", 2.7e-4, 1.3e-4, _ghost),
+    Variant("hyperbolic_fringes", "foot, mm", 12, 1.1, lambda s, rng: {"foot_mm": _around(s, rng)}),
+    Variant("intensity_noise", "white, relative", 8e-5, 4.7e-5, _only("rms", ("line",))),
+    Variant("intensity_noise", "slow, relative", 9e-5, 3.1e-5,
         lambda s, rng: {"rms": s, "line": 0.0, "correlation_s": _between(0.3, 5, rng)}),
-    Way("intra_pixel_response", "scatter of the width, px", 0.006, 0.003,
+    Variant("intra_pixel_response", "scatter of the width, px", 0.006, 0.003,
         lambda s, rng: {"width_px": 2 * [float(rng.uniform(0.8, 1.0))], "width_rms_px": s}),
-    Way("ipc", "share to the next pixel", 0.004, 9e-4, _nearest),
-    Way("ipc", "share from every other row", 0.0023, 9.8e-4, _every_other_row),
-    Way("lag", "share", 3.3e-5, 1.4e-5,
+    Variant("ipc", "share to the next pixel", 0.004, 9e-4, _nearest),
+    Variant("ipc", "share from every other row", 0.0023, 9.8e-4, _every_other_row),
+    Variant("lag", "share", 3.3e-5, 1.4e-5,
         lambda s, rng: {"share": s, "decay_frames": float(rng.choice([0.0, rng.uniform(1, 3)]))}),
-    Way("nonlinearity", "quadratic", 0.0011, 4.3e-4, _bent),
-    Way("quantisation", "step beyond 1 ADU, ADU", 1.0, 1.0,
+    Variant("nonlinearity", "quadratic", 0.0011, 4.3e-4, _bent),
+    Variant("quantisation", "step beyond 1 ADU, ADU", 1.0, 1.0,
         lambda s, rng: {"coarse_adu": float(np.ceil(s)), "dnl_rms": 0.0, "ripple": 0.0}),
-    Way("quantisation", "scatter of the codes", 0.012, 0.0036, _only("dnl_rms", _CODES)),
-    Way("quantisation", "ripple of the codes", 0.007, 0.0027,
+    Variant("quantisation", "scatter of the codes", 0.012, 0.0036, _only("dnl_rms", _CODES)),
+    Variant("quantisation", "ripple of the codes", 0.007, 0.0027,
         lambda s, rng: {"coarse_adu": 0.0, "dnl_rms": 0.0, "ripple": s,
                         "ripple_phase_rad": float(rng.choice([0.0, np.pi]))}),
-    Way("rolling_shutter", "line time, us", 0.053, 0.0073, lambda s, rng: {"line_time_us": s}),
-    Way("row_noise", "rows, e-", 0.75, 0.3, _only("row_rms", _ROWS)),
-    Way("row_noise", "columns, e-", 0.7, 0.32, _only("column_rms", _ROWS)),
-    Way("row_noise", "rows in turn, e-", 0.29, 0.12, _only("interlace_rms", _ROWS)),
-    Way("straylight", "bump, of the light", 1.5e-3, 7e-4, _bump),
-    Way("telegraph_noise", "amplitude, e-", 19, 10,
+    Variant("rolling_shutter", "line time, us", 0.053, 0.0073, lambda s, rng: {"line_time_us": s}),
+    Variant("row_noise", "rows, e-", 0.75, 0.3, _only("row_rms", _ROWS)),
+    Variant("row_noise", "columns, e-", 0.7, 0.32, _only("column_rms", _ROWS)),
+    Variant("row_noise", "rows in turn, e-", 0.29, 0.12, _only("interlace_rms", _ROWS)),
+    Variant("straylight", "bump, of the light", 1.5e-3, 7e-4, _bump),
+    Variant("telegraph_noise", "amplitude, e-", 19, 10,
         lambda s, rng: {"amplitude_e": s, "share": float(rng.uniform(0.01, 0.05)),
                         "switching_s": _between(0.3, 3, rng)}),
-    Way("wavelength_drift", "ramp, 1/h", 0.0025, 4.4e-4, _only("ramp", _WAVE)),
-    Way("wavelength_drift", "hop", 3e-5, 3.3e-6,
+    Variant("wavelength_drift", "ramp, 1/h", 0.0025, 4.4e-4, _only("ramp", _WAVE)),
+    Variant("wavelength_drift", "hop", 3e-5, 3.3e-6,
         lambda s, rng: {"ramp": 0.0, "walk": 0.0, "hop": s, "hops_per_h": 300.0}),
 )
 # fmt: on
 """Every way of every effect."""
 
 
-def ways_of() -> Mapping[str, tuple[Way, ...]]:
+def variants_of() -> Mapping[str, tuple[Variant, ...]]:
     """Ways by the name of the effect."""
-    names = dict.fromkeys(way.effect for way in WAYS)
-    return {name: tuple(w for w in WAYS if w.effect == name) for name in names}
+    names = dict.fromkeys(way.effect for way in VARIANTS)
+    return {name: tuple(w for w in VARIANTS if w.effect == name) for name in names}
 
 
 STRONGEST = 10.0  # times the threshold that an effect is at most

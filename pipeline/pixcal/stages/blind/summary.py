@@ -95,9 +95,9 @@ def _more_questions(part: int, own: Sequence[Grade]) -> dict[str, dict[str, Any]
     return {}
 
 
-def _clear(own: Grade) -> bool:
+def _clear(graded: Grade) -> bool:
     """Whether the weakest effect has twice its threshold."""
-    return own.times is not None and own.times >= TWICE
+    return graded.times is not None and graded.times >= TWICE
 
 
 def _count(answers: Iterable[bool]) -> dict[str, Any]:
@@ -135,12 +135,12 @@ def confusion(grades: Sequence[Grade]) -> dict[str, dict[str, int]]:
     return {name: dict(sorted(row.items())) for name, row in sorted(table.items())}
 
 
-def _by_effect(own: Sequence[Grade]) -> dict[str, dict[str, Any]]:
+def _by_effect(grades: Sequence[Grade]) -> dict[str, dict[str, Any]]:
     """Of every effect: named first, below and above twice the threshold too, and the maps."""
-    found = {}
-    for name in sorted({g.truth[0] for g in own}):
-        those = [g for g in own if g.truth[0] == name]
-        found[name] = {
+    table = {}
+    for name in sorted({g.truth[0] for g in grades}):
+        those = [g for g in grades if g.truth[0] == name]
+        table[name] = {
             "below_twice": _count(g.right for g in those if not _clear(g)),
             "from_twice": _count(g.right for g in those if _clear(g)),
             "right": _count(g.right for g in those),
@@ -153,22 +153,22 @@ def _by_effect(own: Sequence[Grade]) -> dict[str, dict[str, Any]]:
                 for axis in AXES
             },
         }
-    return found
+    return table
 
 
 def _along(grades: Iterable[Grade], axis: str) -> list[AxisError]:
     return [one for g in grades for one in g.offsets if one.axis == axis]
 
 
-def _of_maps(own: Sequence[Grade]) -> dict[str, Any]:
+def _of_maps(grades: Sequence[Grade]) -> dict[str, Any]:
     """Errors of the offsets over the bound, medians: of all maps, and of those that are biased."""
-    every = [one for axis in AXES for one in _along(own, axis)]
-    found: dict[str, Any] = {"target": BOUNDS}
-    for name, chosen in (("all", every), ("biased", [one for one in every if one.biased])):
-        found[name] = {
+    errors = [one for axis in AXES for one in _along(grades, axis)]
+    facts: dict[str, Any] = {"target": BOUNDS}
+    for name, chosen in (("all", errors), ("biased", [one for one in errors if one.biased])):
+        facts[name] = {
             "maps": len(chosen),
             "before": median(one.before for one in chosen),
             "after": median(one.after for one in chosen),
             "within_target": _count(one.after <= BOUNDS for one in chosen),
         }
-    return found
+    return facts

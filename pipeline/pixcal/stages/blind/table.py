@@ -43,23 +43,23 @@ def as_markdown(score: Plain) -> str:
 
 
 def _about(score: Plain) -> str:
-    told = f"{len(score['cases'])} cases, size {score['size']}"
+    text = f"{len(score['cases'])} cases, size {score['size']}"
     if score["seed"] is not None:
         seeds = score["seed"] if isinstance(score["seed"], list) else [score["seed"]]
-        told += f", seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
+        text += f", seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
     if score["missing"]:
-        told += f"; **{len(score['missing'])} of {score['made']} are not diagnosed yet**"
+        text += f"; **{len(score['missing'])} of {score['made']} are not diagnosed yet**"
     if score["purpose"] == "development":
-        told += " — **development seed: not an examination**"
+        text += " — **development seed: not an examination**"
     sittings = score["sittings"]
     if len(sittings["codes"]) > 1:
-        told += f" — **diagnosed by {len(sittings['codes'])} versions of the program**"
+        text += f" — **diagnosed by {len(sittings['codes'])} versions of the program**"
     seconds = sittings["median_seconds"]
     if seconds["diagnosis"] is not None:
-        told += f". A case took {seconds['diagnosis']:.0f} s, its maps {seconds['maps']:.1f} s more"
+        text += f". A case took {seconds['diagnosis']:.0f} s, its maps {seconds['maps']:.1f} s more"
     if sittings["without_maps"]:
-        told += f"; {sittings['without_maps']} have no maps, for they could not be fitted"
-    return told + "."
+        text += f"; {sittings['without_maps']} have no maps, for they could not be fitted"
+    return text + "."
 
 
 def _parts(parts: Mapping[str, Plain]) -> str:
@@ -83,10 +83,10 @@ def _percent(count: Plain) -> tuple[str, str]:
 def _target(count: Plain) -> tuple[str, str]:
     if "target" not in count:
         return "", ""
-    told = f"≥ {100 * count['target']:.0f} %"
+    text = f"≥ {100 * count['target']:.0f} %"
     if count["share"] is None:
-        return told, ""
-    return told, "yes" if count["share"] >= count["target"] else "**no**"
+        return text, ""
+    return text, "yes" if count["share"] >= count["target"] else "**no**"
 
 
 def _medians(medians: Mapping[str, float | None]) -> str:
@@ -102,18 +102,18 @@ def _maps(maps: Plain) -> str:
     titles = {"all": "all cases of one effect", "biased": "those that the effect biases"}
     rows = []
     for which, title in titles.items():
-        own = maps[which]
-        if not own["maps"]:
+        errors = maps[which]
+        if not errors["maps"]:
             rows.append((title, 0, "", "", "", "", ""))
             continue
         of_target = ("", "")
         if which == "biased":
-            reached = "yes" if own["after"] <= maps["target"] else "**no**"
+            reached = "yes" if errors["after"] <= maps["target"] else "**no**"
             of_target = (f"≤ {maps['target']}", reached)
-        within = own["within_target"]
+        within = errors["within_target"]
         rows.append(
             (
-                title, own["maps"], f"{own['before']:.2f}", f"{own['after']:.2f}",
+                title, errors["maps"], f"{errors['before']:.2f}", f"{errors['after']:.2f}",
                 f"{within['right']} ({_percent(within)[1]})", *of_target,
             )
         )  # fmt: skip
@@ -129,16 +129,16 @@ def _effects(effects: Mapping[str, Plain], right: Mapping[str, str]) -> str:
     if not effects:
         return ""
     rows = []
-    for name, own in effects.items():
-        counts = [f"{own[k]['right']} of {own[k]['of']}" for k in right]
-        closed = "" if own["closed"] is None else f"{own['closed']:.2f}"
-        rows.append((name, *counts, closed, *(_before_after(o) for o in own["offsets"].values())))
+    for name, facts in effects.items():
+        counts = [f"{facts[k]['right']} of {facts[k]['of']}" for k in right]
+        closed = "" if facts["closed"] is None else f"{facts['closed']:.2f}"
+        rows.append((name, *counts, closed, *(_before_after(o) for o in facts["offsets"].values())))
     more = ("gap closed, median", "error along x, bounds", "along y")
     return _table(("one effect", *right.values(), *more), rows)
 
 
-def _before_after(own: Mapping[str, float | None]) -> str:
-    before, after = own["before"], own["after"]
+def _before_after(medians: Mapping[str, float | None]) -> str:
+    before, after = medians["before"], medians["after"]
     return "" if before is None or after is None else f"{before:.2f} → {after:.2f}"
 
 
@@ -168,10 +168,10 @@ def _failures(wrong: Sequence[Plain]) -> str:
 
 
 def _claimed(one: Plain) -> str:
-    told = [] if one["sigmas"] is None else [f"{one['sigmas']:.1f} sigmas"]
+    parts = [] if one["sigmas"] is None else [f"{one['sigmas']:.1f} sigmas"]
     if one["gap_closed"] is not None:
-        told.append(f"closes {one['gap_closed']:.2f}")
-    return f"{one['effect']} ({', '.join(told)})" if told else str(one["effect"])
+        parts.append(f"closes {one['gap_closed']:.2f}")
+    return f"{one['effect']} ({', '.join(parts)})" if parts else str(one["effect"])
 
 
 def _table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

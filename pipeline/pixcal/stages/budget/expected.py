@@ -110,9 +110,9 @@ class SetBound:
     @cached_property
     def information(self) -> F64:
         """Of one frame on each pixel's phase, 1/rad², at the median fringe phase."""
-        found = phase_information(self.iota, self.alpha, self.variance, self.frames)
+        per_pixel = phase_information(self.iota, self.alpha, self.variance, self.frames)
         # A pixel beyond the beams would take for ever; it still must have a number.
-        return np.asarray(np.maximum(found, DARKNESS) / self.loss[0])
+        return np.asarray(np.maximum(per_pixel, DARKNESS) / self.loss[0])
 
     @property
     def k(self) -> F64:
@@ -161,12 +161,12 @@ class SetBound:
             "read_noise": phase_information(self.iota, self.alpha, self.variance, self.frames),
             "phases": self.information,
         }
-        found, before = {"photons": ideal}, ideal
+        factors, before = {"photons": ideal}, ideal
         for name, information in steps.items():
             now = float(np.median(1 / (np.maximum(information, DARKNESS) * self.k**2)))
-            found[name] = now / before
+            factors[name] = now / before
             before = now
-        return found
+        return factors
 
     def calibration(self) -> WeightErrors:
         """What errors of bias and flat cost the typical pixel."""
@@ -224,7 +224,7 @@ class JoinedBound:
             return np.asarray(np.eye(n)[best])
         scale = float(self.median(np.full(n, 1 / n)).max())
         # Least t with every component below it: smooth where the largest itself is not.
-        found = minimize(
+        split = minimize(
             lambda v: v[-1],
             [*np.full(n, 1 / n), 1.0],
             bounds=[(1e-4, 1.0)] * n + [(0.0, None)],
@@ -233,7 +233,7 @@ class JoinedBound:
                 {"type": "ineq", "fun": lambda v: v[-1] - self.median(v[:-1]) / scale},
             ],
         ).x[:-1]
-        return np.asarray(found / found.sum(), float)
+        return np.asarray(split / split.sum(), float)
 
 
 def joined(bench: Bench, contrast: Sequence[float] | None = None) -> JoinedBound:
@@ -268,7 +268,7 @@ def levers(bench: Bench, now: JoinedBound) -> list[Lever]:
     """What could be changed, the most helpful first; and what equal weights would lose."""
     split, period = planned_split(bench), bench.frames.period_s
     best = now.best_split()
-    found = [
+    candidates = [
         Lever("as planned", _worse(now, split), period),
         *(
             Lever(name, _worse(joined(changed, contrast), split), changed.frames.period_s, note)
@@ -277,15 +277,15 @@ def levers(bench: Bench, now: JoinedBound) -> list[Lever]:
     ]
     if len(now.components) == 2 and np.abs(best - split).max() > 0.02:
         shares = " : ".join(f"{100 * s:.0f}" for s in best)
-        found.append(Lever(f"frames shared {shares} %", _worse(now, best), period))
+        candidates.append(Lever(f"frames shared {shares} %", _worse(now, best), period))
     plain = tuple(
         replace(s, loss=(s.loss[0] * ratio, s.loss[1] * ratio))
         for s, ratio in ((s, _unweighted_ratio(s)) for s in now.sets)
     )
-    found.append(
+    candidates.append(
         Lever("equal weights", _worse(JoinedBound(plain), split), period, "a loss: do not")
     )
-    return sorted(found, key=lambda lever: lever.variance * lever.period_s)
+    return sorted(candidates, key=lambda lever: lever.variance * lever.period_s)
 
 
 def _worse(bound: JoinedBound, split: F64) -> float:
@@ -303,38 +303,38 @@ Change = tuple[str, Bench, list[float] | None, str]
 def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
     """(name, bench, contrast of each set, note) of every change that is one."""
     d, o, f = bench.detector, bench.optics, bench.frames
-    found = _finer_fringes(bench, now)
+    changes = _finer_fringes(bench, now)
     limit = brightest_allowed(bench)
     if limit is not None and min(s.peak_e for s in f.fringes) < 0.95 * limit:
         fuller = tuple(replace(s, peak_e=max(s.peak_e, limit)) for s in f.fringes)
         name = f"brightest fringe at {limit / 1e3:.3g} ke-"
-        found.append((name, replace(bench, frames=replace(f, fringes=fuller)), None, "no margin"))
+        changes.append((name, replace(bench, frames=replace(f, fringes=fuller)), None, "no margin"))
     doubled = tuple(replace(s, peak_e=2 * s.peak_e) for s in f.fringes)
-    found.append(
+    changes.append(
         ("twice the light a frame", replace(bench, frames=replace(f, fringes=doubled)), None,
          "and the well for it")
     )  # fmt: skip
     if d.read_noise_e > 0:
         quiet = replace(d, read_noise_e=d.read_noise_e / 2)
-        found.append(
+        changes.append(
             (f"read noise {quiet.read_noise_e:.3g} e-", replace(bench, detector=quiet), None, "")
         )
     if o.visibility < 0.995:
         clear = replace(o, visibility=1.0)
-        found.append(("visibility 1", replace(bench, optics=clear), None, ""))
+        changes.append(("visibility 1", replace(bench, optics=clear), None, ""))
     if abs(np.log(o.power_ratio)) > 0.02:
         equal = replace(o, power_ratio=1.0)
-        found.append(("fibres of equal power", replace(bench, optics=equal), None, ""))
+        changes.append(("fibres of equal power", replace(bench, optics=equal), None, ""))
     if any(s.loss[0] > 1.01 for s in now.sets):
         random = tuple(replace(s, phase_law="random") for s in f.fringes)
-        found.append(
+        changes.append(
             ("phases over the whole turn", replace(bench, frames=replace(f, fringes=random)),
              None, "")
         )  # fmt: skip
     if f.period_s > 1.05 * f.exptime_s:
         fast = replace(bench, frames=replace(f, period_s=f.exptime_s))
-        found.append((f"a frame every {f.exptime_s:.3g} s", fast, None, "no dead time"))
-    return found
+        changes.append((f"a frame every {f.exptime_s:.3g} s", fast, None, "no dead time"))
+    return changes
 
 
 def _finer_fringes(bench: Bench, now: JoinedBound) -> list[Change]:

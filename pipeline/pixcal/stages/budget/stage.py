@@ -239,47 +239,47 @@ def _lever_facts(lever: Lever, precision: float | None) -> dict[str, Any]:
 
 def _left_out(bench: Bench) -> list[str]:
     """What the bound does not know."""
-    d, found = bench.detector, []
-    found.append(
+    d, sentences = bench.detector, []
+    sentences.append(
         "systematic errors (crosstalk, drifts, ghosts, nonlinearity): no number of frames removes "
         "them"
     )
     if bench.effects:
-        found.append(f"the effects of the bench file: {', '.join(sorted(bench.effects))}")
+        sentences.append(f"the effects of the bench file: {', '.join(sorted(bench.effects))}")
     if d.prnu_rms > 0:
-        found.append(
+        sentences.append(
             f"the response of single pixels: its {100 * d.prnu_rms:.2g} % rms scatters their "
             f"errors by {50 * d.prnu_rms:.2g} %"
         )
     if not bench.shot_noise:
-        found.append("shot_noise: false in the bench file: a budget always counts it")
-    return found
+        sentences.append("shot_noise: false in the bench file: a budget always counts it")
+    return sentences
 
 
 def _warnings(bench: Bench, bound: JoinedBound) -> list[str]:
-    found, limit = [], brightest_allowed(bench)
+    sentences, limit = [], brightest_allowed(bench)
     ny, nx = bench.detector.shape
     for scan, s in zip(bench.frames.fringes, bound.sets, strict=True):
         noise = s.variance + scan.peak_e + (bench.optics.laser_noise_rms * scan.peak_e) ** 2
         top = scan.peak_e + MARGIN * noise**0.5
         if limit is not None and top > limit:
-            found.append(
+            sentences.append(
                 f"{scan.name}: the brightest fringe, {scan.peak_e / 1e3:.4g} ke-, reaches "
                 f"{top / 1e3:.4g} ke- at {MARGIN:.0f} sigma; the range ends at "
                 f"{limit / 1e3:.4g} ke-, so that some samples are lost"
             )
         if s.interfringe < 2:
-            found.append(
+            sentences.append(
                 f"{scan.name}: interfringe {s.interfringe:.3g} px is below two pixels: the fringes "
                 "cannot be told from coarser ones"
             )
         across = float(np.hypot(np.median(s.kx) * nx, np.median(s.ky) * ny) / (2 * np.pi))
         if across < HONEST_FRINGES:
-            found.append(
+            sentences.append(
                 f"{scan.name}: {across:.2g} fringes across the window; fewer than "
                 f"{HONEST_FRINGES:g} leave true offsets and fringes mixed up"
             )
-    return found
+    return sentences
 
 
 def _view(bench: Bench, bound: JoinedBound, result: dict[str, Any]) -> BudgetView:

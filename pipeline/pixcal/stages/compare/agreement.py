@@ -206,12 +206,12 @@ def beyond_noise(p: Part, accuracy: float = SIGMA_ACCURACY) -> Estimate:
 
 def own(p: Part, accuracy: float = SIGMA_ACCURACY) -> tuple[Estimate, Estimate]:
     """What each map holds that is neither noise nor in the other."""
-    found = []
+    estimates = []
     for square, noise in zip((p.first, p.second), p.noise, strict=True):
         chance = (square * p.difference + (square - p.both) ** 2) / p.freedom
         error = np.sqrt(chance + (2 * accuracy * noise) ** 2)
-        found.append(Estimate((square - p.both - noise) / p.pixels, float(error) / p.pixels))
-    return found[0], found[1]
+        estimates.append(Estimate((square - p.both - noise) / p.pixels, float(error) / p.pixels))
+    return estimates[0], estimates[1]
 
 
 def significance(p: Part, accuracy: float = SIGMA_ACCURACY) -> float:

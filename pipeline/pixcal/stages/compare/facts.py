@@ -77,25 +77,27 @@ def _evidence(
 ) -> list[str]:
     """What noise does not explain, in words; a whole list is made up once in 1 / `CLAIM` times."""
     share = CLAIM / FAMILIES
-    found = []
+    evidence = []
     sides = [s["side_px"] for s in scales if s["significance"] > norm.isf(share / len(scales))]
     if sides:
-        found.append(f"scales of {', '.join(map(str, sides))} px")
+        evidence.append(f"scales of {', '.join(map(str, sides))} px")
     for name, profile in (("columns", columns), ("rows", rows)):
         wave = profile["period"]
         if wave is not None:
-            found.append(
+            evidence.append(
                 f"{name}: a wave of {wave['px']:.4g} px, amplitude {wave['amplitude_px']:.2g} px"
             )
         elif profile["significance"] > norm.isf(share):
-            found.append(f"{name}: their means differ {profile['ratio']:.2g} times more than noise")
+            evidence.append(
+                f"{name}: their means differ {profile['ratio']:.2g} times more than noise"
+            )
     for kind in ("mean", "scatter"):
         number = blocks["beyond"][kind]
         if number:
-            found.append(f"the {kind} of {number} of {blocks['number']} blocks")
+            evidence.append(f"the {kind} of {number} of {blocks['number']} blocks")
     if poisson.sf(outliers["beyond_5_sigma"] - 1, outliers["expected"]) < share:
-        found.append(f"{outliers['beyond_5_sigma']} single pixels")
-    return found
+        evidence.append(f"{outliers['beyond_5_sigma']} single pixels")
+    return evidence
 
 
 def _suspicion(scales: list[dict[str, Any]]) -> str | None:
@@ -176,13 +178,13 @@ def _blocks(places: Places) -> dict[str, Any]:
     number = int((places.count > 0).sum())
     share = CLAIM / FAMILIES / max(1, number)
     limits = {"mean": float(norm.isf(share / 2)), "scatter": float(norm.isf(share))}
-    found: list[dict[str, Any]] = []
+    listed: list[dict[str, Any]] = []
     beyond = dict.fromkeys(limits, 0)
     for kind, z in (("mean", places.shift), ("scatter", places.scatter)):
         size = np.nan_to_num(np.abs(z) if kind == "mean" else z)
         for y, x in np.argwhere(size > limits[kind]):
             beyond[kind] += 1
-            found.append(
+            listed.append(
                 {
                     "kind": kind,
                     "y": [int(y) * places.side, (int(y) + 1) * places.side],
@@ -193,13 +195,13 @@ def _blocks(places: Places) -> dict[str, Any]:
                     "pull_rms": float((places.squares[y, x] / places.count[y, x]) ** 0.5),
                 }
             )
-    found.sort(key=lambda place: -abs(place["significance"]))
+    listed.sort(key=lambda place: -abs(place["significance"]))
     return {
         "side_px": places.side,
         "number": number,
         "limit_sigma": limits,
         "beyond": beyond,
-        "worst": found[:LISTED],
+        "worst": listed[:LISTED],
     }
 
 

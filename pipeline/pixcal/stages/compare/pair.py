@@ -193,18 +193,18 @@ def read_sums(pair: Pair, outlying: Outlying | None, runtime: Runtime) -> Sums:
         Pixels to leave out.
     """
     tiles = pair.tiles()
-    found = run_tasks(
+    results = run_tasks(
         partial(_sums_task, pair, outlying), tiles, runtime, label=f"sums {pair.name}"
     )
-    fine = found[0][0]
-    for more, _, _, _ in found[1:]:
+    fine = results[0][0]
+    for more, _, _, _ in results[1:]:
         fine = tuple(a + b for a, b in zip(fine, more, strict=True))
     ny, nx = pair.window
     side = 1 << pair.coarse
-    k = len(found[0][1].values)
+    k = len(results[0][1].values)
     coarse = _empty(k, -(-ny // side), -(-nx // side))
     columns, rows = _empty(k, 1, nx), _empty(k, ny, 1)
-    for ((y0, y1), (x0, x1)), (_, blocks, down, across) in zip(tiles, found, strict=True):
+    for ((y0, y1), (x0, x1)), (_, blocks, down, across) in zip(tiles, results, strict=True):
         at = np.s_[y0 // side : -(-y1 // side), x0 // side : -(-x1 // side)]
         for whole, piece, place in (
             (coarse, blocks, at),
@@ -265,20 +265,20 @@ def read_pixels(pair: Pair, sums: Sums, runtime: Runtime) -> Pixels:
     total = sums.total()
     reach = REACH * (max(total.first, total.second) / max(total.pixels, 1)) ** 0.5 or 1.0
     tiles = pair.tiles()
-    found = run_tasks(
+    pieces = run_tasks(
         partial(_pixels_task, pair, sums.projection, reach), tiles, runtime,
         label=f"pixels {pair.name}",
     )  # fmt: skip
     side = 1 << pair.coarse
     squares, count = (np.zeros(sums.coarse.count.shape) for _ in range(2))
-    for ((y0, y1), (x0, x1)), piece in zip(tiles, found, strict=True):
+    for ((y0, y1), (x0, x1)), piece in zip(tiles, pieces, strict=True):
         at = np.s_[y0 // side : -(-y1 // side), x0 // side : -(-x1 // side)]
         squares[at], count[at] = piece.squares, piece.count
-    far = sorted((f for piece in found for f in piece.far), key=lambda f: -abs(f[2] / f[3]))
+    far = sorted((f for piece in pieces for f in piece.far), key=lambda f: -abs(f[2] / f[3]))
     return Pixels(
-        np.sum([piece.pulls for piece in found], axis=0),
-        np.sum([piece.picture for piece in found], axis=0),
-        reach, tuple(far), sum(piece.beyond for piece in found), squares, count,
+        np.sum([piece.pulls for piece in pieces], axis=0),
+        np.sum([piece.picture for piece in pieces], axis=0),
+        reach, tuple(far), sum(piece.beyond for piece in pieces), squares, count,
     )  # fmt: skip
 
 

@@ -131,8 +131,8 @@ class Side:
 
     def read(self, tile: Tile, direction: Vector) -> SideTile:
         """Offset along a unit vector (x, y), its variance, and its modes, on a tile."""
-        found = [s.delta(tile) for s in self.sets]
-        delta, sigma = (np.stack([f[n] for f in found]) for n in (0, 1))
+        offsets = [s.delta(tile) for s in self.sets]
+        delta, sigma = (np.stack([f[n] for f in offsets]) for n in (0, 1))
         shares = self._shares([s.axis(tile) for s in self.sets], sigma, direction)
         lacking = ~np.isfinite(shares).all(axis=0)
         known = np.isfinite(sigma)
@@ -184,11 +184,11 @@ def whole_run(run: Path, label: str | None = None) -> Side:
         FittedSet(name, group / name, fitted_shape(run, facts, acquisition, window))
         for name, facts in result["sets"].items()
     )
-    told = {
+    about_sets = {
         name: {key: facts[key] for key in ("frames", "interfringe_px", "model", "axis")}
         for name, facts in result["sets"].items()
     }
-    facts = {"run": str(run), "key": manifest.key, "sets": told}
+    facts = {"run": str(run), "key": manifest.key, "sets": about_sets}
     return Side(
         label or run.name or str(run), run, manifest.key, sets, window,
         (first.chunks[0], first.chunks[1]), facts,

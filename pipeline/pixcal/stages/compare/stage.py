@@ -163,13 +163,13 @@ def _compare_all(
 ) -> tuple[dict[str, Any], list[PairView]]:
     pairs, views = [], []
     for i, j in combinations(range(len(sides)), 2):
-        found, parts = {}, []
+        by_component, parts = {}, []
         for name, direction in components.items():
             pair = Pair(sides[i], sides[j], name, direction)
             facts, view = compare_pair(pair, config.sigma_accuracy, runtime)
-            found[name] = facts
+            by_component[name] = facts
             parts.append(view)
-        pairs.append({"sides": [i, j], "components": found})
+        pairs.append({"sides": [i, j], "components": by_component})
         labels = sides[i].label, sides[j].label
         views.append(PairView((i + 1, j + 1), labels, tuple(parts)))
     result = {
@@ -237,28 +237,28 @@ def _view(
 def _summary(pairs: list[dict[str, Any]], components: dict[str, Vector]) -> dict[str, Any]:
     """What each side holds of its own, from all pairs."""
     numbers = [(p["sides"][0], p["sides"][1]) for p in pairs]
-    told: dict[str, Any] = {}
+    summary: dict[str, Any] = {}
     for name in components:
         excess = [
             Estimate(e["variance_px2"], e["variance_error_px2"])
             for e in (p["components"][name]["beyond_noise"] for p in pairs)
         ]
-        told[name] = {
+        summary[name] = {
             "ratio": [p["components"][name]["ratio"] for p in pairs],
             "own": [estimate_facts(e) for e in three_cornered_hat(numbers, excess)],
         }
-    return told
+    return summary
 
 
 def _warnings(sides: Sequence[Side], components: dict[str, Vector]) -> list[str]:
-    found = []
+    sentences = []
     if "delta_fringe" in components:
         for side in sides:
             turned = 0.0 if side.both else _angle(side.axes[0], components["delta_fringe"])
             if turned > NOTED_DEG:
                 share = np.sin(np.radians(turned))
-                found.append(
+                sentences.append(
                     f"{side.label}: fringes turned by {turned:.1f} degrees: {100 * share:.1g} % of "
                     "the offsets along the fringes count as a difference"
                 )
-    return found
+    return sentences

@@ -30,29 +30,31 @@ def measured_again(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatme
     runtime : Runtime
         Its memory: where it does not suffice, effects stay as the diagnosis found them.
     """
-    asked = [t for t in plan.every if t.how == "undone on maps" and t.origin == "diagnosis"]
-    asked = [t for t in asked if type(t.effect).measured_again is not Effect.measured_again]
-    if not asked:
+    remeasured = [t for t in plan.every if t.how == "undone on maps" and t.origin == "diagnosis"]
+    remeasured = [
+        t for t in remeasured if type(t.effect).measured_again is not Effect.measured_again
+    ]
+    if not remeasured:
         return plan
     try:
         parts = tuple(_parts(run_dir, runtime))
-        found = {t.effect.name: _again(t, parts) for t in asked}
+        refined = {t.effect.name: _again(t, parts) for t in remeasured}
     except (InputError, FileNotFoundError, np.linalg.LinAlgError):
         # Frames are missing, or too large: what the diagnosis found is good, only less precise.
         return plan
-    return Treatments(tuple(found.get(t.effect.name, t) for t in plan.every))
+    return Treatments(tuple(refined.get(t.effect.name, t) for t in plan.every))
 
 
 def _again(treatment: Treatment, parts: tuple[Evidence, ...]) -> Treatment:
-    found = treatment.effect.measured_again(parts)
-    if found is None:
+    estimate = treatment.effect.measured_again(parts)
+    if estimate is None:
         return treatment
-    covariance = found.details.get("covariance")
+    covariance = estimate.details.get("covariance")
     return replace(
         treatment,
-        effect=found.effect,
-        errors=found.errors,
-        why=f"{treatment.why}; {found.why}",
+        effect=estimate.effect,
+        errors=estimate.errors,
+        why=f"{treatment.why}; {estimate.why}",
         covariance=None if covariance is None else np.asarray(covariance, float),
     )
 

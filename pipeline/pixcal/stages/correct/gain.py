@@ -42,12 +42,12 @@ class Maps:
     @property
     def pairs(self) -> list[tuple[str, str, float]]:
         """Sets along one axis, and the sign of the second one's offsets to those of the first."""
-        found = []
+        aligned = []
         for a, b in combinations(self.names, 2):
             along = float(np.dot(self.axes[a], self.axes[b]))
             if abs(along) > ALIGNED:
-                found.append((a, b, float(np.sign(along))))
-        return found
+                aligned.append((a, b, float(np.sign(along))))
+        return aligned
 
     def read(self, group: Path, name: str, array: str, *ranges: tuple[int, int]) -> F64:
         """A part of a map."""
@@ -73,7 +73,7 @@ class Sums:
 
 
 @dataclass(frozen=True)
-class Told:
+class TileSums:
     """Sums of one tile: of its sets, and of pairs of them (as `Sums.halves`)."""
 
     sets: list[Sums]
@@ -95,15 +95,15 @@ def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
     need = cy * cx * (16 * (variants + 2 * batches) + 60 * len(maps.names) + 100)
     plan = make_plan("measuring the gain", need, 0, runtime)
     tiles = maps.source.tiles()
-    told = run_tasks(partial(_tile, maps), tiles, runtime.with_workers(plan.workers), label="gain")
+    sums = run_tasks(partial(_tile, maps), tiles, runtime.with_workers(plan.workers), label="gain")
     sets = {}
     for n, name in enumerate(maps.names):
         total = _empty(ny, nx, maps.effects)
-        for at, one in zip(tiles, told, strict=True):
+        for at, one in zip(tiles, sums, strict=True):
             _add(total, one.sets[n], *maps.source.ranges(at))
         sets[name] = total
     pairs = [
-        {"sets": [a, b]} | _agreement(np.sum([t.pairs[n] for t in told], axis=0))
+        {"sets": [a, b]} | _agreement(np.sum([t.pairs[n] for t in sums], axis=0))
         for n, (a, b, _) in enumerate(maps.pairs)
     ]
     return {"sets": {name: _described(total) for name, total in sets.items()}, "pairs": pairs}
@@ -113,7 +113,7 @@ def _batches(folder: Path) -> int:
     return int(ArrayReader(folder / "batch_count").shape[0])
 
 
-def _tile(maps: Maps, at: tuple[int, int]) -> Told:
+def _tile(maps: Maps, at: tuple[int, int]) -> TileSums:
     y, x = maps.source.ranges(at)
     delta: dict[str, tuple[F64, F64]] = {}
     error: dict[str, tuple[F64, F64]] = {}
@@ -128,7 +128,7 @@ def _tile(maps: Maps, at: tuple[int, int]) -> Told:
         apart = [delta[a][n] - sign * delta[b][n] for n in (0, 1)]
         expected = [error[a][n] ** 2 + error[b][n] ** 2 for n in (0, 1)]
         pairs.append(_squares(apart, expected))
-    return Told(sets, pairs)
+    return TileSums(sets, pairs)
 
 
 def _of_set(
@@ -165,14 +165,14 @@ def _of_halves(
     maps: Maps, name: str, good: Mask, part: tuple[tuple[int, int], tuple[int, int]]
 ) -> F64:
     """Of half the difference between the halves of the frames, which is the noise of the map."""
-    every = (0, _batches(maps.before / name))
-    own = [
-        ArrayReader(maps.before / name / array).read(every, *part)
+    batches = (0, _batches(maps.before / name))
+    stored = [
+        ArrayReader(maps.before / name / array).read(batches, *part)
         for array in ("batch_delta", "batch_sigma")
     ]
-    middle = every[1] // 2
+    middle = batches[1] // 2
     parts = (slice(middle), slice(middle, None))
-    before = [mean_of(own[0][cut], own[1][cut]) for cut in parts]
+    before = [mean_of(stored[0][cut], stored[1][cut]) for cut in parts]
     after = [
         maps.read(maps.after, name, array, (0, HALVES), *part)
         for array in ("batch_delta", "batch_sigma")
@@ -201,14 +201,14 @@ def _empty(ny: int, nx: int, effects: int) -> Sums:
     )
 
 
-def _add(total: Sums, own: Sums, y: tuple[int, int], x: tuple[int, int]) -> None:
-    total.count += own.count
-    total.moved[:, 0] += own.moved[:, 0]
-    total.moved[:, 1] = np.maximum(total.moved[:, 1], own.moved[:, 1])
-    total.rows[:, slice(*y)] += own.rows
-    total.columns[:, slice(*x)] += own.columns
-    total.halves += own.halves
-    total.square += own.square
+def _add(total: Sums, tile: Sums, y: tuple[int, int], x: tuple[int, int]) -> None:
+    total.count += tile.count
+    total.moved[:, 0] += tile.moved[:, 0]
+    total.moved[:, 1] = np.maximum(total.moved[:, 1], tile.moved[:, 1])
+    total.rows[:, slice(*y)] += tile.rows
+    total.columns[:, slice(*x)] += tile.columns
+    total.halves += tile.halves
+    total.square += tile.square
 
 
 def _described(total: Sums) -> dict[str, Any]:
@@ -239,7 +239,7 @@ def _patterns(profile: F64, total: Sums) -> dict[str, Any] | None:
     with np.errstate(divide="ignore", invalid="ignore"):
         means = np.where(count > 0, profile[:2] / count, np.nan)
     chance = np.sqrt(total.square * (PERIOD - 1)) / max(total.count, 1)
-    before, after = (repeating(own) for own in means)
+    before, after = (repeating(profile_of) for profile_of in means)
     return {"period_px": PERIOD, "before_px": before, "after_px": after, "chance_px": float(chance)}
 
 
@@ -264,8 +264,8 @@ def repeating(profile: F64) -> float | None:
 
 def _agreement(sums: F64) -> dict[str, Any]:
     """Rms (px) before and after, and what the errors let expect."""
-    found: dict[str, Any] = {}
+    rms: dict[str, Any] = {}
     for (square, expected, count), when in zip(sums, ("before", "after"), strict=True):
-        found[f"{when}_px"] = float(np.sqrt(square / max(count, 1)))
-        found[f"{when}_expected_px"] = float(np.sqrt(expected / max(count, 1)))
-    return found
+        rms[f"{when}_px"] = float(np.sqrt(square / max(count, 1)))
+        rms[f"{when}_expected_px"] = float(np.sqrt(expected / max(count, 1)))
+    return rms

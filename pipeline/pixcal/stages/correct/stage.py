@@ -153,12 +153,12 @@ def _corrected_maps(
     ]
     sides = sides_of(own_sets)
     for name, closed in zip(names, own_sets, strict=True):
-        own = replace(closed, open_sides=sides)
-        left[name] = parameter_errors(own, runtime)
+        opened = replace(closed, open_sides=sides)
+        left[name] = parameter_errors(opened, runtime)
         target = made.scratch / "undone" / name
-        undo_on_maps(own, target, runtime, name)
-        halves[name] = own.has_halves
-        fitted.append(fit_set(target, own.source, facts[name], acquisition, name, model))
+        undo_on_maps(opened, target, runtime, name)
+        halves[name] = opened.has_halves
+        fitted.append(fit_set(target, opened.source, facts[name], acquisition, name, model))
     group = made.folder / "corrected.zarr"
     totals = write_maps(group, fitted, runtime)
     gain = measure_gain(
@@ -231,16 +231,16 @@ def _swept_set(
 
 def _of_set(fitted: FittedSet, totals: Totals, gain: Json, before: Json, plan: Treatments) -> Json:
     """What ``correction.json`` says of a set."""
-    own = totals.sets[fitted.name]
+    summary = totals.sets[fitted.name]
     by_effect = dict(zip((e.name for e in plan.on_maps), gain.pop("change_by_effect"), strict=True))
     on_samples = gain.pop("change_on_samples")
     if plan.on_samples:
         # They are undone at once: the sweep does not tell one from the other.
         by_effect[" and ".join(e.name for e in plan.on_samples)] = on_samples
-    after = describe(fitted, own.masked, own.sigma_px)
+    after = describe(fitted, summary.masked, summary.sigma_px)
     return gain | {
         "change_by_effect": by_effect,
-        "sigma_median_px": {"before": before["sigma_median_px"], "after": own.sigma_px},
+        "sigma_median_px": {"before": before["sigma_median_px"], "after": summary.sigma_px},
         "chi2_reduced": {"before": before["chi2_reduced"], "after": after["chi2_reduced"]},
         "fit": after,
     }
@@ -272,7 +272,7 @@ def _publish(run_dir: Path) -> None:
         cards.append(("NEFFECT", len(undone), "effects undone"))
         for n, effect in enumerate(undone, start=1):
             cards.append((f"EFFECT{n}", effect["effect"], "effect undone"))
-            told = json.dumps(effect["parameters"])
-            history.append(f"{effect['effect']}: {effect['treatment']}: {told}")
+            parameters = json.dumps(effect["parameters"])
+            history.append(f"{effect['effect']}: {effect['treatment']}: {parameters}")
     publish_maps(run_dir, folder / "corrected.zarr", result["outputs"], cards, history, SUFFIX)
     write_json(run_dir / "products" / "correction.json", result)

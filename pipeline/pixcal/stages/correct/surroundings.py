@@ -52,14 +52,14 @@ def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, scatter: float) -> 
     """
     y, x = np.indices(unknown.shape)
     y, x = y + maps.origin[0], x + maps.origin[1]
-    found = []
+    variants = []
     for a, b in SIGNS:
         sign = 1.0 - 2.0 * ((a * y + b * x) % 2)
         z = (maps.theta[2] + 1j * maps.theta[1]) * np.exp(1j * scatter * sign * beyond)
         z *= np.where(unknown, 1 + sign, 1.0)
         theta = np.stack([maps.theta[0], z.imag, z.real])
-        found.append(replace(maps, theta=theta))
-    return found
+        variants.append(replace(maps, theta=theta))
+    return variants
 
 
 def usable(theta: F64, mask: NDArray[np.uint8]) -> Mask:
@@ -87,10 +87,10 @@ def border_misfit(theta: F64, k: tuple[float, float], good: Mask) -> float:
     depth = np.arange(SKIPPED, lines)
     total = 0.0
     for part in (value.real, value.imag):
-        own = np.where(good & np.isfinite(part), part, np.nan)
-        own = own - np.nanmedian(own[SKIPPED:], axis=0)
-        mean = np.nanmedian(own, axis=1)
-        spread = 1.4826 * np.nanmedian(np.abs(own[SKIPPED:] - mean[SKIPPED:, None]))
+        values = np.where(good & np.isfinite(part), part, np.nan)
+        values = values - np.nanmedian(values[SKIPPED:], axis=0)
+        mean = np.nanmedian(values, axis=1)
+        spread = 1.4826 * np.nanmedian(np.abs(values[SKIPPED:] - mean[SKIPPED:, None]))
         error = spread * np.sqrt(np.pi / 2 / max(int(good[0].sum()), 1))
         if not (error > 0 and np.isfinite(mean).all()):
             continue

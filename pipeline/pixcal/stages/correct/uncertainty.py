@@ -37,17 +37,17 @@ def moved(effect: Effect, errors: Mapping[str, float]) -> list[Effect]:
     errors : mapping
         1-sigma errors by the parameters' names, such as ``couplings[0].share``.
     """
-    found: list[Effect] = []
+    variants: list[Effect] = []
     for name, error in errors.items():
         for step in (error, -error):
             plain = to_plain(effect)
             try:
                 _add(plain, re.findall(r"\w+", name), step)
-                found += parse_effects({effect.name: plain}, name, {effect.name: type(effect)})
+                variants += parse_effects({effect.name: plain}, name, {effect.name: type(effect)})
             except (InputError, LookupError, TypeError):
                 continue  # beyond what the parameter may be: to the other side
             break
-    return found
+    return variants
 
 
 def _add(plain: Any, path: Sequence[str], step: float) -> None:
@@ -70,10 +70,10 @@ def parameter_errors(swept: Swept, runtime: Runtime) -> dict[str, float | None]:
     """
     tiles = scout_tiles(swept.source.grid, TILES)
     plan = make_plan("errors of the parameters", task_bytes(swept), 0, runtime)
-    told = run_tasks(
+    sums = run_tasks(
         partial(_tile, swept), tiles, runtime.with_workers(plan.workers), label="parameters"
     )
-    total = np.sum(told, axis=0)
+    total = np.sum(sums, axis=0)
     return {
         effect.name: float(np.sqrt(square / max(count, 1)))
         if swept.errors.get(effect.name)
@@ -119,25 +119,27 @@ def left_over(swept: Swept, maps: FringeMaps, good: Mask, inside: tuple[slice, s
     inside : (slice, slice)
         The tile.
     """
-    found = []
+    variances = []
     for effect in swept.effects:
         after, _ = undone(maps, (effect,))
         theta = after.theta[(slice(None), *inside)]
         covariance = swept.covariances.get(effect.name)
         slopes = None if covariance is None else effect.phase_slopes(after)
         if covariance is None or slopes is None:
-            others = moved(effect, swept.errors.get(effect.name, {}))
-            steps = [o for other in others if (o := other.undo(maps)) is not None]
+            perturbed = moved(effect, swept.errors.get(effect.name, {}))
+            steps = [o for other in perturbed if (o := other.undo(maps)) is not None]
             slopes = np.array([phase_change(after.theta, o.theta) for o in steps])
             covariance = np.eye(len(steps))
         variance = np.zeros(theta.shape[1:])
         if len(slopes):
             modes = straight_modes(theta, swept.k).reshape(-1, variance.size)
             change = slopes[(slice(None), *inside)].reshape(len(slopes), -1)
-            own = modes[:, good[inside].ravel()]
-            taken = solve_modes(own @ own.T, own @ change[:, good[inside].ravel()].T)
+            good_modes = modes[:, good[inside].ravel()]
+            taken = solve_modes(
+                good_modes @ good_modes.T, good_modes @ change[:, good[inside].ravel()].T
+            )
             change = change - taken.T @ modes
             variance = np.einsum("np,np->p", covariance @ change, change).reshape(variance.shape)
-        found.append(variance)
+        variances.append(variance)
         maps = after
-    return found
+    return variances

@@ -112,13 +112,14 @@ def _finish(writers: dict[str, ArrayWriter]) -> None:
 def _halve(swept: Swept, writers: dict[str, ArrayWriter], middle: int, at: tuple[int, int]) -> None:
     """Phases of the halves of the frames relative to the whole, and their errors, from batches."""
     y, x = swept.source.ranges(at)
-    every = (0, swept.n_batches)
+    batches = (0, swept.n_batches)
     phase, sigma = (
-        ArrayReader(swept.folder / name).read(every, y, x).astype(np.float32) for name in BATCH_MAPS
+        ArrayReader(swept.folder / name).read(batches, y, x).astype(np.float32)
+        for name in BATCH_MAPS
     )
-    found = [mean_of(phase[part], sigma[part]) for part in (slice(middle), slice(middle, None))]
+    halves = [mean_of(phase[part], sigma[part]) for part in (slice(middle), slice(middle, None))]
     for n, name in enumerate(("half_phase", "half_sigma")):
-        writers[name].write((0, y[0], x[0]), np.stack([f[n] for f in found]))
+        writers[name].write((0, y[0], x[0]), np.stack([f[n] for f in halves]))
 
 
 def mean_of(maps: F32, sigma: F32) -> tuple[F32, F32]:
@@ -162,10 +163,12 @@ def _undo_tile(
     if swept.has_halves:
         for n in range(HALVES):
             half = ArrayReader(target / "half_phase")
-            own = padded(half.read((n, n + 1), *swept.within(part))[0].astype(float), swept, part)
-            its = undone(_turned(maps, own), swept.effects)[1]
+            half_phase = padded(
+                half.read((n, n + 1), *swept.within(part))[0].astype(float), swept, part
+            )
+            its = undone(_turned(maps, half_phase), swept.effects)[1]
             rest = np.sum(its, axis=0) - change if its else 0.0
-            variants.append((own + rest)[inside])
+            variants.append((half_phase + rest)[inside])
             error = ArrayReader(target / "half_sigma").read((n, n + 1), y, x)[0]
             errors.append(error * factor)
     variants += [-step[inside] for step in steps]
@@ -190,8 +193,8 @@ def _of_neighbours(
         return np.zeros(known.shape)
     within = padded(np.ones([b - a for a, b in swept.within(part)], bool), swept, part, False)
     phase = ArrayReader(swept.folder / "phase").read(*swept.within(part)).astype(float)
-    others = disturbed(maps, within & ~known, ~within, scatter_of(phase))
-    steps = [phase_change(after.theta, undone(o, swept.effects)[0].theta) for o in others]
+    disturbed_maps = disturbed(maps, within & ~known, ~within, scatter_of(phase))
+    steps = [phase_change(after.theta, undone(o, swept.effects)[0].theta) for o in disturbed_maps]
     error = np.sqrt(np.mean(np.square(steps), axis=0))
     return np.asarray(np.where(known, error, 0.0))
 

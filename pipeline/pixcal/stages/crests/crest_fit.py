@@ -160,9 +160,9 @@ def _minimise(
 
     def residual(c: F64) -> F64:
         geometry = at(c)
-        away = (geometry.vector() - nominal)[free] / scale
+        shift = (geometry.vector() - nominal)[free] / scale
         points = (c[0] + relative_phase(paths, geometry) - target) * weight
-        return np.concatenate([points, away * precision])
+        return np.concatenate([points, shift * precision])
 
     def derivative(c: F64) -> F64:
         columns = _jacobian(paths, at(c))[:, free] * scale
@@ -170,11 +170,11 @@ def _minimise(
         return np.vstack([points, np.column_stack([np.zeros(free.sum()), np.diag(precision)])])
 
     offset = float(np.mean(target - relative_phase(paths, start.with_vector(origin))))
-    found = least_squares(
+    solution = least_squares(
         residual, np.concatenate([[offset], np.zeros(free.sum())]), derivative,
         method="lm", x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=200,
     )  # fmt: skip
-    return at(found.x), float(found.x[0]), derivative(found.x), int(found.nfev)
+    return at(solution.x), float(solution.x[0]), derivative(solution.x), int(solution.nfev)
 
 
 @dataclass(frozen=True)
@@ -217,10 +217,10 @@ def cost_map(
 
 def _thinned(paths: CrestPaths, fit: CrestFit) -> CrestPaths:
     """Some of the points that the fit used, with errors so small that they weigh as much as all."""
-    every = np.flatnonzero(fit.used)
-    chosen = every[np.linspace(0, len(every) - 1, min(len(every), MAP_POINTS)).astype(int)]
+    used = np.flatnonzero(fit.used)
+    chosen = used[np.linspace(0, len(used) - 1, min(len(used), MAP_POINTS)).astype(int)]
     few = paths.take(chosen)
-    return replace(few, sigma=few.sigma * np.sqrt(fit.spread * len(chosen) / len(every)))
+    return replace(few, sigma=few.sigma * np.sqrt(fit.spread * len(chosen) / len(used)))
 
 
 def _least_cost(
@@ -231,14 +231,14 @@ def _least_cost(
     Unknowns: phase, foot of the centre (x, y), direction, tilt, length of the baseline.
     """
     best, nominal = fit.geometry, fit.prior.nominal.vector()
-    found = float(np.hypot(best.baseline_x, best.baseline_y))
+    best_length = float(np.hypot(best.baseline_x, best.baseline_y))
     # With the ratio kept the phases hardly change: the way along the valley.
-    first = found * distance / best.distance if length is None else length
+    first = best_length * distance / best.distance if length is None else length
     angle = float(np.arctan2(best.baseline_y, best.baseline_x))
     start = np.array([fit.phase0, best.centre_x, best.centre_y, angle, best.baseline_z, first])
     sigma = fit.prior.sigma
     free_length = np.inf if length is None else 0.0
-    known = np.array([np.inf, *sigma[:2], sigma[4] / found, sigma[5], free_length])
+    known = np.array([np.inf, *sigma[:2], sigma[4] / best_length, sigma[5], free_length])
     if not refit:
         known[1:5] = 0
     free = known > 0
@@ -285,8 +285,8 @@ def valley(paths: CrestPaths, fit: CrestFit, distance: F64) -> tuple[F64, F64]:
     ratio, cost : (d,) float64
     """
     few = _thinned(paths, fit)
-    found = [_least_cost(few, fit, float(d), None, refit=True) for d in distance]
-    cost, length = np.array(found).T
+    results = [_least_cost(few, fit, float(d), None, refit=True) for d in distance]
+    cost, length = np.array(results).T
     return length / distance, cost
 
 

@@ -223,10 +223,10 @@ def seed_vector(patch: NDArray[Any], good: NDArray[np.bool_], nominal: Vector) -
     maps = np.where(good, patch, level).astype(np.float64)[None] / level - 1
     k = find_fringe_vector(maps, good, nominal)
     if np.hypot(k[0] - nominal[0], k[1] - nominal[1]) > MAX_AWAY * np.hypot(*nominal):
-        found, expected = (2 * np.pi / np.hypot(*v) for v in (k, nominal))
+        measured, expected = (2 * np.pi / np.hypot(*v) for v in (k, nominal))
         raise InputError(
-            f"no fringes found near the nominal ones: the strongest period is {found:.1f} px, at "
-            f"{np.degrees(np.arctan2(k[1], k[0])):.0f} degrees from x, where baseline_mm gives "
+            f"no fringes found near the nominal ones: the strongest period is {measured:.1f} px, "
+            f"at {np.degrees(np.arctan2(k[1], k[0])):.0f} degrees from x, where baseline_mm gives "
             f"{expected:.1f} px at {np.degrees(np.arctan2(nominal[1], nominal[0])):.0f} degrees"
         )
     return k
@@ -311,10 +311,10 @@ def find_crests(
         if not precision.any():
             continue
         phi[n] = np.angle((precision * np.exp(1j * phase)).sum())
-        away = _wrapped(phase - phi[n])
+        residual = _wrapped(phase - phi[n])
         # A whole radian from the carrier is no fringe that the polynomial could follow.
-        precision[np.abs(away) > 1] = 0
-        total += precision * away
+        precision[np.abs(residual) > 1] = 0
+        total += precision * residual
         weight += precision
     use = weight > 0
     if use.sum() < MIN_POINTS:

@@ -291,11 +291,11 @@ def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit, maps: _Maps) -
     }  # fmt: skip
     for array, (data, units) in points.items():
         write_array(folder / array, data, dims=("point",), attrs={"units": units})
-    for axis, found, units in (("baseline", maps.baseline, "mm"), ("ratio", maps.ratio, "1")):
-        note = "others refitted" if found.refitted else "phase refitted, others held"
+    for axis, grid, units in (("baseline", maps.baseline, "mm"), ("ratio", maps.ratio, "1")):
+        note = "others refitted" if grid.refitted else "phase refitted, others held"
         attrs = {"units": "1", "comment": note}
-        write_array(folder / f"cost_{axis}", found.cost, dims=("distance", axis), attrs=attrs)
-        write_array(folder / axis, found.second, dims=(axis,), attrs={"units": units})
+        write_array(folder / f"cost_{axis}", grid.cost, dims=("distance", axis), attrs=attrs)
+        write_array(folder / axis, grid.second, dims=(axis,), attrs={"units": units})
     distance = maps.baseline.distance
     write_array(folder / "distance", distance, dims=("distance",), attrs={"units": "mm"})
     write_array(folder / "valley_ratio", maps.valley_ratio, dims=("distance",))
@@ -308,16 +308,16 @@ def _from_prior(fit: CrestFit) -> NDArray[np.bool_]:
 
 
 def _warnings(fit: CrestFit) -> list[str]:
-    found = []
+    sentences = []
     if fit.chi2_reduced > NOTABLE_CHI2:
-        found.append(
+        sentences.append(
             f"points scatter {np.sqrt(fit.chi2_reduced):.1f} times more than their noise; errors "
             "allow for it as if points were independent, which offsets of whole blocks are not"
         )
     lost = int((~fit.used).sum())
     if lost > 0.05 * len(fit.used):
-        found.append(f"{lost} of {len(fit.used)} points are outliers and were left out")
-    return found
+        sentences.append(f"{lost} of {len(fit.used)} points are outliers and were left out")
+    return sentences
 
 
 def _geometry_facts(fit: CrestFit) -> dict[str, float]:
@@ -339,9 +339,9 @@ def _fitted_geometry(
         return None, "RUN/fit is not there yet"
     if facts["model"] != "hyperbolic":
         return None, f"the fit took {facts['model']} fringes, which have no positions of the fibres"
-    found = facts["geometry"]
-    geometry = nominal.with_vector([found[f"{name}_mm"] for name in PARAMETERS])
-    return (geometry, np.array([found[f"{name}_sigma_mm"] for name in PARAMETERS])), ""
+    fitted = facts["geometry"]
+    geometry = nominal.with_vector([fitted[f"{name}_mm"] for name in PARAMETERS])
+    return (geometry, np.array([fitted[f"{name}_sigma_mm"] for name in PARAMETERS])), ""
 
 
 def _agreement(paths: CrestPaths, fit: CrestFit, other: Geometry, sigma: F64) -> dict[str, Any]:
@@ -350,7 +350,7 @@ def _agreement(paths: CrestPaths, fit: CrestFit, other: Geometry, sigma: F64) ->
     both = np.hypot(fit.sigma, sigma)
     ny, nx = paths.frame
     y, x = (a.ravel() for a in np.mgrid[0 : ny - 1 : 33j, 0 : nx - 1 : 33j])
-    away = phase(x, y, fit.geometry) - phase(x, y, other)
+    difference_rad = phase(x, y, fit.geometry) - phase(x, y, other)
     modes = phase_jacobian(x, y, fit.geometry)
     modes -= modes.mean(axis=0)
     expected = np.einsum("ni,ij,nj->n", modes, fit.covariance, modes)
@@ -367,8 +367,8 @@ def _agreement(paths: CrestPaths, fit: CrestFit, other: Geometry, sigma: F64) ->
                 PARAMETERS, difference, both, _from_prior(fit), strict=True
             )
         },
-        "phase_rms_px": float(np.std(away) * px),
-        "phase_max_px": float(np.max(np.abs(away - away.mean())) * px),
+        "phase_rms_px": float(np.std(difference_rad) * px),
+        "phase_max_px": float(np.max(np.abs(difference_rad - difference_rad.mean())) * px),
         "phase_sigma_px": float(np.sqrt(expected.mean()) * px),
     }
 
