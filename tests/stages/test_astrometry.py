@@ -22,11 +22,12 @@ from pixcal.stages import astrometry
 from pixcal.stages.astrometry import Config, error_map, simulation, stage
 from pixcal.stages.astrometry.detector import Detector, open_components
 from pixcal.stages.astrometry.error_map import place_errors, tile_side
-from pixcal.stages.astrometry.modes import Modes, SetModes
+from pixcal.stages.astrometry.modes import Modes
 from pixcal.stages.astrometry.simulation import KINDS, Observation, observe
 from pixcal.stages.astrometry.summary import scientific, table, with_error
 from pixcal.stages.astrometry.telescope import Telescope, exposures, star
 from pixcal.stages.astrometry.truth import free_from_modes
+from pixcal.stages.fitted_shape import fitted_shape
 from pixcal.storage.artefact import build, read_json, write_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.products import write_map
@@ -38,8 +39,20 @@ K = 2 * np.pi / 9.5
 PAPER = Telescope(7.0, 130.0, 600.0, 0.0, 4.4)
 DECLARED = Declared(4.4, 1.0, 16.0, "", 50_000.0)
 STRAIGHT = {
-    "vertical": {"model": "paraxial", "kx": K, "ky": 0.0, "axis": [1.0, 0.0]},
-    "horizontal": {"model": "paraxial", "kx": 0.0, "ky": K, "axis": [0.0, 1.0]},
+    "vertical": {
+        "model": "paraxial",
+        "kx": K,
+        "ky": 0.0,
+        "phase_at_origin_rad": 0.0,
+        "axis": [1.0, 0.0],
+    },
+    "horizontal": {
+        "model": "paraxial",
+        "kx": 0.0,
+        "ky": K,
+        "phase_at_origin_rad": 0.0,
+        "axis": [0.0, 1.0],
+    },
 }
 
 
@@ -121,8 +134,8 @@ def the_detector(run: Path, truth: Path | None = None, seed: int = 0) -> Detecto
     fit = read_json(run / "fit" / "fit.json")
     components = open_components(run, fit, truth)
     if truth is not None:
-        sets = [SetModes.of_fit(SHAPE, facts, None) for facts in fit["sets"].values()]  # type: ignore[arg-type]
-        components, _ = free_from_modes(components, sets, SYNC)
+        sets = (fitted_shape(run, s, None, SHAPE) for s in fit["sets"].values())  # type: ignore[arg-type]
+        components, _ = free_from_modes(components, Modes(SHAPE, tuple(sets)), SYNC)
     return Detector(tuple(components), seed)
 
 
@@ -235,6 +248,7 @@ def test_maps_of_noise_are_told_from_maps_that_help(tmp_path: Path) -> None:
 GEOMETRY = Geometry(632.8e-6, 4.4e-3, 18.0, 12.0, 400.0, 6.0, 0.0, 0.0)
 HYPERBOLIC = {
     "model": "hyperbolic", "kx": 0.1, "ky": 0.0, "axis": [1.0, 0.0],
+    "phase_at_origin_rad": 0.0,
     "geometry": {
         f"{n}_mm": float(v)
         for n, v in zip(

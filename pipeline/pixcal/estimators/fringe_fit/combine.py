@@ -68,9 +68,22 @@ def combine_parallel(
     """
     a = np.asarray(axes, float)
     sign = np.sign(a @ a[0]).reshape(-1, *([1] * (delta.ndim - 1)))
-    good = np.isfinite(delta) & np.isfinite(sigma) & (sigma > 0)
+    return weighted_mean(sign * delta, sigma)
+
+
+def weighted_mean(values: F64, sigma: F64) -> tuple[F64, F64, F64]:
+    """Mean of maps (n, ...) weighted by 1 / sigma²; NaN do not count.
+
+    Returns
+    -------
+    mean, error : (...) float64
+        NaN where there is no value.
+    chi2 : (...) float64
+        Disagreement of the maps.
+    """
+    good = np.isfinite(values) & np.isfinite(sigma) & (sigma > 0)
     w = np.where(good, 1 / np.where(good, sigma, 1.0) ** 2, 0.0)
-    d = np.where(good, sign * delta, 0.0)
+    d = np.where(good, values, 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         total = w.sum(0)
         mean = np.where(total > 0, (w * d).sum(0) / total, np.nan)

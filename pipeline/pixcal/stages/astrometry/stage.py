@@ -38,11 +38,12 @@ from pixcal.report.astrometry_figures import AstrometryView, astrometry_figure
 from pixcal.report.drawing import png
 from pixcal.stages.astrometry.detector import Component, Detector, generator, open_components
 from pixcal.stages.astrometry.error_map import ErrorMaps, error_maps, place_errors, tile_side
-from pixcal.stages.astrometry.modes import Modes, SetModes
+from pixcal.stages.astrometry.modes import Modes
 from pixcal.stages.astrometry.simulation import Observation, core_weights, observe
 from pixcal.stages.astrometry.summary import TARGET_PX, axis_facts, table
 from pixcal.stages.astrometry.telescope import Telescope, exposures, star
 from pixcal.stages.astrometry.truth import BAND, free_from_modes
+from pixcal.stages.fitted_shape import fitted_shape
 from pixcal.storage.artefact import Build, Manifest, read_json, write_json
 from pixcal.storage.fits_map import content_digest
 from pixcal.storage.formats import STAGES
@@ -96,7 +97,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
                 inputs[f"truth/{image.path.name}"] = content_digest(image.path)
 
         def body(made: Build) -> None:
-            _measure(made, components, fit, acquisition, telescope, config, runtime)
+            _measure(run_dir, made, components, fit, acquisition, telescope, config, runtime)
 
         options = result_options(config) | {"truth": None}
         publish = partial(copy_products, run_dir, STAGE, "astrometry.*")
@@ -104,6 +105,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
 
 def _measure(
+    run_dir: Path,
     made: Build,
     components: list[Component],
     fit: Mapping[str, Any],
@@ -122,13 +124,13 @@ def _measure(
             f"--window: {observed.side} px{by_itself} do not fit maps of {shape[1]} × {shape[0]} "
             f"px (x × y); give an odd number up to {min(shape)}"
         )
-    sets = [SetModes.of_fit(shape, facts, acquisition) for facts in fit["sets"].values()]
-    modes = Modes(shape, tuple(sets)).number if config.truth is not None else 0
-    need = planned(shape, modes, observed.side, config)
+    sets = (fitted_shape(run_dir, s, acquisition, shape) for s in fit["sets"].values())
+    modes = Modes(shape, tuple(sets)) if config.truth is not None else None
+    need = planned(shape, modes.number if modes else 0, observed.side, config)
     runtime = runtime.with_workers(make_plan("astrometry", *need, runtime).workers)
     removed = None
-    if config.truth is not None:
-        components, removed = free_from_modes(components, sets, runtime)
+    if modes is not None:
+        components, removed = free_from_modes(components, modes, runtime)
     detector = Detector(tuple(components), config.seed)
     maps = error_maps(made.folder / "astrometry.zarr", detector, observed, runtime)
     if not maps.places.any():

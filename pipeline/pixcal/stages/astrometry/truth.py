@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.stages.astrometry.detector import Component
-from pixcal.stages.astrometry.modes import Modes, SetModes
+from pixcal.stages.astrometry.modes import Modes
 
 F64 = NDArray[np.float64]
 
-ENOUGH = 4_000_000  # pixels that tell the modes; of larger detectors some bands are left out
+ENOUGH = 4_000_000  # pixels that determine the modes; of larger detectors some bands are left out
 BAND = 16  # rows of a task
 
 
 def free_from_modes(
-    components: Sequence[Component], sets: Sequence[SetModes], runtime: Runtime
+    components: Sequence[Component], modes: Modes, runtime: Runtime
 ) -> tuple[list[Component], dict[str, dict[str, float]]]:
     """Fit the modes to truth minus maps, and have them taken off the truth.
 
@@ -28,31 +28,25 @@ def free_from_modes(
     dict
         For each component the rms (px) of the ``smooth`` and of the ``fringe`` modes taken off.
     """
-    shape = components[0].delta.shape
-    modes = Modes(shape, tuple(sets))
+    ny, nx = modes.shape
     # An odd step: bands must not keep pace with fringes.
-    step = (shape[0] * shape[1] // ENOUGH) | 1
-    bands = [(y, min(y + BAND, shape[0])) for y in range(0, shape[0], BAND * step)]
+    step = (ny * nx // ENOUGH) | 1
+    bands = [(y, min(y + BAND, ny)) for y in range(0, ny, BAND * step)]
     task = partial(_sums, tuple(components), modes)
     parts = run_tasks(task, bands, runtime, label="modes of the truth")
+    groups = {"smooth": slice(modes.n_smooth), "fringe": slice(modes.n_smooth, None)}
     freed, removed = [], {}
     for n, component in enumerate(components):
         normal, right, count = (sum(part[n][k] for part in parts) for k in range(3))
+        normal = np.asarray(normal)
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         # Modes of two sets overlap: of all combinations that do, the least.
-        scaled = np.asarray(normal) / np.outer(scale, scale)
-        coefficients = np.linalg.lstsq(scaled, right / scale, rcond=1e-10)[0] / scale
-        freed.append(
-            replace(component, modes=replace(modes, coefficients=tuple(coefficients.tolist())))
-        )
-        groups = {"smooth": slice(modes.n_smooth), "fringe": slice(modes.n_smooth, None)}
+        fit = np.linalg.lstsq(normal / np.outer(scale, scale), right / scale, rcond=1e-10)[0]
+        c = fit / scale
+        freed.append(replace(component, modes=replace(modes, coefficients=tuple(c.tolist()))))
         removed[component.name] = {
-            kind: float(
-                np.sqrt(
-                    coefficients[p] @ np.asarray(normal)[p, p] @ coefficients[p] / max(count, 1)
-                )
-            )
-            for kind, p in groups.items()
+            group: float(np.sqrt(c[p] @ normal[p, p] @ c[p] / max(count, 1)))
+            for group, p in groups.items()
         }
     return freed, removed
 

@@ -20,7 +20,8 @@ from pixcal.stages.blind.benches import Layout
 from pixcal.stages.blind.cases import effects_of
 from pixcal.stages.blind.draw import Truth
 from pixcal.stages.blind.second import second_offsets
-from pixcal.stages.compare.sides import PART_OF, fitted_shape
+from pixcal.stages.compare.sides import PART_OF
+from pixcal.stages.fitted_shape import fitted_shape
 from pixcal.storage.artefact import read_json
 from pixcal.storage.products import read_map
 

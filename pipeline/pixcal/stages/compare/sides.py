@@ -4,7 +4,7 @@ A side gives the offset along any direction that its fringe sets measure, its va
 modes that this side's fit took off, as they come out in that direction.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,14 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.fringe_fit.combine import axes_span_plane, combine_parallel, combine_sets
+from pixcal.estimators.fringe_fit.combine import (
+    axes_span_plane,
+    combine_parallel,
+    combine_sets,
+    weighted_mean,
+)
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.estimators.fringe_fit.models import FringeShape
-from pixcal.estimators.fringe_fit.models.hyperbolic import Hyperbolic
-from pixcal.estimators.fringe_fit.models.paraxial import Paraxial
-from pixcal.kernels.optics import PARAMETERS, Geometry
-from pixcal.model.acquisition import Acquisition
 from pixcal.model.errors import InputError
+from pixcal.stages.fitted_shape import fitted_shape
 from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.stage import read_acquisition, require
@@ -62,13 +64,8 @@ class FittedSet:
             ArrayReader(self.folder / f"batch_{name}").read(whole, *tile)[chosen].astype(float)
             for name in ("delta", "sigma")
         )
-        good = np.isfinite(delta) & (sigma > 0)
-        weight = np.where(good, 1 / np.where(good, sigma, 1.0) ** 2, 0.0)
-        total = weight.sum(axis=0)
-        there = total > 0
-        mean = (weight * np.where(good, delta, 0.0)).sum(axis=0) / np.where(there, total, 1.0)
-        error = 1 / np.sqrt(np.where(there, total, 1.0))
-        return np.where(there, mean, np.nan), np.where(there, error, np.nan)
+        mean, error, _ = weighted_mean(delta, sigma)
+        return mean, error
 
     def modes(self, tile: Tile) -> F64:
         """What the fit took off the set's map, (mode, y, x), px but for a factor."""
@@ -193,40 +190,6 @@ def whole_run(run: Path, label: str | None = None) -> Side:
         label or run.name or str(run), run, manifest.key, sets, window,
         (first.chunks[0], first.chunks[1]), facts,
     )  # fmt: skip
-
-
-def fitted_shape(
-    run: Path, facts: Mapping[str, Any], acquisition: Acquisition, window: tuple[int, int]
-) -> FringeShape:
-    """The fringes of a set as fitted, from pixel (0, 0).
-
-    Parameters
-    ----------
-    run : Path
-        For messages.
-    facts : mapping
-        What ``fit.json`` says of the set.
-    window : (int, int)
-        (y, x), px.
-
-    Raises
-    ------
-    InputError
-        If they were fitted by a model that is not known here.
-    """
-    phase, origin = facts["phase_at_origin_rad"], (0.0, 0.0)
-    if facts["model"] == "paraxial":
-        return Paraxial(phase, facts["kx"], facts["ky"], origin, max(window) / 2)
-    if facts["model"] != "hyperbolic":
-        raise InputError(
-            f"{run}: fitted with {facts['model']!r} fringes, whose modes are not known"
-        )
-    geometry = Geometry(
-        acquisition.fibres.wavelength_nm * 1e-6,
-        acquisition.detector.pitch_um * 1e-3,
-        *(facts["geometry"][f"{name}_mm"] for name in PARAMETERS),
-    )
-    return Hyperbolic(phase, geometry, tuple(geometry.vector()), (1.0,) * len(PARAMETERS), origin)
 
 
 def parts_of(run: Path, *, interleaved: bool) -> tuple[Side, Side]:

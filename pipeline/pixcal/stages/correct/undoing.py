@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.fringe_fit.combine import weighted_mean
 from pixcal.estimators.fringe_fit.fringes import wrapped
 from pixcal.estimators.fringe_fit.geometry import tile_plane
 from pixcal.estimators.fringe_fit.tile_sums import TileSums, sum_row
@@ -124,17 +125,8 @@ def _halve(swept: Swept, writers: dict[str, ArrayWriter], middle: int, at: tuple
 
 def mean_of(maps: F32, sigma: F32) -> tuple[F32, F32]:
     """Weighted mean (y, x) of maps (batch, y, x) and its error; NaN where there is none."""
-    good = np.isfinite(maps) & (sigma > 0)
-    weight = np.where(good, 1 / np.where(good, sigma, 1.0).astype(float) ** 2, 0.0)
-    total = weight.sum(axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        mean = (weight * np.where(good, maps, 0.0)).sum(axis=0) / total
-        error = 1 / np.sqrt(total)
-    there = total > 0
-    return (
-        np.where(there, mean, np.nan).astype(np.float32),
-        np.where(there, error, np.nan).astype(np.float32),
-    )
+    mean, error, _ = weighted_mean(maps.astype(float), sigma.astype(float))
+    return mean.astype(np.float32), error.astype(np.float32)
 
 
 def _undo_tile(
