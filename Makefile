@@ -117,4 +117,4 @@ blind-full: $(TOOLS) ## 200 cases of 128 x 128 pixels (hours, 15 GB of disk); an
 
 clean: ## remove the environment, the demo and all caches
 	rm -rf .venv demo site work/reproduction build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
-	find pipeline cli tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +
+	find pipeline cli bench tests benchmarks -name __pycache__ -type d -prune -exec rm -rf {} +

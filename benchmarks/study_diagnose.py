@@ -25,6 +25,7 @@ from scipy.special import ndtr
 from scipy.stats import binomtest, kstest
 
 import pixcal
+from blind_examination.strengths import variants_of
 from pixcal.effects import effects, parse_effects
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.gap import compare, flagged
@@ -33,7 +34,6 @@ from pixcal.model.bench import SCHEMA
 from pixcal.model.config import to_plain
 from pixcal.simulation.effect import Effect
 from pixcal.stages import diagnose, ingest, reduce, simulate
-from pixcal.stages.blind.strengths import variants_of
 from pixcal.stages.diagnose.inquiry import REFERENCES, Inquiry, inquire
 from pixcal.stages.diagnose.search import looks_like
 from pixcal.stages.diagnose.shrinkage import differing, shrinkage
@@ -44,11 +44,11 @@ import matplotlib.pyplot as plt
 OUT = Path(__file__).parents[1] / "docs" / "appendix" / "diagnose"
 HERE, PROCESSES = Runtime(cluster="sync"), Runtime(cluster="processes", quiet=False)
 STRENGTHS = (0.3, 1.0, 3.0, 10.0)
-"""Times the threshold (`pixcal.stages.blind.strengths`), of each way in turn."""
+"""Times the threshold (`blind_examination.strengths`), of each way in turn."""
 FIRST_SEED, SEEDS_APART = 5000, 10
 CODE = (
     "effects", "estimators", "kernels", "model", "simulation", "stages/diagnose", "stages/fit",
-    "stages/reduce", "stages/blind/strengths.py", "stages/evidence.py", "stages/simulate.py",
+    "stages/reduce", "stages/evidence.py", "stages/simulate.py",
 )  # fmt: skip
 """Of pixcal, what a play depends on."""
 MOST_WRONG = 3

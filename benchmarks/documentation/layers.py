@@ -7,7 +7,11 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = {"pixcal": ROOT / "pipeline/pixcal", "pixcal_cli": ROOT / "cli/pixcal_cli"}
+PACKAGES = {
+    "pixcal": ROOT / "pipeline/pixcal",
+    "blind_examination": ROOT / "bench/blind_examination",
+    "pixcal_cli": ROOT / "cli/pixcal_cli",
+}
 Graph = dict[str, set[str]]
 
 BOX, GAP, RISE, EDGE = (132, 40), 36, 84, 24
@@ -32,7 +36,7 @@ def imports_of_folders() -> Graph:
 
 
 def _folder(parts: list[str]) -> str:
-    return parts[0] if parts[0] == "pixcal_cli" else parts[1] if len(parts) > 1 else ""
+    return parts[0] if parts[0] != "pixcal" else parts[1] if len(parts) > 1 else ""
 
 
 def _imported(file: Path) -> Iterator[str]:
@@ -46,7 +50,7 @@ def _imported(file: Path) -> Iterator[str]:
             parts = name.split(".")
             folder = _folder(parts) if parts[0] in PACKAGES else ""
             # A name of `pixcal` itself is no folder.
-            if folder == "pixcal_cli" or (folder and (PACKAGES["pixcal"] / folder).is_dir()):
+            if folder in PACKAGES or (folder and (PACKAGES["pixcal"] / folder).is_dir()):
                 yield folder
 
 

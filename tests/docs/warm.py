@@ -60,7 +60,7 @@ def serve(folder: Path) -> None:
 
 
 def _import_all() -> None:
-    for package in ("pixcal", "pixcal_cli"):
+    for package in ("pixcal", "blind_examination", "pixcal_cli"):
         for found in pkgutil.walk_packages(import_module(package).__path__, f"{package}."):
             import_module(found.name)
     for library in ("xarray", "dask.array", "distributed", "numcodecs.zarr3"):

@@ -12,7 +12,7 @@ from pixcal.engine.run import Runtime, run_tasks
 ROOT = Path(__file__).parents[2]
 FILES = sorted(
     file
-    for folder in ("pipeline/pixcal", "cli/pixcal_cli")
+    for folder in ("pipeline/pixcal", "cli/pixcal_cli", "bench/blind_examination")
     for file in (ROOT / folder).rglob("*.py")
 )
 FORBIDDEN = {
@@ -24,7 +24,7 @@ FORBIDDEN = {
 }  # fmt: skip
 PICKLES = {"pipeline/pixcal/engine/parcel.py", "pipeline/pixcal/engine/cluster.py"}
 """Tasks on their way to Dask's workers, made by this process; nothing else is ever unpickled."""
-STARTS = {"pipeline/pixcal/stages/blind/second.py"}
+STARTS = {"bench/blind_examination/second.py"}
 """The second bench, as a program of its own; what it is told are names of effects and numbers."""
 
 

@@ -8,7 +8,11 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 BENCH = sorted((ROOT / "bench").rglob("*.py"))
-PIXCAL = sorted([*(ROOT / "pipeline").rglob("*.py"), *(ROOT / "cli").rglob("*.py")])
+PIXCAL = sorted(
+    file
+    for folder in ("pipeline", "cli", "bench/blind_examination")
+    for file in (ROOT / folder).rglob("*.py")
+)
 
 
 def imported(file: Path) -> Iterator[str]:

@@ -13,16 +13,9 @@ import pytest
 import yaml
 from astropy.io import fits
 
-from pixcal.effects import effects, parse_effects
-from pixcal.engine.plan import make_plan
-from pixcal.engine.run import Runtime
-from pixcal.model.acquisition import load_acquisition
-from pixcal.model.config import to_plain
-from pixcal.model.errors import InputError, PlanError
-from pixcal.stages import blind, correct, diagnose, ingest, reduce
-from pixcal.stages.blind.benches import LAYOUTS
-from pixcal.stages.blind.cases import write_examination
-from pixcal.stages.blind.draw import (
+from blind_examination.benches import LAYOUTS
+from blind_examination.cases import write_examination
+from blind_examination.draw import (
     LEFT_OUT,
     NOTHING,
     ONE,
@@ -37,16 +30,23 @@ from pixcal.stages.blind.draw import (
     Truth,
     draw_examination,
 )
-from pixcal.stages.blind.grade import grade
-from pixcal.stages.blind.manifest import read_manifest
-from pixcal.stages.blind.offsets import offset_errors
-from pixcal.stages.blind.parameters import check_parameters
-from pixcal.stages.blind.running import share
-from pixcal.stages.blind.seal import read_seal
-from pixcal.stages.blind.second import SecondCase, catalogue, second_offsets
-from pixcal.stages.blind.strengths import STRONGEST, VARIANTS, Variant
-from pixcal.stages.blind.summary import summary
-from pixcal.stages.blind.table import as_markdown, write_between
+from blind_examination.grade import grade
+from blind_examination.manifest import read_manifest
+from blind_examination.offsets import offset_errors
+from blind_examination.parameters import check_parameters
+from blind_examination.running import share
+from blind_examination.seal import read_seal
+from blind_examination.second import SecondCase, catalogue, second_offsets
+from blind_examination.strengths import STRONGEST, VARIANTS, Variant
+from blind_examination.summary import summary
+from blind_examination.table import as_markdown, write_between
+from pixcal.effects import effects, parse_effects
+from pixcal.engine.plan import make_plan
+from pixcal.engine.run import Runtime
+from pixcal.model.acquisition import load_acquisition
+from pixcal.model.config import to_plain
+from pixcal.model.errors import InputError, PlanError
+from pixcal.stages import blind, correct, diagnose, ingest, reduce
 from pixcal.stages.diagnose import look
 from pixcal.storage.artefact import build, write_json
 from pixcal.storage.formats import STAGES
@@ -120,7 +120,7 @@ def test_half_of_the_cases_are_of_the_second_bench() -> None:
 
 
 def test_a_second_bench_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pixcal.stages.blind.second.NEEDED", ("galsim", "hcipy_of_old"))
+    monkeypatch.setattr("blind_examination.second.NEEDED", ("galsim", "hcipy_of_old"))
     catalogue.cache_clear()
     with pytest.raises(InputError, match=r"hcipy_of_old; .*pixcal\[second-bench\].*--bench own"):
         draw_examination(20, 5, "small")
@@ -131,7 +131,7 @@ def test_a_second_bench_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch
 def test_what_is_no_case_is_not_told_to_the_second_bench(
     case: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pixcal.stages.blind.second._asked", pytest.fail)
+    monkeypatch.setattr("blind_examination.second._asked", pytest.fail)
     with pytest.raises(InputError, match="not a case of the second bench"):
         second_offsets(SecondCase(case, 1, 0.5), LAYOUTS["tiny"])
 
@@ -139,7 +139,7 @@ def test_what_is_no_case_is_not_told_to_the_second_bench(
 def test_laws_whose_package_is_missing_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     real = importlib.util.find_spec
     monkeypatch.setattr(
-        "pixcal.stages.blind.second.importlib.util.find_spec",
+        "blind_examination.second.importlib.util.find_spec",
         lambda name: None if name == "pyxel" else real(name),
     )
     catalogue.cache_clear()
@@ -253,7 +253,7 @@ def test_the_bench_does_not_depend_on_the_truth() -> None:
 def test_a_seed_that_is_not_given_cannot_be_guessed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pixcal.stages.blind.cases.write_examination", lambda *_: None)
+    monkeypatch.setattr("blind_examination.cases.write_examination", lambda *_: None)
     config = blind.MakeConfig(1, bench="own")
     seeds = {blind.make(tmp_path / "e", tmp_path / "t", config, SYNC).seed for _ in range(8)}
     assert len(seeds) == 8

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from blind_examination.draw import PARTS, SECOND
 from pixcal.model.errors import InputError
-from pixcal.stages.blind.draw import PARTS, SECOND
 
 Plain = Mapping[str, Any]
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from blind_examination.draw import Examination
 from pixcal.model.bench import Bench
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
-from pixcal.stages.blind.draw import Examination
 from pixcal.storage.artefact import read_json, write_json
 
 SCHEMA = "pixcal/blind-truth/2"

@@ -7,19 +7,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from blind_examination.benches import LAYOUTS
+from blind_examination.draw import LEFT_OUT, ONE
+from blind_examination.grade import Grade, grade
+from blind_examination.manifest import FILE, RUNS, Manifest, purpose_of, read_manifest
+from blind_examination.offsets import offset_errors
+from blind_examination.options import ScoreConfig
+from blind_examination.oracle import Oracle, ask_oracle
+from blind_examination.running import DIAGNOSIS, DONE, FAILED, PRODUCTS, share
+from blind_examination.seal import Sealed, read_seal
+from blind_examination.summary import PLACE, median, summary
+from blind_examination.table import as_markdown, write_between
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.model.blind_options import ScoreConfig
 from pixcal.model.errors import DamagedError, InputError, PixcalError, PlanError
-from pixcal.stages.blind.benches import LAYOUTS
-from pixcal.stages.blind.draw import LEFT_OUT, ONE
-from pixcal.stages.blind.grade import Grade, grade
-from pixcal.stages.blind.manifest import FILE, RUNS, Manifest, purpose_of, read_manifest
-from pixcal.stages.blind.offsets import offset_errors
-from pixcal.stages.blind.oracle import Oracle, ask_oracle
-from pixcal.stages.blind.running import DIAGNOSIS, DONE, FAILED, PRODUCTS, share
-from pixcal.stages.blind.seal import Sealed, read_seal
-from pixcal.stages.blind.summary import PLACE, median, summary
-from pixcal.stages.blind.table import as_markdown, write_between
 from pixcal.storage.artefact import read_json, write_json
 
 SCHEMA = "pixcal/blind-score/3"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
-from pixcal.stages.blind.draw import (
+from blind_examination.draw import (
     LEFT_OUT,
     NOTHING,
     ONE,
@@ -17,8 +17,8 @@ from pixcal.stages.blind.draw import (
     SECOND_OTHER,
     SEVERAL,
 )
-from pixcal.stages.blind.grade import QUESTIONS, WITHIN, Grade
-from pixcal.stages.blind.offsets import AXES, AxisError
+from blind_examination.grade import QUESTIONS, WITHIN, Grade
+from blind_examination.offsets import AXES, AxisError
 
 NOBODY = "nothing"
 TWICE = 2.0

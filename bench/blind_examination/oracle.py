@@ -10,6 +10,8 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from blind_examination.cases import effects_of
+from blind_examination.draw import Truth
 from pixcal.effects import effects
 from pixcal.engine.run import Runtime
 from pixcal.estimators.diagnosis.gap import Reference, expect_nominal, expect_with, log_likelihood
@@ -18,8 +20,6 @@ from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.stages import ingest, reduce
-from pixcal.stages.blind.cases import effects_of
-from pixcal.stages.blind.draw import Truth
 from pixcal.stages.diagnose.inquiry import REFERENCES
 from pixcal.stages.diagnose.look import look_at
 from pixcal.stages.diagnose.search import CONFIRM

@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from blind_examination.benches import Layout
+from blind_examination.cases import effects_of
+from blind_examination.draw import Truth
+from blind_examination.second import second_offsets
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import Camera
-from pixcal.stages.blind.benches import Layout
-from pixcal.stages.blind.cases import effects_of
-from pixcal.stages.blind.draw import Truth
-from pixcal.stages.blind.second import second_offsets
 from pixcal.stages.compare.sides import PART_OF
 from pixcal.stages.fitted_shape import fitted_shape
 from pixcal.storage.artefact import read_json

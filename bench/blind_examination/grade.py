@@ -4,8 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pixcal.effects import effects
-from pixcal.stages.blind.draw import (
+from blind_examination.draw import (
     LEFT_OUT,
     NOTHING,
     ONE,
@@ -16,8 +15,9 @@ from pixcal.stages.blind.draw import (
     SEVERAL,
     Truth,
 )
-from pixcal.stages.blind.offsets import AxisError
-from pixcal.stages.blind.parameters import check_parameters
+from blind_examination.offsets import AxisError
+from blind_examination.parameters import check_parameters
+from pixcal.effects import effects
 
 BLAMED = 0.5  # share of the gap from which an absent effect is blamed for most of it
 WITHIN = (1, 2, 3)  # errors that a parameter may be off

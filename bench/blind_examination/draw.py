@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from blind_examination.benches import LAYOUTS, draw_bench
+from blind_examination.second import SecondCase, SecondLaw, catalogue
+from blind_examination.strengths import STRONGEST, Variant, variants_of
 from pixcal.effects import effects
 from pixcal.model.bench import Bench
-from pixcal.stages.blind.benches import LAYOUTS, draw_bench
-from pixcal.stages.blind.second import SecondCase, SecondLaw, catalogue
-from pixcal.stages.blind.strengths import STRONGEST, Variant, variants_of
 
 ONE, NOTHING, SEVERAL, LEFT_OUT, SECOND_ONE, SECOND_NOTHING, SECOND_PAIR, SECOND_OTHER = range(1, 9)
 # in the order of the table

@@ -15,18 +15,18 @@ from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
+from blind_examination.benches import LAYOUTS
+from blind_examination.draw import Examination, Truth, draw_examination
+from blind_examination.manifest import EXAMINATION, case_name, write_manifest
+from blind_examination.options import MakeConfig
+from blind_examination.seal import write_seal
+from blind_examination.second import record_second
 from pixcal.effects import parse_effects
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.bench import Bench
-from pixcal.model.blind_options import MakeConfig
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import Camera
-from pixcal.stages.blind.benches import LAYOUTS
-from pixcal.stages.blind.draw import Examination, Truth, draw_examination
-from pixcal.stages.blind.manifest import EXAMINATION, case_name, write_manifest
-from pixcal.stages.blind.seal import write_seal
-from pixcal.stages.blind.second import record_second
 from pixcal.stages.simulate import acquire
 from pixcal.storage.artefact import digest, lock
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from blind_examination.benches import Layout
 from pixcal.model.errors import InputError
-from pixcal.stages.blind.benches import Layout
 
 F64 = NDArray[np.float64]
 
