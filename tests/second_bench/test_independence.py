@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-BENCH = sorted((ROOT / "bench").rglob("*.py"))
+BENCH = sorted((ROOT / "bench/second_bench").rglob("*.py"))
 PIXCAL = sorted(
     file
     for folder in ("pipeline", "cli", "bench/blind_examination")
