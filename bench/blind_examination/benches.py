@@ -120,5 +120,5 @@ def _sets(layout: Layout, rng: np.random.Generator) -> tuple[SimulatedSet, ...]:
 
 
 def _round(value: float) -> float:
-    """To four digits, as an owner would declare it."""
+    """To four significant digits."""
     return float(f"{value:.4g}")

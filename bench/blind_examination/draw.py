@@ -51,7 +51,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Truth:
-    """What is in a case, and what a diagnosis may not consider."""
+    """Effects in a case, and the effect that a diagnosis may not consider."""
 
     part: int
     left_out: str  # effect that is no candidate
@@ -162,7 +162,7 @@ def _second(part: int, count: int, _size: str, rng: np.random.Generator) -> Iter
 
 
 def _turns(names: list[str], rng: np.random.Generator) -> Iterator[str]:
-    """All names in some order, again and again, so that none is left out for long."""
+    """All names in random order, over and over."""
     while True:
         yield from (names[n] for n in rng.permutation(len(names)))
 

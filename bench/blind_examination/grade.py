@@ -1,4 +1,4 @@
-"""One case: what the diagnosis says, held against the truth."""
+"""Grade of one case: its diagnosis compared with the truth."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ Diagnosis = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Grade:
-    """How a case was answered."""
+    """Grade of a case."""
 
     case: str
     part: int
@@ -74,7 +74,7 @@ QUESTIONS = {
 
 
 def grade(case: str, truth: Truth, diagnosis: Diagnosis | None, error: str = "") -> Grade:
-    """Hold a diagnosis against the truth.
+    """Compare a diagnosis with the truth.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def _parameters(truth: Truth, diagnosis: Diagnosis) -> list[dict[str, Any]]:
 
 
 def _why(truth: Truth, diagnosis: Diagnosis, named: Sequence[str]) -> str:
-    """What a wrong answer comes from, as far as the diagnosis tells."""
+    """Reason of a wrong answer, from the diagnosis."""
     reasons = []
     if truth.part in (NOTHING, SECOND_NOTHING):
         return (

@@ -1,4 +1,4 @@
-"""What everybody may read of an examination: ``blind.json`` beside its cases."""
+"""The public manifest of an examination: ``blind.json`` beside its cases."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ EXAMINATION = 1000  # seeds from here on are for examinations, those below for d
 
 @dataclass(frozen=True)
 class Manifest:
-    """What an examination consists of, without the truth."""
+    """Contents of an examination, without the truth."""
 
     schema: str
     purpose: str  # examination or development
@@ -36,7 +36,7 @@ def case_name(number: int) -> str:
 
 
 def purpose_of(seed: int) -> str:
-    """What cases of a seed are for."""
+    """Purpose of the cases of a seed."""
     return "examination" if seed >= EXAMINATION else "development"
 
 

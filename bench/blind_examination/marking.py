@@ -1,4 +1,4 @@
-"""``pixcal blind score``: the seal is opened, and every case held against its truth."""
+"""``pixcal blind score``: the seal is opened, and every case compared with its truth."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -81,7 +81,7 @@ def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: Runtime) -> 
 
 
 def _require_alike(folders: Sequence[Path]) -> None:
-    """Refuse what cannot be scored together, before the long work."""
+    """Refuse examinations that cannot be scored together."""
     manifests = [read_manifest(folder) for folder in folders]
     for folder, manifest in zip(folders, manifests, strict=True):
         if manifest.size != manifests[0].size:
@@ -95,7 +95,7 @@ def _require_alike(folders: Sequence[Path]) -> None:
 
 @dataclass(frozen=True)
 class _Marked:
-    """An examination, opened."""
+    """An examination with its truth and grades."""
 
     folder: Path
     manifest: Manifest
@@ -140,7 +140,7 @@ def _is_done(run_dir: Path) -> bool:
 
 @contextmanager
 def _understood(file: Path) -> Iterator[None]:
-    """What is amiss as the content of a case's file is looked at is the file's fault."""
+    """Turn errors in the contents of a case's file into an error that names the file."""
     try:
         yield
     except (AttributeError, LookupError, TypeError, ValueError) as error:
@@ -169,7 +169,7 @@ def _graded(folder: Path, manifest: Manifest, opened: Sealed, number: int) -> Gr
 
 
 def _summary_of_runs(cases: Sequence[Path]) -> dict[str, Any]:
-    """By how many versions of the code the cases were diagnosed, how long that took, what failed.
+    """Versions of the code that diagnosed the cases, their times, and failures.
 
     One is right: what was changed after a part of the seal was opened is no blind examination.
     """

@@ -1,4 +1,4 @@
-"""What the true effects, with their true parameters, close of the gap.
+"""Share of the gap that the true effects close, with their true parameters.
 
 They are simulated as a candidate of the diagnosis is, on the same frames, against the same
 reference and by the same statistics; what then is left is the share that nobody could do better
@@ -32,7 +32,7 @@ EXPLAINS = 0.5  # share of a statistic's gap that the true effects leave at most
 
 @dataclass(frozen=True)
 class Oracle:
-    """What the true effects do to the gap."""
+    """Effect of the true effects on the gap."""
 
     closed: float  # share of the gap that they close
     causes: frozenset[tuple[str, str]]  # statistics, of sets, that differ because of them

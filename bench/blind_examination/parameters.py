@@ -13,7 +13,7 @@ Plain = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class ParameterCheck:
-    """A parameter held against the truth."""
+    """A fitted parameter and its truth."""
 
     name: str
     true: float

@@ -63,7 +63,7 @@ def run(folder: Path, config: RunConfig, runtime: Runtime) -> tuple[int, int]:
 
 
 def share(what: str, size: str, cases: int, runtime: Runtime) -> tuple[Runtime, Runtime]:
-    """How many cases are looked at at once, and what each gets: one core, and memory.
+    """Number of simultaneous cases, and the memory of each, which has one core.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def _case(
 
 
 def _begun_by(run_dir: Path) -> str | None:
-    """The code that a case was begun with, if that is told."""
+    """Version of the code that a case was begun with, if known."""
     try:
         return str(read_json(run_dir / BEGUN)["code"])
     except (DamagedError, FileNotFoundError, LookupError, TypeError):

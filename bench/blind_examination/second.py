@@ -46,7 +46,7 @@ class SecondLaw:
 
 @dataclass(frozen=True)
 class SecondCase:
-    """What the second bench is asked for."""
+    """Request to the second bench."""
 
     case: str
     seed: int
@@ -86,7 +86,7 @@ def catalogue() -> tuple[tuple[str, ...], tuple[SecondLaw, ...], tuple[str, ...]
 
 
 def _asked(*line: str | Path) -> str:
-    """What the program prints."""
+    """Standard output of the program."""
     command = [sys.executable, "-m", PROGRAM, *map(str, line)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:

@@ -1,4 +1,4 @@
-"""How strong the effects of an examination are: from where they are just seen to ten times that."""
+"""Strengths of the effects: from the detection threshold to ten times that."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ Make = Callable[[float, np.random.Generator], Plain]
 
 @dataclass(frozen=True)
 class Variant:
-    """One of the ways in which an effect comes."""
+    """A variant of an effect."""
 
     effect: str
     strength: str  # what its strength is, for people
@@ -157,7 +157,7 @@ VARIANTS = (
 
 
 def variants_of() -> Mapping[str, tuple[Variant, ...]]:
-    """Ways by the name of the effect."""
+    """Variants by the name of the effect."""
     names = dict.fromkeys(way.effect for way in VARIANTS)
     return {name: tuple(w for w in VARIANTS if w.effect == name) for name in names}
 

@@ -116,7 +116,7 @@ def _count(answers: Iterable[bool]) -> dict[str, Any]:
 
 
 def median(values: Iterable[float | None]) -> float | None:
-    """Median of what is known; None of nothing."""
+    """Median of the known values; None without any."""
     known = [v for v in values if v is not None]
     return float(np.median(known)) if known else None
 

@@ -37,7 +37,7 @@ def astrometry(run: Path, config: Astrometry, runtime: "Runtime") -> None:
 
 
 def _show(result: Mapping[str, Any], rows: Sequence[Sequence[str]]) -> None:
-    """The table, and what the mission needs."""
+    """The table, and the requirement of the mission."""
     t, axes = result["telescope"], result["axes"]
     bound = next(iter(axes.values()))["photon_bound"]
     click.echo(

@@ -1,4 +1,4 @@
-"""``pixcal centroids`` and ``pixcal wcs``: what the maps do to the places of stars."""
+"""``pixcal centroids`` and ``pixcal wcs``: correction of star positions."""
 
 from pathlib import Path
 

@@ -125,7 +125,7 @@ def _show_summary(summary: Mapping[str, Any], labels: list[str]) -> None:
 
 
 def _amount(estimate: Mapping[str, float]) -> str:
-    """A size with its error, or its upper limit (95 %) where it is not seen."""
+    """A size with its error, or its upper limit (95 %) where it is not significant."""
     if estimate["variance_px2"] < 2 * estimate["variance_error_px2"]:
         return f"< {estimate['upper_px']:.2g}"
     return f"{estimate['px']:.3g} ± {estimate['error_px']:.1g}"

@@ -27,7 +27,7 @@ def crests(run: Path, config: Crests, runtime: "Runtime") -> None:
 
 
 def _show(name: str, facts: dict[str, Any]) -> None:
-    """The points, the fibres, and the difference to the fit's."""
+    """The points, the fibres, and the difference from the fit."""
     click.echo(
         f"  {name}: {facts['points_used']} of {facts['points']} points, error per point "
         f"{facts['point_sigma_median_px']:.2g} px, chi2 {facts['chi2_reduced']:.3g}"

@@ -28,7 +28,7 @@ LONG_WORD = 600
 
 
 class InOrder(click.Group):
-    """Lists its commands in the order in which the data take them."""
+    """Lists its commands in processing order."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Names of the commands."""
@@ -103,7 +103,7 @@ def explain(error: BaseException) -> tuple[int, str]:
 
 
 def one_line(message: str) -> str:
-    """A message as one line that a terminal takes as it is, with long words cut in their middle."""
+    """A message as one printable line, with long words shortened."""
     words = ("".join(c if c.isprintable() else "�" for c in word) for word in message.split())
     return " ".join(w if len(w) < LONG_WORD else f"{w[:150]}…{w[-150:]}" for w in words)
 

@@ -1,4 +1,4 @@
-"""What the commands print on stdout: where a result is, and the numbers that matter most."""
+"""What the commands print on stdout: where the results are, and the main numbers."""
 
 import math
 from collections import Counter
@@ -15,7 +15,7 @@ from pixcal.storage.cube_place import cubes_of
 
 @contextmanager
 def announce(stage: str, folder: Path) -> Iterator[None]:
-    """Say where the stage that runs inside the block left its artefact, and whether it is new."""
+    """Print where the stage inside the block left its artefact, and whether it is new."""
     before = _made_at(folder)
     yield
     state = "up to date" if before is not None and before == _made_at(folder) else "written"
@@ -331,7 +331,7 @@ def show_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 
 
 def show_notes(sentences: Sequence[str]) -> None:
-    """Print what a reader should know, a line each."""
+    """Print notes, a line each."""
     for sentence in sentences:
         click.echo(f"  note: {sentence}")
 

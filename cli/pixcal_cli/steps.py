@@ -1,4 +1,4 @@
-"""The main road: ``pixcal run``, its steps one by one, and ``pixcal simulate``.
+"""``pixcal run``, its steps one by one, and ``pixcal simulate``.
 
 Stages are imported where they are called: for a fast ``pixcal --help``.
 """
@@ -124,7 +124,7 @@ def allan(run: Path, config: options.Allan, runtime: "Runtime") -> None:
 
 
 def effect_list(text: str) -> tuple[str, ...]:
-    """Names of effects, divided by commas.
+    """Names of effects, comma-separated.
 
     Raises
     ------

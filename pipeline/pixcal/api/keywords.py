@@ -67,7 +67,7 @@ def function_of(kind: type) -> Callable[[Callable[..., T]], Callable[..., T]]:
 
 
 def accepted(hint: Any) -> Any:
-    """What a caller may give for a field: any path for a Path, any sequence for a tuple of some."""
+    """Type that a caller may pass for a field: any path for a Path, a sequence for a tuple."""
     if hint is Path:
         return StrPath
     arguments = get_args(hint)

@@ -137,7 +137,7 @@ class Run:
 
     @cached_property
     def diagnosis(self) -> dict[str, Any]:
-        """Contents of ``diagnosis.json``: verdict, causes, what is left of the gap."""
+        """Contents of ``diagnosis.json``: verdict, causes, residual gap."""
         return self._read("diagnose", "diagnosis")
 
     @cached_property
@@ -159,12 +159,12 @@ class Run:
 
     @cached_property
     def correction(self) -> dict[str, Any]:
-        """Contents of ``correction.json``: what was done about each effect that was found."""
+        """Contents of ``correction.json``: how each identified effect was treated."""
         return self._read("corrected", "correction")
 
     @cached_property
     def corrected(self) -> dict[str, OffsetMap]:
-        """The maps without the effects that were found; none where nothing was to be undone."""
+        """The maps corrected for the identified effects; none if nothing had to be corrected."""
         return self._maps(self.correction["outputs"], "_corrected")
 
     def _maps(self, names: Sequence[str], suffix: str) -> dict[str, OffsetMap]:

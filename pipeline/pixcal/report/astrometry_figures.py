@@ -1,4 +1,4 @@
-"""What the maps bring for stars, in one picture: a table, errors against effort, and where."""
+"""The figure of star centroids: a table, errors against electrons and positions, and error maps."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What a chapter of the page is made of: figures, tables, words, and parts that are folded."""
+"""Blocks of a section of the page: figures, tables, paragraphs, and collapsible parts."""
 
 import base64
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from pixcal.report.tables import Table
 
 @dataclass(frozen=True)
 class Plate:
-    """A figure with its title, and a caption that says what to see and what would be bad."""
+    """A figure with its title, and a caption that says what is good and what is bad."""
 
     title: str
     caption: str
@@ -37,7 +37,7 @@ class Words:
 
 @dataclass(frozen=True)
 class Fold:
-    """Blocks that are shown on demand."""
+    """A collapsible group of blocks."""
 
     title: str
     blocks: Sequence["Plate | Table | Words"]
@@ -68,7 +68,7 @@ def plate(title: str, caption: str, figure: Figure) -> Plate:
 
 
 def folded(table: Table, shown: int, what: str) -> list[Block]:
-    """A table whose rows beyond the first ones are folded, ``what`` they are said there."""
+    """A table whose rows beyond the first ones are collapsed; ``what`` names them."""
     if len(table.rows) <= shown + 2:
         return [table]
     rest = table.rows[shown:]

@@ -1,4 +1,4 @@
-"""The picture of a budget: precision against frames, and what would help most."""
+"""The figure of a budget: precision against frames, and which change of the bench helps most."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -53,7 +53,7 @@ def budget_figure(view: BudgetView) -> Figure:
 
 
 def _span(view: BudgetView) -> F64:
-    """Frames from well before to well after all that is marked."""
+    """Range of the frame axis, with a margin around all marks."""
     marks = [float(line.planned) for line in (*view.sets, *view.joined)]
     if view.frames:
         marks.append(float(view.frames))

@@ -25,7 +25,7 @@ UNFLAGGED = "#eef1f5"
 SEVERAL = "#000080"
 
 # the fringe frequencies of each set, on the spectrum and on paper
-MARKS = ("#ff3d1f", "#00a7e1", "#ff3dc8", "#39c24a")
+MARKS = ("#ff3d1f", "#ff3dc8", "#00a7e1", "#39c24a")
 
 # one colour for each bit of the flags
 FLAGS = {

@@ -1,4 +1,4 @@
-"""The picture of a comparison: one map against the other, by scale, by place, by column and row."""
+"""The figure of a comparison: pixel by pixel, by scale, by position, by column and row."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -97,7 +97,7 @@ def _against(axes: Axes, view: ComponentView) -> None:
 
 
 def _scales(axes: Axes, view: ComponentView) -> None:
-    """What is common, what differs, and what noise lets expect, at each scale."""
+    """Common part, difference and expected noise at each scale."""
     sizes = [s[key] for s in view.scales for key in ("difference_px", "expected_px")]
     unit = unit_for(sizes, "px")
     at = np.arange(len(view.scales), dtype=float)
@@ -148,7 +148,7 @@ def _seen(estimate: Mapping[str, float]) -> bool:
 def _limits(
     axes: Axes, at: F64, scales: Sequence[Mapping[str, Any]], key: str, colour: str, unit: Unit
 ) -> None:
-    """Upper limits as arrows, where nothing is seen."""
+    """Upper limits as arrows, where nothing is significant."""
     for x, scale in zip(at, scales, strict=True):
         if not _seen(scale[key]):
             top = scale[key]["upper_px"] * unit.factor

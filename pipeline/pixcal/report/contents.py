@@ -1,4 +1,4 @@
-"""What a report shows, as plain data: read by the stage, drawn by the page."""
+"""Contents of a report, as plain data: read by the stage, drawn by the page."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -95,7 +95,7 @@ class Detector:
 
 @dataclass(frozen=True)
 class EffectWords:
-    """What an effect is, for people."""
+    """Title, description and parameters of an effect."""
 
     title: str  # title, about: in a few words, and in a sentence
     about: str = ""

@@ -107,7 +107,7 @@ def _colour(k: int) -> str:
 
 
 def _stretched(axes: Axes, view: CrestView, paths: NDArray[np.int64], title: str) -> None:
-    """Shape of some paths: across less its mean, a path beside the other."""
+    """Shapes of some paths side by side: position across the fringes less its mean."""
     chosen = {int(k): np.flatnonzero((view.k == k) & view.used) for k in paths}
     reach = max([float(np.ptp(view.across[on])) for on in chosen.values() if len(on)], default=0.0)
     noise = float(np.median(view.sigma_px)) or 1e-6

@@ -1,4 +1,4 @@
-"""The places of a statistic's curve in words: which row, which neighbour, which period."""
+"""Abscissae of a statistic's curve in words: which row, which neighbour, which period."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -74,7 +74,7 @@ def places(curve: Mapping[str, Any]) -> list[str]:
 
 
 def place(curve: Mapping[str, Any], at: int) -> str:
-    """Where in a curve a value is, in words."""
+    """Position of a value in a curve, in words."""
     label, name = str(curve["x_label"]), places(curve)[at]
     if not label and len(curve["x"]) == 1:
         return "all frames"

@@ -63,7 +63,7 @@ def diagnosis(contents: Contents) -> Section:
 
 
 def _lead(contents: Contents) -> str:
-    """What was compared with what."""
+    """Which simulation the data were compared with."""
     fringes = contents.acquisition.get("frames", {}).get("fringes")
     bench = "straight fringes, constant light, " if fringes else ""
     given = [s.config.get("nominal") for s in contents.stages if s.name == "diagnose"]
@@ -297,7 +297,7 @@ def _where(result: Diagnosis) -> Iterator[Block]:
 
 
 def _maps(result: Diagnosis) -> Iterator[Block]:
-    """The map of where, if the differences are of some places more than of others."""
+    """The map of the deviations, if some parts of the detector stand out."""
     shape = result.facts.get("looked_at", {}).get("shape")
     places = result.facts["gap"].get("places", ())
     panels = maps.panels(shape, places, result.curves) if shape else []
@@ -359,7 +359,7 @@ def _row(curve: Facts, causes: bool) -> list[str]:
 
 
 def _digits(one: float, other: float) -> int:
-    """As many as show by how much two values differ."""
+    """Significant digits that resolve the difference of two values."""
     size, apart = max(abs(one), abs(other)), abs(one - other)
     if not (math.isfinite(size) and apart > 0):
         return 3
@@ -434,7 +434,7 @@ def _remainder(result: Diagnosis) -> Iterator[Block]:
 
 
 def _largest(result: Diagnosis) -> Iterator[Block]:
-    """Where there is no gap: how far off the worst statistics are all the same."""
+    """The largest deviations where there is no gap."""
     curves = sorted(result.curves, key=lambda c: -c["significance"])[:PLOTS]
     if not curves:
         return

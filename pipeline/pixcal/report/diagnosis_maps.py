@@ -1,4 +1,4 @@
-"""The map of where: how far data are from simulations in the cells of a window, or in windows."""
+"""Map of the deviations of the data from the simulations, by cell of a window or by window."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ SMALLEST = 0.17
 
 @dataclass(frozen=True)
 class Spot:
-    """A part of the detector and how far it is off."""
+    """A part of the detector and its deviation."""
 
     rows: tuple[float, float]  # rows, columns: ends
     columns: tuple[float, float]
@@ -44,14 +44,14 @@ class Panel:
 
     @property
     def largest(self) -> float:
-        """Standard deviations of the spot that is furthest off, before or after."""
+        """Largest deviation of any spot, before or after, in standard deviations."""
         return max(abs(s) for spot in self.spots for s in spot.sigmas)
 
 
 def panels(
     shape: tuple[int, int], places: Sequence[Mapping[str, Any]], curves: Sequence[Mapping[str, Any]]
 ) -> list[Panel]:
-    """Maps that are worth looking at, the furthest off first.
+    """Maps with a notable deviation, the largest first.
 
     Parameters
     ----------

@@ -13,14 +13,14 @@ _UNITS = {"sigma": "σ", "2 √count": "2 √number", "": "", "h^-0.5": "1/√h"
 
 
 def unit(name: str) -> str:
-    """A unit as people write it."""
+    """A unit in its usual notation."""
     if name in _UNITS:
         return _UNITS[name]
     return name.replace("h^0.5", "√h").replace("e-", "e⁻").replace("um", "µm")
 
 
 def percent(value: float) -> str:
-    """A share in per cent: two digits, and none beyond a hundredth of a per cent."""
+    """A share in per cent, to two digits or a hundredth of a per cent."""
     return f"{number(round(100 * float(value), 2), 2)}\u00a0%"
 
 
@@ -56,7 +56,7 @@ def effect_title(diagnosis: Diagnosis, name: str) -> str:
 
 
 def level(verdict: str) -> str:
-    """How much a verdict should worry: a cause that was found is still at work in the data."""
+    """Severity of a verdict; a cause that was identified still affects the data."""
     return {"no gap": "good", "unexplained": "bad"}.get(verdict, "check")
 
 

@@ -1,4 +1,4 @@
-"""What all figures share: axes, scales, legible text, and the way to a PNG.
+"""What all figures share: axes, colour scales, units, and the PNG.
 
 Figures are made by themselves, never through pyplot: nothing is global, threads do not meet.
 """
@@ -36,7 +36,7 @@ class Unit:
 
 
 def unit_for(values: Any, name: str) -> Unit:
-    """Thousandths or millionths of a unit, as the largest of the values asks."""
+    """The unit, its thousandths or its millionths, by the largest value."""
     finite = np.abs(np.asarray(values, dtype=float))
     top = float(np.max(finite[np.isfinite(finite)], initial=0.0))
     if top == 0 or top >= 0.1:
@@ -46,7 +46,7 @@ def unit_for(values: Any, name: str) -> Unit:
 
 @dataclass(frozen=True)
 class ColourScale:
-    """Limits and colours of a map, and which ends go beyond."""
+    """Limits and colour map, and at which ends values exceed them."""
 
     low: float
     high: float
@@ -85,7 +85,7 @@ def _scale(image: NDArray[Any], low: float, high: float, colours: Colormap) -> C
 
 
 def new_figure(width: float, height: float) -> Figure:
-    """A figure of so many inches that lays itself out."""
+    """A figure of a given size (inches) with a computed layout."""
     layout = ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
     return Figure(figsize=(width, height), dpi=DPI, layout=layout)
 
@@ -194,7 +194,7 @@ def fit_box(shape: tuple[int, int], width: float, height: float, least: float = 
 
 
 def finish(axes: Axes, *, grid: bool = True) -> None:
-    """The look of axes that hold lines or points."""
+    """Style of axes with lines or points."""
     axes.spines[["top", "right"]].set_visible(False)
     if grid:
         axes.grid(True, color="#d9dee5", linewidth=0.7)
@@ -203,7 +203,7 @@ def finish(axes: Axes, *, grid: bool = True) -> None:
 
 
 def limits(values: Sequence[Any], share: float = 0.002) -> tuple[float, float]:
-    """Limits that hold all but few of the values, with a margin."""
+    """Axis limits that contain all but a small share of the values, with a margin."""
     finite = np.concatenate([np.ravel(np.asarray(v, dtype=float)) for v in values])
     finite = finite[np.isfinite(finite)]
     if not len(finite):

@@ -1,4 +1,4 @@
-"""Figures after EMVA 1288: photon transfer, and spectra and profiles of what is not uniform."""
+"""Figures after EMVA 1288: photon transfer, and spectra and profiles of DSNU and PRNU."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -115,7 +115,7 @@ def offsets(
 def _profile(
     axes: Axes, at: F64, means: Profile, errors: Profile, unit: Unit, *, upright: bool
 ) -> None:
-    """Means along an axis with their errors, over what independent offsets would give."""
+    """Means along an axis with their errors, beside the ±2σ band of independent offsets."""
     mean = means.mean * unit.factor
     noise = errors.mean * unit.factor / np.sqrt(np.maximum(means.count, 1))
     # The scatter of one line is itself uncertain: the band uses that of all lines.
@@ -144,7 +144,7 @@ def _profile(
 
 
 def _nearby(values: F64) -> tuple[F64, F64, F64]:
-    """Least, mean and greatest of some values in a row, for each of them; NaN left out."""
+    """Minimum, mean and maximum of groups of neighbouring values; NaN are ignored."""
     size = -(-len(values) // (MEANS_DRAWN // 2))
     groups = np.arange(len(values)) // size
     starts = np.arange(0, len(values), size)
@@ -382,7 +382,7 @@ def _classes(image: NDArray[np.uint8]) -> NDArray[np.int64]:
 
 
 def _square(axes: Axes, shape: tuple[int, int]) -> None:
-    """Square pixels, unless the map is so long that nothing would be seen."""
+    """Square pixels, unless the map is very elongated."""
     ny, nx = shape
     if max(ny, nx) <= 6 * min(ny, nx):
         axes.set_aspect("equal")

@@ -1,4 +1,4 @@
-"""The page: contents in, one HTML document out."""
+"""The HTML page, from the contents of a run."""
 
 from collections.abc import Iterator, Sequence
 from importlib.resources import files
@@ -115,26 +115,26 @@ def _offset_plates(offset: OffsetMap, contents: Contents) -> Iterator[Plate]:
         (f"Each point is the mean of {n} × {n} px. " if n > 1 else "")
         + "Colours span ±3 robust standard deviations. The profiles are means over whole columns "
         "(below) and rows (right), in full resolution. Good: a map without pattern, means inside "
-        "the band of independent offsets. Bad: teeth with a period of few rows or columns "
-        "(crosstalk, read-out), a smooth crest (curved fringes fitted as straight ones), stripes "
-        "with the fringes' period. Steps between blocks are the stitching of the mask and belong "
-        "to the detector.",
+        "the band of independent offsets. Bad: a pattern that repeats every few rows or columns "
+        "(crosstalk, read-out), a large-scale curvature (hyperbolic fringes fitted as straight "
+        "ones), stripes with the fringe period. Steps between blocks come from the stitching of "
+        "the lithography mask: they are real offsets.",
         map_figures.offsets(offset.name, offset.delta, offset.sigma),
     )
     if offset.detail is not None:
         (y0, x0), part = offset.detail.start, offset.detail.delta
         yield plate(
-            f"Middle of the map of {name}, pixel by pixel",
+            f"Centre of the map of {name}, pixel by pixel",
             f"Rows {y0} to {y0 + part.shape[0] - 1}, columns {x0} to {x0 + part.shape[1] - 1}, "
-            "without averaging: patterns of few pixels, which the means above wash out, show here.",
+            "without averaging: shows patterns of a few pixels, which block means wash out.",
             map_figures.offsets(offset.name, part, offset.detail.sigma, offset.detail.start),
         )
     yield plate(
         f"Errors and distribution of {name}",
-        "Left: 1-sigma error; it follows the illumination and the visibility; faint fringes (a few "
-        "per cent) are the chance of how the phases fell. Right: all offsets against a normal law "
+        "Left: 1-sigma error; it follows the illumination and the visibility. Fringes of a few per "
+        "cent come from the random phases of the frames. Right: all offsets, a normal distribution "
         "of the same robust width, and the width of the noise. Bad: wings far above the normal "
-        "law, or a histogram no wider than the noise (then the map holds no measured offsets).",
+        "distribution, or a histogram no wider than the noise (no offsets were measured).",
         map_figures.errors_and_histogram(offset),
     )
     if offset.spectrum is not None:
@@ -160,8 +160,8 @@ def _levels(contents: Contents) -> Section:
             f"Set {s.name}: mean level ι and visibility α/ι",
             "Both should follow the smooth light of the fibres. A ring or a speck is dust; a "
             "pattern of rows in the visibility is crosstalk; visibility above 1 is impossible and "
-            "points to a wrong bias. Fringes of less than a per cent are the chance of how the "
-            "phases fell. The errors grow where the visibility falls.",
+            "points to a wrong bias. Fringes below one per cent come from the random phases of the "
+            "frames. The errors grow where the visibility falls.",
             map_figures.map_row(
                 [("mean level ι", "e⁻", s.iota), ("visibility α/ι", "α/ι", s.visibility)]
             ),
@@ -179,14 +179,14 @@ def _temporal(contents: Contents) -> Section:
     blocks = [
         plate(
             f"Set {s.name}: parameters of the frames",
-            "Right: how often each value occurs; for the phase, the dashed line and its band are a "
-            "uniform coverage and its chance (±2σ). Good: phases all over the turn, constant "
+            "Right: histograms; for the phase, the dashed line and its band are a uniform "
+            "distribution and its ±2σ scatter. Good: phases over the whole cycle, constant "
             "visibility. Bad: gaps in the phase (the fit is then ill-conditioned), a slow drift or "
             "steps in B (laser, coupling), visibility that drops (vibration within the exposure)."
             + (
                 " The fringe vector was free: noise about zero is vibration, a trend is drift."
                 if s.series.moving
-                else " The fringe vector was held: it does not move by more than its error."
+                else " The fringe vector was held constant: it moves by less than its error."
             ),
             set_figures.temporal(s),
         )
@@ -196,15 +196,15 @@ def _temporal(contents: Contents) -> Section:
 
 
 def _residuals(contents: Contents) -> Section:
-    lead = "What is left after the fit, over the noise that gain and read noise predict."
+    lead = "Residuals of the fit over the noise predicted from gain and read noise."
     blocks = [
         plate(
             f"Set {s.name}: reduced χ²",
-            "Good: a map without pattern and a histogram on the dashed law. A histogram shifted "
-            "as a whole (red) means that gain or read noise are off by that factor, or that the "
-            "light fluctuates; the errors were scaled by its root. Bad: fringes, rows or blocks in "
-            "the map, or a long tail. Effects that are linear and constant (crosstalk, curved "
-            "fringes) leave nothing here: look for them in the maps.",
+            "Good: a map without pattern and a histogram on the dashed curve. A histogram scaled "
+            "as a whole (red) means that gain or read noise is wrong by that factor, or that the "
+            "light fluctuates; the errors were multiplied by its square root. Bad: fringes, rows "
+            "or blocks in the map, or a long tail. Linear, constant effects (crosstalk, hyperbolic "
+            "fringes) leave no residuals: look for them in the maps.",
             set_figures.residuals(s),
         )
         for s in contents.sets
@@ -258,9 +258,9 @@ def _masks(contents: Contents) -> Section:
         )
     blocks.append(flag_table(panels))
     lead = (
-        "Pixels without an offset, and why. A pixel may have several flags. A set's own mask "
-        "includes that of the calibration frames; in the products a flag counts where it costs the "
-        "pixel its value."
+        "Pixels without an offset, and why. A pixel may have several flags. The mask of a set "
+        "includes that of the calibration frames. In the products a flag is counted where it "
+        "removes the pixel's value."
     )
     return Section("masks", "Masks", lead, blocks)
 
@@ -268,7 +268,7 @@ def _masks(contents: Contents) -> Section:
 def _removed(contents: Contents) -> Section:
     lead = (
         "These modes of the maps are degenerate with the geometry of the bench. The products do "
-        "not contain them. Remove them from both sides before you compare maps."
+        "not contain them. Remove them from both maps before a comparison."
     )
     groups: dict[tuple[str, ...], list[str]] = {}
     for fringes in contents.sets:

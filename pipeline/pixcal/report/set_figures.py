@@ -82,7 +82,7 @@ def _coverage(axes: Axes, values: F64, bounds: tuple[float, float], *, uniform: 
 
 
 def _clock(time: F64) -> tuple[F64, str]:
-    """Times in the unit that suits them."""
+    """Times in a suitable unit."""
     span = float(np.ptp(time)) if len(time) else 0.0
     for unit, length in (("h", 3600.0), ("min", 60.0)):
         if span > 3 * length:
@@ -95,7 +95,7 @@ def _dot(frames: int) -> float:
 
 
 def residuals(fringes: FringeSet) -> Figure:
-    """Map of the reduced chi-square, and its histogram against what chance gives."""
+    """Map of the reduced chi-square, and its histogram against the expected distribution."""
     figure, ((left, right),) = axes_grid((WIDE, 4.4), 1, 2, beside=1.95, width_ratios=[1, 1.15])
     summary = fringes.chi2
     scale = span_scale(summary.image)
@@ -142,7 +142,7 @@ def _chi2_histogram(axes: Axes, summary: MapSummary, facts: dict[str, Any]) -> N
 
 
 def allan(name: str, measured: dict[str, Any], facts: dict[str, Any] | None) -> Figure:
-    """Allan deviation against the averaging length, and what it is of the square-root law.
+    """Allan deviation against averaging length, and its ratio to the square-root law.
 
     Parameters
     ----------

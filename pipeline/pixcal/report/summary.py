@@ -1,4 +1,4 @@
-"""Maps of any size reduced to what a figure can show, in one reading by bands of rows.
+"""Maps of any size, reduced in one pass over bands of rows to what a figure shows.
 
 A map of 46 Mpix does not fit a page: it is shown as means of n × n pixels. Profiles, counts and
 spectra use every pixel they are said to use.

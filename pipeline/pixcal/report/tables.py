@@ -1,4 +1,4 @@
-"""Tables of the page: every number that the stages left, as words."""
+"""Tables of the page: the numbers of every stage."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -109,7 +109,7 @@ def reduction_tables(facts: Mapping[str, Any]) -> Iterator[Table]:
 
 
 def merit_table(facts: Mapping[str, Any]) -> Iterator[Table]:
-    """What a data sheet of the detector would say."""
+    """Figures of merit, as in a data sheet of the detector."""
     rows = [
         [f["title"], with_error(f["value"], f["error"]), f["unit"].replace("e-", "e⁻"), f["note"]]
         for f in (facts.get("figures_of_merit") or {}).values()
@@ -123,7 +123,7 @@ def merit_table(facts: Mapping[str, Any]) -> Iterator[Table]:
 
 
 def _columns_table(title: str, columns: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Like facts of several sets, one column each."""
+    """The same quantities of several sets, one column each."""
     keys = dict.fromkeys(key for facts in columns.values() for key in facts)
     rows = [[key, *(_plain(facts.get(key)) for facts in columns.values())] for key in keys]
     return Table(title, ["quantity", *columns], rows)

@@ -1,4 +1,4 @@
-"""Numbers and names as words."""
+"""Numbers and names as text."""
 
 import math
 from datetime import UTC, datetime, timedelta
@@ -34,7 +34,7 @@ _FIBRES = {
 
 
 def mode_in_words(name: str) -> str:
-    """What a removed mode is."""
+    """Meaning of a removed mode."""
     if name.startswith("d psi / d "):
         moved = name.removeprefix("d psi / d ")
         return f"how the fringes change with {_FIBRES.get(moved, moved)}"
@@ -47,7 +47,7 @@ def flag_name(flag: PixelFlag) -> str:
 
 
 def number(value: Any, digits: int = 3) -> str:
-    """A number with so many digits, powers of ten written out; a dash for what is not known."""
+    """A number with some significant digits and a power of ten; a dash if unknown."""
     if value is None:
         return "–"
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -104,7 +104,7 @@ def share(part: int, whole: int) -> str:
 
 
 def duration(seconds: float) -> str:
-    """A time in the unit that suits it."""
+    """A time in a suitable unit."""
     for unit, length in (("d", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * length:
             return f"{number(seconds / length)} {unit}"

@@ -20,7 +20,7 @@ GOOD, CHECK, BAD = "good", "check", "bad"
 
 @dataclass(frozen=True)
 class Card:
-    """One number that matters, with what it is compared to."""
+    """One key number and its reference."""
 
     title: str
     value: str
@@ -30,7 +30,7 @@ class Card:
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence, and how much it should worry (``good``, ``check`` or ``bad``)."""
+    """One sentence and its severity (``good``, ``check`` or ``bad``)."""
 
     level: str
     text: str
@@ -199,9 +199,9 @@ def _of_set(fringes: FringeSet) -> Iterator[Finding]:
     if scale is not None and abs(scale - 1) > 0.02:
         yield Finding(
             _level(abs(scale - 1), 0.02, 0.3),
-            f"{name}: residuals are {number(scale**2, 4)} times the declared noise in variance, "
-            f"so all errors were multiplied by {number(scale, 4)}. The gain or the read noise may "
-            "be wrong, or the model incomplete.",
+            f"{name}: the variance of the residuals is {number(scale**2, 4)} times that of the "
+            f"declared noise; all errors were multiplied by {number(scale, 4)}. The gain or the "
+            "read noise may be wrong, or the model incomplete.",
         )
     if facts.get("period_note"):
         yield Finding(CHECK, _sentence(f"{name}: {facts['period_note']}"))

@@ -23,7 +23,7 @@ MATTERS = 0.3  # share of SIGMA from which an error that SIGMA does not hold lim
 
 @dataclass(frozen=True)
 class Advice:
-    """What a reader of the maps must know first."""
+    """What to know before using the maps."""
 
     sentences: tuple[str, ...]  # which maps to use, and what limits them; none without maps
     rows: tuple[tuple[str, str, str, str], ...]  # a row for each cause, under `HEADER`
@@ -76,7 +76,7 @@ def _artefact(run_dir: Path, stage: str, file: str) -> Json | None:
 
 
 def _correction(run_dir: Path) -> Json | None:
-    """That of the present fit and diagnosis."""
+    """The correction of the present fit and diagnosis, if there is one."""
     correction = _artefact(run_dir, "corrected", "correction.json")
     if correction is not None:
         for stage, key in require(run_dir, "corrected").inputs.items():
@@ -115,7 +115,7 @@ def _corrects(how: str) -> bool:
 
 
 def _limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json | None) -> str:
-    """The largest of what errors hold, and of what they do not."""
+    """What limits the maps: the largest bias, or noise."""
     made = correction if correction is not None and correction["outputs"] else None
     least = min(sigma.values(), default=math.nan)
     noise = ", ".join(f"{s:.2g} px ({name})" for name, s in sigma.items())
@@ -161,7 +161,7 @@ def _moved(cause: Json, sigma: Mapping[str, float]) -> str:
 
 
 def _action(cause: Json, correction: Json | None) -> str:
-    """What was done about an effect, or is to be done."""
+    """How an effect was treated, or what to do about it."""
     action = _on_map(cause)["action"]
     treated = {e["effect"]: e for e in (correction or {}).get("effects", ())}.get(cause["effect"])
     why = treated["why"] if treated else _reason(cause)
@@ -187,7 +187,7 @@ def _reason(cause: Json) -> str:
 
 
 def size_of(cause: Json) -> str:
-    """The strengths of an effect in their units, with their errors."""
+    """The strengths of an effect with errors and units."""
     kind = known_effects().get(cause["effect"])
     if kind is None:
         return "-"

@@ -1,4 +1,4 @@
-"""What the maps of a run do to centroids: tables corrected, and a WCS that corrects."""
+"""Correction of centroids by the maps of a run: tables, and a WCS distortion."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,7 +37,7 @@ class Offsets:
 
 
 def read_offsets(run_dir: Path) -> Offsets:
-    """The maps of a run that are to be used: corrected ones where there are any.
+    """The maps of a run to use: corrected ones where there are any.
 
     With a single fringe axis the offsets along it; those across it are taken as zero.
 

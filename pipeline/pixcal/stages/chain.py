@@ -36,7 +36,7 @@ def run(
     step: Step = _silent,
     note: Callable[[str], object] = lambda _text: None,
 ) -> Done:
-    """Do all steps; the maps are good without a diagnosis or a correction of them.
+    """Run all steps; a diagnosis or correction that is impossible is not an error.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Report: one HTML page on everything that a run holds."""
+"""Report: one HTML page on the whole run."""
 
 import inspect
 from collections.abc import Mapping, Sequence
@@ -132,7 +132,7 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
 
 @dataclass(frozen=True)
 class _Job:
-    """One reading of a map; ``kind`` says what is made of it."""
+    """One pass over a map; ``kind`` says what is computed."""
 
     name: str
     kind: str
@@ -140,7 +140,7 @@ class _Job:
 
 
 def _jobs(run_dir: Path, fit: Mapping[str, Any] | None) -> list[_Job]:
-    """Every map that is read, once for each thing made of it."""
+    """Every map to read, once for each summary of it."""
     calibration = run_dir / "reduce" / "calibration.zarr"
     jobs = [
         _Job(f"detector/{name}", "map", (ArrayReader(calibration / name),))

@@ -1,4 +1,4 @@
-"""What is done about each effect of a diagnosis: undone on samples, on maps, or left, and why."""
+"""Treatment of each effect of a diagnosis: corrected on samples, on maps, or not, and why."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ CORRECTED = ("undone on maps", "undone on samples", IN_CORRECTED)
 
 @dataclass(frozen=True)
 class Treatment:
-    """An effect and what is done about it."""
+    """An effect and its treatment."""
 
     effect: Effect
     origin: str  # `diagnosis`, or `nominal`: known to be there before the diagnosis
@@ -43,7 +43,7 @@ class Treatment:
 
     @property
     def action(self) -> str:
-        """As in ``diagnosis.json``: what is to be done about the map."""
+        """What to do about the map, as in ``diagnosis.json``."""
         if self.corrects:
             return "corrected"
         absorbed = self.how in ("in the fit", "absorbed by the fit")

@@ -235,7 +235,7 @@ def _vector(power: F64) -> F64:
 
 
 def _of_lines(fx: F64, fy: F64, shape: tuple[int, ...]) -> Mask:
-    """Frequencies (cycles/px) of rows or columns that repeat: those are circuits, and not glass."""
+    """Frequencies (cycles/px) of periodic rows or columns, which are electronics, not optics."""
     marked = np.zeros(fx.shape, bool)
     for across, along, n, m in ((fx, fy, shape[1], shape[0]), (fy, fx, shape[0], shape[1])):
         level = np.abs(across) * n < NEAR

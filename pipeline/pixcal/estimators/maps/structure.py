@@ -95,7 +95,7 @@ CELLS = (8, 16)
 
 
 def redness(values: F64) -> float:
-    """How much more the means of cells of a map (NaN: none) scatter than those of white noise.
+    """Scatter of cell means of a map over that of white noise; NaN are masked.
 
     The most that cells of several sizes show: what is alike over blocks of the foundry's stitching
     does not average down as single pixels do.
@@ -116,7 +116,7 @@ def redness(values: F64) -> float:
 
 @dataclass(frozen=True)
 class Offsets:
-    """Offsets as true ones can be: the part of a map that is kept, and how the rest scatters."""
+    """A model of true offsets: the part of a map that is kept, and the scatter of the rest."""
 
     kept: F64  # (y, x) without bending, repeating rows and columns, and fringes; px
     # (term, y, x) what was taken out: all that an effect of the bench or the readout would

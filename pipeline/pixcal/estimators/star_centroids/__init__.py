@@ -1,1 +1,1 @@
-"""Star centroids: what the offsets do to them, and their correction."""
+"""Star centroids: the effect of the offsets, and their correction."""

@@ -1,4 +1,4 @@
-"""Centroids of stars by a fit of their known shape, and what wrong pixel positions do to them.
+"""Centroids of stars by a PSF fit, and the effect of wrong pixel positions.
 
 A pixel whose response lies at (x + dx, y + dy) receives of a star at (a, b), with N electrons on a
 background of B in each pixel,
@@ -105,7 +105,7 @@ class Star:
         return np.asarray(np.sqrt(np.mean([self.bound(p) ** 2 for p in places], axis=0)))
 
     def weights(self, place: F64, good: Good | None = None) -> F64:
-        """How much each pixel's displacement moves the centroid that is fitted.
+        """Change of the fitted centroid per displacement of each pixel.
 
         Parameters
         ----------

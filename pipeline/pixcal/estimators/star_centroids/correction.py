@@ -1,4 +1,4 @@
-"""Centroids that were measured as if pixels were a perfect grid, put right by a map of offsets.
+"""Correction, by a map of offsets, of centroids measured on a perfect grid.
 
 A pixel whose offset is +d responds at larger x by d: the star that it shows lies at larger x than
 its index says. A centroid is wrong by a weighted sum of the offsets under the star
@@ -66,7 +66,7 @@ class Corrected:
 def correct_centroids(
     place: F64, offsets: NDArray[np.floating], sigma: NDArray[np.floating], star: Star
 ) -> Corrected:
-    """Add to each centroid what the offsets under the star have taken from it.
+    """Correct each centroid for the offsets under the star.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def correct_centroids(
 
 
 def correction_map(offsets: NDArray[np.floating], star: Star | None) -> NDArray[np.float32]:
-    """What to add to the centroid of a star in the middle of each pixel.
+    """Correction of the centroid of a star centred on each pixel.
 
     Parameters
     ----------

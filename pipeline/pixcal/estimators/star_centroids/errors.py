@@ -1,4 +1,4 @@
-"""From the errors of many centroids to their rms, with what a draw of the maps' errors adds undone.
+"""Rms of centroid errors, corrected for the added random draw of the maps' errors.
 
 On a detector that is the maps plus a draw of their errors, true offsets t, errors of the maps e and
 the draw d are independent, e and d alike. Stars fitted on a perfect grid err by K(t + e + d), with

@@ -1,4 +1,4 @@
-"""What the maps are for: the error of star centroids without them and with them."""
+"""Error of star centroids without and with the maps."""
 
 from pixcal.stages.astrometry.stage import Config, run
 from pixcal.stages.astrometry.summary import table

@@ -1,4 +1,4 @@
-"""The detector that stars fall on: where its pixels lie, and where they are thought to lie.
+"""The detector of the simulated stars: true and measured positions of its pixels.
 
 The true offsets of a real detector are not known, but the maps say what they may be: the measured
 offset and a draw of its error. That draw is what the maps do not know; a centroid that takes pixels
@@ -28,7 +28,7 @@ AXES = {"delta_x": ("x", (1.0, 0.0)), "delta_y": ("y", (0.0, 1.0))}
 
 
 def generator(seed: int, *key: int) -> np.random.Generator:
-    """Random numbers of one purpose and place, the same whoever asks."""
+    """Random generator keyed by purpose and position, independent of the task."""
     return np.random.default_rng([seed, *key])
 
 
@@ -65,7 +65,7 @@ class Patch:
 
 @dataclass(frozen=True)
 class Detector:
-    """The whole of it; picklable, reads what it is asked for."""
+    """The whole detector; picklable, read on demand."""
 
     components: tuple[Component, ...]
     seed: int
@@ -77,7 +77,7 @@ class Detector:
 
     @property
     def drawn(self) -> bool:
-        """Whether pixels lie where the maps say plus a draw of their errors."""
+        """Whether the true positions are the maps plus a random draw of their errors."""
         return not self.components[0].truth
 
     @property

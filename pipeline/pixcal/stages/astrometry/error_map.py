@@ -1,4 +1,4 @@
-"""The error of a star's centroid at every place of the detector, to first order, by convolution.
+"""Error of a star's centroid at every position, to first order, by convolution.
 
 A star in the middle of each pixel; its error is the sum of the displacements around it, weighted
 as `centroids.Star.weights` says. Masked pixels have no part in it, and the
@@ -56,7 +56,7 @@ class ErrorMaps:
 
 
 def tile_side(shape: tuple[int, int]) -> tuple[int, int]:
-    """Side of a task's part, and of the blocks that it holds a whole number of, px."""
+    """Side of a task's tile, and of the blocks it is divided into, px."""
     block = max(LEAST_BLOCK, -(-max(shape) // SHOWN))
     return block * max(1, TILE // block), block
 

@@ -1,4 +1,4 @@
-"""The modes of offset maps that no fringes can tell from the bench (physics note, section 2).
+"""Modes of offset maps that are degenerate with the bench (physics note, section 2).
 
 Smooth modes (a plane; what moving a fibre does to hyperbolic fringes) act on stars like distortion
 of the telescope, which a mission has to measure anyway. The fringe and its harmonic are lost to

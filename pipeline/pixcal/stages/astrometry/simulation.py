@@ -1,4 +1,4 @@
-"""Stars on the detector, observed and fitted: each at several places near to each other."""
+"""Simulated stars, each observed and fitted at several dithered positions."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -45,7 +45,7 @@ def observe(detector: Detector, plan: Observation, runtime: Runtime) -> F64:
 
 
 def core_weights(star: Star, axes: F64) -> F64:
-    """What each pixel tells of a star in the middle of the window, (component, y, x), sum 1."""
+    """Weight of each pixel in the centroid of a centred star, (component, y, x), sum 1."""
     weights = -star.weights(np.zeros(2))
     return np.asarray(np.einsum("ka,abyx,kb->kyx", axes, weights, axes))
 

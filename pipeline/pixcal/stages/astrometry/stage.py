@@ -1,4 +1,4 @@
-"""``pixcal astrometry``: what the maps bring for the centroids of stars.
+"""``pixcal astrometry``: how much the maps improve star centroids.
 
 ``astrometry.json`` holds ``schema`` and ``pixcal``; ``detector`` (what the simulated pixels are,
 and with a truth the rms of the modes that it was freed from); ``telescope``; ``stars``; ``axes``,
@@ -69,7 +69,7 @@ Config = Astrometry
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Hold centroids on a perfect grid against centroids on the measured maps.
+    """Compare centroids on a perfect grid with centroids on the measured maps.
 
     Reads the maps in ``RUN/products``; makes ``RUN/astrometry`` and the products
     ``astrometry.json`` and ``astrometry.png``.

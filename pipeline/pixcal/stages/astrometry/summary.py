@@ -30,7 +30,7 @@ class Row:
 def axis_facts(
     errors: F64, bound: float, uas_per_px: float, *, drawn: bool, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """What is said of one axis.
+    """Results along one axis.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def axis_facts(
 
 
 def averaging_lengths(positions: int) -> list[int]:
-    """Powers of two, and all."""
+    """Powers of two, and the number of positions."""
     return sorted({2**n for n in range(positions.bit_length())} | {positions})
 
 
@@ -124,7 +124,7 @@ def _facts(comparison: Comparison, uas_per_px: float) -> dict[str, Any]:
 
 
 def table(result: Mapping[str, Any]) -> list[Row]:
-    """The rows that matter of ``astrometry.json``."""
+    """The main rows of ``astrometry.json``."""
     stars = result["stars"]
     cases = {
         "floor": "no photon noise",

@@ -56,7 +56,7 @@ class Telescope:
 
 
 def exposures(psf: Psf, electrons: float, detector: Declared) -> int:
-    """Exposures that a star takes which must fill no pixel."""
+    """Number of exposures of a star such that no pixel saturates."""
     return max(1, math.ceil(electrons * psf.peak / (detector.full_well_e or FULL_WELL_E)))
 
 

@@ -1,4 +1,4 @@
-"""Freeing a truth from the modes that no fringes can tell from the bench."""
+"""Removal, from a truth, of the modes that are degenerate with the bench."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -20,7 +20,7 @@ BAND = 16  # rows of a task
 def free_from_modes(
     components: Sequence[Component], modes: Modes, runtime: Runtime
 ) -> tuple[list[Component], dict[str, dict[str, float]]]:
-    """Fit the modes to truth minus maps, and have them taken off the truth.
+    """Fit the modes to truth minus maps, and remove them from the truth.
 
     Returns
     -------

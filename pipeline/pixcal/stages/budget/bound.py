@@ -130,7 +130,7 @@ def sampling_loss(iota: float, alpha: float, variance: float, phases: F64) -> tu
 
 @dataclass(frozen=True)
 class WeightErrors:
-    """What wrong weights cost a pixel: share of its frames for each unit of the error's square.
+    """Cost of wrong weights: relative increase in frames per squared error.
 
     Weights ``(1 + e(u)) / variance`` raise the variance of the estimate by the variance of e over
     the phases, each phase counting with its information (second order; the first vanishes).

@@ -1,4 +1,4 @@
-"""What a bench can reach before any photon is spent: frames for a precision, and what limits it.
+"""Expected precision of a bench: frames for a given precision, and what limits it.
 
 The bound of `bound` on a grid of pixels spread over the window, for each fringe
 set and for the sets joined. What is systematic is not in it.
@@ -146,7 +146,7 @@ class SetBound:
         return float(self.per_frame.max()) * self.loss[1] / self.loss[0]
 
     def shares(self) -> dict[str, float]:
-        """What the frames are for: the least number, and the factors that raise it.
+        """Photon-limited variance, and the factors that increase it.
 
         ``photons`` is the variance (px²) of one frame of a pixel in the brightest light, at full
         contrast, without other noise; each factor is for what its name says, given those before.
@@ -169,7 +169,7 @@ class SetBound:
         return factors
 
     def calibration(self) -> WeightErrors:
-        """What errors of bias and flat cost the typical pixel."""
+        """Cost of bias and flat errors for the typical pixel."""
         n = self.typical
         return WeightErrors.of(float(self.iota[n]), float(self.alpha[n]), self.variance)
 
@@ -265,7 +265,7 @@ class Lever:
 
 
 def levers(bench: Bench, now: JoinedBound) -> list[Lever]:
-    """What could be changed, the most helpful first; and what equal weights would lose."""
+    """Possible changes of the bench, the most helpful first, and the loss of equal weights."""
     split, period = planned_split(bench), bench.frames.period_s
     best = now.best_split()
     candidates = [
@@ -358,12 +358,12 @@ def _finer_fringes(bench: Bench, now: JoinedBound) -> list[Change]:
 
 
 def pixel_contrast(kx: float, ky: float) -> float:
-    """Contrast that a square pixel, sensitive all over, leaves of fringes (kx, ky) rad/px."""
+    """Contrast of fringes (kx, ky), rad/px, averaged over a square, uniform pixel."""
     return float(np.sinc(kx / (2 * np.pi)) * np.sinc(ky / (2 * np.pi)))
 
 
 def brightest_allowed(bench: Bench) -> float | None:
-    """Electrons that the well and the converter hold, or None where nothing limits them."""
+    """Largest signal of full well and converter, e-; None without a limit."""
     d = bench.detector
     converter = (d.top_adu - d.bias_adu) * d.gain_e_per_adu
     return converter if d.full_well_e is None else min(d.full_well_e, converter)

@@ -1,4 +1,4 @@
-"""``pixcal budget``: what a bench can reach, before any photon is spent.
+"""``pixcal budget``: the expected precision of a bench.
 
 ``budget.json`` holds ``schema``, ``pixcal``, ``bench`` (its file and digest), ``precision_px``
 wanted and ``frames`` given (null where not asked for), ``window`` (y, x) and, by part, the
@@ -179,7 +179,7 @@ def _set_facts(
 
 
 def _calibration(bench: Bench, s: SetBound) -> dict[str, Any]:
-    """Frames of bias and flat that leave nothing to gain, and what those planned leave."""
+    """Bias and flat frames that are needed, and the cost of those planned."""
     errors, f = s.calibration(), bench.frames
     level, flat = float(np.median(s.iota)), flat_error(bench)
     bias_e = None if not f.bias else (sample_variance(bench) / f.bias) ** 0.5
@@ -238,7 +238,7 @@ def _lever_facts(lever: Lever, precision: float | None) -> dict[str, Any]:
 
 
 def _left_out(bench: Bench) -> list[str]:
-    """What the bound does not know."""
+    """What the bound does not include."""
     d, sentences = bench.detector, []
     sentences.append(
         "systematic errors (crosstalk, drifts, ghosts, nonlinearity): no number of frames removes "

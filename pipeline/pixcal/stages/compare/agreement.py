@@ -1,4 +1,4 @@
-"""How far two maps of the same pixels agree, scale by scale: what is common, what is noise.
+"""Agreement of two maps of the same pixels, scale by scale: common signal and noise.
 
 The window is cut into blocks of 1, 2, 4, ... pixels a side. The squares of a map's block means,
 each block counting with its pixels, fall from side to side; what they lose from one to the next is
@@ -186,13 +186,13 @@ class Estimate:
 
 
 def common(p: Part) -> Estimate:
-    """What both maps hold, by their covariance."""
+    """Common signal of both maps, from their covariance."""
     error = np.sqrt((p.first * p.second + p.both**2) / p.freedom)
     return Estimate(p.both / p.pixels, float(error) / p.pixels)
 
 
 def beyond_noise(p: Part, accuracy: float = SIGMA_ACCURACY) -> Estimate:
-    """What the difference holds that noise does not explain.
+    """Excess of the difference over noise.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ def beyond_noise(p: Part, accuracy: float = SIGMA_ACCURACY) -> Estimate:
 
 
 def own(p: Part, accuracy: float = SIGMA_ACCURACY) -> tuple[Estimate, Estimate]:
-    """What each map holds that is neither noise nor in the other."""
+    """Signal of each map that is neither noise nor common."""
     estimates = []
     for square, noise in zip((p.first, p.second), p.noise, strict=True):
         chance = (square * p.difference + (square - p.both) ** 2) / p.freedom
@@ -289,7 +289,7 @@ def strongest_period(difference: F64, sigma: F64) -> Period | None:
 def three_cornered_hat(
     pairs: Sequence[tuple[int, int]], excess: Sequence[Estimate]
 ) -> list[Estimate]:
-    """What each of three or more maps holds of its own, from the differences of all pairs.
+    """Own errors of three or more maps, from the differences of all pairs.
 
     A difference's variance beyond noise is the sum of what its two maps hold (Gray and Allan 1974).
 

@@ -26,7 +26,7 @@ LISTED = 10  # most blocks, and most pixels, that are named
 def describe(
     pair: Pair, sums: Sums, pixels: Pixels, places: Places, limit: float, accuracy: float
 ) -> dict[str, Any]:
-    """All that is said of a component.
+    """Results of one component.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def _evidence(
     blocks: dict[str, Any],
     outliers: dict[str, Any],
 ) -> list[str]:
-    """What noise does not explain, in words; a whole list is made up once in 1 / `CLAIM` times."""
+    """Significant differences in words; the false-alarm rate of the whole list is `CLAIM`."""
     share = CLAIM / FAMILIES
     evidence = []
     sides = [s["side_px"] for s in scales if s["significance"] > norm.isf(share / len(scales))]
@@ -174,7 +174,7 @@ def _profile(sums: Sums, blocks: Any, accuracy: float) -> dict[str, Any]:
 
 
 def _blocks(places: Places) -> dict[str, Any]:
-    """Blocks whose mean, or whose scatter, is beyond what chance gives any of them."""
+    """Blocks whose mean or scatter differs significantly."""
     number = int((places.count > 0).sum())
     share = CLAIM / FAMILIES / max(1, number)
     limits = {"mean": float(norm.isf(share / 2)), "scatter": float(norm.isf(share))}

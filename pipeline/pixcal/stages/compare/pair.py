@@ -132,7 +132,7 @@ def _values(pair: Pair, tile: Tile) -> tuple[F64, F64]:
 
 @dataclass(frozen=True)
 class Sums:
-    """What one reading of both sides leaves."""
+    """Sums of one pass over both sides."""
 
     fine: tuple[Grouping, ...]  # blocks of 1, 2, 4, ... pixels, up to the coarse ones
     coarse: Blocks  # of the whole window

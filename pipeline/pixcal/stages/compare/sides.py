@@ -1,4 +1,4 @@
-"""The sides of a comparison: fitted runs, or some batches of one, read tile by tile.
+"""The two sides of a comparison: fitted runs, or parts of one, read tile by tile.
 
 A side gives the offset along any direction that its fringe sets measure, its variance, and the
 modes that this side's fit took off, as they come out in that direction.
@@ -119,7 +119,7 @@ class Side:
         return axes_span_plane(self.axes)
 
     def sets_along(self, direction: Vector) -> tuple[FittedSet, ...]:
-        """The sets whose modes are felt along a direction."""
+        """The sets whose modes contribute along a direction."""
         ones = np.ones((len(self.sets), 1))
         shares = self._shares(self.axes, ones, direction)
         return tuple(
@@ -148,7 +148,7 @@ class Side:
         )
 
     def _shares(self, axes: Sequence[Vector], sigma: F64, direction: Vector) -> F64:
-        """What each set's map counts in a direction (set, ...): the fit's own weights."""
+        """Weight of each set along a direction (set, ...), as in the fit."""
         shares = np.empty_like(sigma)
         for n in range(len(axes)):
             unit = np.zeros_like(sigma)

@@ -1,4 +1,4 @@
-"""``pixcal compare``: what two maps of the same pixels have in common, and what not.
+"""``pixcal compare``: common signal and differences of maps of the same pixels.
 
 ``compare.json`` holds ``schema``, ``pixcal``, ``sides`` (label, run, key of its fit, fringe sets)
 and ``pairs``: for each two sides their numbers and, for each component, what
@@ -188,7 +188,7 @@ def _compare_all(
 def compare_pair(
     pair: Pair, accuracy: float, runtime: Runtime
 ) -> tuple[dict[str, Any], ComponentView]:
-    """Two sides along one direction: what to say, and what to show.
+    """Compare two sides along one direction: results and figure.
 
     Raises
     ------
@@ -235,7 +235,7 @@ def _view(
 
 
 def _summary(pairs: list[dict[str, Any]], components: dict[str, Vector]) -> dict[str, Any]:
-    """What each side holds of its own, from all pairs."""
+    """Own errors of each side, from all pairs."""
     numbers = [(p["sides"][0], p["sides"][1]) for p in pairs]
     summary: dict[str, Any] = {}
     for name in components:

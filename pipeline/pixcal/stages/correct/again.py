@@ -1,4 +1,4 @@
-"""Effects measured again for the correction: on all frames, where the diagnosis used a half."""
+"""Effects remeasured for the correction on all frames; the diagnosis fits half of them."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -23,7 +23,7 @@ MOST_PARTS = 4  # times that many at most
 
 
 def measured_again(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatments:
-    """The same with effects that act on maps as all frames show them, where that is better.
+    """The same treatments, with effects on maps remeasured on all frames where possible.
 
     Parameters
     ----------

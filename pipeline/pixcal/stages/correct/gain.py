@@ -1,4 +1,4 @@
-"""What the maps gained: how far they moved, what repeats, how sets and halves of frames agree.
+"""Effect of the correction: change of the maps, periodic patterns, agreement of sets and halves.
 
 Everything is measured on pixels that are good before and after.
 """
@@ -81,7 +81,7 @@ class TileSums:
 
 
 def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
-    """What ``correction.json`` says of the sets and of pairs of them.
+    """Statistics of the sets and of pairs of sets, for ``correction.json``.
 
     Returns
     -------
@@ -263,7 +263,7 @@ def repeating(profile: F64) -> float | None:
 
 
 def _agreement(sums: F64) -> dict[str, Any]:
-    """Rms (px) before and after, and what the errors let expect."""
+    """Rms (px) before and after, and that expected from the errors."""
     rms: dict[str, Any] = {}
     for (square, expected, count), when in zip(sums, ("before", "after"), strict=True):
         rms[f"{when}_px"] = float(np.sqrt(square / max(count, 1)))

@@ -1,4 +1,4 @@
-"""Where the detector goes on beyond the window, as its maps tell."""
+"""Sides at which the detector extends beyond the window, from its maps."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ ALONG = 1024  # pixels along a side that tell whether it is open
 
 
 def sides_of(sets: Sequence[Swept]) -> Sides:
-    """Where the detector goes on beyond the window, as the maps of all sets tell."""
+    """Sides at which the detector extends beyond the window, from the maps of all sets."""
     misfits = np.zeros((4, 2))
     for swept in sets:
         if swept.passes_borders:

@@ -1,4 +1,4 @@
-"""The fit with a diagnosis: effects found are undone where that is possible, maps made again.
+"""The fit with a diagnosis: identified effects are corrected where possible.
 
 The ordinary fit and its products stay as they are. What acts on samples is undone as the cube is
 swept again; what acts on maps, on the maps that the sweep left. Shapes of the fringes are fitted to
@@ -48,7 +48,7 @@ Config = Fit
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Fit a run, and fit it again without the effects that its diagnosis found.
+    """Fit a run, and again with the effects of its diagnosis corrected.
 
     Makes ``RUN/fit`` where it is not up to date, ``RUN/corrected``, and the products
     ``delta_x_corrected.fits``, ``delta_y_corrected.fits`` (or ``delta_fringe_corrected.fits``) and
@@ -97,7 +97,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
 
 def attempt(run_dir: Path, config: Config, runtime: Runtime) -> str | None:
-    """As `run`, for those to whom the fitted maps are good without it.
+    """As `run`, but a correction that is impossible is not an error.
 
     Returns
     -------
@@ -230,7 +230,7 @@ def _swept_set(
 
 
 def _of_set(fitted: FittedSet, totals: Totals, gain: Json, before: Json, plan: Treatments) -> Json:
-    """What ``correction.json`` says of a set."""
+    """Entry of a set in ``correction.json``."""
     summary = totals.sets[fitted.name]
     by_effect = dict(zip((e.name for e in plan.on_maps), gain.pop("change_by_effect"), strict=True))
     on_samples = gain.pop("change_on_samples")

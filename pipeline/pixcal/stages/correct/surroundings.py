@@ -39,7 +39,7 @@ def scatter_of(phase: F64) -> float:
 
 
 def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, scatter: float) -> list[FringeMaps]:
-    """The maps with what is not known of some pixels moved by its error, in `SIGNS`.
+    """The maps with unknown pixels perturbed by their errors, in the patterns of `SIGNS`.
 
     Parameters
     ----------
@@ -63,12 +63,12 @@ def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, scatter: float) -> 
 
 
 def usable(theta: F64, mask: NDArray[np.uint8]) -> Mask:
-    """Pixels (y, x) whose fit tells what light they had, flagged or not."""
+    """Pixels (y, x) whose fitted signal is usable, flagged or not."""
     return np.asarray(np.isfinite(theta).all(axis=0) & (mask & UNKNOWN == 0))
 
 
 def border_misfit(theta: F64, k: tuple[float, float], good: Mask) -> float:
-    """How far the first line of pixels is off from what the next ones let expect: a chi-square.
+    """Chi-square of the first line of pixels against an extrapolation of the next ones.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A set as it was swept, and what its maps are to be freed of."""
+"""A swept fringe set, and the effects to correct on its maps."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,7 +28,7 @@ HALVES = 2  # parts of the frames that are corrected each for itself
 
 @dataclass(frozen=True)
 class Swept:
-    """A set as swept, and what its maps are to be freed of."""
+    """A swept fringe set, and the effects to correct on its maps."""
 
     folder: Path  # `sweep.zarr/<set name>`
     source: ReducedSet  # for the tiles
@@ -65,7 +65,7 @@ class Swept:
 
     @property
     def carrier(self) -> Carrier:
-        """That phases are relative to."""
+        """Carrier of the phases."""
         facts = read_json(self.folder / "scout.json")
         (kx, ky), (y, x) = facts["k"], facts["reference"]
         return Carrier((float(kx), float(ky)), (float(y), float(x)))
@@ -77,7 +77,7 @@ class Swept:
 
     @property
     def passes_borders(self) -> bool:
-        """Whether what is undone moves charge, so that pixels beyond the window matter."""
+        """Whether a correction moves charge, so that pixels beyond the window matter."""
         return any(effect.undo_halo for effect in (*self.effects, *self.samples))
 
     @property
@@ -105,7 +105,7 @@ class Swept:
 
 
 def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
-    """What was fitted on a part; what is not known there is like the pixels around it.
+    """Fitted maps of a part; unknown pixels are interpolated.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""``pixcal crests``: the fringe fit held against crests traced in single frames."""
+"""``pixcal crests``: an independent check of the fit, from crests traced in single frames."""
 
 from pixcal.stages.crests.stage import STAGE, Config, run
 

@@ -24,7 +24,7 @@ MAP_POINTS = 400  # points that a cost map is computed with; its numbers are sca
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the geometry beforehand."""
+    """Prior knowledge of the geometry."""
 
     nominal: Geometry
     # (6,) 1-sigma errors, mm, in the order of `PARAMETERS`; 0 holds a parameter, infinity frees
@@ -135,7 +135,7 @@ def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -
 
 
 def _scale(prior: Prior) -> F64:
-    """Millimetres that a unit of each unknown stands for."""
+    """Scale of each unknown, mm."""
     usual = Prior.of_bench(prior.nominal).sigma
     return np.where(np.isfinite(prior.sigma) & (prior.sigma > 0), prior.sigma, usual)
 
@@ -216,7 +216,7 @@ def cost_map(
 
 
 def _thinned(paths: CrestPaths, fit: CrestFit) -> CrestPaths:
-    """Some of the points that the fit used, with errors so small that they weigh as much as all."""
+    """A subset of the points used, with errors reduced to keep the total weight."""
     used = np.flatnonzero(fit.used)
     chosen = used[np.linspace(0, len(used) - 1, min(len(used), MAP_POINTS)).astype(int)]
     few = paths.take(chosen)

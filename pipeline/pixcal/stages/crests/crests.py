@@ -274,7 +274,7 @@ def find_crests(
     k: Vector,
     segment: int | None = None,
 ) -> CrestPaths:
-    """Crests and valleys of frames that need not be in memory.
+    """Crests and valleys, from frames that are read one by one.
 
     Parameters
     ----------

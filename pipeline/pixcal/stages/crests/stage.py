@@ -1,4 +1,4 @@
-"""Crests and valleys: fibre positions found apart from the fit (paper, section 6, figures 16, 17).
+"""Crests and valleys: fibre positions independent of the fit (paper, section 6, figures 16, 17).
 
 ``crests.json`` holds ``schema``, ``pixcal`` and, for each fringe set under ``sets``: ``frames``
 (numbers of those read), ``points``, ``points_used`` (no outliers), ``paths``, ``interfringe_px``,
@@ -72,7 +72,7 @@ Config = Crests
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Find the fibres from crests and valleys and hold them against the fit.
+    """Locate the fibres from crests and valleys, and compare them with the fit.
 
     Reads ``RUN/reduce`` and, where it is there, ``RUN/fit``; makes ``RUN/crests`` and the products
     ``crests.json`` and ``crests-<set>.png``.
@@ -303,7 +303,7 @@ def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit, maps: _Maps) -
 
 
 def _from_prior(fit: CrestFit) -> NDArray[np.bool_]:
-    """Parameters of which the prior says more than the points."""
+    """Parameters that the prior constrains more than the points."""
     return np.asarray(fit.sigma > np.sqrt(0.5) * fit.prior.sigma)
 
 
