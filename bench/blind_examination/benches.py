@@ -7,7 +7,7 @@ import numpy as np
 from pixcal.model.bench import (
     SCHEMA,
     Bench,
-    Rung,
+    ExposureStep,
     SimulatedDetector,
     SimulatedFrames,
     SimulatedOptics,
@@ -82,8 +82,8 @@ def draw_bench(layout: Layout, rng: np.random.Generator) -> Bench:
         period_s=0.14,
         per_file=layout.frames,
         bias=layout.bias,
-        darks=(Rung(0.5, layout.dark),),
-        flats=tuple(Rung(seconds, layout.flat) for seconds in FLATS_S),
+        darks=(ExposureStep(0.5, layout.dark),),
+        flats=tuple(ExposureStep(seconds, layout.flat) for seconds in FLATS_S),
         flat_rate_e_s=LAMP_E_S,
         fringes=_sets(layout, rng),
     )

@@ -15,7 +15,7 @@ EXAMINATION = 1000  # seeds from here on are for examinations, those below for d
 
 
 @dataclass(frozen=True)
-class Manifest:
+class ExaminationManifest:
     """Contents of an examination, without the truth."""
 
     schema: str
@@ -44,11 +44,11 @@ def write_manifest(folder: Path, examination: Examination, commitment: str) -> N
     """Write it into the folder of the cases."""
     without = tuple(truth.left_out for truth in examination.truths)
     purpose = purpose_of(examination.seed)
-    manifest = Manifest(SCHEMA, purpose, examination.size, commitment, without)
+    manifest = ExaminationManifest(SCHEMA, purpose, examination.size, commitment, without)
     write_json(folder / FILE, to_plain(manifest))
 
 
-def read_manifest(folder: Path) -> Manifest:
+def read_manifest(folder: Path) -> ExaminationManifest:
     """Read it.
 
     Raises
@@ -59,4 +59,4 @@ def read_manifest(folder: Path) -> Manifest:
     file = folder / FILE
     if not file.is_file():
         raise InputError(f"{file}: not found; give a directory that 'pixcal blind make' wrote")
-    return parse(Manifest, read_json(file), str(file))
+    return parse(ExaminationManifest, read_json(file), str(file))

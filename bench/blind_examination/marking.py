@@ -10,7 +10,7 @@ from typing import Any
 from blind_examination.benches import LAYOUTS
 from blind_examination.draw import LEFT_OUT, ONE
 from blind_examination.grade import Grade, grade
-from blind_examination.manifest import FILE, RUNS, Manifest, purpose_of, read_manifest
+from blind_examination.manifest import FILE, RUNS, ExaminationManifest, purpose_of, read_manifest
 from blind_examination.offsets import offset_errors
 from blind_examination.options import ScoreConfig
 from blind_examination.oracle import Oracle, ask_oracle
@@ -98,7 +98,7 @@ class _Marked:
     """An examination with its truth and grades."""
 
     folder: Path
-    manifest: Manifest
+    manifest: ExaminationManifest
     opened: Sealed
     grades: list[Grade]
     missing: list[str]
@@ -151,7 +151,7 @@ def _understood(file: Path) -> Iterator[None]:
         raise damaged from error
 
 
-def _graded(folder: Path, manifest: Manifest, opened: Sealed, number: int) -> Grade:
+def _graded(folder: Path, manifest: ExaminationManifest, opened: Sealed, number: int) -> Grade:
     name, truth = manifest.cases[number], opened.examination.truths[number]
     run_dir = folder / RUNS / name
     if not (run_dir / DIAGNOSIS).is_file():

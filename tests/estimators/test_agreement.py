@@ -8,9 +8,9 @@ from scipy.optimize import minimize_scalar
 
 from pixcal.stages.compare.agreement import (
     Blocks,
-    Estimate,
     Part,
     Projection,
+    VarianceEstimate,
     beyond_noise,
     common,
     halve,
@@ -177,11 +177,11 @@ def test_the_accuracy_of_sigma_is_allowed_for():
 
 
 def test_sizes_of_estimates():
-    assert Estimate(-1.0, 0.5).rms == 0
-    assert Estimate(4.0, 0.0).rms == 2
-    assert Estimate(4.0, 0.0).rms_error == 0
-    assert Estimate(1e-6, 1e-8).rms_error == pytest.approx(1e-8 / 2e-3, rel=0.01)
-    assert Estimate(0.0, 1.0).upper == pytest.approx(1.645**0.5, rel=1e-3)
+    assert VarianceEstimate(-1.0, 0.5).rms == 0
+    assert VarianceEstimate(4.0, 0.0).rms == 2
+    assert VarianceEstimate(4.0, 0.0).rms_error == 0
+    assert VarianceEstimate(1e-6, 1e-8).rms_error == pytest.approx(1e-8 / 2e-3, rel=0.01)
+    assert VarianceEstimate(0.0, 1.0).upper == pytest.approx(1.645**0.5, rel=1e-3)
 
 
 def test_periods():
@@ -210,8 +210,10 @@ def test_periods():
 def test_three_cornered_hat():
     own_of = [1.0, 4.0, 0.0]
     pairs = [(0, 1), (0, 2), (1, 2)]
-    found = three_cornered_hat(pairs, [Estimate(own_of[i] + own_of[j], 0.1) for i, j in pairs])
+    found = three_cornered_hat(
+        pairs, [VarianceEstimate(own_of[i] + own_of[j], 0.1) for i, j in pairs]
+    )
     assert [e.variance for e in found] == pytest.approx(own_of)
     assert [e.error for e in found] == pytest.approx([0.1 * 0.75**0.5] * 3)
     four = [(i, j) for i in range(4) for j in range(i)]
-    assert len(three_cornered_hat(four, [Estimate(1.0, 1.0)] * 6)) == 4
+    assert len(three_cornered_hat(four, [VarianceEstimate(1.0, 1.0)] * 6)) == 4

@@ -22,7 +22,7 @@ from pixcal.stages.crests.crest_fit import (
 )
 from pixcal.stages.crests.crests import (
     SEED_PIXELS,
-    Carrier,
+    CrestCarrier,
     CrestPaths,
     Windows,
     find_crests,
@@ -42,7 +42,7 @@ class ArrayFrames:
     frames: NDArray[Any]  # (t, y, x) electrons; not finite: no sample
     good: NDArray[np.bool_]  # (y, x)
 
-    def __call__(self, frame: int, windows: Windows, carrier: Carrier) -> F64:
+    def __call__(self, frame: int, windows: Windows, carrier: CrestCarrier) -> F64:
         sums = np.zeros((*windows.shape, N_SUMS))
         signal = self.frames[frame]
         for y in range(0, signal.shape[0], 512):
@@ -356,7 +356,7 @@ def test_sums_do_not_depend_on_the_tiling(tile: tuple[int, int]) -> None:
     frame = exposed(shape, truth, np.random.default_rng(1))
     good = np.ones(shape, bool)
     windows = Windows.lay(shape, paraxial_vector(truth))
-    carrier = Carrier.straight(paraxial_vector(truth), shape)
+    carrier = CrestCarrier.straight(paraxial_vector(truth), shape)
     sums = np.zeros((*windows.shape, N_SUMS))
     for y in range(0, shape[0], tile[0]):
         for x in range(0, shape[1], tile[1]):

@@ -8,7 +8,8 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from pixcal.report.budget_figures import BudgetView, Line, budget_figure
+from pixcal.report.budget_figures import BudgetView, budget_figure
+from pixcal.report.budget_figures import PrecisionLine as Line
 from pixcal.report.drawing import png
 
 

@@ -19,7 +19,7 @@ from pixcal.report import blocks as blocks_module
 from pixcal.report import curve_places, diagnosis_words
 from pixcal.report import diagnosis_maps as maps
 from pixcal.report.blocks import Block, Fold, Plate, Section, Words
-from pixcal.report.contents import Contents, Diagnosis, EffectWords, StageRecord
+from pixcal.report.contents import Contents, DiagnosisContents, EffectWords, StageRecord
 from pixcal.report.curve_places import place, places
 from pixcal.report.diagnosis import diagnosis
 from pixcal.report.diagnosis_figures import Bar, Closed, curves_figure, gap_figure
@@ -74,7 +74,7 @@ def a_cause(effect: str = "lag", **changes: Any) -> dict[str, Any]:
 def a_diagnosis(
     verdict: str = "explained", causes: tuple[dict[str, Any], ...] | None = None,
     curves: tuple[dict[str, Any], ...] | None = None, **gap: Any,
-) -> Diagnosis:  # fmt: skip
+) -> DiagnosisContents:  # fmt: skip
     if causes is None:
         causes = (a_cause(),) if "explained" in verdict.split() else ()
     if curves is None:
@@ -108,10 +108,10 @@ def a_diagnosis(
         "lag": EffectWords("words", "Charge stays.", {"share": ("e-/um", "left behind")}),
         "ipc": EffectWords("crosstalk"),
     }
-    return Diagnosis(facts, list(curves), words, NOTICED)
+    return DiagnosisContents(facts, list(curves), words, NOTICED)
 
 
-def contents(found: Diagnosis | None, **changes: Any) -> Contents:
+def contents(found: DiagnosisContents | None, **changes: Any) -> Contents:
     frames = {
         "bias": ["b"], "dark": ["d"], "flat": ["f"],
         "fringes": [{"name": "one", "files": ["x"], "baseline_mm": [6.0, 0.0]}],

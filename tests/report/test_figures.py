@@ -13,7 +13,7 @@ from PIL import Image
 
 from pixcal.report import detector_figures, map_figures, set_figures
 from pixcal.report.colours import DIVERGING, MASKED, PALETTE, SEQUENTIAL, srgb
-from pixcal.report.contents import FringeSet, OffsetMap, Series
+from pixcal.report.contents import FrameSeries, MapContents, SetContents
 from pixcal.report.drawing import png, span_scale, symmetric_scale, unit_for
 from pixcal.report.summary import (
     ArraySource,
@@ -49,7 +49,7 @@ def test_maps_of_any_size_become_pictures(shape: tuple[int, int]) -> None:
     delta, sigma = a_map(shape), a_map(shape, 4e-4, 1e-5)
     for figure in (
         map_figures.offsets("delta_x", delta, sigma),
-        map_figures.errors_and_histogram(OffsetMap("delta_x", delta, sigma, None)),
+        map_figures.errors_and_histogram(MapContents("delta_x", delta, sigma, None)),
         map_figures.map_row([("bias", "ADU", delta), ("flat", "1", sigma), ("dark", "e", sigma)]),
     ):
         assert min(open_png(png(figure)).size) > 150
@@ -105,16 +105,16 @@ def test_equal_masks_are_drawn_once() -> None:
     assert [a.get_title() for a in axes if a.get_visible()] == ["a\nb", "c"]
 
 
-def a_set(frames: int, *, moving: bool) -> FringeSet:
+def a_set(frames: int, *, moving: bool) -> SetContents:
     rng = np.random.default_rng(3)
     time = 0.14 * np.arange(frames)
     free = 1e-6 * rng.normal(size=(2, frames)) * moving
-    series = Series(time, np.ones(frames), np.ones(frames), rng.uniform(-3, 3, frames), *free)
+    series = FrameSeries(time, np.ones(frames), np.ones(frames), rng.uniform(-3, 3, frames), *free)
     level = a_map((40, 50), 2e4, 10.0)
     chi2 = a_map((40, 50), 1.0, 0.1)
     facts = {"frames": frames, "chi2_reduced": 1.01, "crb_median_px": 3e-4}
     flags = summarise_flags(ArraySource(np.zeros((40, 50), np.uint8)))
-    return FringeSet("name", facts, level, a_map((40, 50), 0.9, 1e-3), chi2, flags, series)
+    return SetContents("name", facts, level, a_map((40, 50), 0.9, 1e-3), chi2, flags, series)
 
 
 @pytest.mark.parametrize("frames", [1, 2, 97, 20_001])

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pixcal.report.contents import Contents, FringeSet, OffsetMap, Series
+from pixcal.report.contents import Contents, FrameSeries, MapContents, SetContents
 from pixcal.report.summary import ArraySource, summarise, summarise_flags
 from pixcal.report.verdict import cards, findings, headline
 
@@ -30,9 +30,9 @@ def contents(
     } | (facts or {})  # fmt: skip
     one = summarise(ArraySource(np.ones(shape)))
     zeros = np.zeros(3)
-    series = Series(zeros, zeros, zeros, zeros, zeros, zeros)
+    series = FrameSeries(zeros, zeros, zeros, zeros, zeros, zeros)
     summary = summarise_flags(ArraySource(flags))
-    fringes = FringeSet("s", chosen, one, one, one, summary, series, allan or dict(WHITE))
+    fringes = SetContents("s", chosen, one, one, one, summary, series, allan or dict(WHITE))
     sigma = summarise(ArraySource(np.full(shape, 2e-4)))
     return Contents(
         acquisition={
@@ -41,7 +41,7 @@ def contents(
         },
         stages=(),
         fit={"sets_chi2_reduced": consistency},
-        offsets=(OffsetMap("delta_x", summarise(ArraySource(delta)), sigma, None),),
+        offsets=(MapContents("delta_x", summarise(ArraySource(delta)), sigma, None),),
         sets=(fringes,),
         flags=summary,
         warnings=warnings,

@@ -15,14 +15,14 @@ from PIL import Image
 
 from pixcal.engine.run import Runtime
 from pixcal.kernels.optics import Geometry, phase
-from pixcal.model.acquisition import Detector as Declared
+from pixcal.model.acquisition import PixelPositions as Declared
 from pixcal.model.errors import InputError, PlanError
 from pixcal.report.drawing import png
 from pixcal.stages import astrometry
 from pixcal.stages.astrometry import Config, error_map, simulation, stage
-from pixcal.stages.astrometry.detector import Detector, open_components
+from pixcal.stages.astrometry.detector import PixelPositions, open_components
 from pixcal.stages.astrometry.error_map import place_errors, tile_side
-from pixcal.stages.astrometry.modes import Modes
+from pixcal.stages.astrometry.modes import DegenerateModes
 from pixcal.stages.astrometry.simulation import KINDS, Observation, observe
 from pixcal.stages.astrometry.summary import scientific, table, with_error
 from pixcal.stages.astrometry.telescope import Telescope, exposures, star
@@ -38,21 +38,10 @@ SHAPE = (97, 131)
 K = 2 * np.pi / 9.5
 PAPER = Telescope(7.0, 130.0, 600.0, 0.0, 4.4)
 DECLARED = Declared(4.4, 1.0, 16.0, "", 50_000.0)
+PARAXIAL = {"model": "paraxial", "phase_at_origin_rad": 0.0}
 STRAIGHT = {
-    "vertical": {
-        "model": "paraxial",
-        "kx": K,
-        "ky": 0.0,
-        "phase_at_origin_rad": 0.0,
-        "axis": [1.0, 0.0],
-    },
-    "horizontal": {
-        "model": "paraxial",
-        "kx": 0.0,
-        "ky": K,
-        "phase_at_origin_rad": 0.0,
-        "axis": [0.0, 1.0],
-    },
+    "vertical": PARAXIAL | {"kx": K, "ky": 0.0, "axis": [1.0, 0.0]},
+    "horizontal": PARAXIAL | {"kx": 0.0, "ky": K, "axis": [0.0, 1.0]},
 }
 
 
@@ -130,13 +119,13 @@ def result_of(run: Path) -> dict[str, Any]:
     return found
 
 
-def the_detector(run: Path, truth: Path | None = None, seed: int = 0) -> Detector:
+def the_detector(run: Path, truth: Path | None = None, seed: int = 0) -> PixelPositions:
     fit = read_json(run / "fit" / "fit.json")
     components = open_components(run, fit, truth)
     if truth is not None:
         sets = (fitted_shape(run, s, None, SHAPE) for s in fit["sets"].values())  # type: ignore[arg-type]
-        components, _ = free_from_modes(components, Modes(SHAPE, tuple(sets)), SYNC)
-    return Detector(tuple(components), seed)
+        components, _ = free_from_modes(components, DegenerateModes(SHAPE, tuple(sets)), SYNC)
+    return PixelPositions(tuple(components), seed)
 
 
 def the_star(electrons: float = 1e8) -> Any:
@@ -412,7 +401,7 @@ def test_one_fringe_axis(tmp_path: Path, truth: bool) -> None:
     axis = np.array([0.6, 0.8])
     true = offsets(1, SCATTER)
     along = axis[0] * true["delta_x"] + axis[1] * true["delta_y"]
-    sets = {"slanted": {"model": "paraxial", "kx": 0.6 * K, "ky": 0.8 * K, "axis": axis.tolist()}}
+    sets = {"slanted": PARAXIAL | {"kx": 0.6 * K, "ky": 0.8 * K, "axis": axis.tolist()}}
     error = np.random.default_rng(3).normal(0, SIGMA, SHAPE)
     run = make_run(tmp_path / "run", {"delta_fringe": along + error}, SIGMA, (), sets)
     folder = write_truth(tmp_path / "truth", true) if truth else None
@@ -486,7 +475,7 @@ def test_masked_pixels_take_places_away(results: dict[str, dict[str, Any]]) -> N
 @pytest.mark.parametrize("truth", [False, True])
 def test_tasks_stay_within_their_plan(case: Path, truth: bool) -> None:
     detector = the_detector(case / "run", case / "truth" if truth else None)
-    modes = Modes(SHAPE, ()).n_smooth + 8 if truth else 0
+    modes = DegenerateModes(SHAPE, ()).n_smooth + 8 if truth else 0
     seen, config = the_star(), Config(positions=9, dither_px=60.0)
     planned, _ = stage.planned(SHAPE, modes, seen.side, config)
     plan = Observation(seen, 4, 9, 60.0)

@@ -13,6 +13,7 @@ import pytest
 import yaml
 from astropy.io import fits
 
+import blind_examination as blind
 from blind_examination.benches import LAYOUTS
 from blind_examination.cases import write_examination
 from blind_examination.draw import (
@@ -46,7 +47,7 @@ from pixcal.engine.run import Runtime
 from pixcal.model.acquisition import load_acquisition
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError, PlanError
-from pixcal.stages import blind, correct, diagnose, ingest, reduce
+from pixcal.stages import correct, diagnose, ingest, reduce
 from pixcal.stages.diagnose import look
 from pixcal.storage.artefact import build, write_json
 from pixcal.storage.formats import STAGES

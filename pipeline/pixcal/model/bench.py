@@ -206,7 +206,7 @@ class SimulatedSet:
 
 
 @dataclass(frozen=True)
-class Rung:
+class ExposureStep:
     """Calibration frames of one exposure time."""
 
     exptime_s: float = quantity(unit="s", low=0, high=1e6, doc="exposure time")
@@ -226,8 +226,12 @@ class SimulatedFrames:
     compress: tuple[str, ...] = quantity((), doc="bias, dark, flat or sets to tile-compress (RICE)")
     bias: int = quantity(0, low=0, high=MAX_FRAMES, doc="number of bias frames")
     bias_exptime_s: float = quantity(0.0, unit="s", low=0, high=1e6, doc="of the bias frames")
-    darks: tuple[Rung, ...] = quantity((), doc="dark frames, one entry for each exposure time")
-    flats: tuple[Rung, ...] = quantity((), doc="flats under a steady lamp: a ladder of levels")
+    darks: tuple[ExposureStep, ...] = quantity(
+        (), doc="dark frames, one entry for each exposure time"
+    )
+    flats: tuple[ExposureStep, ...] = quantity(
+        (), doc="flats under a steady lamp: a ladder of levels"
+    )
     flat_rate_e_s: float | None = quantity(
         None, unit="e-/s", low=1e-3, high=1e12, doc="the lamp, for unit response"
     )

@@ -19,7 +19,7 @@ COLOURS = (BLUE, GREEN, *MARKS)
 
 
 @dataclass(frozen=True)
-class Line:
+class PrecisionLine:
     """Precision against frames: one over their root."""
 
     label: str
@@ -34,8 +34,8 @@ class BudgetView:
 
     name: str  # of the bench file
     # sets, joined: of each set; of the components of all sets, against the frames of all
-    sets: tuple[Line, ...]
-    joined: tuple[Line, ...]
+    sets: tuple[PrecisionLine, ...]
+    joined: tuple[PrecisionLine, ...]
     precision: float | None  # wanted, px
     frames: int | None  # given, of each set
     period_s: float  # from frame to frame

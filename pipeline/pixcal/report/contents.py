@@ -22,7 +22,7 @@ class Detail:
 
 
 @dataclass(frozen=True)
-class OffsetMap:
+class MapContents:
     """One product of the fit; all maps in px.
 
     Attributes
@@ -41,7 +41,7 @@ class OffsetMap:
 
 
 @dataclass(frozen=True)
-class Series:
+class FrameSeries:
     """Parameters of each frame (t,): time in s, phi in rad, dkx and dky in rad/px."""
 
     time: F64
@@ -58,7 +58,7 @@ class Series:
 
 
 @dataclass(frozen=True)
-class FringeSet:
+class SetContents:
     """One fringe set.
 
     Attributes
@@ -77,12 +77,12 @@ class FringeSet:
     visibility: MapSummary
     chi2: MapSummary
     flags: FlagSummary
-    series: Series
+    series: FrameSeries
     allan: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
-class Detector:
+class DetectorContents:
     """What the reduction found."""
 
     facts: dict[str, Any] = field(default_factory=dict)  # `reduce.json`; empty where there is none
@@ -104,7 +104,7 @@ class EffectWords:
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class DiagnosisContents:
     """What ``pixcal diagnose`` found."""
 
     facts: dict[str, Any]  # `diagnosis.json`
@@ -150,12 +150,12 @@ class Contents:
     acquisition: dict[str, Any]  # as in `acquisition.json`
     stages: tuple[StageRecord, ...]
     arrays: tuple[ArrayRecord, ...] = ()
-    detector: Detector = field(default_factory=Detector)
+    detector: DetectorContents = field(default_factory=DetectorContents)
     fit: dict[str, Any] | None = None  # `fit.json`
-    offsets: tuple[OffsetMap, ...] = ()
-    sets: tuple[FringeSet, ...] = ()
+    offsets: tuple[MapContents, ...] = ()
+    sets: tuple[SetContents, ...] = ()
     flags: FlagSummary | None = None  # of the products
-    diagnosis: Diagnosis | None = None  # where the run was diagnosed
+    diagnosis: DiagnosisContents | None = None  # where the run was diagnosed
     warnings: tuple[str, ...] = ()  # sentences that the stages left
     advice: tuple[str, ...] = ()  # which map to use, and what limits it
     # what each cause does to the map, and what is done about it; the header first

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 from pixcal.report import detector_figures, emva_figures, map_figures
 from pixcal.report.blocks import Block, Plate, Section, plate
-from pixcal.report.contents import Contents, Detector
+from pixcal.report.contents import Contents, DetectorContents
 from pixcal.report.tables import Table, is_table, merit_table, reduction_tables
 from pixcal.report.text import number
 
@@ -61,7 +61,7 @@ def detector(contents: Contents) -> Section:
     return Section("detector", "Detector", lead, blocks)
 
 
-def _merit_plates(measured: Detector) -> Iterator[Plate]:
+def _merit_plates(measured: DetectorContents) -> Iterator[Plate]:
     """Photon transfer, and what is not uniform, in the dark and in light."""
     figures, curves = measured.facts.get("figures_of_merit") or {}, measured.curves
     transfer = curves.get("photon_transfer") or {}

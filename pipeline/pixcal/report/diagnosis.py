@@ -7,7 +7,7 @@ from typing import Any
 from pixcal.report import diagnosis_figures as figures
 from pixcal.report import diagnosis_maps as maps
 from pixcal.report.blocks import Block, Fold, Section, Words, folded, plate
-from pixcal.report.contents import Contents, Diagnosis, EffectWords
+from pixcal.report.contents import Contents, DiagnosisContents, EffectWords
 from pixcal.report.curve_places import place
 from pixcal.report.diagnosis_words import (
     DETECTOR,
@@ -82,7 +82,7 @@ def _heading(text: str) -> Words:
 # Overview
 
 
-def _overview(result: Diagnosis) -> Iterator[Block]:
+def _overview(result: DiagnosisContents) -> Iterator[Block]:
     gap, causes = result.facts["gap"], result.facts["causes"]
     closed = [
         figures.Closed(
@@ -119,7 +119,7 @@ def _bars(gap: Facts, with_causes: bool) -> list[figures.Bar]:
     return [whole, *sorted(parts, key=lambda b: -b.before)]
 
 
-def _causes_table(result: Diagnosis) -> Table:
+def _causes_table(result: DiagnosisContents) -> Table:
     rows = []
     for rank, cause in enumerate(result.facts["causes"], 1):
         alike = cause["not_told_apart_from"]
@@ -145,7 +145,7 @@ def _causes_table(result: Diagnosis) -> Table:
 # A cause
 
 
-def _cause(rank: int, cause: Facts, result: Diagnosis) -> Iterator[Block]:
+def _cause(rank: int, cause: Facts, result: DiagnosisContents) -> Iterator[Block]:
     name = cause["effect"]
     words = result.effects.get(name, EffectWords(""))
     yield _heading(f"Cause {rank}: {effect_title(result, name)}")
@@ -187,7 +187,7 @@ def _advice(words: str, frames: Sequence[str] | None) -> str:
     return f" {words}: {listed(frames)}." if frames else ""
 
 
-def _named(result: Diagnosis, names: Sequence[Facts]) -> list[Facts]:
+def _named(result: DiagnosisContents, names: Sequence[Facts]) -> list[Facts]:
     curves = {(c["statistic"], c["set"]): c for c in result.curves}
     keys = [(n["statistic"], n["set"]) for n in names[:PLOTS]]
     return [curves[key] for key in keys if key in curves]
@@ -269,7 +269,7 @@ def _in_short(value: Any) -> str:
 # Where
 
 
-def _where(result: Diagnosis) -> Iterator[Block]:
+def _where(result: DiagnosisContents) -> Iterator[Block]:
     curves = sorted((c for c in result.curves if c["in_gap"]), key=lambda c: -c["significance"])
     if not curves:
         return
@@ -296,7 +296,7 @@ def _where(result: Diagnosis) -> Iterator[Block]:
         )
 
 
-def _maps(result: Diagnosis) -> Iterator[Block]:
+def _maps(result: DiagnosisContents) -> Iterator[Block]:
     """The map of the deviations, if some parts of the detector stand out."""
     shape = result.facts.get("looked_at", {}).get("shape")
     places = result.facts["gap"].get("places", ())
@@ -371,7 +371,7 @@ def _sigma(value: float) -> str:
     return "0.0" if text in ("+0.0", "-0.0") else text.replace("-", "−")
 
 
-def _absolute(result: Diagnosis) -> Iterator[Block]:
+def _absolute(result: DiagnosisContents) -> Iterator[Block]:
     causes = [cause["effect"] for cause in result.facts["causes"]]
     each = causes if len(causes) > 1 else []
     rows = []
@@ -394,7 +394,7 @@ def _absolute(result: Diagnosis) -> Iterator[Block]:
 # Residual
 
 
-def _remainder(result: Diagnosis) -> Iterator[Block]:
+def _remainder(result: DiagnosisContents) -> Iterator[Block]:
     if more := _advice("Recommended frames", result.facts.get("more_would_tell")):
         yield Words(more.strip(), "advice")
     if not result.facts["causes"]:
@@ -433,7 +433,7 @@ def _remainder(result: Diagnosis) -> Iterator[Block]:
     yield plate("Largest residual differences", _READ, figures.curves_figure(left[:PLOTS]))
 
 
-def _largest(result: Diagnosis) -> Iterator[Block]:
+def _largest(result: DiagnosisContents) -> Iterator[Block]:
     """The largest deviations where there is no gap."""
     curves = sorted(result.curves, key=lambda c: -c["significance"])[:PLOTS]
     if not curves:
@@ -450,7 +450,7 @@ def _largest(result: Diagnosis) -> Iterator[Block]:
 # Candidates
 
 
-def _candidates(result: Diagnosis) -> Iterator[Block]:
+def _candidates(result: DiagnosisContents) -> Iterator[Block]:
     causes = {c["effect"] for c in result.facts["causes"]}
     tried = sorted(
         (c for c in result.facts["candidates"] if c["effect"] not in causes),
@@ -473,7 +473,7 @@ def _candidates(result: Diagnosis) -> Iterator[Block]:
     yield Fold(title, [Table("Rejected effects", header, rows)])
 
 
-def _frames_used(result: Diagnosis) -> Iterator[Block]:
+def _frames_used(result: DiagnosisContents) -> Iterator[Block]:
     """Frames and windows that were fitted and held out."""
     facts = result.facts.get("looked_at")
     if not facts:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from pixcal.report.contents import Diagnosis
+from pixcal.report.contents import DiagnosisContents
 from pixcal.report.text import number
 
 # what `curves.json` has for the name of a set where a curve is of no single set
@@ -47,7 +47,7 @@ def listed(names: Iterable[str], last: str = "and") -> str:
     return f"{', '.join(first)} {last} {end}" if first else end
 
 
-def effect_title(diagnosis: Diagnosis, name: str) -> str:
+def effect_title(diagnosis: DiagnosisContents, name: str) -> str:
     """An effect in a few words and its name: own effects are known by the causes alone."""
     words = diagnosis.effects.get(name)
     given = [c["title"] for c in diagnosis.facts["causes"] if c["effect"] == name and "title" in c]
@@ -60,7 +60,7 @@ def level(verdict: str) -> str:
     return {"no gap": "good", "unexplained": "bad"}.get(verdict, "check")
 
 
-def answer(diagnosis: Diagnosis) -> str:
+def answer(diagnosis: DiagnosisContents) -> str:
     """The verdict as one sentence."""
     facts = diagnosis.facts
     gap, verdict = facts["gap"], facts["verdict"]
@@ -94,7 +94,7 @@ def answer(diagnosis: Diagnosis) -> str:
     )
 
 
-def differing(diagnosis: Diagnosis) -> int:
+def differing(diagnosis: DiagnosisContents) -> int:
     """Statistics in which data and nominal simulation differ."""
     return sum(bool(c["in_gap"]) for c in diagnosis.curves)
 

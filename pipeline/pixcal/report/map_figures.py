@@ -27,7 +27,7 @@ from pixcal.report.colours import (
     SEVERAL,
     UNFLAGGED,
 )
-from pixcal.report.contents import OffsetMap
+from pixcal.report.contents import MapContents
 from pixcal.report.drawing import (
     TITLE,
     WIDE,
@@ -158,7 +158,7 @@ def _nearby(values: F64) -> tuple[F64, F64, F64]:
     return low[groups], mean[groups], high[groups]
 
 
-def errors_and_histogram(offset: OffsetMap) -> Figure:
+def errors_and_histogram(offset: MapContents) -> Figure:
     """The map of errors, and the histograms of offsets and of errors."""
     sigma = offset.sigma
     figure, ((left, right),) = axes_grid(
@@ -175,7 +175,7 @@ def errors_and_histogram(offset: OffsetMap) -> Figure:
     return figure
 
 
-def _histogram(axes: Axes, offset: OffsetMap) -> None:
+def _histogram(axes: Axes, offset: MapContents) -> None:
     delta, symbol = offset.delta, SYMBOLS[offset.name]
     unit = unit_for([delta.robust_std], "px")
     values = delta.sample.astype(float) * unit.factor

@@ -8,7 +8,7 @@ from jinja2 import Environment, StrictUndefined
 from pixcal import __version__
 from pixcal.report import map_figures, set_figures
 from pixcal.report.blocks import Block, Plate, Section, plate
-from pixcal.report.contents import Contents, OffsetMap
+from pixcal.report.contents import Contents, MapContents
 from pixcal.report.detector_page import detector
 from pixcal.report.diagnosis import diagnosis
 from pixcal.report.summary import FlagSummary
@@ -108,7 +108,7 @@ def _maps(contents: Contents) -> Section:
     return _of_fit("maps", "Maps of the offsets", lead, blocks)
 
 
-def _offset_plates(offset: OffsetMap, contents: Contents) -> Iterator[Plate]:
+def _offset_plates(offset: MapContents, contents: Contents) -> Iterator[Plate]:
     name, n = NAMES[offset.name], offset.delta.block
     yield plate(
         f"Map of {name}",

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2 as chi2_law
 
 from pixcal.report.colours import BAR, BLUE, GREEN, GREY, INK, RED
-from pixcal.report.contents import FringeSet
+from pixcal.report.contents import SetContents
 from pixcal.report.drawing import (
     WIDE,
     add_bar,
@@ -31,7 +31,7 @@ F64 = NDArray[np.float64]
 POINTS = 6000  # most frames that are drawn one by one; of longer runs, every n-th
 
 
-def temporal(fringes: FringeSet) -> Figure:
+def temporal(fringes: SetContents) -> Figure:
     """Intensity, visibility, phase and (when it is free) fringe vector of each frame."""
     series = fringes.series
     step = -(-len(series.time) // POINTS)
@@ -94,7 +94,7 @@ def _dot(frames: int) -> float:
     return float(np.clip(70 / np.sqrt(max(frames, 1)), 1.2, 4.5))
 
 
-def residuals(fringes: FringeSet) -> Figure:
+def residuals(fringes: SetContents) -> Figure:
     """Map of the reduced chi-square, and its histogram against the expected distribution."""
     figure, ((left, right),) = axes_grid((WIDE, 4.4), 1, 2, beside=1.95, width_ratios=[1, 1.15])
     summary = fringes.chi2

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pixcal.model.flags import PixelFlag
-from pixcal.report.contents import ArrayRecord, FringeSet, StageRecord
+from pixcal.report.contents import ArrayRecord, SetContents, StageRecord
 from pixcal.report.summary import FlagSummary
 from pixcal.report.text import date_of_mjd, duration, exact, flag_name, number, share, with_error
 
@@ -38,7 +38,7 @@ class Table:
     kind: str = "table"
 
 
-def allan_table(measured: Sequence[FringeSet]) -> Table:
+def allan_table(measured: Sequence[SetContents]) -> Table:
     """Slope, knee and batches of each set."""
     rows = []
     for s in measured:

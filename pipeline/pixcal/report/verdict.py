@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.report.contents import Contents, Diagnosis, FringeSet
+from pixcal.report.contents import Contents, DiagnosisContents, SetContents
 from pixcal.report.diagnosis_words import level, residual_gap
 from pixcal.report.text import NAMES, duration, number, share, with_error
 
@@ -120,7 +120,7 @@ def _detector_cards(facts: dict[str, Any]) -> Iterator[Card]:
             yield Card(f["title"], f"{with_error(f['value'], f['error'])} {unit}", f["note"], GOOD)
 
 
-def _diagnosis_card(diagnosis: Diagnosis) -> Card:
+def _diagnosis_card(diagnosis: DiagnosisContents) -> Card:
     verdict, gap = diagnosis.facts["verdict"], diagnosis.facts["gap"]
     causes = ", ".join(c["effect"] for c in diagnosis.facts["causes"])
     detail = "no significant difference" if verdict == "no gap" else f"The {residual_gap(gap)}"
@@ -186,7 +186,7 @@ def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:].rstrip(".") + "."
 
 
-def _of_set(fringes: FringeSet) -> Iterator[Finding]:
+def _of_set(fringes: SetContents) -> Iterator[Finding]:
     facts, name = fringes.facts, f"Set {fringes.name}"
     ratio = _ratio(facts.get("sigma_median_px"), facts.get("crb_median_px"))
     if ratio is not None:
@@ -238,7 +238,7 @@ def _of_shape(name: str, facts: dict[str, Any]) -> Iterator[Finding]:
         )
 
 
-def _of_allan(fringes: FringeSet) -> Iterator[Finding]:
+def _of_allan(fringes: SetContents) -> Iterator[Finding]:
     measured = fringes.allan
     if measured is None:
         yield Finding(CHECK, f"Set {fringes.name}: the Allan deviation has not been measured.")
@@ -269,7 +269,7 @@ def _of_allan(fringes: FringeSet) -> Iterator[Finding]:
         )
 
 
-def _of_target(fringes: FringeSet) -> Iterator[Finding]:
+def _of_target(fringes: SetContents) -> Iterator[Finding]:
     """Frames needed for the target precision, if photon noise is the limit."""
     sigma, frames = fringes.facts.get("sigma_median_px"), fringes.facts.get("frames")
     if not sigma or not frames:

@@ -17,7 +17,7 @@ from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
 from pixcal.model.bench import (
     SCHEMA,
     Bench,
-    Rung,
+    ExposureStep,
     SimulatedDetector,
     SimulatedFrames,
     SimulatedOptics,
@@ -286,7 +286,7 @@ def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:
         frames=SimulatedFrames(
             exptime_s=exposure,
             period_s=period,
-            flats=(Rung(exposure, 1),),
+            flats=(ExposureStep(exposure, 1),),
             flat_rate_e_s=1.0,
             fringes=tuple(
                 SimulatedSet(

@@ -20,12 +20,12 @@ from pixcal.report.contents import (
     ArrayRecord,
     Contents,
     Detail,
-    Detector,
-    Diagnosis,
+    DetectorContents,
+    DiagnosisContents,
     EffectWords,
-    FringeSet,
-    OffsetMap,
-    Series,
+    FrameSeries,
+    MapContents,
+    SetContents,
     StageRecord,
 )
 from pixcal.report.detector_page import DETECTOR_MAPS
@@ -106,7 +106,7 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
             for m in manifests.values()
         ),
         arrays=_arrays(run_dir, manifests),
-        detector=Detector(
+        detector=DetectorContents(
             facts,
             {
                 name: results[f"detector/{name}"]
@@ -195,14 +195,14 @@ def _summary(job: _Job) -> MapSummary | FlagSummary | Spectrum | Detail | None:
     return summarise(first)
 
 
-def _offsets(fit: Mapping[str, Any] | None, results: Mapping[str, Any]) -> tuple[OffsetMap, ...]:
+def _offsets(fit: Mapping[str, Any] | None, results: Mapping[str, Any]) -> tuple[MapContents, ...]:
     made = []
     for name in fit["outputs"] if fit else ():
         delta = results[f"{name}/delta"]
         # Pixel by pixel is the whole map already where no blocks were averaged.
         part = results[f"{name}/detail"] if delta.block > 1 and min(delta.shape) > DETAIL else None
         made.append(
-            OffsetMap(name, delta, results[f"{name}/sigma"], results[f"{name}/spectrum"], part)
+            MapContents(name, delta, results[f"{name}/sigma"], results[f"{name}/spectrum"], part)
         )
     return tuple(made)
 
@@ -212,19 +212,19 @@ def _sets(
     fit: Mapping[str, Any] | None,
     measured: Mapping[str, Any],
     results: Mapping[str, Any],
-) -> tuple[FringeSet, ...]:
+) -> tuple[SetContents, ...]:
     made = []
     for name, facts in fit["sets"].items() if fit else ():
         folder = run_dir / "fit" / "fit.zarr" / name
         made.append(
-            FringeSet(
+            SetContents(
                 name=name,
                 facts=facts,
                 iota=results[f"set/{name}/iota"],
                 visibility=results[f"set/{name}/visibility"],
                 chi2=results[f"set/{name}/chi2"],
                 flags=results[f"flags/set/{name}"],
-                series=Series(
+                series=FrameSeries(
                     *(_column(folder / n) for n in ("time", "B", "A", "phi", "dkx", "dky"))
                 ),
                 allan=measured.get(name),
@@ -240,11 +240,11 @@ def _column(path: Path) -> NDArray[np.float64]:
 # The diagnosis
 
 
-def _diagnosis(folder: Path) -> Diagnosis:
+def _diagnosis(folder: Path) -> DiagnosisContents:
     facts, curves = read_json(folder / "diagnosis.json"), read_json(folder / "curves.json")
     chance = np.log(CHANCE / max(facts["statistics"], 1))
     words = {name: _effect_words(kind) for name, kind in effects().items()}
-    return Diagnosis(facts, curves, words, sigmas_of(chance))
+    return DiagnosisContents(facts, curves, words, sigmas_of(chance))
 
 
 def _effect_words(kind: type[Effect]) -> EffectWords:

@@ -115,7 +115,7 @@ def redness(values: F64) -> float:
 
 
 @dataclass(frozen=True)
-class Offsets:
+class OffsetModel:
     """A model of true offsets: the part of a map that is kept, and the scatter of the rest."""
 
     kept: F64  # (y, x) without bending, repeating rows and columns, and fringes; px
@@ -132,7 +132,7 @@ class Offsets:
         return np.asarray(self.kept + np.tensordot(size, self.terms, 1))
 
 
-def true_offsets(delta: F64, sigma: F64, psi: F64) -> Offsets:
+def true_offsets(delta: F64, sigma: F64, psi: F64) -> OffsetModel:
     """Part a measured map of offsets.
 
     Parameters
@@ -166,4 +166,4 @@ def true_offsets(delta: F64, sigma: F64, psi: F64) -> Offsets:
     # rest is red by. Of white maps the factor is one.
     scatter[: len(bending)] *= redness(rest)
     kept = np.nan_to_num(rest * np.sqrt(true / max(variance, 1e-300)))
-    return Offsets(kept, terms, scatter)
+    return OffsetModel(kept, terms, scatter)

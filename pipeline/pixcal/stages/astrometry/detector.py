@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.model.errors import InputError
-from pixcal.stages.astrometry.modes import Modes
+from pixcal.stages.astrometry.modes import DegenerateModes
 from pixcal.storage.fits_map import FitsMap
 
 F64 = NDArray[np.float64]
@@ -43,7 +43,7 @@ class Component:
     mask: FitsMap
     # the true offset is the sum of the maps times the numbers; empty where it is not known
     truth: tuple[tuple[float, FitsMap], ...] = ()
-    modes: Modes | None = None  # what the truth is freed from
+    modes: DegenerateModes | None = None  # what the truth is freed from
 
     def true(self, y: Range, x: Range) -> F64:
         """The true offset along the axis, modes included, px."""
@@ -64,7 +64,7 @@ class Patch:
 
 
 @dataclass(frozen=True)
-class Detector:
+class PixelPositions:
     """The whole detector; picklable, read on demand."""
 
     components: tuple[Component, ...]

@@ -16,7 +16,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.star_centroids.centroids import Star
-from pixcal.stages.astrometry.detector import Detector
+from pixcal.stages.astrometry.detector import PixelPositions
 from pixcal.stages.astrometry.simulation import MOST_LOST
 from pixcal.storage.cube import ArrayWriter, create_array, create_group
 
@@ -61,7 +61,7 @@ def tile_side(shape: tuple[int, int]) -> tuple[int, int]:
     return block * max(1, TILE // block), block
 
 
-def error_maps(folder: Path, detector: Detector, star: Star, runtime: Runtime) -> ErrorMaps:
+def error_maps(folder: Path, detector: PixelPositions, star: Star, runtime: Runtime) -> ErrorMaps:
     """Write the error at every place, and sum it up.
 
     Writes arrays (y, x), float32, px: ``perfect_<component>`` and ``measured_<component>``; NaN at
@@ -93,7 +93,7 @@ def error_maps(folder: Path, detector: Detector, star: Star, runtime: Runtime) -
 
 
 def _tile(
-    detector: Detector,
+    detector: PixelPositions,
     star: Star,
     writers: list[ArrayWriter],
     side: int,
@@ -109,7 +109,9 @@ def _tile(
     return _blocks(np.where(good, errors, 0.0) ** 2, block), _blocks(good.astype(float), block)
 
 
-def place_errors(detector: Detector, star: Star, y: tuple[int, int], x: tuple[int, int]) -> F64:
+def place_errors(
+    detector: PixelPositions, star: Star, y: tuple[int, int], x: tuple[int, int]
+) -> F64:
     """Errors (grid, component, y, x), px, of stars in the middle of some pixels."""
     half, (ny, nx) = star.half, detector.shape
     patch = detector.patch((y[0] - half, y[1] + half), (x[0] - half, x[1] + half))

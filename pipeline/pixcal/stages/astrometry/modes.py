@@ -19,7 +19,7 @@ Range = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Modes:
+class DegenerateModes:
     """A combination of the modes of all sets."""
 
     shape: tuple[int, int]  # of the detector, (y, x)

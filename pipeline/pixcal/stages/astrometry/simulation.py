@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.star_centroids.centroids import Star
-from pixcal.stages.astrometry.detector import Detector, Patch, generator
+from pixcal.stages.astrometry.detector import Patch, PixelPositions, generator
 
 F64 = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ class Observation:
     dither: float  # they lie within so many px of the first, along x and y
 
 
-def observe(detector: Detector, plan: Observation, runtime: Runtime) -> F64:
+def observe(detector: PixelPositions, plan: Observation, runtime: Runtime) -> F64:
     """Observe and fit stars all over the detector.
 
     Returns
@@ -50,12 +50,12 @@ def core_weights(star: Star, axes: F64) -> F64:
     return np.asarray(np.einsum("ka,abyx,kb->kyx", axes, weights, axes))
 
 
-def _batch(detector: Detector, plan: Observation, stars: range) -> F64:
+def _batch(detector: PixelPositions, plan: Observation, stars: range) -> F64:
     core = core_weights(plan.star, detector.axes)
     return np.stack([_star(detector, plan, core, n) for n in stars])
 
 
-def _star(detector: Detector, plan: Observation, core: F64, number: int) -> F64:
+def _star(detector: PixelPositions, plan: Observation, core: F64, number: int) -> F64:
     """Errors of one star (position, kind, component)."""
     star, half, axes = plan.star, plan.star.half, detector.axes
     rng = generator(detector.seed, 2, number)

@@ -36,9 +36,9 @@ from pixcal.model.errors import InputError
 from pixcal.model.options import Astrometry
 from pixcal.report.astrometry_figures import AstrometryView, astrometry_figure
 from pixcal.report.drawing import png
-from pixcal.stages.astrometry.detector import Component, Detector, generator, open_components
+from pixcal.stages.astrometry.detector import Component, PixelPositions, generator, open_components
 from pixcal.stages.astrometry.error_map import ErrorMaps, error_maps, place_errors, tile_side
-from pixcal.stages.astrometry.modes import Modes
+from pixcal.stages.astrometry.modes import DegenerateModes
 from pixcal.stages.astrometry.simulation import Observation, core_weights, observe
 from pixcal.stages.astrometry.summary import TARGET_PX, axis_facts, table
 from pixcal.stages.astrometry.telescope import Telescope, exposures, star
@@ -125,13 +125,13 @@ def _measure(
             f"px (x × y); give an odd number up to {min(shape)}"
         )
     sets = (fitted_shape(run_dir, s, acquisition, shape) for s in fit["sets"].values())
-    modes = Modes(shape, tuple(sets)) if config.truth is not None else None
+    modes = DegenerateModes(shape, tuple(sets)) if config.truth is not None else None
     need = planned(shape, modes.number if modes else 0, observed.side, config)
     runtime = runtime.with_workers(make_plan("astrometry", *need, runtime).workers)
     removed = None
     if modes is not None:
         components, removed = free_from_modes(components, modes, runtime)
-    detector = Detector(tuple(components), config.seed)
+    detector = PixelPositions(tuple(components), config.seed)
     maps = error_maps(made.folder / "astrometry.zarr", detector, observed, runtime)
     if not maps.places.any():
         raise InputError(
@@ -190,7 +190,10 @@ def planned(shape: tuple[int, int], modes: int, side: int, config: Config) -> tu
 
 
 def _detector_facts(
-    detector: Detector, maps: ErrorMaps, config: Config, removed: dict[str, dict[str, float]] | None
+    detector: PixelPositions,
+    maps: ErrorMaps,
+    config: Config,
+    removed: dict[str, dict[str, float]] | None,
 ) -> dict[str, Any]:
     return {
         "pixels": "maps and a draw of their errors" if detector.drawn else "truth",
@@ -202,7 +205,7 @@ def _detector_facts(
 
 
 def _axes(
-    detector: Detector, observed: Star, errors: F64, maps: ErrorMaps, telescope: Telescope
+    detector: PixelPositions, observed: Star, errors: F64, maps: ErrorMaps, telescope: Telescope
 ) -> dict[str, Any]:
     bounds = np.sqrt((detector.axes**2) @ observed.bound() ** 2)
     facts = {}
@@ -259,7 +262,7 @@ def _curve(psf: Psf, half: int, acquisition: Acquisition, config: Config) -> F64
 
 
 def _view(
-    result: dict[str, Any], detector: Detector, observed: Star, maps: ErrorMaps, photons: F64
+    result: dict[str, Any], detector: PixelPositions, observed: Star, maps: ErrorMaps, photons: F64
 ) -> AstrometryView:
     """What the picture shows."""
     ny, nx = detector.shape

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.stages.astrometry.detector import Component
-from pixcal.stages.astrometry.modes import Modes
+from pixcal.stages.astrometry.modes import DegenerateModes
 
 F64 = NDArray[np.float64]
 
@@ -18,7 +18,7 @@ BAND = 16  # rows of a task
 
 
 def free_from_modes(
-    components: Sequence[Component], modes: Modes, runtime: Runtime
+    components: Sequence[Component], modes: DegenerateModes, runtime: Runtime
 ) -> tuple[list[Component], dict[str, dict[str, float]]]:
     """Fit the modes to truth minus maps, and remove them from the truth.
 
@@ -52,7 +52,7 @@ def free_from_modes(
 
 
 def _sums(
-    components: tuple[Component, ...], modes: Modes, y: tuple[int, int]
+    components: tuple[Component, ...], modes: DegenerateModes, y: tuple[int, int]
 ) -> list[tuple[F64, F64, int]]:
     """Normal equations of the modes in truth minus map over a band, for each component."""
     x = (0, modes.shape[1])

@@ -24,7 +24,7 @@ from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.model.options import Budget
-from pixcal.report.budget_figures import BudgetView, Line, budget_figure
+from pixcal.report.budget_figures import BudgetView, PrecisionLine, budget_figure
 from pixcal.report.drawing import png
 from pixcal.stages.budget.expected import (
     JoinedBound,
@@ -285,7 +285,7 @@ def _warnings(bench: Bench, bound: JoinedBound) -> list[str]:
 def _view(bench: Bench, bound: JoinedBound, result: dict[str, Any]) -> BudgetView:
     """What the figure shows."""
     lines = [
-        Line(
+        PrecisionLine(
             f"{name} ({facts['interfringe_px']:.3g} px)",
             facts["frame_px"]["median"],
             facts["frame_px"]["worst"],
@@ -295,7 +295,7 @@ def _view(bench: Bench, bound: JoinedBound, result: dict[str, Any]) -> BudgetVie
     ]
     total = sum(scan.count for scan in bench.frames.fringes)
     joint = [
-        Line(name, facts["frame_px"]["median"], facts["frame_px"]["worst"], total)
+        PrecisionLine(name, facts["frame_px"]["median"], facts["frame_px"]["worst"], total)
         for name, facts in result["joined"]["components"].items()
     ]
     return BudgetView(

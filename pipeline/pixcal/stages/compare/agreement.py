@@ -163,7 +163,7 @@ def part(fine: Grouping, coarse: Grouping, projection: Projection, pixels: int) 
 
 
 @dataclass(frozen=True)
-class Estimate:
+class VarianceEstimate:
     """A variance (px²) that may come out negative, its 1-sigma error, and both as an rms (px)."""
 
     variance: float
@@ -185,13 +185,13 @@ class Estimate:
         return math.sqrt(max(self.variance, 0.0) + UPPER * self.error)
 
 
-def common(p: Part) -> Estimate:
+def common(p: Part) -> VarianceEstimate:
     """Common signal of both maps, from their covariance."""
     error = np.sqrt((p.first * p.second + p.both**2) / p.freedom)
-    return Estimate(p.both / p.pixels, float(error) / p.pixels)
+    return VarianceEstimate(p.both / p.pixels, float(error) / p.pixels)
 
 
-def beyond_noise(p: Part, accuracy: float = SIGMA_ACCURACY) -> Estimate:
+def beyond_noise(p: Part, accuracy: float = SIGMA_ACCURACY) -> VarianceEstimate:
     """Excess of the difference over noise.
 
     Parameters
@@ -201,16 +201,18 @@ def beyond_noise(p: Part, accuracy: float = SIGMA_ACCURACY) -> Estimate:
     """
     chance = 2 / p.freedom * max(p.difference, p.expected) ** 2
     error = np.sqrt(chance + (2 * accuracy * p.expected) ** 2)
-    return Estimate((p.difference - p.expected) / p.pixels, float(error) / p.pixels)
+    return VarianceEstimate((p.difference - p.expected) / p.pixels, float(error) / p.pixels)
 
 
-def own(p: Part, accuracy: float = SIGMA_ACCURACY) -> tuple[Estimate, Estimate]:
+def own(p: Part, accuracy: float = SIGMA_ACCURACY) -> tuple[VarianceEstimate, VarianceEstimate]:
     """Signal of each map that is neither noise nor common."""
     estimates = []
     for square, noise in zip((p.first, p.second), p.noise, strict=True):
         chance = (square * p.difference + (square - p.both) ** 2) / p.freedom
         error = np.sqrt(chance + (2 * accuracy * noise) ** 2)
-        estimates.append(Estimate((square - p.both - noise) / p.pixels, float(error) / p.pixels))
+        estimates.append(
+            VarianceEstimate((square - p.both - noise) / p.pixels, float(error) / p.pixels)
+        )
     return estimates[0], estimates[1]
 
 
@@ -224,7 +226,7 @@ def significance(p: Part, accuracy: float = SIGMA_ACCURACY) -> float:
 
 
 @dataclass(frozen=True)
-class Line:
+class StructuralLine:
     """The second map against the first, errors in both."""
 
     # slope, error: None where there is nothing in common to draw a line through
@@ -237,14 +239,14 @@ class Line:
 SEEN = 5.0  # sigma at which a covariance is a signal that a line can be drawn through
 
 
-def straight_line(p: Part) -> Line:
+def straight_line(p: Part) -> StructuralLine:
     """Structural relation with known error variances (Fuller, Measurement Error Models, 1.3)."""
     root = np.sqrt(max(p.first * p.second, 1e-300))
     correlation = p.both / root
     scatter = (1 - correlation**2) / np.sqrt(max(p.freedom, 1.0))
     signal = common(p)
     if signal.variance < SEEN * signal.error or min(p.noise) <= 0:
-        return Line(None, None, float(correlation), float(scatter))
+        return StructuralLine(None, None, float(correlation), float(scatter))
     ratio = p.noise[1] / p.noise[0]
     lead = p.second - ratio * p.first
     slope = (lead + np.sqrt(lead**2 + 4 * ratio * p.both**2)) / (2 * p.both)
@@ -253,7 +255,7 @@ def straight_line(p: Part) -> Line:
     about = max(p.second - 2 * slope * p.both + slope**2 * p.first, 0.0) / p.freedom
     variance = (along * about + first * about - (slope * first) ** 2) / along**2 / p.freedom
     error = np.sqrt(max(variance, about / along / p.freedom))
-    return Line(float(slope), float(error), float(correlation), float(scatter))
+    return StructuralLine(float(slope), float(error), float(correlation), float(scatter))
 
 
 @dataclass(frozen=True)
@@ -287,8 +289,8 @@ def strongest_period(difference: F64, sigma: F64) -> Period | None:
 
 
 def three_cornered_hat(
-    pairs: Sequence[tuple[int, int]], excess: Sequence[Estimate]
-) -> list[Estimate]:
+    pairs: Sequence[tuple[int, int]], excess: Sequence[VarianceEstimate]
+) -> list[VarianceEstimate]:
     """Own errors of three or more maps, from the differences of all pairs.
 
     A difference's variance beyond noise is the sum of what its two maps hold (Gray and Allan 1974).
@@ -297,7 +299,7 @@ def three_cornered_hat(
     ----------
     pairs : sequence of (int, int)
         Numbers of the maps of each pair.
-    excess : sequence of Estimate
+    excess : sequence of VarianceEstimate
         From `beyond_noise`, of each pair.
     """
     design = np.zeros((len(pairs), 1 + max(map(max, pairs))))
@@ -307,4 +309,4 @@ def three_cornered_hat(
     inverse = np.linalg.inv(design.T @ (design * weight[:, None]))
     values = inverse @ (design.T @ (weight * np.array([e.variance for e in excess])))
     errors = np.sqrt(np.diag(inverse))
-    return [Estimate(float(v), float(e)) for v, e in zip(values, errors, strict=True)]
+    return [VarianceEstimate(float(v), float(e)) for v, e in zip(values, errors, strict=True)]

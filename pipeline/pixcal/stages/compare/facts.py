@@ -6,8 +6,8 @@ import numpy as np
 from scipy.stats import norm, poisson
 
 from pixcal.stages.compare.agreement import (
-    Estimate,
     Part,
+    VarianceEstimate,
     beyond_noise,
     common,
     own,
@@ -15,7 +15,7 @@ from pixcal.stages.compare.agreement import (
     straight_line,
     strongest_period,
 )
-from pixcal.stages.compare.pair import Pair, Pixels, Places, Sums
+from pixcal.stages.compare.pair import Pair, PairSums, Pixels, Places
 
 CLAIM = 1e-3  # chance of a false claim of a difference, of all that is looked at together
 # kinds of evidence: scales, columns, rows, means of blocks, scatter in blocks, single pixels
@@ -24,13 +24,13 @@ LISTED = 10  # most blocks, and most pixels, that are named
 
 
 def describe(
-    pair: Pair, sums: Sums, pixels: Pixels, places: Places, limit: float, accuracy: float
+    pair: Pair, sums: PairSums, pixels: Pixels, places: Places, limit: float, accuracy: float
 ) -> dict[str, Any]:
     """Results of one component.
 
     Parameters
     ----------
-    sums : Sums
+    sums : PairSums
         Without the outlying pixels.
     limit : float
         Sigma beyond which pixels were left out.
@@ -129,7 +129,7 @@ def _amounts(p: Part, accuracy: float) -> dict[str, Any]:
     }
 
 
-def estimate_facts(e: Estimate) -> dict[str, float]:
+def estimate_facts(e: VarianceEstimate) -> dict[str, float]:
     """A size with its error and upper limit, as rms and as variance."""
     return {
         "px": e.rms,
@@ -145,7 +145,7 @@ def _scale(side: int, p: Part, accuracy: float) -> dict[str, Any]:
     return {"side_px": side, "correlation": float(correlation), **_amounts(p, accuracy)}
 
 
-def _profile(sums: Sums, blocks: Any, accuracy: float) -> dict[str, Any]:
+def _profile(sums: PairSums, blocks: Any, accuracy: float) -> dict[str, Any]:
     """Means of the columns (or rows): how far they differ, and the strongest wave."""
     p = sums.of_means(blocks)
     mean, error = (np.ravel(values) for values in sums.differences(blocks))

@@ -131,7 +131,7 @@ def _values(pair: Pair, tile: Tile) -> tuple[F64, F64]:
 
 
 @dataclass(frozen=True)
-class Sums:
+class PairSums:
     """Sums of one pass over both sides."""
 
     fine: tuple[Grouping, ...]  # blocks of 1, 2, 4, ... pixels, up to the coarse ones
@@ -184,7 +184,7 @@ class Sums:
         return (second - first) / count, np.sqrt(blocks.noise.sum(axis=0)) / count
 
 
-def read_sums(pair: Pair, outlying: Outlying | None, runtime: Runtime) -> Sums:
+def read_sums(pair: Pair, outlying: Outlying | None, runtime: Runtime) -> PairSums:
     """Read both sides once.
 
     Parameters
@@ -214,7 +214,7 @@ def read_sums(pair: Pair, outlying: Outlying | None, runtime: Runtime) -> Sums:
             whole.values[:, *place] += piece.values
             whole.noise[:, *place] += piece.noise
             whole.count[place] += piece.count
-    return Sums(fine, coarse, columns, rows, pair.levels)
+    return PairSums(fine, coarse, columns, rows, pair.levels)
 
 
 def _empty(k: int, ny: int, nx: int) -> Blocks:
@@ -260,7 +260,7 @@ class Pixels:
         return float((high - low) / 2)
 
 
-def read_pixels(pair: Pair, sums: Sums, runtime: Runtime) -> Pixels:
+def read_pixels(pair: Pair, sums: PairSums, runtime: Runtime) -> Pixels:
     """Read both sides once more, with the modes known."""
     total = sums.total()
     reach = REACH * (max(total.first, total.second) / max(total.pixels, 1)) ** 0.5 or 1.0
@@ -320,7 +320,7 @@ class Places:
     count: F64
 
     @classmethod
-    def of(cls, pair: Pair, sums: Sums, pixels: Pixels) -> "Places":
+    def of(cls, pair: Pair, sums: PairSums, pixels: Pixels) -> "Places":
         """Put coarse blocks together."""
         blocks, squares, count = sums.coarse, pixels.squares, pixels.count
         for _ in range((pair.shown >> pair.coarse).bit_length() - 1):

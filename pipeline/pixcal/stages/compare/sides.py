@@ -35,7 +35,7 @@ PART_OF = 1e-3  # a set whose share in a direction is below this brings no modes
 
 
 @dataclass(frozen=True)
-class FittedSet:
+class ComparedSet:
     """One fringe set of a fitted run."""
 
     name: str
@@ -98,7 +98,7 @@ class Side:
     label: str
     run: Path
     key: str  # of its fit
-    sets: tuple[FittedSet, ...]
+    sets: tuple[ComparedSet, ...]
     window: tuple[int, int]  # (y, x), px
     chunk: tuple[int, int]  # of its maps on disk
     facts: dict[str, Any]  # what to say of it
@@ -118,7 +118,7 @@ class Side:
         """Whether it measures both components."""
         return axes_span_plane(self.axes)
 
-    def sets_along(self, direction: Vector) -> tuple[FittedSet, ...]:
+    def sets_along(self, direction: Vector) -> tuple[ComparedSet, ...]:
         """The sets whose modes contribute along a direction."""
         ones = np.ones((len(self.sets), 1))
         shares = self._shares(self.axes, ones, direction)
@@ -178,7 +178,7 @@ def whole_run(run: Path, label: str | None = None) -> Side:
     first = ArrayReader(group / next(iter(result["sets"])) / "delta")
     window = (first.shape[0], first.shape[1])
     sets = tuple(
-        FittedSet(name, group / name, fitted_shape(run, facts, acquisition, window))
+        ComparedSet(name, group / name, fitted_shape(run, facts, acquisition, window))
         for name, facts in result["sets"].items()
     )
     about_sets = {
@@ -202,7 +202,7 @@ def parts_of(run: Path, *, interleaved: bool) -> tuple[Side, Side]:
     """
     side = whole_run(run)
     labels = ("odd batches", "even batches") if interleaved else ("first half", "second half")
-    halves: list[list[FittedSet]] = [[], []]
+    halves: list[list[ComparedSet]] = [[], []]
     counts: list[dict[str, int]] = [{}, {}]
     for s in side.sets:
         count = ArrayReader(s.folder / "batch_count").read()

@@ -23,15 +23,15 @@ from pixcal.model.errors import InputError
 from pixcal.model.options import Compare
 from pixcal.report.compare_figures import ComponentView, PairView, compare_figure
 from pixcal.report.drawing import png
-from pixcal.stages.compare.agreement import Estimate, three_cornered_hat
+from pixcal.stages.compare.agreement import VarianceEstimate, three_cornered_hat
 from pixcal.stages.compare.facts import describe, estimate_facts
 from pixcal.stages.compare.pair import (
     DISAGREE,
     Outlying,
     Pair,
+    PairSums,
     Pixels,
     Places,
-    Sums,
     read_pixels,
     read_sums,
 )
@@ -215,7 +215,7 @@ def compare_pair(
 
 
 def _view(
-    pair: Pair, sums: Sums, pixels: Pixels, places: Places, facts: dict[str, Any]
+    pair: Pair, sums: PairSums, pixels: Pixels, places: Places, facts: dict[str, Any]
 ) -> ComponentView:
     profiles = [tuple(np.ravel(v) for v in sums.differences(b)) for b in (sums.columns, sums.rows)]
     return ComponentView(
@@ -240,7 +240,7 @@ def _summary(pairs: list[dict[str, Any]], components: dict[str, Vector]) -> dict
     summary: dict[str, Any] = {}
     for name in components:
         excess = [
-            Estimate(e["variance_px2"], e["variance_error_px2"])
+            VarianceEstimate(e["variance_px2"], e["variance_error_px2"])
             for e in (p["components"][name]["beyond_noise"] for p in pairs)
         ]
         summary[name] = {

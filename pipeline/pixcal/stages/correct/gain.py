@@ -55,7 +55,7 @@ class Maps:
 
 
 @dataclass
-class Sums:
+class SetSums:
     """Sums over pixels of one set."""
 
     count: int
@@ -73,10 +73,10 @@ class Sums:
 
 
 @dataclass(frozen=True)
-class TileSums:
-    """Sums of one tile: of its sets, and of pairs of them (as `Sums.halves`)."""
+class TileGain:
+    """Sums of one tile: of its sets, and of pairs of them (as `SetSums.halves`)."""
 
-    sets: list[Sums]
+    sets: list[SetSums]
     pairs: list[F64]
 
 
@@ -113,7 +113,7 @@ def _batches(folder: Path) -> int:
     return int(ArrayReader(folder / "batch_count").shape[0])
 
 
-def _tile(maps: Maps, at: tuple[int, int]) -> TileSums:
+def _tile(maps: Maps, at: tuple[int, int]) -> TileGain:
     y, x = maps.source.ranges(at)
     delta: dict[str, tuple[F64, F64]] = {}
     error: dict[str, tuple[F64, F64]] = {}
@@ -128,12 +128,12 @@ def _tile(maps: Maps, at: tuple[int, int]) -> TileSums:
         apart = [delta[a][n] - sign * delta[b][n] for n in (0, 1)]
         expected = [error[a][n] ** 2 + error[b][n] ** 2 for n in (0, 1)]
         pairs.append(_squares(apart, expected))
-    return TileSums(sets, pairs)
+    return TileGain(sets, pairs)
 
 
 def _of_set(
     maps: Maps, name: str, delta: tuple[F64, F64], part: tuple[tuple[int, int], tuple[int, int]]
-) -> Sums:
+) -> SetSums:
     before, after = delta
     good = np.isfinite(before) & np.isfinite(after)
     first = HALVES * maps.has_halves[name]
@@ -147,7 +147,7 @@ def _of_set(
     if maps.has_halves[name]:
         halves = _of_halves(maps, name, good, part)
     profiles = np.stack([np.where(good, values, 0.0) for values in (before, after, good)])
-    return Sums(
+    return SetSums(
         int(good.sum()),
         np.array([_square_and_most(m[good]) for m in moved]),
         profiles.sum(axis=2),
@@ -195,13 +195,13 @@ def _squares(apart: Sequence[F64], expected: Sequence[F64]) -> F64:
     )
 
 
-def _empty(ny: int, nx: int, effects: int) -> Sums:
-    return Sums(
+def _empty(ny: int, nx: int, effects: int) -> SetSums:
+    return SetSums(
         0, np.zeros((2 + effects, 2)), np.zeros((3, ny)), np.zeros((3, nx)), np.zeros((2, 3)), 0.0
     )
 
 
-def _add(total: Sums, tile: Sums, y: tuple[int, int], x: tuple[int, int]) -> None:
+def _add(total: SetSums, tile: SetSums, y: tuple[int, int], x: tuple[int, int]) -> None:
     total.count += tile.count
     total.moved[:, 0] += tile.moved[:, 0]
     total.moved[:, 1] = np.maximum(total.moved[:, 1], tile.moved[:, 1])
@@ -211,7 +211,7 @@ def _add(total: Sums, tile: Sums, y: tuple[int, int], x: tuple[int, int]) -> Non
     total.square += tile.square
 
 
-def _described(total: Sums) -> dict[str, Any]:
+def _described(total: SetSums) -> dict[str, Any]:
     pixels = max(total.count, 1)
     change = [
         {"rms_px": float(np.sqrt(square / pixels)), "max_px": float(most)}
@@ -228,7 +228,7 @@ def _described(total: Sums) -> dict[str, Any]:
     }
 
 
-def _patterns(profile: F64, total: Sums) -> dict[str, Any] | None:
+def _patterns(profile: F64, total: SetSums) -> dict[str, Any] | None:
     """Rms of what repeats every `PERIOD` rows (px), before and after, and of offsets that do not.
 
     None where the window is too small.

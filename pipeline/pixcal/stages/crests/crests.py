@@ -145,7 +145,7 @@ class Smooth:
 
 
 @dataclass(frozen=True)
-class Carrier:
+class CrestCarrier:
     """What a frame is demodulated with."""
 
     phase: Smooth  # rad
@@ -158,7 +158,7 @@ class Carrier:
 
 
 # (number of a frame, windows, carrier) -> sums (across, along, N_SUMS) of the whole frame
-Accumulate = Callable[[int, Windows, Carrier], F64]
+Accumulate = Callable[[int, Windows, CrestCarrier], F64]
 
 
 @dataclass(frozen=True)
@@ -237,7 +237,7 @@ def tile_sums(
     good: NDArray[np.bool_],
     start: tuple[int, int],
     windows: Windows,
-    carrier: Carrier,
+    carrier: CrestCarrier,
 ) -> tuple[tuple[int, int], F64]:
     """Sums of the windows that a tile touches.
 
@@ -292,10 +292,10 @@ def find_crests(
     InputError
         If there are too few fringes, or too few windows show them.
     """
-    carrier, windows = Carrier.straight(k, frame), Windows.lay(frame, k, segment)
+    carrier, windows = CrestCarrier.straight(k, frame), Windows.lay(frame, k, segment)
     for _ in range(SETTLING):
         phase, sigma, light = _window_phases(accumulate(0, windows, carrier), windows)
-        carrier = Carrier(
+        carrier = CrestCarrier(
             _follow(windows, phase, sigma, carrier.phase),
             _brightened(windows, light, sigma, carrier.light),
         )

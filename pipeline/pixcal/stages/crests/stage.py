@@ -42,7 +42,7 @@ from pixcal.stages.crests.crest_fit import (
 )
 from pixcal.stages.crests.crests import (
     SEED_PIXELS,
-    Carrier,
+    CrestCarrier,
     CrestPaths,
     Windows,
     find_crests,
@@ -223,7 +223,7 @@ class _SetFrames:
     runtime: Runtime
     name: str
 
-    def __call__(self, frame: int, windows: Windows, carrier: Carrier) -> F64:
+    def __call__(self, frame: int, windows: Windows, carrier: CrestCarrier) -> F64:
         task = partial(_row_task, self.source, self.frames[frame], windows, carrier)
         label = f"crests {self.name}"
         sums = np.zeros((*windows.shape, N_SUMS))
@@ -236,7 +236,7 @@ class _SetFrames:
 
 
 def _row_task(
-    source: ReducedSet, frame: int, windows: Windows, carrier: Carrier, row: int
+    source: ReducedSet, frame: int, windows: Windows, carrier: CrestCarrier, row: int
 ) -> tuple[NDArray[np.int64], F64]:
     """Numbers and sums of the windows that a row of tiles touches."""
     numbers, parts = [], []

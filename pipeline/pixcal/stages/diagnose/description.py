@@ -12,7 +12,7 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.bench import (
     SCHEMA,
     Bench,
-    Rung,
+    ExposureStep,
     SimulatedDetector,
     SimulatedFrames,
     SimulatedOptics,
@@ -73,7 +73,7 @@ def bench_of(
         frames=SimulatedFrames(
             exptime_s=exposure,
             period_s=max(period, exposure),
-            flats=(Rung(exposure, 1),),
+            flats=(ExposureStep(exposure, 1),),
             flat_rate_e_s=1.0,
             fringes=tuple(
                 SimulatedSet(

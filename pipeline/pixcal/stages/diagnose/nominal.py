@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.estimators.maps.corrected import corrected_offsets, phase_change, straight_modes
-from pixcal.estimators.maps.structure import Offsets, smooth_surface, true_offsets
+from pixcal.estimators.maps.structure import OffsetModel, smooth_surface, true_offsets
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
 from pixcal.model.acquisition import Acquisition
@@ -211,7 +211,7 @@ class FittedSet:
         )
 
     @cached_property
-    def offsets(self) -> Offsets:
+    def offsets(self) -> OffsetModel:
         """Offsets that can be true."""
         return true_offsets(self.delta, self.sigma, np.arctan2(*filled(self.theta, self.k)[1:]))
 
