@@ -15,7 +15,7 @@ from PIL import Image
 
 from pixcal.engine.run import Runtime
 from pixcal.kernels.optics import Geometry, phase
-from pixcal.model.acquisition import PixelPositions as Declared
+from pixcal.model.acquisition import Detector as Declared
 from pixcal.model.errors import InputError, PlanError
 from pixcal.report.drawing import png
 from pixcal.stages import astrometry
