@@ -1,5 +1,6 @@
 """The figure of a budget: precision against frames, and which change of the bench helps most."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,47 +29,61 @@ class PrecisionLine:
     planned: int  # frames of the bench
 
 
-@dataclass(frozen=True)
-class BudgetView:
-    """What the figure shows."""
+def budget_figure(result: Mapping[str, Any]) -> Figure:
+    """Precision against frames on the left, time with each change of the bench on the right.
 
-    name: str  # of the bench file
-    # sets, joined: of each set; of the components of all sets, against the frames of all
-    sets: tuple[PrecisionLine, ...]
-    joined: tuple[PrecisionLine, ...]
-    precision: float | None  # wanted, px
-    frames: int | None  # given, of each set
-    period_s: float  # from frame to frame
-    # name, variance of one frame (px²) and period (s) of each change
-    levers: tuple[tuple[str, float, float], ...]
-
-
-def budget_figure(view: BudgetView) -> Figure:
-    """Precision against frames on the left, time with each change of the bench on the right."""
+    Parameters
+    ----------
+    result : mapping
+        Contents of ``budget.json``.
+    """
     figure = new_figure(WIDE, 4.9)
     left, right = figure.subplots(1, 2, width_ratios=[1.25, 1])
-    _precision(left, view)
-    _levers(right, view)
+    _precision(left, result)
+    _levers(right, result)
     return figure
 
 
-def _span(view: BudgetView) -> F64:
+def _lines(entries: Mapping[str, Any]) -> list[PrecisionLine]:
+    lines = []
+    for name, facts in entries.items():
+        period = f" ({facts['interfringe_px']:.3g} px)" if "interfringe_px" in facts else ""
+        frame = facts["frame_px"]
+        planned = facts["planned"]["frames"]
+        lines.append(PrecisionLine(name + period, frame["median"], frame["worst"], planned))
+    return lines
+
+
+def _as_planned(result: Mapping[str, Any]) -> Mapping[str, Any]:
+    lever: Mapping[str, Any] = next(v for v in result["levers"] if v["name"] == "as planned")
+    return lever
+
+
+def _span(
+    sets: Sequence[PrecisionLine],
+    joined: Sequence[PrecisionLine],
+    precision: float | None,
+    frames: int | None,
+) -> F64:
     """Range of the frame axis, with a margin around all marks."""
-    marks = [float(line.planned) for line in (*view.sets, *view.joined)]
-    if view.frames:
-        marks.append(float(view.frames))
-    if view.precision:
-        marks += [(line.median / view.precision) ** 2 for line in (*view.sets, *view.joined)]
-        marks += [(line.worst / view.precision) ** 2 for line in view.sets]
+    marks = [float(line.planned) for line in (*sets, *joined)]
+    if frames:
+        marks.append(float(frames))
+    if precision:
+        marks += [(line.median / precision) ** 2 for line in (*sets, *joined)]
+        marks += [(line.worst / precision) ** 2 for line in sets]
     low, high = np.log10(max(min(marks) / 5, 1.0)), np.log10(max(marks) * 4)
     return np.logspace(low, high, 61)
 
 
-def _precision(axes: Axes, view: BudgetView) -> None:
-    frames = _span(view)
-    for order, (line, colour) in enumerate(zip(view.sets, _cycle(len(view.sets)), strict=True)):
+def _precision(axes: Axes, result: Mapping[str, Any]) -> None:
+    sets = _lines(result["sets"])
+    joined = _lines(result["joined"]["components"]) if len(sets) > 1 else []
+    wanted, given = result["precision_px"], result["frames"]
+    frames = _span(sets, joined, wanted, given)
+    for order, (line, colour) in enumerate(zip(sets, _cycle(len(sets)), strict=True)):
         # Sets are often alike: the later ones are thinner, so that none is hidden.
-        width = 2.0 + 3.0 * (len(view.sets) - 1 - order)
+        width = 2.0 + 3.0 * (len(sets) - 1 - order)
         axes.plot(
             frames, line.median / np.sqrt(frames), color=colour, linewidth=width, label=line.label
         )
@@ -77,25 +92,25 @@ def _precision(axes: Axes, view: BudgetView) -> None:
             axes.fill_between(frames, *ends, color=colour, alpha=0.18, linewidth=0)
         axes.plot(
             line.planned, line.median / np.sqrt(line.planned), "o", color=colour,
-            markersize=8 + 3 * (len(view.sets) - 1 - order),
+            markersize=8 + 3 * (len(sets) - 1 - order),
         )  # fmt: skip
-    for line, colour, style in zip(view.joined, (INK, GREY), ("-", "--"), strict=False):
+    for line, colour, style in zip(joined, (INK, GREY), ("-", "--"), strict=False):
         axes.plot(
             frames, line.median / np.sqrt(frames), color=colour, ls=style, linewidth=1.4,
             label=f"{line.label}, frames of all sets",
         )  # fmt: skip
-    if view.precision:
-        axes.axhline(view.precision, color=RED, linewidth=1.2)
+    if wanted:
+        axes.axhline(wanted, color=RED, linewidth=1.2)
         axes.annotate(
-            f"wanted {number(view.precision)} px", (frames[0], view.precision), xytext=(4, 4),
+            f"wanted {number(wanted)} px", (frames[0], wanted), xytext=(4, 4),
             textcoords="offset points", color=RED, fontsize=10,
         )  # fmt: skip
-        for line in (*view.sets, *view.joined):
-            axes.plot((line.median / view.precision) ** 2, view.precision, "s", color=RED)
-    if view.frames:
-        axes.axvline(view.frames, color=RED, linewidth=1.2)
+        for line in (*sets, *joined):
+            axes.plot((line.median / wanted) ** 2, wanted, "s", color=RED)
+    if given:
+        axes.axvline(given, color=RED, linewidth=1.2)
         axes.annotate(
-            f"{number(view.frames)} frames of each set", (view.frames, 0.02),
+            f"{number(given)} frames of each set", (given, 0.02),
             xycoords=("data", "axes fraction"), xytext=(-5, 0), textcoords="offset points",
             ha="right", color=RED, fontsize=10,
         )  # fmt: skip
@@ -104,10 +119,10 @@ def _precision(axes: Axes, view: BudgetView) -> None:
     axes.set_xlim(frames[0], frames[-1])
     axes.set(xlabel="frames", ylabel="1σ bound of a pixel's offset (px)")
     _plain(axes)
-    _clock(axes, view.period_s)
+    _clock(axes, _as_planned(result)["period_s"])
     finish(axes)
     axes.plot([], [], "o", color=GREY, label="planned")
-    if any(line.worst > 1.01 * line.median for line in view.sets):
+    if any(line.worst > 1.01 * line.median for line in sets):
         axes.fill_between([], [], [], color=GREY, alpha=0.25, label="median to worst pixel")
     axes.legend(fontsize=9, framealpha=0.9, loc="upper right")
 
@@ -144,11 +159,13 @@ def _clock(axes: Axes, period: float) -> None:
     top.xaxis.set_minor_locator(NullLocator())
 
 
-def _levers(axes: Axes, view: BudgetView) -> None:
+def _levers(axes: Axes, result: Mapping[str, Any]) -> None:
     """Time for the same precision, relative to the plan."""
-    planned = next(v * p for name, v, p in view.levers if name == "as planned")
-    names = [name for name, _, _ in view.levers][::-1]
-    share = np.array([v * p / planned for _, v, p in view.levers])[::-1]
+    plan = _as_planned(result)
+    planned = plan["variance"] * plan["period_s"]
+    levers = result["levers"][::-1]
+    names = [lever["name"] for lever in levers]
+    share = np.array([lever["variance"] * lever["period_s"] / planned for lever in levers])
     colours = [INK if name == "as planned" else RED if s > 1 else BLUE
                for name, s in zip(names, share, strict=True)]  # fmt: skip
     at = np.arange(len(names))
@@ -159,8 +176,8 @@ def _levers(axes: Axes, view: BudgetView) -> None:
             va="bottom", color=INK,
         )  # fmt: skip
         text = f"{100 * value:.3g} %"
-        if view.precision:
-            text += f"   {duration(value * planned / view.precision**2)}"
+        if result["precision_px"]:
+            text += f"   {duration(value * planned / result['precision_px'] ** 2)}"
         axes.annotate(
             text, (value, y), xytext=(4, 0), textcoords="offset points", va="center", fontsize=9
         )

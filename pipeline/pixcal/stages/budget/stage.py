@@ -24,7 +24,7 @@ from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.model.options import Budget
-from pixcal.report.budget_figures import BudgetView, PrecisionLine, budget_figure
+from pixcal.report.budget_figures import budget_figure
 from pixcal.report.drawing import png
 from pixcal.stages.budget.expected import (
     JoinedBound,
@@ -97,17 +97,17 @@ def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, 
         "bench": {"file": str(bench_file), "digest": digest(to_plain(bench))},
     } | result
     if out is not None:
-        _write(out, result, _view(bench, bound, result))
+        _write(out, result)
     return result
 
 
-def _write(out: Path, result: dict[str, Any], view: BudgetView) -> None:
+def _write(out: Path, result: dict[str, Any]) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
         raise InputError(f"--out {out}: a file is in the way; choose another directory") from error
     aside = out / ".budget.png.aside"
-    aside.write_bytes(png(budget_figure(view)))
+    aside.write_bytes(png(budget_figure(result)))
     aside.replace(out / "budget.png")
     write_json(out / "budget.json", result)
 
@@ -280,32 +280,3 @@ def _warnings(bench: Bench, bound: JoinedBound) -> list[str]:
                 f"{HONEST_FRINGES:g} leave true offsets and fringes mixed up"
             )
     return sentences
-
-
-def _view(bench: Bench, bound: JoinedBound, result: dict[str, Any]) -> BudgetView:
-    """What the figure shows."""
-    lines = [
-        PrecisionLine(
-            f"{name} ({facts['interfringe_px']:.3g} px)",
-            facts["frame_px"]["median"],
-            facts["frame_px"]["worst"],
-            facts["planned"]["frames"],
-        )
-        for name, facts in result["sets"].items()
-    ]
-    total = sum(scan.count for scan in bench.frames.fringes)
-    joint = [
-        PrecisionLine(name, facts["frame_px"]["median"], facts["frame_px"]["worst"], total)
-        for name, facts in result["joined"]["components"].items()
-    ]
-    return BudgetView(
-        name=Path(result["bench"]["file"]).name,
-        sets=tuple(lines),
-        joined=tuple(joint) if len(bound.sets) > 1 else (),
-        precision=result["precision_px"],
-        frames=result["frames"],
-        period_s=bench.frames.period_s,
-        levers=tuple(
-            (lever["name"], lever["variance"], lever["period_s"]) for lever in result["levers"]
-        ),
-    )
