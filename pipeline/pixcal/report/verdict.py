@@ -98,7 +98,7 @@ def cards(contents: Contents) -> Iterator[Card]:
             f"σ / Cramér–Rao bound, {fringes.name}",
             number(ratio, 4),
             "1 is the best that an unbiased estimator can reach",
-            _level(ratio, 1.1, 1.5),
+            _bound_level(ratio),
         )
         if fringes.allan is not None and fringes.allan.get("slope") is not None:
             yield _allan_card(fringes.name, fringes.allan)
@@ -191,7 +191,7 @@ def _of_set(fringes: SetContents) -> Iterator[Finding]:
     ratio = _ratio(facts.get("sigma_median_px"), facts.get("crb_median_px"))
     if ratio is not None:
         yield Finding(
-            _level(ratio, 1.1, 1.5),
+            _bound_level(ratio),
             f"{name}: the errors are {number(ratio, 4)} times the Cramér–Rao bound of its "
             f"{number(facts.get('frames'))} frames.",
         )
@@ -289,6 +289,11 @@ def _of_target(fringes: SetContents) -> Iterator[Finding]:
 
 def _ratio(above: float | None, below: float | None) -> float | None:
     return above / below if above is not None and below else None
+
+
+def _bound_level(ratio: float | None) -> str:
+    """Severity of errors over their bound; below it the declared noise is too large."""
+    return CHECK if ratio is not None and ratio < 0.98 else _level(ratio, 1.1, 1.5)
 
 
 def _level(value: float | None, good: float, look: float) -> str:
