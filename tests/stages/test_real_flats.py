@@ -9,6 +9,7 @@ import pytest
 from numpy_detectors import Detector, reduced
 
 from pixcal.effects.gain_error import GainError
+from pixcal.effects.lag import Lag
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.estimators.detector.flat_ladder import ladder as ladder_of
 from pixcal.estimators.diagnosis.test_statistics import DETECTOR, measure
@@ -90,6 +91,25 @@ def test_exposures_that_all_last_longer_are_no_response(tmp_path: Path) -> None:
     found = Nonlinearity.estimate(evidence)
     assert found is not None
     assert found.significance < 3
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01])
+def test_pairs_of_flats_tell_of_charge_that_stays_behind(share: float, tmp_path: Path) -> None:
+    flats = ladder(list(zip(LEVELS, 1 + 0.001 * np.arange(12), strict=True)))
+    evidence, _ = reduced(Detector(**CAMERA, flats=flats), 15, tmp_path)
+    rng, stacks = np.random.default_rng(3), []
+    for stack in evidence.stacks:
+        adu = stack.adu - evidence.bias
+        if stack.kind == "flat":
+            adu *= 1 + 0.001 * rng.standard_normal((2, 1, 1))
+            adu[0] *= 1 - share
+        stacks.append(replace(stack, adu=(adu + evidence.bias).astype(np.float32)))
+    found = Lag.estimate(replace(evidence, stacks=tuple(stacks)))
+    assert found is not None
+    assert isinstance(found.effect, Lag)
+    assert found.effect.share == pytest.approx(share, abs=4 * found.errors["share"])
+    assert found.errors["share"] < 0.001
+    assert (found.significance > 5) == (share > 0)
 
 
 def test_noise_that_is_cut_off_at_code_zero_is_told_of(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from pixcal.estimators.detector.flat_ladder import flicker
 from pixcal.estimators.detector.levels_of_lag import BANDS, in_bands, shares_by_level
 from pixcal.estimators.detector.noiseless_charge import missing_noise
 from pixcal.estimators.diagnosis.distortions import Freedom
@@ -39,7 +40,8 @@ CONTROLS = 8
 _MAX_DECAY = 3.0
 _CLIP = 5.0
 _MIN_FRAMES = 20
-_MIN_FLATS = 8
+_SERIES = 8
+_STEADIEST = 1e-4
 _ROUNDS = 2
 _CLEAR = 4.0
 _NOT_EXPONENTIAL, _NOT_EVEN = 40.0, 25.0
@@ -461,20 +463,14 @@ def _mean(values: list[tuple[float, float]]) -> tuple[float, float]:
 
 
 def _of_flats(evidence: Evidence) -> Estimate | None:
-    """Deficit of the first frame of each flat, over the level.
+    """The first frame of each flat against the rest, over the level.
 
     Any offset of first frames is taken from stacks without light.
     """
-    levels, steps, errors = [], [], []
-    for stack in evidence.stacks:
-        found = _first_frame(stack, evidence)
-        if found is not None:
-            levels.append(found[0])
-            steps.append(found[1])
-            errors.append(found[2])
-    level, step, error = np.array(levels), np.array(steps), np.array(errors)
-    if len(level) < 2 or np.ptp(level) < 10 * error.min():
+    found = np.array([f for s in evidence.stacks if (f := _first_frame(s, evidence)) is not None])
+    if len(found) < 2 or np.ptp(found[:, 0]) < 10 * found[:, 2].min():
         return None
+    level, step, error = found.T
     design = np.stack([-level, np.ones_like(level)]) / error
     covariance = np.linalg.inv(design @ design.T)
     share = float((covariance @ (design @ (step / error)))[0])
@@ -483,18 +479,24 @@ def _of_flats(evidence: Evidence) -> Estimate | None:
         Lag(float(np.clip(share, 0, 0.5)), 0.0, 0.0),
         {"share": share_error},
         share / share_error,
-        "the first flat after darkness is fainter",
+        "the first flat of a level is fainter; after another flat, rather than darkness, the share "
+        "is a lower limit",
         {"share": share},
     )
 
 
 def _first_frame(stack: Stack, evidence: Evidence) -> tuple[float, float, float] | None:
     """Level of a stack, how much its first frame differs from the others, and the error; e-."""
-    if len(stack.adu) < _MIN_FLATS:
+    count = len(stack.adu)
+    if count < (2 if stack.kind == "flat" else _SERIES):
         return None
     light = (stack.adu - evidence.bias)[:, evidence.good] * evidence.gain
     means = light.mean(axis=1)
     rest = means[1:]
+    level = float(rest.mean())
     # What the lamp did from frame to frame is measured by the frames themselves.
-    error = rest.std(ddof=2) * np.sqrt(1 + 1 / len(rest))
-    return float(rest.mean()), float(means[0] - rest.mean()), float(error)
+    if count < _SERIES:
+        scatter = level * max(flicker(evidence), _STEADIEST)
+    else:
+        scatter = float(rest.std(ddof=2))
+    return level, float(means[0] - level), scatter * float(np.sqrt(1 + 1 / len(rest)))
