@@ -50,11 +50,19 @@ def test_brighter_fatter_takes_noise_in_proportion_to_the_level(
 
 
 def test_a_gain_lies_between_what_was_declared_and_measured() -> None:
-    gain = MeasuredGain(np.ones((3, 5)), ((1.06, 0.01), (1.06, 0.01)))
+    gain = MeasuredGain(np.ones((3, 5)), ((1.03, 0.01), (1.03, 0.01)))
     rng = np.random.default_rng(5)
     drawn = np.array([gain.drawn(rng)[0, 0] for _ in range(2000)])
-    # Two of three equally good values say 1.06.
-    assert drawn.mean() == pytest.approx(1.04, abs=1e-3)
+    # Two of three equally good values say 1.03.
+    assert drawn.mean() == pytest.approx(1.02, abs=1e-3)
     assert drawn.std() == pytest.approx(0.01 / np.sqrt(3), rel=0.1)
-    corrected = np.array([gain.drawn(rng, 1 / 1.06)[0, 0] for _ in range(2000)])
+    corrected = np.array([gain.drawn(rng, 1 / 1.03)[0, 0] for _ in range(2000)])
     assert corrected.mean() == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_declared_gain_that_flats_contradict_does_not_count() -> None:
+    gain = MeasuredGain(np.ones((3, 5)), ((1.2, 0.01), (1.2, 0.01)))
+    rng = np.random.default_rng(6)
+    drawn = np.array([gain.drawn(rng)[0, 0] for _ in range(2000)])
+    assert drawn.mean() == pytest.approx(1.2, abs=1e-3)
+    assert drawn.std() == pytest.approx(0.01 / np.sqrt(2), rel=0.1)

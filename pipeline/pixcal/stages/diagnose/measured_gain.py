@@ -17,6 +17,8 @@ F64 = NDArray[np.float64]
 
 DECLARED_ERROR = 0.01
 """Relative error that a declared gain may well have."""
+DISAGREE = 3.0
+"""Errors between a declared gain and that of the flats beyond which only the latter counts."""
 FRAMES = 8
 """Flats that are simulated with and without effects, from the same random numbers."""
 LIT = 4.0
@@ -55,6 +57,10 @@ class MeasuredGain:
         """
         values = np.array([1.0, *(value * change for value, _ in self.transfer)])
         weights = np.array([DECLARED_ERROR, *(error for _, error in self.transfer)]) ** -2.0
+        if self.transfer:
+            measured, error = np.average(values[1:], weights=weights[1:]), weights[1:].sum() ** -0.5
+            if abs(measured - 1) > DISAGREE * np.hypot(DECLARED_ERROR, error):
+                values, weights = values[1:], weights[1:]
         common = np.average(values, weights=weights) + weights.sum() ** -0.5 * rng.standard_normal()
         return np.asarray(max(common, 0.1) * self.amplifiers, np.float32)
 
