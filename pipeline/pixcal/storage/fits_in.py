@@ -10,6 +10,7 @@ import math
 import sys
 import zlib
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -65,18 +66,18 @@ class Coding:
     bzero: float = 0.0
     blank: int | None = None
 
-    @property
+    @cached_property
     def exact(self) -> bool:
         """Whether the values are a native type, at most with the sign bit turned."""
         plain = self.bscale == 1 and self.blank is None
         return plain and (self.bitpix, self.bzero) in _EXACT
 
-    @property
+    @cached_property
     def stored(self) -> np.dtype[Any]:
         """Type of the stored samples, in native byte order."""
         return np.dtype(_STORED[self.bitpix])
 
-    @property
+    @cached_property
     def dtype(self) -> np.dtype[Any]:
         """Type of the values: float32 where they are scaled or may be missing (NaN)."""
         return np.dtype(_EXACT[self.bitpix, int(self.bzero)] if self.exact else "f4")

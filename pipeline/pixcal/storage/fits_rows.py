@@ -63,18 +63,17 @@ def read_rows(
     """
     _, ny, nx = file.shape
     coding, within = file.coding, bands(rows)
-    stored = np.empty((min(BAND, rows[1] - rows[0]), nx), coding.stored)
+    stored = coding.stored
     found = np.empty((len(planes), len(within), 2))
+    scratch = np.empty((min(BAND, rows[1] - rows[0]), nx), stored)
     direct = out is not None and coding.exact and out.dtype == coding.dtype
     with file.source.open() as handle:
         for (n, plane), (b, (y0, y1)) in product(enumerate(planes), enumerate(within)):
             target = None if out is None else out[n, y0 - rows[0] : y1 - rows[0]]
-            raw = stored[: y1 - y0]
-            if direct and target is not None:
-                raw = target.view(coding.stored)
-            start = file.offset + (plane * ny + y0) * nx * coding.stored.itemsize
+            raw = target.view(stored) if direct and target is not None else scratch[: y1 - y0]
+            start = file.offset + (plane * ny + y0) * nx * stored.itemsize
             _read_exactly(handle, start, raw, file.source.path)
-            found[n, b, 0] = google_crc32c.value(raw.tobytes())
+            found[n, b, 0] = google_crc32c.value(raw)
             values = _values(raw, coding)
             found[n, b, 1] = np.fmax.reduce(values, axis=None)
             if target is not None and not direct:

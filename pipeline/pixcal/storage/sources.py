@@ -37,7 +37,7 @@ class SourceFile:
             If it is gone, cannot be read, or was changed.
         """
         try:
-            handle = self.path.open("rb", buffering=0)
+            handle = io.FileIO(self.path)
         except OSError as error:
             raise unreadable(self.path, error) from error
         try:
