@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip --quiet install --no-compile
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: study-diagnose help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-full fuzz torture effect-pictures reproduce reproduce-full blind blind-second blind-full clean
+.PHONY: study-diagnose help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-full cluster fuzz torture effect-pictures reproduce reproduce-full blind blind-second blind-full clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 17
@@ -74,6 +74,9 @@ bench: $(INSTALLED) ## speed against a bare scan, and beside other methods (6 mi
 
 bench-full: $(INSTALLED) ## the same for 46 Mpix: time and memory (20 minutes, 60 GB of disk)
 	$(BIN)/python benchmarks/throughput.py --full
+
+cluster: $(TOOLS) ## ingest to maps on hosts of a network of which one vanishes (a minute)
+	$(BIN)/python benchmarks/cluster.py
 
 fuzz: $(INSTALLED) ## bad input in thousands of cases, for docs/appendix/fuzz.md (under ten minutes on two cores)
 	$(BIN)/python benchmarks/fuzz.py --write
