@@ -44,8 +44,8 @@ demo: $(INSTALLED) ## calibrate the sample acquisition into demo/
 test: $(TOOLS) ## run the tests
 	$(BIN)/pytest -n 3 --dist loadfile -m "not long" --durations=15
 
-test-long: $(TOOLS) ## run the tests that take longest (minutes)
-	$(BIN)/pytest -n 2 -m long
+test-long: $(TOOLS) ## run the tests that take longest: commands of the pages, faults, whole diagnoses (minutes)
+	$(BIN)/pytest -n 2 --dist loadfile -m long --durations=15
 
 lint: $(TOOLS) ## check style and types
 	$(BIN)/ruff check .

@@ -167,6 +167,7 @@ def run_block(block: Block, folder: Path, shell: Shell) -> None:
         shell("python block.py", folder)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("page", PAGES_TO_RUN, ids=lambda page: page.name)
 def test_the_blocks_of_a_page_run_one_after_the_other(
     page: Path, workspace: Path, shell: Shell, request: pytest.FixtureRequest
@@ -179,6 +180,7 @@ def test_the_blocks_of_a_page_run_one_after_the_other(
         run_block(block, workspace, shell)
 
 
+@pytest.mark.long
 def test_the_readme_shows_what_the_demo_prints(demo: tuple[Path, str]) -> None:
     """All words and lines; numbers may differ in their last digits from machine to machine."""
 

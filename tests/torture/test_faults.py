@@ -9,6 +9,8 @@ import pytest
 from faults import clocks, damage, full_disk, inputs, kills, places, processes, workers
 from faults.bench import STAGES, Bench
 
+pytestmark = pytest.mark.long
+
 SEED = 7
 ARTEFACTS = ("ingest", "reduce", "sweep", "fit")
 
@@ -84,7 +86,6 @@ def test_odd_paths(bench: Bench) -> None:
     assert places.hard_names(bench, ["Übung, 夜 -'*?\n $HOME"]).tried == 1
 
 
-@pytest.mark.long
 def test_a_worker_that_dies(bench: Bench) -> None:
     with workers.cluster() as address:
         assert workers.killed(bench, address, "ingest", 1, SEED).tried == 1
