@@ -269,7 +269,7 @@ def test_a_method_in_a_process_of_its_own(
     assert np.load(phase).shape == bench.shape
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scenario_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     methods = ("advanced iterative", "alternating, A and B constant")
     monkeypatch.setattr(comparison, "METHODS", {m: measure.METHODS[m] for m in methods})

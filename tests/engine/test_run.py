@@ -171,7 +171,7 @@ def test_an_address_that_is_none(address: str) -> None:
         run_tasks(POWER, [1], Runtime(address), label="test")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scheduler_that_does_not_answer() -> None:
     # In a process of its own: clusters of other tests leave their event loops behind.
     code = (

@@ -89,7 +89,10 @@ def expected(chain: Chain) -> Path:
     return chain(Runtime("sync"))
 
 
-@pytest.mark.parametrize("place", ["threads", "processes", "cluster"])
+@pytest.mark.parametrize(
+    "place",
+    ["threads", *(pytest.param(p, marks=pytest.mark.long) for p in ("processes", "cluster"))],
+)
 def test_the_same_bits_wherever_it_runs(
     chain: Chain, expected: Path, place: str, request: Any
 ) -> None:
@@ -158,6 +161,7 @@ def wait_for_tiles(run: Path, number: int) -> None:
         time.sleep(0.002)
 
 
+@pytest.mark.long
 def test_a_killed_worker_costs_its_tiles_and_no_others(
     cluster: Any, reduced: Path, fitted: Path
 ) -> None:
@@ -184,6 +188,7 @@ def test_a_killed_worker_costs_its_tiles_and_no_others(
     assert_same(fitted / "products", run / "products")
 
 
+@pytest.mark.long
 def test_a_lost_scheduler_ends_in_one_line_and_the_fit_is_resumed(
     another_cluster: Any, reduced: Path, fitted: Path
 ) -> None:

@@ -635,7 +635,7 @@ print(int(status["VmHWM"].split()[0]) * 1024, plans[0].total)
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_memory_stays_within_the_plan(tmp_path: Path) -> None:
     camera = Camera(14, (256, 256))
     times = [round(0.01 * n, 2) for n in range(1, 13)]
@@ -703,7 +703,7 @@ def test_real_frames_give_the_gain_and_noise_of_their_camera(tmp_path: Path) -> 
     assert 104 * 1040 < found["flags"]["dead"] < 1.2 * 104 * 1040
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_numbers_of_the_real_camera_are_those_of_its_own_package() -> None:
     msfc_ccd = pytest.importorskip("msfc_ccd")
     named_arrays = pytest.importorskip("named_arrays")

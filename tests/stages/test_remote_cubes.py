@@ -83,7 +83,7 @@ def cluster() -> Iterator[Runtime]:
         yield Runtime(made.scheduler_address)
 
 
-@pytest.fixture(params=["threads", pytest.param("processes", marks=pytest.mark.slow), "cluster"])
+@pytest.fixture(params=["threads", pytest.param("processes", marks=pytest.mark.long), "cluster"])
 def runtime(request: pytest.FixtureRequest) -> Runtime:
     if request.param == "cluster":
         found: Runtime = request.getfixturevalue("cluster")

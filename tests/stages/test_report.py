@@ -324,7 +324,7 @@ def test_it_is_skipped_until_an_input_changes(whole: Path) -> None:
     assert set(manifest.inputs) == {"ingest", "reduce", "sweep", "fit", "allan", "diagnose"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_same_inputs_give_the_same_page_whatever_the_workers(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", (41, 53), ("one",))
     first = page_of(run)
@@ -468,7 +468,7 @@ def browse(page: Path, folder: Path) -> tuple[Any, list[str]]:
     return np.asarray(Image.open(shot).convert("RGB")).astype(int), urls
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
 def test_a_browser_shows_it_and_asks_for_nothing(whole: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.html"
