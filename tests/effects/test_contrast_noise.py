@@ -106,12 +106,3 @@ def test_what_looks_like_it_is_not_taken_for_it(acquired: Acquired, alike: dict[
     found = ContrastNoise.estimate(acquired(None, alike))
     assert found is not None
     assert found.significance < 4
-
-
-def test_the_skewness_tells_a_vibration_from_what_goes_either_way(acquired: Acquired) -> None:
-    one_sided = ContrastNoise.estimate(acquired(None, contrast(vibration_rad=0.2)))
-    either = ContrastNoise.estimate(acquired(None, contrast(polarisation=0.01, polarisation_s=0.0)))
-    assert one_sided is not None
-    assert either is not None
-    assert one_sided.details["skewness"] < -0.7
-    assert abs(either.details["skewness"]) < 0.5

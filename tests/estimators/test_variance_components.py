@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from pixcal.estimators.frame_series.damping import best_damping
+from pixcal.estimators.frame_series.profiled import best_shape
 from pixcal.estimators.frame_series.variance_components import (
     Components,
     Modes,
@@ -159,12 +159,16 @@ def test_a_time_constant_is_found() -> None:
     for _ in range(6):
         series = rng.standard_normal(600) + 2 * damped_walk(rng.standard_normal(600), np.exp(-0.1))
 
-        def fit(keep: float, start: Components | None, series: np.ndarray = series) -> Components:
-            power = damped_power(600, keep)
-            return estimate_components(modes_of(series, np.ones(599), power), start=start)
+        def fit(
+            value: float, start: Components | None, steps: int = 60, series: np.ndarray = series
+        ) -> Components:
+            power = damped_power(600, float(np.exp(-1 / value)))
+            modes = modes_of(series, np.ones(599), power)
+            return estimate_components(modes, start=start, steps=steps)
 
-        found = best_damping(fit, 1, 1200.0)
-        assert found.growth > 10
-        pulls.append(np.log(found.time / 10) / found.log_time_error)
-        assert abs(found.rms - 2) < 4 * found.rms_error < 2.0
+        profile = best_shape(fit, np.geomspace(0.3, 1200.0, 9), steady=False)
+        rms, error = profile.found.root(1)
+        owed = profile.slope([side.root(1)[0] for side in profile.sides])
+        pulls.append((profile.value - 10) / profile.error)
+        assert abs(rms - 2) < 4 * np.hypot(error, owed) < 2.0
     assert np.max(np.abs(pulls)) < 3.5

@@ -1,29 +1,18 @@
 """Fringes that wash out, a little, differently in every frame."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Self, cast
+from typing import Self
 
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.damping import Damping, best_damping
-from pixcal.estimators.frame_series.light import OFFSETS, FrameLight, light_courses, light_of
-from pixcal.estimators.frame_series.variance_components import (
-    Components,
-    joint_log_chance,
-    log_chance,
-    sigmas,
-)
+from pixcal.estimators.frame_series.light import light_courses
 from pixcal.kernels.processes import damped_walk
 from pixcal.kernels.scene import FrameStates
-from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.config import quantity
-from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.track import Track, at
-
-POWERS = ("power", "power_walk", *OFFSETS)
-PARTS = ("contrast", "contrast_walk", *POWERS)
 
 
 @dataclass(frozen=True)
@@ -96,74 +85,3 @@ class ContrastNoise(Effect):
         courses = light_courses(evidence)
         tracks = tuple(Track.of(name, time, change) for name, time, _, change in courses)
         return replace(self, vibration_rad=0.0, polarisation=0.0, tracks=tracks)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Scatter of A/B over all frames, beyond the noise: its white part and its slow one.
-
-        What an offset of B makes of it is told by B itself and by frames without light. The noise
-        is measured, from two halves of the pixels (`FringeEvidence.halves`).
-        """
-        light = light_of(evidence)
-        if light is None:
-            return None
-        there = light.components(PARTS)
-        none = light.components(PARTS, absent=PARTS[:2])
-        damping = _damping(light)
-        slow = sigmas(log_chance(damping.growth))
-        values, errors = _shaken(light, damping.components if slow > SIGNIFICANT else None)
-        if slow > SIGNIFICANT:
-            drift = _drifting(damping, float(np.mean([s.step_s for s in light.sets])))
-            values, errors = values | drift[0], errors | drift[1]
-        return Estimate(
-            cls(**cast("Any", {"polarisation": 0.0} | values)),
-            errors,
-            sigmas(joint_log_chance(there, none, there.size[:2])),
-            "scatter of the fringe amplitude relative to the intensity, correlated between two "
-            "halves of the pixels",
-            {"slow_sigmas": slow, "skewness": _skewness(light, values["vibration_rad"])},
-        )
-
-
-def _damping(light: FrameLight) -> Damping:
-    parts = ("contrast", "contrast_damped", *POWERS)
-
-    def fit(keep: float, start: Components | None) -> Components:
-        return light.components(parts, keep, start=start)
-
-    return best_damping(fit, 1, 2.0 * max(map(len, light.sets)))
-
-
-def _shaken(
-    light: FrameLight, found: Components | None
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Vibration within the exposures, from the variance of log A/B that is white.
-
-    The logarithm is exponentially distributed: its rms is half the phase's square, and its variance
-    scatters as its fourth moment says, four times as much as a normal one's.
-    """
-    found = light.components(("contrast", *POWERS)) if found is None else found
-    rms, own = found.root(0)
-    error = np.hypot(own, rms * np.sqrt(1.5 / sum(map(len, light.sets))))
-    size, above = float(np.sqrt(2 * rms)), float(np.sqrt(2 * (rms + error)))
-    return {"vibration_rad": min(size, 2.0)}, {"vibration_rad": above - size}
-
-
-def _drifting(damping: Damping, step: float) -> tuple[dict[str, float], dict[str, float]]:
-    """Slow change: its size and its time."""
-    time = damping.time * step
-    return (
-        {"polarisation": min(damping.rms, 0.5), "polarisation_s": time},
-        {"polarisation": damping.rms_error, "polarisation_s": time * damping.log_time_error},
-    )
-
-
-def _skewness(light: FrameLight, vibration_rad: float) -> float:
-    """Skewness of log A/B without the noise: well below 0 of vibrations, 0 of what goes either way.
-
-    That of one frame is -2; to be cleaned of what follows the phase mixes some frames.
-    """
-    if not vibration_rad:
-        return 0.0
-    scatter = np.concatenate([series.values[:, 1] for series in light.sets])
-    return float((scatter**3).mean() / (vibration_rad**2 / 2) ** 3)

@@ -1,47 +1,22 @@
 """A bench that warms and creeps: a fringe vector that changes in the course of a run."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize_scalar
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.fringe_motion import (
-    Motion,
-    motion_of,
-    ramps,
-    ramps_and_colour,
-    slow_vectors,
-)
-from pixcal.estimators.frame_series.series import FrameSeries
-from pixcal.estimators.frame_series.variance_components import (
-    MAX_STEPS,
-    Components,
-    joint_log_chance,
-    log_chance,
-    log_chance_of_any,
-    sigmas,
-)
+from pixcal.estimators.frame_series.fringe_motion import slow_vectors
 from pixcal.kernels.scene import FrameStates
-from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.config import quantity
-from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.track import Track, at
 
 F64 = NDArray[np.float64]
 
 HOUR_S = 3600.0
-SETTLINGS = 10
-"""Time constants tried at first, from `QUICKEST` frames to the length of the run."""
-QUICKEST = 3.0
-PARTS = ("jitter_x", "jitter_y", "walk_x", "walk_y")
-
-
 TRACKS = ("along_x", "along_y")
 
 
@@ -131,113 +106,3 @@ class FringeDrift(Effect):
             for axis in (0, 1)
         )
         return replace(self.scaled(0.0), along_x=x, along_y=y)
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Ramp, settling and walk of the frames' own vectors.
-
-        Where sets have fringes of different directions, a change of wavelength is told apart and
-        does not count here; with one direction it cannot be.
-        """
-        motion = motion_of(evidence)
-        if motion is None:
-            return None
-        parts = [*PARTS, "walk_k"] if motion.crossed else list(PARTS)
-        slow = motion.components(parts)
-        steady = motion.components(parts, absent=PARTS[2:])
-        walks = joint_log_chance(slow, steady, slow.size[2:4])
-        values, errors, ramped = _slow_parameters(motion, parts)
-        return Estimate(
-            replace(cls().scaled(0.0), **values),
-            errors,
-            sigmas(log_chance_of_any([walks, ramped])),
-            "slow change of the fringe vector beyond its white noise"
-            + (
-                "" if motion.crossed else "; along the fringe axis, wavelength drift looks the same"
-            ),
-            {
-                "walk_sigmas": sigmas(walks),
-                "ramp_sigmas": sigmas(ramped),
-            },
-        )
-
-
-def _slow_parameters(
-    motion: Motion, parts: Sequence[str]
-) -> tuple[dict[str, Any], dict[str, float], float]:
-    """Ramp, walk and, where it is sure, settling: values and errors by field.
-
-    And the logarithm of the chance of such a ramp where there is none.
-    """
-    plain = motion.components(parts, partial(_shapes, motion.crossed, None))
-    ramp = plain.beta[:2]
-    ramped = log_chance(float(ramp @ np.linalg.pinv(plain.beta_covariance[:2, :2]) @ ramp) / 2)
-    tau, found = _settling(motion, parts, plain)
-    error = np.sqrt(np.diag(found.shape_covariance(range(2, len(parts)))))
-    walk, walk_error = np.array([found.root(2), found.root(3)]).T
-    values: dict[str, Any] = {
-        "ramp": _pair(found.beta[:2] * HOUR_S),
-        "walk": _pair(walk * np.sqrt(HOUR_S)),
-    }
-    spread = {"ramp": error[:2] * HOUR_S, "walk": walk_error * np.sqrt(HOUR_S)}
-    errors: dict[str, float] = {}
-    if tau is not None:
-        at = 3 if motion.crossed else 2
-        values |= {"settle": _pair(found.beta[at : at + 2]), "settle_s": tau}
-        spread |= {"settle": error[at : at + 2]}
-        errors["settle_s"] = float(error[at + 2])
-    for name, pair in spread.items():
-        errors |= {f"{name}[{i}]": float(pair[i]) for i in range(2)}
-    return values, errors, ramped
-
-
-def _settling(
-    motion: Motion, parts: Sequence[str], plain: Components
-) -> tuple[float | None, Components]:
-    """Time constant of a settling and the fit with it; without one, None and the plain fit."""
-    length = max(float(np.ptp(s.time_s)) for s in motion.series)
-    step = min(s.step_s for s in motion.series)
-
-    def fitted(tau: float, steps: int) -> Components:
-        known = partial(_shapes, motion.crossed, (tau, None))
-        return motion.components(parts, known, start=plain, steps=steps)
-
-    trials = np.geomspace(QUICKEST * step, length, SETTLINGS)
-    tau = float(max(trials, key=lambda t: fitted(t, 0).profile))
-    if sigmas(log_chance(fitted(tau, MAX_STEPS).profile - plain.profile, 2)) < SIGNIFICANT - 1:
-        return None, plain
-    reach = trials[1] / trials[0]
-    found = minimize_scalar(
-        lambda t: -fitted(np.exp(t), MAX_STEPS).profile,
-        bounds=(np.log(tau / reach), np.log(tau * reach)),
-        method="bounded",
-        options={"xatol": 0.01},
-    )
-    tau = float(np.exp(found.x))
-    best = fitted(tau, MAX_STEPS)
-    if sigmas(log_chance(best.profile - plain.profile, 2)) < SIGNIFICANT:
-        return None, plain
-    at = 3 if motion.crossed else 2
-    size = (float(best.beta[at]), float(best.beta[at + 1]))
-    # Once more with the slope along the time constant: its error, and its share in the others'.
-    known = partial(_shapes, motion.crossed, (tau, size))
-    return tau, motion.components(parts, known, start=best)
-
-
-def _shapes(
-    crossed: bool, settling: tuple[float, tuple[float, float] | None] | None, series: FrameSeries
-) -> F64:
-    """Known shapes of a series: ramps, change of colour, decay along x and y, its slope in tau."""
-    shapes = [ramps_and_colour(series) if crossed else ramps(series)]
-    if settling is not None:
-        tau, size = settling
-        fade = np.exp(-series.time_s / tau)
-        shapes.append(fade[:, None, None] * np.eye(2))
-        if size is not None:
-            slope = fade * series.time_s / tau**2
-            shapes.append(slope[:, None, None] * np.array(size)[:, None])
-    return np.concatenate(shapes, axis=2)
-
-
-def _pair(values: F64) -> tuple[float, float]:
-    return float(values[0]), float(values[1])

@@ -1,22 +1,13 @@
 """Fibres that shake: a fringe vector of its own in every frame."""
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.fringe_motion import motion_of, ramps
-from pixcal.estimators.frame_series.spectral_line import Line
-from pixcal.estimators.frame_series.variance_components import (
-    joint_log_chance,
-    log_chance_of_any,
-    sigmas,
-)
 from pixcal.kernels.processes import swing
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.config import quantity
-from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.recording import Recording
 
 
@@ -64,45 +55,3 @@ class FringeJitter(Effect):
         swung = swing(time, self.vibration_hz, phase, recording.exptime_s)
         change = drawn * np.array(self.rms) + np.outer(swung, self.vibration)
         return replace(states, dkx=states.dkx + change[:, 0], dky=states.dky + change[:, 1])
-
-    @classmethod
-    def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """White part of the frames' own vectors beyond the noise, and the line in their spectrum.
-
-        The noise is measured, from two halves of the pixels (`FringeEvidence.halves`).
-        """
-        motion = motion_of(evidence)
-        if motion is None:
-            return None
-        parts = ["jitter_x", "jitter_y", "walk_x", "walk_y"] + ["walk_k"] * motion.crossed
-        full = motion.components(parts, ramps)
-        less = motion.components(parts, ramps, absent=("jitter_x", "jitter_y"))
-        (x, x_error), (y, y_error) = full.root(0), full.root(1)
-        white = joint_log_chance(full, less, full.size[:2])
-        line = 0.0 if motion.line is None else motion.line.log_chance
-        values: dict[str, Any] = {"rms": (min(x, 0.1), min(y, 0.1))}
-        errors = {"rms[0]": x_error, "rms[1]": y_error}
-        if motion.line is not None and motion.line.sure:
-            swung = _vibration(motion.line, motion.series[0].exptime_s)
-            values, errors = values | swung[0], errors | swung[1]
-        return Estimate(
-            replace(cls().scaled(0.0), **values),
-            errors,
-            sigmas(log_chance_of_any([white, line])),
-            "scatter of the fringe vector from frame to frame beyond drift, correlated between two "
-            "halves of the pixels",
-            {
-                "frames": sum(map(len, motion.series)),
-                "white_sigmas": sigmas(white),
-                "vibration_sigmas": sigmas(line),
-            },
-        )
-
-
-def _vibration(line: Line, exptime_s: float) -> tuple[dict[str, Any], dict[str, float]]:
-    """Values and errors by field, the smear of the exposure taken off."""
-    smear = float(np.sinc(line.hz * (exptime_s if np.isfinite(exptime_s) else 0.0)))
-    size, error = line.amplitude / smear, line.amplitude_error / smear
-    errors = {"vibration_hz": line.hz_error}
-    errors |= {f"vibration[{i}]": float(error[i]) for i in range(2)}
-    return {"vibration": (float(size[0]), float(size[1])), "vibration_hz": line.hz}, errors

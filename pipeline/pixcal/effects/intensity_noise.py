@@ -1,27 +1,12 @@
 """Power of the laser, or of its coupling into the fibres, changing from frame to frame."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Self, cast
+from typing import Self
 
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.damping import Damping, best_damping
-from pixcal.estimators.frame_series.light import (
-    OFFSETS,
-    FrameLight,
-    ambient_shares,
-    light_courses,
-    light_of,
-)
-from pixcal.estimators.frame_series.spectral_line import Line
-from pixcal.estimators.frame_series.variance_components import (
-    Components,
-    joint_log_chance,
-    log_chance,
-    log_chance_of_any,
-    sigmas,
-)
+from pixcal.estimators.frame_series.light import ambient_shares, light_courses
 from pixcal.kernels.processes import damped_walk, swing
 from pixcal.kernels.scene import FrameStates
 from pixcal.kernels.significance import SIGNIFICANT
@@ -32,8 +17,6 @@ from pixcal.simulation.track import Track, at
 
 MOST_AMBIENT = 0.3
 """Share of light that does not follow the laser beyond which contrast noise is likelier."""
-PARTS = ("power", "power_walk", "contrast", "contrast_walk", *OFFSETS)
-DAMPED = ("power_damped", "contrast", "contrast_walk", *OFFSETS)
 
 
 @dataclass(frozen=True)
@@ -110,66 +93,13 @@ class IntensityNoise(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """What B and A of all frames do together, beyond the noise; and the line in its spectrum.
-
-        What B does alone (an offset) and A alone (the contrast) does not count. The noise is
-        measured, from two halves of the pixels (`FringeEvidence.halves`).
-        """
-        light = light_of(evidence)
-        if light is None:
-            return None
-        there = light.components(PARTS)
-        none = light.components(PARTS, absent=PARTS[:2])
-        changes = joint_log_chance(there, none, there.size[:2])
-        line = 0.0 if light.line is None else light.line.log_chance
-        step = float(np.mean([s.step_s for s in light.sets]))
-        damping = _damping(light)
-        values, errors = _change(damping, step)
-        if light.line is not None and light.line.sure:
-            values, errors = _with_line(values, errors, light.line, light.sets[0].exptime_s)
+        """As of `Effect`, with the ambient light, which makes the contrast follow the laser."""
+        found = super().estimate(evidence)
         shares = ambient_shares(evidence)
-        clear = any(SIGNIFICANT * error < share < MOST_AMBIENT for share, error in shares)
+        if found is None or not any(
+            SIGNIFICANT * error < share < MOST_AMBIENT for share, error in shares
+        ):
+            return found
         ambient = tuple(float(np.clip(share, 0, MOST_AMBIENT)) for share, _ in shares)
-        return Estimate(
-            cls(**cast("Any", values), ambient=ambient if clear else ()),
-            errors,
-            sigmas(log_chance_of_any([changes, line])),
-            "common change of intensity and fringe amplitude, correlated between two halves of the "
-            "pixels",
-            {"change_sigmas": sigmas(changes), "line_sigmas": sigmas(line)},
-        )
-
-
-def _damping(light: FrameLight) -> Damping:
-    def fit(keep: float, start: Components | None) -> Components:
-        return light.components(DAMPED, keep, start=start)
-
-    return best_damping(fit, 0, 2.0 * max(map(len, light.sets)))
-
-
-def _change(damping: Damping, step: float) -> tuple[dict[str, float], dict[str, float]]:
-    """Size of the change and its correlation time, without a line; values and errors."""
-    if sigmas(log_chance(damping.growth)) < SIGNIFICANT or not damping.rms:
-        rms, error = damping.white.root(0)
-        # Less than a frame is not told from none.
-        return (
-            {"rms": min(rms, 0.5), "correlation_s": 0.0, "line": 0.0},
-            {"rms": error, "correlation_s": step},
-        )
-    time = damping.time * step
-    return (
-        {"rms": min(damping.rms, 0.5), "correlation_s": time, "line": 0.0},
-        {"rms": damping.rms_error, "correlation_s": time * damping.log_time_error},
-    )
-
-
-def _with_line(
-    values: dict[str, float], errors: dict[str, float], line: Line, exptime_s: float
-) -> tuple[dict[str, float], dict[str, float]]:
-    """With amplitude and frequency of the line, the smear of the exposure taken off."""
-    smear = float(np.sinc(line.hz * (exptime_s if np.isfinite(exptime_s) else 0.0)))
-    size, error = float(line.amplitude[0]) / smear, float(line.amplitude_error[0]) / smear
-    return (
-        values | {"line": min(size, 0.5), "line_hz": line.hz},
-        errors | {"line": error, "line_hz": line.hz_error},
-    )
+        assert isinstance(found.effect, cls)
+        return replace(found, effect=replace(found.effect, ambient=ambient))

@@ -5,27 +5,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.fringe_motion import (
-    Hop,
-    Motion,
-    colour_of,
-    motion_of,
-    ramps_and_colour,
-)
+from pixcal.estimators.frame_series.fringe_motion import Hop, Motion, colour_of, motion_of
 from pixcal.estimators.frame_series.hopping import Hopping, find_hopping, scatter_of
-from pixcal.estimators.frame_series.series import FrameSeries
-from pixcal.estimators.frame_series.variance_components import (
-    log_chance_of_any,
-    sigmas,
-    signed_sigmas,
-)
 from pixcal.kernels import optics
 from pixcal.kernels.scene import FrameStates, geometry
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.frame_fit import fit_frames
 from pixcal.simulation.recording import Recording
 
 F64 = NDArray[np.float64]
@@ -100,58 +88,21 @@ class WavelengthDrift(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Slow part and jumps of the frames' own vectors along those of the sets.
-
-        With fringes of different directions, against motions that are the same for all sets; with
-        one direction, against the motion across the fringes' axis.
-        """
-        motion = motion_of(evidence)
-        if motion is None:
+        """Ramp and walk as of `Effect`, beside the hops that stand out, which are counted."""
+        motion, slow = motion_of(evidence), fit_frames(cls, evidence, leave=("hop",))
+        if motion is None or slow is None:
             return None
-        parts = ["jitter_x", "jitter_y", "walk_x", "walk_y", "walk_k"]
-        if not motion.crossed:
-            parts[2:4] = ["walk"]
-        slow = motion.components(parts, raw=True)
-        steady = motion.components(parts, absent=["walk_k"], raw=True)
-        drifts = signed_sigmas(slow.likelihood - steady.likelihood, float(slow.size[-1]))
-        values, errors = _slow_parameters(motion, parts)
-        ramps = abs(values["ramp"] / errors["ramp"])
         jumps = [hop for hops in motion.hops.values() for hop in hops]
+        effect, errors = slow.model, dict(slow.errors)
         if jumps:
-            hopping = _hops(motion, jumps, walks=values["walk"] > CALM * errors["walk"])
-            values, errors = values | hopping[0], errors | hopping[1]
-        # A ramp goes either way.
-        chance = log_chance_of_any([log_ndtr(-drifts), np.log(2) + log_ndtr(-ramps)])
+            walks = effect.walk > CALM * errors.get("walk", np.inf)
+            values, hop_errors = _hops(motion, jumps, walks=walks)
+            effect, errors = replace(effect, **values), errors | hop_errors
         sharpest = max((hop.sigmas for hop in jumps), default=-np.inf)
+        significance = float(max(slow.significance, sharpest))
         return Estimate(
-            cls(**({"hop": 0.0} | values)),
-            errors,
-            float(max(sigmas(chance), sharpest)),
-            "slow change of the length of the fringe vector"
-            + ("" if motion.crossed else "; motion of the fibres along the axis looks the same"),
-            {"walk_sigmas": drifts, "ramp_sigmas": ramps, "hops": len(jumps)},
+            effect, errors, significance, slow.why, {**slow.details, "hops": len(jumps)}
         )
-
-
-def _slow_parameters(
-    motion: Motion, parts: Sequence[str]
-) -> tuple[dict[str, float], dict[str, float]]:
-    """Ramp and walk, beside ramps of the fringe vector where sets tell them apart."""
-    known = ramps_and_colour if motion.crossed else _colour
-    found = motion.components(parts, known)
-    at = known(motion.series[0]).shape[2] - 1
-    walk, error = found.root(len(parts) - 1)
-    return (
-        {"ramp": float(found.beta[at]) * HOUR_S, "walk": walk * HOUR_S**0.5},
-        {
-            "ramp": float(np.sqrt(found.shape_covariance(range(2, len(parts)))[at, at])) * HOUR_S,
-            "walk": error * HOUR_S**0.5,
-        },
-    )
-
-
-def _colour(series: FrameSeries) -> F64:
-    return ramps_and_colour(series)[..., 2:]
 
 
 def _hops(

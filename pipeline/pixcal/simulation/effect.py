@@ -20,6 +20,8 @@ from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.changes import Template, Way
 from pixcal.simulation.forward import DOMAINS, ForwardModel, Stage
+from pixcal.simulation.frame_changes import acts_on_frames_alone
+from pixcal.simulation.frame_fit import fit_frames
 from pixcal.simulation.score import score, score_again
 
 F32 = NDArray[np.float32]
@@ -160,8 +162,16 @@ class Effect(ForwardModel):
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Parameters and errors from an acquisition; None where it holds no evidence of it.
 
-        By the forward model alone, unless an effect knows a better way.
+        By the forward model alone, unless an effect knows a better way: from the series of the
+        frames where it acts on whole frames, else from frames that are taken again.
         """
+        if acts_on_frames_alone(cls):
+            series = fit_frames(cls, evidence)
+            if series is None:
+                return None
+            return Estimate(
+                series.model, series.errors, series.significance, series.why, series.details
+            )
         found = score(cls, evidence)
         if found is None:
             return None

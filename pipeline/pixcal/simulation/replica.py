@@ -107,10 +107,9 @@ class Replica:
         self._bench = _bench(evidence, sets)
         starts = _starts(evidence, sets)
         self._recordings: dict[str | int, tuple[Recording, int]] = {}
+        self._recordings.update(set_recordings(evidence).items())
         for n, stack in enumerate(evidence.stacks):
             self._recordings[n] = _of_stack(self._bench, n, stack, evidence, starts[n])
-        for n, found in enumerate(sets):
-            self._recordings[found.name] = _of_set(self._bench, n, found, starts[found.name])
 
     def taken(
         self,
@@ -153,6 +152,13 @@ class Replica:
         for n, adu in enumerate(camera.analogue(replace(recording, bench=bench), frames)):
             out[n] = adu
         return out
+
+
+def set_recordings(evidence: Evidence) -> dict[str, tuple[Recording, int]]:
+    """Of each fringe set: its recording, and the number of the first frame there is of it."""
+    sets = list(evidence.fringes.values())
+    bench, starts = _bench(evidence, sets), _starts(evidence, sets)
+    return {s.name: _of_set(bench, n, s, starts[s.name]) for n, s in enumerate(sets)}
 
 
 def _fitted(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Fitted:

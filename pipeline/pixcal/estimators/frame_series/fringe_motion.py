@@ -5,7 +5,7 @@ own vector k; a motion of the fibres moves all vectors alike. Sets with fringes 
 directions therefore tell them apart; with one direction only, what happens along k is either.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,15 +16,12 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.series import MEDIAN, FrameSeries, assemble, motion_series
 from pixcal.estimators.frame_series.spectral_line import Line, find_line, without_line
 from pixcal.estimators.frame_series.variance_components import (
-    MAX_STEPS,
-    Components,
     cosine_modes,
     estimate_components,
     walk_power,
 )
 
 F64 = NDArray[np.float64]
-Shapes = Callable[[FrameSeries], F64]
 
 CROSSED = 0.5  # sine of the angle between fringes from which they count as different
 HOP_WINDOWS = (2, 4, 8, 16, 32)  # frames before and after, of which the means are compared
@@ -57,39 +54,13 @@ class Motion:
     line: Line | None  # the strongest, sure or not
     crossed: bool  # whether there are fringes of different directions
 
-    def components(
-        self,
-        parts: Sequence[str],
-        known: Shapes | None = None,
-        absent: Sequence[str] = (),
-        raw: bool = False,
-        start: Components | None = None,
-        steps: int = MAX_STEPS,
-    ) -> Components:
-        """Sizes of kinds of motion, from all sets together.
-
-        Parameters
-        ----------
-        parts : sequence of str
-            Of ``jitter_x``, ``jitter_y`` (rad²/px²), ``walk_x``, ``walk_y``, ``walk`` (both alike;
-            rad²/px²/s) and ``walk_k`` (of the relative wavelength; 1/s).
-        known : callable, optional
-            Shapes (t, 2, q) of a series, with coefficients common to all sets.
-        absent : sequence of str
-            Of ``parts``, those to hold at zero.
-        raw : bool
-            With the hops.
-        start, steps
-            As of `estimate_components`.
-        """
-        every = self.raw if raw else self.series
-        modes = assemble(every, lambda s: np.stack([_part(name, s) for name in parts]), known)
-        held = [list(parts).index(name) for name in absent]
-        return estimate_components(modes, held, start, steps)
-
 
 def motion_of(evidence: Evidence) -> Motion | None:
     """Motion of the fringes in all sets with frames enough; None without any."""
+    return evidence.once("motion of the fringes", make=lambda: _motion_of(evidence))
+
+
+def _motion_of(evidence: Evidence) -> Motion | None:
     found = [s for s in map(motion_series, evidence.fringes.values()) if s is not None]
     if not found:
         return None
@@ -232,7 +203,7 @@ def _with_hops(series: FrameSeries, hops: Sequence[Hop], times: float) -> FrameS
     return replace(series, values=series.values - colour[:, None] * np.array(series.k))
 
 
-def _part(name: str, series: FrameSeries) -> F64:
+def motion_part(name: str, series: FrameSeries) -> F64:
     """Covariance (t - 1, 2, 2) of the modes of a series for a unit of a kind of motion."""
     kind, _, axis = name.partition("_")
     n = len(series)
@@ -250,7 +221,7 @@ def _part(name: str, series: FrameSeries) -> F64:
 def _level(series: FrameSeries) -> F64:
     """Variance (t - 1, 2) of the cosine modes, of noise, jitter and walk."""
     names = ("jitter_x", "jitter_y", "walk_x", "walk_y")
-    modes = assemble([series], lambda s: np.stack([_part(name, s) for name in names]))
+    modes = assemble([series], lambda s: np.stack([motion_part(name, s) for name in names]))
     size = np.maximum(estimate_components(modes).size, 0.0)
     # The first half of the modes are those of the series, the others of its two halves.
     covariance = np.einsum("i,inab->nab", size, modes.parts)[: len(series) - 1]

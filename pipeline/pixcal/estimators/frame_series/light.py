@@ -28,6 +28,7 @@ F64 = NDArray[np.float64]
 
 FEWEST_DARK = 12  # frames without light from which their offset is learnt
 OFFSETS = ("offset", "offset_walk")
+LIGHT_PARTS = ("power", "power_walk", "contrast", "contrast_walk", *OFFSETS)
 PATTERNS = {
     # What moves (B, log A/B), as the covariance of the two.
     "power": np.array([[1.0, 0.0], [0.0, 0.0]]),
@@ -75,11 +76,12 @@ class FrameLight:
         """Cosine modes of all series; parameters as of `components`."""
 
         def covariance(series: FrameSeries) -> F64:
-            return np.stack([self._part(name, keep, series) for name in parts])
+            return np.stack([self.part(name, keep, series) for name in parts])
 
         return assemble([*self.sets, *self.dark], covariance)
 
-    def _part(self, name: str, keep: float, series: FrameSeries) -> F64:
+    def part(self, name: str, keep: float, series: FrameSeries) -> F64:
+        """Covariance (t - 1, 2, 2) of the modes of a series for a unit of a kind of change."""
         kind, _, time = name.partition("_")
         n, level = len(series), self.level.get(series.name)
         power = {
@@ -132,6 +134,10 @@ def ambient_shares(evidence: Evidence) -> list[tuple[float, float]]:
 
 def light_of(evidence: Evidence) -> FrameLight | None:
     """Light of all sets with frames enough; None without any."""
+    return evidence.once("light of the frames", make=lambda: _light_of(evidence))
+
+
+def _light_of(evidence: Evidence) -> FrameLight | None:
     found = {f.name: light_series(f) for f in evidence.fringes.values()}
     sets = [s.cleaned() for s in found.values() if s is not None]
     if not sets:

@@ -1,0 +1,81 @@
+"""The best value of a parameter that series do not depend on linearly, by its likelihood."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.frame_series.variance_components import Components
+
+F64 = NDArray[np.float64]
+
+FARTHEST = 3.0  # largest error of the logarithm of a parameter: beyond, it is not known
+HALVINGS = 4  # of the distance to the values on either side
+
+
+class Fit(Protocol):
+    """Components for a value of the parameter, and where to begin."""
+
+    def __call__(self, value: float, start: Components | None, steps: int = ...) -> Components:
+        """Sizes after some steps of the fit."""
+        ...
+
+
+@dataclass(frozen=True)
+class Profiled:
+    """A parameter, and the components with it."""
+
+    value: float
+    error: float
+    found: Components
+    sides: tuple[Components, ...]  # a little below and above
+    log_width: float = 0.0  # from the value to either side, of the logarithm
+
+    def slope(self, sizes: Sequence[float]) -> float:
+        """What a size changes by with the parameter's error, from its values at the sides."""
+        if not self.sides:
+            return 0.0
+        log_error = self.error / self.value
+        return abs(sizes[1] - sizes[0]) / (2 * self.log_width) * log_error
+
+
+def best_shape(fit: Fit, trials: F64, steady: bool, start: Components | None = None) -> Profiled:
+    """The best of some values, and between them.
+
+    Parameters
+    ----------
+    fit : callable
+    trials : (n,) float64
+        In equal steps of the logarithm.
+    steady : bool
+        Whether it is one of known shapes, whose likelihoods are compared without restriction.
+    start : Components, optional
+        Sizes at which known shapes are tried at first.
+    """
+
+    def high(found: Components) -> float:
+        return found.profile if steady else found.likelihood
+
+    fits: list[Components] = []
+    for value in trials:
+        fits.append(fit(float(value), fits[-1] if fits else start, *((0,) if start else ())))
+    best = int(np.argmax([high(found) for found in fits]))
+    log_value = float(np.log(trials[best]))
+    found = fit(float(trials[best]), fits[best])
+    width = float(np.log(trials[1] / trials[0]))
+    for _ in range(HALVINGS):
+        # A parabola through the three, ever closer; its curvature is the information.
+        sides = tuple(fit(float(np.exp(log_value + w)), found) for w in (-width, width))
+        below, above = (high(side) - high(found) for side in sides)
+        bend = -(below + above)
+        error = width / np.sqrt(bend) if bend > 0 else np.inf
+        shift = float(np.clip((above - below) / (2 * max(bend, 1e-9)), -1, 1)) * width
+        moved = fit(float(np.exp(log_value + shift)), found)
+        if high(moved) > high(found):
+            log_value, found = log_value + shift, moved
+        width /= 2
+    value = float(np.exp(log_value))
+    error = min(float(error), FARTHEST) * value
+    return Profiled(value, error, found, sides, log_width=2 * width)

@@ -1,0 +1,202 @@
+"""What a forward model does to the series of the frames: light, contrast, fringe vector.
+
+A model of whole frames needs no samples to be taken again: its `ForwardModel.states` are the change
+of the series, draw by draw. What is the same in all draws is a shape of known course; their scatter
+is a part of the covariance of the series' cosine modes.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.fringe_motion import motion_of
+from pixcal.estimators.frame_series.light import light_of
+from pixcal.estimators.frame_series.series import FrameSeries
+from pixcal.estimators.frame_series.spectral_line import Line
+from pixcal.estimators.frame_series.variance_components import cosine_modes
+from pixcal.kernels.scene import FrameStates
+from pixcal.simulation.forward import ForwardModel
+from pixcal.simulation.recording import Recording
+from pixcal.simulation.replica import set_recordings
+
+F64 = NDArray[np.float64]
+
+DRAWS = 96
+AROUND = 1.1  # ratio of frequencies over which the power of a change hardly differs
+UNIT = 1e-3  # size at which a strength is looked at that is zero by default
+# factor on parameters to see what depends on them, and on frequencies, of which an exposure might
+# be whole periods
+OTHER = 1 / np.sqrt(2)
+LIGHT, MOTION = slice(0, 2), slice(2, 4)  # (B over its mean less one, log A/B), and (kx, ky)
+
+
+@dataclass(frozen=True)
+class Watched:
+    """A series that a model may change."""
+
+    series: FrameSeries
+    channels: slice
+    recording: Recording | None  # None: frames without light, which no state changes
+    frames: NDArray[np.intp]  # places of the series' values in the recording
+
+    def changes(self, model: ForwardModel, draws: int) -> F64:
+        """Change of the series by each draw (r, t, 2)."""
+        found = np.zeros((draws, len(self.series), 2))
+        if self.recording is None:
+            return found
+        bench, count = self.recording.bench, self.recording.count
+        one, nothing = np.ones(count), np.zeros(count)
+        still = FrameStates(nothing, one, one, nothing, nothing)
+        for seed, out in enumerate(found, start=1):
+            s = model.states(still, replace(self.recording, bench=replace(bench, seed=seed)))
+            contrast = np.log(np.maximum(s.amplitude, 1e-9) / np.maximum(s.level, 1e-9))
+            every = np.stack([s.level - 1, contrast, s.dkx, s.dky], axis=1)
+            out[:] = every[self.frames, self.channels]
+        return found
+
+    def part(self, model: ForwardModel) -> F64:
+        """Covariance (t - 1, 2, 2) of the modes by a random model."""
+        modes = cosine_modes(self.changes(model, DRAWS).transpose(1, 0, 2))
+        modes -= modes.mean(axis=1, keepdims=True)
+        power = np.einsum("kra,krb->kab", modes, modes) / (DRAWS - 1)
+        order = np.arange(1, len(power) + 1)
+        first = np.ceil(order / AROUND).astype(int) - 1
+        last = np.minimum(np.floor(order * AROUND).astype(int), len(power))
+        sums = np.concatenate([np.zeros((1, 2, 2)), np.cumsum(power, axis=0)])
+        return np.asarray((sums[last] - sums[first]) / (last - first)[:, None, None])
+
+
+@dataclass(frozen=True)
+class Strength:
+    """One number of a model's strengths, and how it shows."""
+
+    model: ForwardModel  # of this strength alone
+    field: str
+    place: int | None  # in a tuple
+    unit: float  # the strength in `model`
+    shape: str | None  # the parameter, no strength, that changes how it shows
+    steady: bool  # whether draws are the same: a shape, and no part of a covariance
+    power: float  # of the strength, that the part goes with
+
+    @property
+    def key(self) -> str:
+        """As errors name it."""
+        return self.field if self.place is None else f"{self.field}[{self.place}]"
+
+    @property
+    def of_line(self) -> bool:
+        """Whether it is the size of a line in the spectrum."""
+        return self.shape is not None and unit_of(self.model, self.shape) == "Hz"
+
+    def at(self, shape: float | None) -> ForwardModel:
+        """Its model with another value of the shape parameter."""
+        if self.shape is None or shape is None:
+            return self.model
+        return replace(self.model, **{self.shape: shape})
+
+    def value(self, size: float) -> float:
+        """Of a size of the part or shape."""
+        if self.steady:
+            return self.unit * size
+        return float(self.unit * max(size, 0.0) ** (1 / self.power))
+
+
+def strengths_of(
+    every: Sequence[Watched], start: ForwardModel, leave: Sequence[str]
+) -> list[Strength]:
+    """Strengths of a model that change some series."""
+    lines = [f.name for f in fields(start) if unit_of(start, f.name) == "Hz"]
+    start = replace(start, **{name: OTHER * getattr(start, name) for name in lines})
+    found = []
+    for field in [f for f in start.strengths if f not in leave]:
+        values = getattr(start, field)
+        for place, value in enumerate(values if isinstance(values, tuple) else (values,)):
+            at = place if isinstance(values, tuple) else None
+            if isinstance(value, float):
+                own = with_number(start.scaled(0.0), field, at, value or UNIT)
+                found += _strength(every, own, field, at, value or UNIT)
+    return found
+
+
+def _strength(
+    every: Sequence[Watched], own: ForwardModel, field: str, place: int | None, unit: float
+) -> list[Strength]:
+    drawn = [w.changes(own, 2) for w in every]
+    if not any(v.any() for v in drawn):
+        return []
+    shape = None
+    for other in fields(own):
+        value = getattr(own, other.name)
+        if other.name not in own.strengths and isinstance(value, float):
+            changed = replace(own, **{other.name: OTHER * value or 1.0})
+            if any(
+                not np.array_equal(v, w.changes(changed, 2))
+                for v, w in zip(drawn, every, strict=True)
+            ):
+                shape = other.name
+                break
+    steady, power = all(np.array_equal(*v) for v in drawn), 1.0
+    if not steady:
+        half = with_number(own, field, place, unit / 2)
+        whole, less = (sum(float(np.trace(w.part(m).sum(0))) for w in every) for m in (own, half))
+        power = float(np.log2(whole / less))
+    return [Strength(own, field, place, unit, shape, steady, power)]
+
+
+class FrameChanges:
+    """Series of an acquisition's frames, by their kind."""
+
+    def __init__(self, evidence: Evidence) -> None:
+        recordings = set_recordings(evidence)
+        light, motion = light_of(evidence), motion_of(evidence)
+
+        def watched(series: FrameSeries, channels: slice) -> Watched:
+            recording, first = recordings[series.name]
+            time_s = evidence.fringes[series.name].time_s
+            places = np.searchsorted(time_s, series.time_s - 1e-9)
+            return Watched(series, channels, recording, first + places)
+
+        self.light, self.crossed = light, motion is not None and motion.crossed
+        self._every = [[watched(s, MOTION) for s in motion.series]] if motion else []
+        self._lines: list[Line | None] = [motion.line] if motion else []
+        if light is not None:
+            dark = [Watched(s, LIGHT, None, np.arange(len(s))) for s in light.dark]
+            self._every.append([*(watched(s, LIGHT) for s in light.sets), *dark])
+            self._lines.append(light.line)
+
+    def series(self, start: ForwardModel, leave: Sequence[str]) -> list[Watched]:
+        """Series of the kinds that a model changes."""
+        return [w for every in self._every if strengths_of(every, start, leave) for w in every]
+
+    def line(self, of: Strength) -> Line | None:
+        """The strongest line of the series that a strength changes."""
+        for every, line in zip(self._every, self._lines, strict=True):
+            if any(w.changes(of.model, 1).any() for w in every):
+                return line
+        return None
+
+
+def unit_of(model: ForwardModel, name: str) -> str:
+    """Unit of a parameter."""
+    return str(next(f.metadata.get("unit", "") for f in fields(model) if f.name == name))
+
+
+def acts_on_frames_alone(kind: type[ForwardModel]) -> bool:
+    """Whether a model changes the states of frames, and nothing else."""
+    steps = ("states", "detector", "light", "photons", "charge", "signal", "readout")
+    return [s for s in steps if getattr(kind, s) is not getattr(ForwardModel, s)] == ["states"]
+
+
+def with_number(model: ForwardModel, field: str, place: int | None, value: float) -> ForwardModel:
+    """The model with another number in a field, or in a place of its tuple, within its range."""
+    limits = next(f.metadata for f in fields(model) if f.name == field)
+    low, high, above = (limits.get(key) for key in ("low", "high", "above"))
+    if above is not None:
+        value = max(value, float(np.nextafter(above, np.inf)))
+    value = float(np.clip(value, -np.inf if low is None else low, np.inf if high is None else high))
+    held = getattr(model, field)
+    new = value if place is None else (*held[:place], value, *held[place + 1 :])
+    return replace(model, **{field: new})
