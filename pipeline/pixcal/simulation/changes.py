@@ -30,6 +30,8 @@ Key = tuple[str | int, str]
 Draw = dict[Key, NDArray[Any]]
 
 SEEDS = (1, 2)
+SCATTER_SEEDS = range(3, 11)
+"""Of draws by which it is told how much one differs from another."""
 FRAMES = 4
 """Calibration frames of an exposure time that are looked at."""
 MIXED = 64
@@ -155,6 +157,15 @@ class Changes:
             one = {**one, **{k: one.get(k, 0) + v for k, v in a.items()}}
             other = {**other, **{k: other.get(k, 0) + v for k, v in b.items()}}
         return Template.of(one, other)
+
+    def scatter(self, model: ForwardModel, way: Way, template: Template) -> float:
+        """Relative rms of the second moments that single draws of a random model add."""
+        total = {k: self.measured(k).weight * template.mean[k] for k in way.keys}
+        sizes = []
+        for seed in SCATTER_SEEDS:
+            drawn = self._second_moments(model, seed, way.keys)
+            sizes.append(sum(float((total[k] * drawn[k]).sum()) for k in way.keys))
+        return float(np.std(sizes, ddof=1)) / max(float(np.mean(sizes)), 1e-300)
 
     def _taken(self, of: str | int) -> F32:
         if of not in self._plain:

@@ -197,6 +197,11 @@ class _Fit:
         model, errors = self._scaled(shape, size, error)
         if significance > HINT and not model.is_null:
             model, errors = self._fitted(model, errors)
+        if self.way.random:
+            # One acquisition holds one draw: where it is well seen, that decides.
+            scatter = self.changes.scatter(model, self.way, self.template(model)) / 2
+            for name in set(errors) & set(self.strengths):
+                errors[name] = float(np.hypot(errors[name], scatter * abs(getattr(model, name))))
         why = RANDOM if self.way.random else STEADY
         keys, template = self.telling(shape)
         telling = dataclasses.replace(self.way, keys=keys)
