@@ -3,7 +3,8 @@
 And ``pixcal/__init__.pyi``, from the options of the commands.
 
 A page names what follows: ``<!-- commands -->`` the help of all commands, to its end;
-``<!-- file: examples/glow.py -->`` a fenced block; ``<!-- keys: SimulatedOptics -->`` a table.
+``<!-- file: examples/glow.py -->`` a fenced block; ``<!-- keys: SimulatedOptics -->`` a table, of
+the parameters of an effect as well; ``<!-- effects -->`` that of all effects, as they act.
 """
 
 import contextlib
@@ -13,6 +14,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import typing
 from pathlib import Path
 
 import click
@@ -22,9 +24,11 @@ import pixcal
 from documentation import readme_picture
 from documentation.layers import picture
 from documentation.stub import STUB, stub
+from pixcal.effects import effects
 from pixcal.model import acquisition, bench
 from pixcal.report.drawing import png
 from pixcal.report.emva_figures import nonuniformity, photon_transfer
+from pixcal.simulation.forward import Stage
 from pixcal_cli.main import cli
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -32,6 +36,7 @@ LAYERS = DOCS / "pictures" / "layers.svg"
 COMMANDS = re.compile(r"(<!-- commands -->\n).*\Z", re.DOTALL)
 FILES = re.compile(r"(<!-- file: (.+?) -->\n\n```[^\n]*\n).*?(```\n)", re.DOTALL)
 TABLES = re.compile(r"(<!-- keys: (\w+) -->\n\n)(?:\|.*\n)*")
+EFFECTS = re.compile(r"(<!-- effects -->\n\n)(?:\|.*\n)*")
 SEE = {
     "pixcal run": "Tutorial: [From FITS to maps](../tutorials/first-maps.md).",
     "pixcal ingest": "How to: [Your own camera](../how-to/own-camera.md). Keys of "
@@ -77,13 +82,33 @@ def help_of_all() -> str:
 
 def key_table(name: str) -> str:
     """The keys of a section of a file, from the dataclass that reads it."""
-    kind = vars(bench).get(name) or vars(acquisition)[name]
-    lines = ["| key | unit | default | meaning |", "|---|---|---|---|"]
+    kind = effects().get(name) or vars(bench).get(name) or vars(acquisition)[name]
+    what = "parameter" if name in effects() else "key"
+    lines = [f"| {what} | unit | default | meaning |", "|---|---|---|---|"]
     for key in dataclasses.fields(kind):
         # Sections have tables of their own.
         if doc := key.metadata.get("doc"):
             unit = key.metadata.get("unit") or "–"
+            if name in effects():
+                doc += _parts(typing.get_type_hints(kind)[key.name])
             lines.append(f"| `{key.name}` | {unit} | {_default(key.default)} | {doc} |")
+    return "\n".join(lines) + "\n"
+
+
+def _parts(kind: object) -> str:
+    """Keys of the entries of a list."""
+    inside = [part for part in typing.get_args(kind) if dataclasses.is_dataclass(part)]
+    names = [f"`{key.name}`" for part in inside for key in dataclasses.fields(part)]
+    return f": {', '.join(names)}" if names else ""
+
+
+def effect_table() -> str:
+    """All effects by the stage at which they act, in their order."""
+    lines = ["| where | effects, in the order in which they act |", "|---|---|"]
+    for stage in Stage:
+        own = sorted((e for e in effects().values() if e.acts_at == stage), key=lambda e: e.order)
+        links = ", ".join(f"[{e.name}](effects/{e.name}.md)" for e in own)
+        lines.append(f"| {stage.name.lower()} | {links} |")
     return "\n".join(lines) + "\n"
 
 
@@ -99,6 +124,7 @@ def filled(text: str) -> str:
     """A page with its marked blocks and tables as they should be."""
     text = COMMANDS.sub(lambda found: found[1] + help_of_all(), text)
     text = FILES.sub(lambda found: found[1] + _content(found[2]) + found[3], text)
+    text = EFFECTS.sub(lambda found: found[1] + effect_table(), text)
     return TABLES.sub(lambda found: found[1] + key_table(found[2]), text)
 
 

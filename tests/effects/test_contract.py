@@ -69,6 +69,15 @@ def test_it_says_what_it_is(cls: type[Effect]) -> None:
         assert field.metadata.get("doc") or dataclasses.is_dataclass(field.type), field.name
 
 
+def test_which_of_one_stage_acts_first_is_said_and_not_left_to_names() -> None:
+    turns = [(cls.acts_at, cls.order) for cls in effects().values()]
+    assert len(set(turns)) == len(turns)
+    assert all(cls.order < Effect.order for cls in effects().values())
+    # Those of a user's own, without an order, come last of their stage.
+    own = effect_of_file(GLOW)()
+    assert own.turn > max(cls().turn for cls in effects().values() if cls.acts_at == own.acts_at)
+
+
 @EVERY
 def test_its_parameters_are_read_as_they_are_written(cls: type[Effect]) -> None:
     for effect in (cls(), cls().scaled(0.5)):

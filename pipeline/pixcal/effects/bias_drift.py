@@ -68,6 +68,7 @@ class BiasDrift(Effect):
     name = "bias_drift"
     title = "offset of the whole frame, changing"
     acts_at = Stage.READOUT
+    order = 3
     domains = ("time", "noise")
     strengths = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e", "run_walk_e_h", "tracks")
     absorbed_because = "the free intensity of each frame absorbs a level common to all pixels"

@@ -42,6 +42,7 @@ class BrighterFatter(Effect):
     name = "brighter_fatter"
     title = "pixels that shrink as they fill"
     acts_at = Stage.CHARGE
+    order = 1
     domains = ("intensity", "noise", "space")
     strengths = ("shift_px_per_e",)
     frames_needed = ("ladder", "baseline")

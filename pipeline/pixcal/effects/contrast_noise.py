@@ -31,6 +31,7 @@ class ContrastNoise(Effect):
     name = "contrast_noise"
     title = "visibility changing from frame to frame"
     acts_at = Stage.LIGHT
+    order = 5
     domains = ("time",)
     strengths = ("vibration_rad", "polarisation", "tracks")
     absorbed_because = "the fit has a free fringe amplitude in each frame"

@@ -53,6 +53,7 @@ class CosmicHits(Effect):
     name = "cosmic_hits"
     title = "particles that hit the detector"
     acts_at = Stage.CHARGE
+    order = 2
     domains = ("noise",)
     strengths = ("rate_cm2_s",)
     left_because = "few samples are hit, and most of them are masked"

@@ -49,6 +49,7 @@ class FlatError(Effect):
     name = "flat_error"
     title = "flat that is not the response to the fringes' light"
     acts_at = Stage.PIXEL
+    order = 2
     domains = ("space",)
     strengths = ("pixel_rms", "smooth_rms")
     absorbed_because = "it scales level and fringes of a pixel equally and leaves the phase"

@@ -34,6 +34,7 @@ class FringeDrift(Effect):
     name = "fringe_drift"
     title = "fringe vector changing slowly"
     acts_at = Stage.LIGHT
+    order = 3
     domains = ("time", "space")
     strengths = ("ramp", "settle", "walk", *TRACKS)
     absorbed_because = "the fit has a free fringe vector in each frame where it moves"

@@ -25,6 +25,7 @@ class FringeJitter(Effect):
     name = "fringe_jitter"
     title = "fringe vector changing from frame to frame"
     acts_at = Stage.LIGHT
+    order = 4
     domains = ("time", "space")
     strengths = ("rms", "vibration")
     absorbed_because = "the fit has a free fringe vector in each frame where it moves"

@@ -42,6 +42,7 @@ class GainError(Effect):
     name = "gain_error"
     title = "gain that is not the one declared"
     acts_at = Stage.CONVERTER
+    order = 1
     domains = ("noise", "intensity")
     strengths = ("relative",)
     left_because = (

@@ -70,6 +70,7 @@ class GhostFringes(Effect):
     name = "ghost_fringes"
     title = "ghost fringes of a parasitic reflection"
     acts_at = Stage.LIGHT
+    order = 7
     domains = ("space",)
     strengths = ("share", "waves")
     frames_needed = ("baseline", "axis")

@@ -64,6 +64,7 @@ class HyperbolicFringes(Effect):
     name = "hyperbolic_fringes"
     title = "hyperbolic fringes"
     acts_at = Stage.LIGHT
+    order = 6
     domains = ("space",)
     strengths = ("share",)
     fit_model = "hyperbolic"

@@ -32,6 +32,7 @@ class IntensityNoise(Effect):
     name = "intensity_noise"
     title = "intensity changing from frame to frame"
     acts_at = Stage.LIGHT
+    order = 2
     domains = ("time",)
     strengths = ("rms", "line", "tracks")
     absorbed_because = "the fit has a free intensity in each frame"

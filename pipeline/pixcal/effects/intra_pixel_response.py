@@ -39,6 +39,7 @@ class IntraPixelResponse(Effect):
     name = "intra_pixel_response"
     title = "pixels of a width"
     acts_at = Stage.PIXEL
+    order = 1
     domains = ("space",)
     strengths = ("width_px", "width_rms_px")
     frames_needed = ("baseline",)

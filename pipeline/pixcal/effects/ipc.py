@@ -67,6 +67,7 @@ class Ipc(Effect):
     name = "ipc"
     title = "crosstalk between pixels"
     acts_at = Stage.SIGNAL
+    order = 1
     domains = ("space", "noise")
     strengths = ("couplings",)
     frames_needed = ("dark", "flat", "baseline")

@@ -66,6 +66,7 @@ class Lag(Effect):
     name = "lag"
     title = "charge left behind in the next frames"
     acts_at = Stage.CHARGE
+    order = 3
     domains = ("time", "intensity")
     strengths = ("share",)
     absorbed_because = (

@@ -60,6 +60,7 @@ class Nonlinearity(Effect):
     name = "nonlinearity"
     title = "response that is not a straight line"
     acts_at = Stage.SIGNAL
+    order = 2
     domains = ("intensity",)
     strengths = ("quadratic", "cubic", "bends")
     frames_needed = ("ladder",)

@@ -46,6 +46,7 @@ class Quantisation(Effect):
     name = "quantisation"
     title = "steps and uneven codes of the converter"
     acts_at = Stage.CONVERTER
+    order = 2
     domains = ("noise", "intensity")
     strengths = ("coarse_adu", "dnl_rms", "ripple", "bits")
     left_because = "rounding adds noise of some hundredths of the bound"

@@ -40,6 +40,7 @@ class RollingShutter(Effect):
     name = "rolling_shutter"
     title = "rows exposed while the phase steps"
     acts_at = Stage.LIGHT
+    order = 9
     domains = ("time", "space")
     strengths = ("line_time_us", "settling")
     left_because = "the part that the fit leaves is a tenth of the bound of 300 frames"

@@ -44,6 +44,7 @@ class RowNoise(Effect):
     name = "row_noise"
     title = "noise common to a row or a column"
     acts_at = Stage.READOUT
+    order = 2
     domains = ("noise", "time")
     strengths = ("row_rms", "flicker_rms", "interlace_rms", "column_rms")
     left_because = "noise that is independent in each frame averages out"

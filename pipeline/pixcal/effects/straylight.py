@@ -64,6 +64,7 @@ class Straylight(Effect):
     name = "straylight"
     title = "scattered light that does not interfere"
     acts_at = Stage.LIGHT
+    order = 8
     domains = ("space",)
     strengths = ("share", "slope_per_px", "bump", "patterns")
     frames_needed = ("axis",)

@@ -45,6 +45,7 @@ class TelegraphNoise(Effect):
     name = "telegraph_noise"
     title = "pixels that jump between two levels"
     acts_at = Stage.READOUT
+    order = 1
     domains = ("noise",)
     strengths = ("amplitude_e",)
     left_because = "such pixels have larger errors, and SIGMA shows them"

@@ -39,6 +39,7 @@ class WavelengthDrift(Effect):
     name = "wavelength_drift"
     title = "wavelength drifting, or hopping between modes"
     acts_at = Stage.LIGHT
+    order = 1
     domains = ("time",)
     strengths = ("ramp", "walk", "hop")
     absorbed_because = "the fit has a free phase and fringe vector in each frame"

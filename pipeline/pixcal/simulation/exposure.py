@@ -55,9 +55,7 @@ class Camera:
     ) -> None:
         self.bench = bench if noise else replace(bench, shot_noise=False)
         self.noise = noise
-        self.effects = sorted(
-            (e for e in effects if not e.is_null), key=lambda e: (e.acts_at, e.name)
-        )
+        self.effects = sorted((e for e in effects if not e.is_null), key=lambda e: e.turn)
         halo = sum(e.halo for e in self.effects)
         self.inside = rows
         self.rows: Rows = (max(0, rows[0] - halo), min(bench.detector.shape[0], rows[1] + halo))

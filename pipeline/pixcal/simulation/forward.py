@@ -3,8 +3,7 @@
 A frozen dataclass of parameters, made with `pixcal.model.config.quantity`: units, ranges, and
 defaults of the size that the literature gives, cited in ``sources``. A model overrides the steps of
 the exposure that it acts on; the others leave things as they are. The order of the steps is that of
-a camera (`pixcal.simulation.exposure`); within a step, models act in the order of
-`ForwardModel.acts_at` and then of their names.
+a camera (`pixcal.simulation.exposure`); within a step, models act in that of `ForwardModel.turn`.
 """
 
 import dataclasses
@@ -55,6 +54,8 @@ class ForwardModel:
     title : str
         In a few words, for people.
     acts_at : Stage
+    order : int
+        Among those of the same stage: lower ones act first.
     domains : tuple of str
         Where it shows: one or more of `DOMAINS`, the first before all.
     strengths : tuple of str
@@ -75,6 +76,7 @@ class ForwardModel:
     name: ClassVar[str]
     title: ClassVar[str]
     acts_at: ClassVar[Stage]
+    order: ClassVar[int] = 100
     domains: ClassVar[tuple[str, ...]]
     strengths: ClassVar[tuple[str, ...]]
     optional_parameters: ClassVar[tuple[str, ...]] = ()
@@ -86,6 +88,11 @@ class ForwardModel:
         """The same effect, ``factor`` times as strong."""
         changed = {name: _times(getattr(self, name), factor) for name in self.strengths}
         return dataclasses.replace(self, **changed)
+
+    @property
+    def turn(self) -> tuple[int, int, str]:
+        """When it acts, among others; those of one order, by their names."""
+        return self.acts_at, self.order, self.name
 
     @property
     def is_null(self) -> bool:

@@ -72,7 +72,7 @@ class Treatments:
     def _those(self, how: str) -> tuple[Effect, ...]:
         """Effects of a treatment, the last that acted first."""
         matching = [t.effect for t in self.every if t.how == how]
-        return tuple(sorted(matching, key=lambda e: (e.acts_at, e.name), reverse=True))
+        return tuple(sorted(matching, key=lambda e: e.turn, reverse=True))
 
     @property
     def on_samples(self) -> tuple[Effect, ...]:

@@ -185,7 +185,7 @@ class FittedSet:
         maps = by_maps = before = FringeMaps(
             filled(self.theta, self.k), self.k, self.origin, self.flat, self.name
         )
-        for effect in sorted(effects, key=lambda e: (e.acts_at, e.name), reverse=True):
+        for effect in sorted(effects, key=lambda e: e.turn, reverse=True):
             # Their levels are those of `IntensityBeforeEffects`, without the noise of maps.
             by_maps = effect.undo(by_maps) or by_maps
             maps = effect.undo(maps) or undone_on_samples(effect, maps) or maps

@@ -47,7 +47,7 @@ class IntensityBeforeEffects:
         """Even frames of these levels (e-) without the effects."""
         frames = np.broadcast_to(levels[:, None, None], (len(levels), ACROSS, ACROSS))
         found = start = np.asarray(frames, np.float32)
-        for effect in sorted(self.effects, key=lambda e: (e.acts_at, e.name), reverse=True):
+        for effect in sorted(self.effects, key=lambda e: e.turn, reverse=True):
             undone = effect.undo_samples(found)
             found = found if undone is None else undone
         if found is start:
