@@ -24,7 +24,7 @@ from pixcal.simulation.replica import set_recordings
 
 F64 = NDArray[np.float64]
 
-DRAWS = 96
+DRAWS = 64
 AROUND = 1.1  # ratio of frequencies over which the power of a change hardly differs
 UNIT = 1e-3  # size at which a strength is looked at that is zero by default
 # factor on parameters to see what depends on them, and on frequencies, of which an exposure might
@@ -108,9 +108,7 @@ def strengths_of(
     every: Sequence[Watched], start: ForwardModel, leave: Sequence[str]
 ) -> list[Strength]:
     """Strengths of a model that change some series."""
-    lines = [f.name for f in fields(start) if unit_of(start, f.name) == "Hz"]
-    start = replace(start, **{name: OTHER * getattr(start, name) for name in lines})
-    found = []
+    start, found = _heard(start), []
     for field in [f for f in start.strengths if f not in leave]:
         values = getattr(start, field)
         for place, value in enumerate(values if isinstance(values, tuple) else (values,)):
@@ -119,6 +117,12 @@ def strengths_of(
                 own = with_number(start.scaled(0.0), field, at, value or UNIT)
                 found += _strength(every, own, field, at, value or UNIT)
     return found
+
+
+def _heard(start: ForwardModel) -> ForwardModel:
+    """The model with frequencies of which an exposure is no whole number of periods."""
+    lines = [f.name for f in fields(start) if unit_of(start, f.name) == "Hz"]
+    return replace(start, **{name: OTHER * getattr(start, name) for name in lines})
 
 
 def _strength(
@@ -140,9 +144,11 @@ def _strength(
                 break
     steady, power = all(np.array_equal(*v) for v in drawn), 1.0
     if not steady:
+        # Of the same random numbers: two draws tell.
         half = with_number(own, field, place, unit / 2)
-        whole, less = (sum(float(np.trace(w.part(m).sum(0))) for w in every) for m in (own, half))
-        power = float(np.log2(whole / less))
+        less = [w.changes(half, 2) for w in every]
+        whole, part = (sum(float(np.diff(v, axis=0).var()) for v in d) for d in (drawn, less))
+        power = float(np.log2(whole / part))
     return [Strength(own, field, place, unit, shape, steady, power)]
 
 
@@ -167,9 +173,13 @@ class FrameChanges:
             self._every.append([*(watched(s, LIGHT) for s in light.sets), *dark])
             self._lines.append(light.line)
 
-    def series(self, start: ForwardModel, leave: Sequence[str]) -> list[Watched]:
-        """Series of the kinds that a model changes."""
-        return [w for every in self._every if strengths_of(every, start, leave) for w in every]
+    def series(self, start: ForwardModel) -> list[Watched]:
+        """Series of the kinds that a model changes when it is strong."""
+        strong = _heard(start)
+        return [
+            w for every in self._every if any(v.changes(strong, 1).any() for v in every)
+            for w in every
+        ]  # fmt: skip
 
     def line(self, of: Strength) -> Line | None:
         """The strongest line of the series that a strength changes."""

@@ -71,10 +71,10 @@ def fit_frames(
         Strengths that are not looked at.
     """
     changes = evidence.once("changes of frames", make=lambda: FrameChanges(evidence))
-    every = changes.series(kind(), leave)
-    if not every:
-        return None
+    every = changes.series(kind())
     strengths = strengths_of(every, kind(), leave)
+    if not strengths:
+        return None
     plain = [s for s in strengths if not s.of_line]
     fit = _Fit(kind(), FrameBasis(changes, every, plain))
     for field in dict.fromkeys(s.field for s in sorted(plain, key=lambda s: s.steady)):
