@@ -35,7 +35,7 @@ from pixcal.model.config import to_plain
 from pixcal.simulation.effect import Effect
 from pixcal.stages import diagnose, ingest, reduce, simulate
 from pixcal.stages.diagnose.inquiry import REFERENCES, Inquiry, inquire
-from pixcal.stages.diagnose.search import looks_like
+from pixcal.stages.diagnose.rejection import similar_to
 from pixcal.stages.diagnose.shrinkage import differing, shrinkage
 
 matplotlib.use("Agg")
@@ -185,7 +185,7 @@ def marked(made: Inquiry, name: str, truth: tuple[Effect, ...]) -> dict[str, Any
             if wrong.alone is None or other == name:
                 continue
             # Of which it is told that the frames do not tell it from the true one.
-            alike = other in found.alike.get(name, ()) or wrong.reason == looks_like(name)
+            alike = other in found.alike.get(name, ()) or wrong.reason == similar_to(name)
             told = shrinkage(data, search.nominal, wrong.alone, where)
             result["closed_by_alike" if alike else "closed_by_wrong"][other] = [
                 1 - told.gap.total,

@@ -10,15 +10,10 @@ from pixcal.estimators.diagnosis.gap import Reference, compare, flagged
 from pixcal.estimators.diagnosis.test_statistics import Curve, Key
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
-from pixcal.stages.diagnose.search import (
-    CONFIRM,
-    MIN_LOGLIK_GAIN_WEAK,
-    MOST,
-    SCREEN,
-    Candidate,
-    Found,
-    Search,
-)
+from pixcal.stages.diagnose.candidates import Candidate, SearchResult
+from pixcal.stages.diagnose.comparison import Comparison
+from pixcal.stages.diagnose.rejection import MIN_LOGLIK_GAIN_WEAK
+from pixcal.stages.diagnose.search import CONFIRM, MOST, SCREEN, Search
 from pixcal.stages.diagnose.shrinkage import LEAST, differing, shrinkage
 
 KEYS: tuple[Key, ...] = (
@@ -99,7 +94,7 @@ def search(
     candidates: Sequence[Candidate],
     mimicked: Mapping[str, float] | None = None,
     seed: int = 500,
-) -> tuple[Found, float]:
+) -> tuple[SearchResult, float]:
     data = REFERENCE.on_scale(curves((), seed, truth))
     found = Search(REFERENCE, data, simulate, lambda *_: mimicked or {}).run(
         {c.name: c for c in candidates}
@@ -110,7 +105,7 @@ def search(
 
 def test_what_is_there_is_taken_and_what_is_not_is_left() -> None:
     found, left = search({"left": 0.03}, [candidate("left", 0.0301), candidate("right", 0.03)])
-    assert found.taken == ("left",)
+    assert found.accepted == ("left",)
     assert left < 0.05
     assert found.candidates["right"].reason == "the held-out frames are not fitted better"
 
@@ -119,7 +114,7 @@ def test_two_effects_are_both_found_in_any_order() -> None:
     both = [candidate("left", 0.03), candidate("right", 0.01), candidate("little", 0.02)]
     results = [search({"left": 0.03, "right": 0.01}, order) for order in (both, both[::-1])]
     for found, left in results:
-        assert set(found.taken) == {"left", "right"}
+        assert set(found.accepted) == {"left", "right"}
         assert left < 0.05
         assert set(found.without) == {"left", "right"}
     assert results[0][1] == pytest.approx(results[1][1])
@@ -129,7 +124,7 @@ def test_of_two_that_are_alike_the_one_that_opens_no_gap_is_taken() -> None:
     found, _ = search(
         {"left": 0.03}, [candidate("mimic", 0.03), candidate("left", 0.03)], {"mimic": 49.0}
     )
-    assert found.taken == ("left",)
+    assert found.accepted == ("left",)
     assert found.candidates["mimic"].reason == "explained by left, which has a similar signature"
 
 
@@ -139,7 +134,7 @@ def test_effects_that_no_unseen_frame_tells_apart_are_named_together() -> None:
     assert twin.estimate is not None
     object.__setattr__(twin.estimate.effect, "name", "twin")
     found, _ = search({"left": 0.03}, [candidate("left", 0.03), twin], {"left": 50.0, "twin": 50.0})
-    (first,) = found.taken
+    (first,) = found.accepted
     other = {"left": "twin", "twin": "left"}[first]
     assert found.alike == {first: (other,)}
 
@@ -151,16 +146,16 @@ def test_an_effect_below_its_threshold_is_not_tried() -> None:
     assert "3.9 sigma" in found.candidates["left"].reason
     assert found.candidates["left"].alone is None
     found, _ = search({"left": 0.03}, [candidate("left", 0.03, 1.4), candidate("right", 0.03, 4.1)])
-    assert not found.taken
+    assert not found.accepted
     assert "1.4 sigma" in found.candidates["left"].reason
     found, _ = search({"left": 0.03}, [candidate("left", 0.03, 0.9), candidate("right", 0.03, 3.9)])
-    assert not found.taken
+    assert not found.accepted
     assert "0.9 sigma" in found.candidates["left"].reason
 
 
 def test_where_no_candidate_is_sure_the_fainter_one_may_be_the_cause() -> None:
     found, _ = search({"left": 0.03}, [candidate("left", 0.03, 1.1), candidate("mimic", 0.03, 2.0)])
-    assert found.taken == ("left",)
+    assert found.accepted == ("left",)
     assert not found.alike
 
 
@@ -172,7 +167,7 @@ def test_one_that_does_as_well_alone_and_nothing_beside_is_not_told_apart(sigmas
     assert twin.estimate is not None
     object.__setattr__(twin.estimate.effect, "name", "twin")
     found, _ = search({"left": 0.03}, [candidate("left", 0.03, sigmas), twin], {})
-    (first,) = found.taken
+    (first,) = found.accepted
     assert found.alike == {first: ({"left": "twin", "twin": "left"}[first],)}
 
 
@@ -185,18 +180,18 @@ def test_once_nothing_differs_only_what_is_sure_is_tried() -> None:
         tried.extend(frozenset(e.label for e in b if isinstance(e, Toy)) for b in benches)
         return simulate(benches, seeds, label, asked)
 
-    def sought(sigmas: float, mimicked: float) -> Found:
+    def sought(sigmas: float, mimicked: float) -> SearchResult:
         tried.clear()
         one, other = candidate("left", 0.03), candidate("right", 2 * NOISE, sigmas)
         data = REFERENCE.on_scale(curves((), 500, {"left": 0.03}))
         found = Search(REFERENCE, data, noted, lambda *_: {"right": mimicked})
         return found.run({"left": one, "right": other})
 
-    assert sought(9.0, 0.0).taken == ("left",)
+    assert sought(9.0, 0.0).accepted == ("left",)
     assert frozenset({"left", "right"}) in tried
     for sigmas, mimicked in ((3.0, 0.0), (9.0, 6.0)):
         found = sought(sigmas, mimicked)
-        assert found.taken == ("left",)
+        assert found.accepted == ("left",)
         assert frozenset({"left", "right"}) not in tried
         assert "3.0 sigma in addition to left" in found.candidates["right"].reason
 
@@ -220,28 +215,28 @@ def test_what_will_be_estimated_again_is_asked_for_when_a_bench_is_confirmed() -
     data = REFERENCE.on_scale(curves((), 500, {"left": 0.03, "right": 0.02}))
     made = [candidate("left", 0.03), candidate("right", 0.02), candidate("little", 0.02)]
     found = Search(REFERENCE, data, noted, estimates).run({c.name: c for c in made})
-    assert set(found.taken) == {"left", "right"}
+    assert set(found.accepted) == {"left", "right"}
     assert len(estimated) == 2
     assert asked == estimated
 
 
 def test_an_effect_that_is_only_hinted_at_passes_a_higher_mark() -> None:
     found, left = search({"left": 0.03}, [candidate("left", 0.03, sigmas=2.0)])
-    assert found.taken == ("left",)
+    assert found.accepted == ("left",)
     assert left < 0.05
     weak = {"left": 0.004}
     found, _ = search(weak, [candidate("left", 0.004, sigmas=2.0)])
     sure, _ = search(weak, [candidate("left", 0.004, sigmas=20.0)])
     gain = sure.final.log_likelihood - sure.nominal.log_likelihood
-    assert sure.taken == ("left",)
-    assert (found.taken == ("left",)) == (gain >= MIN_LOGLIK_GAIN_WEAK)
+    assert sure.accepted == ("left",)
+    assert (found.accepted == ("left",)) == (gain >= MIN_LOGLIK_GAIN_WEAK)
 
 
 @pytest.mark.parametrize("size", [0.006, 0.04])
 def test_a_stand_in_for_an_unknown_cause_is_not_claimed(size: float) -> None:
     """It makes the data likelier, but little of the gap is closed beside what stays open."""
     found, left = search({"unknown": 0.05, "little": 0.004}, [candidate("little", size)])
-    assert not found.taken
+    assert not found.accepted
     assert left == pytest.approx(1, abs=0.02)
     assert "stays unexplained" in found.candidates["little"].reason
 
@@ -250,18 +245,18 @@ def test_a_small_remainder_of_what_another_cause_brings_about_is_not_claimed() -
     both = [candidate("left", 0.03), candidate("little", 0.003)]
     truth = {"left": 0.03, "little": 0.003}
     alone, _ = search(truth, both)
-    assert alone.taken == ("left", "little")
+    assert alone.accepted == ("left", "little")
     beside, _ = search(truth, both, {"little": 20.0})
-    assert beside.taken == ("left",)
+    assert beside.accepted == ("left",)
     assert "40% of its significance" in beside.candidates["little"].reason
 
 
 def test_a_small_remainder_that_only_the_held_out_frames_show_is_not_claimed() -> None:
     truth = {"left": 0.03, "right": 0.03, "little": 0.0048}
     strong = [candidate("left", 0.03), candidate("right", 0.03), candidate("little", 0.0048)]
-    assert set(search(truth, strong)[0].taken) == {"left", "right", "little"}
+    assert set(search(truth, strong)[0].accepted) == {"left", "right", "little"}
     weak, left = search(truth, [*strong[:2], candidate("little", 0.0048, sigmas=2.8)])
-    assert set(weak.taken) == {"left", "right"}
+    assert set(weak.accepted) == {"left", "right"}
     assert left < 0.15
     assert "not significant (2.8 sigma) in" in weak.candidates["little"].reason
 
@@ -269,20 +264,20 @@ def test_a_small_remainder_that_only_the_held_out_frames_show_is_not_claimed() -
 def test_a_large_share_of_the_gap_is_claimed_whatever_another_cause_brings_about() -> None:
     both = [candidate("left", 0.03), candidate("right", 0.03)]
     found, _ = search({"left": 0.03, "right": 0.018}, both, {"right": 20.0})
-    assert set(found.taken) == {"left", "right"}
+    assert set(found.accepted) == {"left", "right"}
 
 
 def test_of_a_vague_law_and_its_replay_the_one_that_leaves_less_of_the_gap_is_taken() -> None:
     data = REFERENCE.on_scale(curves((), 500, {"left": 0.03}))
-    judged = Search(REFERENCE, data, simulate, lambda *_: {})
-    replay = judged.held_against((Toy("left", 0.0288),), [curves((Toy("left", 0.0288),), 0)])
+    judged = Comparison(REFERENCE, data)
+    replay = judged.trial((Toy("left", 0.0288),), [curves((Toy("left", 0.0288),), 0)])
     vague = replace(
         replay.expected,
         mean={key: 0.75 * mean for key, mean in data.items()},
         variance={key: 4 * v for key, v in judged.nominal.expected.variance.items()},
     )
     law = replace(replay, expected=vague, log_likelihood=replay.log_likelihood + 1)
-    assert judged._closer(replay, law)
+    assert judged.replay_fits_better(replay, law)
 
 
 def test_a_replay_that_is_likelier_than_the_law_is_taken() -> None:
@@ -297,8 +292,8 @@ def test_a_replay_that_is_likelier_than_the_law_is_taken() -> None:
 def test_a_cause_beyond_the_most_is_told_that_no_more_were_sought() -> None:
     truth = dict.fromkeys(SINGLE, 0.03)
     found, _ = search(truth, [candidate(label, 0.03) for label in SINGLE])
-    (left_out,) = set(SINGLE) - set(found.taken)
-    assert len(found.taken) == MOST
+    (left_out,) = set(SINGLE) - set(found.accepted)
+    assert len(found.accepted) == MOST
     assert "the search stops after" in found.candidates[left_out].reason
 
 
@@ -333,7 +328,7 @@ def test_each_cause_is_weighed_alone_by_as_many_simulations_as_all_together() ->
     found = Search(REFERENCE, data, noted, lambda *_: {}).run(
         {label: candidate(label, size) for label, size in sizes.items()}
     )
-    assert set(found.taken) == set(sizes)
+    assert set(found.accepted) == set(sizes)
     for name in sizes:
         assert benches[frozenset({name})] == CONFIRM
 
@@ -344,8 +339,8 @@ def test_what_opens_elsewhere_widens_the_interval_of_what_is_left() -> None:
     benches = [(candidate("mimic", 0.03).estimate.effect,)]  # type: ignore[union-attr]
     (made,) = simulate(benches, CONFIRM, "", ())
     assert not isinstance(made, str)
-    tried = Search(REFERENCE, data, simulate, lambda *_: {})
-    trial = tried.held_against(benches[0], made)
+    tried = Comparison(REFERENCE, data)
+    trial = tried.trial(benches[0], made)
     where = flagged(compare(data, tried.nominal.expected))
     told = shrinkage(data, tried.nominal, trial, where)
     opened = flagged(told.after) - where
@@ -368,15 +363,15 @@ def test_where_fewer_effects_are_refused_all_stay(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setitem(globals(), "simulate", fails)
     truth = {"left": 0.03, "right": 0.02}
     found, left = search(truth, [candidate(label, size) for label, size in truth.items()])
-    assert set(found.taken) == {e.name for e in found.final.effects}
-    assert set(found.without) == set(found.taken)
+    assert set(found.accepted) == {e.name for e in found.final.effects}
+    assert set(found.without) == set(found.accepted)
     assert left < 0.05
 
 
 def test_nothing_is_claimed_of_nothing() -> None:
     for seed in range(600, 640):
         found, left = search({}, [candidate(label, 2 * NOISE) for label in PATTERNS], None, seed)
-        assert not found.taken
+        assert not found.accepted
         assert left == 0
 
 
@@ -392,7 +387,7 @@ def test_an_estimate_inflated_by_another_effect_is_scaled_down() -> None:
         [candidate("left", 0.03), candidate("right", 0.02)],
         {"right": 25.0},
     )
-    assert set(found.taken) == {"left", "right"}
+    assert set(found.accepted) == {"left", "right"}
     sizes = {e.label: e.size for e in found.final.effects if isinstance(e, Toy)}
     assert sizes["right"] == pytest.approx(0.01)
     assert left < 0.05
@@ -415,7 +410,7 @@ def test_a_bench_that_fails_only_when_confirmed_costs_its_candidate(
     monkeypatch.setitem(globals(), "simulate", fails)
     both = {"left": 0.03, "right": 0.01}
     found, _ = search(both, [candidate(label, size) for label, size in both.items()])
-    assert found.taken == ("right",)
+    assert found.accepted == ("right",)
     assert found.candidates["left"].reason == "cannot be simulated: no light left"
 
 
@@ -423,5 +418,5 @@ def test_a_cause_always_has_a_gap_that_it_closes() -> None:
     for seed in range(700, 730):
         found, left = search({"left": 0.0025}, [candidate("left", 0.0025)], None, seed)
         data = REFERENCE.on_scale(curves((), seed, {"left": 0.0025}))
-        assert bool(differing(found.nominal, found.final, data)) >= bool(found.taken)
+        assert bool(differing(found.nominal, found.final, data)) >= bool(found.accepted)
         assert left <= 1

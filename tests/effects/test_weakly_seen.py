@@ -5,8 +5,8 @@ import pytest
 from pixcal.effects.ipc import Ipc
 from pixcal.effects.row_noise import RowNoise
 from pixcal.simulation.effect import Effect, Estimate
+from pixcal.stages.diagnose.candidates import Candidate
 from pixcal.stages.diagnose.inquiry import weakly_seen
-from pixcal.stages.diagnose.search import Candidate
 
 KINDS: dict[str, type[Effect]] = {"ipc": Ipc, "row_noise": RowNoise}
 

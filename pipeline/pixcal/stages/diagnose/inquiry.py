@@ -16,10 +16,11 @@ from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Again, Effect, Estimate
+from pixcal.stages.diagnose.candidates import Candidate, SearchResult
 from pixcal.stages.diagnose.deciding import MORE
 from pixcal.stages.diagnose.look import DiagnosisInput, look_at, plain_part
 from pixcal.stages.diagnose.result import by_domain
-from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Candidate, Found, Search
+from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Search
 from pixcal.stages.diagnose.trial import OF_ESTIMATE, Curves, Effects, Signature, Trials, estimate
 from pixcal.stages.diagnose.windows import whole_of
 
@@ -46,7 +47,7 @@ class Inquiry:
     data : mapping
         Curves of the data on the reference's scales.
     search : Search
-    found : Found
+    found : SearchResult
     """
 
     base: Effects
@@ -55,7 +56,7 @@ class Inquiry:
     reference: Reference
     data: Mapping[Key, F64]
     search: Search
-    found: Found
+    found: SearchResult
 
 
 def inquire(
@@ -155,7 +156,7 @@ def places(made: Inquiry) -> list[dict[str, Any]]:
         data = own.on_scale(look.each[number])
         nominal = compare(data, expect_nominal(own))
         final = nominal
-        if made.found.taken:
+        if made.found.accepted:
             bench = (*made.base, *made.found.final.effects)
             final = compare(data, expect_with(own, trials.of_window(number, bench, CONFIRM)))
         places.append({"window": plain_part(window.part), "domains": by_domain(nominal, final)})

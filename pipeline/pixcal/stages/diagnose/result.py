@@ -21,8 +21,8 @@ from pixcal.estimators.diagnosis.test_statistics.signature import statistic_name
 from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place
 from pixcal.simulation.effect import DOMAINS
+from pixcal.stages.diagnose.candidates import Candidate, SearchResult
 from pixcal.stages.diagnose.deciding import recommend_frames
-from pixcal.stages.diagnose.search import Candidate, Found
 from pixcal.stages.diagnose.shrinkage import Shrinkage, Trial, differing, shrinkage
 
 F64 = NDArray[np.float64]
@@ -43,7 +43,7 @@ SHOWN = 3
 
 
 def describe(
-    found: Found,
+    found: SearchResult,
     data: Mapping[Key, F64],
     measured: Mapping[Key, Curve],
     reference: Reference,
@@ -54,7 +54,7 @@ def describe(
 
     Parameters
     ----------
-    found : Found
+    found : SearchResult
     data : mapping
         Curves of the unseen frames, on the reference's scales.
     measured : mapping
@@ -70,7 +70,7 @@ def describe(
     verdict = _verdict(found, final)
     curves = _curves(found, final, data, measured, reference)
     by_key = {(c["statistic"], c["set"]): c for c in curves}
-    causes = [_cause(name, found, data, where, final, facts) for name in found.taken]
+    causes = [_cause(name, found, data, where, final, facts) for name in found.accepted]
     diagnosis = {
         "schema": SCHEMA,
         "pixcal": __version__,
@@ -118,10 +118,10 @@ def by_domain(
     return found
 
 
-def _verdict(found: Found, final: Shrinkage) -> str:
+def _verdict(found: SearchResult, final: Shrinkage) -> str:
     if not final.where:
         return "no gap"
-    if not found.taken:
+    if not found.accepted:
         return "unexplained"
     still = [
         key
@@ -133,7 +133,7 @@ def _verdict(found: Found, final: Shrinkage) -> str:
 
 def _cause(
     name: str,
-    found: Found,
+    found: SearchResult,
     data: Mapping[Key, F64],
     where: set[Key],
     final: Shrinkage,
@@ -187,7 +187,7 @@ def _telling(before: Trial, after: Trial, data: Mapping[Key, F64]) -> list[dict[
 
 
 def _candidate(
-    candidate: Candidate, found: Found, data: Mapping[Key, F64], where: set[Key]
+    candidate: Candidate, found: SearchResult, data: Mapping[Key, F64], where: set[Key]
 ) -> dict[str, Any]:
     closed = 0.0
     if candidate.alone is not None and where:
@@ -207,7 +207,7 @@ def _candidate(
 
 
 def _curves(
-    found: Found,
+    found: SearchResult,
     final: Shrinkage,
     data: Mapping[Key, F64],
     measured: Mapping[Key, Curve],
@@ -296,7 +296,7 @@ def _entry(key: Key, final: Shrinkage, curve: Mapping[str, Any]) -> dict[str, An
 
 
 def _absolute(
-    found: Found,
+    found: SearchResult,
     final: Shrinkage,
     curves: Mapping[Key, dict[str, Any]],
     reference: Reference,
@@ -306,7 +306,7 @@ def _absolute(
     Intervals are of one sigma: where a measurement may lie if the simulation is right.
     """
     keys: Sequence[Key] = [k for k in curves if curves[k]["unit"] in ("px", "e-", "rad")]
-    only = {n: trial for n in found.taken if (trial := found.candidates[n].alone) is not None}
+    only = {n: trial for n in found.accepted if (trial := found.candidates[n].alone) is not None}
     rows = []
     for key in keys:
         curve = curves[key]

@@ -1,0 +1,106 @@
+"""Candidates of a search for causes, and its result."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from pixcal.simulation.effect import Effect, Estimate
+from pixcal.stages.diagnose.shrinkage import Trial
+from pixcal.stages.diagnose.trial import Effects
+
+
+@dataclass
+class Candidate:
+    """An effect that may be a cause.
+
+    Attributes
+    ----------
+    name : str
+    estimate : Estimate, optional
+        From the fitted frames.
+    reason : str
+        Why it was rejected; empty when it was accepted.
+    alone : Trial, optional
+        The bench with this effect only.
+    ways : int
+        Number of variants that were simulated; the likeliest one counts.
+    share : float
+        Fraction of its significance that the causes accepted before it do not produce.
+    replay : Effect, optional
+        The effect as measured, whatever its law.
+    """
+
+    name: str
+    estimate: Estimate | None
+    reason: str = ""
+    alone: Trial | None = None
+    ways: int = 1
+    share: float = 1.0
+    replay: Effect | None = None
+
+    @property
+    def significance(self) -> float:
+        """Of the estimate, sigma; zero without one."""
+        return 0.0 if self.estimate is None else self.estimate.significance
+
+    def by_law(self, effect: Effect) -> Effect | None:
+        """The effect as the best of its laws describes it; None where it is its own law."""
+        assert self.estimate is not None
+        if effect == self.replay:
+            return self.estimate.effect
+        return self.estimate.by_law
+
+
+@dataclass
+class Accepted:
+    """Causes accepted so far.
+
+    Attributes
+    ----------
+    current : Trial
+        The bench with all of them.
+    shares : dict
+        Fraction of the significance of each remaining candidate that they do not produce.
+    effects : dict
+        By name, in the order of acceptance.
+    alike : dict
+        By the name of a cause, the candidates that fit about as well.
+    """
+
+    current: Trial
+    shares: dict[str, float]
+    effects: dict[str, Effect] = field(default_factory=dict)
+    alike: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @property
+    def bench(self) -> Effects:
+        """Effects of the bench with all causes."""
+        return tuple(self.effects.values())
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """Causes that were accepted, and the simulations that decided.
+
+    Attributes
+    ----------
+    nominal, final : Trial
+        The bench without effects, and with all causes.
+    accepted : tuple of str
+        Names of the causes, in the order of acceptance.
+    without : mapping
+        The bench with all causes but one, by its name.
+    candidates : mapping
+    alike : mapping
+        By the name of a cause, the candidates that fit about as well.
+    by_law : mapping
+        The bench with one cause as the best of its laws describes it, by its name. A cause that is
+        its own law is left out.
+    """
+
+    nominal: Trial
+    final: Trial
+    accepted: tuple[str, ...]
+    without: Mapping[str, Trial]
+    candidates: Mapping[str, Candidate]
+    alike: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    by_law: Mapping[str, Trial] = field(default_factory=dict)

@@ -1,0 +1,109 @@
+"""Why a candidate is rejected: before it is accepted, or once each cause was left out in turn."""
+
+from collections.abc import Mapping
+
+from pixcal.kernels.significance import SIGNIFICANT
+from pixcal.stages.diagnose.candidates import Candidate
+from pixcal.stages.diagnose.comparison import LAW_ERROR, Comparison
+from pixcal.stages.diagnose.shrinkage import LEAST, Trial
+
+MIN_LOGLIK_GAIN_WEAK = 12.0
+"""By which a weak candidate must raise the log-likelihood of the held-out frames; others by
+`LEAST`."""
+OPEN = 0.15
+"""Residual gap above which an unknown cause is assumed."""
+LITTLE = 0.1
+"""Fraction of the gap that a doubtful cause must close,"""
+BESIDE_OPEN = 0.25
+"""and fraction of the residual gap."""
+
+Rejection = tuple[str, str]
+"""Name of a cause, and why it is rejected."""
+
+
+def similar_to(name: str) -> str:
+    """Why a candidate is not tried any more beside an accepted cause."""
+    return f"explained by {name}, which has a similar signature"
+
+
+def needed_gain(candidate: Candidate) -> float:
+    """Gain in log-likelihood of the held-out frames that a candidate needs."""
+    return LEAST if candidate.significance >= SIGNIFICANT else MIN_LOGLIK_GAIN_WEAK
+
+
+def too_little(gain: float) -> str:
+    """Why a candidate that was tried is rejected."""
+    if gain < LEAST:
+        return "the held-out frames are not fitted better"
+    return (
+        f"the log-likelihood of the held-out frames rises by only {gain:.1f}; an effect of weak "
+        f"significance needs {MIN_LOGLIK_GAIN_WEAK:g}"
+    )
+
+
+def redundant(
+    comparison: Comparison, current: Trial, without: Mapping[str, Trial]
+) -> Rejection | None:
+    """A cause without which the held-out frames are about as likely.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    current : Trial
+        The bench with all causes.
+    without : mapping
+        The bench with all causes but one, by its name.
+    """
+    gains = {
+        name: comparison.allowing_for_laws(current, trial).log_likelihood
+        - comparison.allowing_for_laws(trial, trial).log_likelihood
+        for name, trial in without.items()
+    }
+    least = min(gains, key=lambda name: gains[name], default=None)
+    if least is None or gains[least] >= LEAST:
+        return None
+    return least, "the other causes explain the data as well without it"
+
+
+def doubtful(
+    comparison: Comparison,
+    current: Trial,
+    without: Mapping[str, Trial],
+    candidates: Mapping[str, Candidate],
+) -> Rejection | None:
+    """A cause that closes little of the gap and may stand in for another.
+
+    For an unknown cause, if much of the gap remains. For another law of the other causes, if their
+    laws produce a good part of its significance, or if it is not significant in the fitted frames.
+
+    Parameters
+    ----------
+    comparison, current, without
+        As for `redundant`.
+    candidates : mapping
+        By name.
+    """
+    where = comparison.gap_of(current)
+    open_still = comparison.residual(current, where)
+    closed = {n: comparison.residual(trial, where) - open_still for n, trial in without.items()}
+    among = [
+        name
+        for name in closed
+        if open_still > OPEN
+        or candidates[name].share < 1 - LAW_ERROR
+        or candidates[name].significance < SIGNIFICANT
+    ]
+    least = min(among, key=lambda name: closed[name], default=None)
+    if least is None or closed[least] >= max(LITTLE, BESIDE_OPEN * open_still):
+        return None
+    closes = f"closes only {max(closed[least], 0):.1%} of the gap"
+    if open_still > OPEN:
+        return least, (
+            f"{closes} while {open_still:.0%} stays unexplained; it may stand in for an unknown "
+            "cause"
+        )
+    sigmas, mimicked = candidates[least].significance, 1 - candidates[least].share
+    why = f"the other causes produce {mimicked:.0%} of its significance"
+    if sigmas < SIGNIFICANT:
+        why = f"it is not significant ({sigmas:.1f} sigma) in the frames that it was fitted to"
+    return least, f"{closes}, and {why}; it may stand in for what their laws do not describe"
