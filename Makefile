@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip --quiet install --no-compile
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: study-diagnose help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-full cluster fuzz torture effect-pictures reproduce reproduce-full blind blind-second blind-full clean
+.PHONY: study-diagnose help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-run bench-full cluster fuzz torture effect-pictures reproduce reproduce-full blind blind-second blind-full clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 17
@@ -71,6 +71,9 @@ bench: $(INSTALLED) ## speed against a bare scan, and beside other methods (6 mi
 	$(BIN)/python benchmarks/chain.py
 	$(BIN)/python benchmarks/throughput.py
 	$(BIN)/python benchmarks/comparison.py
+
+bench-run: $(INSTALLED) ## time and peak memory of `pixcal run` on two benches that pixcal did not write (4 minutes)
+	$(BIN)/python benchmarks/run_cost.py ordinary:5 lag/traps:6
 
 bench-full: $(INSTALLED) ## the same for 46 Mpix: time and memory (20 minutes, 60 GB of disk)
 	$(BIN)/python benchmarks/throughput.py --full

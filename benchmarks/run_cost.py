@@ -1,0 +1,63 @@
+"""Processor time and peak memory of ``pixcal run`` on acquisitions of the second bench.
+
+Fails where the memory passes the limit that ``pixcal run`` plans for by default, or the processor
+time passes that of the longest run allowed: 120 s on two cores.
+
+    python benchmarks/run_cost.py ordinary:5 lag/traps:6 --strength 0.7
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from pixcal.model.options import Running
+
+LONGEST_S, CORES = 120.0, 2
+BENCH = Path(__file__).parents[1] / "bench"
+
+
+def cost(case: str, seed: str, strength: str) -> bool:
+    """Run a case; whether it stays within its limits."""
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder)
+        made = [sys.executable, "-m", "second_bench", case, "--seed", seed]
+        made += ["--strength", strength, "--out", str(place / "acq")]
+        subprocess.run([*made, "--truth", str(place / "truth.json")], cwd=BENCH, check=True)
+        code = "from pixcal_cli.main import main; main()"
+        command = [sys.executable, "-c", code, "run", str(place / "acq"), "--quiet"]
+        begin = time.monotonic()
+        with subprocess.Popen([*command, "--out", str(place / "run")], stdout=-3) as process:
+            _, status, used = os.wait4(process.pid, 0)
+            process.returncode = os.waitstatus_to_exitcode(status)
+        found = json.loads((place / "run" / "products" / "diagnosis.json").read_text())
+    seconds, peak = used.ru_utime + used.ru_stime, used.ru_maxrss << 10
+    causes = ", ".join(cause["effect"] for cause in found["causes"]) or "none"
+    print(
+        f"{case} seed {seed}: {found['verdict']}, causes {causes}; {seconds:.0f} s of processor "
+        f"time ({time.monotonic() - begin:.0f} s in all), {peak >> 20} MiB of the "
+        f"{Running().memory >> 20} MiB planned for",
+        flush=True,
+    )
+    within = seconds <= CORES * LONGEST_S and peak <= Running().memory
+    return within and process.returncode == 0
+
+
+def main() -> int:
+    """Entry point."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("cases", nargs="+", metavar="CASE:SEED")
+    parser.add_argument("--strength", default="0.7")
+    asked = parser.parse_args()
+    beyond = 0
+    for case, _, seed in (listed.rpartition(":") for listed in asked.cases):
+        beyond += not cost(case, seed, asked.strength)
+    return 1 if beyond else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
