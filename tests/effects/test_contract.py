@@ -16,6 +16,7 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps, Stage
 from pixcal.simulation.exposure import Camera, frames_of, states_of
 from pixcal.simulation.recording import Recording, recordings
+from pixcal.stages.diagnose.nominal import Measured
 
 ROOT = Path(__file__).parents[2]
 GLOW = ROOT / "docs" / "examples" / "glow.py"
@@ -76,6 +77,11 @@ def test_which_of_one_stage_acts_first_is_said_and_not_left_to_names() -> None:
     # Those of a user's own, without an order, come last of their stage.
     own = effect_of_file(GLOW)()
     assert own.turn > max(cls().turn for cls in effects().values() if cls.acts_at == own.acts_at)
+
+
+def test_what_was_measured_of_a_bench_is_set_before_any_effect_acts() -> None:
+    first = Measured.acts_at, Measured.order
+    assert first < min((cls.acts_at, cls.order) for cls in effects().values())
 
 
 @EVERY

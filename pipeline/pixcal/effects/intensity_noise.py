@@ -6,7 +6,7 @@ from typing import Self
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.light import ambient_shares, light_courses
+from pixcal.estimators.frame_series.light import ambient_shares, light_courses, separate_powers
 from pixcal.kernels.processes import damped_walk, swing
 from pixcal.kernels.scene import FrameStates
 from pixcal.kernels.significance import SIGNIFICANT
@@ -24,9 +24,9 @@ class IntensityNoise(Effect):
     """Intensity B and amplitude A of every frame, multiplied by the same factor.
 
     White from frame to frame, or correlated over ``correlation_s`` (a first-order autoregression,
-    which is what a damped random walk is at equal steps), and a line of one frequency. Nothing of
-    it is constant in time, so maps alone do not tell of it; the fit leaves every frame its own
-    intensity.
+    which is what a damped random walk is at equal steps), and a line of one frequency. Where each
+    fibre's power changes by itself, the contrast changes a little too. Nothing of it is constant in
+    time, so maps alone do not tell of it; the fit leaves every frame its own intensity.
     """
 
     name = "intensity_noise"
@@ -53,12 +53,26 @@ class IntensityNoise(Effect):
     ambient: tuple[float, ...] = quantity(
         (), low=0, high=0.9, doc="share of each set's mean light that does not follow the laser"
     )
+    separate: float = quantity(
+        0.0, low=0, high=0.1, doc="relative rms of the contrast, white, where each fibre's power "
+        "changes by itself"
+    )  # fmt: skip
     tracks: tuple[Track, ...] = quantity((), doc="relative changes as measured, set by set")
+    contrast_tracks: tuple[Track, ...] = quantity(
+        (), doc="relative changes of the contrast as measured, where the fibres change separately"
+    )
 
     def scaled(self, factor: float) -> Self:
         """As in `Effect.scaled`."""
         tracks = tuple(track.scaled(factor) for track in self.tracks)
-        return replace(self, rms=factor * self.rms, line=factor * self.line, tracks=tracks)
+        return replace(
+            self,
+            rms=factor * self.rms,
+            line=factor * self.line,
+            separate=factor * self.separate,
+            tracks=tracks,
+            contrast_tracks=tuple(track.scaled(factor) for track in self.contrast_tracks),
+        )
 
     @property
     def is_null(self) -> bool:
@@ -76,7 +90,9 @@ class IntensityNoise(Effect):
         name = recording.bench.frames.fringes[recording.number].name
         change += at(self.tracks, name, time)
         level = np.maximum(1 + (1 - self._ambient(recording.number)) * change, 0.0)
-        fringe = np.maximum(1 + change, 0.0)
+        contrast = self.separate * recording.rng(self.name, 2).standard_normal(recording.count)
+        contrast += at(self.contrast_tracks, name, time)
+        fringe = np.maximum(1 + change, 0.0) * np.maximum(1 + contrast, 0.0)
         return replace(states, level=states.level * level, amplitude=states.amplitude * fringe)
 
     def replayed(self, evidence: Evidence) -> Self | None:
@@ -86,7 +102,14 @@ class IntensityNoise(Effect):
         tracks = tuple(
             Track.of(name, time, level / (1 - share[name])) for name, time, level, _ in courses
         )
-        return replace(self, rms=0.0, line=0.0, tracks=tracks)
+        contrast = tuple(
+            Track.of(name, time, change - level * share[name] / (1 - share[name]))
+            for name, time, level, change in courses
+            if self.separate
+        )
+        return replace(
+            self, rms=0.0, line=0.0, separate=0.0, tracks=tracks, contrast_tracks=contrast
+        )
 
     def _ambient(self, number: int) -> float:
         """Share of a set; zero where none is given."""
@@ -94,13 +117,20 @@ class IntensityNoise(Effect):
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """As of `Effect`, with the ambient light, which makes the contrast follow the laser."""
+        """As of `Effect`, with what moves the contrast along.
+
+        Ambient light makes it follow the laser; fibres whose powers change separately move it by a
+        little of what they move the intensity.
+        """
         found = super().estimate(evidence)
-        shares = ambient_shares(evidence)
-        if found is None or not any(
-            SIGNIFICANT * error < share < MOST_AMBIENT for share, error in shares
-        ):
-            return found
-        ambient = tuple(float(np.clip(share, 0, MOST_AMBIENT)) for share, _ in shares)
+        if found is None:
+            return None
         assert isinstance(found.effect, cls)
-        return replace(found, effect=replace(found.effect, ambient=ambient))
+        effect = found.effect
+        shares = ambient_shares(evidence)
+        if any(SIGNIFICANT * error < share < MOST_AMBIENT for share, error in shares):
+            ambient = tuple(float(np.clip(share, 0, MOST_AMBIENT)) for share, _ in shares)
+            effect = replace(effect, ambient=ambient)
+        elif found.significance > SIGNIFICANT:
+            effect = replace(effect, separate=separate_powers(evidence))
+        return replace(found, effect=effect)

@@ -23,10 +23,12 @@ from pixcal.estimators.frame_series.variance_components import (
     estimate_components,
     walk_power,
 )
+from pixcal.kernels.significance import SIGNIFICANT
 
 F64 = NDArray[np.float64]
 
 FEWEST_DARK = 12  # frames without light from which their offset is learnt
+IMBALANCE = 0.15  # difference of the fibres' powers over their sum, at most
 OFFSETS = ("offset", "offset_walk")
 LIGHT_PARTS = ("power", "power_walk", "contrast", "contrast_walk", *OFFSETS)
 PATTERNS = {
@@ -130,6 +132,30 @@ def ambient_shares(evidence: Evidence) -> list[tuple[float, float]]:
             error = np.sqrt(float(rest @ rest) / max(len(rest) - 1, 1) / square)
             found[name] = slope / (1 + slope), float(error) / (1 + slope) ** 2
     return list(found.values())
+
+
+def separate_powers(evidence: Evidence) -> float:
+    """Relative rms change of the contrast where the powers of two fibres change separately.
+
+    With power shares ``(1 + d) / 2`` and ``(1 - d) / 2`` the contrast goes with ``sqrt(1 - d²)``. A
+    change x of d moves it by ``-d x``, and x is about as large as the relative change of the sum. A
+    contrast that changes by up to `IMBALANCE` of the intensity is therefore no effect of its own.
+    Zero where it changes by more, or no more than by noise.
+    """
+    of_level = of_contrast = chance = 0.0
+    for f in evidence.fringes.values():
+        series = light_series(f)
+        if series is None:
+            continue
+        noise = float(series.noise[1, 1])
+        b, a = f.free[:, 0], np.hypot(f.free[:, 1], f.free[:, 2])
+        seen = float(np.var(a / b / np.median(a / b)))
+        of_level += float(np.var(b / b.mean()))
+        of_contrast += seen - noise
+        chance += 2 * seen**2 / len(b)
+    if of_contrast <= SIGNIFICANT * np.sqrt(chance) or of_contrast > IMBALANCE**2 * of_level:
+        return 0.0
+    return float(np.sqrt(of_contrast / max(len(evidence.fringes), 1)))
 
 
 def light_of(evidence: Evidence) -> FrameLight | None:

@@ -85,6 +85,8 @@ class Measured(Effect):
     name = " measured"
     title = "as measured"
     acts_at = Stage.LIGHT
+    # Before all effects: what it sets would replace what they do.
+    order = -1
     domains = ()
     strengths = ()
     sources = ()
