@@ -150,3 +150,19 @@ def test_ambient_light_is_told_from_a_change_of_contrast(
     assert found is not None
     assert isinstance(found.effect, IntensityNoise)
     assert any(found.effect.ambient) == any(shares)
+
+
+@pytest.mark.parametrize(("separate", "recognised"), [(8e-4, True), (5e-3, False), (0.0, False)])
+def test_fibres_that_change_separately_move_the_contrast_by_a_little(
+    acquired: Callable[..., Evidence], separate: float, recognised: bool
+) -> None:
+    """Contrast that changes by up to a sixth of the intensity; more is an effect of its own."""
+    on = {"rms": 0.01, "separate": separate}
+    evidence = acquired(None, {"intensity_noise": on})
+    found = IntensityNoise.estimate(evidence)
+    assert found is not None
+    assert isinstance(found.effect, IntensityNoise)
+    assert found.effect.separate == (pytest.approx(separate, rel=0.2) if recognised else 0)
+    replay = found.effect.replayed(evidence)
+    assert replay is not None
+    assert bool(replay.contrast_tracks) == recognised

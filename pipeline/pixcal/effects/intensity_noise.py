@@ -133,4 +133,5 @@ class IntensityNoise(Effect):
             effect = replace(effect, ambient=ambient)
         elif found.significance > SIGNIFICANT:
             effect = replace(effect, separate=separate_powers(evidence))
-        return replace(found, effect=effect)
+        law = "the power of each fibre changes by itself" if effect.separate else found.law
+        return replace(found, effect=effect, law=law)

@@ -28,7 +28,7 @@ from pixcal.kernels.significance import SIGNIFICANT
 F64 = NDArray[np.float64]
 
 FEWEST_DARK = 12  # frames without light from which their offset is learnt
-IMBALANCE = 0.15  # difference of the fibres' powers over their sum, at most
+IMBALANCE = 0.02, 0.15  # least and most difference of the fibres' powers over their sum
 OFFSETS = ("offset", "offset_walk")
 LIGHT_PARTS = ("power", "power_walk", "contrast", "contrast_walk", *OFFSETS)
 PATTERNS = {
@@ -140,7 +140,7 @@ def separate_powers(evidence: Evidence) -> float:
     With power shares ``(1 + d) / 2`` and ``(1 - d) / 2`` the contrast goes with ``sqrt(1 - d²)``. A
     change x of d moves it by ``-d x``, and x is about as large as the relative change of the sum. A
     contrast that changes by up to `IMBALANCE` of the intensity is therefore no effect of its own.
-    Zero where it changes by more, or no more than by noise.
+    Zero where it changes by more or less, or no more than by noise.
     """
     of_level = of_contrast = chance = 0.0
     for f in evidence.fringes.values():
@@ -153,7 +153,8 @@ def separate_powers(evidence: Evidence) -> float:
         of_level += float(np.var(b / b.mean()))
         of_contrast += seen - noise
         chance += 2 * seen**2 / len(b)
-    if of_contrast <= SIGNIFICANT * np.sqrt(chance) or of_contrast > IMBALANCE**2 * of_level:
+    least, most = (d**2 * of_level for d in IMBALANCE)
+    if of_contrast <= SIGNIFICANT * np.sqrt(chance) or not least < of_contrast < most:
         return 0.0
     return float(np.sqrt(of_contrast / max(len(evidence.fringes), 1)))
 
