@@ -36,6 +36,7 @@ class ContrastNoise(Effect):
     strengths = ("vibration_rad", "polarisation", "tracks")
     absorbed_because = "the fit has a free fringe amplitude in each frame"
     frames_needed = ()
+    quick = False
     sources = (
         "Rousset et al., section 4.2: micro-vibrations within a frame are still to be looked at",
         "Colavita 1999, PASP 111, 111: the visibility falls by exp(-s²/2) for a phase of rms s "

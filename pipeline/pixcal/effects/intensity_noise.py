@@ -37,6 +37,7 @@ class IntensityNoise(Effect):
     strengths = ("rms", "line", "tracks")
     absorbed_because = "the fit has a free intensity in each frame"
     frames_needed = ()
+    quick = False
     sources = (
         "Rousset et al., section on simulations: 2 % fluctuations of the laser (design/paper.txt)",
         "Thorlabs manual 12112-S01 (HRP350 He-Ne laser): modes that sweep through the gain curve "
