@@ -24,7 +24,7 @@ from pixcal.simulation.shot import Shot
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-_DISAGREE = 4.0
+_DISAGREE = 2.5
 _MIN_FRAMES = 8
 _CURVED = 3.0
 
