@@ -41,7 +41,7 @@ def blind() -> None:
 )
 def make(folder: Path, sealed: Path, config: MakeConfig, runtime: "Runtime") -> None:
     """Simulate cases with no, one or several effects, and seal the truth."""
-    import blind_examination as stage  # here: for a fast `pixcal --help`
+    from blind_examination import examination as stage  # here: for a fast `pixcal --help`
 
     examination = stage.make(folder, sealed, config, runtime)
     click.echo(f"cases in {folder}: {config.cases}; their truth in {sealed}")
@@ -53,7 +53,7 @@ def make(folder: Path, sealed: Path, config: MakeConfig, runtime: "Runtime") -> 
 )
 def run(folder: Path, config: RunConfig, runtime: "Runtime") -> None:
     """Diagnose every case of DIR that is not done yet."""
-    import blind_examination as stage  # here: for a fast `pixcal --help`
+    from blind_examination import examination as stage  # here: for a fast `pixcal --help`
 
     done, failed = stage.run(folder, config, runtime)
     failures = f", {failed} of which failed" if failed else ""
@@ -69,7 +69,7 @@ def run(folder: Path, config: RunConfig, runtime: "Runtime") -> None:
 )
 def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: "Runtime") -> None:
     """Compare every diagnosis with its truth."""
-    import blind_examination as stage  # here: for a fast `pixcal --help`
+    from blind_examination import examination as stage  # here: for a fast `pixcal --help`
 
     result = stage.score(folder, sealed, config, runtime)
     _show(result)

@@ -13,7 +13,7 @@ import pytest
 import yaml
 from astropy.io import fits
 
-import blind_examination as blind
+from blind_examination import examination as blind
 from blind_examination.benches import LAYOUTS
 from blind_examination.cases import write_examination
 from blind_examination.draw import (

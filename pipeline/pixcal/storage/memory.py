@@ -9,10 +9,10 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
@@ -94,22 +94,24 @@ class MemoryBuild:
 class MemoryArray:
     """An array in whole chunks, as `pixcal.storage.cube` has them."""
 
-    values: NDArray[Any]
+    values: "NDArray[Any]"
     chunks: tuple[int, ...]
     fill_value: Any
     attrs: dict[str, Any]
 
-    def write(self, start: Sequence[int], data: NDArray[Any]) -> None:
+    def write(self, start: Sequence[int], data: "NDArray[Any]") -> None:
         """Write a block."""
         at = tuple(slice(s, s + n) for s, n in zip(start, data.shape, strict=True))
         self.values[at] = data
 
-    def chunk(self, index: Sequence[int]) -> NDArray[Any]:
+    def chunk(self, index: Sequence[int]) -> "NDArray[Any]":
         """A chunk, padded at the edges; not to be changed."""
         sides = zip(index, self.chunks, strict=True)
         part = self.values[tuple(slice(i * c, (i + 1) * c) for i, c in sides)]
         if part.shape == self.chunks:
             return part
+        import numpy as np  # here: for a fast `pixcal --help`
+
         whole = np.full(self.chunks, self.fill_value, self.values.dtype)
         whole[tuple(map(slice, part.shape))] = part
         return whole
