@@ -117,6 +117,8 @@ def _default(value: object) -> str:
         return "needed"
     if value in (None, (), ""):
         return "–"
+    if isinstance(value, tuple) and dataclasses.is_dataclass(value[0]):
+        return f"{len(value)} entries"
     return f"`{list(value) if isinstance(value, tuple) else value}`"
 
 
