@@ -92,19 +92,6 @@ class BiasDrift(Effect):
     )
     tracks: tuple[Track, ...] = quantity((), unit="e-", doc="offsets of fringe runs as measured")
 
-    def scaled(self, factor: float) -> Self:
-        """As in `Effect.scaled`."""
-        plain = replace(self, tracks=())
-        tracks = tuple(track.scaled(factor) for track in self.tracks)
-        changed = {n: factor * getattr(self, n) for n in plain.strengths if n != "tracks"}
-        return replace(plain, tracks=tracks, **changed)
-
-    @property
-    def is_null(self) -> bool:
-        """As in `Effect.is_null`."""
-        plain = any(getattr(self, n) for n in self.strengths if n != "tracks")
-        return not plain and not any(v for t in self.tracks for v in t.value)
-
     def trend(self, time_s: F64) -> F64:
         """Offset (t,), e-, that is not random; of an acquisition's times."""
         fade = np.exp(-time_s / self.settle_s)
@@ -124,7 +111,6 @@ class BiasDrift(Effect):
         return offset
 
     def readout(self, adu: F32, shot: Shot) -> F32:
-        """As in `Effect.readout`."""
         offset = self.offset(shot.time_s, shot.bench.seed, shot.rng(self.name))
         if shot.recording.kind == "fringes":
             offset += self._in_run(shot)

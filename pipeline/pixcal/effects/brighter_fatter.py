@@ -71,7 +71,6 @@ class BrighterFatter(Effect):
 
     @property
     def halo(self) -> int:
-        """As in `Effect.halo`."""
         return REACH
 
     @property
@@ -79,7 +78,6 @@ class BrighterFatter(Effect):
         return self.shift_px_per_e * boundary_shifts(self.falloff_px)
 
     def charge(self, charge: F32, shot: Shot) -> F32:
-        """As in `Effect.charge`."""
         return charge + moved_charge(charge, self._shifts, self.along_y)
 
     def restored(self, charge: F32) -> F32:
@@ -101,12 +99,10 @@ class BrighterFatter(Effect):
         return found
 
     def undo_samples(self, charge: F32) -> F32:
-        """As in `Effect.undo_samples`."""
         return np.stack([self.restored(frame) for frame in charge])
 
     @property
     def undo_halo(self) -> int:
-        """As in `Effect.undo_halo`."""
         return _TURNS * (REACH + 1)
 
     @classmethod

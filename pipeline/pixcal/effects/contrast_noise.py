@@ -54,23 +54,7 @@ class ContrastNoise(Effect):
     )
     tracks: tuple[Track, ...] = quantity((), doc="relative changes as measured, set by set")
 
-    def scaled(self, factor: float) -> Self:
-        """As in `Effect.scaled`."""
-        return replace(
-            self,
-            vibration_rad=factor * self.vibration_rad,
-            polarisation=factor * self.polarisation,
-            tracks=tuple(track.scaled(factor) for track in self.tracks),
-        )
-
-    @property
-    def is_null(self) -> bool:
-        """As in `Effect.is_null`."""
-        plain = self.vibration_rad or self.polarisation
-        return not plain and not any(v for t in self.tracks for v in t.value)
-
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
-        """As in `Effect.states`."""
         energy = recording.rng(self.name).standard_exponential(recording.count)
         drawn = recording.rng(self.name, 1).standard_normal(recording.count)
         keep = np.exp(-recording.period_s / self.polarisation_s) if self.polarisation_s else 0.0
@@ -83,7 +67,6 @@ class ContrastNoise(Effect):
         return replace(states, amplitude=np.minimum(states.amplitude * factor, most))
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        """As in `Effect.replayed`."""
         courses = light_courses(evidence)
         tracks = tuple(Track.of(name, time, change) for name, time, _, change in courses)
         return replace(self, vibration_rad=0.0, polarisation=0.0, tracks=tracks)

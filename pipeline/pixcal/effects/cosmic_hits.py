@@ -79,7 +79,6 @@ class CosmicHits(Effect):
     )
 
     def charge(self, charge: F32, shot: Shot) -> F32:
-        """As in `Effect.charge`."""
         detector = shot.bench.detector
         pitch = detector.pitch_um
         area = np.prod([(n + 2 * MARGIN_PX) * pitch * 1e-4 for n in detector.shape])

@@ -88,7 +88,6 @@ class FlatError(Effect):
     def light(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
     ) -> LightMaps:
-        """As in `Effect.light`."""
         if recording.kind != "fringes":
             return light
         ratio = self.ratio(recording.bench.detector, rows)

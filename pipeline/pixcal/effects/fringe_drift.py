@@ -1,7 +1,7 @@
 """A bench that warms and creeps: a fringe vector that changes in the course of a run."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Self, cast
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,24 +60,6 @@ class FringeDrift(Effect):
     along_x: tuple[Track, ...] = quantity((), unit="rad/px", doc="slow change of kx as measured")
     along_y: tuple[Track, ...] = quantity((), unit="rad/px", doc="slow change of ky as measured")
 
-    def scaled(self, factor: float) -> Self:
-        """As in `Effect.scaled`."""
-        tracks = {
-            name: tuple(track.scaled(factor) for track in getattr(self, name)) for name in TRACKS
-        }
-        plain = {
-            name: tuple(factor * v for v in getattr(self, name))
-            for name in self.strengths
-            if name not in TRACKS
-        }
-        return replace(self, **cast("Any", plain | tracks))
-
-    @property
-    def is_null(self) -> bool:
-        """As in `Effect.is_null`."""
-        plain = any(any(getattr(self, n)) for n in self.strengths if n not in TRACKS)
-        return not plain and not any(v for n in TRACKS for t in getattr(self, n) for v in t.value)
-
     def vector_change(self, time_s: F64) -> F64:
         """Change of the fringe vector (t, 2), rad/px, that is not random; from its first frame.
 
@@ -90,7 +72,6 @@ class FringeDrift(Effect):
         return np.asarray(np.outer(time_s / HOUR_S, self.ramp) + np.outer(fade, self.settle))
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
-        """As in `Effect.states`."""
         time = np.arange(recording.count, dtype=float) * recording.period_s
         steps = recording.rng(self.name).standard_normal((recording.count, 2))
         walk = np.cumsum(steps, axis=0) * np.sqrt(recording.period_s / HOUR_S)

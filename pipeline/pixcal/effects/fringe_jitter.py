@@ -49,7 +49,6 @@ class FringeJitter(Effect):
     )  # fmt: skip
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
-        """As in `Effect.states`."""
         drawn = recording.rng(self.name).standard_normal((recording.count, 2))
         time = np.arange(recording.count, dtype=float) * recording.period_s
         phase = 2 * np.pi * recording.rng(self.name, 1).random()

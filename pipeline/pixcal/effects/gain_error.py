@@ -65,15 +65,12 @@ class GainError(Effect):
     )  # fmt: skip
 
     def detector(self, maps: DetectorMaps, bench: Bench, rows: Rows) -> DetectorMaps:
-        """As in `Effect.detector`."""
         return replace(maps, dark_rate=maps.dark_rate * np.float32(1 + self.relative))
 
     def photons(self, mean: F32, shot: Shot) -> F32:
-        """As in `Effect.photons`."""
         return mean * np.float32(1 + self.relative)
 
     def signal(self, signal: F32, shot: Shot) -> F32:
-        """As in `Effect.signal`."""
         return signal / np.float32(1 + self.relative)
 
     @classmethod

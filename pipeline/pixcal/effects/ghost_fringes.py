@@ -92,16 +92,6 @@ class GhostFringes(Effect):
     in_flats: bool = quantity(False, doc="whether flats have the static pattern too")
     waves: tuple[GhostWave, ...] = quantity((), doc="ghosts as measured, beside the one above")
 
-    def scaled(self, factor: float) -> Self:
-        """As in `Effect.scaled`."""
-        waves = tuple(wave.scaled(factor) for wave in self.waves)
-        return replace(self, share=self.share * factor, waves=waves)
-
-    @property
-    def is_null(self) -> bool:
-        """As in `Effect.is_null`."""
-        return not self.share and all(w == w.scaled(0.0) for w in self.waves)
-
     def _waves(self, of: str) -> list[GhostWave]:
         """All waves of a set."""
         size, turn = self.share, self.phase_rad
@@ -131,7 +121,6 @@ class GhostFringes(Effect):
     def light(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
     ) -> LightMaps:
-        """As in `Effect.light`."""
         columns = (0, light.iota.shape[1])
         if recording.kind == "flat" and self.in_flats:
             mean, _ = self._factors("", rows, columns)
@@ -147,11 +136,9 @@ class GhostFringes(Effect):
         )  # fmt: skip
 
     def predict(self, maps: FringeMaps) -> FringeMaps:
-        """As in `Effect.predict`."""
         return self._times(maps, 1)
 
     def undo(self, maps: FringeMaps) -> FringeMaps:
-        """As in `Effect.undo`."""
         return self._times(maps, -1)
 
     def _times(self, maps: FringeMaps, power: int) -> FringeMaps:

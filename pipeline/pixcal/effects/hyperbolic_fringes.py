@@ -89,7 +89,6 @@ class HyperbolicFringes(Effect):
     pairs: tuple[FibrePair, ...] = quantity((), doc="position of each set's fibre pair")
 
     def check(self, bench: Bench) -> None:
-        """As in `Effect.check`."""
         if bench.optics.fringes != "straight" and not self.is_null:
             raise InputError(
                 "effects.hyperbolic_fringes: the bench's fringes are exact already; set "
@@ -99,7 +98,6 @@ class HyperbolicFringes(Effect):
     def light(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
     ) -> LightMaps:
-        """As in `Effect.light`."""
         if recording.kind != "fringes":
             return light
         bench = recording.bench

@@ -64,24 +64,12 @@ class IntensityNoise(Effect):
     )
 
     def scaled(self, factor: float) -> Self:
-        """As in `Effect.scaled`."""
-        tracks = tuple(track.scaled(factor) for track in self.tracks)
+        along = tuple(track.scaled(factor) for track in self.contrast_tracks)
         return replace(
-            self,
-            rms=factor * self.rms,
-            line=factor * self.line,
-            separate=factor * self.separate,
-            tracks=tracks,
-            contrast_tracks=tuple(track.scaled(factor) for track in self.contrast_tracks),
+            super().scaled(factor), separate=factor * self.separate, contrast_tracks=along
         )
 
-    @property
-    def is_null(self) -> bool:
-        """As in `Effect.is_null`."""
-        return not self.rms and not self.line and not any(v for t in self.tracks for v in t.value)
-
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
-        """As in `Effect.states`."""
         drawn = recording.rng(self.name).standard_normal(recording.count)
         keep = np.exp(-recording.period_s / self.correlation_s) if self.correlation_s else 0.0
         time = np.arange(recording.count, dtype=float) * recording.period_s
@@ -97,7 +85,6 @@ class IntensityNoise(Effect):
         return replace(states, level=states.level * level, amplitude=states.amplitude * fringe)
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        """As in `Effect.replayed`."""
         courses = light_courses(evidence)
         share = {name: self._ambient(n) for n, name in enumerate(evidence.fringes)}
         tracks = tuple(

@@ -60,7 +60,6 @@ class IntraPixelResponse(Effect):
     def light(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
     ) -> LightMaps:
-        """As in `Effect.light`."""
         if recording.kind != "fringes":
             return light
         detector = recording.bench.detector
@@ -73,11 +72,9 @@ class IntraPixelResponse(Effect):
         return replace(light, alpha_sin=light.alpha_sin * kept, alpha_cos=light.alpha_cos * kept)
 
     def predict(self, maps: FringeMaps) -> FringeMaps:
-        """As in `Effect.predict`."""
         return replace(maps, theta=maps.theta * self._factors(maps)[:, None, None])
 
     def undo(self, maps: FringeMaps) -> FringeMaps:
-        """As in `Effect.undo`."""
         return replace(maps, theta=maps.theta / self._factors(maps)[:, None, None])
 
     def _factors(self, maps: FringeMaps) -> F64:

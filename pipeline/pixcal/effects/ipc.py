@@ -123,22 +123,12 @@ class Ipc(Effect):
             )
         )
 
-    def scaled(self, factor: float) -> Self:
-        """The same kernel with all shares ``factor`` times as large."""
-        return replace(self, couplings=tuple(c.scaled(factor) for c in self.couplings))
-
-    @property
-    def is_null(self) -> bool:
-        """Whether all shares are zero."""
-        return all(c.share == 0 for c in self.couplings)
-
     @property
     def halo(self) -> int:
         """Rows that the longest coupling reaches over."""
         return max((abs(c.dy) for c in self.couplings), default=0)
 
     def signal(self, signal: F32, shot: Shot) -> F32:
-        """As in `Effect.signal`."""
         return couple(signal, self.couplings, (shot.rows[0], 0))
 
     @classmethod

@@ -122,11 +122,9 @@ class Lag(Effect):
 
     @property
     def frames_back(self) -> int:
-        """As in `Effect.frames_back`."""
         return len(self.releases)
 
     def charge(self, charge: F32, shot: Shot) -> F32:
-        """As in `Effect.charge`."""
         found = charge - self._left_behind(charge, shot, shot.frame)
         for back, release in enumerate(self.releases, start=1):
             before = shot.charge(shot.frame - back)

@@ -46,6 +46,10 @@ class Bend:
     level_e: float = quantity(unit="e-", low=0, high=1e8, doc="charge")
     change_e: float = quantity(unit="e-", low=-1e7, high=1e7, doc="signal beyond the polynomial")
 
+    def scaled(self, factor: float) -> Self:
+        """The same point of a response ``factor`` times as far from the polynomial."""
+        return replace(self, change_e=factor * self.change_e)
+
 
 @dataclass(frozen=True)
 class Nonlinearity(Effect):
@@ -82,18 +86,6 @@ class Nonlinearity(Effect):
     )
     bends: tuple[Bend, ...] = quantity((), doc="points of the response as measured, rising")
 
-    def scaled(self, factor: float) -> Self:
-        """As in `Effect.scaled`."""
-        bends = tuple(replace(bend, change_e=factor * bend.change_e) for bend in self.bends)
-        return replace(
-            self, quadratic=factor * self.quadratic, cubic=factor * self.cubic, bends=bends
-        )
-
-    @property
-    def is_null(self) -> bool:
-        """As in `Effect.is_null`."""
-        return not (self.quadratic or self.cubic or any(bend.change_e for bend in self.bends))
-
     @property
     def turns_at(self) -> float:
         """Level (u) from which the response no longer rises; infinite when it always does."""
@@ -102,7 +94,6 @@ class Nonlinearity(Effect):
         return min(rising, default=np.inf)
 
     def check(self, bench: Bench) -> None:
-        """As in `Effect.check`."""
         well = bench.detector.full_well_e
         if well is not None and well > self.turns_at * self.level_e:
             raise InputError(
@@ -135,11 +126,9 @@ class Nonlinearity(Effect):
         return np.asarray(np.interp(wanted, given, charge), np.float32)
 
     def undo_samples(self, charge: F32) -> F32:
-        """As in `Effect.undo_samples`."""
         return self.linearised(charge)
 
     def signal(self, signal: F32, shot: Shot) -> F32:
-        """As in `Effect.signal`."""
         return self.response(signal)
 
     @classmethod

@@ -137,7 +137,6 @@ class Quantisation(Effect):
         return np.asarray(np.maximum(passed, 0) * np.float32(self.step_adu), np.float32)
 
     def readout(self, adu: F32, shot: Shot) -> F32:
-        """As in `Effect.readout`."""
         detector = shot.bench.detector
         uneven = self.dnl_rms > 0 or self.ripple > 0
         normals = shot.normals(self.name) if uneven else None

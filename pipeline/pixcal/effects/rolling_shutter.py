@@ -70,7 +70,6 @@ class RollingShutter(Effect):
     )  # fmt: skip
 
     def check(self, bench: Bench) -> None:
-        """As in `Effect.check`."""
         if 0 < len(self.settling) < FEWEST:
             raise InputError(
                 f"effects.rolling_shutter: settling: {len(self.settling)} values; give none, or "
@@ -98,7 +97,6 @@ class RollingShutter(Effect):
         return after, before
 
     def photons(self, mean: F32, shot: Shot) -> F32:
-        """As in `Effect.photons`."""
         recording = shot.recording
         if recording.kind != "fringes":
             return mean

@@ -68,7 +68,6 @@ class RowNoise(Effect):
     )
 
     def readout(self, adu: F32, shot: Shot) -> F32:
-        """As in `Effect.readout`."""
         rng = shot.recording.pixel_rng(self.name, shot.frame)
         rows, columns = self.offsets(shot.bench.detector.shape, rng)
         gain = shot.bench.detector.gain_e_per_adu

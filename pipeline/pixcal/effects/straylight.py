@@ -37,6 +37,10 @@ class StrayPattern:
         low=-20, high=20, doc="of Legendre products in log(1 + share), by total degree"
     )
 
+    def scaled(self, factor: float) -> Self:
+        """The same pattern, ``factor`` times as strong."""
+        return replace(self, coefficients=tuple(factor * c for c in self.coefficients))
+
     def share(self, rows: F64, columns: F64) -> F64:
         """Share (y, x) of the fibres' light; beyond the part that of its edge. Never negative."""
         (y0, y1), (x0, x1) = self.rows, self.columns
@@ -89,26 +93,6 @@ class Straylight(Effect):
     )
     patterns: tuple[StrayPattern, ...] = quantity((), doc="as measured, set by set")
 
-    def scaled(self, factor: float) -> Self:
-        """As in `Effect.scaled`."""
-        x, y = self.slope_per_px
-        return replace(
-            self,
-            share=factor * self.share,
-            slope_per_px=(factor * x, factor * y),
-            bump=factor * self.bump,
-            patterns=tuple(
-                replace(p, coefficients=tuple(factor * c for c in p.coefficients))
-                for p in self.patterns
-            ),
-        )
-
-    @property
-    def is_null(self) -> bool:
-        """As in `Effect.is_null`."""
-        plain = self.share or any(self.slope_per_px) or self.bump
-        return not plain and not any(c for p in self.patterns for c in p.coefficients)
-
     def pattern(self, rows: Rows, columns: Rows, of: str = "") -> F64:
         """Share (y, x) in a set on rows and columns of the window (first, one after the last)."""
         y, x = np.arange(*rows, dtype=float), np.arange(*columns, dtype=float)
@@ -124,7 +108,6 @@ class Straylight(Effect):
     def light(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
     ) -> LightMaps:
-        """As in `Effect.light`."""
         if recording.kind != "fringes":
             return light
         name = recording.bench.frames.fringes[recording.number].name
@@ -136,7 +119,6 @@ class Straylight(Effect):
         return replace(maps, theta=np.stack([maps.theta[0] * self._more(maps), *maps.theta[1:]]))
 
     def undo(self, maps: FringeMaps) -> FringeMaps:
-        """As in `Effect.undo`."""
         return replace(maps, theta=np.stack([maps.theta[0] / self._more(maps), *maps.theta[1:]]))
 
     def _more(self, maps: FringeMaps) -> F64:

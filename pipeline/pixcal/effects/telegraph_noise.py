@@ -73,7 +73,6 @@ class TelegraphNoise(Effect):
     )  # fmt: skip
 
     def readout(self, adu: F32, shot: Shot) -> F32:
-        """As in `Effect.readout`."""
         found = adu.copy()
         detector, recording = shot.bench.detector, shot.recording
         keep = float(np.exp(-2 * recording.period_s / self.switching_s)) if self.switching_s else 0

@@ -63,7 +63,6 @@ class WavelengthDrift(Effect):
     )
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
-        """As in `Effect.states`."""
         bench, count = recording.bench, recording.count
         hours = recording.period_s / HOUR_S
         steps = recording.rng(self.name).standard_normal(count)

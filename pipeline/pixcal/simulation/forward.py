@@ -97,7 +97,8 @@ class ForwardModel:
     @property
     def is_null(self) -> bool:
         """Whether it does nothing."""
-        return all(_is_zero(getattr(self, name)) for name in self.strengths)
+        null = self.scaled(0.0)
+        return all(getattr(self, name) == getattr(null, name) for name in self.strengths)
 
     @property
     def halo(self) -> int:
@@ -149,8 +150,7 @@ class ForwardModel:
 
 
 def _times(value: Any, factor: float) -> Any:
-    return tuple(_times(v, factor) for v in value) if isinstance(value, tuple) else value * factor
-
-
-def _is_zero(value: Any) -> bool:
-    return all(map(_is_zero, value)) if isinstance(value, tuple) else value == 0
+    """A number, or what says itself how it is ``scaled``, times a factor; of tuples each part."""
+    if isinstance(value, tuple):
+        return tuple(_times(part, factor) for part in value)
+    return value.scaled(factor) if hasattr(value, "scaled") else factor * value
