@@ -12,11 +12,10 @@ from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError, PixcalError
 from pixcal.simulation.effect import DOMAINS, Effect, Estimate, Stage
 
+# steps of the exposure: each gives back what it is given first, changed
 STEPS = ("states", "detector", "light", "photons", "charge", "signal", "readout")
-"""Steps of the exposure: each gives back what it is given first, changed."""
 OTHERS = ("__post_init__", "check", "predict", "undo", "undo_samples", "noise_factor")
-MOST_AROUND = 4096
-"""Rows around a piece, or frames before one, that an effect may ask for."""
+MOST_AROUND = 4096  # rows around a piece, or frames before one, that an effect may ask for
 
 
 def checked(effect: type[Effect], file: Path) -> type[Effect]:

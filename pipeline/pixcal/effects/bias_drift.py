@@ -39,18 +39,14 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 HOUR_S = 3600.0
-STEADY = 3.0
-"""The same for a ramp and a walk; below, a walk explains the frames as well."""
-SETTLINGS = 8
-"""Time constants tried, from some steps to the length of the run."""
+STEADY = 3.0  # the same for a ramp and a walk; below, a walk explains the frames as well
+SETTLINGS = 8  # time constants tried, from some steps to the length of the run
+# fringes count where their mean offset is as well known as this, of a sample's read noise
 WORTH = 0.3
-"""Fringes count where their mean offset is as well known as this, of a sample's read noise."""
+# what moves the light of the frames of a run
 PARTS = ("power", "power_walk", "contrast", "contrast_walk", *OFFSETS)
-"""What moves the light of the frames of a run."""
-KNOTS = 32
-"""Most points of a track."""
-_KEY, _RUN = 1000, 2000
-"""First keys of the walks' random numbers: no recording has them."""
+KNOTS = 32  # most points of a track
+_KEY, _RUN = 1000, 2000  # first keys of the walks' random numbers: no recording has them
 
 
 @dataclass(frozen=True)

@@ -16,19 +16,13 @@ from pixcal.simulation.shot import Shot
 
 F32 = NDArray[np.float32]
 
-LEVEL = 5e4
-"""Electrons at which powers of the level are one."""
-
-POWERS = 3
-"""Of the response that is free beside."""
-
+LEVEL = 5e4  # electrons at which powers of the level are one
+POWERS = 3  # of the response that is free beside
 _DISAGREE = 4.0
+# standard deviations, with a response that is free beside, from which it may explain all
 _HINTED = 1.5
-"""Standard deviations, with a response that is free beside, from which it may explain all."""
-_NEEDED = 12.0
-"""Chi-square of `POWERS` terms beyond which they are needed: one in 130 by chance."""
-_TURNS = 4
-"""Of the inverse: each gains the size of the effect, a few per cent."""
+_NEEDED = 12.0  # chi-square of `POWERS` terms beyond which they are needed: one in 130 by chance
+_TURNS = 4  # of the inverse: each gains the size of the effect, a few per cent
 
 
 @dataclass(frozen=True)

@@ -18,15 +18,9 @@ from pixcal.simulation.shot import Shot
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-MARGIN_PX = 16
-"""How far beside the window tracks may begin."""
-
-THRESHOLD = 6.5
-"""Standard deviations of the noise from which a sample is an outlier."""
-
-JOINED = 3.0
-"""Standard deviations from which samples join outliers that lie near each other."""
-
+MARGIN_PX = 16  # how far beside the window tracks may begin
+THRESHOLD = 6.5  # standard deviations of the noise from which a sample is an outlier
+JOINED = 3.0  # standard deviations from which samples join outliers that lie near each other
 Samples = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]
 
 _STRAGGLING = 0.15
@@ -37,8 +31,8 @@ _MIN_HITS = 5
 _OFTEN = 2
 _RARE = 0.01
 _BRIGHTEST = 4
+# outliers of the noise itself over those of a Gaussian: shot noise of faint light is skewed
 _SKEW = 5.0
-"""Outliers of the noise itself over those of a Gaussian: shot noise of faint light is skewed."""
 
 
 @dataclass(frozen=True)

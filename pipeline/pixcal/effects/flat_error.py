@@ -24,13 +24,9 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-WAVES = 6
-"""Plane waves that make up the smooth part."""
-SMOOTH_SEEN = 3.0
-"""Standard deviations of the smooth part from which its scale is fitted."""
-AGREE = 3.0
-"""Standard deviations within which waves of one length are all that neighbours share."""
-
+WAVES = 6  # plane waves that make up the smooth part
+SMOOTH_SEEN = 3.0  # standard deviations of the smooth part from which its scale is fitted
+AGREE = 3.0  # standard deviations within which waves of one length are all that neighbours share
 _CLIP = 5.0
 _MIN_PIXELS = 200
 _MIN_FRAMES = 8

@@ -19,10 +19,9 @@ C128 = NDArray[np.complex128]
 
 PARENTS = ("modulated", "fixed", "both", "crossed")
 BOTH = "ghosts of both fibres"
-UNTIED = 0.5
-"""Share of the chi-square of the waves that the law of a beam may leave."""
+UNTIED = 0.5  # share of the chi-square of the waves that the law of a beam may leave
+# differences between sets, relative and in errors, of a pattern that is the flat's
 ALIKE, ALIKE_SIGMAS = 0.1, 5.0
-"""Differences between sets, relative and in errors, of a pattern that is the flat's."""
 
 
 @dataclass(frozen=True)

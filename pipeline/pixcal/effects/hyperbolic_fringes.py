@@ -28,10 +28,9 @@ from pixcal.simulation.recording import Recording
 F64 = NDArray[np.float64]
 
 _ITERATIONS = 4
+# chi-square by which positions of their own must fit the sets better than a common one,
 _APART = 25.0
-"""Chi-square by which positions of their own must fit the sets better than a common one,"""
-_MODEL = 0.02
-"""and the share of all of it."""
+_MODEL = 0.02  # and the share of all of it
 
 
 @dataclass(frozen=True)

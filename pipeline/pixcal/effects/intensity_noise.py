@@ -15,8 +15,8 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.track import Track, at
 
+# share of light that does not follow the laser beyond which contrast noise is likelier
 MOST_AMBIENT = 0.3
-"""Share of light that does not follow the laser beyond which contrast noise is likelier."""
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,7 @@ from pixcal.simulation.recording import Recording
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-REPEAT = 0.002
-"""To what part the visibility of two pairs of fibres is taken to be the same."""
-
+REPEAT = 0.002  # to what part the visibility of two pairs of fibres is taken to be the same
 _MIN_PIXELS = 200
 _APART = 1.1
 _CLIP = 5.0

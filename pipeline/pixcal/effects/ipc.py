@@ -34,11 +34,10 @@ from pixcal.simulation.shot import Shot
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-LEAST_SHARE = 2e-5
-"""Couplings below do not move offsets by what matters, and take time."""
-MIN_FLAT = 0.01
-"""Least response that maps are divided by."""
+LEAST_SHARE = 2e-5  # couplings below do not move offsets by what matters, and take time
+MIN_FLAT = 0.01  # least response that maps are divided by
 
+# A kernel of the size and kind that the paper finds on its GIGAPYX-4600
 FOUR_ROWS = (
     # Rows in pairs, unequal ones, and one that skips a row: the paper finds 2 to 3 % up and down,
     # repeating every four rows, "sparse", and not always between closest neighbours.
@@ -53,7 +52,6 @@ FOUR_ROWS = (
     Coupling(0, -1, 0.004, every_rows=4, row=2),
     Coupling(0, -1, 0.004, every_rows=4, row=3),
 )
-"""A kernel of the size and kind that the paper finds on its GIGAPYX-4600."""
 
 
 @dataclass(frozen=True)

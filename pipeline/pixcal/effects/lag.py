@@ -25,18 +25,11 @@ from pixcal.simulation.shot import Shot
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-TAIL = 1e-3
-"""Share of the charge left behind whose release is brought forward to the last frame."""
-
-LAGS = 6
-"""Frames back that are looked at."""
-
+TAIL = 1e-3  # share of the charge left behind whose release is brought forward to the last frame
+LAGS = 6  # frames back that are looked at
+# of the phase that pixels are free to have, so that a bent response is not taken for lag
 HARMONICS = 5
-"""Of the phase that pixels are free to have, so that a bent response is not taken for lag."""
-
-CONTROLS = 8
-"""Frames after a frame that are compared with the one before it."""
-
+CONTROLS = 8  # frames after a frame that are compared with the one before it
 _MAX_DECAY = 3.0
 _CLIP = 5.0
 _MIN_FRAMES = 20
@@ -44,10 +37,9 @@ _SERIES = 8
 _STEADIEST = 1e-4
 _ROUNDS = 2
 _CLEAR = 4.0
+# chi-squares from which releases, or the level, are taken as they come
 _NOT_EXPONENTIAL, _NOT_EVEN = 40.0, 25.0
-"""Chi-squares from which releases, or the level, are taken as they come."""
-_TURNS = 3
-"""Of the inverse: each gains a factor of the share."""
+_TURNS = 3  # of the inverse: each gains a factor of the share
 
 
 @dataclass(frozen=True)

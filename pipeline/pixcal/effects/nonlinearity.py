@@ -24,16 +24,12 @@ from pixcal.simulation.shot import Shot
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-FALLOFF_PX = 0.5
-"""Of the shift of boundaries by the brighter-fatter effect beside the response."""
-
+FALLOFF_PX = 0.5  # of the shift of boundaries by the brighter-fatter effect beside the response
+# levels, as shares of the brightest, at which a response is measured
 KNOTS = np.array([0, 1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 3 / 4, 7 / 8, 1])
-"""Levels, as shares of the brightest, at which a response is measured."""
-
+# chi-square of a measured response beside a polynomial, over that of the polynomial, from which it
+# is told
 BESIDE = 0.05
-"""Chi-square of a measured response beside a polynomial, over that of the polynomial, from which it
-is told."""
-
 _INVERSE = 1 << 14
 _NOT_TOLD = 1e-3
 _OTHER_ORDER = 4

@@ -26,8 +26,8 @@ from pixcal.simulation.shot import Shot
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+# A step between codes moves by less than a code, so that only its neighbours need be asked
 FARTHEST = 0.98
-"""A step between codes moves by less than a code, so that only its neighbours need be asked."""
 FEW_MISSING = 1.1  # step up to which wrong bits may be why codes never come, every so often
 _KEY = 997
 

@@ -18,10 +18,9 @@ from pixcal.simulation.shot import Shot
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-FEWEST = 4
-"""Rows at which a profile of the settling is given."""
+FEWEST = 4  # rows at which a profile of the settling is given
+# relative error of the slope: what the frames' own parameters absorb is known to about that
 _MODEL = 0.01
-"""Relative error of the slope: what the frames' own parameters absorb is known to about that."""
 
 
 @dataclass(frozen=True)

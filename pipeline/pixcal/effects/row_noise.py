@@ -21,12 +21,10 @@ from pixcal.simulation.shot import Shot
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-FREEDOM = 3
-"""Parameters of a pixel in the fit of the fringes."""
-TURNS = 2.0
-"""Fringes along a row from which its mean tells nothing of them."""
+FREEDOM = 3  # parameters of a pixel in the fit of the fringes
+TURNS = 2.0  # fringes along a row from which its mean tells nothing of them
+# lowest mode across the rows that counts in frames with light, whose pattern is smooth
 FIRST_MODE = 3
-"""Lowest mode across the rows that counts in frames with light, whose pattern is smooth."""
 
 
 @dataclass(frozen=True)

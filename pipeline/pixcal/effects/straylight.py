@@ -18,11 +18,8 @@ from pixcal.simulation.recording import Recording
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-DEGREE = 8
-"""Of the polynomials that a measured pattern is made of."""
-BEAMS = 2
-"""Degree of what two Gaussian beams do to the logarithm of the visibility."""
-
+DEGREE = 8  # of the polynomials that a measured pattern is made of
+BEAMS = 2  # degree of what two Gaussian beams do to the logarithm of the visibility
 _MIN_PIXELS = 200
 
 

@@ -21,9 +21,7 @@ from pixcal.simulation.shot import Shot
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-HARMONICS = 5
-"""Of the phase that are taken out of fringe residuals before they count as noise."""
-
+HARMONICS = 5  # of the phase that are taken out of fringe residuals before they count as noise
 _MIN_FRAMES = 10
 _ENOUGH = 20
 _LEAST_NOISE_ADU = 0.8

@@ -19,10 +19,9 @@ from pixcal.simulation.recording import Recording
 F64 = NDArray[np.float64]
 
 HOUR_S = 3600.0
+# scatter about two levels, over that from frame to frame, up to which there are no more
 LEVEL = 1.5
-"""Scatter about two levels, over that from frame to frame, up to which there are no more."""
-CALM = 2.0
-"""Errors of a walk up to which the levels hold still."""
+CALM = 2.0  # errors of a walk up to which the levels hold still
 
 
 @dataclass(frozen=True)

@@ -24,10 +24,8 @@ F64 = NDArray[np.float64]
 
 # sums kept for each pixel: 6 normal, 3 right-hand, weighted square of the residual, samples
 N_SUMS = 11
-
 # determinant over the product of the diagonal: without three phases it is zero up to rounding
 SINGULAR = 1e-9
-
 _FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
 
 

@@ -27,11 +27,8 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 BLOCK = 16  # pixels along each side of a block
-
 LADDER = 4  # groups of flats from which the curve may bend
-
 N_BINS = 512  # bins of level: bin n holds `n² / 4` to `(n + 1)² / 4` ADU, the last one all above
-
 REACH = 2  # pixels between neighbours whose covariance is measured, along each axis
 
 # rows and columns from a pixel to its neighbours, each pair of pixels once

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 F32 = NDArray[np.float32]
 
 FILL = 65535  # code of a sample without weight
-
 _DIGITS = 7
 
 

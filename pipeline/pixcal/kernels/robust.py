@@ -26,7 +26,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 BATCH = 64  # frames that are looked at together
-
 _LEVEL_PIXELS = 4096
 _ROUNDING = np.float32(1e-6)
 _SIGMA_OF_MAD = 1.482602218505602

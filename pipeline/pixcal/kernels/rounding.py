@@ -17,7 +17,6 @@ F64 = NDArray[np.float64]
 SHEPPARD = 1 / 12  # variance that rounding adds to noise of a step or more
 UNTOLD = 0.35  # noise below which levels that are all alike do not tell it
 SMOOTH = 1.0  # noise from which mean and variance no longer depend on the level, to 1e-7
-
 _FRACTIONS = 256
 _REACH = 9.0
 _HARMONICS = 8

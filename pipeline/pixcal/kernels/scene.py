@@ -15,7 +15,6 @@ from pixcal.model.flags import PixelFlag
 
 # Rows and columns of the chip that share a generator. Another number would be another chip.
 TILE = (64, 256)
-
 Rows = tuple[int, int]
 
 

@@ -25,7 +25,6 @@ Float32 = NDArray[np.float32]
 
 # Rows of the window that share a noise generator. Another number would be other noise.
 BLOCK_ROWS = 64
-
 # mean (e-) below which the Poisson quantile is found by summing the distribution
 EXACT_BELOW = 16.0
 

@@ -15,9 +15,7 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 STEPS_PER_PX = 4  # points of a track that stand for a pixel of its length
-
 GRAZING = 0.02  # least cosine to the layer's normal: no track is longer than 50 times the depth
-
 _RANGE = 4.0
 
 

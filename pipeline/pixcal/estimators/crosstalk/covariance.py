@@ -31,7 +31,6 @@ F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
 MIN_CHARGE = 0.1  # charge (10⁴ e-) of the least light whose noise can tell
-
 TINY = np.float32(1e-20)
 TERMS = 5  # D, D', 1, D D', D² + D'²
 # place of each normal sum; terms 2 and 3 meet in the same sum as 0 and 1

@@ -156,8 +156,8 @@ def _plain(dense: Dense) -> tuple[F64, list[Coupling]]:
     return np.array(columns).T, couplings
 
 
+# which shares of a kernel are one number, and the coupling that they are
 Part = tuple[F64, Coupling]
-"""Which shares of a kernel are one number, and the coupling that they are."""
 
 
 def _of_step(dense: Dense, step: tuple[int, int]) -> list[Part]:

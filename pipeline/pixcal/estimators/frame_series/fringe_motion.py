@@ -28,10 +28,9 @@ HOP_WINDOWS = (2, 4, 8, 16, 32)  # frames before and after, of which the means a
 SURE_HOP = 6.5
 SURE_STEP = 2.5  # standard deviations of a hop beside a slope, which tells half as well
 MOST_HOPS = 64
-OCTAVE = 1.4
-"""Ratio of frequencies over which the power of a slow change hardly differs."""
+OCTAVE = 1.4  # ratio of frequencies over which the power of a slow change hardly differs
+# excess of the power over that of white noise, in errors, that is a slow change's
 SLOW_SIGMAS = 3.0
-"""Excess of the power over that of white noise, in errors, that is a slow change's."""
 
 
 @dataclass(frozen=True)

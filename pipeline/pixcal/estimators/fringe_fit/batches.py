@@ -7,9 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 DEFAULT_FRAMES = 500  # frames of a batch in a long run (paper, section 4.3)
-
 MIN_FRAMES = 16  # fewest frames of a batch: each pixel has three unknowns of its own there
-
 WANTED = 24  # batches wanted of a run too short for `DEFAULT_FRAMES`
 
 

@@ -16,7 +16,6 @@ from pixcal.model.errors import InputError
 F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]
 Phases = TypeVar("Phases", NDArray[np.float32], NDArray[np.float64])
-
 MIN_FRINGES = 1.5  # fewest fringes across a window for a peak to be looked for
 # fewest fringes for maps with honest errors: with 1.3 to 1.8 the gauge takes true offsets for
 # fringes, and errors were 2 to 4 times what SIGMA says (measured on 80 x 80 px)

@@ -28,10 +28,8 @@ C128 = NDArray[np.complex128]
 # motion of the phase between a tile's centre and its corner (rad, rms) that may be left out: far
 # below the noise of a sample, some 1e-2 rad
 STILL = 3e-4
-
 # phases tabulated for the normal matrices of a batch, whose error is larger than the run's
 BATCH_TABLE = 1024
-
 # scatter of the visibility that the weights may leave out: it costs 0.5 % of the error at most
 # (measured: 0.7 to 1.3 % at 0.05)
 STEADY = 0.03

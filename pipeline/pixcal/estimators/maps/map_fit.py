@@ -18,7 +18,6 @@ F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 BLOCK = 8  # pixels along the side of a block
-
 _CLIP = 5.0
 _LEAST = 1e-30  # variance of a map that its signals fit exactly
 

@@ -35,12 +35,10 @@ HARMONICS = 4  # of the fringes: a response that is not linear leaves waves ther
 MOST = 3  # waves of one set
 SIGNIFICANT = 5.0  # standard deviations of a further wave
 APART = 30.0  # chi-square by which vectors of their own must fit the sets better than a common one
-
 _MIN_PIXELS = 200
 _CLIP = 6.0
 _ITERATIONS = 4
 _SMOOTH = 3  # degree of what beams and lamp do to the maps
-
 LIGHT = "the mean light"
 STATIC, FORWARD, BACKWARD = slice(0, 2), slice(2, 4), slice(4, 6)
 

@@ -20,7 +20,6 @@ from pixcal.kernels.psf import Psf, expected_windows, fit_windows
 
 F64 = NDArray[np.float64]
 Good = NDArray[np.bool_]
-
 # least variance of a pixel, as a share of the star's electrons: dark rings weigh no more
 TINY = 1e-9
 

@@ -17,7 +17,6 @@ from pixcal.estimators.detector.telegraph.moments import Moments
 F64 = NDArray[np.float64]
 
 AMPLITUDES = np.geomspace(0.1, 300, 90)  # amplitudes over the common noise that are looked at
-
 _DRAWN = 600
 _UNDERFLOW = 1e-200
 

@@ -8,7 +8,6 @@ from pixcal.estimators.detector.telegraph.population import find_population, fin
 from pixcal.kernels.significance import sigmas_of_best
 
 ROUNDS = 3  # most, in which population and time are found, each with the other known
-
 SETTLED = 0.5  # change of the time, over its error, after which no other round is needed
 
 

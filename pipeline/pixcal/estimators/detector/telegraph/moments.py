@@ -15,7 +15,6 @@ from scipy.stats import chi2
 F64 = NDArray[np.float64]
 
 NOISY = 3.0  # excess of the variance, in its own sigmas, from which a pixel's noise is looked at
-
 _OUTLIER = 5.0
 _LEAST = 8
 
