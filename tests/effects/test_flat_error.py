@@ -89,12 +89,6 @@ def test_without_flats_nothing_is_said(acquired: Callable[..., Evidence]) -> Non
     assert FlatError.estimate(bare) is None
 
 
-def test_a_measured_pattern_is_taken_out() -> None:
-    rng = np.random.default_rng(1)
-    theta, ratio = rng.random((3, 4, 5)), 1 + 0.1 * rng.random((4, 5))
-    np.testing.assert_allclose(FlatError.corrected(theta * ratio, ratio), theta)
-
-
 def test_free_terms_are_taken_off_whatever_their_size() -> None:
     free = polynomial((9, 11), 2).reshape(6, -1).T * np.array([1, 1e6, 1e-6, 1, 1, 0])
     columns = free @ np.arange(12.0).reshape(6, 2)

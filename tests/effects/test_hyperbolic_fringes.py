@@ -68,18 +68,6 @@ def test_a_share_of_it_is_that_share(make_effect_bench: Callable[..., Bench]) ->
     assert slope[0] == pytest.approx(0.1 * slope[1], rel=1e-3)
 
 
-def test_maps_are_straightened() -> None:
-    y, x = np.mgrid[:31, :37].astype(float)
-    psi = optics.phase(x, y, PAPER)
-    theta = 2e4 * np.stack([np.ones_like(psi), np.sin(psi), np.cos(psi)])
-    flat = HyperbolicFringes().straightened(theta, PAPER)
-    np.testing.assert_allclose(
-        np.exp(1j * np.arctan2(flat[1], flat[2])),
-        np.exp(1j * optics.paraxial_phase(x, y, PAPER)),
-        atol=1e-9,
-    )
-
-
 def test_a_bench_that_is_exact_already_is_refused(make_effect_bench: Callable[..., Bench]) -> None:
     exact = make_effect_bench({"optics.fringes": "exact"})
     with pytest.raises(InputError, match="hyperbolic_fringes: the bench's fringes are exact"):

@@ -14,7 +14,7 @@ from pixcal.estimators.frame_series.series import (
     motion_series,
     without,
 )
-from pixcal.estimators.frame_series.spectral_line import find_line, without_line
+from pixcal.estimators.frame_series.spectral_line import cleared_of_line, find_line
 from pixcal.estimators.frame_series.variance_components import walk_power
 from pixcal.estimators.fringe_fit.tile import Coding
 
@@ -150,13 +150,12 @@ def test_a_line_is_found_with_its_frequency_and_amplitude() -> None:
     rng = np.random.default_rng(4)
     swing = np.sin(2 * np.pi * 1.7 * 0.14 * np.arange(T))[:, None] * [0.8, 0.4]
     every = [series_of(swing + rng.standard_normal((T, 2))) for _ in range(2)]
-    line = find_line(every, white)
+    line, cleared = cleared_of_line(every, white)
     assert line is not None
     assert line.sure
     assert line.hz == pytest.approx(1.7, abs=4 * line.hz_error)
     assert line.hz_error < 0.01
     assert np.all(np.abs(line.amplitude - [0.8, 0.4]) < 4 * line.amplitude_error)
-    cleared = [without_line(s, line) for s in every]
     again = find_line(cleared, white)
     assert again is not None
     assert not again.sure

@@ -10,7 +10,6 @@ from pixcal.estimators.frame_series.variance_components import (
     Modes,
     _State,
     cosine_modes,
-    damped_power,
     estimate_components,
     joint_log_chance,
     log_chance,
@@ -47,6 +46,12 @@ def test_modes_of_white_noise_and_a_walk_are_independent_and_of_the_power_that_i
     walk = cosine_modes(np.tril(np.ones((31, 31))))
     np.testing.assert_allclose(white @ white.T, np.eye(30), atol=1e-12)
     np.testing.assert_allclose(walk @ walk.T, np.diag(walk_power(31)), atol=1e-10)
+
+
+def damped_power(frames: int, keep: float) -> np.ndarray:
+    """Of the cosine modes of a first-order autoregression of unit variance."""
+    angle = np.pi * np.arange(1, frames) / frames
+    return np.asarray((1 - keep**2) / (1 + keep**2 - 2 * keep * np.cos(angle)))
 
 
 def test_a_damped_walk_has_the_power_that_is_said() -> None:

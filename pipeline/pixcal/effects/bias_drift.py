@@ -11,13 +11,14 @@ from scipy.fft import idct
 
 from pixcal.estimators.detector.noiseless_charge import noiseless_level
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.light import OFFSETS, FrameLight, light_of
+from pixcal.estimators.frame_series.light import LIGHT_PARTS, FrameLight, light_of
 from pixcal.estimators.frame_series.offset import (
     OffsetSeries,
     dark_offsets,
     fringe_offsets,
     offset_modes,
 )
+from pixcal.estimators.frame_series.profiled import Profiled, best_shape
 from pixcal.estimators.frame_series.variance_components import (
     MAX_STEPS,
     Components,
@@ -43,8 +44,6 @@ STEADY = 3.0  # the same for a ramp and a walk; below, a walk explains the frame
 SETTLINGS = 8  # time constants tried, from some steps to the length of the run
 # fringes count where their mean offset is as well known as this, of a sample's read noise
 WORTH = 0.3
-# what moves the light of the frames of a run
-PARTS = ("power", "power_walk", "contrast", "contrast_walk", *OFFSETS)
 KNOTS = 32  # most points of a track
 _KEY, _RUN = 1000, 2000  # first keys of the walks' random numbers: no recording has them
 
@@ -161,9 +160,9 @@ class BiasDrift(Effect):
         if light is None:
             return None
         light = replace(light, dark=())
-        there = light.components(PARTS)
-        none = light.components(PARTS, absent=OFFSETS)
-        walk, error = there.root(PARTS.index("offset_walk"))
+        modes, at = light.modes(LIGHT_PARTS), LIGHT_PARTS.index("offset_walk")
+        there, none = estimate_components(modes), estimate_components(modes, absent=(at - 1, at))
+        walk, error = there.root(at)
         chance = joint_log_chance(there, none, there.size[-2:])
         per_hour = float(np.sqrt(HOUR_S))
         return Estimate(
@@ -194,7 +193,7 @@ class BiasDrift(Effect):
         changes = [joint_log_chance(full, none, full.size[:2])]
         best, settling = _settling(every, full)
         changes.append(settling)
-        found = best[1] if best else full
+        found = best.found if best else full
         slope = float(found.beta[0])
         slope_error = float(np.sqrt(found.shape_covariance((1,))[0, 0]))
         changes.append(log_chance((slope / slope_error) ** 2 / 2))
@@ -212,10 +211,9 @@ class BiasDrift(Effect):
         }  # fmt: skip
         values["settle_e"] = 0.0
         if best:
-            time, fit, time_error = best
-            own = float(np.sqrt(fit.shape_covariance((1,))[1, 1]))
-            values |= {"settle_e": float(fit.beta[1]), "settle_s": time}
-            errors |= {"settle_e": own, "settle_s": time_error}
+            own = float(np.sqrt(found.shape_covariance((1,))[1, 1]))
+            values |= {"settle_e": float(found.beta[1]), "settle_s": best.value}
+            errors |= {"settle_e": own, "settle_s": best.error}
         return Estimate(
             cls(**values),
             errors,
@@ -244,38 +242,21 @@ def _ramp(series: OffsetSeries) -> F64:
     return np.asarray(series.time_s[:, None] / HOUR_S)
 
 
-def _settling(
-    every: Sequence[OffsetSeries], plain: Components
-) -> tuple[tuple[float, Components, float] | None, float]:
-    """Time constant, components and the time constant's error, where a settling is sure; chance."""
+def _settling(every: Sequence[OffsetSeries], plain: Components) -> tuple[Profiled | None, float]:
+    """What decays from the first frame on, where that is sure; and how likely by chance."""
     step = min(s.step_s for s in every)
     length = max(s.time_s[-1] for s in every) - min(s.time_s[0] for s in every)
+
+    def fit(value: float, start: Components | None, steps: int = MAX_STEPS) -> Components:
+        shapes = [np.hstack([_ramp(s), np.exp(-s.time_s / value)[:, None]]) for s in every]
+        return estimate_components(offset_modes(every, shapes), start=start, steps=steps)
+
     times = np.geomspace(3 * step, max(length, 6 * step), SETTLINGS)
-    last = plain
-
-    def fit(time: float, steps: int = 6) -> Components:
-        shapes = [np.hstack([_ramp(s), np.exp(-s.time_s / time)[:, None]]) for s in every]
-        return estimate_components(offset_modes(every, shapes), start=last, steps=steps)
-
-    fits = [fit(time) for time in times]
-    best = int(np.argmax([f.profile for f in fits]))
+    best = best_shape(fit, times, True, plain)
     # Every other of the time constants is as good as a trial of its own.
-    chance = log_chance_of_any(
-        [log_chance(max(fits[best].profile - plain.profile, 0.0))] * (SETTLINGS // 2)
-    )
-    if sigmas(chance) < SIGNIFICANT:
-        return None, chance
-    log_time, width = float(np.log(times[best])), float(np.log(times[1] / times[0]))
-    bend = 1e-9
-    for _ in range(5):
-        # Parabola through three, ever closer.
-        last = fit(float(np.exp(log_time)), MAX_STEPS)
-        below, above = (fit(float(np.exp(log_time + w))).profile for w in (-width, width))
-        bend = max(2 * last.profile - below - above, 1e-9)
-        log_time += float(np.clip((above - below) / (2 * bend), -1, 1)) * width
-        error, width = width / np.sqrt(bend), width / 2
-    time = float(np.exp(log_time))
-    return (time, fit(time, MAX_STEPS), time * min(float(error), 3.0)), chance
+    growth = max(best.found.profile - plain.profile, 0.0)
+    chance = log_chance_of_any([log_chance(growth)] * (SETTLINGS // 2))
+    return best if sigmas(chance) > SIGNIFICANT else None, chance
 
 
 def _with_level(track: Track, evidence: Evidence) -> Track:
@@ -289,7 +270,7 @@ def _with_level(track: Track, evidence: Evidence) -> Track:
 def _tracks(light: FrameLight) -> tuple[Track, ...]:
     """Offsets of every set: the part of (B, log A/B) that moves the first and not A (Wiener)."""
     light = replace(light, dark=())
-    drifts, every = ("offset_walk", "offset_smooth"), (*PARTS, "offset_smooth")
+    drifts, every = ("offset_walk", "offset_smooth"), (*LIGHT_PARTS, "offset_smooth")
     found = []
     for series in light.sets:
         alone = replace(light, sets=(series,))

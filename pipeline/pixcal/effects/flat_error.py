@@ -39,7 +39,7 @@ class FlatError(Effect):
     Flats by a lamp of another colour, another angle or another polarisation. Mean and fringe of a
     pixel change by the same factor: iota and alpha show it, divided by the flat, in the same pixels
     in all sets; the offsets do not move. The pattern belongs to the chip, so maps alone do not hold
-    what `predict` would need; `corrected` takes a measured pattern out.
+    what `predict` would need.
     """
 
     name = "flat_error"
@@ -88,11 +88,6 @@ class FlatError(Effect):
             return light
         ratio = self.ratio(recording.bench.detector, rows)
         return LightMaps(light.iota * ratio, light.alpha_sin * ratio, light.alpha_cos * ratio)
-
-    @staticmethod
-    def corrected(theta: F64, ratio: F64) -> F64:
-        """Maps (3, y, x) of a fit without a pattern (y, x); the phases stay."""
-        return np.asarray(theta / ratio)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:

@@ -56,8 +56,8 @@ class HyperbolicFringes(Effect):
     difference in height of the tips rule the curvature of a set. The arms of a mount do not move
     together: ``pairs`` has the position of each set's fibres, where it is not that of all.
 
-    The maps of a fit do not say where on the chip they lie, so `predict` cannot tell;
-    `straightened` undoes it where the geometry is given, and ``fit --model hyperbolic`` fits it.
+    The maps of a fit do not say where on the chip they lie, so `predict` cannot tell; ``fit --model
+    hyperbolic`` takes it up.
     """
 
     name = "hyperbolic_fringes"
@@ -127,12 +127,6 @@ class HyperbolicFringes(Effect):
             baseline_y=own.baseline_y * wider,
             baseline_z=pair.height_mm,
         )
-
-    def straightened(self, theta: F64, where: Geometry) -> F64:
-        """Maps (3, y, x) of a fit without the bending, from pixel (0, 0) of the geometry."""
-        y, x = np.mgrid[: theta.shape[1], : theta.shape[2]].astype(float)
-        z = (theta[2] + 1j * theta[1]) * np.exp(-1j * self.share * bending(x, y, where))
-        return np.stack([theta[0], z.imag, z.real])
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:

@@ -229,13 +229,6 @@ class Ipc(Effect):
 
         Coupled pixels share their shot noise and so show less of it; undoing gives it back, and
         makes the read noise, which came after the couplings, a little larger.
-
-        Parameters
-        ----------
-        charge, read_noise : float
-            Mean signal and read noise, e-.
-        maps : FringeMaps
-            That are undone.
         """
         shape = (maps.theta.shape[1], maps.theta.shape[2])
         shot, read = noise_shares(self._at_small_signals, shape, maps.origin)

@@ -142,21 +142,6 @@ class Quantisation(Effect):
         normals = shot.normals(self.name) if uneven else None
         return self.converted(adu, detector.seed, detector.top_adu, normals)
 
-    def restored(self, samples: F32, specimen: int) -> F32:
-        """Samples in the middle of what their code spans: straight, as far as widths are known.
-
-        Parameters
-        ----------
-        samples : ndarray of float32
-            ADU, of `converted`.
-        specimen : int
-            Seed of the detector; without random widths it does not matter.
-        """
-        number = np.rint(samples / np.float32(self.step_adu)).astype(np.int64)
-        begins = np.sort(self.thresholds(specimen, int(number.max(initial=0)) + 2))
-        middle = (begins[number] + begins[number + 1]) / 2
-        return np.asarray(middle * self.step_adu, np.float32)
-
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
         """Step by the codes that never come, widths by how often the others do.

@@ -172,7 +172,7 @@ def _nuisance_parts(changes: FrameChanges, name: str, every: Sequence[Watched]) 
         if (w.channels is LIGHT) != (name in LIGHT_PARTS):
             found.append(np.zeros((len(w.series) - 1, 2, 2)))
         elif w.channels is LIGHT and changes.light is not None:
-            found.append(changes.light.part(name, 0.0, w.series))
+            found.append(changes.light.part(name, w.series))
         else:
             found.append(motion_part(name, w.series))
     return found

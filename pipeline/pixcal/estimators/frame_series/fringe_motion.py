@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from scipy.fft import idct
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.series import MEDIAN, FrameSeries, assemble, motion_series
-from pixcal.estimators.frame_series.spectral_line import Line, find_line, without_line
-from pixcal.estimators.frame_series.variance_components import (
-    cosine_modes,
-    estimate_components,
-    walk_power,
+from pixcal.estimators.frame_series.series import (
+    MEDIAN,
+    FrameSeries,
+    mode_variance,
+    motion_series,
 )
+from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
+from pixcal.estimators.frame_series.variance_components import cosine_modes, walk_power
 
 F64 = NDArray[np.float64]
 
@@ -66,16 +67,9 @@ def _motion_of(evidence: Evidence) -> Motion | None:
     hops = {s.name: find_hops(s) for s in found}
     # A hop is in all cosine modes: what follows the phase is sought where none is left.
     still = [_with_hops(s, hops[s.name], -1.0).cleaned() for s in found]
-    line = find_line(still, _level)
-    cleared = still
-    if line is not None and line.sure:
-        cleared = [without_line(s, line) for s in still]
-        # Once more, over a level that the line itself does not raise.
-        levels = {s.name: _level(s) for s in cleared}
-        line = find_line(still, lambda s: levels[s.name]) or line
-        cleared = [without_line(s, line) for s in still]
+    line, cleared = cleared_of_line(still, _level)
     return Motion(
-        series=tuple(cleared),
+        series=cleared,
         raw=tuple(_with_hops(s, hops[s.name], 1.0) for s in still),
         hops=hops,
         line=line,
@@ -220,11 +214,7 @@ def motion_part(name: str, series: FrameSeries) -> F64:
 def _level(series: FrameSeries) -> F64:
     """Variance (t - 1, 2) of the cosine modes, of noise, jitter and walk."""
     names = ("jitter_x", "jitter_y", "walk_x", "walk_y")
-    modes = assemble([series], lambda s: np.stack([motion_part(name, s) for name in names]))
-    size = np.maximum(estimate_components(modes).size, 0.0)
-    # The first half of the modes are those of the series, the others of its two halves.
-    covariance = np.einsum("i,inab->nab", size, modes.parts)[: len(series) - 1]
-    return np.asarray(np.einsum("naa->na", covariance))
+    return mode_variance(series, np.stack([motion_part(name, series) for name in names]))
 
 
 def _crossed(every: Sequence[FrameSeries]) -> bool:

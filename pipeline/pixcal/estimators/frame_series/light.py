@@ -7,20 +7,21 @@ frames without light say how large the offset is by itself.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack, stripes
-from pixcal.estimators.frame_series.series import FrameSeries, assemble, light_series
-from pixcal.estimators.frame_series.spectral_line import Line, find_line, without_line
+from pixcal.estimators.frame_series.series import (
+    FrameSeries,
+    assemble,
+    light_series,
+    mode_variance,
+)
+from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
 from pixcal.estimators.frame_series.variance_components import (
-    MAX_STEPS,
-    Components,
     Modes,
-    damped_power,
-    estimate_components,
     walk_power,
 )
 from pixcal.kernels.significance import SIGNIFICANT
@@ -29,8 +30,7 @@ F64 = NDArray[np.float64]
 
 FEWEST_DARK = 12  # frames without light from which their offset is learnt
 IMBALANCE = 0.02, 0.15  # least and most difference of the fibres' powers over their sum
-OFFSETS = ("offset", "offset_walk")
-LIGHT_PARTS = ("power", "power_walk", "contrast", "contrast_walk", *OFFSETS)
+LIGHT_PARTS = ("power", "power_walk", "contrast", "contrast_walk", "offset", "offset_walk")
 PATTERNS = {
     # What moves (B, log A/B), as the covariance of the two.
     "power": np.array([[1.0, 0.0], [0.0, 0.0]]),
@@ -48,41 +48,18 @@ class FrameLight:
     level: dict[str, float]  # mean signal of each set, e-
     line: Line | None = None  # the strongest in B, sure or not
 
-    def components(
-        self,
-        parts: Sequence[str],
-        keep: float = 0.0,
-        absent: Sequence[str] = (),
-        start: Components | None = None,
-        steps: int = MAX_STEPS,
-    ) -> Components:
-        """Sizes of kinds of change, from all sets together.
+    def modes(self, parts: Sequence[str]) -> Modes:
+        """Cosine modes of all series, with the parts that kinds of change have in them.
 
-        Parameters
-        ----------
-        parts : sequence of str
-            ``power``, ``contrast`` or ``offset`` (white), with ``_walk`` (a random walk; 1/s),
-            ``_smooth`` (ramps and settlings: the square of a walk's spectrum) or ``_damped`` (of
-            unit variance); offsets in e-², the others relative.
-        keep : float
-            Correlation of neighbours of a damped change.
-        absent : sequence of str
-            Of ``parts``, those to hold at zero.
-        start, steps
-            As of `estimate_components`.
+        ``power``, ``contrast`` or ``offset`` (white), with ``_walk`` (a random walk; 1/s) or
+        ``_smooth`` (ramps and settlings: the square of a walk's spectrum); offsets in e-², the
+        others relative.
         """
-        held = [list(parts).index(name) for name in absent]
-        return estimate_components(self.modes(parts, keep), held, start, steps)
+        return assemble(
+            [*self.sets, *self.dark], lambda s: np.stack([self.part(name, s) for name in parts])
+        )
 
-    def modes(self, parts: Sequence[str], keep: float = 0.0) -> Modes:
-        """Cosine modes of all series; parameters as of `components`."""
-
-        def covariance(series: FrameSeries) -> F64:
-            return np.stack([self.part(name, keep, series) for name in parts])
-
-        return assemble([*self.sets, *self.dark], covariance)
-
-    def part(self, name: str, keep: float, series: FrameSeries) -> F64:
+    def part(self, name: str, series: FrameSeries) -> F64:
         """Covariance (t - 1, 2, 2) of the modes of a series for a unit of a kind of change."""
         kind, _, time = name.partition("_")
         n, level = len(series), self.level.get(series.name)
@@ -90,7 +67,6 @@ class FrameLight:
             "": np.ones(n - 1),
             "walk": walk_power(n) * series.step_s,
             "smooth": walk_power(n) ** 2 / n**2,
-            "damped": damped_power(n, keep),
         }[time]
         if level is None:
             pattern = PATTERNS["power"] * (kind == "offset")
@@ -175,30 +151,14 @@ def _light_of(evidence: Evidence) -> FrameLight | None:
     }
     stacks = (*evidence.of_kind("bias"), *evidence.of_kind("dark"))
     dark = [_dark_series(s, n, evidence) for n, s in enumerate(stacks)]
-    return _with_line(FrameLight(tuple(sets), tuple(d for d in dark if d is not None), level))
+    light = FrameLight(tuple(sets), tuple(d for d in dark if d is not None), level)
+    parts = LIGHT_PARTS[:4]
 
+    def variance(series: FrameSeries) -> F64:
+        return mode_variance(series, np.stack([light.part(name, series) for name in parts]))
 
-def _with_line(light: FrameLight) -> FrameLight:
-    line = find_line(light.sets, lambda s: _level(light, s), channels=(0,))
-    if line is None or not line.sure:
-        return FrameLight(light.sets, light.dark, light.level, line)
-    cleared = tuple(without_line(s, line) for s in light.sets)
-    calm = FrameLight(cleared, light.dark, light.level)
-    levels = {s.name: _level(calm, s) for s in cleared}
-    # Once more, over a level that the line itself does not raise.
-    line = find_line(light.sets, lambda s: levels[s.name], channels=(0,)) or line
-    cleared = tuple(without_line(s, line) for s in light.sets)
-    return FrameLight(cleared, light.dark, light.level, line)
-
-
-def _level(light: FrameLight, series: FrameSeries) -> F64:
-    """Variance (t - 1, 2) of a series' cosine modes, of noise and white and walking changes."""
-    alone = FrameLight((series,), (), light.level)
-    modes = alone.modes(("power", "power_walk", "contrast", "contrast_walk"))
-    size = np.maximum(estimate_components(modes).size, 0.0)
-    # The first half of the modes are those of the series, the others of its two halves.
-    covariance = np.einsum("i,inab->nab", size, modes.parts)[: len(series) - 1]
-    return np.asarray(np.einsum("naa->na", covariance))
+    line, cleared = cleared_of_line(sets, variance, channels=(0,))
+    return replace(light, sets=cleared, line=line)
 
 
 def _dark_series(stack: Stack, number: int, evidence: Evidence) -> FrameSeries | None:

@@ -14,7 +14,11 @@ from scipy.fft import idct
 from scipy.ndimage import median_filter
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
-from pixcal.estimators.frame_series.variance_components import Modes, cosine_modes
+from pixcal.estimators.frame_series.variance_components import (
+    Modes,
+    cosine_modes,
+    estimate_components,
+)
 
 F64 = NDArray[np.float64]
 
@@ -226,6 +230,15 @@ def assemble(
         least=np.concatenate([least, of_noise]),
         share=float(np.average([s.share for s in every], weights=[len(s) for s in every])),
     )
+
+
+def mode_variance(series: FrameSeries, parts: F64) -> F64:
+    """Variance (t - 1, 2) of a series' modes, of noise and parts (m, t - 1, 2, 2) of any size."""
+    modes = assemble([series], lambda _: parts)
+    size = np.maximum(estimate_components(modes).size, 0.0)
+    # The first half of the modes are those of the series, the others of its two halves.
+    covariance = np.einsum("i,inab->nab", size, modes.parts)[: len(series) - 1]
+    return np.asarray(np.einsum("naa->na", covariance))
 
 
 def _noise_parts(noise: F64) -> F64:

@@ -74,11 +74,28 @@ def find_line(
     return Line(hz, sharpness, amplitude, error, min(float(chance), 0.0))
 
 
-def without_line(series: FrameSeries, line: Line) -> FrameSeries:
-    """The series without the line."""
-    turn = 2 * np.pi * line.hz * series.time_s
-    swing = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    return replace(series, values=without(series.values, swing))
+def cleared_of_line(
+    every: Sequence[FrameSeries],
+    level: Callable[[FrameSeries], F64],
+    channels: Sequence[int] = (0, 1),
+) -> tuple[Line | None, tuple[FrameSeries, ...]]:
+    """The strongest line, as `find_line`, and the series without it if it is sure."""
+    line = find_line(every, level, channels)
+    if line is None or not line.sure:
+        return line, tuple(every)
+    # Once more, over a level that the line itself does not raise.
+    levels = {s.name: level(s) for s in _without_line(every, line)}
+    line = find_line(every, lambda s: levels[s.name], channels) or line
+    return line, _without_line(every, line)
+
+
+def _without_line(every: Sequence[FrameSeries], line: Line) -> tuple[FrameSeries, ...]:
+    found = []
+    for s in every:
+        turn = 2 * np.pi * line.hz * s.time_s
+        swing = np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        found.append(replace(s, values=without(s.values, swing)))
+    return tuple(found)
 
 
 def _spectrum(s: FrameSeries, level: F64, channels: Sequence[int], grid: F64) -> tuple[F64, F64]:

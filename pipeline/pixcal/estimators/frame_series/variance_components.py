@@ -37,18 +37,6 @@ def walk_power(frames: int) -> F64:
     return np.asarray(1 / (4 * np.sin(angle) ** 2))
 
 
-def damped_power(frames: int, keep: float) -> F64:
-    """Variance (t - 1) of the cosine modes of a first-order autoregression of unit variance.
-
-    Parameters
-    ----------
-    keep : float
-        Correlation of neighbours, 0 to below 1.
-    """
-    angle = np.pi * np.arange(1, frames) / frames
-    return np.asarray((1 - keep**2) / (1 + keep**2 - 2 * keep * np.cos(angle)))
-
-
 @dataclass(frozen=True)
 class Modes:
     """Cosine modes of one or more series of ``c`` channels, and the parts of their covariance."""
