@@ -120,12 +120,22 @@ def test_the_shell_completes_commands_and_options() -> None:
         assert f"plain,{expected}\n" in shell(env=os.environ | env).stdout
 
 
-def test_help_loads_no_heavy_library() -> None:
-    code = "import sys, pixcal_cli.main; print(*sys.modules)"
+def loaded_with(module: str) -> set[str]:
+    code = f"import sys, {module}; print(*sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    loaded = set(out.stdout.split())
+    return set(out.stdout.split())
+
+
+def test_help_loads_no_heavy_library() -> None:
+    loaded = loaded_with("pixcal_cli.main")
     assert "pixcal_cli.main" in loaded
     assert not loaded & {"numpy", "dask", "zarr", "numba", "astropy", "scipy", "matplotlib"}
+
+
+def test_a_run_loads_no_library_that_few_runs_need() -> None:
+    loaded = loaded_with("pixcal.stages.chain")
+    assert "pixcal.stages.chain" in loaded
+    assert not loaded & {"scipy.stats", "scipy.signal", "distributed", "pandas"}
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,10 @@ from pixcal.estimators.detector.calibration import (
     Rung,
     dark_line,
     linearity,
-    median_and_sigma,
     response_rate,
     usual_variance,
 )
+from pixcal.kernels.robust import median_and_sigma
 
 F64 = NDArray[np.float64]
 SHAPE = (7, 11)

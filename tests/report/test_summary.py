@@ -12,7 +12,6 @@ from pixcal.report.summary import (
     block_mean,
     block_side,
     detail,
-    robust_spread,
     spectrum,
     summarise,
     summarise_flags,
@@ -103,12 +102,6 @@ def test_a_map_without_good_pixels_is_no_error() -> None:
     assert made.good == 0
     assert np.isnan([made.mean, made.std, made.median, made.robust_std]).all()
     assert np.isnan(made.image).all()
-
-
-def test_the_robust_spread_is_that_of_the_normal_law_and_ignores_outliers() -> None:
-    values = np.random.default_rng(2).normal(0, 3.0, 100_000)
-    values[:1000] = 1e6
-    assert robust_spread(values) == pytest.approx(3.0, rel=0.03)
 
 
 def test_a_ratio_is_nan_where_there_is_no_light() -> None:

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage, stats
+from scipy import ndimage
 from scipy.optimize import brentq
+from scipy.special import ndtr
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.significance import sigmas_of_count
@@ -128,7 +129,7 @@ class CosmicHits(Effect):
         )
         if seen <= 0:
             return None
-        chance = _SKEW * sum(s.samples for s in searches) * float(stats.norm.sf(THRESHOLD))
+        chance = _SKEW * sum(s.samples for s in searches) * float(ndtr(-THRESHOLD))
         chance = max(chance, float(sum(s.downwards for s in searches)))
         count = sum(len(s.peaks) for s in searches)
         default = cls().electrons_per_um

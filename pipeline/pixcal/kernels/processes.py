@@ -4,7 +4,6 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 F64 = NDArray[np.float64]
 
@@ -24,6 +23,9 @@ def damped_walk(normals: F64, keep: float) -> F64:
     """
     if not len(normals):
         return normals
+    # Here: scipy.signal takes most of a second to import, and few runs need it.
+    from scipy.signal import lfilter
+
     step = np.sqrt(1 - keep**2)
     walk, _ = lfilter([step], [1.0, -keep], normals, zi=[(1 - step) * normals[0]])
     return np.asarray(walk)

@@ -275,3 +275,12 @@ class Combination:
 def _finite_median(values: F32) -> float:
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else math.nan
+
+
+def median_and_sigma(values: NDArray[Any]) -> tuple[float, float]:
+    """Median of the finite values and their robust standard deviation (1.4826 MAD); NaN if none."""
+    finite = values[np.isfinite(values)].astype(float)
+    if not finite.size:
+        return np.nan, np.nan
+    median = float(np.median(finite))
+    return median, _SIGMA_OF_MAD * float(np.median(np.abs(finite - median)))

@@ -3,8 +3,7 @@
 import math
 
 import numpy as np
-from scipy.special import log_ndtr, ndtri_exp
-from scipy.stats import chi2, poisson
+from scipy.special import chdtrc, gammainc, gammaln, log_ndtr, ndtri_exp, xlogy
 
 # standard deviations from which an estimate or a part of its law is taken for real
 SIGNIFICANT = 4.0
@@ -19,7 +18,7 @@ def sigmas_of_chi2(value: float, dof: int) -> float:
     if value > _LARGE:
         # The logarithm of so small a probability underflows; this is its leading order.
         return math.sqrt(value - (dof - 1) * math.log(value / dof))
-    return -float(ndtri_exp(min(float(chi2.logsf(value, dof)), -1e-300)))
+    return -float(ndtri_exp(min(math.log(chdtrc(dof, max(value, 0.0))), -1e-300)))
 
 
 def sigmas_of_count(count: int, expected: float) -> float:
@@ -33,11 +32,11 @@ def sigmas_of_count(count: int, expected: float) -> float:
     expected : float
         Mean of the Poisson distribution, above zero.
     """
-    log_equal = float(poisson.logpmf(count, expected))
+    log_equal = float(xlogy(count, expected) - gammaln(count + 1) - expected)
     log_chance = log_equal + math.log(0.5)
-    log_more = float(poisson.logsf(count, expected))
-    if math.isfinite(log_more):
-        log_chance = float(np.logaddexp(log_chance, log_more))
+    more = float(gammainc(count + 1, expected))
+    if more > 0:
+        log_chance = float(np.logaddexp(log_chance, math.log(more)))
     return -float(ndtri_exp(min(log_chance, -1e-300)))
 
 

@@ -18,8 +18,9 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from numpy.typing import NDArray
 from PIL import Image
 
+from pixcal.kernels.robust import median_and_sigma
 from pixcal.report.colours import DIVERGING, INK, PALETTE, SEQUENTIAL
-from pixcal.report.summary import MapSummary, robust_spread
+from pixcal.report.summary import MapSummary
 
 WIDE = 10.4  # width of a figure that takes the whole page, inches
 DPI = 130
@@ -61,7 +62,7 @@ class ColourScale:
 
 def symmetric_scale(image: NDArray[Any], middle: float = 0.0) -> ColourScale:
     """Three robust standard deviations on both sides of the middle."""
-    reach = 3 * robust_spread(image)
+    reach = 3 * median_and_sigma(image)[1]
     if not reach > 0:
         finite = image[np.isfinite(image)]
         reach = float(np.max(np.abs(finite - middle), initial=0.0)) or 1.0

@@ -10,7 +10,6 @@ from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from pixcal.model.flags import PixelFlag
 from pixcal.report.colours import (
@@ -188,9 +187,9 @@ def _histogram(axes: Axes, offset: MapContents) -> None:
         count, _ = np.histogram(values, edges)
         axes.stairs(count, edges, fill=True, color=BAR, edgecolor=BLUE, label=f"{symbol}, pixels")
         at = np.linspace(edges[0], edges[-1], 400)
-        per_bin = len(values) * (edges[1] - edges[0])
+        top = len(values) * (edges[1] - edges[0]) / (np.sqrt(2 * np.pi) * spread)
         axes.plot(
-            at, per_bin * norm.pdf(at, middle, spread), color=INK, linewidth=1.4,
+            at, top * np.exp(-(((at - middle) / spread) ** 2) / 2), color=INK, linewidth=1.4,
             label=f"normal, σ = {spread:.3g} (robust)",
         )  # fmt: skip
         if np.isfinite(noise) and noise > 0:
@@ -199,7 +198,7 @@ def _histogram(axes: Axes, offset: MapContents) -> None:
                 label=f"noise, ±1σ = ±{noise:.3g}",
             )  # fmt: skip
         axes.set_yscale("log")
-        axes.set_ylim(0.5, 30 * max(float(count.max()), per_bin * norm.pdf(0, 0, spread), 1.0))
+        axes.set_ylim(0.5, 30 * max(float(count.max()), top, 1.0))
     axes.set(xlabel=f"{symbol} ({unit.label})", ylabel="pixels per bin")
     finish(axes)
     if axes.get_legend_handles_labels()[0]:

@@ -8,7 +8,7 @@ from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
-from scipy.stats import chi2 as chi2_law
+from scipy.special import gammaln, xlogy
 
 from pixcal.report.colours import BAR, BLUE, GREEN, GREY, INK, RED
 from pixcal.report.contents import SetContents
@@ -124,10 +124,10 @@ def _chi2_histogram(axes: Axes, summary: MapSummary, facts: dict[str, Any]) -> N
     at = np.linspace(max(low, 1e-6), high, 500)
     per_bin = len(values) * (edges[1] - edges[0])
     axes.plot(
-        at, per_bin * freedom * chi2_law.pdf(at * freedom, freedom), color=INK, linewidth=1.3,
+        at, per_bin * _reduced_chi2_density(at, freedom), color=INK, linewidth=1.3,
         ls="--", label=f"χ² law, {freedom} degrees of freedom",
     )  # fmt: skip
-    scaled = per_bin * freedom / noise * chi2_law.pdf(at * freedom / noise, freedom)
+    scaled = per_bin / noise * _reduced_chi2_density(at / noise, freedom)
     axes.plot(at, scaled, color=RED, linewidth=1.5, label=f"the same × {noise:.4f}")
     outside = int((values > high).sum())
     if outside:
@@ -230,3 +230,9 @@ def _add_clock(axes: Axes, frames: F64, seconds: F64) -> None:
 
 def _floats(values: Any) -> F64:
     return np.array([np.nan if v is None else v for v in values or ()], dtype=float)
+
+
+def _reduced_chi2_density(at: NDArray[np.float64], freedom: int) -> NDArray[np.float64]:
+    """Probability density of a chi-square of many degrees of freedom over their number."""
+    half = freedom / 2
+    return np.asarray(half * np.exp(xlogy(half - 1, half * at) - half * at - gammaln(half)))

@@ -11,7 +11,8 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import median_abs_deviation
+
+from pixcal.kernels.robust import median_and_sigma
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -107,13 +108,7 @@ class MapSummary:
     @property
     def robust_std(self) -> float:
         """Standard deviation by the median absolute deviation, which few outliers do not move."""
-        return robust_spread(self.sample)
-
-
-def robust_spread(values: NDArray[Any]) -> float:
-    """Standard deviation by the median absolute deviation of finite values; NaN without any."""
-    finite = values[np.isfinite(values)].astype(float)
-    return float(median_abs_deviation(finite, scale="normal")) if len(finite) else float("nan")
+        return median_and_sigma(self.sample)[1]
 
 
 def block_side(shape: tuple[int, ...], most: int = SHOWN_PIXELS) -> int:

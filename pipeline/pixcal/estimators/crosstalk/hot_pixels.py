@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, median_filter
 
 from pixcal.estimators.crosstalk.links import REACH, Classes, Place
-from pixcal.estimators.detector.calibration import median_and_sigma
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling, couple, outflow
+from pixcal.kernels.robust import median_and_sigma
 
 F64 = NDArray[np.float64]
 

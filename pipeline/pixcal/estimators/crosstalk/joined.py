@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from pixcal.estimators.crosstalk.dense import Dense, Frames, frames_of, within
 from pixcal.estimators.crosstalk.links import links
@@ -179,7 +179,7 @@ def _significant(dense: Dense, group: Sequence[Part]) -> list[Part]:
     shares, weight = dense.shares[at], float(precision.sum())
     mean = float(precision.sum(0) @ shares) / weight
     apart = shares - mean
-    if len(at) > 1 and chi2.sf(float(apart @ precision @ apart), len(at) - 1) > ALIKE:
+    if len(at) > 1 and chdtrc(len(at) - 1, max(float(apart @ precision @ apart), 0.0)) > ALIKE:
         return [_alike(dense, group)] if abs(mean) > THERE * weight**-0.5 else []
     return [part for part in group if _sigmas(dense, part[0]) > THERE]
 

@@ -22,10 +22,10 @@ from pixcal.estimators.crosstalk.maps import (
     smooth_modes,
     without,
 )
-from pixcal.estimators.detector.calibration import median_and_sigma
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.corrected import phase_change
 from pixcal.kernels.crosstalk import Coupling, filled, uncouple_fringes
+from pixcal.kernels.robust import median_and_sigma
 
 F64 = NDArray[np.float64]
 C128 = NDArray[np.complex128]

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri_exp
-from scipy.stats import norm
+from scipy.special import log_ndtr, ndtri, ndtri_exp
 
 from pixcal.estimators.crosstalk.information import Measured
 from pixcal.estimators.crosstalk.links import Classes, Place, periods
@@ -48,7 +47,7 @@ class Choice:
     def significance(self) -> float:
         """Sigmas of a normal variate as rare as the best of so many looks."""
         looks = INDEPENDENT * self.looks
-        one = np.log(2) + norm.logsf(np.sqrt(self.best))
+        one = np.log(2) + log_ndtr(-np.sqrt(self.best))
         none = looks * np.log1p(-np.exp(one))
         if none < -0.5:
             return float(ndtri_exp(none))
@@ -91,7 +90,7 @@ def choose(measured: Measured, pattern: Callable[[Classes], float]) -> Choice:
 
 
 def _critical(looks: int) -> float:
-    return float(norm.isf(FALSE_ALARM / looks / 2) ** 2)
+    return float(ndtri(FALSE_ALARM / looks / 2) ** 2)
 
 
 def _period(present: Measured, pattern: Callable[[Classes], float], critical: float) -> Classes:

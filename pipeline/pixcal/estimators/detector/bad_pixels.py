@@ -8,9 +8,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
-from pixcal.estimators.detector.calibration import MIN_RUNGS, Rung, median_and_sigma
+from pixcal.estimators.detector.calibration import MIN_RUNGS, Rung
+from pixcal.kernels.robust import median_and_sigma
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -111,7 +112,7 @@ def noisy(
     ratio = variance / expected
     dofs, which = np.unique(dof, return_inverse=True)
     with np.errstate(invalid="ignore", divide="ignore"):
-        limits = chi2.isf(_FALSE_ALARM, dofs) / dofs
+        limits = chdtri(dofs, _FALSE_ALARM) / dofs
         significant = (dof > 0) & (ratio > limits[which].reshape(dof.shape))
         flat_top = kurtosis < -_KURTOSIS_SIGMAS * np.sqrt(24 / dof)
     loud = significant & (ratio > factor**2)

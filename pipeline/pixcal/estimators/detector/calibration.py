@@ -6,7 +6,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
+
+from pixcal.kernels.robust import median_and_sigma
 
 F64 = NDArray[np.float64]
 
@@ -85,7 +87,7 @@ def usual_variance(variance: NDArray[Any], dof: int) -> float:
     if dof < 1:
         return np.nan
     # The median of a variance of few samples is below its mean.
-    return median_and_sigma(variance)[0] * dof / float(chi2.median(dof))
+    return median_and_sigma(variance)[0] * dof / float(chdtri(dof, 0.5))
 
 
 def response_rate(rungs: Sequence[Rung]) -> tuple[F64, F64]:
@@ -151,12 +153,3 @@ def linearity(exptimes: F64, levels: F64, used: NDArray[np.bool_]) -> Linearity 
     return Linearity(
         float(np.abs(deviation[used]).max()), deviation, float(slope), float(intercept)
     )
-
-
-def median_and_sigma(values: NDArray[Any]) -> tuple[float, float]:
-    """Median of the finite values and their robust standard deviation (1.4826 MAD); NaN if none."""
-    finite = values[np.isfinite(values)].astype(float)
-    if not finite.size:
-        return np.nan, np.nan
-    median = float(np.median(finite))
-    return median, 1.482602218505602 * float(np.median(np.abs(finite - median)))

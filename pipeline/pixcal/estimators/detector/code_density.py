@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d, uniform_filter1d
 from scipy.optimize import minimize_scalar
-from scipy.signal import savgol_coeffs, savgol_filter
 from scipy.special import log_ndtr
 
 F64 = NDArray[np.float64]
@@ -254,6 +253,9 @@ def code_widths(counts: F64, noise: float, first: float = 0.0) -> CodeWidths | N
     half = int(np.clip(noise / 2, _LEAST_HALF, _MOST_HALF))
     if noise < LEAST_NOISE or len(counts) < 2 * _CALM:
         return None
+    # Here: scipy.signal takes most of a second to import, and few runs need it.
+    from scipy.signal import savgol_coeffs, savgol_filter
+
     length = 2 * half + 1
     expected = savgol_filter(counts, length, _ORDER)
     # Weights that hardly depend on the code's own count.

@@ -9,7 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pixcal.estimators.detector.calibration import Rung, median_and_sigma
+from pixcal.estimators.detector.calibration import Rung
+from pixcal.kernels.robust import median_and_sigma
 
 # Variance over the signal, in units of the least at lower levels, below which pixels are full. A
 # response that bends by a fifth lessens it to 0.64.

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri_exp
-from scipy.stats import t as student
+from scipy.special import ndtri_exp, stdtr
 
 from pixcal.estimators.diagnosis.test_statistics import Curve, Key
 from pixcal.estimators.diagnosis.test_statistics.signature import statistic_named
@@ -177,7 +176,7 @@ def independent_values(values: F64, floor: float = 0.0) -> float:
     for number in range(count):
         others = np.delete(values, number, axis=0)
         error = np.sqrt(_variance(others, floor) * (1 + 1 / len(others)))
-        chance = 2 * student.sf(np.abs(values[number] - others.mean(axis=0)) / error, count - 2)
+        chance = 2 * stdtr(count - 2, -np.abs(values[number] - others.mean(axis=0)) / error)
         total -= float(np.log1p(-min(float(chance.min()), 1 - 1e-9)))
     return float(np.clip(count / total, 1, n))
 
@@ -213,13 +212,14 @@ def compare(data: Mapping[Key, F64], expected: Expectation) -> dict[Key, Differe
     keys = [key for key in expected.mean if key in data]
     if not keys:
         return {}
-    # All values at once: a call of SciPy's distributions takes longer than a curve.
+    # All values at once: a call takes longer than a curve.
     sizes = [len(data[key]) for key in keys]
     starts = np.cumsum([0, *sizes[:-1]])
     off = np.concatenate([data[key] - expected.mean[key] for key in keys])
     error = np.sqrt(np.concatenate([expected.variance[key] for key in keys]))
     noise = np.concatenate([expected.noise[key] for key in keys])
-    tails = student.logsf(np.abs(off) / error, expected.dof)
+    with np.errstate(divide="ignore"):
+        tails = np.log(stdtr(expected.dof, -np.abs(off) / error))
     sigmas = -ndtri_exp(np.minimum(tails, -1e-300)) * np.sign(off)
     least = np.minimum.reduceat(tails, starts) + np.log(2)
     any_of = _any_of(least, np.array([expected.independent[key] for key in keys]))

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from pixcal.kernels.normal_matrix import inverse_normal
 
@@ -27,7 +27,7 @@ F64 = NDArray[np.float64]
 RCOND = 1e-8  # modes of the two sides that are alike to this (in their squares) count as one
 # relative error of the maps' own errors that a difference is allowed before it counts
 SIGMA_ACCURACY = 0.02
-UPPER = float(norm.ppf(0.95))
+UPPER = float(ndtri(0.95))
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm, poisson
+from scipy.special import gammainc, ndtr, ndtri
 
 from pixcal.stages.compare.agreement import (
     Part,
@@ -78,7 +78,7 @@ def _evidence(
     """Significant differences in words; the false-alarm rate of the whole list is `CLAIM`."""
     share = CLAIM / FAMILIES
     evidence = []
-    sides = [s["side_px"] for s in scales if s["significance"] > norm.isf(share / len(scales))]
+    sides = [s["side_px"] for s in scales if s["significance"] > -ndtri(share / len(scales))]
     if sides:
         evidence.append(f"scales of {', '.join(map(str, sides))} px")
     for name, profile in (("columns", columns), ("rows", rows)):
@@ -87,7 +87,7 @@ def _evidence(
             evidence.append(
                 f"{name}: a wave of {wave['px']:.4g} px, amplitude {wave['amplitude_px']:.2g} px"
             )
-        elif profile["significance"] > norm.isf(share):
+        elif profile["significance"] > -ndtri(share):
             evidence.append(
                 f"{name}: their means differ {profile['ratio']:.2g} times more than noise"
             )
@@ -95,14 +95,15 @@ def _evidence(
         number = blocks["beyond"][kind]
         if number:
             evidence.append(f"the {kind} of {number} of {blocks['number']} blocks")
-    if poisson.sf(outliers["beyond_5_sigma"] - 1, outliers["expected"]) < share:
+    # The chance of so many or more, by the Poisson law.
+    if gammainc(outliers["beyond_5_sigma"], outliers["expected"]) < share:
         evidence.append(f"{outliers['beyond_5_sigma']} single pixels")
     return evidence
 
 
 def _suspicion(scales: list[dict[str, Any]]) -> str | None:
     """Maps that agree better than they can."""
-    close = [s["side_px"] for s in scales if s["significance"] < -norm.isf(CLAIM / len(scales))]
+    close = [s["side_px"] for s in scales if s["significance"] < ndtri(CLAIM / len(scales))]
     if not close:
         return None
     return (
@@ -177,7 +178,7 @@ def _blocks(places: Places) -> dict[str, Any]:
     """Blocks whose mean or scatter differs significantly."""
     number = int((places.count > 0).sum())
     share = CLAIM / FAMILIES / max(1, number)
-    limits = {"mean": float(norm.isf(share / 2)), "scatter": float(norm.isf(share))}
+    limits = {"mean": float(-ndtri(share / 2)), "scatter": float(-ndtri(share))}
     listed: list[dict[str, Any]] = []
     beyond = dict.fromkeys(limits, 0)
     for kind, z in (("mean", places.shift), ("scatter", places.scatter)):
@@ -209,7 +210,7 @@ def _outliers(pixels: Pixels) -> dict[str, Any]:
     total = int(pixels.pulls.sum())
     return {
         "beyond_5_sigma": pixels.beyond,
-        "expected": float(2 * norm.sf(5) * total),
+        "expected": float(2 * ndtr(-5) * total),
         "worst": [
             {"x": x, "y": y, "difference_px": d, "error_px": e}
             for y, x, d, e in pixels.far[:LISTED]

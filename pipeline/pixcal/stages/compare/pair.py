@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
@@ -256,7 +256,7 @@ class Pixels:
     def spread(self) -> float:
         """Robust standard deviation of the pulls: 1 for noise alone."""
         total = np.concatenate([[0], np.cumsum(self.pulls)]) / max(1, int(self.pulls.sum()))
-        low, high = np.interp(norm.cdf([-1, 1]), total, PULLS)
+        low, high = np.interp(ndtr([-1, 1]), total, PULLS)
         return float((high - low) / 2)
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from pixcal import __version__
 from pixcal.engine.run import Runtime
@@ -204,7 +204,7 @@ def compare_pair(
         )
     pixels = read_pixels(pair, everything, runtime)
     # Where all pixels scatter more than noise, or are many, few of those far off are outliers.
-    chance = float(norm.isf(STRAY / everything.pixels))
+    chance = float(-ndtri(STRAY / everything.pixels))
     limit = max(DISAGREE, chance) * max(1.0, pixels.spread)
     sums = everything
     if any(abs(d / e) > limit for _, _, d, e in pixels.far):

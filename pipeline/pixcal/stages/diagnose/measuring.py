@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
-from scipy.stats import median_abs_deviation
 
 from pixcal.estimators.detector.amplifiers import relative_gain
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.structure import flattened, smooth_surface
 from pixcal.kernels.processes import ramp_step
+from pixcal.kernels.robust import median_and_sigma
 from pixcal.kernels.rounding import level_before_rounding
 from pixcal.kernels.sample_sums import calm_residuals, pixel_moments
 from pixcal.kernels.scene import DetectorMaps
@@ -200,7 +200,7 @@ def excess_scatter(found: Sequence[FringeEvidence], good: NDArray[np.bool_]) -> 
     for one, other in itertools.pairwise(found):
         apart = flattened(np.where(good, one.delta - other.delta, np.nan))
         error = np.hypot(one.sigma, other.sigma)[good] / k
-        most = max(most, float(median_abs_deviation(apart[good] / error, scale="normal")))
+        most = max(most, median_and_sigma(apart[good] / error)[1])
     return most
 
 

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.detector.bad_pixels import dead, hot, noisy
-from pixcal.estimators.detector.calibration import median_and_sigma, usual_variance
+from pixcal.estimators.detector.calibration import usual_variance
+from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.columns import Index, extent, indices
 from pixcal.stages.reduce.frame_statistics import STATISTICS, Limits

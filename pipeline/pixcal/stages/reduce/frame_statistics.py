@@ -19,13 +19,12 @@ from pixcal.estimators.detector.calibration import (
     DarkLine,
     Rung,
     dark_line,
-    median_and_sigma,
     response_rate,
     usual_variance,
 )
 from pixcal.estimators.detector.full_wells import unsaturated
 from pixcal.kernels.photon_transfer import COLUMNS, N_BINS, bin_pairs, pair_statistics
-from pixcal.kernels.robust import BATCH, Combination, Combined
+from pixcal.kernels.robust import BATCH, Combination, Combined, median_and_sigma
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.columns import Index, Strip, extent, grid
 from pixcal.stages.reduce.exposures import Group

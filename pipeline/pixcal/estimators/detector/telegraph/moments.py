@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 F64 = NDArray[np.float64]
 
@@ -80,10 +80,10 @@ def moments_of(series: Series) -> Moments | None:
     kurtosis = (n - 1) / ((n - 2) * (n - 3)) * ((n + 1) * kurtosis + 6)
     neighbours = (x[1:] * x[:-1]).sum(axis=0) / (n - 1)
     dof = float(np.median(n)) - 1
-    centre = np.median(variance) * dof / chi2.median(dof)
+    centre = np.median(variance) * dof / chdtri(dof, 0.5)
     # Half the pixels lie between the quartiles, whatever the noisy ones do.
     low, high = np.quantile(variance / centre, (0.25, 0.75))
-    wide = (high - low) / np.diff(chi2.ppf((0.25, 0.75), dof) / dof)[0]
+    wide = (high - low) / np.diff(chdtri(dof, (0.75, 0.25)) / dof)[0]
     return Moments(
         series.pixel[used],
         n,

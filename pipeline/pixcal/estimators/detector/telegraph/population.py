@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize
-from scipy.special import expit
-from scipy.stats import gamma
+from scipy.special import expit, gammaln, xlogy
 
 from pixcal.estimators.detector.telegraph.classes import AMPLITUDES, Classes, Mixture, joined
 from pixcal.estimators.detector.telegraph.moments import Moments
@@ -55,7 +54,8 @@ def find_population(parts: Sequence[Moments], switching_s: float) -> Population:
     def weights(p: F64) -> F64:
         """Share of the pixels in each class of amplitudes."""
         share, mean, shape = expit(p[0]), np.exp(p[1]), _shape(p)
-        density = gamma.pdf(AMPLITUDES, shape, scale=mean / shape)
+        x = AMPLITUDES * shape / mean
+        density = np.exp(xlogy(shape - 1, x) - x - gammaln(shape)) * shape / mean
         return np.asarray(share * density * np.gradient(AMPLITUDES))
 
     def cost(p: F64) -> float:
