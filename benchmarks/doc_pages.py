@@ -26,8 +26,8 @@ from documentation.layers import picture
 from documentation.stub import STUB, stub
 from pixcal.effects import effects
 from pixcal.model import acquisition, bench
+from pixcal.report.detector_figures import nonuniformity, photon_transfer
 from pixcal.report.drawing import png
-from pixcal.report.emva_figures import nonuniformity, photon_transfer
 from pixcal.simulation.forward import Stage
 from pixcal_cli.main import cli
 
@@ -159,7 +159,7 @@ def draw_ccd(folder: Path) -> None:
         curves = json.loads(Path("ccd-run/reduce/figures_of_merit.json").read_text())
     for name, figure in (
         ("ccd-photon-transfer", photon_transfer(curves["photon_transfer"], None)),
-        ("ccd-dsnu", nonuniformity(curves["dsnu"], "DSNU")),
+        ("ccd-dsnu", nonuniformity({"DSNU": curves["dsnu"]})),
     ):
         (folder / f"{name}.png").write_bytes(png(figure))
 

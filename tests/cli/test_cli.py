@@ -24,7 +24,7 @@ from hypothesis import strategies as st
 from pixcal import __version__
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import DamagedError, InputError
-from pixcal.report import blocks
+from pixcal.report import page as report_page
 from pixcal.stages import fit, reduce
 from pixcal_cli import results
 from pixcal_cli.main import cli, explain, invoke
@@ -524,7 +524,7 @@ def test_the_steps_one_by_one_give_the_same(
     bench_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also with another number of workers and other memory; progress goes to stderr only."""
-    monkeypatch.setattr(blocks, "png", lambda figure: b"")
+    monkeypatch.setattr(report_page, "png", lambda figure: b"")
     for line in ("ingest ACQ --out STEPS", *(f"{stage} STEPS" for stage in STAGES[1:])):
         out, err = typed(bench_run, f"{line} --cluster sync --memory 1GiB")
         assert out.startswith(f"{line.split()[0]}: STEPS/{line.split()[0]} (written)\n")

@@ -5,7 +5,6 @@ import html
 import io
 import math
 import re
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -15,18 +14,15 @@ from PIL import Image
 from pixcal.estimators.diagnosis.test_statistics import DETECTOR, known_statistics
 from pixcal.estimators.diagnosis.test_statistics.look import STEPS
 from pixcal.estimators.diagnosis.test_statistics.noise import OUTLIERS
-from pixcal.report import blocks as blocks_module
 from pixcal.report import curve_places, diagnosis_words
 from pixcal.report import diagnosis_maps as maps
-from pixcal.report.blocks import Block, Fold, Plate, Section, Words
+from pixcal.report import page as page_module
 from pixcal.report.contents import Contents, DiagnosisContents, EffectWords, StageRecord
 from pixcal.report.curve_places import place, places
-from pixcal.report.diagnosis import diagnosis
 from pixcal.report.diagnosis_figures import Bar, Closed, curves_figure, gap_figure
 from pixcal.report.diagnosis_words import percent, with_interval
 from pixcal.report.drawing import png
-from pixcal.report.page import render
-from pixcal.report.tables import Table
+from pixcal.report.page import render, section
 from pixcal.report.verdict import cards
 
 NOTICED = 3.7
@@ -36,7 +32,7 @@ NASTY = "<script>alert('$\\frac{1}{$')</script> & \"quotes\"\n\t\x07é漢"
 @pytest.fixture
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests of words: drawing takes most of the time."""
-    monkeypatch.setattr(blocks_module, "png", lambda _figure: b"")
+    monkeypatch.setattr(page_module, "png", lambda _figure: b"")
 
 
 def a_curve(
@@ -124,41 +120,76 @@ def contents(found: DiagnosisContents | None, **changes: Any) -> Contents:
     return Contents(acquisition=acquisition, stages=(), diagnosis=found, **changes)
 
 
-def every(blocks: Any) -> Iterator[Block]:
-    for block in blocks:
-        yield block
-        if isinstance(block, Fold):
-            yield from every(block.blocks)
+@dataclasses.dataclass(frozen=True)
+class Table:
+    """A table of the page."""
+
+    title: str
+    header: list[str]
+    rows: list[list[str]]
 
 
-def text_of(section: Section) -> str:
-    parts = [section.lead]
-    for block in every(section.blocks):
-        if isinstance(block, Words):
-            parts.append(block.text)
-        elif isinstance(block, Table):
-            parts += [block.title, *block.header, *(cell for row in block.rows for cell in row)]
-        else:
-            parts.append(block.title)
-    return "\n".join(parts)
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """The section on the diagnosis, as a reader of the page has it."""
+
+    page: str
+
+    @property
+    def text(self) -> str:
+        return words(self.page)
+
+    def marked(self, tag: str, role: str = "") -> list[str]:
+        """Text of the elements of a kind."""
+        start = f'<{tag} class="{role}[^"]*">' if role else f"<{tag}>"
+        return [words(m) for m in re.findall(f"{start}(.*?)</{tag}>", self.page, re.DOTALL)]
+
+    @property
+    def answer(self) -> str:
+        (text,) = self.marked("p", "answer")
+        return text
+
+    def answered(self, level: str) -> bool:
+        return f'<p class="answer {level}">' in self.page
+
+    @property
+    def plates(self) -> list[str]:
+        return [html.unescape(title) for title in re.findall(r'<img [^>]*alt="([^"]*)"', self.page)]
+
+    def tables(self, title: str) -> list[Table]:
+        made = []
+        for part in re.findall(r"<table>(.*?)</table>", self.page, re.DOTALL):
+            rows = [
+                [words(cell) for cell in re.findall(r"<t[hd][^>]*>(.*?)</t[hd]>", row, re.DOTALL)]
+                for row in re.findall(r"<tr>(.*?)</tr>", part, re.DOTALL)
+            ]
+            caption = words(re.findall(r"<caption>(.*?)</caption>", part, re.DOTALL)[0])
+            made.append(Table(caption, rows[0], rows[1:]))
+        return [table for table in made if table.title.startswith(title)]
 
 
-def table(section: Section, title: str) -> Table:
-    (found,) = (
-        b for b in every(section.blocks) if isinstance(b, Table) and b.title.startswith(title)
-    )
-    return found
+def words(text: str) -> str:
+    """Text without tags, its lines joined."""
+    return re.sub(r"[ \n]+", " ", html.unescape(re.sub(r"<[^>]*>", " ", text))).strip()
 
 
-def answer(section: Section) -> Words:
-    (found,) = (b for b in section.blocks if isinstance(b, Words) and b.role == "answer")
+def diagnosis(of: Contents) -> Shown:
+    return Shown(section("diagnosis", of))
+
+
+def text_of(shown: Shown) -> str:
+    return shown.text
+
+
+def table(shown: Shown, title: str) -> Table:
+    (found,) = shown.tables(title)
     return found
 
 
 def test_a_run_that_was_not_diagnosed_says_what_to_run() -> None:
-    section = diagnosis(contents(None))
-    assert section.lead.startswith("Not run: run 'pixcal diagnose RUN'")
-    assert not section.blocks
+    shown = diagnosis(contents(None))
+    assert shown.text.startswith("Not run: run 'pixcal diagnose RUN'")
+    assert not shown.plates
     assert not any("diagnosis" in card.title for card in cards(contents(None)))
 
 
@@ -166,13 +197,13 @@ def test_a_run_that_was_not_diagnosed_says_what_to_run() -> None:
 def test_no_gap_is_said_at_once_and_what_came_nearest_is_shown() -> None:
     curves = (a_curve("a", sigma=1.0, after=1.0), a_curve("b", sigma=3.1, after=3.1))
     found = a_diagnosis("no gap", curves=curves, total=0.0, after=0.0, interval=[0.0, 0.0])
-    section = diagnosis(contents(found))
-    assert answer(section).level == "good"
-    assert answer(section).text.startswith("No gap")
-    assert "none of 102 statistics" in answer(section).text
-    nearest = table(section, "Largest deviations, none of them significant")
+    shown = diagnosis(contents(found))
+    assert shown.answered("good")
+    assert shown.answer.startswith("No gap")
+    assert "none of 102 statistics" in shown.answer
+    nearest = table(shown, "Largest deviations, none of them significant")
     assert [row[1] for row in nearest.rows] == ["title of b", "title of a"]
-    assert "with causes" not in text_of(section)
+    assert "with causes" not in text_of(shown)
     (card,) = (c for c in cards(contents(found)) if c.title == "diagnosis")
     assert (card.value, card.level) == ("no gap", "good")
 
@@ -180,47 +211,42 @@ def test_no_gap_is_said_at_once_and_what_came_nearest_is_shown() -> None:
 @pytest.mark.usefixtures("without_figures")
 def test_unexplained_says_where_and_what_could_tell_more() -> None:
     found = a_diagnosis("unexplained", after=1.0, interval=[0.9, 1.1])
-    section = diagnosis(contents(found))
-    assert answer(section).level == "bad"
-    assert "in 2 of 102 statistics, mostly in noise. None of the 2 effects" in (
-        answer(section).text
-    )
-    advice = [b.text for b in section.blocks if isinstance(b, Words) and b.role == "advice"]
+    shown = diagnosis(contents(found))
+    assert shown.answered("bad")
+    assert "in 2 of 102 statistics, mostly in noise. None of the 2 effects" in (shown.answer)
+    advice = shown.marked("p", "advice")
     assert len(advice) == 1
     assert "dark frames" in advice[0]
-    titles = [b.title for b in section.blocks if isinstance(b, Plate)]
-    assert titles == ["The gap", "The largest differences"]
-    assert "with causes" not in text_of(section)
+    assert shown.plates == ["The gap", "The largest differences"]
+    assert "with causes" not in text_of(shown)
 
 
 @pytest.mark.usefixtures("without_figures")
 def test_causes_come_with_their_numbers() -> None:
     causes = (a_cause(), a_cause("mine", p_value=3e-4, gap_closed=0.2, gain_over_rest=0.05))
-    section = diagnosis(contents(a_diagnosis(causes=causes)))
-    assert answer(section).text.startswith(
+    shown = diagnosis(contents(a_diagnosis(causes=causes)))
+    assert shown.answer.startswith(
         "Explained: what lag is (lag) and what mine is (mine) account for"
     )
-    assert (
-        "residual gap is 3.0\u00a0% (90\u00a0% interval 1.0 to 6.0\u00a0%)" in answer(section).text
-    )
-    assert [row[:4] for row in table(section, "Causes").rows] == [
+    assert "residual gap is 3.0\u00a0% (90\u00a0% interval 1.0 to 6.0\u00a0%)" in shown.answer
+    assert [row[:4] for row in table(shown, "Causes").rows] == [
         ["1. what lag is (lag)", "80\u00a0% [75, 83]", "61\u00a0%", "< 10⁻¹²"],
         ["2. what mine is (mine)", "20\u00a0% [75, 83]", "5.0\u00a0%", "3.0 × 10⁻⁴"],
     ]
-    assert "Charge stays. Evidence: frames follow others." in text_of(section)
-    assert list(table(section, "Parameters of lag").rows) == [
+    assert "Charge stays. Evidence: frames follow others." in text_of(shown)
+    assert list(table(shown, "Parameters of lag").rows) == [
         ["share", "0.002000 ± 0.000020", "e⁻/µm", "left behind"]
     ]
-    units = table(section, "Differences in physical units (1σ intervals)")
+    units = table(shown, "Differences in physical units (1σ intervals)")
     assert units.header[2:] == ["measured", "nominal", "with causes", "lag only", "mine only"]
     assert list(units.rows[0])[2:] == [
         "0.00200", "3.00 × 10⁻⁵ [2.00 × 10⁻⁵, 4.00 × 10⁻⁵]", "0.00190 [0.00180, 0.00210]",
         "0.00170", "4.00 × 10⁻⁵",
     ]  # fmt: skip
-    assert [b.title for b in section.blocks if isinstance(b, Plate)] == [
+    assert shown.plates == [
         "The gap", "Evidence for what lag is (lag)", "Evidence for what mine is (mine)",
     ]  # fmt: skip
-    assert "No statistic differs significantly any more." in text_of(section)
+    assert "No statistic differs significantly any more." in text_of(shown)
 
 
 @pytest.mark.usefixtures("without_figures")
@@ -231,14 +257,12 @@ def test_parameters_of_any_shape_are_listed() -> None:
                     "none": None},
         uncertainty={"couplings[3].share": 0.001, "pair[1]": 0.1},
     )  # fmt: skip
-    section = diagnosis(contents(a_diagnosis(causes=(cause,))))
-    assert [row[:2] for row in table(section, "Parameters").rows] == [
+    shown = diagnosis(contents(a_diagnosis(causes=(cause,))))
+    assert [row[:2] for row in table(shown, "Parameters").rows] == [
         ["pair", "1 (not fitted), 2.00 ± 0.10"], ["on", "yes"], ["kind", "slow"], ["none", "–"],
     ]  # fmt: skip
-    assert "Common to all: every 4." in text_of(section)
-    first, rest = (
-        b for b in every(section.blocks) if isinstance(b, Table) and b.title.startswith("coupl")
-    )
+    assert "Common to all: every 4." in text_of(shown)
+    first, rest = shown.tables("coupl")
     assert list(first.header) == ["dy", "share"]
     assert first.rows[3] == ["4", "0.0400 ± 0.0010"]
     assert len(first.rows) == 12
@@ -253,8 +277,8 @@ def test_every_difference_is_listed_once_the_worst_of_each_domain_first() -> Non
         for domain, count in domains.items()
         for n in range(count)
     )
-    section = diagnosis(contents(a_diagnosis(curves=(*curves, a_curve("quiet", sigma=1.0)))))
-    first, rest = table(section, "Statistics that differ"), table(section, "Other statistics")
+    shown = diagnosis(contents(a_diagnosis(curves=(*curves, a_curve("quiet", sigma=1.0)))))
+    first, rest = table(shown, "Statistics that differ"), table(shown, "Other statistics")
     assert len(first.rows) == 12
     assert {row[0] for row in first.rows} == set(domains)
     for rows in (first.rows, rest.rows):
@@ -271,8 +295,8 @@ def test_every_difference_is_listed_once_the_worst_of_each_domain_first() -> Non
 def test_values_that_hardly_differ_are_shown_with_the_digits_that_tell() -> None:
     nominal = {key: [1.0, 1.0007] for key in ("value", "low", "high")}
     curve = a_curve(unit="px", measured=[1.0, 1.0012], nominal=nominal)
-    section = diagnosis(contents(a_diagnosis(curves=(curve,))))
-    (row,) = table(section, "Statistics that differ").rows
+    shown = diagnosis(contents(a_diagnosis(curves=(curve,))))
+    (row,) = table(shown, "Statistics that differ").rows
     assert row[3:5] == ["1.00120 px", "1.00070"]
     assert row[5] == "+9.0"
 
@@ -287,29 +311,27 @@ def test_what_remains_is_named_and_what_is_new_is_a_warning() -> None:
         "partly explained", curves=curves, after=0.31, interval=[0.25, 0.36],
         domains={"space": [0.5, 0.0], "time": [0.5, 0.2], "intensity": [0, 0], "noise": [0, 0]},
     )  # fmt: skip
-    section = diagnosis(contents(found))
-    assert "69\u00a0% of the gap" in answer(section).text
-    assert (
-        "31\u00a0% (90\u00a0% interval 25 to 36\u00a0%), mostly in time, " in answer(section).text
-    )
-    rest = table(section, "Statistics that still differ")
+    shown = diagnosis(contents(found))
+    assert "69\u00a0% of the gap" in shown.answer
+    assert "31\u00a0% (90\u00a0% interval 25 to 36\u00a0%), mostly in time, " in shown.answer
+    rest = table(shown, "Statistics that still differ")
     assert [row[1] for row in rest.rows] == ["title of stays", "title of new"]
     assert rest.rows[0][-2:] == ["+8.0", "79\u00a0%"]
     assert rest.rows[1][-2:] == ["−6.0", "new"]
-    assert "Of these, 1 did not differ before" in text_of(section)
+    assert "Of these, 1 did not differ before" in text_of(shown)
 
 
 @pytest.mark.usefixtures("without_figures")
 def test_what_was_considered_and_looked_at_is_folded() -> None:
-    section = diagnosis(contents(a_diagnosis()))
-    folds = {b.title: b for b in section.blocks if isinstance(b, Fold)}
-    tried = table(section, "Rejected effects")
-    assert tried in folds["2 other effects were considered and rejected"].blocks
+    shown = diagnosis(contents(a_diagnosis()))
+    tried = table(shown, "Rejected effects")
+    fold = shown.page.split("2 other effects were considered and rejected</summary>")[1]
+    assert "Rejected effects" in fold.split("</details>")[0]
     assert list(tried.rows) == [
         ["mine", "+5.0", "11\u00a0%", "no likelier with it"],
         ["crosstalk (ipc)", "+0.4", "–", "not seen (0.4 sigma)"],
     ]
-    frames = table(section, "Frames and windows")
+    frames = table(shown, "Frames and windows")
     assert frames.rows[0] == [
         "window", "rows 0 to 63, columns 10 to 73",
         "rows 0 to 63, columns 10 to 73; rows 70 to 133, columns 0 to 63",
@@ -321,10 +343,10 @@ def test_what_was_considered_and_looked_at_is_folded() -> None:
 @pytest.mark.usefixtures("without_figures")
 def test_a_cause_names_its_law_and_what_that_closes_where_it_differs() -> None:
     law = "rows exposed while the phase steps"
-    for by_law, shown in ((0.5, ". The law alone closes 50\u00a0% of the gap."), (0.79, ".")):
+    for by_law, ends in ((0.5, ". The law alone closes 50\u00a0% of the gap."), (0.79, ".")):
         cause = a_cause(law=law, gap_closed_by_law=by_law)
-        section = diagnosis(contents(a_diagnosis(causes=(cause,))))
-        assert f"Law: {law}{shown}" in text_of(section)
+        shown = diagnosis(contents(a_diagnosis(causes=(cause,))))
+        assert f"Law: {law}{ends}" in text_of(shown)
     assert "Law:" not in text_of(diagnosis(contents(a_diagnosis())))
     cause = a_cause(law="", gap_closed_by_law=0.5)
     shown = text_of(diagnosis(contents(a_diagnosis(causes=(cause,)))))
@@ -336,21 +358,21 @@ def test_a_cause_names_its_law_and_what_that_closes_where_it_differs() -> None:
 def test_a_richer_nominal_bench_is_named() -> None:
     stage = StageRecord("diagnose", "k", 2, "0", {"nominal": {"ipc": {}, "lag": {}}}, {})
     assert "Included from the start: ipc and lag." in (
-        diagnosis(dataclasses.replace(contents(a_diagnosis()), stages=(stage,))).lead
+        diagnosis(dataclasses.replace(contents(a_diagnosis()), stages=(stage,))).text
     )
-    assert "straight fringes" not in diagnosis(contents(a_diagnosis(), frames={"fringes": []})).lead
+    assert "straight fringes" not in diagnosis(contents(a_diagnosis(), frames={"fringes": []})).text
 
 
 @pytest.mark.usefixtures("without_figures")
 def test_effects_that_are_not_told_apart_are_named_with_what_would_decide() -> None:
     cause = a_cause(not_told_apart_from=["ipc", "mine"], would_decide=["dark frames", "flats"])
-    section = diagnosis(contents(a_diagnosis(causes=(cause,))))
-    assert table(section, "Causes").rows[0][-1] == "ipc or mine"
+    shown = diagnosis(contents(a_diagnosis(causes=(cause,))))
+    assert table(shown, "Causes").rows[0][-1] == "ipc or mine"
     words = (
         "The data cannot distinguish it from crosstalk (ipc) or mine. "
         "Recommended frames: dark frames and flats."
     )
-    assert words in text_of(section)
+    assert words in text_of(shown)
 
 
 # The map of where

@@ -18,6 +18,7 @@ from pixcal.report.drawing import png, span_scale, symmetric_scale, unit_for
 from pixcal.report.summary import (
     ArraySource,
     MapSummary,
+    Spectrum,
     spectrum,
     summarise,
     summarise_flags,
@@ -49,8 +50,9 @@ def test_maps_of_any_size_become_pictures(shape: tuple[int, int]) -> None:
     delta, sigma = a_map(shape), a_map(shape, 4e-4, 1e-5)
     for figure in (
         map_figures.offsets("delta_x", delta, sigma),
-        map_figures.errors_and_histogram(MapContents("delta_x", delta, sigma, None)),
-        map_figures.map_row([("bias", "ADU", delta), ("flat", "1", sigma), ("dark", "e", sigma)]),
+        map_figures.errors_and_histogram([MapContents("delta_x", delta, sigma, None)]),
+        map_figures.errors_and_histogram([MapContents("delta_x", delta, sigma, None)] * 3),
+        map_figures.map_grid([("bias", "ADU", delta), ("flat", "1", sigma), ("dark", "e", sigma)]),
     ):
         assert min(open_png(png(figure)).size) > 150
 
@@ -67,13 +69,17 @@ def test_long_profiles_are_drawn_as_ranges_that_hold_every_mean() -> None:
     assert np.nanmean(middle) == pytest.approx(np.nanmean(values), abs=0.02)
 
 
+def with_spectrum(name: str, made: Spectrum) -> MapContents:
+    return MapContents(name, a_map((20, 30)), a_map((20, 30)), made)
+
+
 @pytest.mark.parametrize("shape", [(67, 131), (2, 300), (450, 500)])
 def test_spectra_of_any_size_become_pictures(shape: tuple[int, int]) -> None:
     values = np.random.default_rng(2).normal(size=shape)
     made = spectrum(ArraySource(values), ArraySource(np.ones(shape)))
     assert made is not None
     vectors = {name: (1.26, 0.1 * n) for n, name in enumerate("abcdef")}
-    open_png(png(map_figures.power("delta_y", made, vectors)))
+    open_png(png(map_figures.power([with_spectrum("delta_y", made)], vectors)))
 
 
 def test_the_fringe_is_marked_where_its_power_is() -> None:
@@ -81,7 +87,7 @@ def test_the_fringe_is_marked_where_its_power_is() -> None:
     y, x = np.mgrid[:128, :128]
     made = spectrum(ArraySource(np.sin(k[0] * x + k[1] * y)), ArraySource(np.full((128, 128), 0.1)))
     assert made is not None
-    axes = map_figures.power("delta_x", made, {"set": k}).axes[0]
+    axes = map_figures.power([with_spectrum("delta_x", made)], {"set": k}).axes[0]
     (marks,) = (line.get_xydata() for line in axes.lines if "fringes" in str(line.get_label()))
     fy, fx = made.frequencies
     i, j = np.unravel_index(made.power.argmax(), made.power.shape)
@@ -92,7 +98,7 @@ def test_the_fringe_is_marked_where_its_power_is() -> None:
 def test_flags_keep_their_colours(shape: tuple[int, int]) -> None:
     values = np.zeros(shape, np.uint8)
     values[: shape[0] // 2] = 1
-    figure = map_figures.flags([("one", summarise_flags(ArraySource(values)))])
+    figure = map_figures.flags({"one": summarise_flags(ArraySource(values))})
     shown = colours_of(figure)
     red = tuple(round(255 * v) for v in to_rgb("#d7301f"))
     assert (red in shown) == (max(shape) <= 400)  # shares, not flags, where blocks are averaged
@@ -101,7 +107,7 @@ def test_flags_keep_their_colours(shape: tuple[int, int]) -> None:
 def test_equal_masks_are_drawn_once() -> None:
     flags = summarise_flags(ArraySource(np.eye(30, dtype=np.uint8)))
     other = summarise_flags(ArraySource(2 * np.eye(30, dtype=np.uint8)))
-    axes = map_figures.flags([("a", flags), ("b", flags), ("c", other)]).axes
+    axes = map_figures.flags({"a": flags, "b": flags, "c": other}).axes
     assert [a.get_title() for a in axes if a.get_visible()] == ["a\nb", "c"]
 
 
@@ -121,14 +127,15 @@ def a_set(frames: int, *, moving: bool) -> SetContents:
 @pytest.mark.parametrize("moving", [False, True])
 def test_runs_of_any_length_become_pictures(frames: int, moving: bool) -> None:
     fringes = a_set(frames, moving=moving)
-    figure = set_figures.temporal(fringes)
-    assert len(figure.axes) == (10 if moving and frames else 6)
+    figure = set_figures.temporal([fringes])
+    assert len(figure.axes) == (6 if moving else 4)
     open_png(png(figure))
-    open_png(png(set_figures.residuals(fringes)))
+    for sets in ([fringes], [fringes] * 3):
+        open_png(png(set_figures.residuals(sets)))
 
 
 def test_long_runs_are_thinned_and_say_so() -> None:
-    figure = set_figures.temporal(a_set(20_001, moving=False))
+    figure = set_figures.temporal([a_set(20_001, moving=False)])
     points = figure.axes[0].lines[0].get_xdata()
     assert len(np.asarray(points)) == 5001
     assert "every 4th frame" in figure.axes[-2].get_xlabel()
@@ -149,7 +156,7 @@ def allan_entry(**changes: Any) -> dict[str, Any]:
 )
 def test_the_allan_plot(changes: dict[str, Any]) -> None:
     facts = {"frames": 2000, "crb_median_px": 4.5e-4}
-    figure = set_figures.allan("name", allan_entry(**changes), facts)
+    figure = set_figures.allan_figure({"name": (allan_entry(**changes), facts)})
     upper = figure.axes[0]
     assert upper.get_xscale() == upper.get_yscale() == "log"
     lines = {str(line.get_label()): line for line in upper.lines}

@@ -14,7 +14,7 @@ from PIL import Image
 
 from pixcal.engine.run import Runtime
 from pixcal.model.errors import DamagedError, InputError
-from pixcal.report import blocks as blocks_module
+from pixcal.report import page as page_module
 from pixcal.stages import report
 from pixcal.storage.artefact import build, read_manifest, write_json
 from pixcal.storage.cube import create_group, write_array
@@ -242,7 +242,7 @@ def section(page: str, name: str) -> str:
 @pytest.fixture
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """For tests of words: drawing takes most of the time."""
-    monkeypatch.setattr(blocks_module, "png", lambda _figure: b"")
+    monkeypatch.setattr(page_module, "png", lambda _figure: b"")
 
 
 @pytest.fixture(scope="module")

@@ -286,9 +286,9 @@ class FringeSet:
     def allan_picture(self) -> Picture:
         """The Allan deviation beside the square-root law, as the report shows it."""
         from pixcal.report.drawing import png  # here, as in `OffsetMap.picture`
-        from pixcal.report.set_figures import allan
+        from pixcal.report.set_figures import allan_figure
 
-        return Picture(png(allan(self.name, self.allan, self.facts)))
+        return Picture(png(allan_figure({self.name: (self.allan, self.facts)})))
 
 
 def open_run(path: StrPath) -> Run:

@@ -81,9 +81,18 @@ class SetContents:
     allan: dict[str, Any] | None = None
 
 
+# title and unit of each map of the reduction
+DETECTOR_MAPS = {
+    "bias": ("bias", "ADU"),
+    "dark_rate": ("dark current", "e⁻/s"),
+    "flat": ("flat", "relative response"),
+    "read_noise": ("read noise", "e⁻"),
+}
+
+
 @dataclass(frozen=True)
 class DetectorContents:
-    """What the reduction found."""
+    """What the reduction measured."""
 
     facts: dict[str, Any] = field(default_factory=dict)  # `reduce.json`; empty where there is none
     # `bias` (ADU), `dark_rate` (e-/s), `flat`, `read_noise` (e-), those that exist
@@ -91,6 +100,12 @@ class DetectorContents:
     # `figures_of_merit.json`; empty where there is none
     curves: dict[str, Any] = field(default_factory=dict)
     flags: FlagSummary | None = None
+
+    def shown(self) -> list[tuple[str, str, MapSummary]]:
+        """Title, unit and summary of each map that was measured."""
+        # A map of one value is what the reduction takes where there are no frames.
+        there = {key: self.maps[key] for key in DETECTOR_MAPS if key in self.maps}
+        return [(*DETECTOR_MAPS[key], m) for key, m in there.items() if m.std > 0]
 
 
 @dataclass(frozen=True)
@@ -170,3 +185,21 @@ class Contents:
     def pitch_um(self) -> float:
         """Pixel pitch."""
         return float(self.acquisition["detector"]["pitch_um"])
+
+    @property
+    def fringe_vectors(self) -> dict[str, tuple[float, float]]:
+        """Fringe vector (kx, ky), rad/px, of each set."""
+        return {s.name: (s.facts["kx"], s.facts["ky"]) for s in self.sets}
+
+    @property
+    def nominal_effects(self) -> list[str]:
+        """Effects that the diagnosis took for granted."""
+        given = [s.config.get("nominal") for s in self.stages if s.name == "diagnose"]
+        return list(given[0] or ()) if given else []
+
+    def masks(self) -> dict[str, FlagSummary]:
+        """Every mask there is, by title."""
+        masks = {f"set {s.name}": s.flags for s in self.sets}
+        if self.detector.flags is not None:
+            masks = {"calibration frames": self.detector.flags} | masks
+        return masks if self.flags is None else masks | {"products": self.flags}

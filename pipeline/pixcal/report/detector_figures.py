@@ -1,12 +1,95 @@
-"""Figures of what the reduction measured."""
+"""Figures of the detector: photon transfer, patterns of DSNU and PRNU (EMVA 1288), linearity."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
-from pixcal.report.colours import BLUE, INK
+from pixcal.report.colours import BLUE, GREY, INK, RED
 from pixcal.report.drawing import WIDE, axes_grid, finish
+
+Curves = Mapping[str, Any]
+
+
+def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
+    """Variance against level, and both over the straight line of gain and read noise.
+
+    Parameters
+    ----------
+    curve : mapping
+        ``level`` (ADU), ``variance`` and ``error`` (ADU²) of the points; ``gain`` (e-/ADU) and
+        ``read_variance`` (ADU²) of the line.
+    saturation : float, optional
+        Level (ADU) where the detector saturates.
+    """
+    level, variance, error = (np.array(curve[k]) for k in ("level", "variance", "error"))
+    shown = (level > 0) & (variance > 0)
+    level, variance, error = level[shown], variance[shown], error[shown]
+    line = level / curve["gain"] + curve["read_variance"]
+    figure, ((left, right),) = axes_grid((WIDE, 3.9), 1, 2, width_ratios=[1.1, 1])
+    look = {"fmt": "o", "color": BLUE, "markersize": 3.5, "elinewidth": 1}
+    left.errorbar(level, variance, error, **look, label="pairs of flats")
+    at = np.geomspace(level.min(), level.max(), 200)
+    left.plot(
+        at, at / curve["gain"] + curve["read_variance"], color=INK, linewidth=1.2,
+        label=f"{curve['gain']:.4g} e⁻/ADU",
+    )  # fmt: skip
+    if curve["read_variance"] > 0:
+        left.axhline(curve["read_variance"], color=GREY, ls=":", label="read noise")
+    left.set(xscale="log", yscale="log", xlabel="level (ADU)", ylabel="variance (ADU²)")
+    right.errorbar(level, variance / line, error / line, **look)
+    right.axhline(1, color=INK, linewidth=1.2)
+    right.set(xlabel="level (ADU)", ylabel="variance over the line")
+    right.margins(y=0.15)
+    right.locator_params(axis="x", nbins=6)
+    for axes in (left, right):
+        if saturation is not None:
+            axes.axvline(saturation, color=RED, ls="--", linewidth=1, label="saturation")
+        finish(axes)
+    left.legend(fontsize=9, frameon=False)
+    return figure
+
+
+def nonuniformity(patterns: Mapping[str, Curves]) -> Figure:
+    """Spectra along rows and columns over the noise, and the means of rows and columns.
+
+    Parameters
+    ----------
+    patterns : mapping
+        For ``DSNU`` and ``PRNU``: ``unit``; ``rows`` and ``columns`` with ``frequency``
+        (cycles/px), ``amplitude`` and ``noise`` of the spectrum, ``at`` (px) and ``profile`` of
+        the means.
+    """
+    figure, grid = axes_grid(
+        (WIDE, 2.6 * len(patterns) + 0.3), len(patterns), 2, beside=1.0, width_ratios=[1, 1.3]
+    )
+    for (left, right), (name, curves) in zip(grid, patterns.items(), strict=True):
+        unit = str(curves["unit"]).replace("e-", "e⁻")
+        peak = False
+        for along, axis, colour in (("rows", "y", BLUE), ("columns", "x", RED)):
+            part = curves[along]
+            left.plot(
+                part["frequency"], part["amplitude"], color=colour, linewidth=0.9,
+                label=f"along {along}",
+            )  # fmt: skip
+            if part["noise"] > 0:
+                left.axhline(part["noise"], color=colour, ls="--", linewidth=1)
+            peak |= max(part["amplitude"]) > 10 * float(np.median(part["amplitude"]))
+            label = f"{along}, against {axis}"
+            right.plot(part["at"], part["profile"], color=colour, linewidth=0.8, label=label)
+        left.set(xlim=(0, 0.5), xlabel="frequency (cycles/px)", ylabel=f"{name} ({unit})")
+        if peak:
+            left.set_yscale("log")
+        else:
+            left.set_ylim(bottom=0)
+        right.axhline(0, color=INK, linewidth=0.8)
+        right.set(xlabel="x or y (px)", ylabel=f"{name}: mean ({unit})")
+        right.margins(x=0.01)
+        for axes in (left, right):
+            finish(axes)
+            axes.legend(fontsize=9, frameon=False, ncols=2, loc="upper right")
+    return figure
 
 
 def linearity(levels: Sequence[Mapping[str, Any]]) -> Figure:

@@ -13,8 +13,9 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
 from pixcal.report.colours import BAND, BLUE, GREY, INK, RED
+from pixcal.report.contents import DiagnosisContents
 from pixcal.report.curve_places import axis_label, places
-from pixcal.report.diagnosis_words import DETECTOR, percent, unit
+from pixcal.report.diagnosis_words import DETECTOR, effect_title, percent, unit
 from pixcal.report.drawing import TITLE, WIDE, Unit, axes_grid, finish, unit_for
 
 F64 = NDArray[np.float64]
@@ -44,6 +45,27 @@ class Closed:
     alone: float
     interval: tuple[float, float]
     over_rest: float
+
+
+def gap(result: DiagnosisContents) -> Figure:
+    """The gap by domain, what differs only with the causes, and the share of each cause."""
+    facts, causes = result.facts["gap"], result.facts["causes"]
+    low, high = facts["interval"]
+    whole = Bar("all", facts["total"], facts["after"], (low, high))
+    parts = [Bar(d, before, after) for d, (before, after) in facts.get("domains", {}).items()]
+    rest = facts["after"] - sum(b.after for b in parts)
+    if causes and parts and rest > 0.001:
+        parts.append(Bar("introduced by the causes", 0.0, rest))
+    closed = [
+        Closed(
+            effect_title(result, c["effect"]),
+            c["gap_closed"],
+            tuple(c["gap_closed_interval"]),
+            c["gain_over_rest"],
+        )
+        for c in causes
+    ]
+    return gap_figure([whole, *sorted(parts, key=lambda b: -b.before)], closed)
 
 
 def gap_figure(bars: Sequence[Bar], causes: Sequence[Closed]) -> Figure:

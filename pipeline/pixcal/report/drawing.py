@@ -23,6 +23,8 @@ from pixcal.report.colours import DIVERGING, INK, PALETTE, SEQUENTIAL
 from pixcal.report.summary import MapSummary
 
 WIDE = 10.4  # width of a figure that takes the whole page, inches
+# room between a map and what is beside it, for a colour bar, its numbers and labels, inches
+BESIDE_BAR = 1.95
 DPI = 130
 # of titles at a fixed height: the labels around them need not be measured
 TITLE: dict[str, Any] = {"fontsize": 11, "y": 1.0}
@@ -91,11 +93,6 @@ def new_figure(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), dpi=DPI, layout=layout)
 
 
-def bare_figure(width: float, height: float) -> Figure:
-    """A figure whose axes are placed by `place`."""
-    return Figure(figsize=(width, height), dpi=DPI)
-
-
 def axes_grid(
     size: tuple[float, float],
     rows: int = 1,
@@ -126,8 +123,17 @@ def axes_grid(
     -------
     Figure, ndarray of Axes (rows, columns)
     """
-    width, height = size
     figure = Figure(figsize=size, dpi=DPI)
+    _margins(figure, rows, columns, left, right, bottom, top, beside, between)
+    return figure, figure.subplots(rows, columns, squeeze=False, **look)
+
+
+def _margins(
+    figure: Figure, rows: int, columns: int, left: float, right: float, bottom: float, top: float,
+    beside: float, between: float,
+) -> None:  # fmt: skip
+    """Margins and gaps in inches."""
+    width, height = figure.get_size_inches()
     # Gaps are shares of the mean width and height of the axes.
     wide = (width - left - right - (columns - 1) * beside) / columns
     high = (height - bottom - top - (rows - 1) * between) / rows
@@ -135,7 +141,61 @@ def axes_grid(
         left / width, bottom / height, 1 - right / width, 1 - top / height,
         beside / wide, between / high,
     )  # fmt: skip
-    return figure, figure.subplots(rows, columns, squeeze=False, **look)
+
+
+def map_axes(
+    number: int, shape: tuple[int, int], *, curve: bool = False, top: float = 0.3
+) -> tuple[Figure, list[Axes], Axes | None]:
+    """Axes for maps with their colour bars, two a row, and for a curve below or beside them.
+
+    Parameters
+    ----------
+    number : int
+        Of maps; beside a single one lies the curve.
+    shape : (int, int)
+        Rows and columns of a map.
+    top : float
+        Room above a map, inches.
+    """
+    tall = float(np.clip(3.2 * shape[0] / shape[1], 1.2, 4.4))
+    names: list[list[Any]] = [[n, n + 1 if n + 1 < number else "."] for n in range(0, number, 2)]
+    heights = [tall] * len(names)
+    if curve and number == 1:
+        names, heights = [[0, "curve"]], [max(tall, 3.2)]
+    elif curve:
+        names, heights = [*names, ["curve", "curve"]], [*heights, 3.0]
+    between, bottom, right = 0.6 + top, 0.6, 0.2 if curve and number == 1 else 1.2
+    height = sum(heights) + (len(heights) - 1) * between + bottom + top
+    figure = Figure(figsize=(WIDE, height), dpi=DPI)
+    _margins(figure, len(names), 2, 0.85, right, bottom, top, BESIDE_BAR, between)
+    axes: dict[Any, Axes] = figure.subplot_mosaic(names, height_ratios=heights)
+    return figure, [axes[n] for n in range(number)], axes.get("curve")
+
+
+def draw_panel(
+    figure: Figure, axes: Axes, summary: MapSummary, label: str, title: str = "",
+    *, scale: ColourScale | None = None, factor: float = 1.0,
+) -> None:  # fmt: skip
+    """A map with its axes, title and colour bar; by default its colours span its values.
+
+    Parameters
+    ----------
+    factor : float
+        What values are multiplied by; ``scale`` is in their unit after it.
+    """
+    scale = scale or span_scale(summary.image * factor)
+    drawn = draw_map(axes, summary, scale, factor)
+    square(axes, summary.shape)
+    axes.set(xlabel="x (px)", ylabel="y (px)")
+    axes.set_title(", ".join(filter(None, (title, block_note(summary)))), **TITLE)
+    add_bar(figure, axes, drawn, label, scale.beyond)
+
+
+def square(axes: Axes, shape: tuple[int, int]) -> None:
+    """Square pixels, unless the map is very elongated."""
+    ny, nx = shape
+    if max(ny, nx) <= 6 * min(ny, nx):
+        axes.set_aspect("equal")
 
 
 def place(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:
@@ -159,8 +219,8 @@ def draw_map(
         shown, norm=scale.norm, cmap=scale.colours, origin="lower", interpolation="nearest",
         extent=covered(summary.image.shape, summary.block, start), aspect="auto",
     )  # fmt: skip
-    axes.set_xlim(x0 - 0.5, x0 + nx - 0.5)
-    axes.set_ylim(y0 - 0.5, y0 + ny - 0.5)
+    axes.set(xlim=(x0 - 0.5, x0 + nx - 0.5), ylim=(y0 - 0.5, y0 + ny - 0.5))
+    axes.locator_params(nbins=5)
     return drawn
 
 
@@ -169,8 +229,10 @@ def add_bar(figure: Figure, axes: Axes, drawn: ScalarMappable, label: str, beyon
     place = axes.inset_axes((1.04, 0, 0.05, 1))
     bar = figure.colorbar(drawn, cax=place, extend=beyond)
     bar.set_label(label)
+    bar.minorticks_off()
     if not isinstance(drawn.norm, LogNorm):
         place.ticklabel_format(useOffset=False, style="plain")
+        place.locator_params(axis="y", nbins=5)
 
 
 def covered(

@@ -17,32 +17,32 @@ from pixcal.report.colours import (
     BAR,
     BLUE,
     FLAGS,
-    GREEN,
     GREY,
     INK,
+    LINES,
     MARKS,
-    RED,
     SEQUENTIAL,
     SEVERAL,
     UNFLAGGED,
 )
-from pixcal.report.contents import MapContents
+from pixcal.report.contents import MapContents, SetContents
 from pixcal.report.drawing import (
+    DPI,
     TITLE,
     WIDE,
-    ColourScale,
     Unit,
     add_bar,
     axes_grid,
-    bare_figure,
     block_note,
     covered,
     draw_map,
+    draw_panel,
     finish,
     fit_box,
     limits,
+    map_axes,
     place,
-    span_scale,
+    square,
     symmetric_scale,
     unit_for,
 )
@@ -51,8 +51,6 @@ from pixcal.report.text import SYMBOLS, flag_name
 
 F64 = NDArray[np.float64]
 
-# room between a map and what is beside it, for a colour bar, its numbers and labels, inches
-BESIDE_BAR = 1.95
 MEANS_DRAWN = 800  # most means of a profile that are drawn one by one
 
 
@@ -72,7 +70,7 @@ def offsets(
     """
     width, height = fit_box(delta.shape, 5.7, 5.4)
     total = height + 3.45
-    figure = bare_figure(WIDE, total)
+    figure = Figure(figsize=(WIDE, total), dpi=DPI)
     left, bottom = 0.95, 2.55
     symbol, unit = SYMBOLS[name], unit_for([delta.robust_std], "px")
     scale = symmetric_scale(delta.image * unit.factor)
@@ -157,88 +155,101 @@ def _nearby(values: F64) -> tuple[F64, F64, F64]:
     return low[groups], mean[groups], high[groups]
 
 
-def errors_and_histogram(offset: MapContents) -> Figure:
-    """The map of errors, and the histograms of offsets and of errors."""
-    sigma = offset.sigma
-    figure, ((left, right),) = axes_grid(
-        (WIDE, 4.5), 1, 2, beside=BESIDE_BAR, width_ratios=[1, 1.15]
-    )
-    unit = unit_for([sigma.median], "px")
-    scale = span_scale(sigma.image * unit.factor)
-    drawn = draw_map(left, sigma, scale, unit.factor)
-    _square(left, sigma.shape)
-    left.set(xlabel="x (px)", ylabel="y (px)")
-    label = _with_note(f"σ of {SYMBOLS[offset.name]} ({unit.label})", sigma)
-    add_bar(figure, left, drawn, label, scale.beyond)
-    _histogram(right, offset)
-    return figure
-
-
-def _histogram(axes: Axes, offset: MapContents) -> None:
-    delta, symbol = offset.delta, SYMBOLS[offset.name]
-    unit = unit_for([delta.robust_std], "px")
-    values = delta.sample.astype(float) * unit.factor
-    spread, middle = delta.robust_std * unit.factor, delta.median * unit.factor
-    noise = offset.sigma.median * unit.factor
-    if len(values) and spread > 0:
-        reach = 6 * spread
-        number = int(np.clip(np.sqrt(len(values)) / 1.5, 15, 120))
-        edges = np.linspace(middle - reach, middle + reach, number + 1)
-        count, _ = np.histogram(values, edges)
-        axes.stairs(count, edges, fill=True, color=BAR, edgecolor=BLUE, label=f"{symbol}, pixels")
-        at = np.linspace(edges[0], edges[-1], 400)
-        top = len(values) * (edges[1] - edges[0]) / (np.sqrt(2 * np.pi) * spread)
-        axes.plot(
-            at, top * np.exp(-(((at - middle) / spread) ** 2) / 2), color=INK, linewidth=1.4,
-            label=f"normal, σ = {spread:.3g} (robust)",
-        )  # fmt: skip
-        if np.isfinite(noise) and noise > 0:
-            axes.axvspan(
-                middle - noise, middle + noise, color=RED, alpha=0.3, linewidth=0,
-                label=f"noise, ±1σ = ±{noise:.3g}",
-            )  # fmt: skip
-        axes.set_yscale("log")
-        axes.set_ylim(0.5, 30 * max(float(count.max()), top, 1.0))
-    axes.set(xlabel=f"{symbol} ({unit.label})", ylabel="pixels per bin")
+def errors_and_histogram(maps: Sequence[MapContents]) -> Figure:
+    """The maps of errors, and the histograms of offsets and of errors."""
+    figure, panels, axes = map_axes(len(maps), maps[0].delta.shape, curve=True)
+    assert axes is not None
+    for panel, offset in zip(panels, maps, strict=True):
+        unit = unit_for([offset.sigma.median], "px")
+        label = f"σ of {SYMBOLS[offset.name]} ({unit.label})"
+        draw_panel(figure, panel, offset.sigma, label, factor=unit.factor)
+    unit = unit_for([offset.delta.robust_std for offset in maps], "px")
+    for offset, colour in zip(maps, LINES, strict=False):
+        _histogram(axes, offset, unit, colour)
+    axes.set_yscale("log")
+    axes.set_ylim(bottom=0.5)
+    axes.set(xlabel=f"offset ({unit.label})", ylabel="pixels per bin")
     finish(axes)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=9, loc="upper right", framealpha=0.9)
+    return figure
 
 
-def power(name: str, spectrum: Spectrum, vectors: Mapping[str, tuple[float, float]]) -> Figure:
-    """Power spectrum of a map in two dimensions, and its means over rings and along the axes.
+def _histogram(axes: Axes, offset: MapContents, unit: Unit, colour: str) -> None:
+    delta, symbol = offset.delta, SYMBOLS[offset.name]
+    values = delta.sample.astype(float) * unit.factor
+    spread, middle = delta.robust_std * unit.factor, delta.median * unit.factor
+    noise = offset.sigma.median * unit.factor
+    if not (len(values) and spread > 0):
+        return
+    bins = int(np.clip(np.sqrt(len(values)) / 1.5, 15, 120))
+    edges = np.linspace(middle - 6 * spread, middle + 6 * spread, bins + 1)
+    count, _ = np.histogram(values, edges)
+    axes.stairs(count, edges, color=colour, linewidth=1.5, label=f"{symbol}, pixels")
+    at = np.linspace(edges[0], edges[-1], 400)
+    top = len(values) * (edges[1] - edges[0]) / (np.sqrt(2 * np.pi) * spread)
+    normal = top * np.exp(-(((at - middle) / spread) ** 2) / 2)
+    axes.plot(
+        at, np.maximum(normal, 0.1), color=colour, linewidth=1.0,
+        ls="--", label=f"normal, σ = {spread:.3g} (robust)",
+    )  # fmt: skip
+    if np.isfinite(noise) and noise > 0:
+        axes.axvspan(
+            middle - noise, middle + noise, color=colour, alpha=0.25, linewidth=0,
+            label=f"noise, ±1σ = ±{noise:.3g}",
+        )  # fmt: skip
+
+
+def power(maps: Sequence[MapContents], vectors: Mapping[str, tuple[float, float]]) -> Figure:
+    """Power spectra of maps in two dimensions, and their means over rings and along the axes.
 
     Parameters
     ----------
-    name : str
-        Of the map.
+    maps : sequence of MapContents
+        With spectra.
     vectors : mapping
         Fringe vector (kx, ky), rad/px, of each set.
     """
-    top = 0.3 + 0.2 * max(len(vectors), 1)
-    figure, ((left, right),) = axes_grid(
-        (WIDE, 4.4 + top), 1, 2, top=top, beside=BESIDE_BAR, width_ratios=[1, 1.1]
-    )
+    top = 0.35 + 0.2 * max(len(vectors), 1)
+    figure, panels, axes = map_axes(len(maps), (1, 1), curve=True, top=top)
+    assert axes is not None
+    for panel, offset, colour in zip(panels, maps, LINES, strict=False):
+        assert offset.spectrum is not None
+        _spectrum_map(figure, panel, offset.spectrum, vectors)
+        _spectrum_lines(axes, SYMBOLS[offset.name], offset.spectrum, colour)
+        panel.set_ylabel(f"{SYMBOLS[offset.name]}: fy (cycles/px)")
+    for vector in vectors.values():
+        for order in (1, 2):
+            f = _folded(np.array([order * v / (2 * np.pi) for v in vector]))
+            axes.axvline(float(np.hypot(*f)), color=GREY, ls=":", linewidth=1)
+    axes.set_yscale("log")
+    axes.set_xlim(0, 0.5)
+    axes.set(xlabel="spatial frequency (cycles/px)", ylabel="power (px² per (cycle/px)²)")
+    finish(axes)
+    axes.legend(fontsize=8.5, framealpha=0.9, ncols=len(maps), loc="upper right")
+    return figure
+
+
+def _spectrum_map(
+    figure: Figure, axes: Axes, spectrum: Spectrum, vectors: Mapping[str, tuple[float, float]]
+) -> None:
     relative = spectrum.power / spectrum.white if spectrum.white > 0 else spectrum.power
     positive = relative[relative > 0]
     low, high = np.percentile(positive, [1, 99.9]) if len(positive) else (0.1, 10.0)
     fy, fx = spectrum.frequencies
-    drawn = left.imshow(
+    drawn = axes.imshow(
         np.where(relative > 0, relative, np.nan), origin="lower", aspect="equal",
         interpolation="nearest", cmap=SEQUENTIAL, norm=LogNorm(low, max(high, 3 * low)),
         extent=(*_edges(fx), *_edges(fy)),
     )  # fmt: skip
     for n, (label, vector) in enumerate(vectors.items()):
-        _mark(left, vector, label, MARKS[n % len(MARKS)])
-    left.set(xlabel="fx (cycles/px)", ylabel="fy (cycles/px)", xlim=(-0.5, 0.5), ylim=(-0.5, 0.5))
-    add_bar(figure, left, drawn, "power / white noise", "both")
+        _mark(axes, vector, label, MARKS[n % len(MARKS)])
+    axes.set(xlabel="fx (cycles/px)", xlim=(-0.5, 0.5), ylim=(-0.5, 0.5))
+    add_bar(figure, axes, drawn, "power / white noise", "both")
     if vectors:
-        left.legend(
+        axes.legend(
             fontsize=9, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False,
         )  # fmt: skip
-    _power_lines(right, spectrum, vectors)
-    right.set_title(f"{SYMBOLS[name]}: means over rings and cuts", **TITLE)
-    return figure
 
 
 def _mark(axes: Axes, vector: tuple[float, float], label: str, colour: str) -> None:
@@ -257,30 +268,19 @@ def _folded(frequency: F64) -> F64:
     return np.asarray((frequency + 0.5) % 1 - 0.5)
 
 
-def _power_lines(
-    axes: Axes, spectrum: Spectrum, vectors: Mapping[str, tuple[float, float]]
-) -> None:
+def _spectrum_lines(axes: Axes, symbol: str, spectrum: Spectrum, colour: str) -> None:
     fy, fx = spectrum.frequencies
     my, mx = len(fy), len(fx)
-    for f, cut, colour, label in (
-        (fx, spectrum.power[my // 2], RED, "along fx (means of columns)"),
-        (fy, spectrum.power[:, mx // 2], GREEN, "along fy (means of rows)"),
+    for f, cut, style, label in (
+        (fx, spectrum.power[my // 2], "-", "along fx (means of columns)"),
+        (fy, spectrum.power[:, mx // 2], "--", "along fy (means of rows)"),
     ):
-        up = f > 0
-        axes.plot(f[up], cut[up], color=colour, linewidth=0.8, alpha=0.75, label=label)
-    ring, mean = spectrum.radial()
-    axes.plot(ring, mean, color=BLUE, linewidth=2, label="mean over rings")
+        look: Any = {"color": colour, "linewidth": 0.8, "alpha": 0.7, "ls": style}
+        axes.plot(f[f > 0], cut[f > 0], label=f"{symbol} {label}", **look)
+    axes.plot(*spectrum.radial(), color=colour, linewidth=2, label=f"{symbol}, mean over rings")
     if spectrum.white > 0:
-        axes.axhline(spectrum.white, color=INK, ls="--", linewidth=1.3, label="white noise of σ")
-    for vector in vectors.values():
-        for order in (1, 2):
-            f = _folded(np.array([order * v / (2 * np.pi) for v in vector]))
-            axes.axvline(float(np.hypot(*f)), color=GREY, ls=":", linewidth=1)
-    axes.set_yscale("log")
-    axes.set_xlim(0, 0.5)
-    axes.set(xlabel="spatial frequency (cycles/px)", ylabel="power (px² per (cycle/px)²)")
-    finish(axes)
-    axes.legend(fontsize=8.5, framealpha=0.9)
+        label = f"{symbol}, white noise of σ"
+        axes.axhline(spectrum.white, color=colour, ls=(0, (6, 3)), linewidth=1.6, label=label)
 
 
 def _edges(f: F64) -> tuple[float, float]:
@@ -288,34 +288,34 @@ def _edges(f: F64) -> tuple[float, float]:
     return float(f[0] - half), float(f[-1] + half)
 
 
-def map_row(panels: Sequence[tuple[str, str, MapSummary]], *, symmetric: bool = False) -> Figure:
-    """Maps side by side, each with its own scale: (title, unit, summary)."""
-    ny, nx = panels[0][2].shape
-    columns = min(2, len(panels))
-    rows = -(-len(panels) // columns)
-    tall = float(np.clip(3.2 * ny / nx, 1.2, 4.4))
-    figure, grid = axes_grid(
-        (WIDE if columns == 2 else WIDE / 2 + 0.5, rows * (tall + 0.9)), rows, columns,
-        right=1.2, bottom=0.6, top=0.3, beside=BESIDE_BAR, between=0.9,
-    )  # fmt: skip
-    for axes in grid.ravel()[len(panels) :]:
-        axes.set_visible(False)
-    for axes, (title, unit, summary) in zip(grid.ravel(), panels, strict=False):
-        scale: ColourScale = (symmetric_scale if symmetric else span_scale)(summary.image)
-        drawn = draw_map(axes, summary, scale)
-        _square(axes, summary.shape)
-        axes.set_title(", ".join(filter(None, (title, block_note(summary)))), **TITLE)
-        axes.set(xlabel="x (px)", ylabel="y (px)")
-        add_bar(figure, axes, drawn, unit, scale.beyond)
+def map_grid(panels: Sequence[tuple[str, str, MapSummary]]) -> Figure:
+    """Maps two a row, each with its own scale: (title, unit, summary)."""
+    figure, axes, _ = map_axes(len(panels), panels[0][2].shape)
+    for panel, (title, unit, summary) in zip(axes, panels, strict=True):
+        draw_panel(figure, panel, summary, unit, title)
     return figure
 
 
-def flags(panels: Sequence[tuple[str, FlagSummary]]) -> Figure:
+def levels(sets: Sequence[SetContents]) -> Figure:
+    """Mean level and visibility of the sets, a row each."""
+    return map_grid(
+        [
+            panel
+            for s in sets
+            for panel in (
+                (f"{s.name}: mean level ι", "e⁻", s.iota),
+                (f"{s.name}: visibility α/ι", "α/ι", s.visibility),
+            )
+        ]
+    )
+
+
+def flags(masks: Mapping[str, FlagSummary]) -> Figure:
     """Maps of flags side by side; those that are the same are drawn once.
 
     Pixel by pixel each flag has its colour; of larger maps the share of masked pixels is shown.
     """
-    panels = _merge_same(panels)
+    panels = _merge_same(masks)
     ny, nx = panels[0][1].shape
     columns = min(3, max(2, len(panels)))
     rows = -(-len(panels) // columns)
@@ -333,7 +333,7 @@ def flags(panels: Sequence[tuple[str, FlagSummary]]) -> Figure:
     for axes, (title, summary) in zip(grid.ravel(), panels, strict=False):
         drawn = _draw_classes(axes, summary) if whole else _draw_share(axes, summary, most)
         axes.set(xlim=(-0.5, summary.shape[1] - 0.5), ylim=(-0.5, summary.shape[0] - 0.5))
-        _square(axes, summary.shape)
+        square(axes, summary.shape)
         axes.set_title(title, **TITLE)
         axes.set(xlabel="x (px)", ylabel="y (px)")
     if whole:
@@ -348,9 +348,9 @@ def flags(panels: Sequence[tuple[str, FlagSummary]]) -> Figure:
     return figure
 
 
-def _merge_same(panels: Sequence[tuple[str, FlagSummary]]) -> list[tuple[str, FlagSummary]]:
+def _merge_same(masks: Mapping[str, FlagSummary]) -> list[tuple[str, FlagSummary]]:
     merged: dict[tuple[bytes, tuple[int, ...]], tuple[list[str], FlagSummary]] = {}
-    for title, summary in panels:
+    for title, summary in masks.items():
         key = (summary.image.tobytes(), tuple(summary.counts.values()))
         merged.setdefault(key, ([], summary))[0].append(title)
     return [("\n".join(titles), summary) for titles, summary in merged.values()]
@@ -378,15 +378,3 @@ def _classes(image: NDArray[np.uint8]) -> NDArray[np.int64]:
     bits = np.unpackbits(image[..., None], axis=-1, bitorder="little").astype(np.int64)
     count = bits.sum(axis=-1)
     return np.where(count > 1, len(FLAGS) + 1, (bits * np.arange(1, 9)).sum(axis=-1))
-
-
-def _square(axes: Axes, shape: tuple[int, int]) -> None:
-    """Square pixels, unless the map is very elongated."""
-    ny, nx = shape
-    if max(ny, nx) <= 6 * min(ny, nx):
-        axes.set_aspect("equal")
-
-
-def _with_note(label: str, summary: MapSummary) -> str:
-    note = block_note(summary)
-    return f"{label}\n{note}" if note else label

@@ -1,5 +1,6 @@
-"""Figures of one fringe set: its frames in time, its residuals, its Allan deviation."""
+"""Figures of the fringe sets: their frames in time, residuals, and Allan deviations."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,75 +11,90 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLoca
 from numpy.typing import NDArray
 from scipy.special import gammaln, xlogy
 
-from pixcal.report.colours import BAR, BLUE, GREEN, GREY, INK, RED
+from pixcal.report.colours import BAR, BLUE, GREY, INK, LINES
 from pixcal.report.contents import SetContents
 from pixcal.report.drawing import (
+    TITLE,
     WIDE,
-    add_bar,
+    Unit,
     axes_grid,
-    block_note,
-    draw_map,
+    draw_panel,
     finish,
     limits,
-    span_scale,
+    map_axes,
     unit_for,
 )
-from pixcal.report.summary import MapSummary
 from pixcal.report.text import with_error
 
 F64 = NDArray[np.float64]
+Facts = Mapping[str, Any]
 
+ALLAN_COLUMNS = (
+    "frames", "seconds", "adev_px", "adev_lo_px", "adev_hi_px", "white_expected_px",
+)  # fmt: skip
+PHASE_BINS = 24
 POINTS = 6000  # most frames that are drawn one by one; of longer runs, every n-th
 
 
-def temporal(fringes: SetContents) -> Figure:
-    """Intensity, visibility, phase and (when it is free) fringe vector of each frame."""
-    series = fringes.series
-    step = -(-len(series.time) // POINTS)
-    time, clock = _clock(series.time[::step])
-    level = float(np.nanmean(series.B)) or 1.0
-    contrast = fringes.visibility.median * series.A / np.where(series.B != 0, series.B, np.nan)
-    rows: list[tuple[str, F64, tuple[float, float] | None]] = [
-        ("B − mean (%)", 100 * (series.B / level - 1), None),
-        ("visibility", contrast, None),
-        ("φ (rad)", np.mod(series.phi, 2 * np.pi), (0.0, 2 * np.pi)),
-    ]
-    if series.moving:
-        unit = unit_for(np.concatenate([series.dkx, series.dky]), "rad/px")
-        rows.append((f"δkx ({unit.label})", series.dkx * unit.factor, None))
-        rows.append((f"δky ({unit.label})", series.dky * unit.factor, None))
+def temporal(sets: Sequence[SetContents]) -> Figure:
+    """Parameters of each frame, a column for each set, and below how often each phase occurs."""
+    moving = any(s.series.moving for s in sets)
+    rows = 5 if moving else 3
     figure, grid = axes_grid(
-        (WIDE, 1.75 * len(rows) + 0.5), len(rows), 2, left=0.95, beside=0.25, between=0.25,
-        width_ratios=[4, 1], sharex="col", sharey="row",
+        (WIDE, 1.55 * (rows + 1) + 1.2), rows + 1, len(sets), left=0.95, beside=0.95, top=0.35,
+        between=0.5,
     )  # fmt: skip
-    for (left, right), (label, values, bounds) in zip(grid, rows, strict=True):
-        low, high = bounds or limits([values], 0.0)
-        left.plot(
-            time, values[::step], "o", color=BLUE, markersize=_dot(len(time)), markeredgewidth=0
+    for column, fringes in zip(grid.T, sets, strict=True):
+        step = -(-len(fringes.series.time) // POINTS)
+        time, clock = _clock(fringes.series.time[::step])
+        for axes, (label, values) in zip(column, _parameters(fringes, moving), strict=False):
+            look: Any = {"markersize": _dot(len(time)), "markeredgewidth": 0}
+            axes.plot(time, values[::step], "o", color=BLUE, **look)
+            axes.set_ylabel(label)
+            axes.set_ylim(*limits([values], 0.0))
+            finish(axes)
+        for axes in column[: rows - 1]:
+            axes.tick_params(labelbottom=False)
+        column[0].set_title(f"set {fringes.name}", **TITLE)
+        column[2].set_ylim(0, 2 * np.pi)
+        column[2].set_yticks([0, np.pi, 2 * np.pi], ["0", "π", "2π"])
+        column[rows - 1].set_xlabel(
+            f"time ({clock})" + (f", every {step}th frame" if step > 1 else "")
         )
-        left.set_ylabel(label)
-        left.set_ylim(low, high)
-        _coverage(right, values, (low, high), uniform=bounds is not None)
-        finish(left)
-        finish(right)
-        if bounds:
-            left.set_yticks([0, np.pi, 2 * np.pi], ["0", "π", "2π"])
-    grid[-1][0].set_xlabel(f"time ({clock})" + (f", every {step}th frame" if step > 1 else ""))
-    grid[-1][1].set_xlabel("frames per bin")
+        _phases(column[-1], np.mod(fringes.series.phi, 2 * np.pi))
     return figure
 
 
-def _coverage(axes: Axes, values: F64, bounds: tuple[float, float], *, uniform: bool) -> None:
-    finite = values[np.isfinite(values)]
-    number = 24
-    count, edges = np.histogram(finite, number, range=bounds)
-    axes.stairs(count, edges, fill=True, color=BAR, edgecolor=BLUE, orientation="horizontal")
-    if uniform:
-        mean = len(finite) / number
-        axes.axvspan(
-            mean - 2 * np.sqrt(mean), mean + 2 * np.sqrt(mean), color=GREY, alpha=0.25, linewidth=0
-        )
-        axes.axvline(mean, color=INK, linewidth=1, ls="--")
+def _parameters(fringes: SetContents, moving: bool) -> list[tuple[str, F64]]:
+    """Label and values of each row."""
+    series = fringes.series
+    level = float(np.nanmean(series.B)) or 1.0
+    contrast = fringes.visibility.median * series.A / np.where(series.B != 0, series.B, np.nan)
+    rows = [
+        ("B − mean (%)", 100 * (series.B / level - 1)),
+        ("visibility", contrast),
+        ("φ (rad)", np.mod(series.phi, 2 * np.pi)),
+    ]
+    if moving:
+        unit = unit_for(np.concatenate([series.dkx, series.dky]), "rad/px")
+        rows.append((f"δkx ({unit.label})", series.dkx * unit.factor))
+        rows.append((f"δky ({unit.label})", series.dky * unit.factor))
+    return rows
+
+
+def _phases(axes: Axes, phi: F64) -> None:
+    """How often each phase occurs, beside a uniform distribution."""
+    finite = phi[np.isfinite(phi)]
+    count, edges = np.histogram(finite, PHASE_BINS, range=(0, 2 * np.pi))
+    mean = len(finite) / PHASE_BINS
+    chance = 2 * np.sqrt(mean)
+    axes.axhspan(mean - chance, mean + chance, color=GREY, alpha=0.25, linewidth=0)
+    axes.stairs(count, edges, fill=True, color=BAR, edgecolor=BLUE)
+    axes.axhline(mean, color=INK, linewidth=1, ls="--")
+    axes.set_xlim(0, 2 * np.pi)
+    axes.set_xticks([0, np.pi, 2 * np.pi], ["0", "π", "2π"])
+    axes.set(xlabel="φ (rad)", ylabel="frames\nper bin")
+    finish(axes)
 
 
 def _clock(time: F64) -> tuple[F64, str]:
@@ -94,109 +110,120 @@ def _dot(frames: int) -> float:
     return float(np.clip(70 / np.sqrt(max(frames, 1)), 1.2, 4.5))
 
 
-def residuals(fringes: SetContents) -> Figure:
-    """Map of the reduced chi-square, and its histogram against the expected distribution."""
-    figure, ((left, right),) = axes_grid((WIDE, 4.4), 1, 2, beside=1.95, width_ratios=[1, 1.15])
-    summary = fringes.chi2
-    scale = span_scale(summary.image)
-    drawn = draw_map(left, summary, scale)
-    ny, nx = summary.shape
-    if max(ny, nx) <= 6 * min(ny, nx):
-        left.set_aspect("equal")
-    left.set(xlabel="x (px)", ylabel="y (px)")
-    note = block_note(summary)
-    label = f"reduced χ²\n{note}" if note else "reduced χ²"
-    add_bar(figure, left, drawn, label, scale.beyond)
-    _chi2_histogram(right, summary, fringes.facts)
-    return figure
-
-
-def _chi2_histogram(axes: Axes, summary: MapSummary, facts: dict[str, Any]) -> None:
-    freedom = max(int(facts["frames"]) - 3, 1)
-    noise = float(facts.get("chi2_reduced") or 1.0)
-    chance = float(np.sqrt(2 / freedom))
-    values = summary.sample.astype(float)
-    low = max(0.0, min(1, noise) * (1 - 6 * chance))
-    high = max(1, noise) * (1 + 8 * chance)
-    edges = np.linspace(low, high, int(np.clip(np.sqrt(max(len(values), 1)) / 1.5, 15, 100)))
-    count, _ = np.histogram(values, edges)
-    axes.stairs(count, edges, fill=True, color=BAR, edgecolor=BLUE, label="pixels")
-    at = np.linspace(max(low, 1e-6), high, 500)
-    per_bin = len(values) * (edges[1] - edges[0])
-    axes.plot(
-        at, per_bin * _reduced_chi2_density(at, freedom), color=INK, linewidth=1.3,
-        ls="--", label=f"χ² law, {freedom} degrees of freedom",
-    )  # fmt: skip
-    scaled = per_bin / noise * _reduced_chi2_density(at / noise, freedom)
-    axes.plot(at, scaled, color=RED, linewidth=1.5, label=f"the same × {noise:.4f}")
-    outside = int((values > high).sum())
-    if outside:
-        axes.annotate(
-            f"{outside} beyond →", (0.99, 0.55), xycoords="axes fraction", ha="right", fontsize=9.5
-        )
-    axes.set_xlim(low, high)
-    axes.set_ylim(0, 1.45 * max(float(count.max()), 1.0))
+def residuals(sets: Sequence[SetContents]) -> Figure:
+    """Maps of the reduced chi-square, and their histograms against the expected distributions."""
+    figure, panels, axes = map_axes(len(sets), sets[0].chi2.shape, curve=True)
+    assert axes is not None
+    for panel, fringes in zip(panels, sets, strict=True):
+        draw_panel(figure, panel, fringes.chi2, "reduced χ²", f"set {fringes.name}")
+    ends = np.array(
+        [_histogram(axes, s, LINES[n % len(LINES)]) for n, s in enumerate(sets)]
+    )  # (set, 3): lowest, highest, tallest
+    axes.set_xlim(ends[:, 0].min(), ends[:, 1].max())
+    axes.set_ylim(0, 1.45 * ends[:, 2].max())
     axes.set(xlabel="reduced χ² of a pixel", ylabel="pixels per bin")
     finish(axes)
     axes.legend(fontsize=9, loc="upper right", framealpha=0.9)
+    return figure
 
 
-def allan(name: str, measured: dict[str, Any], facts: dict[str, Any] | None) -> Figure:
-    """Allan deviation against averaging length, and its ratio to the square-root law.
+def _histogram(axes: Axes, fringes: SetContents, colour: str) -> tuple[float, float, float]:
+    """Histogram of a set; ends of its axis and height of its largest bin."""
+    freedom = max(int(fringes.facts["frames"]) - 3, 1)
+    noise = float(fringes.facts.get("chi2_reduced") or 1.0)
+    chance = float(np.sqrt(2 / freedom))
+    values = fringes.chi2.sample.astype(float)
+    low, high = max(0.0, min(1, noise) * (1 - 6 * chance)), max(1, noise) * (1 + 8 * chance)
+    edges = np.linspace(low, high, int(np.clip(np.sqrt(max(len(values), 1)) / 1.5, 15, 100)))
+    count, _ = np.histogram(values, edges)
+    outside = int((values > high).sum())
+    label = f"{fringes.name}: pixels" + (f", {outside} beyond {high:.2f}" if outside else "")
+    axes.stairs(count, edges, color=colour, linewidth=1.5, label=label)
+    at = np.linspace(max(low, 1e-6), high, 500)
+    per_bin = len(values) * (edges[1] - edges[0])
+    for scale, style, name in (
+        (1.0, "--", f"χ² law, {freedom} degrees of freedom"),
+        (noise, "-", f"the same × {noise:.4f}"),
+    ):
+        law = per_bin / scale * _reduced_chi2_density(at / scale, freedom)
+        axes.plot(at, law, color=colour, linewidth=1.0, ls=style, label=name)
+    return low, high, max(float(count.max()), 1.0)
+
+
+def allan(sets: Sequence[SetContents]) -> Figure:
+    """Allan deviations against averaging length, and their ratios to the square-root law."""
+    return allan_figure({s.name: (s.allan or {}, s.facts) for s in sets})
+
+
+def allan_figure(sets: Mapping[str, tuple[Facts, Facts]]) -> Figure:
+    """Allan deviations against averaging length, and their ratios to the square-root law.
 
     Parameters
     ----------
-    name : str
-        Of the set.
-    measured : dict
-        Its entry in ``allan.json``.
-    facts : dict, optional
-        Its entry in ``fit.json``, for the Cramér-Rao bound.
+    sets : mapping
+        Entries in ``allan.json`` and, for the Cramér-Rao bound, in ``fit.json``, by set.
     """
-    frames, adev, low, high, white, seconds = (
-        _floats(measured.get(key))
-        for key in (
-            "frames", "adev_px", "adev_lo_px", "adev_hi_px", "white_expected_px", "seconds",
-        )
-    )  # fmt: skip
-    unit = unit_for(adev, "px")
-    bars = np.nan_to_num(np.abs(np.stack([adev - low, high - adev])))
     figure, ((axes,), (below,)) = axes_grid(
         (WIDE, 6.2), 2, 1, top=0.65, between=0.2, sharex=True, height_ratios=[3, 1.1]
     )
-    look = {"fmt": "o", "color": BLUE, "elinewidth": 1.3, "capsize": 3, "markersize": 6}
-    axes.errorbar(
-        frames, adev * unit.factor, bars * unit.factor, zorder=3, **look,
-        label="measured" + _slope_label(measured),
-    )  # fmt: skip
-    axes.plot(
-        frames, white * unit.factor, color=GREEN, linewidth=1.5, label="square-root law from σ"
-    )
-    below.axhline(1, color=GREEN, linewidth=1.5)
-    if facts and facts.get("crb_median_px"):
-        bound = facts["crb_median_px"] * np.sqrt(facts["frames"] / frames)
-        style = {"color": RED, "ls": "--", "linewidth": 1.5}
-        axes.plot(frames, bound * unit.factor, label="Cramér–Rao bound", **style)
-        below.plot(frames, bound / white, **style)
-    below.errorbar(frames, adev / white, bars / white, **look)
-    if measured.get("knee_frames"):
-        for each in (axes, below):
-            each.axvline(measured["knee_frames"], color=INK, ls=":", linewidth=1.4)
-        axes.annotate(
-            f" knee: {measured['knee_frames']:.0f} frames", (measured["knee_frames"], 0.04),
-            xycoords=("data", "axes fraction"), fontsize=10,
-        )  # fmt: skip
+    curves = {
+        name: {key: _floats(measured.get(key)) for key in ALLAN_COLUMNS}
+        for name, (measured, _) in sets.items()
+    }
+    unit = unit_for(np.concatenate([c["adev_px"] for c in curves.values()]), "px")
+    for n, (name, curve) in enumerate(curves.items()):
+        look: Any = {"color": LINES[n % len(LINES)], "aside": 1.012 ** (n - (len(sets) - 1) / 2)}
+        _allan_lines(axes, below, name, *sets[name], curve, unit, **look)
+    below.axhline(1, color=GREY, linewidth=1.5)
     _log_axes(axes, below)
+    frames = np.unique(np.concatenate([c["frames"] for c in curves.values()]))
     shown = frames[:: -(-len(frames) // 9)]
     below.set_xticks(shown, [f"{v:.0f}" for v in shown])
     axes.set_ylabel(f"Allan deviation of δ ({unit.label})")
     below.set(xlabel="averaging length (frames)", ylabel="measured / law")
-    _add_clock(axes, frames, seconds)
-    axes.legend(fontsize=10, framealpha=0.9, title=f"set {name}")
+    first = next(iter(curves.values()))
+    _add_clock(axes, first["frames"], first["seconds"])
+    axes.legend(fontsize=10, framealpha=0.9)
     return figure
 
 
-def _slope_label(measured: dict[str, Any]) -> str:
+def _allan_lines(
+    axes: Axes, below: Axes, name: str, measured: Facts, facts: Facts, curve: Mapping[str, F64],
+    unit: Unit, *, color: str, aside: float,
+) -> None:  # fmt: skip
+    """One set: points, square-root law, bound, knee; points of sets lie a little ``aside``."""
+    frames, adev, white = curve["frames"], curve["adev_px"], curve["white_expected_px"]
+    low, high = curve["adev_lo_px"], curve["adev_hi_px"]
+    bars = np.nan_to_num(np.abs(np.stack([adev - low, high - adev])))
+    look: dict[str, Any] = {
+        "fmt": "o",
+        "color": color,
+        "elinewidth": 1.3,
+        "capsize": 3,
+        "markersize": 6,
+    }
+    label = f"{name}: measured{_slope_label(measured)}"
+    at = frames * aside
+    axes.errorbar(at, adev * unit.factor, bars * unit.factor, zorder=3, label=label, **look)
+    below.errorbar(at, adev / white, bars / white, **look)
+    law: dict[str, Any] = {"color": color, "linewidth": 1.5}
+    first = color == LINES[0]  # the legend says once what styles of lines mean
+    axes.plot(frames, white * unit.factor, label="square-root law from σ" if first else None, **law)
+    if facts.get("crb_median_px"):
+        bound = facts["crb_median_px"] * np.sqrt(facts["frames"] / frames)
+        law |= {"ls": "--"}
+        axes.plot(frames, bound * unit.factor, label="Cramér–Rao bound" if first else None, **law)
+        below.plot(frames, bound / white, **law)
+    if knee := measured.get("knee_frames"):
+        for each in (axes, below):
+            each.axvline(knee, color=color, ls=":", linewidth=1.4)
+        axes.annotate(
+            f" knee: {knee:.0f} frames", (knee, 0.04), xycoords=("data", "axes fraction"),
+            fontsize=10, color=color,
+        )  # fmt: skip
+
+
+def _slope_label(measured: Facts) -> str:
     slope, error = measured.get("slope"), measured.get("slope_err")
     return "" if slope is None else f", slope {with_error(slope, error)}"
 

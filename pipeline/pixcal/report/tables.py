@@ -1,13 +1,22 @@
-"""Tables of the page: the numbers of every stage."""
+"""Tables of the page: the numbers of every stage. Templates call them by name."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from pixcal.model.flags import PixelFlag
-from pixcal.report.contents import ArrayRecord, SetContents, StageRecord
-from pixcal.report.summary import FlagSummary
-from pixcal.report.text import date_of_mjd, duration, exact, flag_name, number, share, with_error
+from pixcal.report.contents import ArrayRecord, Contents, SetContents, StageRecord
+from pixcal.report.summary import FlagSummary, MapSummary
+from pixcal.report.text import (
+    date_of_mjd,
+    duration,
+    exact,
+    flag_name,
+    mode_in_words,
+    number,
+    share,
+    with_error,
+)
 
 FLAG_WORDS = {
     PixelFlag.HOT: "dark signal far above that of the other pixels",
@@ -35,10 +44,9 @@ class Table:
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
-    kind: str = "table"
 
 
-def allan_table(measured: Sequence[SetContents]) -> Table:
+def allan(measured: Sequence[SetContents]) -> Table:
     """Slope, knee and batches of each set."""
     rows = []
     for s in measured:
@@ -58,14 +66,14 @@ def allan_table(measured: Sequence[SetContents]) -> Table:
     return Table("Allan deviation in numbers", header, rows)
 
 
-def flag_table(panels: Sequence[tuple[str, FlagSummary]]) -> Table:
+def flags(masks: Mapping[str, FlagSummary]) -> Table:
     """How many pixels have each flag, one column each mask."""
     rows = []
     for flag in PixelFlag:
-        counts = [_count(s.counts[flag.value], s) for _, s in panels]
+        counts = [_count(s.counts[flag.value], s) for s in masks.values()]
         rows.append([flag_name(flag), FLAG_WORDS[flag], *counts])
-    rows.append(["any", "masked", *(_count(s.masked, s) for _, s in panels)])
-    return Table("Pixels flagged", ["flag", "meaning", *(title for title, _ in panels)], rows)
+    rows.append(["any", "masked", *(_count(s.masked, s) for s in masks.values())])
+    return Table("Pixels flagged", ["flag", "meaning", *masks], rows)
 
 
 def _count(pixels: int, summary: FlagSummary) -> str:
@@ -73,7 +81,7 @@ def _count(pixels: int, summary: FlagSummary) -> str:
     return f"{number(pixels)} ({share(pixels, ny * nx)})"
 
 
-def reduction_tables(facts: Mapping[str, Any]) -> Iterator[Table]:
+def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
     """Gain and read noise side by side, the ladder of flats, then what each set was made of."""
     rows = []
     for key, label in (("gain_e_per_adu", "gain (e⁻/ADU)"), ("read_noise_e", "read noise (e⁻)")):
@@ -105,10 +113,10 @@ def reduction_tables(facts: Mapping[str, Any]) -> Iterator[Table]:
         yield _columns_table("Fringe sets as reduced", sets)
     rest = {k: v for k, v in facts.items() if k not in _REDUCTION_SHOWN}
     if rest:
-        yield Table("Other numbers of the reduction", ["quantity", "value"], flat_rows(rest))
+        yield Table("Other numbers of the reduction", ["quantity", "value"], _flat_rows(rest))
 
 
-def merit_table(facts: Mapping[str, Any]) -> Iterator[Table]:
+def merit(facts: Mapping[str, Any]) -> Iterator[Table]:
     """Figures of merit, as in a data sheet of the detector."""
     rows = [
         [f["title"], with_error(f["value"], f["error"]), f["unit"].replace("e-", "e⁻"), f["note"]]
@@ -120,6 +128,50 @@ def merit_table(facts: Mapping[str, Any]) -> Iterator[Table]:
             ["figure", "value", "unit", ""],
             rows,
         )
+
+
+def saturation(facts: Mapping[str, Any]) -> float | None:
+    """Level (ADU) where the detector saturates, if the flats reach it."""
+    full = (facts.get("figures_of_merit") or {}).get("saturation")
+    return full["value"] if full and full["error"] is not None else None
+
+
+def patterns(curves: Mapping[str, Any]) -> dict[str, Any]:
+    """What was measured of DSNU and PRNU."""
+    return {key.upper(): curves[key] for key in ("dsnu", "prnu") if key in curves}
+
+
+def calibration(maps: Sequence[tuple[str, str, MapSummary]]) -> Table:
+    """Location and width of the calibration maps."""
+    rows = [
+        [title, unit, *(number(v, 4) for v in (m.median, m.robust_std, m.mean, m.std))]
+        for title, unit, m in maps
+    ]
+    header = ["map", "unit", "median", "robust σ", "mean", "σ"]
+    return Table("Calibration maps in numbers", header, rows)
+
+
+def removed_modes(sets: Sequence[SetContents]) -> Iterator[Table]:
+    """The removed modes; sets that have the same ones share a table."""
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for fringes in sets:
+        groups.setdefault(tuple(fringes.facts.get("removed_modes", ())), []).append(fringes.name)
+    for modes, names in groups.items():
+        rows = [[mode, mode_in_words(mode)] for mode in modes]
+        title = f"Set{'s' if len(names) > 1 else ''} {', '.join(names)}"
+        yield Table(title, ["mode", "description"], rows)
+
+
+def provenance(contents: Contents) -> Iterator[Table]:
+    """All of fit.json, the frames, the stages, and the acquisition as understood."""
+    if contents.fit is not None:
+        yield from _fit(contents.fit)
+    if contents.arrays:
+        yield _frames(contents.arrays)
+    yield from _stages(contents.stages)
+    # Detector frames alone have no optics.
+    listed = {key: value for key, value in contents.acquisition.items() if value is not None}
+    yield Table("Acquisition as understood", ["key", "value"], _flat_rows(listed))
 
 
 def _columns_table(title: str, columns: Mapping[str, Mapping[str, Any]]) -> Table:
@@ -140,7 +192,7 @@ def _list_table(title: str, entries: Sequence[Mapping[str, Any]]) -> Table:
     return Table(title, keys, [[_plain(entry.get(key)) for key in keys] for entry in entries])
 
 
-def stage_tables(stages: Sequence[StageRecord]) -> Iterator[Table]:
+def _stages(stages: Sequence[StageRecord]) -> Iterator[Table]:
     """What each stage was made from, by key; and the digests of the files."""
     present = {stage.name: stage.key for stage in stages}
     rows = []
@@ -170,7 +222,7 @@ def stage_tables(stages: Sequence[StageRecord]) -> Iterator[Table]:
         yield Table("Digests of the files", ["array", "digest"], files)
 
 
-def fit_tables(fit: Mapping[str, Any]) -> Iterator[Table]:
+def _fit(fit: Mapping[str, Any]) -> Iterator[Table]:
     """All numbers of fit.json; the removed modes have a section of their own."""
     sets = {
         name: dict(_flat({k: v for k, v in facts.items() if k != "removed_modes"}))
@@ -178,10 +230,10 @@ def fit_tables(fit: Mapping[str, Any]) -> Iterator[Table]:
     }
     yield _columns_table("fit.json, each set", sets)
     rest = {key: value for key, value in fit.items() if key != "sets"}
-    yield Table("fit.json, all sets together", ["quantity", "value"], flat_rows(rest))
+    yield Table("fit.json, all sets together", ["quantity", "value"], _flat_rows(rest))
 
 
-def frames_table(arrays: Sequence[ArrayRecord]) -> Table:
+def _frames(arrays: Sequence[ArrayRecord]) -> Table:
     """What was ingested."""
     rows = []
     for a in arrays:
@@ -225,7 +277,7 @@ def _flat(data: Any, key: str = "") -> Iterator[tuple[str, Any]]:
         yield key, data
 
 
-def flat_rows(data: Any) -> list[list[str]]:
+def _flat_rows(data: Any) -> list[list[str]]:
     """Rows of dotted key and value."""
     return [[key, _plain(value)] for key, value in _flat(data)]
 

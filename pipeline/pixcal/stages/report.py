@@ -17,6 +17,7 @@ from pixcal.estimators.diagnosis.gap import CHANCE, sigmas_of
 from pixcal.model.config import result_options
 from pixcal.model.options import Report
 from pixcal.report.contents import (
+    DETECTOR_MAPS,
     ArrayRecord,
     Contents,
     Detail,
@@ -28,7 +29,6 @@ from pixcal.report.contents import (
     SetContents,
     StageRecord,
 )
-from pixcal.report.detector_page import DETECTOR_MAPS
 from pixcal.report.page import render
 from pixcal.report.summary import (
     BAND_ROWS,

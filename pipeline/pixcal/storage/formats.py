@@ -34,7 +34,7 @@ STAGES = {
         Stage("diagnose", 5, "diagnose RUN", of_fringes=False),
         Stage("corrected", 2, "fit RUN --with-diagnosis"),
         Stage("astrometry", 1, "astrometry RUN"),
-        Stage("report", 1, "report RUN", of_fringes=False),
+        Stage("report", 2, "report RUN", of_fringes=False),
         # In directories of their own.
         Stage("compare", 1, "compare RUN --out DIR"),
         Stage("simulate", 1, "simulate BENCH.yaml --out ACQ"),
