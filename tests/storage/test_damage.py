@@ -1,11 +1,15 @@
 """Damaged artefacts: seen before they are used, and made again by their own command."""
 
+import math
 import shutil
+import tracemalloc
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from pixcal.model.errors import DamagedError
 from pixcal.storage import artefact
@@ -184,6 +188,28 @@ def test_equal_maps_are_equal_files(product: Path) -> None:
     again = product.with_name("again.fits")
     write_map(again, data, sigma, mask, [("MODEL", "paraxial", "shape")], ["a line"])
     assert again.read_bytes() == product.read_bytes()
+
+
+class Ramp:
+    """A map that is nowhere in memory; its values are the numbers of their rows."""
+
+    shape = (6007, 501)
+
+    def read(self, rows: tuple[int, int]) -> NDArray[Any]:
+        return np.repeat(np.arange(*rows, dtype=np.float32)[:, None], self.shape[1], axis=1)
+
+
+def test_products_are_written_a_band_of_rows_at_a_time(tmp_path: Path) -> None:
+    ramp, path = Ramp(), tmp_path / "delta_x.fits"
+    tracemalloc.start()
+    write_map(path, ramp, ramp, np.zeros(ramp.shape, np.uint8), [])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    whole = 4 * math.prod(ramp.shape)
+    assert peak - math.prod(ramp.shape) < whole / 5
+    data, sigma, _, _ = read_map(path)
+    for found in (data, sigma):
+        np.testing.assert_array_equal(found, ramp.read((0, ramp.shape[0])))
 
 
 def test_altered_and_cut_products_are_seen(product: Path) -> None:

@@ -72,17 +72,37 @@ class FitsMap:
 
 def word_sum(path: Path, start: int, n_bytes: int) -> int:
     """Sum of the 32-bit words of a part of a file in ones' complement (FITS 4.0, appendix J)."""
-    total, left = 0, n_bytes
+    total = 0
     with path.open("rb") as file:
         file.seek(start)
-        while left:
-            piece = file.read(min(_PIECE, left))
-            left -= len(piece)
-            piece += bytes(-len(piece) % 4)
-            total += int(np.frombuffer(piece, ">u4").sum(dtype=np.uint64))
+        for at in range(0, n_bytes, _PIECE):
+            total = add_words(total, file.read(min(_PIECE, n_bytes - at)))
+    return total
+
+
+def add_words(total: int, part: bytes, at: int = 0) -> int:
+    """Add the next part of some data, which begins at a byte, to their `word_sum`."""
+    part = bytes(at % 4) + part
+    words = np.frombuffer(part + bytes(-len(part) % 4), ">u4")
+    total += int(words.sum(dtype=np.uint64))
     while total >> 32:
         total = (total & 0xFFFFFFFF) + (total >> 32)
     return total
+
+
+def encoded(total: int) -> str:
+    """The complement of a `word_sum` as CHECKSUM holds it (FITS 4.0, appendix J.2)."""
+    columns = []
+    for byte in (total ^ 0xFFFFFFFF).to_bytes(4, "big"):
+        parts = [byte // 4 + 48 + (byte % 4 if n == 0 else 0) for n in range(4)]
+        # Letters and digits only: what one of a pair gains the other loses.
+        while any(58 <= c <= 64 or 91 <= c <= 96 for c in parts):
+            for n in (0, 2):
+                if any(58 <= c <= 64 or 91 <= c <= 96 for c in parts[n : n + 2]):
+                    parts[n], parts[n + 1] = parts[n] + 1, parts[n + 1] - 1
+        columns.append(parts)
+    text = bytes(column[n] for n in range(4) for column in columns).decode("ascii")
+    return text[-1] + text[:-1]
 
 
 def content_digest(path: Path) -> str:

@@ -29,7 +29,7 @@ from pixcal.stages.correct.uncertainty import parameter_errors
 from pixcal.stages.correct.undoing import undo_on_maps
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
 from pixcal.stages.fit.maps import Totals, write_maps
-from pixcal.stages.fit.products import header_of, plan_products, publish_maps
+from pixcal.stages.fit.products import header_of, publish_maps
 from pixcal.stages.fit.sweep import Config as SweepConfig
 from pixcal.stages.fit.sweep import load_run, nominal_vector, sweep_set
 from pixcal.stages.reduce.ingested import Ingested
@@ -81,8 +81,6 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     }
     inputs = {"fit": fitted.key, "diagnose": diagnosed.key}
     acquisition = load_run(run_dir)
-    if plan.changes:
-        plan_products(run_dir, [s.name for s in acquisition.frames.fringes], runtime)
     with lock(run_dir):
         body = partial(_correct, run_dir, plan, acquisition, runtime)
         return make(

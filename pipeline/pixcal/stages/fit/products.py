@@ -1,40 +1,15 @@
 """The fit's products: what other programs read."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from pixcal.engine.plan import make_plan
-from pixcal.engine.run import Runtime
 from pixcal.model.errors import DamagedError
 from pixcal.stages.fit.sweep import load_run
-from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.fits_facts import date_of
 from pixcal.storage.products import Card, is_whole, write_map
-
-PIXEL_BYTES = 9
-"""A map, its errors and its flags, whole, for each pixel."""
-KEPT_BYTES = 128 << 20
-"""What the allocator keeps of the tasks that are done by then (measured on 46 Mpix)."""
-
-
-def plan_products(run_dir: Path, sets: list[str], runtime: Runtime) -> None:
-    """Refuse a fit whose products would not fit the memory allowed, before anything is read.
-
-    Raises
-    ------
-    PlanError
-        With both numbers.
-    """
-    ny, nx = ReducedSet(run_dir / "reduce" / "reduced.zarr" / sets[0]).shape
-    shared = PIXEL_BYTES * ny * nx + KEPT_BYTES
-    make_plan("writing the products of the fit", 0, shared, replace(runtime, cluster="sync"))
 
 
 def published(run_dir: Path) -> bool:
@@ -143,27 +118,11 @@ def publish_maps(
     suffix : str
         Of the names of the products.
     """
-    mask = ArrayReader(group / "mask").read() if outputs else np.empty((0, 0), np.uint8)
     for name in outputs:
-        _publish_map(
-            group, name, run_dir / "products" / f"{name}{suffix}.fits", mask, cards, history
+        delta, sigma, mask = (
+            ArrayReader(group / array) for array in (name, f"{name}_sigma", "mask")
         )
+        product = run_dir / "products" / f"{name}{suffix}.fits"
+        write_map(product, delta, sigma, mask, cards, history)
     for other in {"delta_x", "delta_y", "delta_fringe"} - set(outputs):
         (run_dir / "products" / f"{other}{suffix}.fits").unlink(missing_ok=True)
-
-
-def _publish_map(
-    group: Path,
-    name: str,
-    product: Path,
-    mask: NDArray[np.uint8],
-    cards: list[Card],
-    history: list[str],
-) -> None:
-    """Write one map; a function, so that its arrays are gone before the next."""
-    data, sigma = (
-        # In the byte order of FITS at once: whole maps are large.
-        ArrayReader(group / array).read(out=np.empty(mask.shape, ">f4"))
-        for array in (name, f"{name}_sigma")
-    )
-    write_map(product, data, sigma, mask, cards, history)

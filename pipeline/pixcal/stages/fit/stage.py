@@ -10,7 +10,7 @@ from pixcal.model.options import Fit
 from pixcal.stages.fit import sweep
 from pixcal.stages.fit.fringe_set import describe, fit_sets
 from pixcal.stages.fit.maps import write_maps
-from pixcal.stages.fit.products import plan_products, publish, published
+from pixcal.stages.fit.products import publish, published
 from pixcal.stages.fit.sweep import load_run
 from pixcal.storage.artefact import Build, Manifest, write_json
 from pixcal.storage.formats import STAGES
@@ -31,9 +31,6 @@ def run(run_dir: Path, config: Config, runtime: Runtime, *, products: bool = Tru
     InputError
         If reduce has not been run, or the frames hold no fringes that can be fitted.
     """
-    sets = [listed.name for listed in load_run(run_dir).frames.fringes]
-    if products and sets:
-        plan_products(run_dir, sets, runtime)
     with working(run_dir, "reduce"):
         swept = sweep.run(run_dir, config, runtime)
         body = partial(_fit_all, run_dir, swept, config, runtime)
