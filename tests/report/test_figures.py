@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from pixcal.report import detector_figures, map_figures, set_figures
-from pixcal.report.colours import DIVERGING, MASKED, PALETTE, SEQUENTIAL, srgb
+from pixcal.report.colours import DIVERGING, MASKED, PALETTE, SEQUENTIAL
 from pixcal.report.contents import FrameSeries, MapContents, SetContents
 from pixcal.report.drawing import png, span_scale, symmetric_scale, unit_for
 from pixcal.report.summary import (
@@ -199,15 +199,6 @@ def test_the_diverging_colours_are_symmetric_and_even() -> None:
     assert (np.diff(grey[40:]) < 0).all()
     assert abs(grey[0] - grey[-1]) < 0.12
     assert to_rgb(MASKED) not in [tuple(c) for c in SEQUENTIAL(np.arange(81))[:, :3]]
-
-
-@pytest.mark.parametrize(
-    ("lab", "rgb"),
-    [((1.0, 0.0, 0.0), (1, 1, 1)), ((0.0, 0.0, 0.0), (0, 0, 0)),
-     ((0.62796, 0.22486, 0.12585), (1, 0, 0)), ((0.45201, -0.03246, -0.31153), (0, 0, 1))],
-)  # fmt: skip
-def test_oklab_gives_the_known_colours(lab: Any, rgb: Any) -> None:
-    np.testing.assert_allclose(srgb(np.array([lab])), [rgb], atol=2e-3)
 
 
 def test_scales_hold_what_they_should() -> None:

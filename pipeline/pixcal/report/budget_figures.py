@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
 from pixcal.report.colours import BAR, BLUE, GREEN, GREY, INK, MARKS, RED
-from pixcal.report.drawing import WIDE, finish, new_figure
+from pixcal.report.drawing import WIDE, finish, new_figure, plain_ticks
 from pixcal.report.text import duration, number
 
 F64 = NDArray[np.float64]
@@ -118,7 +118,8 @@ def _precision(axes: Axes, result: Mapping[str, Any]) -> None:
     axes.set_yscale("log")
     axes.set_xlim(frames[0], frames[-1])
     axes.set(xlabel="frames", ylabel="1σ bound of a pixel's offset (px)")
-    _plain(axes)
+    plain_ticks(axes.xaxis, *axes.get_xlim(), most=9)
+    plain_ticks(axes.yaxis, *axes.get_ylim(), most=9)
     _clock(axes, _as_planned(result)["period_s"])
     finish(axes)
     axes.plot([], [], "o", color=GREY, label="planned")
@@ -129,15 +130,6 @@ def _precision(axes: Axes, result: Mapping[str, Any]) -> None:
 
 def _cycle(number: int) -> list[str]:
     return [COLOURS[n % len(COLOURS)] for n in range(number)]
-
-
-def _plain(axes: Axes) -> None:
-    """Ticks at 1, 2 and 5 of each decade where there are few decades."""
-    for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        few = np.log10(limits[1] / limits[0]) < 2.6
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if few else (1,), numticks=12))
-        axis.set_major_formatter(FuncFormatter(lambda v, _: number(v, 1)))
-        axis.set_minor_formatter(NullFormatter())
 
 
 def _clock(axes: Axes, period: float) -> None:

@@ -35,41 +35,13 @@ FLAGS = {
     64: "#2ca25f", 128: "#8c510a",
 }  # fmt: skip
 
-# Björn Ottosson's OKLab (2020): a space whose distances are those that the eye sees.
-_LMS_FROM_LAB = np.array(
-    [
-        [1, 0.3963377774, 0.2158037573],
-        [1, -0.1055613458, -0.0638541728],
-        [1, -0.0894841775, -1.2914855480],
-    ]
-)
-_RGB_FROM_LMS = np.array(
-    [
-        [4.0767416621, -3.3077115913, 0.2309699292],
-        [-1.2684380046, 2.6097574011, -0.3413193965],
-        [-0.0041960863, -0.7034186147, 1.7076147010],
-    ]
-)
+
+def _sampled(name: str) -> F64:
+    return np.asarray(colormaps[name](np.linspace(0, 1, LEVELS)))[:, :3]
 
 
-def srgb(lab: F64) -> F64:
-    """sRGB (n, 3) in 0..1 of OKLab colours (n, 3), clipped to what a screen shows."""
-    linear = (lab @ _LMS_FROM_LAB.T) ** 3 @ _RGB_FROM_LMS.T
-    linear = np.clip(linear, 0, 1)
-    gamma = 1.055 * linear ** (1 / 2.4) - 0.055
-    return np.asarray(np.where(linear <= 0.0031308, 12.92 * linear, gamma))
-
-
-def _diverging() -> F64:
-    """Blue through white to red, in equal steps of perceived difference from the middle."""
-    ends = np.array([[0.36, -0.035, -0.145], [0.97, 0.0, 0.0], [0.43, 0.155, 0.085]])
-    at = np.linspace(0, 2, LEVELS)
-    lab = np.stack([np.interp(at, [0, 1, 2], channel) for channel in ends.T], axis=1)
-    return srgb(lab)
-
-
-_DIVERGING = _diverging()
-_SEQUENTIAL = np.asarray(colormaps["viridis"](np.linspace(0, 1, LEVELS)))[:, :3]
+_DIVERGING = _sampled("RdBu_r")
+_SEQUENTIAL = _sampled("viridis")
 
 DIVERGING = ListedColormap(_DIVERGING, name="pixcal_diverging").with_extremes(bad=MASKED)
 SEQUENTIAL = ListedColormap(_SEQUENTIAL, name="pixcal_sequential").with_extremes(bad=MASKED)

@@ -9,11 +9,20 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
 
 from pixcal.report.colours import BAND, BLUE, DIVERGING, GREEN, GREY, INK, RED, SEQUENTIAL
-from pixcal.report.drawing import WIDE, Unit, covered, finish, limits, new_figure, unit_for
+from pixcal.report.drawing import (
+    WIDE,
+    Unit,
+    covered,
+    finish,
+    limits,
+    new_figure,
+    plain_ticks,
+    unit_for,
+)
 from pixcal.report.text import SYMBOLS
 
 F64 = NDArray[np.float64]
@@ -172,11 +181,7 @@ def _round_off(axes: Axes, values: F64) -> None:
     good = values[np.isfinite(values) & (values > 0)]
     if len(good):
         axes.set_ylim(0.45 * good.min(), 3 * good.max() * (good.max() / good.min()) ** 0.22)
-    low, high = axes.get_ylim()
-    steps = [m * 10.0**e for e in range(-9, 9) for m in (1, 2, 5)]
-    axes.yaxis.set_major_locator(FixedLocator([s for s in steps if low <= s <= high]))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-    axes.yaxis.set_minor_locator(NullLocator())
+    plain_ticks(axes.yaxis, *axes.get_ylim())
 
 
 def _places(figure: SubFigure, axes: Axes, view: ComponentView) -> None:

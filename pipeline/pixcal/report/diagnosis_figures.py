@@ -7,16 +7,14 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 
 from pixcal.report.colours import BAND, BLUE, GREY, INK, RED
 from pixcal.report.contents import DiagnosisContents
 from pixcal.report.curve_places import axis_label, places
 from pixcal.report.diagnosis_words import DETECTOR, effect_title, percent, unit
-from pixcal.report.drawing import TITLE, WIDE, Unit, axes_grid, finish, unit_for
+from pixcal.report.drawing import TITLE, WIDE, Unit, axes_grid, finish, plain_ticks, unit_for
 
 F64 = NDArray[np.float64]
 
@@ -250,7 +248,7 @@ def _value_axis(axes: Axes, curve: Mapping[str, Any], values: F64, scale: Unit) 
         if good.max() > SPAN * good.min():
             axes.set_yscale("log")
             axes.set_ylim(good.min() / 2, good.max() * 2)
-            _plain_numbers(axes.yaxis, good.min() / 2, good.max() * 2)
+            plain_ticks(axes.yaxis, good.min() / 2, good.max() * 2)
     else:
         axes.axhline(0, color=GREY, linewidth=0.8)
     axes.set_ylabel(_plain(scale.label, 24))
@@ -280,23 +278,11 @@ def _place_axis(axes: Axes, curve: Mapping[str, Any], x: F64, named: bool) -> No
     axes.set_xscale("log")
     low, high = float(x.min()) / 1.3, float(x.max()) * 1.3
     axes.set_xlim(low, high)
-    _plain_numbers(axes.xaxis, low, high)
+    plain_ticks(axes.xaxis, low, high)
 
 
 def _turned(names: Sequence[str]) -> bool:
     return sum(len(n) + 2 for n in names) > ROOM
-
-
-def _plain_numbers(axis: Axis, low: float, high: float) -> None:
-    """Numbers without powers of ten on a logarithmic axis, at most six."""
-    for steps in ((1, 2, 5), (1, 3), (1,)):
-        ticks = [m * 10.0**e for e in range(-12, 13) for m in steps]
-        shown = [t for t in ticks if low <= t <= high]
-        if len(shown) <= 6:
-            break
-    axis.set_major_locator(FixedLocator(shown))
-    axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-    axis.set_minor_locator(NullLocator())
 
 
 def _is_named(curve: Mapping[str, Any]) -> bool:

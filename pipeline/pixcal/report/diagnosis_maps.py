@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
@@ -12,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from pixcal.report.colours import GREY, INK
+from pixcal.report.colours import DIVERGING, GREY, INK
 from pixcal.report.drawing import TITLE, WIDE, axes_grid
 
 F64 = NDArray[np.float64]
@@ -20,7 +19,6 @@ F64 = NDArray[np.float64]
 CELLS = "cell of 4 × 4"  # `x_label` of curves whose values are cells of the window
 ASIDE = 3.0  # standard deviations below which a map is not worth looking at
 MOST = 3  # maps side by side
-COLOURS = "RdBu_r"
 LARGEST = 12.0  # standard deviations at which colours end
 # least side of a window in the picture, share of the detector's: real ones would be dots
 SMALLEST = 0.17
@@ -122,13 +120,12 @@ def where_figure(shape: tuple[int, int], maps: Sequence[Panel], *, with_after: b
 def _draw(
     axes: Axes, shape: tuple[int, int], panel: Panel, scale: Normalize, *, after: bool
 ) -> None:
-    colours = mpl.colormaps[COLOURS]
     ny, nx = shape
     axes.add_patch(Rectangle((0, 0), nx, ny, fill=False, edgecolor=GREY, linewidth=1))
     for spot in panel.spots:
         (top, left), (high, wide) = _shown(spot, shape)
         sigma = spot.sigmas[after]
-        colour = colours(scale(sigma))
+        colour = DIVERGING(scale(sigma))
         axes.add_patch(
             Rectangle((left, top), wide, high, facecolor=colour, edgecolor="white", linewidth=1)
         )

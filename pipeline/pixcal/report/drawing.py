@@ -10,17 +10,20 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 from numpy.typing import NDArray
 from PIL import Image
 
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.report.colours import DIVERGING, INK, PALETTE, SEQUENTIAL
 from pixcal.report.summary import MapSummary
+from pixcal.report.text import exact
 
 WIDE = 10.4  # width of a figure that takes the whole page, inches
 # room between a map and what is beside it, for a colour bar, its numbers and labels, inches
@@ -263,6 +266,19 @@ def finish(axes: Axes, *, grid: bool = True) -> None:
         axes.grid(True, color="#d9dee5", linewidth=0.7)
         axes.set_axisbelow(True)
     axes.tick_params(colors=INK)
+
+
+def plain_ticks(axis: Axis, low: float, high: float, most: int = 6) -> None:
+    """Plain numbers on a logarithmic axis from ``low`` to ``high``, no more than ``most``."""
+    fine = (1, 1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 3.5, 4, 5, 6, 7, 8, 9)
+    for steps in (fine, (1, 1.5, 2, 3, 4, 5, 7), (1, 2, 5), (1, 3), (1,)):
+        ticks = [m * 10.0**e for e in range(-12, 16) for m in steps]
+        shown = [t for t in ticks if low <= t <= high]
+        if len(shown) <= most:
+            break
+    axis.set_major_locator(FixedLocator(shown[:: -(-len(shown) // most) or 1]))
+    axis.set_major_formatter(FuncFormatter(lambda v, _: exact(v)))
+    axis.set_minor_locator(NullLocator())
 
 
 def limits(values: Sequence[Any], share: float = 0.002) -> tuple[float, float]:

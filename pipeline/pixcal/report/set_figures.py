@@ -5,9 +5,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.axis import Axis
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+from matplotlib.ticker import NullLocator
 from numpy.typing import NDArray
 from scipy.special import gammaln, xlogy
 
@@ -22,6 +21,7 @@ from pixcal.report.drawing import (
     finish,
     limits,
     map_axes,
+    plain_ticks,
     unit_for,
 )
 from pixcal.report.text import with_error
@@ -175,7 +175,11 @@ def allan_figure(sets: Mapping[str, tuple[Facts, Facts]]) -> Figure:
         look: Any = {"color": LINES[n % len(LINES)], "aside": 1.012 ** (n - (len(sets) - 1) / 2)}
         _allan_lines(axes, below, name, *sets[name], curve, unit, **look)
     below.axhline(1, color=GREY, linewidth=1.5)
-    _log_axes(axes, below)
+    axes.set(xscale="log", yscale="log")
+    axes.xaxis.set_minor_locator(NullLocator())
+    plain_ticks(axes.yaxis, *axes.get_ylim())
+    finish(axes)
+    finish(below)
     frames = np.unique(np.concatenate([c["frames"] for c in curves.values()]))
     shown = frames[:: -(-len(frames) // 9)]
     below.set_xticks(shown, [f"{v:.0f}" for v in shown])
@@ -228,22 +232,6 @@ def _slope_label(measured: Facts) -> str:
     return "" if slope is None else f", slope {with_error(slope, error)}"
 
 
-def _log_axes(axes: Axes, below: Axes) -> None:
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    _plain_ticks(axes.yaxis)
-    axes.xaxis.set_minor_locator(NullLocator())
-    finish(axes)
-    finish(below)
-
-
-def _plain_ticks(axis: Axis) -> None:
-    """Ticks at 1, 2 and 5 of each decade, written as plain numbers."""
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-    axis.set_minor_formatter(NullFormatter())
-
-
 def _add_clock(axes: Axes, frames: F64, seconds: F64) -> None:
     """The same axis in seconds, on top."""
     if not len(seconds) or not seconds[0] > 0:
@@ -251,7 +239,8 @@ def _add_clock(axes: Axes, frames: F64, seconds: F64) -> None:
     pace = float(seconds[0] / frames[0])
     clock = (lambda f: np.asarray(f) * pace, lambda s: np.asarray(s) / pace)
     top = axes.secondary_xaxis("top", functions=clock)
-    _plain_ticks(top.xaxis)
+    low, high = axes.get_xlim()
+    plain_ticks(top.xaxis, pace * low, pace * high, most=9)
     top.set_xlabel("averaging time (s)")
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.report.contents import Contents, DiagnosisContents, SetContents
+from pixcal.report.contents import Contents, DiagnosisContents
 from pixcal.report.diagnosis_words import level, residual_gap
 from pixcal.report.text import NAMES, duration, number, share, with_error
 
@@ -57,28 +57,23 @@ def headline(contents: Contents) -> str:
 
 
 def detector_headline(facts: dict[str, Any]) -> str:
-    """Gain and read noise in a sentence, measured where they could be."""
+    """Gain, read noise and full well in a sentence, measured where they could be."""
     figures = facts.get("figures_of_merit") or {}
-    parts = [
-        f"{name} {with_error(figures[key]['value'], figures[key]['error'])} {unit}"
-        for key, name, unit in (
-            ("conversion_gain", "gain", "e⁻/ADU"),
-            ("read_noise", "read noise", "e⁻"),
-            ("full_well", "full well", "e⁻"),
-        )
-        if key in figures and not figures[key]["note"]
-    ]
-    if parts:
-        return f"The detector: {', '.join(parts)}."
-    for key, name, unit in (
-        ("gain_e_per_adu", "gain", "e⁻/ADU"),
-        ("read_noise_e", "read noise", "e⁻"),
+    parts = []
+    for key, entry, name, unit in (
+        ("conversion_gain", "gain_e_per_adu", "gain", "e⁻/ADU"),
+        ("read_noise", "read_noise_e", "read noise", "e⁻"),
+        ("full_well", "", "full well", "e⁻"),
     ):
-        entry = facts.get(key, {})
-        if entry.get("measured") is not None:
-            parts.append(f"{name} {with_error(entry['measured'], entry.get('error'))} {unit}")
-        elif entry.get("used") is not None:
-            parts.append(f"{name} {number(entry['used'], 4)} {unit} (declared)")
+        known = facts.get(entry, {})
+        if key in figures and not figures[key]["note"]:
+            parts.append(
+                f"{name} {with_error(figures[key]['value'], figures[key]['error'])} {unit}"
+            )
+        elif known.get("measured") is not None:
+            parts.append(f"{name} {with_error(known['measured'], known.get('error'))} {unit}")
+        elif known.get("used") is not None:
+            parts.append(f"{name} {number(known['used'], 4)} {unit} (declared)")
     return f"The detector: {', '.join(parts)}." if parts else "The detector was not measured."
 
 
@@ -159,26 +154,25 @@ def _mask_card(contents: Contents) -> Card:
 
 def findings(contents: Contents) -> list[Finding]:
     """Findings, the most serious first."""
-    made = [Finding(CHECK, _sentence(text)) for text in contents.warnings]
+    made = [(CHECK, text) for text in contents.warnings]
     if not contents.acquisition.get("frames", {}).get("flat"):
-        made.append(Finding(CHECK, "There are no flat frames: the flat is taken as 1 everywhere."))
+        made.append((CHECK, "there are no flat frames: the flat is taken as 1 everywhere"))
     if contents.has_fringes and not contents.sets:
-        made.append(Finding(CHECK, "The fit has not been run: there are no maps of offsets yet."))
-    for fringes in contents.sets:
-        made += _of_set(fringes)
+        made.append((CHECK, "the fit has not been run: there are no maps of offsets yet"))
+    for s in contents.sets:
+        made += [(level, f"set {s.name}: {text}") for level, text in _of_set(s.facts, s.allan)]
     consistency = (contents.fit or {}).get("sets_chi2_reduced")
     if consistency is not None:
-        agree = consistency < 1.2
-        made.append(
-            Finding(
-                GOOD if agree else BAD,
-                f"Fringe sets that measure the same offsets "
-                f"{'agree' if agree else 'do not agree'}: reduced χ² {number(consistency)}."
-                + ("" if agree else " An effect that depends on the fringe vector is present."),
-            )
-        )
+        words = "fringe sets that measure the same offsets"
+        chi2 = f"reduced χ² {number(consistency)}"
+        if consistency < 1.2:
+            made.append((GOOD, f"{words} agree: {chi2}"))
+        else:
+            effect = "an effect that depends on the fringe vector is present"
+            made.append((BAD, f"{words} do not agree: {chi2}; {effect}"))
     order = {BAD: 0, CHECK: 1, GOOD: 2}
-    return sorted(made, key=lambda f: order[f.level])
+    ranked = sorted(made, key=lambda f: order[f[0]])
+    return [Finding(level, _sentence(text)) for level, text in ranked]
 
 
 def _sentence(text: str) -> str:
@@ -186,104 +180,92 @@ def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:].rstrip(".") + "."
 
 
-def _of_set(fringes: SetContents) -> Iterator[Finding]:
-    facts, name = fringes.facts, f"Set {fringes.name}"
+Said = Iterator[tuple[str, str]]  # severity and sentence
+
+
+def _of_set(facts: dict[str, Any], allan: dict[str, Any] | None) -> Said:
     ratio = _ratio(facts.get("sigma_median_px"), facts.get("crb_median_px"))
     if ratio is not None:
-        yield Finding(
-            _bound_level(ratio),
-            f"{name}: the errors are {number(ratio, 4)} times the Cramér–Rao bound of its "
-            f"{number(facts.get('frames'))} frames.",
-        )
+        frames = f"its {number(facts.get('frames'))} frames"
+        level = _bound_level(ratio)
+        yield level, f"the errors are {number(ratio, 4)} times the Cramér–Rao bound of {frames}"
     scale = facts.get("sigma_scale")
     if scale is not None and abs(scale - 1) > 0.02:
-        yield Finding(
+        yield (
             _level(abs(scale - 1), 0.02, 0.3),
-            f"{name}: the variance of the residuals is {number(scale**2, 4)} times that of the "
-            f"declared noise; all errors were multiplied by {number(scale, 4)}. The gain or the "
-            "read noise may be wrong, or the model incomplete.",
+            f"the variance of the residuals is {number(scale**2, 4)} times that of the declared "
+            f"noise; all errors were multiplied by {number(scale, 4)}. The gain or the read noise "
+            "may be wrong, or the model incomplete",
         )
     if facts.get("period_note"):
-        yield Finding(CHECK, _sentence(f"{name}: {facts['period_note']}"))
+        yield CHECK, facts["period_note"]
     if facts.get("fringe_vector_moves"):
-        yield Finding(
-            CHECK,
-            f"{name}: the fringe vector varies from frame to frame; it was fitted in each frame.",
-        )
-    yield from _of_shape(name, facts)
-    if facts.get("batch_note") and fringes.allan is None:
-        yield Finding(CHECK, _sentence(f"{name}: {facts['batch_note']}"))
-    yield from _of_allan(fringes)
-    yield from _of_target(fringes)
+        yield CHECK, "the fringe vector varies from frame to frame; it was fitted in each frame"
+    if facts.get("model") == "hyperbolic":
+        yield from _of_geometry(facts)
+    if facts.get("batch_note") and allan is None:
+        yield CHECK, facts["batch_note"]
+    yield from _of_allan(allan)
+    yield from _of_target(facts)
 
 
-def _of_shape(name: str, facts: dict[str, Any]) -> Iterator[Finding]:
-    """Model of the fringes, and whether the fitted bench geometry is plausible."""
-    if facts.get("model") != "hyperbolic":
-        return
+def _of_geometry(facts: dict[str, Any]) -> Said:
+    """Why the fringes are hyperbolic, and whether the fitted bench geometry is plausible."""
     why = f" ({facts['evidence']})" if facts.get("evidence") else ""
-    yield Finding(GOOD, f"{name}: the fringes were fitted as hyperbolic{why}.")
+    yield GOOD, f"the fringes were fitted as hyperbolic{why}"
     geometry = facts.get("geometry", {})
     for axis in ("x", "y"):
         centre = geometry.get(f"centre_{axis}_mm")
         nominal = geometry.get(f"centre_{axis}_nominal_mm")
         if centre is None or nominal is None or abs(centre - nominal) <= FAR_MM:
             continue
-        yield Finding(
+        yield (
             CHECK,
-            f"{name}: the fit places the fibres {number(abs(centre - nominal))} mm from their "
-            f"nominal position along {axis}. If the bench is better aligned than that, smooth "
-            "structure of the detector (steps between stitched blocks) was fitted as curvature of "
-            "the fringes: fit with --model paraxial and compare.",
+            f"the fit places the fibres {number(abs(centre - nominal))} mm from their nominal "
+            f"position along {axis}. If the bench is better aligned than that, smooth structure "
+            "of the detector (steps between stitched blocks) was fitted as curvature of the "
+            "fringes: fit with --model paraxial and compare",
         )
 
 
-def _of_allan(fringes: SetContents) -> Iterator[Finding]:
-    measured = fringes.allan
+def _of_allan(measured: dict[str, Any] | None) -> Said:
     if measured is None:
-        yield Finding(CHECK, f"Set {fringes.name}: the Allan deviation has not been measured.")
+        yield CHECK, "the Allan deviation has not been measured"
         return
     for text in measured.get("warnings") or ():
-        yield Finding(CHECK, _sentence(f"Set {fringes.name}, Allan deviation: {text}"))
+        yield CHECK, f"Allan deviation: {text}"
     if measured.get("slope") is None:
         return
-    knee = measured.get("knee_frames")
-    if knee is not None:
-        yield Finding(
+    law = "with the square root of the number of frames"
+    if (knee := measured.get("knee_frames")) is not None:
+        yield (
             CHECK,
-            f"Set {fringes.name}: beyond {number(round(knee))} frames the Allan deviation no "
-            "longer falls with the square root of the number of frames: the bench or the detector "
-            "drifts.",
+            f"beyond {number(round(knee))} frames the Allan deviation no longer falls {law}: the "
+            "bench or the detector drifts",
         )
     elif _slope_is_white(measured):
-        yield Finding(
-            GOOD,
-            f"Set {fringes.name}: the Allan deviation falls with the square root of the number of "
-            "frames, over all averaging lengths.",
-        )
+        yield GOOD, f"the Allan deviation falls {law}, over all averaging lengths"
     else:
-        yield Finding(
-            CHECK,
-            f"Set {fringes.name}: the Allan deviation falls with slope "
-            f"{with_error(measured['slope'], measured.get('slope_err'))}, not −0.5.",
-        )
+        slope = with_error(measured["slope"], measured.get("slope_err"))
+        yield CHECK, f"the Allan deviation falls with slope {slope}, not −0.5"
 
 
-def _of_target(fringes: SetContents) -> Iterator[Finding]:
+def _of_target(facts: dict[str, Any]) -> Said:
     """Frames needed for the target precision, if photon noise is the limit."""
-    sigma, frames = fringes.facts.get("sigma_median_px"), fringes.facts.get("frames")
+    sigma, frames = facts.get("sigma_median_px"), facts.get("frames")
+    target = f"{number(TARGET_PX, 1)} px"
     if not sigma or not frames:
         return
     if sigma <= TARGET_PX:
-        yield Finding(GOOD, f"Set {fringes.name}: reaches the target of {number(TARGET_PX, 1)} px.")
+        yield GOOD, f"reaches the target of {target}"
         return
     needed = frames * (sigma / TARGET_PX) ** 2
-    pace = fringes.facts.get("batch_period_s")
+    pace = facts.get("batch_period_s")
     time = f" ({duration(needed * pace)} at this rate)" if pace else ""
-    yield Finding(
+    yield (
         GOOD,
-        f"Set {fringes.name}: the target of {number(TARGET_PX, 1)} px needs {number(needed, 2)} "
-        f"frames{time}, if the square-root law holds that long.",
+        f"the target of {target} needs {number(needed, 2)} frames{time}, if the square-root law "
+        "holds that long",
     )
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.effects import effects
 from pixcal.engine.plan import make_plan
@@ -94,10 +93,8 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
     """Read everything that the page shows."""
     facts = _optional_json(run_dir / "reduce" / "reduce.json")
     fit = read_json(run_dir / "fit" / "fit.json") if "fit" in manifests else None
-    measured = read_json(run_dir / "allan" / "allan.json")["sets"] if "allan" in manifests else {}
-    jobs = _jobs(run_dir, fit)
-    results = _summaries(jobs, runtime)
-    sets = _sets(run_dir, fit, measured, results)
+    allan = read_json(run_dir / "allan" / "allan.json") if "allan" in manifests else {}
+    results = _summaries(_jobs(run_dir, fit), runtime)
     summary = advice(run_dir)
     return Contents(
         acquisition=read_json(run_dir / "ingest" / "acquisition.json"),
@@ -108,17 +105,16 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
         arrays=_arrays(run_dir, manifests),
         detector=DetectorContents(
             facts,
-            {
-                name: results[f"detector/{name}"]
-                for name in DETECTOR_MAPS
-                if f"detector/{name}" in results
-            },
+            {n: results[f"detector/{n}"] for n in DETECTOR_MAPS if f"detector/{n}" in results},
             _optional_json(run_dir / "reduce" / "figures_of_merit.json"),
             results.get("flags/detector"),
         ),
         fit=fit,
-        offsets=_offsets(fit, results),
-        sets=sets,
+        offsets=tuple(_offset(name, results) for name in (fit["outputs"] if fit else ())),
+        sets=tuple(
+            _set(run_dir / "fit" / "fit.zarr", name, of_set, allan.get("sets", {}), results)
+            for name, of_set in (fit["sets"].items() if fit else ())
+        ),
         flags=results.get("flags/products"),
         diagnosis=_diagnosis(run_dir / "diagnose") if "diagnose" in manifests else None,
         warnings=_warnings(manifests, facts),
@@ -195,46 +191,25 @@ def _summary(job: _Job) -> MapSummary | FlagSummary | Spectrum | Detail | None:
     return summarise(first)
 
 
-def _offsets(fit: Mapping[str, Any] | None, results: Mapping[str, Any]) -> tuple[MapContents, ...]:
-    made = []
-    for name in fit["outputs"] if fit else ():
-        delta = results[f"{name}/delta"]
-        # Pixel by pixel is the whole map already where no blocks were averaged.
-        part = results[f"{name}/detail"] if delta.block > 1 and min(delta.shape) > DETAIL else None
-        made.append(
-            MapContents(name, delta, results[f"{name}/sigma"], results[f"{name}/spectrum"], part)
-        )
-    return tuple(made)
+def _offset(name: str, results: Mapping[str, Any]) -> MapContents:
+    delta = results[f"{name}/delta"]
+    # Pixel by pixel is the whole map already where no blocks were averaged.
+    part = results[f"{name}/detail"] if delta.block > 1 and min(delta.shape) > DETAIL else None
+    return MapContents(name, delta, results[f"{name}/sigma"], results[f"{name}/spectrum"], part)
 
 
-def _sets(
-    run_dir: Path,
-    fit: Mapping[str, Any] | None,
-    measured: Mapping[str, Any],
+def _set(
+    group: Path,
+    name: str,
+    facts: dict[str, Any],
+    allan: Mapping[str, Any],
     results: Mapping[str, Any],
-) -> tuple[SetContents, ...]:
-    made = []
-    for name, facts in fit["sets"].items() if fit else ():
-        folder = run_dir / "fit" / "fit.zarr" / name
-        made.append(
-            SetContents(
-                name=name,
-                facts=facts,
-                iota=results[f"set/{name}/iota"],
-                visibility=results[f"set/{name}/visibility"],
-                chi2=results[f"set/{name}/chi2"],
-                flags=results[f"flags/set/{name}"],
-                series=FrameSeries(
-                    *(_column(folder / n) for n in ("time", "B", "A", "phi", "dkx", "dky"))
-                ),
-                allan=measured.get(name),
-            )
-        )
-    return tuple(made)
-
-
-def _column(path: Path) -> NDArray[np.float64]:
-    return ArrayReader(path).read().astype(float)
+) -> SetContents:
+    maps = (results[f"set/{name}/{of}"] for of in ("iota", "visibility", "chi2"))
+    columns = ("time", "B", "A", "phi", "dkx", "dky")
+    series = FrameSeries(*(ArrayReader(group / name / n).read().astype(float) for n in columns))
+    flags = results[f"flags/set/{name}"]
+    return SetContents(name, facts, **maps, flags=flags, series=series, allan=allan.get(name))
 
 
 # The diagnosis
