@@ -205,7 +205,7 @@ def _set(
     allan: Mapping[str, Any],
     results: Mapping[str, Any],
 ) -> SetContents:
-    maps = (results[f"set/{name}/{of}"] for of in ("iota", "visibility", "chi2"))
+    maps = {of: results[f"set/{name}/{of}"] for of in ("iota", "visibility", "chi2")}
     columns = ("time", "B", "A", "phi", "dkx", "dky")
     series = FrameSeries(*(ArrayReader(group / name / n).read().astype(float) for n in columns))
     flags = results[f"flags/set/{name}"]
