@@ -1,7 +1,8 @@
 """From FITS files to maps and report, against a plain read and a plain write: ``make bench``.
 
-The limits are measured in the same run as the stages: every FITS file read once, and the samples of
-the reduced cubes written once more by the same writer and flushed to the disk.
+The limits are measured in the same run as the stages: every FITS file read once, the samples of the
+reduced cubes written once more by the same writer and flushed to the disk, and as many bytes copied
+in memory. Where two threads gain less than twice, their ratio tells what stands in the way.
 """
 
 import argparse
@@ -13,12 +14,16 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pixcal.engine.run import Runtime
 from pixcal.stages import allan, fit, ingest, reduce, report
 from pixcal.storage.cube import ArrayReader, create_array
 from workload import Workload, seconds
 
 THREADS = 2
+STAGES = ("ingest", "reduce", "fit", "allan", "report")
+COPIED = np.ones(32 << 20, np.uint8)  # larger than what the processor keeps
 
 
 def main() -> None:
@@ -35,23 +40,32 @@ def main() -> None:
 
 
 def compare(work: Workload) -> None:
-    """Times of the stages on one thread and on two, and of the limits."""
-    gb = work.gigabytes
-    files = sorted((work.folder / "acq").rglob("*.fits"))
+    """Times of the stages and of the limits, on one thread and on two."""
     every_stage(work, THREADS)  # kernels compiled, files in memory
-    one, read = every_stage(work, 1), seconds(lambda: share_out(read_file, files))
-    two, write = every_stage(work, THREADS), write_again(work)
+    # The limits of two threads before the stages of two threads, whose cubes they write again.
+    one = every_stage(work, 1) | limits(work, 1)
+    two = every_stage(work, THREADS) | limits(work, THREADS)
+    whole, gb = sum(two[stage] for stage in STAGES), work.gigabytes
     print(f"{gb:.2f} GB of raw samples, {work.shape[1]} x {work.shape[0]} px x {work.frames} x 2")
-    print(f"plain read {read:.1f} s, plain write {write:.1f} s")
-    print("stage     1 thread  2 threads  ratio  share")
-    whole = sum(two.values())
-    for stage, took in two.items():
-        gain, share = one[stage] / took, took / whole
-        print(f"{stage:8} {one[stage]:8.1f} s {took:8.1f} s {gain:6.2f} {share:6.0%}")
-    ratio = whole / (read + write)
+    print("             1 thread  2 threads  ratio  share")
+    for name, took in two.items():
+        share = f"{took / whole:6.0%}" if name in STAGES else " limit"
+        print(f"{name:10} {one[name]:8.1f} s {took:8.1f} s {one[name] / took:6.2f} {share}")
+    ratio = whole / (two["read"] + two["write"])
     print(f"whole: {whole:.1f} s, {gb / whole:.2f} GB/s, {ratio:.1f} times plain read and write")
     beside = size(work.run) / size(work.folder / "acq")
     print(f"on disk beside the FITS files: {beside:.2f} times as much as they")
+
+
+def limits(work: Workload, threads: int) -> dict[str, float]:
+    """Seconds to read the files, to write the cubes' samples again, and to copy as many bytes."""
+    files = sorted((work.folder / "acq").rglob("*.fits"))
+    copies = [COPIED for _ in range(int(1e9 * work.gigabytes / COPIED.nbytes))]
+    return {
+        "read": seconds(lambda: share_out(read_file, files, threads)),
+        "write": write_again(work, threads),
+        "copy": seconds(lambda: share_out(np.copy, copies, threads)),
+    }
 
 
 def every_stage(work: Workload, threads: int) -> dict[str, float]:
@@ -75,7 +89,7 @@ def read_file(file: Path) -> None:
             pass
 
 
-def write_again(work: Workload) -> float:
+def write_again(work: Workload, threads: int) -> float:
     """Seconds to write the samples of the reduced cubes by the same writer; they are in memory."""
     took = 0.0
     for number, source in enumerate(work.sources):
@@ -86,15 +100,15 @@ def write_again(work: Workload) -> float:
         for n in range(0, len(columns), 16):
             blocks = [((0, y[0], x[0]), reader.read((0, reader.shape[0]), y, x))
                       for y, x in columns[n : n + 16]]  # fmt: skip
-            took += seconds(lambda: share_out(lambda at: writer.write(*at), blocks))  # noqa: B023
+            took += seconds(lambda: share_out(lambda at: writer.write(*at), blocks, threads))  # noqa: B023
         took += seconds(os.sync)
         shutil.rmtree(target)
     return took
 
 
-def share_out(work: Callable[[Any], None], items: Sequence[Any]) -> None:
+def share_out(work: Callable[[Any], object], items: Sequence[Any], threads: int) -> None:
     """Do something with every item, in threads."""
-    with ThreadPoolExecutor(THREADS) as pool:
+    with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, items))
 
 

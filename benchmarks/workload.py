@@ -179,7 +179,7 @@ import json, sys
 from pathlib import Path
 from pixcal.engine import plan
 from pixcal.engine.run import Runtime
-from pixcal.stages import fit, ingest, reduce
+from pixcal.stages import allan, fit, ingest, reduce, report
 import time
 planned = []
 of = plan.Plan.total.fget
@@ -189,7 +189,7 @@ begin = time.perf_counter()
 if stage == "ingest":
     ingest.run(run.parent / "acq", run, ingest.Config(), Runtime())
 else:
-    module = {"reduce": reduce, "fit": fit}[stage]
+    module = {"reduce": reduce, "fit": fit, "allan": allan, "report": report}[stage]
     module.run(run, module.Config(), Runtime())
 took = time.perf_counter() - begin
 status = Path("/proc/self/status").read_text()
