@@ -33,6 +33,7 @@ from pixcal.estimators.frame_series.stability import (
     white_population,
 )
 from pixcal.kernels.allan import allan_deviation, averaging_lengths, disjoint_differences
+from pixcal.kernels.quantiles import quantiles_of_parts
 from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Allan, Region
@@ -46,6 +47,7 @@ SCHEMA = "pixcal/allan/1"
 MIN_BATCHES = 3
 # a task takes a square of as many of the fit's chunks a side: one file of each length
 TILES_A_SIDE = 4
+COUNT_BYTES = 64 << 20  # of the digits of all values of a map (`quantiles_of_parts`)
 DIFFERENCES = 32  # differences in time whose products show what pixels share
 # levels of the quantiles that describe the noise over a region
 NOISE_LEVELS = (np.arange(64) + 0.5) / 64
@@ -160,7 +162,9 @@ def _measure_set(
     lengths = averaging_lengths(batches.n)
     cy, cx = batches.chunks
     tile_bytes = 4 * cy * cx * (2 * batches.n + len(lengths) * (TILES_A_SIDE**2 + 2))
-    held = 9 * batches.window[0] * batches.window[1] + 40 * MAX_DRAWS * len(lengths)
+    # Some rows of a map in copies; counts of its values; draws of the curve.
+    rows = 16 * TILES_A_SIDE * cy * batches.window[1]
+    held = rows + COUNT_BYTES + 40 * MAX_DRAWS * len(lengths)
     plan = make_plan(f"the Allan deviation of {name}", tile_bytes, held, runtime)
     runtime = runtime.with_workers(plan.workers)
     if lengths:
@@ -323,24 +327,31 @@ def _quantiles(
     """Central 68 % and median over a region for each length's number, and how many pixels."""
     quantiles, pixels = {}, 0
     for n in usable:
-        values = ArrayReader(path).read((n, n + 1), region[:2], region[2:])
-        values = values[values > 0]  # not NaN; nor zero, which no noise gives
-        pixels = max(pixels, len(values))
-        if len(values):
-            levels = (ONE_SIGMA[0], 0.5, ONE_SIGMA[1])
-            low, median, high = np.quantile(values, levels, overwrite_input=True).tolist()
+        parts = partial(_positive, path, (n, n + 1), region)
+        found, count = quantiles_of_parts(parts, (ONE_SIGMA[0], 0.5, ONE_SIGMA[1]))
+        pixels = max(pixels, count)
+        if count:
+            low, median, high = found.tolist()
             quantiles[n] = (low, median, high)
     return quantiles, pixels
 
 
+def _positive(path: Path, lengths: Range | None, region: Region) -> Iterator[F32]:
+    """Finite values of a map over a region that are above zero, some rows at a time."""
+    reader = ArrayReader(path)
+    y0, y1, x0, x1 = region
+    for rows in _spans(y0, y1, reader.chunks[-2]):
+        values = reader.read(*([lengths] if lengths else []), rows, (x0, x1))
+        # No noise gives zero.
+        yield values[(values > 0) & (values < np.inf)]
+
+
 def _noise_levels(path: Path, region: Region) -> F64:
     """Quantiles of the expected deviation of one batch over a region, px."""
-    values = ArrayReader(path).read(region[:2], region[2:])
-    values = values[np.isfinite(values) & (values > 0)]
-    if not len(values):
+    levels, count = quantiles_of_parts(partial(_positive, path, None, region), NOISE_LEVELS)
+    if not count:
         raise DamagedError(f"{path}: no errors of batches", path)
-    levels = np.quantile(values, NOISE_LEVELS, overwrite_input=True)
-    return np.asarray(levels, dtype=np.float64)
+    return levels
 
 
 def _as_json(

@@ -29,8 +29,8 @@ SAME_AS_SWEPT = ("iota", "alpha", "chi2", "mask")
 MANTISSA = 12
 """Binary digits kept of the batches' maps: the others, far below their noise, would take as much
 disk again."""
-TOLD = 4000
-"""Errors that a tile tells for the median of all."""
+TOLD, TOLD_IN_ALL = 4000, 4_000_000
+"""Errors that a tile tells at most for the median of all, and about how many all of them tell."""
 
 
 @dataclass(frozen=True)
@@ -170,7 +170,8 @@ def _tile_task(
     joint["mask"].write(start, flags)
     freedom = np.isfinite(delta).sum(axis=0) - len(values)
     goods = [np.isfinite(s) for s in sigma]
-    some = [_some(s[good].astype(np.float32)) for s, good in zip(sigma, goods, strict=True)]
+    number = max(1, min(TOLD, TOLD_IN_ALL // len(fitted[0].planes)))
+    some = [_some(s[good].astype(np.float32), number) for s, good in zip(sigma, goods, strict=True)]
     return _Told(
         [int(good.sum()) for good in goods],
         some,
@@ -302,9 +303,9 @@ def _rounded(values: F32) -> F32:
     return values
 
 
-def _some(values: F32) -> F32:
-    """Every n-th of many values; a copy, lest they all stay in memory."""
-    return values[:: max(1, len(values) // TOLD)].copy()
+def _some(values: F32, number: int) -> F32:
+    """About a number of many values, evenly; a copy, lest they all stay in memory."""
+    return values[:: max(1, len(values) // number)].copy()
 
 
 def axis(shape: FringeShape, y: float, x: float) -> tuple[float, float]:
