@@ -18,7 +18,7 @@ import yaml
 from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime
-from pixcal.kernels.fringe_sums import fringe_block
+from pixcal.kernels.bilinear import N_SUMS, sweep_block
 from pixcal.stages import fit, ingest, reduce, simulate
 from pixcal.stages.reduced_set import ReducedSet
 
@@ -40,18 +40,24 @@ def plain_sum(codes: NDArray[np.uint16]) -> None:
 def weighted_sums(source: ReducedSet) -> Callable[[NDArray[np.uint16]], None]:
     """What adds the samples of a chunk of a set to the sums of its pixels, as a fit does."""
     coding, phase, one = source.coding, 2.4 * np.arange(source.block), np.ones(source.block)
-    rows = np.column_stack([one, 0.9 * one, np.cos(phase), np.sin(phase), one]).astype(np.float32)
+    g = np.column_stack([one, np.cos(phase), np.sin(phase)]).astype(np.float32)
+    still = np.zeros((source.block, 2), np.float32)
 
     @cache
-    def of_pixels(n: int) -> tuple[NDArray[Any], ...]:
-        model = (np.full(n, value, np.float32) for value in (2e4, 0.6, 0.6))
-        return *model, np.zeros((4, n)), np.zeros((7, n))
+    def of_pixels(shape: tuple[int, int]) -> tuple[NDArray[Any], ...]:
+        model = np.multiply.outer([2e4, 1.2e4, 1.2e4], np.ones(shape)).astype(np.float32)
+        return (
+            model,
+            np.full(shape, 256, np.float32),
+            np.ones(shape, np.float32),
+            np.zeros((N_SUMS, *shape)),
+        )
 
     def add(codes: NDArray[np.uint16]) -> None:
-        flat = codes.reshape(len(codes), -1)
-        fringe_block(
-            flat, coding.scale, coding.offset, coding.fill, rows[: len(flat)], 0.01,
-            *of_pixels(flat.shape[1]),
+        n, *shape = codes.shape
+        sweep_block(
+            codes, coding.scale, coding.offset, coding.fill, g[:n], still[:n], 0.0, 0.0,
+            *of_pixels((shape[0], shape[1])),
         )  # fmt: skip
 
     return add

@@ -293,21 +293,61 @@ def solve_pixels(sums: F64) -> tuple[F64, F64, F64]:
     return step.reshape(3, *shape), covariance.reshape(6, *shape), chi2.reshape(shape)
 
 
+@njit(inline="always")  # type: ignore[untyped-decorator]
+def _adjugate(sums: Any, p: int) -> Any:
+    """Upper triangle of a pixel's inverse normal matrix times the determinant, and one over it."""
+    a, b, c = sums[0, p], sums[1, p], sums[2, p]
+    d, e, f = sums[3, p], sums[4, p], sums[5, p]
+    i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
+    i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
+    det = a * i00 + b * i01 + c * i02
+    return i00, i01, i02, i11, i12, i22, (1.0 / det if det > SINGULAR * a * d * f else np.nan)
+
+
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def _solve(sums: F64, step: F64, covariance: F64, chi2: F64) -> None:
     for p in range(sums.shape[1]):
-        a, b, c = sums[0, p], sums[1, p], sums[2, p]
-        d, e, f = sums[3, p], sums[4, p], sums[5, p]
         r0, r1, r2 = sums[6, p], sums[7, p], sums[8, p]
-        i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
-        i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
-        det = a * i00 + b * i01 + c * i02
-        inverse = 1.0 / det if det > SINGULAR * a * d * f else np.nan
-        covariance[0, p], covariance[1, p] = i00 * inverse, i01 * inverse
-        covariance[2, p], covariance[3, p] = i02 * inverse, i11 * inverse
-        covariance[4, p], covariance[5, p] = i12 * inverse, i22 * inverse
+        i00, i01, i02, i11, i12, i22, inverse = _adjugate(sums, p)
+        for k, value in enumerate((i00, i01, i02, i11, i12, i22)):
+            covariance[k, p] = value * inverse
         s0 = (i00 * r0 + i01 * r1 + i02 * r2) * inverse
         s1 = (i01 * r0 + i11 * r1 + i12 * r2) * inverse
         s2 = (i02 * r0 + i12 * r1 + i22 * r2) * inverse
         step[0, p], step[1, p], step[2, p] = s0, s1, s2
         chi2[p] = sums[9, p] - (s0 * r0 + s1 * r1 + s2 * r2)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
+def close_batch(part: F64, total: F64, model: F32, turn: F32, sigma: F32) -> None:
+    """Phase of a batch relative to the start model, and its error; its sums go to the run's.
+
+    Parameters
+    ----------
+    part, total : (N_SUMS, p) float64
+        Sums of the batch, zero afterwards, and of the run, added to.
+    model : (3, p) float32
+        Start model, e-.
+    turn, sigma : (p,) float32
+        Written: rad; NaN where the batch does not give all three unknowns.
+    """
+    for p in range(part.shape[1]):
+        r0, r1, r2 = part[6, p], part[7, p], part[8, p]
+        _, i01, i02, i11, i12, i22, inverse = _adjugate(part, p)
+        m1, m2 = np.float64(model[1, p]), np.float64(model[2, p])
+        s = m1 + (i01 * r0 + i11 * r1 + i12 * r2) * inverse
+        c = m2 + (i02 * r0 + i12 * r1 + i22 * r2) * inverse
+        across, along = s * m2 - c * m1, c * m2 + s * m1
+        if abs(across) < 0.25 * along:
+            # The arc tangent's series: good to 2e-8 rad there, and three times as fast.
+            q = across / along
+            z = q * q
+            turn[p] = q * (1 - z * (1 / 3 - z * (1 / 5 - z * (1 / 7 - z / 9))))
+        else:
+            turn[p] = np.arctan2(across, along)
+        variance = (c * c * i11 - 2 * c * s * i12 + s * s * i22) * inverse
+        sigma[p] = np.sqrt(max(variance, 0.0)) / (s * s + c * c)
+    for k in range(len(part)):
+        for p in range(part.shape[1]):
+            total[k, p] += part[k, p]
+            part[k, p] = 0.0

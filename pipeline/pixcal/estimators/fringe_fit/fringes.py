@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.optimize import minimize
 
-from pixcal.estimators.fringe_fit.harmonics import FrameMoments
 from pixcal.model.errors import InputError
 
 F64 = NDArray[np.float64]
@@ -50,14 +49,6 @@ class FrameParameters:
         turn = self.dk[:, 0] * (x - self.reference[1]) + self.dk[:, 1] * (y - self.reference[0])
         phasor = (self.g[:, 1] + 1j * self.g[:, 2]) * np.exp(1j * turn)
         return np.stack([self.g[:, 0], phasor.real, phasor.imag], axis=1)
-
-    @cached_property
-    def _moments(self) -> FrameMoments:
-        return FrameMoments.of(self.g)
-
-    def moments_at(self, y: float, x: float) -> FrameMoments:
-        """The frames' moments at a point; the same for all where the fringe vector is held."""
-        return FrameMoments.of(self.at(y, x)) if self.moving else self._moments
 
     @property
     def B(self) -> F64:

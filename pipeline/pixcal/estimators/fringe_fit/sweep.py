@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.batches import Batches
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, SmoothPhasor, plane_wave, wrapped
-from pixcal.estimators.fringe_fit.pixel_sums import PixelSums, pixel_sums
+from pixcal.estimators.fringe_fit.pixel_sums import PixelSums
 from pixcal.estimators.fringe_fit.tile import Coding, Tile
 from pixcal.estimators.fringe_fit.tile_fit import start_model
 
@@ -83,7 +83,7 @@ def sweep_tile(
                 continue
             first = FrameParameters(frames.g[:n_held], frames.dk[:n_held], frames.reference)
             model, smooth = start_model(tile, held, coding, first, k)
-            pixels = pixel_sums(tile, coding, frames, model, smooth.map)
+            pixels = PixelSums(tile, coding, frames, model)
             sums = _BatchSums(tile, frames, batches, smooth, pixels)
             for part in held:
                 sums.add(part, position)

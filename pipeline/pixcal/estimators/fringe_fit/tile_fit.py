@@ -6,10 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, SmoothPhasor, smooth_phasor
-from pixcal.estimators.fringe_fit.harmonics import FrameMoments
 from pixcal.estimators.fringe_fit.tile import Coding, Tile
 from pixcal.kernels.bilinear import N_SUMS, solve_pixels, sweep_block
-from pixcal.kernels.fringe_sums import fringe_block
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -122,31 +120,10 @@ def start_model(
 def _unweighted_pixels(
     tile: Tile, blocks: Sequence[NDArray[np.uint16]], coding: Coding, frames: FrameParameters
 ) -> F64:
-    """Pixels (3, y, x) by least squares that do not weight them.
-
-    Where no sample is missing and the fringe vector is held the normal matrix is the same for all,
-    and frames have their own weights; else all samples count alike.
-    """
-    n = tile.good.size
-    moments = FrameMoments.of(frames.g)
-    sums, missing, start = np.zeros((4, n)), np.zeros((7, n)), 0
-    nothing = np.zeros(n, np.float32)
-    simple = not frames.moving
-    for part in (block[a : a + 64] for block in blocks for a in range(0, len(block), 64)):
-        at = slice(start, start + len(part))
-        start += len(part)
-        simple = simple and not fringe_block(
-            np.ascontiguousarray(part).reshape(len(part), n),
-            coding.scale, coding.offset, coding.fill, moments.rows[at], 0.0,
-            nothing, nothing, nothing, sums, missing,
-        )  # fmt: skip
-    if not simple:
-        model = np.zeros((3, *tile.shape), np.float32)
-        even = (np.ones(tile.shape, np.float32), np.zeros(tile.shape, np.float32))
-        return solve_pixels(accumulate(tile, blocks, coding, frames, model, variance=even))[0]
-    weighted = moments.rows[:, 4].astype(float) * frames.g.T
-    theta = np.linalg.lstsq(weighted @ frames.g, sums[:3], rcond=1e-9)[0]
-    return np.asarray(theta.reshape(3, *tile.shape))
+    """Pixels (3, y, x) by least squares in which all samples count alike."""
+    nothing = np.zeros((3, *tile.shape), np.float32)
+    even = (np.ones(tile.shape, np.float32), np.zeros(tile.shape, np.float32))
+    return solve_pixels(accumulate(tile, blocks, coding, frames, nothing, variance=even))[0]
 
 
 def fit_tile(
