@@ -294,10 +294,8 @@ def solve_pixels(sums: F64) -> tuple[F64, F64, F64]:
 
 
 @njit(inline="always")  # type: ignore[untyped-decorator]
-def _adjugate(sums: Any, p: int) -> Any:
+def _adjugate(a: float, b: float, c: float, d: float, e: float, f: float) -> Any:
     """Upper triangle of a pixel's inverse normal matrix times the determinant, and one over it."""
-    a, b, c = sums[0, p], sums[1, p], sums[2, p]
-    d, e, f = sums[3, p], sums[4, p], sums[5, p]
     i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
     i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
     det = a * i00 + b * i01 + c * i02
@@ -308,7 +306,9 @@ def _adjugate(sums: Any, p: int) -> Any:
 def _solve(sums: F64, step: F64, covariance: F64, chi2: F64) -> None:
     for p in range(sums.shape[1]):
         r0, r1, r2 = sums[6, p], sums[7, p], sums[8, p]
-        i00, i01, i02, i11, i12, i22, inverse = _adjugate(sums, p)
+        i00, i01, i02, i11, i12, i22, inverse = _adjugate(
+            sums[0, p], sums[1, p], sums[2, p], sums[3, p], sums[4, p], sums[5, p]
+        )
         for k, value in enumerate((i00, i01, i02, i11, i12, i22)):
             covariance[k, p] = value * inverse
         s0 = (i00 * r0 + i01 * r1 + i02 * r2) * inverse
@@ -331,23 +331,48 @@ def close_batch(part: F64, total: F64, model: F32, turn: F32, sigma: F32) -> Non
     turn, sigma : (p,) float32
         Written: rad; NaN where the batch does not give all three unknowns.
     """
-    for p in range(part.shape[1]):
-        r0, r1, r2 = part[6, p], part[7, p], part[8, p]
-        _, i01, i02, i11, i12, i22, inverse = _adjugate(part, p)
-        m1, m2 = np.float64(model[1, p]), np.float64(model[2, p])
-        s = m1 + (i01 * r0 + i11 * r1 + i12 * r2) * inverse
-        c = m2 + (i02 * r0 + i12 * r1 + i22 * r2) * inverse
-        across, along = s * m2 - c * m1, c * m2 + s * m1
-        if abs(across) < 0.25 * along:
-            # The arc tangent's series: good to 2e-8 rad there, and three times as fast.
-            q = across / along
-            z = q * q
-            turn[p] = q * (1 - z * (1 / 3 - z * (1 / 5 - z * (1 / 7 - z / 9))))
-        else:
-            turn[p] = np.arctan2(across, along)
-        variance = (c * c * i11 - 2 * c * s * i12 + s * s * i22) * inverse
-        sigma[p] = np.sqrt(max(variance, 0.0)) / (s * s + c * c)
-    for k in range(len(part)):
-        for p in range(part.shape[1]):
-            total[k, p] += part[k, p]
-            part[k, p] = 0.0
+    _close_pixels(
+        part[0], part[1], part[2], part[3], part[4], part[5], part[6], part[7], part[8],
+        model[1], model[2], turn, sigma,
+    )  # fmt: skip
+    total += part
+    part[:] = 0
+
+
+@njit(inline="always")  # type: ignore[untyped-decorator]
+def _fringe(
+    n00: float, n01: float, n02: float, n11: float, n12: float, n22: float,
+    b0: float, b1: float, b2: float, m1: float, m2: float,
+) -> Any:  # fmt: skip
+    """Fringe of a pixel across and along that of the model, and the variance of its phase."""
+    _, i01, i02, i11, i12, i22, inverse = _adjugate(n00, n01, n02, n11, n12, n22)
+    s = m1 + (i01 * b0 + i11 * b1 + i12 * b2) * inverse
+    c = m2 + (i02 * b0 + i12 * b1 + i22 * b2) * inverse
+    square = s * s + c * c
+    variance = (c * c * i11 - 2 * c * s * i12 + s * s * i22) * inverse / (square * square)
+    return s * m2 - c * m1, c * m2 + s * m1, variance
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _close_pixels(
+    n00: Any, n01: Any, n02: Any, n11: Any, n12: Any, n22: Any, b0: Any, b1: Any, b2: Any,
+    m1: Any, m2: Any, turn: Any, sigma: Any,
+) -> None:  # fmt: skip
+    # One array a sum, as in `_sweep_row`.
+    far = False
+    for i in range(turn.size):
+        across, along, variance = _fringe(
+            n00[i], n01[i], n02[i], n11[i], n12[i], n22[i], b0[i], b1[i], b2[i], m1[i], m2[i]
+        )
+        # The arc tangent's series: good to 2e-8 rad up to a quarter.
+        q = across / along
+        z = q * q
+        turn[i] = q * (1 - z * (1 / 3 - z * (1 / 5 - z * (1 / 7 - z / 9))))
+        sigma[i] = np.sqrt(max(variance, 0.0))
+        far |= not (along > 0 and z < 0.0625)
+    if far:
+        for i in range(turn.size):
+            across, along, _ = _fringe(
+                n00[i], n01[i], n02[i], n11[i], n12[i], n22[i], b0[i], b1[i], b2[i], m1[i], m2[i]
+            )
+            turn[i] = np.arctan2(across, along)
