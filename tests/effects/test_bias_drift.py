@@ -296,6 +296,21 @@ def test_tracks_are_replayed(make_effect_bench: Callable[..., Bench]) -> None:
         np.testing.assert_allclose(on - plain, wanted, atol=0.1)
 
 
+def test_a_track_takes_the_place_of_the_laws_in_its_run_alone(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    bench = make_effect_bench({"detector.shape": [20, 24]})
+    law = BiasDrift(**RUN | {"ramp_e_h": 1e4, "walk_e_h": 300.0, "run_walk_e_h": 300.0})
+    both = replace(law, tracks=(Track("vertical", (0.0,), (50.0,)),))
+    for r in recordings(bench):
+        plain, by_law, on = (frames_of(bench, r, e) for e in ((), (law,), (both,)))
+        if r.folder == "vertical":
+            np.testing.assert_allclose((on - plain).mean(axis=(1, 2)), 50, atol=0.1)
+        else:
+            np.testing.assert_array_equal(on, by_law)
+            assert np.ptp((on - plain).mean(axis=(1, 2))) > 1
+
+
 def test_the_level_of_an_offset_shows_in_the_shot_noise_it_lacks(
     acquired: Callable[..., Evidence],
 ) -> None:

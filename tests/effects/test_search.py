@@ -12,7 +12,7 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
 from pixcal.stages.diagnose.comparison import Comparison
-from pixcal.stages.diagnose.rejection import MIN_LOGLIK_GAIN_WEAK
+from pixcal.stages.diagnose.rejection import MIN_LOGLIK_GAIN_WEAK, doubtful
 from pixcal.stages.diagnose.search import CONFIRM, MOST, SCREEN, Search
 from pixcal.stages.diagnose.shrinkage import LEAST, differing, shrinkage
 
@@ -259,6 +259,41 @@ def test_a_small_remainder_that_only_the_held_out_frames_show_is_not_claimed() -
     assert set(weak.accepted) == {"left", "right"}
     assert left < 0.15
     assert "not significant (2.8 sigma) in" in weak.candidates["little"].reason
+
+
+@pytest.mark.parametrize(
+    ("open_still", "closed", "claimed"),
+    [(0.1, 0.01, False), (0.1, 0.03, True), (0.02, 0.01, True), (0.3, 0.08, False)],
+)
+def test_a_cause_that_closes_much_less_than_stays_open_is_not_claimed(
+    monkeypatch: pytest.MonkeyPatch, open_still: float, closed: float, claimed: bool
+) -> None:
+    """However sure it is: it may stand in for what the law of the first does not describe."""
+    comparison = Comparison(REFERENCE, REFERENCE.on_scale(curves((), 500)))
+    both, without = (replace(comparison.nominal, log_likelihood=n) for n in (1.0, 0.0))
+    left = {both.log_likelihood: open_still, without.log_likelihood: open_still + closed}
+    monkeypatch.setattr(comparison, "residual", lambda trial, _: left[trial.log_likelihood])
+    rejected = doubtful(comparison, both, {"little": without}, {"little": candidate("little", 1.0)})
+    assert (rejected is None) == claimed
+    assert claimed or "stays unexplained" in rejected[1]
+
+
+def test_candidates_without_promise_are_simulated_once() -> None:
+    """The best is simulated further in the round that takes it, the others are not."""
+    rounds: list[tuple[int, set[str]]] = []
+
+    def noted(
+        benches: Sequence[Sequence[Effect]], seeds: int, label: str, asked: Sequence[str]
+    ) -> list[list[dict[Key, Curve]] | str]:
+        if label == "candidates, round 1":
+            rounds.append((seeds, {e.name for bench in benches for e in bench}))
+        return simulate(benches, seeds, label, asked)
+
+    data = REFERENCE.on_scale(curves((), 500, {"left": 0.03}))
+    named = {c.name: c for c in (candidate("left", 0.03), candidate("right", 0.03))}
+    assert Search(REFERENCE, data, noted, lambda *_: {}).run(named).accepted == ("left",)
+    assert rounds == [(1, {"left", "right"}), (SCREEN, {"left"})]
+    assert named["right"].alone is not None
 
 
 def test_a_large_share_of_the_gap_is_claimed_whatever_another_cause_brings_about() -> None:

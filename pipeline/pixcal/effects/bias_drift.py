@@ -54,7 +54,8 @@ class BiasDrift(Effect):
 
     Slow changes are those of the temperature: a ramp, a settling after power-on, a random walk that
     goes on through all frames, or one that begins anew with each run of fringes, when the readout
-    settles to its pace. ``tracks`` are offsets as measured, with no law.
+    settles to its pace. ``tracks`` are offsets of fringe runs as
+    measured, in place of the laws.
     The fit takes up by B, the intensity of a frame, as much of an offset as looks like light; the
     rest is pattern, where the light is uneven or samples were divided by a flat. Maps alone do not
     tell: the fit's mean intensity hides a constant offset, and nothing else is constant in time.
@@ -106,16 +107,20 @@ class BiasDrift(Effect):
         return offset
 
     def readout(self, adu: F32, shot: Shot) -> F32:
-        offset = self.offset(shot.time_s, shot.bench.seed, shot.rng(self.name))
         if shot.recording.kind == "fringes":
-            offset += self._in_run(shot)
+            offset = self._in_run(shot)
+        else:
+            offset = self.offset(shot.time_s, shot.bench.seed, shot.rng(self.name))
         return adu + np.float32(offset / shot.bench.detector.gain_e_per_adu)
 
     def _in_run(self, shot: Shot) -> float:
-        """Offset of a frame of fringes since its run began, e-."""
+        """Offset of a frame of fringes, e-: as measured, or by the laws where it was not."""
         time = shot.frame * shot.recording.period_s
         name = shot.bench.frames.fringes[shot.recording.number].name
-        offset = float(at(self.tracks, name, time))
+        rng = shot.rng(self.name)
+        if any(track.set == name for track in self.tracks):
+            return float(at(self.tracks, name, time)) + self.jitter_rms * rng.standard_normal()
+        offset = self.offset(shot.time_s, shot.bench.seed, rng)
         if self.run_walk_e_h:
 
             def normal(level: int, place: int) -> float:
@@ -126,12 +131,12 @@ class BiasDrift(Effect):
         return offset
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        """As in `Effect.replayed`: the slow offset of every frame of fringes."""
+        """As in `Effect.replayed`: the slow offset of every frame of fringes, the law elsewhere."""
         light = light_of(evidence)
         if light is None:
             return None
         tracks = tuple(_with_level(track, evidence) for track in _tracks(light))
-        return replace(self.scaled(0.0), jitter_rms=self.jitter_rms, tracks=tracks)
+        return replace(self, tracks=tracks)
 
     def undo(self, maps: FringeMaps) -> FringeMaps | None:
         """As in `Effect.undo`: the mean offset of a replayed run is no light."""

@@ -66,6 +66,7 @@ class Lag(Effect):
     )
     optional_parameters = ("decay_frames", "spread", "quiet")
     frames_needed = ("random",)
+    quick = False
     sources = (
         "Bonjour, Blanc and Kayal 2012, IEEE Electron Device Letters 33(12), 1735: lag of pinned "
         "photodiodes by barriers, pockets and traps of the transfer gate",

@@ -1,11 +1,14 @@
 """Candidates of a search for causes, and its result."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.shrinkage import Trial
 from pixcal.stages.diagnose.trial import Effects
+
+NEARLY_ALL = 0.9
+"""Share of its significance from which a candidate is not scaled down."""
 
 
 @dataclass
@@ -42,12 +45,54 @@ class Candidate:
         """Of the estimate, sigma; zero without one."""
         return 0.0 if self.estimate is None else self.estimate.significance
 
+    def variants(self, share: float) -> list[Effect]:
+        """Effects to simulate: as estimated, with sure parameters alone, scaled down, replayed.
+
+        Parameters
+        ----------
+        share : float
+            Fraction of its significance that the causes before it do not produce.
+        """
+        assert self.estimate is not None
+        whole, sure = self.estimate.effect, self.estimate.sure
+        ways = [whole, *([sure] if sure != whole else [])]
+        if share < NEARLY_ALL:
+            ways += [way.scaled(share) for way in ways]
+        if self.replay is not None:
+            ways.append(self.replay)
+        self.ways = max(self.ways, len(ways))
+        return ways
+
     def by_law(self, effect: Effect) -> Effect | None:
         """The effect as the best of its laws describes it; None where it is its own law."""
         assert self.estimate is not None
         if effect == self.replay:
             return self.estimate.effect
         return self.estimate.by_law
+
+
+@dataclass(frozen=True)
+class Addition:
+    """A variant of a candidate, added to the causes.
+
+    Attributes
+    ----------
+    name : str
+    effect : Effect
+        As simulated.
+    trial : Trial
+    gain : float
+        In log-likelihood, over the causes without it in as many simulations.
+    """
+
+    name: str
+    effect: Effect
+    trial: Trial
+    gain: float
+
+
+Additions = dict[str, Addition]
+"""Of every candidate the likeliest, by its name."""
 
 
 @dataclass
@@ -104,3 +149,12 @@ class SearchResult:
     candidates: Mapping[str, Candidate]
     alike: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     by_law: Mapping[str, Trial] = field(default_factory=dict)
+
+
+def likeliest(additions: Iterable[Addition]) -> Additions:
+    """Of every candidate the addition that gains most."""
+    best: Additions = {}
+    for one in additions:
+        if one.name not in best or one.gain > best[one.name].gain:
+            best[one.name] = one
+    return best

@@ -1,6 +1,6 @@
 """A reduced run is looked at, its nominal bench simulated, and causes of the gap are searched."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,8 +11,16 @@ from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.gap import Reference, compare, expect_nominal, expect_with
+from pixcal.estimators.diagnosis.gap import (
+    Difference,
+    Reference,
+    compare,
+    expect_nominal,
+    expect_with,
+    flagged,
+)
 from pixcal.estimators.diagnosis.test_statistics import Key
+from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Again, Effect, Estimate
@@ -107,6 +115,12 @@ def inquire(
         raise InputError(f"{where}: {nominal}")
     reference = Reference.of(nominal)
     data = reference.on_scale(look.measured)
+    slow = {_key_of(s): s for s in signatures if not kinds[s.name].quick}
+    if outdone := outdone_by_others(compare(data, expect_nominal(reference)), slow):
+        reference = reference.without(outdone)
+        data = reference.on_scale(look.measured)
+        kept = tuple(s for s in signatures if _key_of(s) not in outdone)
+        trials = replace(trials, signatures=kept)
 
     def asked_again(on: Effects, names: Sequence[str], few: Runtime) -> dict[str, float]:
         window = look.first
@@ -228,6 +242,17 @@ def weakly_seen(
         if estimate.significance >= SIGNIFICANT
         and (kinds[name].quick or (slow and estimate.significance == most < CLEAR))
     )
+
+
+def outdone_by_others(differences: Mapping[Key, Difference], slow: Collection[Key]) -> set[Key]:
+    """Slow statistics that need not be made again: another one differs, and by more."""
+    others = flagged(differences) - set(slow)
+    least = min((differences[key].log_chance for key in others), default=np.inf)
+    return {key for key in slow if key in differences and differences[key].log_chance > least}
+
+
+def _key_of(kind: Signature) -> Key:
+    return signature_key(kind.name, kind.domains[0])
 
 
 def _estimates(

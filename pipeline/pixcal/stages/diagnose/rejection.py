@@ -15,7 +15,7 @@ OPEN = 0.15
 LITTLE = 0.1
 """Fraction of the gap that a doubtful cause must close,"""
 BESIDE_OPEN = 0.25
-"""and fraction of the residual gap."""
+"""and every cause, as a fraction of the residual gap."""
 
 Rejection = tuple[str, str]
 """Name of a cause, and why it is rejected."""
@@ -73,8 +73,9 @@ def doubtful(
 ) -> Rejection | None:
     """A cause that closes little of the gap and may stand in for another.
 
-    For an unknown cause, if much of the gap remains. For another law of the other causes, if their
-    laws produce a good part of its significance, or if it is not significant in the fitted frames.
+    For an unknown cause, if much more of the gap remains than it closes. For another law of the
+    other causes, if their laws produce a good part of its significance, or if it is not significant
+    in the fitted frames.
 
     Parameters
     ----------
@@ -86,18 +87,21 @@ def doubtful(
     where = comparison.gap_of(current)
     open_still = comparison.residual(current, where)
     closed = {n: comparison.residual(trial, where) - open_still for n, trial in without.items()}
-    among = [
+    imitated = {
         name
         for name in closed
-        if open_still > OPEN
-        or candidates[name].share < 1 - LAW_ERROR
-        or candidates[name].significance < SIGNIFICANT
-    ]
+        if candidates[name].share < 1 - LAW_ERROR or candidates[name].significance < SIGNIFICANT
+    }
+    needed = {
+        name: max(BESIDE_OPEN * open_still, LITTLE if open_still > OPEN or name in imitated else 0)
+        for name in closed
+    }
+    among = [name for name in closed if closed[name] < needed[name]]
     least = min(among, key=lambda name: closed[name], default=None)
-    if least is None or closed[least] >= max(LITTLE, BESIDE_OPEN * open_still):
+    if least is None:
         return None
     closes = f"closes only {max(closed[least], 0):.1%} of the gap"
-    if open_still > OPEN:
+    if open_still > OPEN or least not in imitated:
         return least, (
             f"{closes} while {open_still:.0%} stays unexplained; it may stand in for an unknown "
             "cause"

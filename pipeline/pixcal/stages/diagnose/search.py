@@ -15,7 +15,14 @@ from pixcal.estimators.diagnosis.gap import Reference
 from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.simulation.effect import Effect
-from pixcal.stages.diagnose.candidates import Accepted, Candidate, SearchResult
+from pixcal.stages.diagnose.candidates import (
+    Accepted,
+    Addition,
+    Additions,
+    Candidate,
+    SearchResult,
+    likeliest,
+)
 from pixcal.stages.diagnose.comparison import Comparison
 from pixcal.stages.diagnose.rejection import (
     MIN_LOGLIK_GAIN_WEAK,
@@ -38,6 +45,10 @@ SCREEN = 3
 """Simulations of a candidate,"""
 CONFIRM = 8
 """and of the accepted causes."""
+PROMISING = 0.25
+"""Share of the best gain from which a candidate is simulated more than once,"""
+SURE_OF_ONE = 3.0
+"""with its effect known to one part in this: what one simulation leaves open."""
 MOST = 5
 """Causes that are accepted at most."""
 SIMILAR = 0.7
@@ -45,10 +56,6 @@ SIMILAR = 0.7
 
 Simulate = Callable[[Sequence[Effects], int, str, Sequence[str]], Sequence[list[Curves] | str]]
 Estimates = Callable[[Effects, Sequence[str]], Mapping[str, float]]
-
-
-Trials = dict[str, tuple[Trial, Effect]]
-"""By the name of a candidate, the bench with it and the effect as simulated."""
 
 
 class Search:
@@ -98,14 +105,10 @@ class Search:
         self._reject_insignificant(causes, remaining)
         if not remaining:
             return False
-        trials, replays = self._tried(causes, remaining)
-        if not causes.effects:
-            for name, (trial, _) in trials.items():
-                candidates[name].alone = trial
-        gains, best = self._favoured(causes, trials, replays, candidates)
-        if best is None:
+        laws, replays = self._tried(causes, remaining)
+        gains, effect, best = self._favoured(laws, replays, candidates)
+        if effect is None:
             return False
-        effect = trials[best][1]
         del remaining[best]
         confirmed = self._confirmed((*causes.bench, effect), asked=[*remaining])
         if isinstance(confirmed, str):
@@ -124,35 +127,30 @@ class Search:
         return True
 
     def _favoured(
-        self,
-        causes: Accepted,
-        trials: Trials,
-        replays: Trials,
-        candidates: Mapping[str, Candidate],
-    ) -> tuple[dict[str, float], str | None]:
-        """Gain in log-likelihood of every candidate, and the best that gains enough.
+        self, laws: Additions, replays: Additions, candidates: Mapping[str, Candidate]
+    ) -> tuple[dict[str, float], Effect | None, str]:
+        """Gain of every candidate, and effect and name of the best that gains enough.
 
-        A replay takes the place of the law in ``trials`` where it fits better.
+        A replay takes the place of the law where it fits better.
         """
-        # As many simulations as the candidates have: chance is the same in both.
-        start = self._start(causes.bench, SCREEN)
-        least = self.comparison.allowing_for_laws(start, causes.current).log_likelihood
-        gains = {n: t.log_likelihood - least for n, (t, _) in trials.items()}
+        gains = {name: law.gain for name, law in laws.items()}
         enough = {n: g for n, g in gains.items() if g >= needed_gain(candidates[n])}
         if gains and not enough:
             # No law of any effect does; one of them may yet have acted by another law.
-            again = {n: t.log_likelihood - least for n, (t, _) in replays.items()}
-            enough = {n: g for n, g in again.items() if g >= MIN_LOGLIK_GAIN_WEAK}
+            enough = {n: r.gain for n, r in replays.items() if r.gain >= MIN_LOGLIK_GAIN_WEAK}
             gains |= enough
-            trials |= {n: replays[n] for n in enough}
+            laws |= {name: replays[name] for name in enough}
         for name in gains.keys() - enough.keys():
             candidates[name].reason = too_little(gains[name])
-        best = max(enough, key=lambda n: enough[n], default=None)
+        if not enough:
+            return gains, None, ""
+        best = max(enough, key=lambda n: enough[n])
+        effect = laws[best].effect
         if best in replays and self.comparison.replay_fits_better(
-            replays[best][0], trials[best][0]
+            replays[best].trial, laws[best].trial
         ):
-            trials[best] = replays[best]
-        return gains, best
+            effect = replays[best].effect
+        return gains, effect, best
 
     def _reject_insignificant(self, causes: Accepted, remaining: dict[str, Candidate]) -> None:
         """Leave out candidates that the fitted frames do not show beyond what the causes produce.
@@ -172,42 +170,67 @@ class Search:
                 remaining[name].reason = f"not significant ({size:.1f} sigma{beside})"
                 del remaining[name]
 
-    def _tried(self, causes: Accepted, remaining: dict[str, Candidate]) -> tuple[Trials, Trials]:
+    def _tried(
+        self, causes: Accepted, remaining: dict[str, Candidate]
+    ) -> tuple[Additions, Additions]:
         """Each candidate added to the causes: its likeliest variant by law, and its replay.
 
-        Variants are the effect as estimated, without strengths that may be zero, and as strong as
-        the causes leave it. Log-likelihoods allow for other laws of the causes. A replay of single
-        frames may imitate what another effect does by its law, so it is kept apart.
+        A replay of single frames may imitate what another effect does by its law, so it is kept
+        apart. One simulation of every variant shows which are promising; the others are simulated
+        further if none of these gains enough, and else wait for the next round.
         """
-        options: list[tuple[str, Effect]] = []
-        for name, candidate in remaining.items():
-            assert candidate.estimate is not None
-            whole, sure = candidate.estimate.effect, candidate.estimate.sure
-            ways = [whole, *([sure] if sure != whole else [])]
-            if causes.shares.get(name, 1.0) < 0.9:
-                ways += [way.scaled(causes.shares[name]) for way in ways]
-            if candidate.replay is not None:
-                ways.append(candidate.replay)
-            candidate.ways = max(candidate.ways, len(ways))
-            options += [(name, way) for way in ways]
-        benches = [(*causes.bench, effect) for _, effect in options]
+        options = [
+            (name, way)
+            for name, one in remaining.items()
+            for way in one.variants(causes.shares.get(name, 1.0))
+        ]
         label = f"candidates, round {len(causes.effects) + 1}"
-        simulated = self._simulate(benches, SCREEN, label, ())
-        laws: Trials = {}
-        replays: Trials = {}
+        once = self._added(causes, remaining, options, 1, label)
+        if not causes.effects:
+            for name, addition in likeliest(once).items():
+                remaining[name].alone = addition.trial
+        least = PROMISING * max((one.gain for one in once), default=0.0)
+        promising = [(o.name, o.effect) for o in once if o.gain >= least]
+        tried = self._added(causes, remaining, promising, SCREEN, label)
+        if all(one.gain < needed_gain(remaining[one.name]) for one in tried):
+            others = [(o.name, o.effect) for o in once if 0 < o.gain < least]
+            tried += self._added(causes, remaining, others, SCREEN, label)
+            tried += [o for o in once if o.gain <= min(least, 0)]
+        replays = [o for o in tried if o.effect == remaining[o.name].replay]
+        return likeliest(o for o in tried if o not in replays), likeliest(replays)
+
+    def _added(
+        self,
+        causes: Accepted,
+        remaining: dict[str, Candidate],
+        options: Sequence[tuple[str, Effect]],
+        simulations: int,
+        label: str,
+    ) -> list[Addition]:
+        """Variants added to the causes; log-likelihoods allow for other laws of these.
+
+        Candidates none of whose variants can be simulated are no longer among the remaining.
+        """
+        start = self.comparison.allowing_for_laws(
+            self._start(causes.bench, simulations), causes.current
+        )
+        benches = [(*causes.bench, effect) for _, effect in options]
+        simulated = self._simulate(benches, simulations, label, ())
+        made: list[Addition] = []
         refused: dict[str, str] = {}
         for (name, effect), bench, curves in zip(options, benches, simulated, strict=True):
             if isinstance(curves, str):
                 refused[name] = f"cannot be simulated: {curves}"
                 continue
-            trial = self.comparison.trial(bench, curves, remaining[name].significance)
+            sure = remaining[name].significance
+            if simulations == 1:
+                sure = min(sure, SURE_OF_ONE)
+            trial = self.comparison.trial(bench, curves, sure)
             trial = self.comparison.allowing_for_laws(trial, causes.current)
-            into = replays if effect == remaining[name].replay else laws
-            if name not in into or trial.log_likelihood > into[name][0].log_likelihood:
-                into[name] = trial, effect
-        for name in refused.keys() - laws.keys():
+            made.append(Addition(name, effect, trial, trial.log_likelihood - start.log_likelihood))
+        for name in refused.keys() - {one.name for one in made}:
             remaining.pop(name).reason = refused[name]
-        return laws, replays
+        return made
 
     def _confirmed(
         self, effects: Effects, simulations: int = CONFIRM, asked: Sequence[str] = ()
