@@ -40,13 +40,13 @@ def test_without_samples_nothing_is_noisy() -> None:
 def test_clean_darks_are_not_hot_and_hot_ones_are() -> None:
     rate = np.random.default_rng(2).normal(20, 3, CLEAN)
     error = np.full(CLEAN, 3.0)
-    assert hot(rate, error, 20, 3, 10).sum() < FEW
+    assert hot(rate, error, 3, 10).sum() < FEW
     rate[7, 9], rate[8, 9], error[8, 9] = 100, 100, 50
-    assert np.argwhere(hot(rate, error, 20, 3, 10)).tolist() == [[7, 9]]
+    assert np.argwhere(hot(rate, error, 3, 10)).tolist() == [[7, 9]]
 
 
 def test_an_unknown_rate_is_not_hot() -> None:
-    assert not hot(np.array([[1e6, np.nan]]), np.zeros((1, 2)), 0, 0, 10).any()
+    assert not hot(np.array([[1e6, np.nan]]), np.zeros((1, 2)), 0, 10).any()
 
 
 @pytest.mark.parametrize("sigma", [0.01, 0.09])
@@ -116,3 +116,30 @@ def test_two_levels_do_not_tell() -> None:
     rungs[0].signal[5, 4] *= 2
     assert np.argwhere(nonlinear(rungs, 0.03)).tolist() == [[5, 4]]
     assert not nonlinear(rungs[:2], 0.03).any()
+
+
+@pytest.mark.parametrize("columns", [3, 20, 70])
+def test_columns_without_light_leave_the_others_linear(columns: int) -> None:
+    rungs, _ = ladder(np.random.default_rng(8), (101, 97))
+    rng = np.random.default_rng(9)
+    for rung in rungs:
+        rung.signal[:, :columns] = rng.normal(0, 2, (101, columns))
+    assert not nonlinear(rungs, 0.03)[:, columns:].any()
+
+
+def test_colours_of_a_mosaic_are_not_dead() -> None:
+    flat = np.random.default_rng(10).normal(1, 0.01, (70, 83))
+    flat[::2, ::2] *= 0.6
+    flat[1::2, 1::2] *= 0.4
+    flat[8, 8] = 0.2
+    found = dead(flat, np.full(flat.shape, 0.01), 0.5, 2.0, 0.05)
+    assert np.argwhere(found).tolist() == [[8, 8]]
+
+
+def test_the_glow_of_an_amplifier_is_not_hot() -> None:
+    y, x = np.mgrid[:90, :110]
+    rate = (
+        20 + 3000 * np.exp(-np.hypot(y, x) / 25) + np.random.default_rng(11).normal(0, 3, y.shape)
+    )
+    rate[40, 50] += 900
+    assert np.argwhere(hot(rate, np.full(y.shape, 3.0), 3, 10)).tolist() == [[40, 50]]

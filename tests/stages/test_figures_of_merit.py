@@ -93,6 +93,55 @@ def test_a_ladder_that_saturates_gives_the_full_well(tmp_path: Path) -> None:
     assert abs(found["value"] - FULL / GAIN) < 3 * found["error"] < 0.15 * FULL / GAIN
 
 
+def camera_run(folder: Path, frames: dict[str, Any], seed: int = 4) -> dict[str, Any]:
+    """Figures of frames (t, y, x) of 100 ADU bias, given light (e-), number and what each adds."""
+    rng = np.random.default_rng(seed)
+    response = 1 + PRNU / 100 * rng.standard_normal(SHAPE)
+    (folder / "acq").mkdir(parents=True)
+    for kind, (light, count, step, row) in frames.items():
+        signal = rng.poisson(light * response, (count, *SHAPE)) + READ * rng.standard_normal(
+            (count, *SHAPE)
+        )
+        signal += row * rng.standard_normal((count, SHAPE[0], 1))
+        samples = step * np.rint((1600 + signal / GAIN) / step)
+        header = fits.Header({"EXPTIME": float(light > 0)})
+        fits.writeto(folder / "acq" / f"{kind}.fits", samples.astype(np.uint16), header)
+    listed = {
+        "schema": "pixcal/acquisition/1",
+        "detector": {"name": "CAM", "pitch_um": 5.5, "gain_e_per_adu": GAIN, "read_noise_e": READ},
+        "frames": {kind.rstrip("0"): [f"{kind}.fits"] for kind in frames},
+    }
+    (folder / "acq" / "acquisition.yaml").write_text(yaml.safe_dump(listed))
+    run = pixcal.run(folder / "acq", folder / "run", diagnosed=False)
+    found: dict[str, Any] = run.reduction["figures_of_merit"]
+    return found
+
+
+def test_one_bias_frame_is_taken_off_the_flats(tmp_path: Path) -> None:
+    prnu = camera_run(tmp_path, {"bias": (0, 1, 1, 0), "flat": (30000, 8, 1, 0)})["prnu"]
+    assert abs(prnu["value"] - PRNU) < 4 * prnu["error"]
+
+
+def test_without_bias_no_saturation_is_claimed(tmp_path: Path) -> None:
+    found = camera_run(tmp_path, {"flat": (30000, 4, 1, 0)})
+    assert not {"saturation", "full_well", "snr_max", "dynamic_range"} & set(found)
+
+
+def test_the_step_of_the_codes_is_found(tmp_path: Path) -> None:
+    found = camera_run(tmp_path, {"bias": (0, 60, 4, 0), "flat": (30000, 8, 4, 0)})
+    rounding = 4 * GAIN / np.sqrt(12)
+    for name, true in (
+        ("read_noise", READ), ("read_noise_with_rounding", np.hypot(READ, rounding))
+    ):  # fmt: skip
+        assert abs(found[name]["value"] - true) < 4 * found[name]["error"], name
+    assert "steps of 4 ADU" in found["read_noise_with_rounding"]["note"]
+
+
+def test_noise_of_rows_is_told_from_that_of_pixels(tmp_path: Path) -> None:
+    noise = camera_run(tmp_path, {"bias": (0, 40, 1, 2.0), "flat": (30000, 8, 1, 2.0)})["row_noise"]
+    assert abs(noise["value"] - 2.0) < 4 * noise["error"] < 0.4
+
+
 def test_the_same_whatever_the_workers(run: pixcal.Run, tmp_path: Path) -> None:
     again = pixcal.ingest(run.path.parent / "acq", tmp_path / "run")
     pixcal.reduce(again, runtime=pixcal.Runtime("sync"))
@@ -109,7 +158,7 @@ def test_terminal_and_report_show_them_and_speak_of_no_fibres(run: pixcal.Run) -
         assert figure["title"] in page
         part = figure["title"].endswith(("of rows", "of columns", "of pixels"))
         assert (figure["title"] in said) != part
-    for title in ("Photon-transfer curve", "DSNU: spectra", "PRNU: spectra", "Linearity"):
+    for title in ("Photon-transfer curve", "DSNU and PRNU: spectra", "Linearity"):
         assert title in page
     for word in ("fibre", "fringe set", "Not measured: there is no"):
         assert word not in said

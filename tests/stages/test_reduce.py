@@ -448,6 +448,14 @@ def small(
     return report(tmp_path)
 
 
+def test_flats_that_are_all_saturated_are_refused_as_such(tmp_path: Path) -> None:
+    camera = Camera(1, SMALL)
+    flats = np.full((4, *SMALL), 4095, np.uint16)
+    kinds = {"bias": (camera.take(9, 0), [0.0] * 9), "flat": (flats, [1.0] * 4)}
+    with pytest.raises(InputError, match="all flats are saturated"):
+        small(tmp_path, kinds, saturation_adu=4095)
+
+
 def test_detector_frames_alone_are_enough(tmp_path: Path) -> None:
     camera = Camera(1, SMALL)
     found = small(
@@ -556,7 +564,7 @@ def test_frames_of_different_sizes_are_refused(tmp_path: Path) -> None:
         "flat": (Camera(8, (19, 24)).take(3, 1, 1e4), [1.0] * 3),
     }
     with pytest.raises(InputError, match="flat have 24 × 19 pixels, those of bias 23 × 19"):
-        small(tmp_path, kinds)
+        small(tmp_path, kinds, saturation_adu=4095)
 
 
 def test_real_numbers_with_holes_are_reduced(tmp_path: Path) -> None:

@@ -224,7 +224,7 @@ def add_neighbours(lit: F64, dark: F64) -> tuple[F64, list[tuple[int, int]]]:
     dof, level, variance, *_ = (lit[used] / np.maximum(lit[used, :1], 1)).T
     dof = lit[used, 0]
     beyond = lit[used, 3:] / dof[:, None] - without[3:] / without[0]
-    weight = dof * level / np.maximum(variance, 1e-300) ** 2
+    weight = dof * level / np.maximum(variance, 1e-100) ** 2
     error = math.hypot(
         math.sqrt((weight**2 * variance**2 / dof).sum()),
         weight.sum() * without[2] / without[0] / math.sqrt(without[0]),

@@ -29,6 +29,7 @@ BATCH = 64  # frames that are looked at together
 _LEVEL_PIXELS = 4096
 _ROUNDING = np.float32(1e-6)
 _SIGMA_OF_MAD = 1.482602218505602
+_BRIGHT, _LIT = 90, 0.1  # percentile of a tile that sees the lamp if any does; share of its signal
 
 
 def clipped_variance_factor(clip: float) -> float:
@@ -236,16 +237,18 @@ class Combination:
         # Twice: the frames' common part is taken out before the limits are measured for good.
         self._reference, deviation = median_and_deviation(frames)
         scale = _SIGMA_OF_MAD * len(frames) / max(len(frames) - 0.8, 0.2)
-        self._sigma = scale * _finite_median(deviation)
+        seen = lit(self._reference) if self._lamp else np.ones(self._reference.shape, np.bool_)
+        self._sigma = scale * _finite_median(deviation[seen])
         levels = self._common(frames)[:, None, None]
         level = frames / levels if self._lamp else frames - levels
         self._reference, deviation = median_and_deviation(level)
         sigma = scale * deviation
-        self._sigma = _finite_median(sigma)
+        self._sigma = _finite_median(sigma[seen])
         if len(frames) == 2:
             # Two samples cannot tell which is wrong, nor their own noise: the tile's noise decides,
             # and of two that disagree the lower one is right, since particles only add charge.
-            apart = np.ptp(level, axis=0) > self._clip * math.sqrt(2) * self._sigma + self._quantum
+            usual = math.sqrt(2) * math.hypot(self._sigma, self._quantum)
+            apart = np.ptp(level, axis=0) > self._clip * usual + self._quantum
             self._reference = np.where(apart, level.min(axis=0), self._reference)
             sigma = np.full_like(sigma, self._sigma)
         sigma = np.maximum(sigma, np.float32(self._sigma))
@@ -263,13 +266,20 @@ class Combination:
         reference = self._reference.reshape(-1)[::stride]
         if not self._lamp:
             return np.array([_finite_median(s - reference) for s in samples], np.float32)
-        level = _finite_median(reference)
+        level = _finite_median(reference[lit(reference)])
         if not level > 3 * self._sigma or level <= 0:
             # Too dark here to see the lamp.
             return np.ones(len(frames), np.float32)
         bright = reference >= level
         ratios = (_finite_median(s[bright] / reference[bright]) for s in samples)
         return np.array([r if r > 0 else np.nan for r in ratios], np.float32)
+
+
+def lit(signal: NDArray[Any]) -> NDArray[np.bool_]:
+    """Pixels of a tile that see the lamp; those of an overscan do not."""
+    finite = signal[np.isfinite(signal)]
+    bright = float(np.percentile(finite, _BRIGHT)) if finite.size else np.inf
+    return np.asarray(signal > _LIT * bright)
 
 
 def _finite_median(values: F32) -> float:

@@ -64,10 +64,11 @@ def tabulate(
     steps = [max(frame_period_s or 0.0, file.exptime_s or 0.0) for file in ordered]
     if stamped and any(f.shape[0] > 1 and not s for f, s in zip(ordered, steps, strict=True)):
         stamped = False
-        warnings.append(
-            "a cube's EXPTIME is missing or zero, and optics.frame_period_s is not given, so its "
-            "frames are numbered"
-        )
+        if array.startswith("fringes"):
+            warnings.append(
+                "a cube's EXPTIME is missing or zero, and optics.frame_period_s is not given, so "
+                "its frames are numbered"
+            )
     if stamped:
         frames = _stamped_frames(ordered, steps, frame_period_s)
         late = next((a for a, b in pairwise(frames) if b.time_s < a.time_s), None)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from pixcal.estimators.detector.calibration import MIN_RUNGS, Rung
-from pixcal.kernels.robust import median_and_sigma
+from pixcal.kernels.robust import lit, median_and_sigma
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -30,24 +30,26 @@ _DEGREE = 3
 _FARTHEST = 4.0
 _CLIPPINGS = 4
 _CLIP = 4.0
+_QUARTILE = 0.6745  # of a normal distribution, in standard deviations
 _FEWEST = 64
 _SAMPLE = 4096
 
 
-def hot(rate: F64, error: F64, median: float, sigma: float, limit: float) -> Mask:
-    """Dark signal far above that of the other pixels.
+def hot(rate: F64, error: F64, sigma: float, limit: float) -> Mask:
+    """Dark signal far above that of the neighbours: the glow of an amplifier is none.
 
     Parameters
     ----------
     rate, error : (y, x) float64
-        Dark signal of each pixel and its standard error (ADU/s).
-    median, sigma : float
-        Of the detector's dark signals (ADU/s).
+        Dark signal of each pixel and its standard error (ADU/s), from a border of blocks on.
+    sigma : float
+        Robust spread of the detector's dark signals (ADU/s); that of the neighbours may be larger.
     limit : float
         In units of ``sigma``.
     """
-    excess = rate - median
-    return (excess > limit * sigma) & (excess > _SIGNIFICANT * error) & (error > 0)
+    median, upper = _around(rate)
+    excess, spread = rate - median, np.fmax(np.fmax(sigma, error), (upper - median) / _QUARTILE)
+    return (excess > limit * spread) & (excess > _SIGNIFICANT * error) & (error > 0)
 
 
 def dead(flat: F64, error: F64, low: float, high: float, floor: float) -> Mask:
@@ -56,25 +58,38 @@ def dead(flat: F64, error: F64, low: float, high: float, floor: float) -> Mask:
     Parameters
     ----------
     flat, error : (y, x) float64
-        Relative response and its standard error; they begin on a border of blocks (as columns of
-        chunks do).
-    low : float
-        Limit in units of the median of the pixel's block of `NEIGHBOURS` by `NEIGHBOURS`.
-    high : float
-        Limit in units of the block's upper quartile: beside a dark edge most may see no light.
+        Relative response and its standard error, from a border of blocks on.
+    low, high : float
+        Limits in units of the median of the pixel's block, and of the upper quartile of those in it
+        above ``floor``: beside a dark edge most may see no light.
     floor : float
         Lowest response at all.
     """
-    median, upper = _around(flat)
+    median, upper = _around(flat)[0], _around(np.where(flat < floor, np.nan, flat))[1]
     below = (flat < low * median) & (median - flat > _SIGNIFICANT * error)
     above = (flat > high * upper) & (flat - upper > _SIGNIFICANT * error) & (flat > floor)
     return below | above | (flat < floor)
 
 
-def _around(flat: F64) -> tuple[F64, F64]:
-    """Median and upper quartile of each pixel's block."""
+def _around(values: F64) -> tuple[F64, F64]:
+    """Median and upper quartile of each pixel's block of `NEIGHBOURS` by `NEIGHBOURS`.
+
+    Of every second row and column, for a mosaic of colour filters; from a border of blocks on, as
+    columns of chunks do. A pixel whose block is empty is its own.
+    """
+    maps = np.stack([values, values])
+    for y, x in np.ndindex(2, 2):
+        own = values[y::2, x::2]
+        if not own.size:
+            continue
+        found = np.stack(_of_blocks(own))
+        maps[:, y::2, x::2] = np.where(np.isfinite(found), found, own)
+    return maps[0], maps[1]
+
+
+def _of_blocks(flat: F64) -> tuple[F64, F64]:
     ny, nx = flat.shape
-    size = NEIGHBOURS
+    size = NEIGHBOURS // 2
     rows, columns = -(-ny // size), -(-nx // size)
     padded = np.full((rows * size, columns * size), np.nan)
     padded[:ny, :nx] = flat
@@ -82,7 +97,7 @@ def _around(flat: F64) -> tuple[F64, F64]:
     ordered = np.sort(blocks, axis=-1)  # NaN last
     last = np.maximum(np.isfinite(blocks).sum(axis=-1) - 1, 0)
     maps = []
-    for rank in ((last + 1) // 2, (3 * last + 3) // 4):
+    for rank in (last // 2, (3 * last + 3) // 4):
         value = np.take_along_axis(ordered, rank[..., None], -1)[..., 0]
         maps.append(value.repeat(size, axis=0).repeat(size, axis=1)[:ny, :nx])
     return maps[0], maps[1]
@@ -141,7 +156,7 @@ def nonlinear(rungs: Sequence[Rung], limit: float) -> Mask:
         return np.zeros(shape, np.bool_)
     signal = np.stack([rung.signal for rung in rungs])
     variance = np.stack([rung.variance for rung in rungs])
-    levels = np.array([median_and_sigma(s)[0] for s in signal])[:, None, None]
+    levels = np.array([median_and_sigma(s[lit(s)])[0] for s in signal])[:, None, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         share = signal / levels
         error = np.sqrt(variance) / levels
@@ -162,7 +177,8 @@ def nonlinear(rungs: Sequence[Rung], limit: float) -> Mask:
 
 def _common(off: F64, brightness: F64, used: Mask) -> F64:
     """What pixels of one brightness (y, x) have in common of their departures (rung, y, x)."""
-    usual, scale = median_and_sigma(brightness)
+    seen = lit(brightness)
+    usual, scale = median_and_sigma(brightness[seen])
     x = (
         np.clip((brightness - usual) / scale, -_FARTHEST, _FARTHEST)
         if scale > 0
@@ -171,6 +187,7 @@ def _common(off: F64, brightness: F64, used: Mask) -> F64:
     x = np.nan_to_num(x)
     some = np.zeros(x.shape, np.bool_)
     some.flat[:: max(x.size // _SAMPLE, 1) | 1] = True
+    some &= seen
     found = np.zeros_like(off)
     for rest, out, own in zip(off, found, used & np.isfinite(off), strict=True):
         kept = own & some

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from pixcal.estimators.detector.calibration import Rung
-from pixcal.kernels.robust import median_and_sigma
+from pixcal.kernels.robust import lit, median_and_sigma
 
 # Variance over the signal, in units of the least at lower levels, below which pixels are full. A
 # response that bends by a fifth lessens it to 0.64.
@@ -26,8 +26,11 @@ def unsaturated(rungs: Sequence[Rung]) -> list[Rung]:
     rungs : sequence of Rung
         Of the same pixels, in any order.
     """
-    levels = np.array([median_and_sigma(rung.signal)[0] for rung in rungs])
-    noise = np.array([median_and_sigma(rung.variance)[0] * rung.frames for rung in rungs])
+    seen = [lit(rung.signal) for rung in rungs]
+    levels, noise = (
+        np.array([median_and_sigma(values[s])[0] for values, s in zip(maps, seen, strict=True)])
+        for maps in ([r.signal for r in rungs], [r.variance * r.frames for r in rungs])
+    )
     full, least = np.zeros(len(rungs), np.bool_), np.inf
     for n in np.argsort(levels):
         if not levels[n] > 0:

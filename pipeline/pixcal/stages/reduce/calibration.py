@@ -209,20 +209,22 @@ def finish(job: Finishing, index: Index) -> F64:
 def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> NDArray[np.uint8]:
     mask = found["flags"].astype(np.uint8)
     limits, medians = job.limits, job.usual
+    # A sample that lies on a change of code is one of two, however little noise it has.
+    least = 3 * (job.floor / job.gain) ** 2
+    expected = np.maximum(medians.dark_variance + found["dark_charge"] / job.gain, least)
     if job.has_flat:
         mask[~np.isfinite(flat)] |= np.uint8(PixelFlag.NO_DATA)
         where = dead(flat, error, limits.dead, limits.bright, _FLAT_FLOOR)
         mask[where] |= np.uint8(PixelFlag.DEAD)
     if job.has_rate:
-        rate_error = found["dark_rate_error"] * np.sqrt(medians.dark_variance)
-        level, sigma = medians.dark_rate, medians.dark_rate_sigma
-        where = hot(found["dark_rate"], rate_error, level, sigma, limits.hot)
+        rate_error = found["dark_rate_error"] * np.sqrt(expected)
+        where = hot(found["dark_rate"], rate_error, medians.dark_rate_sigma, limits.hot)
         mask[where] |= np.uint8(PixelFlag.HOT)
     if np.isfinite(medians.dark_variance):
         where = noisy(
             found["dark_variance"],
             found["dark_dof"],
-            medians.dark_variance + found["dark_charge"] / job.gain,
+            expected,
             found["kurtosis"],
             found["outliers"],
             limits.noisy,

@@ -28,6 +28,8 @@ _LINEAR_SHARE = 0.7
 _SATURATED_RUNG = 1e-2
 _GAIN_ERROR = 0.2
 _GUESS_ERROR = 0.1
+_SMOOTH = 0.25 + SHEPPARD
+"""Variance of a sample, in square codes, from which rounding adds the same at every level."""
 _NO_LINE = 10.0
 """Reduced chi-square of a photon-transfer curve that is no line."""
 _LINEARITY = 0.02
@@ -127,7 +129,8 @@ class Summary:
             found.append(
                 "the photon-transfer curve is no straight line (reduced chi-square "
                 f"{self.gain.chi2_reduced:.3g}): do not rely on the gain measured; causes are a "
-                "nonlinear response, a lamp that flickers, or charge shared by neighbours"
+                "nonlinear response, amplifiers of different gain, a lamp that flickers, or charge "
+                "shared by neighbours"
             )
         if self.gain is not None and self.gain.neighbours:
             lags = ", ".join(f"({y}, {x})" for y, x in self.gain.neighbours)
@@ -153,16 +156,21 @@ class Summary:
             value, error = self.gain.gain, self.gain.error
             if abs(value - declared) > max(3 * error, 0.02 * declared):
                 found.append(
-                    f"photon transfer gives a gain of {value:.4g} ± {error:.2g} e-/ADU, declared "
-                    f"are {declared:g}: {gain:.4g} is used"
+                    f"photon transfer gives a gain of {value:.4g} ± {error:.2g} e-/ADU, not the "
+                    f"{declared:g} of detector.gain_e_per_adu: "
+                    + (
+                        "correct it, or use '--gain measured'; all electrons are counted with it"
+                        if gain == declared
+                        else "electrons are counted with the measured one"
+                    )
                 )
         noise = self.declared.read_noise_e
         if self.before_rounding is not None:
             value, error = (gain * v for v in self.before_rounding)
             if abs(value - noise) > max(3 * error, 0.1 * noise):
                 found.append(
-                    f"the read noise measured is {value:.4g} ± {error:.2g} e-, declared are "
-                    f"{noise:g}: the measured one is used"
+                    f"the read noise is {value:.4g} ± {error:.2g} e-, not the {noise:g} of "
+                    "detector.read_noise_e: the measured one is used"
                 )
         return found
 
@@ -186,9 +194,12 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     """
     medians = usual(folder, job.shape, job.gain)
     if job.flat and not medians.response > _LIT * medians.response_error:
-        found = "no pixel has a response"
-        if math.isfinite(medians.response):
-            found = f"{medians.response:.2g} ± {medians.response_error:.2g} ADU/s in a pixel"
+        if not math.isfinite(medians.response):
+            raise InputError(
+                f"frames.flat: all flats are saturated (at {job.saturation:.0f} ADU); take them "
+                "again with less light, or list none"
+            )
+        found = f"{medians.response:.2g} ± {medians.response_error:.2g} ADU/s in a pixel"
         raise InputError(
             f"frames.flat: the flats hold no light ({found}); take them again, or list none"
         )
@@ -255,6 +266,9 @@ def _gain(
     highest = _LINEAR_SHARE * top
     dark, lit = sums
     lit = np.where(lit[:, 1:2] <= highest * lit[:, :1], lit, 0.0)
+    # Noise of less than half a code is rounded up or down by where its level lies.
+    smooth = lit[:, 2:3] > _SMOOTH * job.quantum**2 * lit[:, :1]
+    lit = np.where(smooth, lit, 0.0) if smooth.any() else lit
     shared, added = add_neighbours(lit, dark)
     fitted = fit_gain(shared, variance, 2 * noise * error, highest, straight=len(job.flat) < LADDER)
     if fitted is None or not fitted.error < _GAIN_ERROR * fitted.gain:

@@ -24,7 +24,7 @@ from pixcal.estimators.detector.emva import (
     transfer_points,
     without_trend,
 )
-from pixcal.kernels.photon_transfer import add_neighbours
+from pixcal.kernels.photon_transfer import BLOCK, LAGS, add_neighbours
 from pixcal.stages.reduce.detector_summary import Summary, pair_sums
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.halves import Window, frames_of, middle_of, read_halves
@@ -34,6 +34,15 @@ from pixcal.storage.cube import CHUNK, ArrayReader
 
 F64 = NDArray[np.float64]
 Json = dict[str, Any]
+
+_TOLD = 1.6
+"""Read noise over that of the rounding from which the amplifier's is their difference."""
+_SHARED = 5.0
+"""Errors of the noise that a row shares from which it is shown."""
+_NO_ERROR = 1e-9
+"""ADU/s: below it all samples are of one code."""
+_WELL = 0.97
+"""Share of the converter's range below which it is the wells that are full."""
 
 
 def characterise(
@@ -61,14 +70,17 @@ def characterise(
     dark, lit = pair_sums(made.scratch / "statistics", job)
     points = transfer_points(add_neighbours(lit, dark)[0])
     top, reached = _top(points, summary, job)
+    top = top if job.dark else None  # levels above an unknown bias say nothing
     middle = middle_of(source.shape)
     halves = read_halves(made, source, summary, top, middle, runtime)
-    found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, _gain_note(facts))}
-    noise = _read_noise(found, facts, gain[0])
-    _full_well(found, gain[0], top, reached, noise)
-    straight = facts["linearity"]
-    if straight is not None:
-        departure = straight["max_deviation_percent"], None
+    note = "" if facts["gain_e_per_adu"]["measured"] is not None else "declared, not measured"
+    found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, note)}
+    noise = _read_noise(found, facts, gain[0], source.quantum)
+    _row_noise(found, dark.sum(axis=0), gain[0])
+    if top is not None:
+        _full_well(found, gain, top, reached, noise)
+    if facts["linearity"] is not None:
+        departure = facts["linearity"]["max_deviation_percent"], _lamp_error(source)
         found["linearity_error"] = _figure("linearity error, largest", "%", departure)
     curves: Json = {"photon_transfer": _listed(points.T, ("level", "variance", "error"))}
     curves["photon_transfer"] |= {"gain": gain[0], "read_variance": (noise or (0.0,))[0] ** 2}
@@ -79,8 +91,12 @@ def characterise(
         percent = np.stack([100 * without_trend(half, halves.good) for half in halves.flat])
         _spread(found, curves, "prnu", "%", percent, halves.good)
     _dark_current(found, made, source, gain[0] / facts["gain_e_per_adu"]["used"], middle)
-    for figure in found.values():
-        if figure["unit"] in ("e-", "e-/s") and figure["error"] is not None:
+    for name, figure in found.items():
+        if (
+            figure["unit"].startswith("e-")
+            and name != "conversion_gain"
+            and figure["error"] is not None
+        ):
             of_gain = figure["value"] * (gain[1] or 0.0) / gain[0]
             figure["error"] = math.hypot(figure["error"], of_gain)
     write_json(made.folder / "figures_of_merit.json", curves)
@@ -101,51 +117,74 @@ def _gain(facts: Json) -> tuple[float, float | None]:
     return entry["measured"], entry["error"]
 
 
-def _gain_note(facts: Json) -> str:
-    return "" if facts["gain_e_per_adu"]["measured"] is not None else "declared, not measured"
-
-
-def _read_noise(found: Json, facts: Json, gain: float) -> Measure | None:
-    """Read noise with and without rounding (e-); returned with rounding, in ADU."""
+def _read_noise(found: Json, facts: Json, gain: float, step: float) -> Measure | None:
+    """Read noise with and without rounding to steps (ADU), in e-; returned with it, in ADU."""
     entry = facts["read_noise_e"]
     scale = gain / facts["gain_e_per_adu"]["used"]
-    whole = entry.get("with_rounding", entry["measured"])
+    whole = entry["with_rounding"]
     if whole is None:
         return None
-    error, rounding = scale * (entry["error"] or 0.0), gain / math.sqrt(12)
+    error, rounding = scale * (entry["error"] or 0.0), step * gain / math.sqrt(12)
     whole *= scale
+    steps = "ADU" if step == 1 else f"steps of {step:g} ADU"
+    note = f"rounding to {steps} adds {rounding:.3g} e-"
+    own = None if entry["measured"] is None else scale * entry["measured"]
+    if step > 1:
+        own = math.sqrt(max(whole**2 - rounding**2, 0.0)) if whole > _TOLD * rounding else None
+    if own is None:
+        note += "; too coarse to measure the noise before it"
     found["read_noise_with_rounding"] = _figure(
-        "read noise with rounding", "e-", (whole, error), f"rounding to ADU adds {rounding:.3g} e-"
+        "read noise with rounding", "e-", (whole, error), note
     )
-    if "with_rounding" in entry and entry["measured"] is not None:
-        own = scale * entry["measured"]
-    else:
-        own = math.sqrt(max(whole**2 - rounding**2, 0.0))
-    found["read_noise"] = _figure("read noise without rounding", "e-", (own, error))
+    if own is not None:
+        found["read_noise"] = _figure("read noise without rounding", "e-", (own, error))
     return whole / gain, error / gain
+
+
+def _row_noise(found: Json, dark: F64, gain: float) -> None:
+    """Noise in time that the pixels of a row, or of a column, have in common."""
+    if not dark[0]:
+        return
+    error = dark[2] / dark[0] / math.sqrt(dark[0])
+    for name, lags in (("row", ((0, 1), (0, 2))), ("column", ((1, 0), (2, 0)))):
+        at = [3 + int(np.flatnonzero((lag == LAGS).all(axis=1))[0]) for lag in lags]
+        # A coupling reaches the next pixel, and a row that repeats the row after it; not both.
+        shared = float(dark[at].min() / dark[0]) * BLOCK / (BLOCK - 1)
+        if shared > _SHARED * error:
+            noise = math.sqrt(shared)
+            title, note = f"noise of whole {name}s", "part of the read noise"
+            found[f"{name}_noise"] = _figure(
+                title, "e-", (gain * noise, gain * error / (2 * noise)), note
+            )
+
+
+def _lamp_error(source: Ingested) -> float | None:
+    """Error of the level of a flat (%), by how those of one exposure differ."""
+    levels = None if source.survey is None else source.survey.levels
+    groups = [] if levels is None else [levels[list(g.frames)] for g in source.exposures.flat]
+    ratios = [own.var(ddof=1) / own.mean() ** 2 / len(own) for own in groups if len(own) > 1]
+    return 100 * math.sqrt(float(np.mean(ratios))) if ratios else None
 
 
 def _top(points: F64, summary: Summary, job: Measuring) -> tuple[Measure | None, bool]:
     """Saturation above bias (ADU) with its error, or the highest level, and whether it is one."""
-    peak = saturation(points)
-    if peak is not None:
+    peak, end = saturation(points), job.saturation - summary.usual.bias
+    if peak is not None and peak[0] + 2 * peak[1] < _WELL * end:
         return peak, True
     if not len(summary.levels) or not summary.usable.any():
         return None, False
-    if not summary.usable.all() and math.isfinite(job.saturation):
-        return (job.saturation - summary.usual.bias, 0.5), True
+    if (peak is not None or not summary.usable.all()) and math.isfinite(end):
+        return (end, 0.5), True
     return (float(summary.levels[summary.usable].max()), 0.0), False
 
 
 def _full_well(
     found: Json,
-    gain: float,
-    top: Measure | None,
+    gain: tuple[float, float | None],
+    top: Measure,
     reached: bool,
     noise: Measure | None,
 ) -> None:
-    if top is None:
-        return
     note = "" if reached else "lower limit: the flats do not saturate"
 
     def figure(title: str, unit: str, measure: Measure, more: str = "") -> Json:
@@ -154,13 +193,13 @@ def _full_well(
         return _figure(title, unit, (value, error if reached else None), said)
 
     found["saturation"] = figure("saturation above bias", "ADU", top)
-    full = gain * top[0]
-    well = full, gain * top[1]
+    well = gain[0] * top[0], gain[0] * top[1]
     found["full_well"] = figure("full well", "e-", well)
-    peak = math.sqrt(full)
-    found["snr_max"] = figure("largest signal-to-noise ratio", "", (peak, well[1] / (2 * peak)))
+    peak = math.sqrt(well[0])
+    error = math.hypot(top[1] / top[0], (gain[1] or 0.0) / gain[0]) * peak / 2
+    found["snr_max"] = figure("largest signal-to-noise ratio", "", (peak, error))
     if noise is not None:
-        electrons = noise[0] * gain, noise[1] * gain
+        electrons = noise[0] * gain[0], noise[1] * gain[0]
         ratio, error, decibels = dynamic_range(well, electrons)
         found["dynamic_range"] = figure("dynamic range", "", (ratio, error), f"{decibels:.1f} dB")
 
@@ -226,9 +265,11 @@ def _dark_current(found: Json, made: Build, source: Ingested, scale: float, midd
     rate = ArrayReader(folder / "dark_rate").read(*middle)[good].mean(dtype=float)
     gain = found["conversion_gain"]["value"]
     slope = dark_slope(*_dark_means(source, middle, good))
-    error = gain * slope[1] if slope is not None else None
+    error = gain * slope[1] if slope is not None and slope[1] > _NO_ERROR else None
     note = _temperature(source.tables)
-    found["dark_current"] = _figure("dark current", "e-/s", (scale * float(rate), error), note)
+    timed = any(source.tables["dark"]["exptime_s"])
+    unit = "e-/s" if timed else "e-/exposure"
+    found["dark_current"] = _figure("dark current", unit, (scale * float(rate), error), note)
 
 
 def _dark_means(source: Ingested, middle: Window, good: NDArray[np.bool_]) -> tuple[F64, F64]:

@@ -4,6 +4,7 @@ Frames of one exposure time may be of several levels, where the lamp was changed
 or a well ends, samples pile up at their highest code.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -81,6 +82,13 @@ def share_at_zero(frames: Reader) -> float:
     """Share of the samples of the first frame that are zero, where no sample is below."""
     samples = _rows(frames, 0, 1)
     return 0.0 if samples.min() < 0 else float((samples == 0).mean())
+
+
+def code_step(arrays: Sequence[Reader]) -> int:
+    """Largest step of which all samples of some frames are multiples; 1 if they are few."""
+    ends = ((array, n) for array in arrays for n in {0, array.shape[0] - 1})
+    codes = {int(code) for array, n in ends for code in np.unique(_rows(array, n, n + 1))}
+    return math.gcd(*codes) if len(codes) >= NEIGHBOURS else 1
 
 
 def _rows(frames: Reader, begin: int, end: int) -> NDArray[Any]:

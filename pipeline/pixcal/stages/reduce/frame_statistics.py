@@ -24,7 +24,7 @@ from pixcal.estimators.detector.calibration import (
 )
 from pixcal.estimators.detector.full_wells import unsaturated
 from pixcal.kernels.photon_transfer import COLUMNS, N_BINS, bin_pairs, pair_statistics
-from pixcal.kernels.robust import BATCH, Combination, Combined, median_and_sigma
+from pixcal.kernels.robust import BATCH, Combination, Combined, lit, median_and_sigma
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.columns import Index, Strip, extent, grid
 from pixcal.stages.reduce.exposures import Group
@@ -208,10 +208,14 @@ def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined)
     group, line = job.flat[number], column.line
     exptime = group.exptime if job.flats_timed else 0.0
     signal = np.where(found.seen == len(group.frames), found.mean, np.nan)
-    level = median_and_sigma(signal)[0]
+    seen = lit(signal)
+    level = median_and_sigma(signal[seen])[0]
     column.levels[number] = level, signal.size, (len(group.frames) - found.seen).sum()
     # Few frames say little of one pixel's noise, and most pixels are like the others.
-    usual = usual_variance(found.variance, len(group.frames) - 1)
+    usual = usual_variance(found.variance[seen], len(group.frames) - 1)
+    if usual < job.quantum**2:
+        # Whole numbers that lie beside one another: their median variance may be nothing.
+        usual = max(usual, float(found.variance[seen].mean()))
     usual = max(level, 0) / job.gain + job.read_noise**2 if np.isnan(usual) else usual
     brighter = np.fmax(signal / level, 1) if level > 0 else 1.0
     variance = np.fmax(found.variance, usual * brighter) / len(group.frames)

@@ -83,7 +83,8 @@ def read_halves(
     if good.sum() < _LEAST_PIXELS:
         return Halves(None, None, good)
     if dark is None:
-        return Halves(None, whole, good)
+        pedestal = ArrayReader(made.folder / "calibration.zarr" / "bias").read(*middle)
+        return Halves(None, whole - pedestal, good)
     return Halves(whole[:2], whole[2:] - whole[:2] if flat is not None else None, good)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from pixcal.model.acquisition import Detector
 from pixcal.model.errors import InputError
 from pixcal.stages.reduce.exposures import Exposures, group_exposures
-from pixcal.stages.reduce.flat_survey import FlatSurvey
+from pixcal.stages.reduce.flat_survey import FlatSurvey, code_step
 from pixcal.storage.artefact import read_json, read_manifest
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
@@ -126,11 +126,16 @@ class Ingested:
                 )
         return ny, nx
 
-    @property
+    @cached_property
     def quantum(self) -> float:
-        """Step of the calibration frames (ADU), 0 where any are real numbers."""
-        groups = (*self.exposures.dark, *self.exposures.flat)
-        return float(all(self._is_integer(group.array) for group in groups))
+        """Step of the calibration frames (ADU), 0 where any are real numbers.
+
+        Cameras of 12 bits that write 16 count in steps of 16.
+        """
+        names = {group.array for group in (*self.exposures.dark, *self.exposures.flat)}
+        if not all(map(self._is_integer, names)):
+            return 0.0
+        return float(code_step([self.arrays[name] for name in sorted(names)]))
 
     def saturation(self, name: str) -> float:
         """Level (ADU) from which on samples of an array are saturated.
