@@ -147,7 +147,7 @@ def _row_noise(found: Json, dark: F64, gain: float) -> None:
         return
     error = dark[2] / dark[0] / math.sqrt(dark[0])
     for name, lags in (("row", ((0, 1), (0, 2))), ("column", ((1, 0), (2, 0)))):
-        at = [3 + int(np.flatnonzero((lag == LAGS).all(axis=1))[0]) for lag in lags]
+        at = [3 + LAGS.tolist().index(list(lag)) for lag in lags]
         # A coupling reaches the next pixel, and a row that repeats the row after it; not both.
         shared = float(dark[at].min() / dark[0]) * BLOCK / (BLOCK - 1)
         if shared > _SHARED * error:
