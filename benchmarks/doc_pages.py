@@ -40,12 +40,12 @@ EFFECTS = re.compile(r"(<!-- effects -->\n\n)(?:\|.*\n)*")
 SEE = {
     "pixcal run": "Tutorial: [From FITS to maps](../tutorials/first-maps.md).",
     "pixcal ingest": "How to: [Your own camera](../how-to/own-camera.md). Keys of "
-    "`acquisition.yaml`: [Files](files.md).",
+    "`acquisition.yaml`: [Input files](files.md).",
     "pixcal fit": "What it computes: [Mathematics](../explanation/mathematics.md).",
     "pixcal diagnose": "How to: [Diagnose a bench](../how-to/diagnose.md).",
     "pixcal astrometry": "How to: [Star centroids](../how-to/astrometry.md).",
     "pixcal compare": "How to: [Repeatability](../how-to/compare.md).",
-    "pixcal simulate": "Keys of the bench file: [Files](files.md#bench-files). How to: [Add your "
+    "pixcal simulate": "Keys of the bench file: [Bench files](bench-files.md). How to: [Add your "
     "own effect](../how-to/own-effect.md).",
     "pixcal budget": "How to: [Plan an exposure](../how-to/budget.md).",
     "pixcal blind": "Rules: [Blind examination](../explanation/blind-examination.md).",

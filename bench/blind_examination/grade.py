@@ -153,7 +153,7 @@ def _parameters(truth: Truth, diagnosis: Diagnosis) -> list[dict[str, Any]]:
                     "effect": drawn.effect,
                     "name": one.name,
                     "true": one.true,
-                    "found": one.found,
+                    "found": one.estimate,
                     "error": one.error,
                     "within": [one.within(errors) for errors in WITHIN],
                 }

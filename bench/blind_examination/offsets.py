@@ -1,7 +1,7 @@
 """Errors of the offset maps of a case against its truth, as fitted and as corrected.
 
 What the data cannot tell from the bench (piston, the modes of the fitted fringes and those that
-free intensities leave) is taken off the difference; the rest is told in Cramér-Rao bounds.
+free intensities leave) is taken off the difference; the rest is given in Cramér-Rao bounds.
 """
 
 from collections.abc import Mapping

@@ -17,12 +17,12 @@ class ParameterCheck:
 
     name: str
     true: float
-    found: float
+    estimate: float
     error: float
 
     def within(self, errors: float) -> bool:
         """Whether it is off by at most some times its error."""
-        return abs(self.found - self.true) <= errors * self.error
+        return abs(self.estimate - self.true) <= errors * self.error
 
 
 def check_parameters(
@@ -67,7 +67,7 @@ def _flat(plain: Plain, prefix: str = "") -> Iterator[tuple[str, float]]:
 def _couplings(
     true: Sequence[Plain], estimated: Sequence[Plain], errors: Mapping[str, float]
 ) -> Iterator[ParameterCheck]:
-    """Share of every true coupling: that of all found ones with its way whose rows meet its own."""
+    """Estimated share of every true coupling: the sum over those with its direction and rows."""
     for one in true:
         matching = [n for n, other in enumerate(estimated) if _meet(one, other)]
         share = sum(float(estimated[n]["share"]) for n in matching)

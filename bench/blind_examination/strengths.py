@@ -153,7 +153,7 @@ VARIANTS = (
         lambda s, rng: {"ramp": 0.0, "walk": 0.0, "hop": s, "hops_per_h": 300.0}),
 )
 # fmt: on
-"""Every way of every effect."""
+"""Every variant of every effect."""
 
 
 def variants_of() -> Mapping[str, tuple[Variant, ...]]:

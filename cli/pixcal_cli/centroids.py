@@ -75,7 +75,7 @@ def centroids(
         left = np.sqrt((corrected.error[good] ** 2).mean(axis=0))
         click.echo(f"  errors of the maps leave {left[0]:.2g} px in x, {left[1]:.2g} px in y")
     if not good.all():
-        click.echo("  note: the others lie off the detector, or too near to masked pixels: NaN")
+        click.echo("  note: the others are off the detector or too close to masked pixels: NaN")
 
 
 @click.command(

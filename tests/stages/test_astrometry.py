@@ -227,11 +227,11 @@ def test_maps_of_noise_are_told_from_maps_that_help(tmp_path: Path) -> None:
     assert found["axes"]["x"]["floor"]["perfect"]["px"] is None
     assert found["axes"]["x"]["floor"]["gain"]["value"] is None
     assert any("not seen above the maps' errors" in w for w in found["warnings"])
-    assert "not seen" in table(found)[0].perfect
+    assert "not significant" in table(found)[0].perfect
     worse = make_run(tmp_path / "worse", added(offsets(4, 1e-3), offsets(5, 2e-3)), 2e-3)
     truth = write_truth(tmp_path / "truth", offsets(4, 1e-3))
     astrometry.run(worse, Config(truth=truth, stars=60, positions=3), SYNC)
-    assert any("do stars harm" in w for w in result_of(worse)["warnings"])
+    assert any("make centroids worse" in w for w in result_of(worse)["warnings"])
 
 
 GEOMETRY = Geometry(632.8e-6, 4.4e-3, 18.0, 12.0, 400.0, 6.0, 0.0, 0.0)

@@ -481,7 +481,7 @@ def test_couplings_are_the_same_in_any_period() -> None:
     errors = {f"couplings[{n}].share": 1e-4 for n in range(3)}
     (one,) = check_parameters("ipc", true, found, errors)
     assert one.within(3)
-    assert one.found == 0.0101
+    assert one.estimate == 0.0101
     (missing,) = check_parameters("ipc", {"couplings": [coupling(0.01, 2, 0, 1)]}, found, errors)
     assert not missing.within(3)
 

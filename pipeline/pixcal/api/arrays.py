@@ -45,8 +45,8 @@ def calibrate(
 ) -> Run:
     """Measure the offsets of pixels from frames in memory.
 
-    The frames take the way of all frames: they are written as FITS, ingested, reduced and fitted,
-    with the same results as `run` has from files.
+    The frames are written as FITS, ingested, reduced and fitted; the results are the same as
+    `run` gives from files.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def calibrate(
     pitch_um, wavelength_nm, distance_mm : float
         Pixel pitch, laser wavelength, nominal distance from the fibres to the detector.
     gain_e_per_adu, read_noise_e : float
-        As the detector's owner declares them: e-/ADU, and e- rms.
+        Declared conversion gain, e-/ADU, and read noise, e- rms.
     exptime_s : float, optional
         Exposure time of the fringe frames; with darks it is needed.
     frame_period_s : float, optional
@@ -70,9 +70,9 @@ def calibrate(
     saturation_adu : float, optional
         Samples at or above this level are saturated.
     gain : {"declared", "measured"}
-        The gain that electrons are counted with: the owner's, or that of the flats.
+        Gain to use: declared, or measured from the flats.
     model : str
-        Shape of the fringes: ``paraxial``, ``hyperbolic``, or ``auto``, by evidence.
+        Shape of the fringes: ``paraxial``, ``hyperbolic``, or ``auto``, chosen from the data.
     out : str or path, optional
         A new directory to keep the run in; by default it is a temporary one, which is removed when
         the `Run` is no longer referred to.

@@ -40,8 +40,8 @@ def run(
     Raises
     ------
     InputError
-        In one line, with the file, key or option that is wrong. What is not possible beside the
-        maps (a diagnosis, a correction) is a warning.
+        In one line, with the file, key or option that is wrong. A diagnosis or correction
+        that is not possible is a warning.
     """
     from pixcal.stages import chain
 
@@ -98,7 +98,9 @@ def fit(run: StrPath, options: of.Fit, *, runtime: Runtime | None = None) -> Run
     from pixcal.stages import fit as stage
 
     if options.own and not options.with_diagnosis:
-        raise InputError("pixcal.fit: own: of use with with_diagnosis only; give that as well")
+        raise InputError(
+            "pixcal.fit: own: has an effect only with with_diagnosis; give that as well"
+        )
     body = correct.run if options.with_diagnosis else stage.run
     body(Path(run), options, runtime or Runtime())
     return open_run(run)
@@ -244,7 +246,7 @@ def budget(bench: StrPath, options: of.Budget, *, out: StrPath | None = None) ->
 def simulate(
     bench: StrPath, out: StrPath, options: of.Simulate, *, runtime: Runtime | None = None
 ) -> Path:
-    """Simulate a bench and write an acquisition, and its truth apart from it.
+    """Simulate a bench; write an acquisition and, in a separate directory, its truth.
 
     Returns
     -------

@@ -27,7 +27,7 @@ _ARGUMENTS = {
 def function_of(kind: type) -> Callable[[Callable[..., T]], Callable[..., T]]:
     """A function that takes the fields of a dataclass as keywords, for one that takes it whole.
 
-    What is given is checked as a file's keys are. Signature and docstring tell every option;
+    What is given is checked as a file's keys are. Signature and docstring list every option;
     type checkers find them in ``pixcal/__init__.pyi``, which ``make doc-pages`` writes.
 
     Parameters

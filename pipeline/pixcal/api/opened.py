@@ -84,7 +84,7 @@ class OffsetMap:
 
 @dataclass(frozen=True)
 class Run:
-    """A run directory, opened. Arrays and tables are read with their first use, and kept.
+    """A run directory, opened. Arrays and tables are read on first use and kept.
 
     It can stand wherever a path of a run is asked for.
 
@@ -96,7 +96,7 @@ class Run:
 
     path: Path
     _kept: TemporaryDirectory[str] | None = field(default=None, repr=False, compare=False)
-    """The temporary directory it lies in, which goes when nothing refers to it any more."""
+    """The temporary directory of the run; it is removed with the last reference to it."""
 
     def __fspath__(self) -> str:
         return str(self.path)
@@ -209,7 +209,7 @@ class Run:
 
 @dataclass(frozen=True)
 class FringeSet:
-    """What the fit found of one fringe set. Arrays are read with their first use, and kept.
+    """One fringe set as fitted. Arrays are read on first use and kept.
 
     Attributes
     ----------

@@ -15,7 +15,7 @@ SCHEMA = "pixcal/acquisition/1"
 
 @dataclass(frozen=True)
 class Detector:
-    """The detector as declared by its owner."""
+    """The detector as declared."""
 
     pitch_um: float = quantity(unit="um", low=0.01, high=1000, doc="pixel pitch")
     gain_e_per_adu: float = quantity(unit="e-/ADU", low=1e-6, high=1e6, doc="conversion gain")
@@ -108,7 +108,7 @@ class Acquisition:
 
     @property
     def fibres(self) -> Optics:
-        """The bench's optics; where there are no fringes, stand-ins that nothing depends on."""
+        """The bench's optics; without fringes, placeholder values that no result depends on."""
         return self.optics or Optics(wavelength_nm=632.8, distance_mm=400.0)
 
 

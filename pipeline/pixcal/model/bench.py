@@ -135,13 +135,13 @@ class SimulatedOptics:
         None, unit="mm", low=0.1, high=1e7, doc="what the acquisition declares; default: the truth"
     )
     offset_mm: tuple[float, float] = quantity(
-        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="foot of the fibres' centre: [x, y]"
+        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="fibres' centre projected on the detector: [x, y]"
     )
     pointing_a_mm: tuple[float, float] = quantity(
-        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="peak of A's light from the foot of A"
+        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="peak of A's light from the projection of A"
     )
     pointing_b_mm: tuple[float, float] = quantity(
-        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="peak of B's light from the foot of B"
+        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="peak of B's light from the projection of B"
     )
     power_ratio: float = quantity(1.0, low=1e-3, high=1e3, doc="power of B over that of A")
     visibility: float = quantity(
@@ -179,7 +179,7 @@ class SimulatedSet:
         None, unit="mm", low=-1e5, high=1e5, doc="of this pair, instead of the one in optics"
     )
     phase_law: str = quantity(
-        "random", choices=("random", "ramp"), doc="random: uniform over a turn; ramp: equal steps"
+        "random", choices=("random", "ramp"), doc="random: uniform over 2π; ramp: equal steps"
     )
     phase_step_rad: float = quantity(0.0, unit="rad", low=-1e3, high=1e3, doc="step of a ramp")
     visibility_jitter_rms: float = quantity(

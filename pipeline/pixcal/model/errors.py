@@ -22,7 +22,7 @@ class DamagedError(InputError):
     Attributes
     ----------
     advice : str
-        What mends it; whoever knows the run that it belongs to says so more exactly.
+        How to repair it; code that knows the run gives the exact command.
     """
 
     def __init__(self, message: str, path: object = "") -> None:

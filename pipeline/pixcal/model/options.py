@@ -298,7 +298,7 @@ class Simulate:
 
 @dataclass(frozen=True)
 class Run:
-    """Options of ``run``, those of its steps among them."""
+    """Options of ``run`` and of its steps."""
 
     overwrite: bool = _overwrite()
     copy: bool = _copy()

@@ -24,7 +24,7 @@ class PrecisionLine:
     """Precision against frames: one over their root."""
 
     label: str
-    median: float  # median, worst: after one frame, px, of the median and of the worst pixel
+    median: float  # median, worst: bound of one frame, px, for the median and for the worst pixel
     worst: float
     planned: int  # frames of the bench
 

@@ -168,9 +168,9 @@ def still_differing(result: DiagnosisContents) -> list[Facts]:
 
 
 def worst_of_each_domain(curves: Sequence[Facts]) -> tuple[list[Facts], list[Facts]]:
-    """`SHOWN` of the sorted curves, from each domain alike as far as it has them; and the others.
+    """The first `SHOWN` curves, shared evenly among the domains, and the others.
 
-    Both are sorted by domain: first the domain of the first.
+    Both are sorted by domain, that of the most significant curve first.
     """
     order = list(dict.fromkeys(c["domain"] for c in curves))
     domains = [[c for c in curves if c["domain"] == domain] for domain in order]

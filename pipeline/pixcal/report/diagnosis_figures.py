@@ -37,7 +37,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Closed:
-    """What a cause closes by itself, with its interval, and beyond all the others."""
+    """Share of the gap that a cause closes alone, with its interval, and its unique share."""
 
     name: str
     alone: float
@@ -148,7 +148,7 @@ def _cause_names(causes: Sequence[Closed]) -> list[str]:
 
 
 def _room(names: Sequence[str]) -> float:
-    """Inches that names beside an axis take."""
+    """Width of the names beside an axis, inches."""
     return 0.4 + 0.085 * max(len(line) for name in names for line in name.splitlines() or [""])
 
 

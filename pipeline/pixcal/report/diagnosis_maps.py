@@ -140,7 +140,7 @@ def _draw(
 
 
 def _shown(spot: Spot, shape: tuple[int, int]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """First row and column, and rows and columns, large enough to be seen and within the window."""
+    """First row and column, and height and width, enlarged to a visible size within the window."""
     starts, sizes = [], []
     for (first, after), whole in zip((spot.rows, spot.columns), shape, strict=True):
         size = max(after - first, SMALLEST * whole)

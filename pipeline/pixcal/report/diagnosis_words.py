@@ -100,12 +100,12 @@ def differing(diagnosis: DiagnosisContents) -> int:
 
 
 def main_domains(gap: Mapping[str, Any]) -> str:
-    """', mostly in noise', or nothing where no domain stands out."""
+    """', mostly in noise', or an empty text where no domain dominates."""
     return _mostly({d: v[0] for d, v in gap.get("domains", {}).items()})
 
 
 def where_left(gap: Mapping[str, Any]) -> str:
-    """The same for what is left."""
+    """The same for the residual gap."""
     return _mostly({d: v[1] for d, v in gap.get("domains", {}).items()})
 
 

@@ -1,6 +1,6 @@
 """What all figures share: axes, colour scales, units, and the PNG.
 
-Figures are made by themselves, never through pyplot: nothing is global, threads do not meet.
+Figures are made without pyplot: no state is global, so threads do not interfere.
 """
 
 import io
@@ -149,12 +149,12 @@ def _margins(
 def map_axes(
     number: int, shape: tuple[int, int], *, curve: bool = False, top: float = 0.3
 ) -> tuple[Figure, list[Axes], Axes | None]:
-    """Axes for maps with their colour bars, two a row, and for a curve below or beside them.
+    """Axes for maps with colour bars, two per row, and for a curve below them.
 
     Parameters
     ----------
     number : int
-        Of maps; beside a single one lies the curve.
+        Of maps; the curve is beside a single map.
     shape : (int, int)
         Rows and columns of a map.
     top : float
@@ -247,7 +247,7 @@ def covered(
 
 
 def block_note(summary: MapSummary) -> str:
-    """How pixels were averaged for the figure, or nothing."""
+    """How pixels were averaged for the figure; empty where they were not."""
     n = summary.block
     return f"mean of {n} × {n} px" if n > 1 else ""
 

@@ -195,7 +195,7 @@ def _allan_lines(
     axes: Axes, below: Axes, name: str, measured: Facts, facts: Facts, curve: Mapping[str, F64],
     unit: Unit, *, color: str, aside: float,
 ) -> None:  # fmt: skip
-    """One set: points, square-root law, bound, knee; points of sets lie a little ``aside``."""
+    """One set: points, square-root law, bound, knee; ``aside`` shifts its points."""
     frames, adev, white = curve["frames"], curve["adev_px"], curve["white_expected_px"]
     low, high = curve["adev_lo_px"], curve["adev_hi_px"]
     bars = np.nan_to_num(np.abs(np.stack([adev - low, high - adev])))

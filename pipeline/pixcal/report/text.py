@@ -76,7 +76,7 @@ def exact(value: Any) -> str:
 
 
 def _grouped(text: str) -> str:
-    """Thousands apart by a thin space that does not break, and a real minus sign."""
+    """Thousands separated by a thin no-break space, and a real minus sign."""
     return text.replace(",", "\u202f").replace("-", "−")
 
 

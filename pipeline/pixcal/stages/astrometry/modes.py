@@ -2,7 +2,7 @@
 
 Smooth modes (a plane; what moving a fibre does to hyperbolic fringes) act on stars like distortion
 of the telescope, which a mission has to measure anyway. The fringe and its harmonic are lost to
-free intensities; over a large window they hold next to nothing of the true offsets.
+free intensities; over a large window they contain almost no part of the true offsets.
 """
 
 from dataclasses import dataclass

@@ -6,14 +6,14 @@ for ``x`` and ``y`` (or ``fringe``) errors in px and µas:
 
 - ``floor``: no photon noise; ``photons``: with it; ``averaged``: the mean over all positions of a
   star, with photon noise; ``separation``: the difference of two stars' means. Each for a
-  ``perfect`` grid, for the ``measured`` maps, and the ``gain``, the one over the other;
+  ``perfect`` grid, for the ``measured`` maps, and the ``gain``, their ratio;
 - ``photon_bound``: the Cramér-Rao bound of one position; ``averaging``: errors against the number
   of positions; ``positions_to_target``: how many the target takes if they are independent;
 - ``second_order_px``: by how much the fits differ from the first order (rms), and
   ``everywhere``: errors of the first order at all places, a star in the middle of each pixel;
 
 and ``warnings`` (sentences). Errors are 1 sigma, of the simulation: other stars, the same detector.
-What is not seen above the maps' own errors is null. ``astrometry.zarr`` holds the maps of errors.
+Values below the maps' own errors are null. ``astrometry.zarr`` holds the maps of errors.
 """
 
 from collections.abc import Mapping
@@ -233,12 +233,12 @@ def _warnings(result: Mapping[str, Any]) -> list[str]:
         gain = axis["floor"]["gain"]["value"]
         if axis["floor"]["perfect"]["px"] is None:
             sentences.append(
-                f"{name}: the pixels' own offsets are not seen above the maps' errors; these maps "
-                "do stars no good, more frames are needed"
+                f"{name}: the pixels' own offsets are below the maps' errors; these maps "
+                "do not improve centroids; more frames are needed"
             )
         elif gain is not None and gain < 1:
             sentences.append(
-                f"{name}: the maps' errors exceed the offsets themselves; these maps do stars harm"
+                f"{name}: the maps' errors exceed the offsets; these maps make centroids worse"
             )
     if "fringe" in result["axes"]:
         sentences.append(
@@ -247,7 +247,7 @@ def _warnings(result: Mapping[str, Any]) -> list[str]:
         )
     if result["detector"]["modes_removed_px"] is None:
         sentences.append(
-            "without a truth, errors of the maps are what SIGMA says: systematic ones are not seen"
+            "without a truth, errors of the maps are those of SIGMA, without systematic errors"
         )
     return sentences
 

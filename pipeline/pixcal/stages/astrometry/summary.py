@@ -88,7 +88,7 @@ def averaging_lengths(positions: int) -> list[int]:
 
 
 def _paired(values: F64) -> F64:
-    """Two stars a row, the odd one left out."""
+    """Pairs of stars, one per row; an unpaired star is left out."""
     return values[: len(values) // 2 * 2].reshape(-1, 2)
 
 
@@ -169,7 +169,7 @@ def with_error(value: float, error: float | None) -> str:
 
 def _length(entry: Mapping[str, Any]) -> str:
     if entry["px"] is None:
-        return "not seen"
+        return "not significant"
     return f"{with_error(entry['px'], entry['err_px'])} px, {entry['uas']:.3g} µas"
 
 

@@ -61,6 +61,6 @@ def exposures(psf: Psf, electrons: float, detector: Declared) -> int:
 
 
 def star(psf: Psf, half: int, electrons: float, background: float, detector: Declared) -> Star:
-    """A star of so many electrons in all its exposures, each of them read with the read noise."""
+    """A star with the given electrons over all exposures, each with its read noise."""
     read_variance = exposures(psf, electrons, detector) * detector.read_noise_e**2
     return Star(psf, half, electrons, background, read_variance)

@@ -328,7 +328,7 @@ def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
     if any(s.loss[0] > 1.01 for s in now.sets):
         random = tuple(replace(s, phase_law="random") for s in f.fringes)
         changes.append(
-            ("phases over the whole turn", replace(bench, frames=replace(f, fringes=random)),
+            ("phases over the whole cycle", replace(bench, frames=replace(f, fringes=random)),
              None, "")
         )  # fmt: skip
     if f.period_s > 1.05 * f.exptime_s:

@@ -7,7 +7,7 @@ wanted and ``frames`` given (null where not asked for), ``window`` (y, x) and, b
 along the set's axis, of the median and of the worst pixel; ``planned`` frames and what they reach;
 ``wanted`` frames, hours and bytes for the precision; what the frames ``given`` reach; ``shares``
 of the frames, ``limited_by``, and ``calibration``. ``joined`` has the same of the sets together:
-its frames are those of all sets, shared as the bench plans. ``levers`` are changes of the bench,
+its frames are those of all sets, in the planned proportions. ``levers`` are changes of the bench,
 the most helpful first; ``left_out`` and ``warnings`` are sentences.
 """
 
@@ -271,7 +271,7 @@ def _warnings(bench: Bench, bound: JoinedBound) -> list[str]:
         if s.interfringe < 2:
             sentences.append(
                 f"{scan.name}: interfringe {s.interfringe:.3g} px is below two pixels: the fringes "
-                "cannot be told from coarser ones"
+                "are aliased"
             )
         across = float(np.hypot(np.median(s.kx) * nx, np.median(s.ky) * ny) / (2 * np.pi))
         if across < HONEST_FRINGES:

@@ -4,8 +4,8 @@ The window is cut into blocks of 1, 2, 4, ... pixels a side. The squares of a ma
 each block counting with its pixels, fall from side to side; what they lose from one to the next is
 the part of the map at that scale: a nested analysis of variance (of Haar's wavelets, where no pixel
 is missing). The parts add up to the whole, and for white noise each holds as much per degree of
-freedom as a pixel does. Products of two maps are taken apart in the same way: what is common to
-both is their covariance at a scale.
+freedom as a pixel does. Products of two maps are decomposed in the same way: the signal common
+to both is their covariance at a scale.
 
 Modes that neither map can know are fitted to both and taken off before anything is compared. It is
 done on the sums: a map less its modes has sums that follow from those of the map and the modes. So
@@ -71,7 +71,7 @@ def halve(sums: F64) -> F64:
 
 @dataclass(frozen=True)
 class Grouping:
-    """A way to group pixels, and what the groups' means hold."""
+    """Sums of squares of the means of groups of pixels."""
 
     groups: int  # those with a good pixel
     products: F64  # (k, k) sum over groups of products of means, each times its pixels
@@ -150,7 +150,7 @@ class Part:
 
 
 def part(fine: Grouping, coarse: Grouping, projection: Projection, pixels: int) -> Part:
-    """What the groups of ``fine`` hold beyond those of ``coarse`` that they make up."""
+    """Part of the maps at the scale of ``fine``: its sums less those of ``coarse``."""
     between = fine.products - coarse.products
     squares = projection.left(between)
     raw = fine.groups - coarse.groups
@@ -217,7 +217,7 @@ def own(p: Part, accuracy: float = SIGMA_ACCURACY) -> tuple[VarianceEstimate, Va
 
 
 def significance(p: Part, accuracy: float = SIGMA_ACCURACY) -> float:
-    """By how many sigma the difference is beyond noise (Wilson and Hilferty's cube root)."""
+    """Significance of the difference beyond noise, sigma (Wilson and Hilferty's cube root)."""
     if p.freedom < 1 or p.expected <= 0:
         return 0.0
     chance = 2 / (9 * p.freedom)

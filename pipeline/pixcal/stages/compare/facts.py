@@ -35,7 +35,7 @@ def describe(
     limit : float
         Sigma beyond which pixels were left out.
     accuracy : float
-        Relative error of SIGMA that is allowed for.
+        Relative error of SIGMA to tolerate.
     """
     total = sums.total()
     scales = [_scale(side, p, accuracy) for side, p in sums.scales() if p.freedom >= 1]

@@ -156,7 +156,7 @@ class PairSums:
         return self.coarse.along(1).along(2).grouping()
 
     def scales(self) -> list[tuple[int, Part]]:
-        """The maps at the scales of blocks of so many pixels; the last holds all larger ones."""
+        """Block side (px) and the maps at that scale; the last holds all larger scales."""
         groupings = list(self.fine[: self.levels + 1])
         blocks = self.coarse
         while len(groupings) <= self.levels:
@@ -334,7 +334,7 @@ class Places:
 
     @property
     def scatter(self) -> F64:
-        """By how many sigma a block's pixels differ more than noise allows; NaN where empty."""
+        """Excess scatter of a block's pixels over noise, sigma; NaN where empty."""
         n = np.where(self.count > 0, self.count, np.nan)
         chance = 2 / (9 * n)
         return np.asarray(((self.squares / n) ** (1 / 3) - (1 - chance)) / np.sqrt(chance))

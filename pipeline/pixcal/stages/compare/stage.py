@@ -193,7 +193,7 @@ def compare_pair(
     Raises
     ------
     InputError
-        If they have hardly a pixel in common.
+        If they have too few pixels in common.
     """
     runtime = pair.plan(runtime)
     everything = read_sums(pair, None, runtime)

@@ -128,7 +128,7 @@ def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
 
 
 def free_of_samples(swept: Swept, part: Part) -> tuple[FringeMaps, Mask]:
-    """What a fit would find on a part if effects on samples were undone with what lies beyond.
+    """Parameters that a fit of a part would give without the effects on samples.
 
     Returns
     -------

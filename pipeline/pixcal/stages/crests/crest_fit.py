@@ -92,10 +92,10 @@ def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -
     Parameters
     ----------
     start : Geometry
-        Where to begin; far is near enough (tested: 10 mm of distance, 18 mm of offset, 5 % of
+        Where to begin; far starts converge (tested: 10 mm of distance, 18 mm of offset, 5 % of
         the baseline).
     prior : Prior, optional
-        Default `Prior.none`: only a large window tells all six parameters.
+        Default `Prior.none`: only a large window determines all six parameters.
 
     Raises
     ------

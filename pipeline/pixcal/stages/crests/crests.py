@@ -201,7 +201,7 @@ class CrestPaths:
         return replace(self, **some)
 
     def outermost(self, paths: int) -> "CrestPaths":
-        """So many paths of each end only, the most informative ones (paper, figure 16)."""
+        """The outermost paths at each end, the most informative ones (paper, figure 16)."""
         every = np.unique(self.k)
         ends = np.union1d(every[:paths], every[-paths:])
         return self.take(np.isin(self.k, ends))
@@ -355,7 +355,7 @@ def _design(y: F64, x: F64, degree: int) -> tuple[F64, list[tuple[int, int]]]:
 
 
 def _highest_degree(windows: Windows, number: int) -> int:
-    """Of a polynomial that so many windows determine."""
+    """Of a polynomial that the windows determine."""
     degree = min(MAX_DEGREE, max(1, min(windows.shape) - 1))
     while degree > 1 and 0.75 * (degree + 1) * (degree + 2) > number:
         degree -= 1
@@ -384,8 +384,8 @@ def _brightened(windows: Windows, light: F64, sigma: F64, before: Smooth) -> Smo
 def _follow(windows: Windows, phase: F64, sigma: F64, before: Smooth) -> Smooth:
     """Polynomial through the phases of the windows, numbered outwards from the middle.
 
-    Each time the known region grows by a third, the polynomial through it tells the turn of
-    the phases beyond: gaps are crossed, and single bad windows do no harm.
+    Each time the known region grows by a third, the polynomial through it fixes the
+    cycle of the phases beyond: gaps are bridged, and single bad windows have no effect.
     """
     use = np.isfinite(sigma)
     if use.sum() < MIN_POINTS:
