@@ -135,7 +135,7 @@ class SimulatedOptics:
         None, unit="mm", low=0.1, high=1e7, doc="what the acquisition declares; default: the truth"
     )
     offset_mm: tuple[float, float] = quantity(
-        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="fibres' centre projected on the detector: [x, y]"
+        (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="projected centre of the fibres: [x, y]"
     )
     pointing_a_mm: tuple[float, float] = quantity(
         (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="peak of A's light from the projection of A"
