@@ -8,7 +8,7 @@ import click
 
 from blind_examination.options import MakeConfig, RunConfig, ScoreConfig
 from pixcal_cli import results
-from pixcal_cli.options import PATH, command, examples
+from pixcal_cli.click_options import PATH, command, examples
 
 if TYPE_CHECKING:
     from pixcal.engine.run import Runtime

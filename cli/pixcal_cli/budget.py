@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from pixcal.model.options import Budget
-from pixcal_cli.options import PATH, bench_argument, config_options, examples
+from pixcal_cli.click_options import PATH, bench_argument, config_options, examples
 from pixcal_cli.results import show_notes, show_table
 
 LIMITS = {

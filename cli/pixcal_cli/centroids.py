@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from pixcal.model.errors import InputError
-from pixcal_cli.options import PATH, examples, run_argument
+from pixcal_cli.click_options import PATH, examples, run_argument
 
 
 @click.command(

@@ -9,7 +9,7 @@ import click
 from pixcal.model.options import Compare
 from pixcal.storage.artefact import read_json
 from pixcal_cli import results
-from pixcal_cli.options import PATH, Command, command
+from pixcal_cli.click_options import PATH, Command, command
 
 if TYPE_CHECKING:
     from pixcal.engine.run import Runtime

@@ -8,7 +8,7 @@ import click
 from pixcal.model.options import Crests
 from pixcal.storage.artefact import read_json
 from pixcal_cli import results
-from pixcal_cli.options import command
+from pixcal_cli.click_options import command
 
 if TYPE_CHECKING:
     from pixcal.engine.run import Runtime

@@ -18,9 +18,9 @@ from pixcal_cli.astrometry import astrometry
 from pixcal_cli.blind import blind
 from pixcal_cli.budget import budget
 from pixcal_cli.centroids import centroids, wcs
+from pixcal_cli.click_options import examples
 from pixcal_cli.compare import compare
 from pixcal_cli.crests import crests
-from pixcal_cli.options import examples
 from pixcal_cli.steps import allan, diagnose, fit, ingest, reduce, report, run, simulate
 
 LONG_WORD = 600

@@ -12,7 +12,7 @@ import click
 from pixcal.model import options
 from pixcal.model.errors import InputError
 from pixcal_cli import results
-from pixcal_cli.options import (
+from pixcal_cli.click_options import (
     PATH,
     Command,
     acquisition_argument,

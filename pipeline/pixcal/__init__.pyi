@@ -432,8 +432,8 @@ def run(
     Raises
     ------
     InputError
-        In one line, with the file, key or option that is wrong. What is not possible beside the
-        maps (a diagnosis, a correction) is a warning.
+        In one line, with the file, key or option that is wrong. A diagnosis or correction
+        that is not possible is a warning.
     """
 
 def simulate(
@@ -444,7 +444,7 @@ def simulate(
     own: collections.abc.Sequence[str | os.PathLike[str]] = (),
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> pathlib.Path:
-    """Simulate a bench and write an acquisition, and its truth apart from it.
+    """Simulate a bench; write an acquisition and, in a separate directory, its truth.
 
     Parameters
     ----------

@@ -27,8 +27,8 @@ from pixcal.model.errors import DamagedError, InputError
 from pixcal.report import page as report_page
 from pixcal.stages import fit, reduce
 from pixcal_cli import results
+from pixcal_cli.click_options import memory_size, region
 from pixcal_cli.main import cli, explain, invoke
-from pixcal_cli.options import memory_size, region
 
 PIXCAL = Path(sys.executable).with_name("pixcal")
 STAGES = ["ingest", "reduce", "fit", "allan", "diagnose", "report"]

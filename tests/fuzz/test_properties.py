@@ -22,8 +22,8 @@ from pixcal.model.errors import InputError
 from pixcal.storage.fits_in import Coding, FrameFile, inspect
 from pixcal.storage.frames import tabulate
 from pixcal.storage.sources import SourceFile
+from pixcal_cli.click_options import memory_size, region
 from pixcal_cli.main import one_line
-from pixcal_cli.options import memory_size, region
 
 ROOT = Path(__file__).parents[2]
 BLOCK = 2880

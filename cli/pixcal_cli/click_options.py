@@ -1,4 +1,4 @@
-"""Options of the commands from the dataclasses of `pixcal.model.options`; arguments they share."""
+"""Click options made from the dataclasses of `pixcal.model.options`; arguments they share."""
 
 import functools
 import math
