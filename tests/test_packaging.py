@@ -38,7 +38,7 @@ def names_in(folder: Path, *patterns: str) -> set[str]:
 def test_the_wheel_holds_the_packages_their_types_and_the_sample(wheel: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         packed = set(archive.namelist())
-    expected = names_in(ROOT / "pipeline", "*.py", "*.pyi", "*.j2", "py.typed")
+    expected = names_in(ROOT / "pipeline", "*.py", "*.pyi", "*.j2", "*.css", "py.typed")
     expected |= names_in(ROOT / "cli", "*.py", "py.typed")
     expected |= names_in(ROOT / "bench", "*.py")
     expected |= {f"pixcal/samples/{name}" for name in names_in(ROOT / "data_samples", "*")}
