@@ -16,12 +16,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.kernels.psf import Psf, expected_windows, fit_windows
+from pixcal.kernels.normal_matrix import root_diagonal
+from pixcal.kernels.psf import Psf
 
 F64 = NDArray[np.float64]
 Good = NDArray[np.bool_]
 # least variance of a pixel, as a share of the star's electrons: dark rings weigh no more
 TINY = 1e-9
+MAX_STEPS = 50
+PRECISION = 1e-9  # a fit has ended when its last step is shorter, px
+SINGULAR = 1e-12  # least eigenvalue of a normal matrix of unit diagonal that is solved
 
 
 @dataclass(frozen=True)
@@ -53,12 +57,7 @@ class Star:
         -------
         (n, side, side) float64
         """
-        return np.asarray(
-            expected_windows(
-                self.psf.coefficients, self.psf.step, place, offsets, self.electrons,
-                self.background,
-            )
-        )  # fmt: skip
+        return np.asarray(self.electrons * self._at(place, offsets)[0] + self.background)
 
     def fit(self, data: F64, offsets: F64, good: Good) -> F64:
         """Fit each star, starting from the middle of its window.
@@ -77,16 +76,32 @@ class Star:
         (n, 4) float64
             a, b (px), N, B (e-); NaN where the fit does not end.
         """
-        return np.asarray(
-            fit_windows(
-                self.psf.coefficients, self.psf.step, data, offsets, good, self.read_variance,
-                self.electrons * TINY, np.array([0.0, 0.0, self.electrons, self.background]),
-            )
-        )  # fmt: skip
+        # What pixels that are not used hold may be anything.
+        data, offsets = np.where(good, data, 0.0), np.where(good[:, None], offsets, 0.0)
+        found = np.full((len(data), 4), np.nan)
+        theta = np.tile([0.0, 0.0, self.electrons, self.background], (len(data), 1))
+        left = np.arange(len(data))
+        for _ in range(MAX_STEPS):
+            own = theta[left]
+            jacobian, weight, mean, _ = self._linear(own, offsets[left])
+            slopes = jacobian.reshape(len(left), 4, -1)
+            weighted = slopes * (weight * good[left]).reshape(len(left), 1, -1)
+            rest = (data[left] - mean).reshape(len(left), -1, 1)
+            step, told = _solved(weighted @ slopes.swapaxes(1, 2), (weighted @ rest)[:, :, 0])
+            length = np.hypot(step[:, 0], step[:, 1])
+            # No further than half a pixel at once: the shape is not linear beyond.
+            own = own + np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None] * step
+            inside = told & (np.hypot(own[:, 0], own[:, 1]) < self.side / 2)
+            done = inside & (length < PRECISION)
+            theta[left], found[left[done]] = own, own[done]
+            left = left[inside & ~done]
+            if not len(left):
+                break
+        return found
 
     def information(self, place: F64, good: Good | None = None) -> F64:
         """Fisher's information of a, b, N and B: (4, 4)."""
-        jacobian, weight, _ = self._linear(place, good)
+        jacobian, weight, _ = self._of_pixels(place, good)
         return np.asarray(np.einsum("iyx,jyx,yx->ij", jacobian, jacobian, weight))
 
     def bound(self, place: F64 | None = None) -> F64:
@@ -119,18 +134,41 @@ class Star:
             Error of the centroid (x, y) for each pixel's displacement (x, y) that the fit does not
             know; a displacement common to all moves the centroid by its opposite.
         """
-        jacobian, weight, slopes = self._linear(place, good)
+        jacobian, weight, slopes = self._of_pixels(place, good)
         covariance = np.linalg.inv(np.einsum("iyx,jyx,yx->ij", jacobian, jacobian, weight))
         return np.asarray(
             np.einsum("ai,iyx,yx,cyx->acyx", covariance[:2], jacobian, weight, slopes)
         )
 
-    def _linear(self, place: F64, good: Good | None) -> tuple[F64, F64, F64]:
-        """Derivatives by a, b, N, B; weights; and derivatives by the pixel's own place."""
-        y, x = np.mgrid[-self.half : self.half + 1, -self.half : self.half + 1]
-        value, along_x, along_y = self.psf.at(x - place[0], y - place[1])
-        slopes = self.electrons * np.stack([along_x, along_y])
-        jacobian = np.concatenate([-slopes, [value, np.ones_like(value)]])
-        mean = self.electrons * value + self.background
-        weight = 1 / (np.maximum(mean, 0) + self.read_variance + self.electrons * TINY)
+    def _of_pixels(self, place: F64, good: Good | None) -> tuple[F64, F64, F64]:
+        """Of one star: derivatives by a, b, N, B; weights; derivatives by the pixels' places."""
+        theta = np.array([[*place, self.electrons, self.background]])
+        jacobian, weight, _, slopes = (part[0] for part in self._linear(theta))
         return jacobian, weight if good is None else weight * good, slopes
+
+    def _linear(self, theta: F64, offsets: F64 | None = None) -> tuple[F64, F64, F64, F64]:
+        """About a, b, N, B (n, 4): derivatives by them, weights, mean, derivatives by the place."""
+        value, along_x, along_y = self._at(theta[:, :2], offsets)
+        electrons, background = theta[:, 2:, None, None].swapaxes(0, 1)
+        slopes = electrons[:, None] * np.stack([along_x, along_y], axis=1)
+        more = np.stack([value, np.ones_like(value)], axis=1)
+        mean = electrons * value + background
+        weight = 1 / (np.maximum(mean, 0) + self.read_variance + self.electrons * TINY)
+        return np.concatenate([-slopes, more], axis=1), weight, mean, slopes
+
+    def _at(self, place: F64, offsets: F64 | None) -> F64:
+        """Share of the light (3, n, side, side) that pixels receive, and its derivatives."""
+        y, x = np.mgrid[-self.half : self.half + 1, -self.half : self.half + 1]
+        a, b = place.T[:, :, None, None]
+        dx, dy = (0.0, 0.0) if offsets is None else offsets.swapaxes(0, 1)
+        return self.psf.at(x + dx - a, y + dy - b)
+
+
+def _solved(normal: F64, right: F64) -> tuple[F64, NDArray[np.bool_]]:
+    """Solutions (n, m) of normal equations, and which there are; the others are zero."""
+    scale = root_diagonal(normal)
+    unit = normal / (scale[:, :, None] * scale[:, None, :])
+    told = np.linalg.eigvalsh(unit)[:, 0] > SINGULAR
+    unit[~told] = np.eye(unit.shape[1])
+    step = np.linalg.solve(unit, (right / scale)[:, :, None])[:, :, 0] / scale
+    return np.where(told[:, None], step, 0.0), told
