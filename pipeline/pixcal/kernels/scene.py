@@ -1,7 +1,7 @@
 """What a bench looks like: its detector, its light and its frames, as arrays for `synthesis`."""
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -16,6 +16,7 @@ from pixcal.model.flags import PixelFlag
 # Rows and columns of the chip that share a generator. Another number would be another chip.
 TILE = (64, 256)
 Rows = tuple[int, int]
+Piece = tuple[slice, slice]
 
 
 @dataclass(frozen=True)
@@ -42,26 +43,15 @@ class DetectorMaps:
 
 def detector_maps(detector: SimulatedDetector, rows: Rows) -> DetectorMaps:
     """The detector's maps for rows of the window (first, one after the last)."""
-    (row, column), width = detector.origin, detector.shape[1]
-    y0, y1, x0, x1 = row + rows[0], row + rows[1], column, column + width
+    names = [field.name for field in fields(DetectorMaps)]
+    shape = rows[1] - rows[0], detector.shape[1]
     maps = DetectorMaps(
-        *(
-            np.empty((y1 - y0, width), np.uint8 if field.name == "mask" else np.float32)
-            for field in fields(DetectorMaps)
-        )
+        *(np.empty(shape, np.uint8 if name == "mask" else np.float32) for name in names)
     )
-    for ty in range(y0 // TILE[0], -(-y1 // TILE[0])):
-        for tx in range(x0 // TILE[1], -(-x1 // TILE[1])):
-            top, left = ty * TILE[0], tx * TILE[1]
-            part_y, part_x = (
-                slice(max(y0, top), min(y1, top + TILE[0])),
-                slice(max(x0, left), min(x1, left + TILE[1])),
-            )
-            tile = _chip_tile(detector, ty, tx)
-            inside = _shift(part_y, top), _shift(part_x, left)
-            window = _shift(part_y, y0), _shift(part_x, x0)
-            for field in fields(DetectorMaps):
-                getattr(maps, field.name)[window] = getattr(tile, field.name)[inside]
+    for ty, tx, inside, window in _tiles(detector, rows):
+        tile = _chip_tile(detector, ty, tx)
+        for name in names:
+            getattr(maps, name)[window] = getattr(tile, name)[inside]
     return maps
 
 
@@ -85,20 +75,23 @@ def chip_map(
     -------
     (y, x) float32
     """
+    out = np.empty((rows[1] - rows[0], detector.shape[1]), np.float32)
+    name = zlib.crc32(effect.encode())
+    for ty, tx, inside, window in _tiles(detector, rows):
+        out[window] = draw(generator(detector.seed, Stream.EFFECT, name, ty, tx))[inside]
+    return out
+
+
+def _tiles(detector: SimulatedDetector, rows: Rows) -> Iterator[tuple[int, int, Piece, Piece]]:
+    """Tiles of the chip under rows of the window: number, and the same pixels in tile and rows."""
     (row, column), width = detector.origin, detector.shape[1]
     y0, y1, x0, x1 = row + rows[0], row + rows[1], column, column + width
-    out = np.empty((y1 - y0, width), np.float32)
-    name = zlib.crc32(effect.encode())
     for ty in range(y0 // TILE[0], -(-y1 // TILE[0])):
         for tx in range(x0 // TILE[1], -(-x1 // TILE[1])):
             top, left = ty * TILE[0], tx * TILE[1]
-            part_y = slice(max(y0, top), min(y1, top + TILE[0]))
-            part_x = slice(max(x0, left), min(x1, left + TILE[1]))
-            tile = draw(generator(detector.seed, Stream.EFFECT, name, ty, tx))
-            out[_shift(part_y, y0), _shift(part_x, x0)] = tile[
-                _shift(part_y, top), _shift(part_x, left)
-            ]
-    return out
+            y = slice(max(y0, top), min(y1, top + TILE[0]))
+            x = slice(max(x0, left), min(x1, left + TILE[1]))
+            yield ty, tx, (_shift(y, top), _shift(x, left)), (_shift(y, y0), _shift(x, x0))
 
 
 def _shift(part: slice, by: int) -> slice:

@@ -26,8 +26,10 @@ from pixcal.estimators.frame_series.variance_components import (
     log_chance_of_any,
     sigmas,
 )
+from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way, dot
 from pixcal.simulation.forward import ForwardModel
+from pixcal.simulation.frame_changes import with_number
 
 F64 = NDArray[np.float64]
 
@@ -47,6 +49,8 @@ MOST = 3.0
 """Factor by which a step changes a parameter at most."""
 TELLING = 0.02
 """Share of the information from which a deviation is looked at again."""
+SINGULAR = 1e-6
+"""Share of the largest eigenvalue below which parameters are not told apart."""
 RANDOM = "what it adds, at random, to the second moments of frames, by its forward model"
 STEADY = "what it changes in frames and maps, beyond what the fit absorbs, by its forward model"
 
@@ -176,12 +180,12 @@ class _Fit:
     def together(self, templates: Sequence[Template]) -> tuple[F64, F64, float]:
         """As `amplitudes`, of what each model changes."""
         right, normal, variance = self.sums(templates)
-        inverse = _inverse(normal)
+        inverse = inverse_normal(normal, SINGULAR)
         size = inverse @ right
         error = np.sqrt(np.maximum(np.diag(inverse @ variance @ inverse), 0))
         if len(size) == 1:
             return size, error, float(right[0] / max(variance[0, 0], 1e-300) ** 0.5)
-        square = float(right @ _inverse(variance) @ right)
+        square = float(right @ inverse_normal(variance, SINGULAR) @ right)
         return size, error, sigmas(log_chance(square / 2, (len(size) + 1) // 2))
 
     def _each_strength(self, model: ForwardModel) -> list[ForwardModel]:
@@ -257,7 +261,7 @@ class _Fit:
         for _ in range(ROUNDS):
             slopes = self._slopes(model, names, at)
             right, normal, variance = self.sums(list(slopes.values()), at)
-            inverse = _inverse(normal)
+            inverse = inverse_normal(normal, SINGULAR)
             covariance = np.diag(inverse @ variance @ inverse)
             errors |= {n: float(v) ** 0.5 for n, v in zip(slopes, covariance, strict=True) if v > 0}
             step = dict(zip(slopes, inverse @ right, strict=True))
@@ -322,22 +326,6 @@ def _moved(model: ForwardModel, step: Mapping[str, float]) -> ForwardModel:
 
 def _replaced(model: ForwardModel, values: Mapping[str, float]) -> ForwardModel:
     """The model with other parameters, held within their ranges."""
-    limits = {f.name: f.metadata for f in dataclasses.fields(model)}
-    held = {}
     for name, value in values.items():
-        low, high, above = (limits[name].get(key) for key in ("low", "high", "above"))
-        if above is not None:
-            value = max(value, float(np.nextafter(above, np.inf)))
-        if low is not None:
-            value = max(value, float(low))
-        if high is not None:
-            value = min(value, float(high))
-        held[name] = float(value)
-    return dataclasses.replace(model, **held)
-
-
-def _inverse(matrix: F64) -> F64:
-    scale = np.sqrt(np.maximum(np.diag(matrix), 0))
-    scale = np.where(scale > 0, scale, 1.0)
-    both = np.outer(scale, scale)
-    return np.asarray(np.linalg.pinv(matrix / both, rcond=1e-6, hermitian=True) / both)
+        model = with_number(model, name, None, value)
+    return model

@@ -14,6 +14,7 @@ from pixcal.estimators.fringe_fit.geometry import TilePlane
 from pixcal.estimators.fringe_fit.local_basis import SCALE_PX, expand, powers
 from pixcal.estimators.fringe_fit.models import FringeShape
 from pixcal.estimators.fringe_fit.tile_sums import N_LOCAL, Carrier, TileSums
+from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
 
 F64 = NDArray[np.float64]
 
@@ -116,23 +117,16 @@ class ModeBasis:
     def covariance(self, normal: F64, spread: float) -> F64:
         """Covariance of the coefficients."""
         n = normal / spread + np.diag(self._precision(1.0))
-        scale = _scales(n)
-        return np.asarray(np.linalg.pinv(n / np.outer(scale, scale)) / np.outer(scale, scale))
+        return inverse_normal(n, 1e-15)
 
     def _precision(self, spread: float) -> F64:
         known = self.shape.precision * spread
         return np.concatenate([known, np.zeros(len(FRINGE_MODES))])
 
 
-def _scales(normal: F64) -> F64:
-    """Size of each mode; 1 for one that is zero all over the window (y on a single row)."""
-    size = np.sqrt(np.maximum(np.diag(normal), 0.0))
-    return np.where(size > 0, size, 1.0)
-
-
 def solve_modes(normal: F64, right: F64) -> F64:
     """Coefficients (mode, n); modes that the window cannot tell apart share what they explain."""
-    scale = _scales(normal)
+    scale = root_diagonal(normal)
     unit = normal / np.outer(scale, scale)
     return np.asarray(
         np.linalg.lstsq(unit, right / scale[:, None], rcond=1e-12)[0] / scale[:, None]

@@ -1,15 +1,16 @@
 """Shapes of the fringes over the window, one file each; found by `fringe_models`.
 
 A shape is what the offsets are measured from: a phase with a few parameters, whose derivatives are
-modes that the offsets cannot hold. A new one is a file with a class like `FringeShape` and a
+modes that the offsets cannot hold. A new one is a file with a subclass of `FringeShape` and a
 module-level ``SHAPE`` naming it.
 """
 
 import importlib
 import pkgutil
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,37 +34,45 @@ class Start:
     baseline_mm: tuple[float, float]  # nominal baseline (x, y)
 
 
-class FringeShape(Protocol):
+class FringeShape(ABC):
     """A shape with its present parameters."""
 
     # whether the phase is linear in the coefficients, so that one step is all
-    linear: ClassVar[bool]
+    linear: ClassVar[bool] = True
 
     @classmethod
+    @abstractmethod
     def start(cls, start: Start) -> Self:
         """Parameters near enough for Gauss-Newton steps to converge."""
 
     @property
+    @abstractmethod
     def names(self) -> tuple[str, ...]:
         """Names of the modes."""
 
     @property
     def precision(self) -> F64:
         """What is known beforehand: 1 / variance of each mode's coefficient, zero for nothing."""
+        return np.zeros(len(self.names))
 
     @property
     def prior_offset(self) -> F64:
         """Present coefficients, counted from what was known beforehand."""
+        return np.zeros(len(self.names))
 
+    @abstractmethod
     def phase(self, y: F64, x: F64) -> F64:
         """Phase (rad) at pixel coordinates that broadcast."""
 
+    @abstractmethod
     def modes(self, y: F64, x: F64) -> F64:
         """Derivatives (mode, y, x) of the phase with respect to the coefficients."""
 
+    @abstractmethod
     def moved(self, step: F64) -> Self:
         """The shape after a step of the coefficients."""
 
+    @abstractmethod
     def vector(self, y: float, x: float) -> tuple[float, float]:
         """Local fringe vector (kx, ky), rad/px."""
 
@@ -75,6 +84,7 @@ class FringeShape(Protocol):
         covariance : (mode, mode) float64
             Of the coefficients.
         """
+        return {}
 
 
 def fringe_models() -> dict[str, type[FringeShape]]:

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from scipy.optimize import least_squares
 
-from pixcal.estimators.fringe_fit.models import F64, Start
+from pixcal.estimators.fringe_fit.models import F64, FringeShape, Start
 from pixcal.kernels.optics import PARAMETERS, Geometry, fringe_vector, phase, phase_jacobian
 
 # the foot of the fibres' centre: the laboratory places it to less than 2 cm (paper, 5.2)
@@ -21,7 +21,7 @@ PRIOR_TILT = 0.02  # the baseline's tilt out of the detector's plane, as a share
 
 
 @dataclass(frozen=True)
-class Hyperbolic:
+class Hyperbolic(FringeShape):
     """Phase ``phase0 + 2 pi / lambda (|r - s_A| - |r - s_B|)``."""
 
     linear: ClassVar[bool] = False
@@ -119,7 +119,6 @@ class Hyperbolic:
         return np.array([0.0] + [1.0] * len(PARAMETERS))
 
     def phase(self, y: F64, x: F64) -> F64:
-        """Phase (rad) at pixel coordinates."""
         return np.asarray(self.phase0 + self._relative(self.geometry, y, x))
 
     def modes(self, y: F64, x: F64) -> F64:
@@ -137,7 +136,6 @@ class Hyperbolic:
         return np.concatenate([[0.0], away])
 
     def moved(self, step: F64) -> Self:
-        """The geometry after a step."""
         values = self.geometry.vector() + np.asarray(step[1:]) * np.array(self.sigma)
         return replace(
             self,
@@ -146,7 +144,6 @@ class Hyperbolic:
         )
 
     def vector(self, y: float, x: float) -> tuple[float, float]:
-        """Local fringe vector (kx, ky), rad/px."""
         kx, ky = fringe_vector(x, y, self.geometry)
         return float(kx), float(ky)
 

@@ -1,18 +1,16 @@
 """Straight fringes: one fringe vector for the whole window (paper, equation 4)."""
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from typing import Any, Self
 
 import numpy as np
 
-from pixcal.estimators.fringe_fit.models import F64, Start
+from pixcal.estimators.fringe_fit.models import F64, FringeShape, Start
 
 
 @dataclass(frozen=True)
-class Paraxial:
+class Paraxial(FringeShape):
     """Phase ``phase0 + kx (x - x_ref) + ky (y - y_ref)``."""
-
-    linear: ClassVar[bool] = True
 
     phase0: float
     kx: float
@@ -27,21 +25,9 @@ class Paraxial:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Piston and the two slopes."""
         return ("1", "x", "y")
 
-    @property
-    def precision(self) -> F64:
-        """Nothing is known beforehand."""
-        return np.zeros(3)
-
-    @property
-    def prior_offset(self) -> F64:
-        """Of no weight."""
-        return np.zeros(3)
-
     def phase(self, y: F64, x: F64) -> F64:
-        """Phase (rad) at pixel coordinates."""
         ry, rx = self.reference
         return np.asarray(self.phase0 + self.kx * (x - rx) + self.ky * (y - ry))
 
@@ -52,7 +38,6 @@ class Paraxial:
         return np.stack([np.ones(y.shape), (x - rx) / self.scale, (y - ry) / self.scale])
 
     def moved(self, step: F64) -> Self:
-        """The plane after a step."""
         return replace(
             self,
             phase0=self.phase0 + float(step[0]),
@@ -61,11 +46,9 @@ class Paraxial:
         )
 
     def vector(self, y: float, x: float) -> tuple[float, float]:
-        """The one fringe vector."""
         return self.kx, self.ky
 
     def facts(self, covariance: F64) -> dict[str, Any]:
-        """The fringe vector and its errors."""
         sigma = np.sqrt(np.maximum(np.diag(covariance), 0)) / self.scale
         return {
             "kx_rad_per_px": self.kx,
