@@ -9,7 +9,7 @@ from scipy import ndimage
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.significance import sigmas_of_count
 from pixcal.kernels.tracks import add_tracks, draw_tracks
 from pixcal.model.config import quantity
@@ -91,23 +91,12 @@ class CosmicHits(Effect):
         return np.minimum(found, np.float32(full))
 
     def tracks(
-        self,
-        rng: np.random.Generator,
-        count: int,
-        pitch_um: float,
-        shape: tuple[int, int],
+        self, rng: np.random.Generator, count: int, pitch_um: float, shape: tuple[int, int],
         margin_px: int = MARGIN_PX,
-    ) -> F64:
+    ) -> F64:  # fmt: skip
         """Draw tracks as `pixcal.kernels.tracks.draw_tracks` does, for pixels of some pitch."""
-        return draw_tracks(
-            rng,
-            count,
-            shape,
-            margin_px,
-            self.thickness_um / pitch_um,
-            self.electrons_per_um * pitch_um,
-            _STRAGGLING,
-        )
+        depth, electrons_per_px = self.thickness_um / pitch_um, self.electrons_per_um * pitch_um
+        return draw_tracks(rng, count, shape, margin_px, depth, electrons_per_px, _STRAGGLING)
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:
@@ -178,23 +167,14 @@ class _Search:
 
 def _searches(evidence: Evidence) -> Iterator[_Search]:
     area = (evidence.pitch_um * 1e-4) ** 2
-    for fringes in evidence.fringes.values():
-        yield _of_fringes(fringes, area)
+    for f in evidence.fringes.values():
+        # As in `CosmicHits.charge`.
+        seconds = f.exptime_s if f.exptime_s > 0 else float(np.median(np.diff(f.time_s)))
+        residual = np.where(f.good, f.residual, np.nan)
+        yield _search(residual, np.sqrt(f.variance), area * seconds)
     for stack in evidence.of_kind("dark"):
         if len(stack.adu) >= _MIN_FRAMES:
-            yield _of_darks(stack, evidence, area)
-
-
-def _of_fringes(fringes: FringeEvidence, area: float) -> _Search:
-    residual = np.where(fringes.good, fringes.residual, np.nan)
-    # As in `CosmicHits.charge`.
-    known = fringes.exptime_s > 0
-    seconds = fringes.exptime_s if known else float(np.median(np.diff(fringes.time_s)))
-    return _search(residual, np.sqrt(fringes.variance), area * seconds)
-
-
-def _of_darks(stack: Stack, evidence: Evidence, area: float) -> _Search:
-    return _search(*evidence.dark_noise(stack), area * np.nan_to_num(stack.exptime_s))
+            yield _search(*evidence.dark_noise(stack), area * np.nan_to_num(stack.exptime_s))
 
 
 def _search(residual: F32, sigma: F32, exposure: float) -> _Search:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.map_fit import gauge_terms, half_theta, neighbour_products, without
 from pixcal.kernels import optics
+from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.scene import TILE, DetectorMaps, LightMaps, Rows, chip_map, geometry
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
@@ -164,8 +165,7 @@ def _scatter(sets: list[FringeEvidence], width: float, bias_variance: float) -> 
         terms = np.array([gain, 1.0])
         normal += np.outer(terms, terms) / error**2
         right += terms * (float(white.mean()) - of_bias) / error**2
-    scale = np.sqrt(np.diag(normal))
-    covariance = np.linalg.pinv(normal / np.outer(scale, scale)) / np.outer(scale, scale)
+    covariance = inverse_normal(normal, 1e-15)
     return float(covariance[0] @ right), float(np.sqrt(covariance[0, 0]))
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.diagnosis.evidence import Evidence, Stack, stripes
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, stripes
 from pixcal.estimators.frame_series.series import (
     FrameSeries,
     assemble,
@@ -85,13 +85,18 @@ def light_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
         series = light_series(f)
         if series is None:
             continue
-        b, a = f.free[:, 0], np.hypot(f.free[:, 1], f.free[:, 2])
         changes = []
-        for channel, values in enumerate((b / b.mean(), a / b / np.median(a / b))):
+        for channel, values in enumerate(_levels(f)):
             noise, seen = float(series.noise[channel, channel]), float(np.var(values))
             changes.append((values - 1) * np.sqrt(max(1 - noise / max(seen, 1e-300), 0.0)))
         found.append((f.name, f.time_s, changes[0], changes[1]))
     return found
+
+
+def _levels(found: FringeEvidence) -> tuple[F64, F64]:
+    """Intensity over its mean and contrast over its median (t,), of every frame by itself."""
+    b, a = found.free[:, 0], np.hypot(found.free[:, 1], found.free[:, 2])
+    return b / b.mean(), a / b / np.median(a / b)
 
 
 def ambient_shares(evidence: Evidence) -> list[tuple[float, float]]:
@@ -123,12 +128,10 @@ def separate_powers(evidence: Evidence) -> float:
         series = light_series(f)
         if series is None:
             continue
-        noise = float(series.noise[1, 1])
-        b, a = f.free[:, 0], np.hypot(f.free[:, 1], f.free[:, 2])
-        seen = float(np.var(a / b / np.median(a / b)))
-        of_level += float(np.var(b / b.mean()))
-        of_contrast += seen - noise
-        chance += 2 * seen**2 / len(b)
+        of_intensity, seen = (float(np.var(values)) for values in _levels(f))
+        of_level += of_intensity
+        of_contrast += seen - float(series.noise[1, 1])
+        chance += 2 * seen**2 / len(f.free)
     least, most = (d**2 * of_level for d in IMBALANCE)
     if of_contrast <= SIGNIFICANT * np.sqrt(chance) or not least < of_contrast < most:
         return 0.0
