@@ -1,5 +1,6 @@
 """Report: one HTML page on the whole run."""
 
+import gc
 import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -80,7 +81,13 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         inputs = {stage: manifest.key for stage, manifest in manifests.items()}
 
         def body(made: Build) -> None:
-            page = render(_collect(run_dir, manifests, runtime))
+            contents = _collect(run_dir, manifests, runtime)
+            # What is there by now stays: the garbage collector need not look at it again and again.
+            gc.freeze()
+            try:
+                page = render(contents)
+            finally:
+                gc.unfreeze()
             (made.folder / "report.html").write_text(page, encoding="utf-8")
             made.summary = {"bytes": len(page.encode()), "sections": page.count("<section")}
 
