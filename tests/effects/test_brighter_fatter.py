@@ -156,6 +156,7 @@ def test_noise_alone_tells_it_when_it_is_large(acquired: Callable[..., Evidence]
     assert BrighterFatter.estimate(replace(evidence, fringes={}, stacks=())) is None
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("other", ["nonlinearity", "ipc"])
 def test_what_looks_like_it_is_not_taken_for_it(
     acquired: Callable[..., Evidence], other: str
@@ -165,6 +166,7 @@ def test_what_looks_like_it_is_not_taken_for_it(
     assert found.significance < 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("falloff", [0.35, 1.2])
 def test_by_itself_its_falloff_is_found_with_its_size(
     acquired: Callable[..., Evidence], falloff: float
@@ -195,6 +197,7 @@ def test_beside_a_bent_response_it_is_not_taken_to_be_alone(
     assert abs(found.effect.shift_px_per_e - 2e-7) < 4 * found.errors["shift_px_per_e"]
 
 
+@pytest.mark.long
 def test_boundaries_that_move_otherwise_between_rows_are_found(
     acquired: Callable[..., Evidence],
 ) -> None:

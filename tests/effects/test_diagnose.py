@@ -160,6 +160,7 @@ def test_a_run_that_was_stopped_goes_on(
     assert not list((run / ".partial").glob("diagnose-*"))
 
 
+@pytest.mark.long
 def test_left_out_it_is_not_put_on_another(with_lag: Path) -> None:
     found = diagnosed(with_lag, only=tuple(name for name in FEW if name != "lag"))
     assert found["verdict"] == "unexplained"
@@ -169,6 +170,7 @@ def test_left_out_it_is_not_put_on_another(with_lag: Path) -> None:
     assert {"contrast_by_step", "frames_before"} & worst
 
 
+@pytest.mark.long
 def test_in_the_nominal_bench_it_is_no_gap(
     with_lag: Path, tmp_path: Path, make_effect_bench: Callable[..., Bench]
 ) -> None:
@@ -180,6 +182,7 @@ def test_in_the_nominal_bench_it_is_no_gap(
     assert found["gap"]["total"] == 0
 
 
+@pytest.mark.long
 def test_of_a_nominal_bench_nothing_is_claimed(reduced: Callable[..., Path]) -> None:
     """Every effect is a candidate; the same on processes."""
     run = reduced()
@@ -192,6 +195,7 @@ def test_of_a_nominal_bench_nothing_is_claimed(reduced: Callable[..., Path]) -> 
     assert (run / "diagnose" / "curves.json").read_bytes() == written
 
 
+@pytest.mark.long
 def test_without_fringes_noise_and_intensity_are_looked_at(reduced: Callable[..., Path]) -> None:
     run = reduced(
         {"row_noise": {"row_rms": 6.0}},
@@ -294,6 +298,7 @@ class Flicker(Effect):
 '''
 
 
+@pytest.mark.long
 def test_an_effect_of_the_users_own_is_found(reduced: Callable[..., Path], tmp_path: Path) -> None:
     file = tmp_path / "flicker.py"
     file.write_text(OWN)

@@ -300,6 +300,7 @@ def test_noise_alone_tells_the_kernel_where_there_are_no_darks(acquired: Acquire
         assert periods["delta"][0] == 4
 
 
+@pytest.mark.long
 def test_maps_at_two_baselines_tell_it_best(acquired: Acquired) -> None:
     """A true displacement is the same at every interfringe, the shift by couplings is not."""
     one = Ipc.estimate(acquired(NO_DARKS, {"ipc": to_plain(Ipc())}))
@@ -327,6 +328,7 @@ def test_detector_frames_alone_are_enough(acquired: Acquired) -> None:
     assert Ipc.estimate(dark) is None
 
 
+@pytest.mark.long
 def test_a_share_that_falls_with_the_signal_is_noticed(acquired: Acquired) -> None:
     couplings = tuple(dataclasses.replace(c, per_ke=-0.008) for c in Ipc.nearest(0.03).couplings)
     changes = {"detector.hot_fraction": 0.01, "detector.hot_rate_e_s": 3.5e4}
@@ -341,6 +343,7 @@ def test_a_share_that_falls_with_the_signal_is_noticed(acquired: Acquired) -> No
 LOOK_ALIKES = ("row_noise", "brighter_fatter", "nonlinearity", "lag", "rolling_shutter")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", LOOK_ALIKES)
 def test_it_is_not_claimed_where_another_effect_is_on(acquired: Acquired, name: str) -> None:
     """They share noise, spoil hot pixels, or leave residuals that repeat; none couples pixels."""
@@ -349,6 +352,7 @@ def test_it_is_not_claimed_where_another_effect_is_on(acquired: Acquired, name: 
     assert found.significance < 4, found.why
 
 
+@pytest.mark.long
 def test_it_is_measured_among_other_effects(acquired: Acquired) -> None:
     others = {"brighter_fatter": {}, "row_noise": {}, "intensity_noise": {}}
     found = Ipc.estimate(acquired(None, {"ipc": to_plain(Ipc())} | others))
@@ -365,6 +369,7 @@ def without_modes(modes: F64, values: F64) -> F64:
     return values - np.tensordot(found, modes, 1)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("changes", [{}, FOUR_SETS], ids=["darks", "two baselines"])
 def test_undone_with_the_kernel_found_the_offsets_are_at_the_bound(
     acquired: Acquired, make_effect_bench: MakeBench, changes: dict[str, object]

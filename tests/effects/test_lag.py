@@ -131,6 +131,7 @@ def test_its_share_is_found(acquired: Callable[..., Evidence], truth: Lag) -> No
     assert found.significance > 20
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("quiet", [0.0, 1.0])
 def test_whether_what_comes_out_has_noise_shows_in_the_residuals(
     acquired: Callable[..., Evidence], quiet: float
@@ -143,6 +144,7 @@ def test_whether_what_comes_out_has_noise_shows_in_the_residuals(
     assert abs(effect.quiet - quiet) < 4 * error
 
 
+@pytest.mark.long
 def test_pixels_that_differ_tell_where_the_contrast_is_noisy(
     acquired: Callable[..., Evidence],
 ) -> None:
@@ -192,6 +194,7 @@ def test_a_bent_response_is_not_taken_for_it(acquired: Callable[..., Evidence]) 
         assert found.significance < 4
 
 
+@pytest.mark.long
 def test_traps_that_fill_up_are_measured_without_their_law(
     acquired: Callable[..., Evidence],
 ) -> None:

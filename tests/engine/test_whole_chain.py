@@ -89,10 +89,8 @@ def expected(chain: Chain) -> Path:
     return chain(Runtime("sync"))
 
 
-@pytest.mark.parametrize(
-    "place",
-    ["threads", *(pytest.param(p, marks=pytest.mark.long) for p in ("processes", "cluster"))],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("place", ["threads", "processes", "cluster"])
 def test_the_same_bits_wherever_it_runs(
     chain: Chain, expected: Path, place: str, request: Any
 ) -> None:

@@ -230,6 +230,7 @@ def test_the_folder_holds_no_trace_of_the_truth(tmp_path: Path) -> None:
     assert '"seed"' not in text
 
 
+@pytest.mark.long
 def test_cases_of_the_second_bench_differ_in_their_samples_alone(tmp_path: Path) -> None:
     """What a case holds is not seen without looking at samples; whose bench it is may be."""
     found = []
@@ -551,7 +552,12 @@ WANDERING = drawn("hyperbolic_fringes", 60.0)
         (Truth(ONE, "lag", (KERNEL,)), None, (1.5, 50.0)),
         (Truth(ONE, "lag", (WANDERING,)), WANDERING, (0.9, 50.0)),
         (Truth(NOTHING, "lag"), None, (0.9, 1.15)),
-        (Truth(SECOND_NOTHING, "lag", second=SecondCase("ordinary/aim", 5, 0)), None, (0.9, 1.15)),
+        pytest.param(
+            Truth(SECOND_NOTHING, "lag", second=SecondCase("ordinary/aim", 5, 0)),
+            None,
+            (0.9, 1.15),
+            marks=pytest.mark.long,
+        ),
     ],
     ids=["undone", "not named", "another shape", "nothing", "nothing, on the second bench"],
 )

@@ -83,7 +83,9 @@ def cluster() -> Iterator[Runtime]:
         yield Runtime(made.scheduler_address)
 
 
-@pytest.fixture(params=["threads", pytest.param("processes", marks=pytest.mark.long), "cluster"])
+@pytest.fixture(
+    params=["threads", *(pytest.param(p, marks=pytest.mark.long) for p in ("processes", "cluster"))]
+)
 def runtime(request: pytest.FixtureRequest) -> Runtime:
     if request.param == "cluster":
         found: Runtime = request.getfixturevalue("cluster")
