@@ -4,12 +4,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pixcal.report.colours import BLUE, GREY, INK, RED
 from pixcal.report.drawing import WIDE, axes_grid, finish
 
 Curves = Mapping[str, Any]
+
+AXES = ("rows", "columns"), ("y", "x"), (BLUE, RED)  # of profiles, their coordinate, colour
 
 
 def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
@@ -62,34 +65,43 @@ def nonuniformity(patterns: Mapping[str, Curves]) -> Figure:
         the means.
     """
     figure, grid = axes_grid(
-        (WIDE, 2.6 * len(patterns) + 0.3), len(patterns), 2, beside=1.0, width_ratios=[1, 1.3]
-    )
-    for (left, right), (name, curves) in zip(grid, patterns.items(), strict=True):
+        (WIDE, 2.6 * len(patterns) + 0.3), len(patterns), 3, right=0.1, beside=0.85,
+        width_ratios=[1.3, 1, 1],
+    )  # fmt: skip
+    for (spectrum, *profiles), (name, curves) in zip(grid, patterns.items(), strict=True):
         unit = str(curves["unit"]).replace("e-", "e⁻")
-        peak = False
-        for along, axis, colour in (("rows", "y", BLUE), ("columns", "x", RED)):
+        _spectra(spectrum, curves)
+        spectrum.set_ylabel(f"{name} ({unit})")
+        for axes, along, axis, colour in zip(profiles, *AXES, strict=True):
             part = curves[along]
-            left.plot(
-                part["frequency"], part["amplitude"], color=colour, linewidth=0.9,
-                label=f"along {along}",
-            )  # fmt: skip
-            if part["noise"] > 0:
-                left.axhline(part["noise"], color=colour, ls="--", linewidth=1)
-            peak |= max(part["amplitude"]) > 10 * float(np.median(part["amplitude"]))
-            label = f"{along}, against {axis}"
-            right.plot(part["at"], part["profile"], color=colour, linewidth=0.8, label=label)
-        left.set(xlim=(0, 0.5), xlabel="frequency (cycles/px)", ylabel=f"{name} ({unit})")
-        if peak:
-            left.set_yscale("log")
-        else:
-            left.set_ylim(bottom=0)
-        right.axhline(0, color=INK, linewidth=0.8)
-        right.set(xlabel="x or y (px)", ylabel=f"{name}: mean ({unit})")
-        right.margins(x=0.01)
-        for axes in (left, right):
+            axes.plot(part["at"], part["profile"], color=colour, linewidth=0.8)
+            axes.axhline(0, color=INK, linewidth=0.8)
+            axes.set(xlabel=f"{axis} (px)", ylabel=f"mean of {along} ({unit})")
+            axes.margins(x=0.01)
+            axes.locator_params(nbins=5)
             finish(axes)
-            axes.legend(fontsize=9, frameon=False, ncols=2, loc="upper right")
     return figure
+
+
+def _spectra(axes: Axes, curves: Curves) -> None:
+    """Spectra along rows and columns, the weaker one in front."""
+    peaks = []
+    for along, _, colour in zip(*AXES, strict=True):
+        part = curves[along]
+        middle = float(np.median(part["amplitude"]))
+        peaks.append(max(part["amplitude"]) > 10 * middle)
+        look: Any = {"color": colour, "zorder": 3 - middle / (1 + middle)}
+        axes.plot(part["frequency"], part["amplitude"], lw=0.9, label=f"along {along}", **look)
+        if part["noise"] > 0:
+            axes.axhline(part["noise"], color=colour, ls="--", linewidth=1)
+    axes.set(xlim=(0, 0.5), xlabel="frequency (cycles/px)")
+    if any(peaks):
+        axes.set_yscale("log")
+        axes.minorticks_off()
+    else:
+        axes.set_ylim(bottom=0)
+    finish(axes)
+    axes.legend(fontsize=9, frameon=False, ncols=2, loc="upper right")
 
 
 def linearity(levels: Sequence[Mapping[str, Any]]) -> Figure:
