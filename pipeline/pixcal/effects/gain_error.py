@@ -10,6 +10,7 @@ from pixcal.estimators.detector.transfer_curve import (
     MIN_PIXELS,
     STEPS,
     residual_sums,
+    shared_steps,
     shot_share,
     sums_of_stacks,
     transfer_curve,
@@ -114,7 +115,7 @@ def shot_share_of_flats(evidence: Evidence) -> tuple[float, float] | None:
     changes it by one factor: the former is taken out as the levels show it or, where the lamp was
     changed between them, by the noise at level zero.
     """
-    pooled = shot_share(sums_of_stacks(evidence))
+    pooled = shot_share(sums_of_stacks(evidence), shared_steps(evidence))
     curve = transfer_curve(evidence)
     if pooled is None or curve is None:
         return pooled

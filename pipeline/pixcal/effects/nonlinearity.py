@@ -138,6 +138,7 @@ class Nonlinearity(Effect):
         """
         level = _full_scale(evidence, cls().level_e)
         ladder, curve = ladder_response(evidence, level), _of_noise(evidence, level)
+        by_levels = ladder is not None and (curve is None or ladder[1][0, 0] < curve[1][0, 0])
         if evidence.fringes:
             shifts = boundary_shifts(FALLOFF_PX)
             part = middle(evidence)
@@ -145,7 +146,7 @@ class Nonlinearity(Effect):
             known = None if noise is None else (noise.size, noise.variance)
             sizes, covariance = fit_response(part, level, 2, shifts, known)
             why = "second and third harmonic of the fringes in the residuals"
-        elif ladder is not None:
+        elif ladder is not None and by_levels:
             sizes, covariance = ladder
             why = "flat levels that are not proportional to the exposure time"
         elif curve is not None:

@@ -147,17 +147,18 @@ class Quantisation(Effect):
         """Step by the codes that never come, widths by how often the others do.
 
         None where samples are no whole numbers, or too few. Where the noise is below one step the
-        light is no smooth function of the code: then fringes tell, from where shot noise is as
-        large as a step.
+        light is no smooth function of the code: then fringes tell, or flats, from where shot noise
+        is as large as a step.
         """
-        fringes = [f.adu for f in evidence.fringes.values()]
-        counts = histogram([*(s.adu for s in evidence.stacks), *fringes], evidence.good)
+        lit = [f.adu for f in evidence.fringes.values()]
+        counts = histogram([*(s.adu for s in evidence.stacks), *lit], evidence.good)
         if counts is None or not counts.any():
             return None
         step, step_error = step_of(counts)
         noise, first = evidence.read_noise / evidence.gain / step, 0.0
-        if noise < LEAST_NOISE and fringes:
-            counts = histogram(fringes, evidence.good)
+        lit = lit or [s.adu for s in evidence.of_kind("flat")]
+        if noise < LEAST_NOISE and lit:
+            counts = histogram(lit, evidence.good)
             shot = LEAST_NOISE**2 - noise**2
             first = float(np.median(evidence.bias)) / step + shot * step * evidence.gain
             noise = LEAST_NOISE

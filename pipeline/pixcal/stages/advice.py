@@ -147,7 +147,12 @@ def _limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json 
 def _row(
     cause: Json, correction: Json | None, sigma: Mapping[str, float]
 ) -> tuple[str, str, str, str]:
-    return cause["effect"], size_of(cause), _moved(cause, sigma), _action(cause, correction)
+    return (
+        cause["effect"],
+        size_of(cause),
+        _moved(cause, sigma),
+        _action(cause, correction, bool(sigma)),
+    )
 
 
 def _moved(cause: Json, sigma: Mapping[str, float]) -> str:
@@ -160,12 +165,15 @@ def _moved(cause: Json, sigma: Mapping[str, float]) -> str:
     )
 
 
-def _action(cause: Json, correction: Json | None) -> str:
+def _action(cause: Json, correction: Json | None, with_maps: bool) -> str:
     """How an effect was treated, or what to do about it."""
     action = _on_map(cause)["action"]
     treated = {e["effect"]: e for e in (correction or {}).get("effects", ())}.get(cause["effect"])
     why = treated["why"] if treated else _reason(cause)
-    if action == "corrected":
+    if not with_maps and action in ("corrected", "unaffected"):
+        ends = "corrected for it" if action == "corrected" else f"unaffected: {why}"
+        text = f"maps of offsets measured with this detector would be {ends}"
+    elif action == "corrected":
         done = treated is not None and _corrects(treated["treatment"])
         text = "maps corrected" if done else "NOT corrected: run 'pixcal fit RUN --with-diagnosis'"
     elif action == "unaffected":

@@ -71,7 +71,7 @@ def _transfer_curve(evidence: Evidence) -> TransferCurve | None:
     points = []
     for stack in filter(_is_enough, evidence.ladder):
         sums = _of_stack(stack, evidence)
-        share = None if sums is None else shot_share([sums, *darks])
+        share = None if sums is None else shot_share([sums, *darks], shared_steps(evidence))
         level = float((stack.adu.mean(axis=0) - evidence.bias)[evidence.good].mean())
         if share is not None and level > 0:
             points.append((level * evidence.gain, *share))
@@ -90,14 +90,32 @@ def _transfer_curve(evidence: Evidence) -> TransferCurve | None:
     return TransferCurve(*at_zero, *rise, top, level, share, error)
 
 
-def shot_share(sums: Iterable[F64]) -> tuple[float, float] | None:
-    """Noise that grows with the level over that expected, with its error; None without samples."""
+def shared_steps(evidence: Evidence) -> NDArray[np.bool_]:
+    """Which of `STEPS` count: where flats told the gain, only those found to share noise.
+
+    The others would add nothing but their own noise.
+    """
+    if np.isnan(evidence.photon_transfer[0]):
+        return np.ones(len(STEPS), np.bool_)
+    counted = {(0, 0), *evidence.neighbours, *((-y, -x) for y, x in evidence.neighbours)}
+    return np.array([(int(y), int(x)) in counted for y, x in STEPS])
+
+
+def shot_share(
+    sums: Iterable[F64], counted: NDArray[np.bool_] | None = None
+) -> tuple[float, float] | None:
+    """Noise that grows with the level over that expected, with its error; None without samples.
+
+    ``counted`` tells which of `STEPS` to add to the first, all by default.
+    """
     total = sum(sums, np.zeros((len(STEPS), 7)))
     if not total[0, 0]:
         return None
     share = variance = 0.0
     for number, (n, s11, s12, s22, p1, p2, square) in enumerate(total):
         own = number == 0
+        if counted is not None and not counted[number]:
+            continue
         normal, right = np.array([[s11, s12], [s12, s22]]), np.array([p1, p2])
         scatter = square / n - own
         known = scatter / _READ_KNOWN**2
@@ -132,15 +150,18 @@ def _of_stack(stack: Stack, evidence: Evidence) -> F64 | None:
         return None
     frames = (stack.adu - evidence.bias.astype(np.float32)) * np.float32(evidence.gain)
     level = frames.mean(axis=0)
-    noise = np.maximum(level, 0) + np.float32(evidence.read_noise**2)
-    # What a frame has more: of light, or of bias.
-    pattern = np.where(good, level if stack.kind == "flat" else 1, 0).astype(np.float32)
+    # What a frame has more: of light, or of bias. Pixels' own levels are too noisy to say how much
+    # noise to expect: that would come out too small a share of it.
+    pattern = evidence.flat if stack.kind == "flat" else np.ones(level.shape)
+    pattern = np.where(good, pattern, 0).astype(np.float32)
+    usual = pattern * max(float(level[good].mean() / pattern[good].mean()), 0.0)
+    noise = usual + np.float32(evidence.read_noise**2)
     more = (frames - level) * (pattern / noise)
     change = more[:, good].sum(axis=1) / (pattern**2 / noise).sum()
-    model = level + change[:, None, None] * pattern
+    brighter = change[:, None, None] * pattern
     ones = np.ones(level.shape)
     return residual_sums(
-        frames - model, model, ones, evidence.read_noise**2 * ones, good,
+        frames - level - brighter, usual + brighter, ones, evidence.read_noise**2 * ones, good,
         np.ones((len(frames), 1)), (noise / len(frames))[None], np.full(len(STEPS), 1 / pixels),
     )  # fmt: skip
 

@@ -188,14 +188,28 @@ def pixel_peakedness(look: Look) -> Curve:
     sets=False,
 )
 def read_noise(evidence: Evidence) -> Curve | None:
-    """Quantiles over all pixels of their variance over the read noise's."""
+    """Quantiles over the pixels of their variance over the read noise's.
+
+    Of masked pixels only those count that jump between levels: white noise is why they are masked.
+    """
     stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= 8]
     if not stacks or not evidence.dithered:
         return None
     # Of whole numbers a median jumps by a code.
     frames = stacks[0].adu - stacks[0].adu[:, evidence.good].mean(axis=1)[:, None, None]
     variance = np.var(frames, axis=0, ddof=1) * (evidence.gain / evidence.read_noise) ** 2
-    return Curve(np.array(QUANTILES), ranges_about(variance.ravel(), QUANTILES))
+    counted = evidence.good | _jumping(frames)
+    return Curve(np.array(QUANTILES), ranges_about(variance[counted], QUANTILES))
+
+
+def _jumping(frames: F32) -> Mask:
+    """Pixels (y, x) of frames (t, y, x) that stay at a level, or whose noise has a flat top."""
+    off = frames - frames.mean(axis=0)
+    square = np.maximum((off**2).mean(axis=0), np.finfo(np.float32).tiny)
+    steps = (np.diff(off, axis=0) ** 2).mean(axis=0) / (2 * square)
+    peak = (off**4).mean(axis=0) / square**2 - 3
+    error = 1 / np.sqrt(len(frames))
+    return np.asarray((steps < 1 - 2 * error) | (peak < -2 * np.sqrt(24) * error))
 
 
 def ranges_about(values: F64, quantiles: Sequence[float]) -> F64:

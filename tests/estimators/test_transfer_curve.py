@@ -1,0 +1,96 @@
+"""Detector frames tell gain, response and converter, of a camera with little noise too."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from pixcal.effects.nonlinearity import Nonlinearity
+from pixcal.effects.quantisation import Quantisation
+from pixcal.estimators.detector.transfer_curve import transfer_curve
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.estimators.diagnosis.test_statistics.noise import read_noise
+
+SHAPE = (93, 101)
+READ, GAIN, BIAS, DARK = 1.0, 1.5, 200.3, 0.4
+
+
+def evidence(seed: int = 1, quadratic: float = 0.0, read: float = READ) -> Evidence:
+    """Ten flats in pairs, and bias and dark frames whose signal is about the read noise."""
+    rng = np.random.default_rng(seed)
+    response = 1 + 0.01 * rng.standard_normal(SHAPE)
+
+    def stack(kind: str, frames: int, seconds: float, light: float) -> Stack:
+        charge = rng.poisson(light * response + DARK * seconds, (frames, *SHAPE)).astype(float)
+        charge *= 1 + quadratic * charge / 2e4
+        charge += read * rng.standard_normal(charge.shape)
+        adu = np.rint(BIAS + charge / GAIN).astype(np.float32)
+        return Stack(kind, seconds, np.arange(float(frames)), adu, step=int(light))
+
+    levels = np.linspace(1500, 18000, 8)
+    return Evidence(
+        fringes={},
+        stacks=(
+            stack("bias", 40, 0.0, 0), stack("dark", 10, 1.0, 0),
+            *(stack("flat", 2, 0.0, float(level)) for level in levels),
+        ),
+        gain=GAIN, read_noise=float(np.hypot(read, GAIN / np.sqrt(12))), amplifier_noise=read,
+        bias=np.full(SHAPE, BIAS), dark_rate=np.full(SHAPE, DARK), flat=response,
+        good=np.ones(SHAPE, np.bool_), saturation_adu=65535.0, pitch_um=5.0, wavelength_nm=600.0,
+        distance_mm=1000.0, photon_transfer=(GAIN, 0.01, 1.0),
+    )  # fmt: skip
+
+
+def test_dark_signal_of_the_order_of_the_read_noise_leaves_the_photon_transfer_right() -> None:
+    curve = transfer_curve(evidence())
+    assert curve is not None
+    assert abs(curve.share - 1) < 4 * curve.error < 0.04
+    assert abs(curve.slope) < 4 * curve.slope_error
+
+
+def test_photon_transfer_tells_a_response_that_bends() -> None:
+    found = Nonlinearity.estimate(evidence(2, quadratic=-0.04))
+    assert found is not None
+    assert isinstance(found.effect, Nonlinearity)
+    at_2e4 = found.effect.quadratic * 2e4 / found.effect.level_e
+    error = found.errors["quadratic"] * 2e4 / found.effect.level_e
+    assert abs(at_2e4 + 0.04) < 4 * error < 0.04
+    assert found.significance > 4
+
+
+@pytest.mark.parametrize("missing", [0.0, 0.1])
+def test_flats_tell_missing_codes_where_the_read_noise_is_below_a_code(missing: float) -> None:
+    given = evidence(3, read=0.5)
+    there = np.random.default_rng(4).random(1 << 14) >= missing
+    there[-1] = True
+    codes = np.flatnonzero(there)
+    code = codes[np.searchsorted(codes, np.arange(1 << 14))].astype(np.float32)
+    stacks = tuple(replace(s, adu=code[s.adu.astype(int)]) for s in given.stacks)
+    found = Quantisation.estimate(replace(given, stacks=stacks))
+    assert found is not None
+    assert (found.significance > 10) == (missing > 0)
+    assert found.significance > 10 or found.significance < 4
+
+
+def with_pixels(noise: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Read-noise statistic with masked pixels that have a noise (t, pixel), and without."""
+    given = evidence(5)
+    bias, *others = given.stacks
+    adu, good = bias.adu.copy(), given.good.copy()
+    adu[:, 3, : noise.shape[1]] += noise.astype(np.float32)
+    good[3, : noise.shape[1]] = False
+    changed = replace(given, stacks=(replace(bias, adu=adu), *others), good=good)
+    found, before = read_noise.measure(changed), read_noise.measure(given)
+    assert found is not None
+    assert before is not None
+    return found.value, before.value
+
+
+def test_masked_pixels_are_part_of_the_read_noise_only_if_they_jump() -> None:
+    rng = np.random.default_rng(6)
+    loud, quiet = with_pixels(10 * rng.standard_normal((40, 60)))
+    assert loud == pytest.approx(quiet, rel=0.05)
+    jumps = 20.0 * ((rng.random((40, 60)) < 0.2).cumsum(axis=0) % 2)
+    loud, quiet = with_pixels(jumps)
+    assert loud[-1] > 2 * quiet[-1]
