@@ -324,6 +324,15 @@ def test_a_replay_that_is_likelier_than_the_law_is_taken() -> None:
     assert found.by_law["left"].effects == (law.estimate.effect,)  # type: ignore[union-attr]
 
 
+def test_a_replay_is_taken_whose_law_is_without_promise() -> None:
+    wrong, other = candidate("left", 0.1), candidate("little", 0.002)
+    wrong.replay = candidate("left", 0.03).estimate.effect  # type: ignore[union-attr]
+    found, left = search({"left": 0.03, "little": 0.002}, [wrong, other])
+    assert found.accepted[0] == "left"
+    assert found.final.effects[0] == wrong.replay
+    assert left < 0.05
+
+
 def test_a_cause_beyond_the_most_is_told_that_no_more_were_sought() -> None:
     truth = dict.fromkeys(SINGLE, 0.03)
     found, _ = search(truth, [candidate(label, 0.03) for label in SINGLE])

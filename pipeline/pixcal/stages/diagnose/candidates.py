@@ -71,7 +71,7 @@ class Candidate:
         return self.estimate.by_law
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Addition:
     """A variant of a candidate, added to the causes.
 

@@ -190,12 +190,22 @@ class Search:
             for name, addition in likeliest(once).items():
                 remaining[name].alone = addition.trial
         least = PROMISING * max((one.gain for one in once), default=0.0)
-        promising = [(o.name, o.effect) for o in once if o.gain >= least]
-        tried = self._added(causes, remaining, promising, SCREEN, label)
+        hopeful = {one.name for one in once if one.gain >= least}
+        # A replay is held against the best of its laws, which may be without promise itself.
+        laws = likeliest(o for o in once if o.effect != remaining[o.name].replay)
+        promising = [
+            one
+            for one in once
+            if one.gain >= least or (one.name in hopeful and one in laws.values())
+        ]
+        tried = self._added(
+            causes, remaining, [(o.name, o.effect) for o in promising], SCREEN, label
+        )
         if all(one.gain < needed_gain(remaining[one.name]) for one in tried):
-            others = [(o.name, o.effect) for o in once if 0 < o.gain < least]
+            rest = [one for one in once if one not in promising]
+            others = [(one.name, one.effect) for one in rest if one.gain > 0]
             tried += self._added(causes, remaining, others, SCREEN, label)
-            tried += [o for o in once if o.gain <= min(least, 0)]
+            tried += [one for one in rest if one.gain <= 0]
         replays = [o for o in tried if o.effect == remaining[o.name].replay]
         return likeliest(o for o in tried if o not in replays), likeliest(replays)
 
