@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pixcal.report.colours import BLUE, GREY, INK, RED
-from pixcal.report.drawing import WIDE, axes_grid, finish
+from pixcal.report.drawing import WIDE, axes_grid, finish, plain_ticks
 
 Curves = Mapping[str, Any]
 
@@ -41,6 +41,8 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
     if curve["read_variance"] > 0:
         left.axhline(curve["read_variance"], color=GREY, ls=":", label="read noise")
     left.set(xscale="log", yscale="log", xlabel="level (ADU)", ylabel="variance (ADU²)")
+    low, high = left.get_xlim()
+    plain_ticks(left.xaxis, low, high, most=5)
     right.errorbar(level, variance / line, error / line, **look)
     right.axhline(1, color=INK, linewidth=1.2)
     right.set(xlabel="level (ADU)", ylabel="variance over the line")
@@ -99,7 +101,8 @@ def _spectra(axes: Axes, curves: Curves) -> None:
         axes.set_yscale("log")
         axes.minorticks_off()
     else:
-        axes.set_ylim(bottom=0)
+        top = max(max(curves[along]["amplitude"]) for along in AXES[0])
+        axes.set_ylim(0, 1.3 * top)
     finish(axes)
     axes.legend(fontsize=9, frameon=False, ncols=2, loc="upper right")
 
