@@ -7,7 +7,8 @@ import pytest
 from astropy.io import fits
 
 from pixcal.model.errors import DamagedError
-from pixcal.storage.fits_map import FitsMap, content_digest
+from pixcal.storage.fits_map import FitsMap
+from pixcal.storage.manifest import file_digest
 from pixcal.storage.products import write_map
 
 SHAPE = (61, 67)
@@ -85,14 +86,14 @@ def test_what_is_not_there(tmp_path: Path, product: Path) -> None:
     with pytest.raises(DamagedError, match="nowhere"):
         FitsMap.open(tmp_path / "nowhere.fits")
     with pytest.raises(DamagedError, match="nowhere"):
-        content_digest(tmp_path / "nowhere.fits")
+        file_digest(tmp_path / "nowhere.fits")
     with pytest.raises(DamagedError, match="delta_x"):
         FitsMap.open(product, "WEIGHT")
 
 
 def test_the_digest_is_of_the_content(product: Path, tmp_path: Path) -> None:
-    before = content_digest(product)
+    before = file_digest(product)
     (tmp_path / "copy.fits").write_bytes(product.read_bytes())
-    assert content_digest(tmp_path / "copy.fits") == before
+    assert file_digest(tmp_path / "copy.fits") == before
     flip(product, 5000)
-    assert content_digest(product) != before
+    assert file_digest(product) != before

@@ -43,9 +43,9 @@ from pixcal.storage.artefact import (
     write_json,
     write_manifest,
 )
-from pixcal.storage.fits_map import content_digest
 from pixcal.storage.fits_out import COMPRESSED, FrameWriter
 from pixcal.storage.formats import STAGES, Stage
+from pixcal.storage.manifest import file_digest
 
 # maps that are told; read noise and gain of a simulated detector are the same in all pixels
 TRUTH_MAPS = tuple(f for f in fields(DetectorMaps) if f.name not in ("read_noise", "adu_per_e"))
@@ -112,7 +112,7 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
     if truth.is_relative_to(out) or out.is_relative_to(truth):
         raise InputError(f"--truth {truth}: one inside the other with {out}; keep the truth apart")
     effects = _checked_effects(plan, bench, config.own)
-    own = {f"effect {file.name}": content_digest(file) for file in config.own}
+    own = {f"effect {file.name}": file_digest(file) for file in config.own}
     stage, told = STAGES["simulate"], STAGES["simulate-truth"]
     key = artefact_key(stage.name, stage.format, to_plain(plan), own)
     before, truth_before = _standing(out, stage, "--out"), _standing(truth, told, "--truth")

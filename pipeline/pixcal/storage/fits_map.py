@@ -1,6 +1,5 @@
 """Maps in FITS files read block by block: one of 46 Mpix need not be in memory."""
 
-import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -103,12 +102,3 @@ def encoded(total: int) -> str:
         columns.append(parts)
     text = bytes(column[n] for n in range(4) for column in columns).decode("ascii")
     return text[-1] + text[:-1]
-
-
-def content_digest(path: Path) -> str:
-    """SHA-256 of a file, hex, 32 characters."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()[:32]
-    except OSError as error:
-        raise DamagedError(f"{path}: cannot be read ({error.strerror})", path) from error

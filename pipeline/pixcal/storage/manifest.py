@@ -49,9 +49,18 @@ def digest(*parts: Any) -> str:
 
 
 def file_digest(path: Local) -> str:
-    """SHA-256 (hex, 32 characters) of a file."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()[:32]
+    """SHA-256 (hex, 32 characters) of a file.
+
+    Raises
+    ------
+    DamagedError
+        If it cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()[:32]
+    except OSError as error:
+        raise DamagedError(f"{path}: cannot be read ({error.strerror})", path) from error
 
 
 def _json(data: Any) -> str:
@@ -155,12 +164,7 @@ def check_intact(folder: Path, manifest: Manifest) -> None:
     for name in damaged_files(folder):
         raise DamagedError(f"{folder / name}: damaged", folder / name)
     for name, expected in manifest.files.items():
-        try:
-            same = file_digest(folder / name) == expected
-        except OSError as error:
-            reason = f"cannot be read ({error.strerror})"
-            raise DamagedError(f"{folder / name}: {reason}", folder / name) from error
-        if not same:
+        if file_digest(folder / name) != expected:
             raise DamagedError(f"{folder / name}: altered since it was written", folder / name)
 
 

@@ -33,10 +33,6 @@ class UrlPath:
     def __truediv__(self, name: str) -> "UrlPath":
         return UrlPath(f"{self.url}/{name}")
 
-    def joinpath(self, *names: str) -> "UrlPath":
-        """The file or folder further down."""
-        return UrlPath("/".join([self.url, *names]))
-
     @property
     def name(self) -> str:
         """Last part of the URL."""

@@ -45,8 +45,8 @@ from pixcal.stages.astrometry.telescope import Telescope, exposures, star
 from pixcal.stages.astrometry.truth import BAND, free_from_modes
 from pixcal.stages.fitted_shape import fitted_shape
 from pixcal.storage.artefact import Build, Manifest, read_json, write_json
-from pixcal.storage.fits_map import content_digest
 from pixcal.storage.formats import STAGES
+from pixcal.storage.manifest import file_digest
 from pixcal.storage.stage import copy_products, make, read_acquisition, working
 
 SCHEMA = "pixcal/astrometry/1"
@@ -92,9 +92,9 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         fit = read_json(run_dir / "fit" / "fit.json")
         components = open_components(run_dir, fit, config.truth)
         for component in components:
-            inputs[component.delta.path.name] = content_digest(component.delta.path)
+            inputs[component.delta.path.name] = file_digest(component.delta.path)
             for _, image in component.truth:
-                inputs[f"truth/{image.path.name}"] = content_digest(image.path)
+                inputs[f"truth/{image.path.name}"] = file_digest(image.path)
 
         def body(made: Build) -> None:
             _measure(run_dir, made, components, fit, acquisition, telescope, config, runtime)
