@@ -59,9 +59,13 @@ def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
     reduced, found = opened.reduction, json.loads((run / "products/diagnosis.json").read_text())
     figures = reduced["figures_of_merit"]
 
-    def off(name: str, true: float) -> float:
-        value = figures.get(name, {}).get("value")
-        return float("nan") if value is None else round(value / true - 1, 5)
+    def value(name: str) -> float:
+        found = figures.get(name, {}).get("value")
+        return float("nan") if found is None else float(found)
+
+    # The read noise that was drawn is that of single pixels.
+    rows = figures.get("row_noise", {}).get("value", 0.0)
+    noise = np.sqrt(max(value("read_noise") ** 2 - rows**2, 0.0))
 
     mask = np.asarray(opened.detector["mask"]) != 0
     true = np.zeros(mask.size, np.bool_)
@@ -75,8 +79,8 @@ def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
         "right": bool(right), "verdict": found["verdict"], "named": named,
         "p": [cause["p_value"] for cause in found["causes"]],
         "where": [w["statistic"] for w in found["gap"].get("where", [])][:4],
-        "gain_off": off("conversion_gain", truth["gain"]),
-        "noise_off": off("read_noise", truth["read_noise_e"]),
+        "gain_off": round(value("conversion_gain") / truth["gain"] - 1, 5),
+        "noise_off": round(noise / truth["read_noise_e"] - 1, 5),
         "missed": round(float((true & ~mask.ravel()).mean()), 6),
         "false": round(float((mask.ravel() & ~true).mean()), 6),
     }  # fmt: skip

@@ -456,6 +456,15 @@ def test_flats_that_are_all_saturated_are_refused_as_such(tmp_path: Path) -> Non
         small(tmp_path, kinds, saturation_adu=4095)
 
 
+def test_an_overscan_is_named(tmp_path: Path) -> None:
+    camera = Camera(1, SMALL)
+    camera.response[:, :5], camera.response[3] = 0, 0
+    kinds = {"bias": (camera.take(9, 0), [0.0] * 9), "flat": (camera.take(4, 1, 3e4), [1.0] * 4)}
+    said = [w for w in small(tmp_path, kinds)["warnings"] if "see no light" in w]
+    assert len(said) == 1
+    assert said[0].startswith("columns 0 to 4 see no light")
+
+
 def test_detector_frames_alone_are_enough(tmp_path: Path) -> None:
     camera = Camera(1, SMALL)
     found = small(

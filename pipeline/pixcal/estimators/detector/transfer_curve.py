@@ -33,25 +33,16 @@ _READ_KNOWN = 0.3
 
 @dataclass(frozen=True)
 class TransferCurve:
-    """Photon transfer of flats over that of the gain used, as a line over the level.
+    """Photon transfer of flats over that of the gain used, as a line over the level."""
 
-    Attributes
-    ----------
-    share, error : float
-        At level zero.
-    slope, slope_error : float
-        Change up to the top.
-    top : float
-        Highest level, e-.
-    levels, shares, errors : (n,) float64
-        Of each level (e-).
-    """
-
+    # share, error: at level zero
     share: float
     error: float
+    # slope, slope_error: change up to the top
     slope: float
     slope_error: float
-    top: float
+    top: float  # highest level, e-
+    # levels, shares, errors: (n,) of each level (e-)
     levels: F64
     shares: F64
     errors: F64

@@ -47,26 +47,17 @@ _MAPS: dict[str, tuple[Any, dict[str, Any]]] = {
 
 @dataclass(frozen=True)
 class Usual:
-    """What is usual on the detector.
+    """What is usual on the detector."""
 
-    Attributes
-    ----------
-    response, response_error : float
-        Median response of the flats and its error in a pixel (ADU/s); NaN without flats.
-    dark_rate, dark_rate_sigma : float
-        Median and robust spread of the dark signal (ADU/s).
-    dark_variance : float
-        Variance of a sample without light and without dark signal (ADU²).
-    bias : float
-        Median (ADU).
-    """
-
+    # response, response_error: median response of the flats and its error in a pixel (ADU/s);
+    # NaN without flats
     response: float
     response_error: float
+    # dark_rate, dark_rate_sigma: median and robust spread of the dark signal (ADU/s)
     dark_rate: float
     dark_rate_sigma: float
-    dark_variance: float
-    bias: float
+    dark_variance: float  # variance of a sample without light and without dark signal (ADU²)
+    bias: float  # median (ADU)
 
 
 def on_grid(folder: Place, shape: tuple[int, int], names: Sequence[str]) -> F64:
@@ -119,43 +110,20 @@ def usual(folder: Place, shape: tuple[int, int], gain: float) -> Usual:
 
 @dataclass(frozen=True)
 class Finishing:
-    """What the second task of a column needs.
+    """What the second task of a column needs."""
 
-    Attributes
-    ----------
-    statistics : Place
-        What `measure` wrote.
-    shape : (int, int)
-        Of the detector's window (y, x).
-    usual : Usual
-        What is usual on the detector.
-    gain : float
-        To use (e-/ADU).
-    read_noise : float
-        Of the detector (e-).
-    read_dof : int
-        Degrees of freedom of each pixel's own; zero to use the detector's for all.
-    floor : float
-        Least read noise of a pixel (e-): the rounding of the converter.
-    has_rate, has_flat : bool
-        Whether dark signal and response were measured.
-    limits : Limits
-        Of the flags.
-    writers : dict
-        Arrays for the maps.
-    """
-
-    statistics: Place
-    shape: tuple[int, int]
-    usual: Usual
-    gain: float
-    read_noise: float
-    read_dof: int
-    floor: float
+    statistics: Place  # what `measure` wrote
+    shape: tuple[int, int]  # of the detector's window (y, x)
+    usual: Usual  # what is usual on the detector
+    gain: float  # to use (e-/ADU)
+    read_noise: float  # of the detector (e-)
+    read_dof: int  # degrees of freedom of each pixel's own; zero to use the detector's for all
+    floor: float  # least read noise of a pixel (e-): the rounding of the converter
+    # has_rate, has_flat: whether dark signal and response were measured
     has_rate: bool
     has_flat: bool
-    limits: Limits
-    writers: Mapping[str, ArrayWriter]
+    limits: Limits  # of the flags
+    writers: Mapping[str, ArrayWriter]  # arrays for the maps
 
 
 def calibration_writers(folder: Place, shape: tuple[int, int]) -> dict[str, ArrayWriter]:

@@ -41,37 +41,20 @@ _LIT = 5.0
 
 @dataclass(frozen=True)
 class Summary:
-    """What the calibration frames say of the detector as a whole; None where they do not.
+    """What the calibration frames say of the detector as a whole; None where they do not."""
 
-    Attributes
-    ----------
-    declared : Detector
-        What its owner says.
-    usual : Usual
-        Medians of the maps.
-    read_noise : (float, float) or None
-        Of a sample, rounding included, from differences of successive frames; its error (ADU).
-    before_rounding : (float, float) or None
-        The same without the rounding of the converter.
-    gain : GainFit or None
-        By photon transfer.
-    levels : (rung,) float64
-        Of the ladder of flats (ADU above bias and dark).
-    usable, full : (rung,) bool
-        Rungs without saturation; those with full pixels though the converter does not saturate.
-    linearity : Linearity or None
-        Of the usable rungs.
-    """
-
-    declared: Detector
-    usual: Usual
+    declared: Detector  # what its owner says
+    usual: Usual  # medians of the maps
+    # of a sample, rounding included, from differences of successive frames; its error (ADU)
     read_noise: tuple[float, float] | None
-    before_rounding: tuple[float, float] | None
-    gain: GainFit | None
-    levels: F64
+    before_rounding: tuple[float, float] | None  # the same without the rounding of the converter
+    gain: GainFit | None  # by photon transfer
+    levels: F64  # (rung,) of the ladder of flats (ADU above bias and dark)
+    # usable, full: (rung,) rungs without saturation; those with full pixels though the
+    # converter does not saturate
     usable: NDArray[np.bool_]
     full: NDArray[np.bool_]
-    linearity: Linearity | None
+    linearity: Linearity | None  # of the usable rungs
 
     def gain_to_use(self, choice: str) -> float:
         """Gain (e-/ADU), ``declared`` or ``measured``.

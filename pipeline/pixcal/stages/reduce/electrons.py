@@ -32,30 +32,14 @@ def convert_bytes(itemsize: int, width: int) -> int:
 
 @dataclass(frozen=True)
 class FringeSet:
-    """A fringe set, raw.
+    """A fringe set, raw."""
 
-    Attributes
-    ----------
-    name : str
-        As in ``acquisition.yaml``.
-    raw : Reader
-        Of the frames.
-    calibration : Place
-        ``calibration.zarr``.
-    exptime : (t,) float32
-        Exposure times for the dark signal (s).
-    saturation : float
-        Samples at or above it have no weight (ADU).
-    gain : float
-        e-/ADU.
-    """
-
-    name: str
-    raw: Reader
-    calibration: Place
-    exptime: F32
-    saturation: float
-    gain: float
+    name: str  # as in ``acquisition.yaml``
+    raw: Reader  # of the frames
+    calibration: Place  # ``calibration.zarr``
+    exptime: F32  # (t,) exposure times for the dark signal (s)
+    saturation: float  # samples at or above it have no weight (ADU)
+    gain: float  # e-/ADU
 
     @property
     def frames(self) -> int:
@@ -99,19 +83,11 @@ def _range_e(
 
 @dataclass(frozen=True)
 class Converting:
-    """What the task of a column needs.
-
-    Attributes
-    ----------
-    fringes : FringeSet
-    scale : Scale
-        Codes of the electrons.
-    writers : dict
-        Arrays of the dataset, and ``counts`` for what `convert` counts.
-    """
+    """What the task of a column needs."""
 
     fringes: FringeSet
-    scale: Scale
+    scale: Scale  # codes of the electrons
+    # arrays of the dataset, and ``counts`` for what `convert` counts
     writers: dict[str, ArrayWriter]
 
 

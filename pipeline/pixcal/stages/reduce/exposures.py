@@ -13,46 +13,26 @@ _SAME = 1e-3
 
 @dataclass(frozen=True)
 class Group:
-    """Frames of one array and one exposure time.
+    """Frames of one array and one exposure time."""
 
-    Attributes
-    ----------
-    array : str
-        Name of the array.
-    exptime : float
-        Median exposure time (s).
-    frames : tuple of int
-        Their numbers in the array.
-    """
-
-    array: str
-    exptime: float
-    frames: tuple[int, ...]
+    array: str  # name of the array
+    exptime: float  # median exposure time (s)
+    frames: tuple[int, ...]  # their numbers in the array
 
 
 @dataclass
 class Exposures:
-    """Groups of the calibration frames and exposure times of the fringe frames.
+    """Groups of the calibration frames and exposure times of the fringe frames."""
 
-    Attributes
-    ----------
-    dark : list of Group
-        Frames without light, bias among them.
-    flat : list of Group
-        Sorted by exposure time.
-    known : bool
-        Whether the exposure times of the flats are known; else there is one group, at one second.
-    fringes : dict
-        Exposure times (s) of the frames of each set, float32, zero where dark is not to be scaled.
-    warnings : list of str
-        Sentences.
-    """
-
-    dark: list[Group] = field(default_factory=list)
-    flat: list[Group] = field(default_factory=list)
+    dark: list[Group] = field(default_factory=list)  # frames without light, bias among them
+    flat: list[Group] = field(default_factory=list)  # sorted by exposure time
+    # whether the exposure times of the flats are known; else there is one group, at one
+    # second
     known: bool = True
+    # exposure times (s) of the frames of each set, float32, zero where dark is not to be
+    # scaled
     fringes: dict[str, NDArray[np.float32]] = field(default_factory=dict)
-    warnings: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)  # sentences
 
     @property
     def has_rate(self) -> bool:

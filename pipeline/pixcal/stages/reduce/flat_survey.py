@@ -33,17 +33,10 @@ PILED = 4
 
 @dataclass(frozen=True)
 class FlatSurvey:
-    """Flats at first sight.
+    """Flats at first sight."""
 
-    Attributes
-    ----------
-    levels : (t,) float64
-        Mean of each frame above the bias (ADU).
-    saturation : float or None
-        Code (ADU) at which samples pile up; None where none do, or samples are real numbers.
-    """
-
-    levels: F64
+    levels: F64  # (t,) mean of each frame above the bias (ADU)
+    # code (ADU) at which samples pile up; None where none do, or samples are real numbers
     saturation: float | None
 
     @classmethod

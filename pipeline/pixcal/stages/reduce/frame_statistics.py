@@ -69,45 +69,25 @@ class Limits:
 
 @dataclass(frozen=True)
 class Measuring:
-    """What the first task of a column needs.
+    """What the first task of a column needs."""
 
-    Attributes
-    ----------
-    frames : mapping
-        A reader of each array.
-    shape : (int, int)
-        Of the detector's window (y, x).
-    dark, flat : sequence of Group
-        Frames without light, and flats.
-    read_series : Group or None
-        The one of ``dark`` whose noise is the read noise.
-    flats_timed : bool
-        Whether the exposure times of the flats are known.
-    saturation, full : float
-        Level (ADU) from which on samples of flats are saturated; of any frames.
-    quantum : float
-        Step of the samples (ADU), 0 for real numbers.
-    gain, read_noise : float
-        Rough guess: e-/ADU, ADU.
-    limits : Limits
-        Of outliers and flags.
-    writers : dict
-        Arrays for the results.
-    """
-
-    frames: Mapping[str, Reader]
-    shape: tuple[int, int]
+    frames: Mapping[str, Reader]  # A reader of each array
+    shape: tuple[int, int]  # of the detector's window (y, x)
+    # dark, flat: frames without light, and flats
     dark: Sequence[Group]
     flat: Sequence[Group]
-    read_series: Group | None
-    flats_timed: bool
+    read_series: Group | None  # the one of ``dark`` whose noise is the read noise
+    flats_timed: bool  # whether the exposure times of the flats are known
+    # saturation, full: level (ADU) from which on samples of flats are saturated; of any
+    # frames
     saturation: float
     full: float
-    quantum: float
+    quantum: float  # step of the samples (ADU), 0 for real numbers
+    # gain, read_noise: rough guess: e-/ADU, ADU
     gain: float
     read_noise: float
-    limits: Limits
-    writers: Mapping[str, ArrayWriter]
+    limits: Limits  # of outliers and flags
+    writers: Mapping[str, ArrayWriter]  # arrays for the results
 
 
 def statistics_writers(folder: Place, shape: tuple[int, int], flats: int) -> dict[str, ArrayWriter]:

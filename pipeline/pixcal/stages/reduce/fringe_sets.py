@@ -31,22 +31,13 @@ _CONVERTERS = (8, 10, 12, 14)
 
 @dataclass(frozen=True)
 class Bounds:
-    """Extremes over the good pixels.
+    """Extremes over the good pixels."""
 
-    Attributes
-    ----------
-    flat : (float, float)
-        Least and largest relative response.
-    bias, dark_rate : float
-        Largest (ADU; e-/s).
-    read_noise : float
-        Usual (e-).
-    """
-
-    flat: tuple[float, float]
+    flat: tuple[float, float]  # least and largest relative response
+    # bias, dark_rate: largest (ADU; e-/s)
     bias: float
     dark_rate: float
-    read_noise: float
+    read_noise: float  # usual (e-)
 
     @property
     def smallest_variance(self) -> float:

@@ -31,20 +31,11 @@ _FRAMES = 64
 
 @dataclass(frozen=True)
 class Halves:
-    """Averages of the even and of the odd frames over the middle of the detector (ADU).
+    """Averages of the even and of the odd frames over the middle of the detector (ADU)."""
 
-    Attributes
-    ----------
-    dark : (2, y, x) float64 or None
-        Without light, shortest exposure.
-    flat : (2, y, x) float64 or None
-        Near half of the saturation, the former subtracted.
-    good : (y, x) bool
-    """
-
-    dark: F64 | None
-    flat: F64 | None
-    good: NDArray[np.bool_]
+    dark: F64 | None  # (2, y, x) without light, shortest exposure
+    flat: F64 | None  # (2, y, x) near half of the saturation, the former subtracted
+    good: NDArray[np.bool_]  # (y, x)
 
 
 def middle_of(shape: tuple[int, int]) -> Window:

@@ -26,15 +26,9 @@ MOST_ADU = 2.0**32
 
 @dataclass(frozen=True)
 class Ingested:
-    """Frames and their tables.
+    """Frames and their tables."""
 
-    Parameters
-    ----------
-    folder : Path or MemoryPath
-        ``RUN/ingest``.
-    """
-
-    folder: Local
+    folder: Local  # ``RUN/ingest``
 
     @cached_property
     def raw(self) -> Place:

@@ -46,6 +46,7 @@ SCHEMA = "pixcal/reduce/1"
 
 _MIN_READ_FRAMES = 8  # fewer do not tell the noise of each pixel
 _SHARED_BYTES = 64 << 20
+_LINES = 4  # rows or columns beside one another without light that are worth a word
 _CUT_OFF = 1e-3
 """Share of samples at code zero from which noise is cut off."""
 
@@ -92,27 +93,13 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
 @dataclass(frozen=True)
 class Reduction:
-    """What is known of frames that were reduced, beside their cubes and maps.
+    """What is known of frames that were reduced, beside their cubes and maps."""
 
-    Attributes
-    ----------
-    job : Measuring
-        How the calibration frames were measured.
-    summary : Summary
-        What they say of the detector.
-    gain : float
-        That is used, e-/ADU.
-    bounds : Bounds
-        Extremes over the good pixels.
-    sets : dict
-        What ``reduce.json`` says of each fringe set.
-    """
-
-    job: Measuring
-    summary: Summary
-    gain: float
-    bounds: Bounds
-    sets: dict[str, dict[str, Any]]
+    job: Measuring  # how the calibration frames were measured
+    summary: Summary  # what they say of the detector
+    gain: float  # that is used, e-/ADU
+    bounds: Bounds  # extremes over the good pixels
+    sets: dict[str, dict[str, Any]]  # what ``reduce.json`` says of each fringe set
 
     def noise(self, config: Config) -> dict[str, dict[str, Any]]:
         """What ``reduce.json`` says of gain and read noise."""
@@ -239,6 +226,7 @@ def _report(
     piled = source.saturation_found if source.detector.saturation_adu is None else None
     warnings = [*source.exposures.warnings, *_cut_off(source), *summary.warnings(found.gain, piled)]
     declared = source.detector.saturation_adu is not None
+    warnings += _dark_lines(ArrayReader(made.folder / "calibration.zarr" / "mask"), source.shape)
     for name, facts in sets.items():
         warnings += set_warnings(name, facts, declared, config.rounding_share)
         facts["quantisation"]["share_at_mean"] = share_at_mean(facts, found.bounds)
@@ -277,6 +265,26 @@ def _cut_off(source: Ingested) -> list[str]:
         for name in ("bias", "dark")
         if name in source.arrays and (share := share_at_zero(source.arrays[name])) > _CUT_OFF
     ]
+
+
+def _dark_lines(mask: ArrayReader, shape: tuple[int, int]) -> list[str]:
+    """What to say of neighbouring rows or columns that see no light at all."""
+    dark = {"rows": np.ones(shape[0], np.bool_), "columns": np.ones(shape[1], np.bool_)}
+    for index in indices(shape):
+        (y0, y1), (x0, x1) = extent(shape, index)
+        dead = mask.read((y0, y1), (x0, x1)) & PixelFlag.DEAD > 0
+        dark["rows"][y0:y1] &= dead.all(axis=1)
+        dark["columns"][x0:x1] &= dead.all(axis=0)
+    said = []
+    for name, lines in dark.items():
+        ends = np.flatnonzero(np.diff(lines, prepend=False, append=False)).reshape(-1, 2)
+        spans = [f"{a} to {b - 1}" for a, b in ends if b - a >= _LINES]
+        if spans and not lines.all():
+            said.append(
+                f"{name} {', '.join(spans)} see no light and are masked as dead: an overscan, or a "
+                "border of the detector"
+            )
+    return said
 
 
 def _report_noise(
