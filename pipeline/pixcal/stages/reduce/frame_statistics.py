@@ -71,7 +71,7 @@ class Limits:
 class Measuring:
     """What the first task of a column needs."""
 
-    frames: Mapping[str, Reader]  # A reader of each array
+    frames: Mapping[str, Reader]  # a reader of each array
     shape: tuple[int, int]  # of the detector's window (y, x)
     # dark, flat: frames without light, and flats
     dark: Sequence[Group]
