@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pixcal.effects.quantisation import Quantisation
-from pixcal.estimators.detector.code_density import histogram, step_of
+from pixcal.estimators.detector.code_density import code_widths, histogram, step_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 
 TOP = 65535.0
@@ -128,6 +128,29 @@ def test_wrong_bits_give_the_codes_of_successive_approximation() -> None:
         expected += taken * 2**bit
     codes = Quantisation(0.0, 0.0, 0.0, bits=BITS).converted(samples, 0, TOP)
     assert np.mean(codes != expected) < 1e-4
+
+
+@pytest.mark.parametrize("step", [0.8, -0.6, -1.3, -2.8, -3.5])
+def test_where_a_bit_leaves_several_codes_out_its_weight_is_told(step: float) -> None:
+    """Codes by successive approximation of noisy light; bit 10 turns over at 1024 and 3072."""
+    off = np.zeros(12)
+    off[[7, 10]] = 0.4, step
+    rng = np.random.default_rng(8)
+    left = rng.normal(rng.uniform(500, 3500, 4_000_000), 3.0)
+    codes = np.zeros(left.size, int)
+    for bit in reversed(range(12)):
+        taken = left >= 2**bit + off[bit]
+        left -= (2**bit + off[bit]) * taken
+        codes += taken << bit
+    widths = code_widths(np.bincount(codes, minlength=4096).astype(float), 3.0)
+    assert widths is not None
+    bits, covariance = widths.bits(0.0)
+    # A common factor of all weights does not show; what a bit adds over all lower ones does.
+    for bit in (7, 10):
+        over = np.where(np.arange(12) == bit, 1.0, np.where(np.arange(12) < bit, -1.0, 0.0))
+        error = np.sqrt(over @ covariance @ over)
+        assert error < 0.06
+        assert over @ (bits - off) == pytest.approx(0, abs=4 * error + 0.03)
 
 
 def test_wrong_bits_are_found_where_only_shot_noise_spans_a_step(

@@ -214,8 +214,11 @@ def _uneven(widths: CodeWidths) -> tuple[dict[str, Any], dict[str, float], list[
     bits, covariance = widths.bits(2 * variance)
     chi2 = float(bits @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ bits)
     wrong = sigmas_of_chi2(chi2, max(int((np.diag(covariance) > 0).sum()), 1))
-    if wrong > max(SIGNIFICANT, sure):
-        rest = widths.without(bits).scatter()[0]
+    share = 1.0 if line.period == 2 else 0.5
+    rest = widths.without(bits).scatter()[0]
+    # Bits repeat too: the least of them as a ripple of two or four codes.
+    clearer = 2 * rest < variance - share * line.amplitude**2
+    if wrong > SIGNIFICANT and (wrong > sure or clearer):
         bits, covariance = widths.bits(2 * rest)
         values, errors, others = _uneven(widths.without(bits))
         values["bits"] = tuple(map(float, bits))
@@ -223,7 +226,6 @@ def _uneven(widths: CodeWidths) -> tuple[dict[str, Any], dict[str, float], list[
         errors |= {f"bits[{n}]": float(e) for n, e in enumerate(spread) if e}
         return values, errors, [wrong, *others]
     if sure > SIGNIFICANT:
-        share = 1.0 if line.period == 2 else 0.5
         for _ in range(2):
             rest = variance - share * line.amplitude**2
             line = widths.ripple(rest)

@@ -19,6 +19,7 @@ F64 = NDArray[np.float64]
 MAX_CODES = 1 << 17
 FEWEST_COUNTS = 5.0  # expected counts of a code that counts
 FEWEST_CODES = 24
+CARRY = 32  # codes whose multiples turn over so many bits that their sum may be off by several
 POPULATED = 20.0  # counts of codes around from which an empty one is a gap
 NEAR = 0.1  # how far the share of codes that come up may be from one over the step
 LEAST_AGREEMENT = 0.5
@@ -30,6 +31,8 @@ _NO_CHANGE = 1e-6
 _MISSED = 3.0
 # scatter of counts that light brings about: levels of pixels do not lie evenly on codes
 _UNEVEN = 2e-3
+# fits of the weights of bits, until the misfit falls by less than
+_BIT_FITS, _SETTLED = 12, 0.1
 # codes of noise below which the peak of dark frames is too narrow for a local fit
 LEAST_NOISE = 1.4
 LOWEST_RIPPLE = 1 / 16  # turns a code
@@ -148,6 +151,7 @@ class CodeWidths:
     width: F64  # (n,)
     variance: F64  # (n,) of the counts by chance, relative
     kernel: F64  # (m,) what multiplies the true widths: one less the local fit
+    gap: NDArray[np.bool_]  # of every code, whether the local fit does without it
 
     def kept(self, frequency: float) -> float:
         """Share of a line's amplitude that the local fit leaves; frequency in turns a code."""
@@ -161,14 +165,16 @@ class CodeWidths:
         """
         square = float(self.kernel @ self.kernel)
         more = (square - float(self.kernel[1:] @ self.kernel[:-1])) / square
-        excess = self.width**2 / square - self.variance
+        there = ~self.gap[self.number]
+        variance = self.variance[there]
+        excess = self.width[there] ** 2 / square - variance
         size = 0.0
         for _ in range(4):
-            weight = 1 / (2 * (self.variance + max(size, 0.0)) ** 2 + self.variance**3)
+            weight = 1 / (2 * (variance + max(size, 0.0)) ** 2 + variance**3)
             size = float(weight @ excess / weight.sum())
         # Neighbours' squares are related by up to a quarter.
         error = float(np.sqrt(1.5 / weight.sum()))
-        chance = 1 / (2 * self.variance**2 + self.variance**3)
+        chance = 1 / (2 * variance**2 + variance**3)
         sigmas = float(chance @ excess / np.sqrt(chance.sum()))
         return size / more, error / more, sigmas
 
@@ -176,30 +182,51 @@ class CodeWidths:
         """By how much each bit's weight is off, in codes, the least first; and the covariance.
 
         A bit that does not change within the codes at hand gets nothing. The common factor of all
-        weights, a gain, does not change the local widths: the smallest errors are given.
+        weights, a gain, does not change the local widths: the smallest errors are given. A weight
+        that is more than a code too small leaves several codes out, which is no linear change, so
+        the fit is repeated about what was found, by changes of a code.
         """
-        codes = np.arange(self.number[-1] + len(self.kernel))
-        every = 1 << np.arange(int(codes[-1]).bit_length())
-        weighs = (codes[:, None] & every > 0).astype(float)
-        steps = np.diff(weighs, axis=0)
-        design = np.stack([np.convolve(s, self.kernel, "same") for s in steps.T], 1)[self.number]
+        number = (len(self.gap) - 1).bit_length()
         weight = 1 / (self.variance + max(scatter, 0.0))
-        normal = (design.T * weight) @ design
-        scale = 1 / np.sqrt(np.maximum(np.diag(normal), _NO_CHANGE))
-        inverse = np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-6, hermitian=True)
-        covariance = inverse * np.outer(scale, scale)
-        return covariance @ (design.T @ (weight * self.width)), covariance
+        bits, left = np.zeros(number), self.width
+        misfit = float(weight @ left**2)
+        for _ in range(_BIT_FITS):
+            slopes = [self._left_out(bits + e) - self._left_out(bits - e) for e in np.eye(number)]
+            design = np.stack(slopes, 1) / 2
+            normal = (design.T * weight) @ design
+            scale = 1 / np.sqrt(np.maximum(np.diag(normal), _NO_CHANGE))
+            gain = np.where(np.diag(normal) > _NO_CHANGE, 2.0 ** np.arange(number) / scale, 0.0)
+            rest = np.eye(number) - np.outer(gain, gain) / max(float(gain @ gain), 1e-300)
+            scaled = rest @ (normal * np.outer(scale, scale)) @ rest
+            inverse = np.linalg.pinv(scaled, rcond=1e-6, hermitian=True)
+            covariance = inverse * np.outer(scale, scale)
+            moved = bits + covariance @ (design.T @ (weight * left))
+            after = self.width - self._left_out(moved)
+            better = misfit - float(weight @ after**2)
+            if better <= 0:
+                break
+            bits, left, misfit = moved, after, misfit - better
+            if better < _SETTLED:
+                break
+        return bits, covariance
+
+    def _left_out(self, bits: F64) -> F64:
+        """Widths (n,) that wrong weights of bits bring about, less what the local fit takes."""
+        codes = np.arange(len(self.gap))
+        begins = codes + (codes[:, None] >> np.arange(len(bits)) & 1) @ bits
+        # A code that begins after a higher one is never reached.
+        reached = np.minimum.accumulate(begins[::-1])[::-1]
+        width, gap = np.diff(reached) - 1, self.gap[:-1]
+        left = np.convolve(np.where(gap, 0.0, width), self.kernel, "same")
+        return np.asarray((left + np.where(gap, width, 0.0))[self.number])
 
     def without(self, bits: F64) -> "CodeWidths":
         """The rest, once the wrong weights of bits (codes) are taken out."""
-        codes = np.arange(self.number[-1] + len(self.kernel))
-        begins = (codes[:, None] >> np.arange(len(bits)) & 1) @ bits
-        taken = np.convolve(np.diff(begins), self.kernel, "same")[self.number]
-        return replace(self, width=self.width - taken)
+        return replace(self, width=self.width - self._left_out(bits))
 
     def ripple(self, scatter: float) -> Ripple:
         """The strongest line, over chance and a scatter of the widths (variance)."""
-        weight = 1 / (self.variance + max(scatter, 0.0))
+        weight = ~self.gap[self.number] / (self.variance + max(scatter, 0.0))
         value = weight * self.width
         total, noise = float(weight.sum()), float(weight**2 @ self.variance)
         own = float(weight @ weight) * max(scatter, 0.0)
@@ -257,10 +284,13 @@ def code_widths(counts: F64, noise: float, first: float = 0.0) -> CodeWidths | N
     from scipy.signal import savgol_coeffs, savgol_filter
 
     length = 2 * half + 1
-    expected = savgol_filter(counts, length, _ORDER)
+    gap = _carried_over(counts)
+    code = np.arange(len(counts))
+    filled = np.interp(code, code[~gap], counts[~gap])
+    expected = savgol_filter(filled, length, _ORDER)
     # Weights that hardly depend on the code's own count.
     calm = uniform_filter1d(expected, length)
-    used = (uniform_filter1d(counts, length) > FEWEST_COUNTS) & (calm > FEWEST_COUNTS)
+    used = (uniform_filter1d(filled, length) > FEWEST_COUNTS) & (calm > FEWEST_COUNTS)
     used &= (expected > 0) & (np.arange(len(counts)) >= first + half)
     if np.count_nonzero(used) < FEWEST_CODES:
         return None
@@ -271,6 +301,23 @@ def code_widths(counts: F64, noise: float, first: float = 0.0) -> CodeWidths | N
     again = np.convolve(kernel, savgol_coeffs(length, _ORDER))
     share = 2 * float(again @ again) / float(kernel @ kernel)
     change = uniform_filter1d((expected - savgol_filter(expected, length, _ORDER)) ** 2, length)
-    missed = np.maximum(change - share * uniform_filter1d((counts - expected) ** 2, length), 0)
+    missed = np.maximum(change - share * uniform_filter1d((filled - expected) ** 2, length), 0)
     variance = expected + _MISSED**2 * missed + (_UNEVEN * expected) ** 2
-    return CodeWidths(np.flatnonzero(used), width, variance[used] / calm[used] ** 2, kernel)
+    number = np.flatnonzero(used)
+    gap = np.concatenate([gap, np.zeros(length, bool)])[: number[-1] + length]
+    return CodeWidths(number, width, variance[used] / calm[used] ** 2, kernel, gap)
+
+
+def _carried_over(counts: F64) -> NDArray[np.bool_]:
+    """Codes that never come, and the one before, where a bit weighs some codes too little.
+
+    One or more, just below a multiple of `CARRY`, among codes that do come.
+    """
+    gap = np.zeros(len(counts), bool)
+    around = uniform_filter1d(counts, 2 * _MOST_HALF + 1)
+    for first in range(CARRY, len(counts), CARRY):
+        below = counts[first - CARRY // 2 : first][::-1]
+        empty = int(np.argmax(below > 0)) if below.any() else 0
+        if empty and counts[first] > 0 and around[first] > POPULATED:
+            gap[first - empty - 1 : first] = True
+    return gap
