@@ -333,6 +333,22 @@ def test_a_replay_is_taken_whose_law_is_without_promise() -> None:
     assert left < 0.05
 
 
+def test_a_candidate_that_other_seeds_refuse_is_told_so() -> None:
+    def refusing(
+        benches: Sequence[Sequence[Effect]], seeds: int, label: str, asked: Sequence[str]
+    ) -> list[list[dict[Key, Curve]] | str]:
+        made = simulate(benches, seeds, label, asked)
+        refused = [seeds > 1 and any(e.name == "left" for e in bench) for bench in benches]
+        return ["too bright" if no else one for no, one in zip(refused, made, strict=True)]
+
+    left = candidate("left", 0.03)
+    left.replay = candidate("left", 0.0001).estimate.effect  # type: ignore[union-attr]
+    data = REFERENCE.on_scale(curves((), 500, {"left": 0.03}))
+    found = Search(REFERENCE, data, refusing, lambda *_: {}).run({"left": left})
+    assert found.accepted == ()
+    assert found.candidates["left"].reason == "cannot be simulated: too bright"
+
+
 def test_a_cause_beyond_the_most_is_told_that_no_more_were_sought() -> None:
     truth = dict.fromkeys(SINGLE, 0.03)
     found, _ = search(truth, [candidate(label, 0.03) for label in SINGLE])

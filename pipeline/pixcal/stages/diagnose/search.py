@@ -202,10 +202,11 @@ class Search:
             causes, remaining, [(o.name, o.effect) for o in promising], SCREEN, label
         )
         if all(one.gain < needed_gain(remaining[one.name]) for one in tried):
-            rest = [one for one in once if one not in promising]
+            # Some may be refused by now: of other seeds.
+            rest = [one for one in once if one not in promising and one.name in remaining]
             others = [(one.name, one.effect) for one in rest if one.gain > 0]
             tried += self._added(causes, remaining, others, SCREEN, label)
-            tried += [one for one in rest if one.gain <= 0]
+            tried += [one for one in rest if one.gain <= 0 and one.name in remaining]
         replays = [o for o in tried if o.effect == remaining[o.name].replay]
         return likeliest(o for o in tried if o not in replays), likeliest(replays)
 
