@@ -53,15 +53,46 @@ def _show(result: Mapping[str, Any]) -> None:
     labels = [side["label"] for side in result["sides"]]
     for pair in result["pairs"]:
         first, second = pair["sides"]
+        components = pair["components"]
         click.echo(f"\n{labels[first]} | {labels[second]}")
-        _show_totals(pair["components"])
-        for name, facts in pair["components"].items():
+        rows = [
+            (
+                name,
+                facts["pixels"],
+                results.with_error(facts["correlation"], facts["correlation_error"]),
+                results.with_error(facts["slope"], facts["slope_error"]),
+                *_sizes(facts),
+            )
+            for name, facts in components.items()
+        ]
+        results.show_table(("", "pixels", "correlation", "slope", *SIZES), rows)
+        for name, facts in components.items():
             click.echo(f"\n  {name} by scale")
-            _show_scales(facts)
-        results.show_notes(_sentences(pair["components"]))
+            *smaller, last = [f"{scale['side_px']} px" for scale in facts["scales"]]
+            sides = [*smaller, f"{last} and larger"]
+            sizes = zip(sides, map(_sizes, facts["scales"]), strict=True)
+            results.show_table(("scale", *SIZES), [(side, *row) for side, row in sizes])
+        results.show_notes(_sentences(components))
     if result["summary"] is not None:
-        _show_summary(result["summary"], labels)
+        click.echo("\neach map's own errors beyond noise, from the differences of all pairs, px")
+        columns = [map(_amount, facts["own"]) for facts in result["summary"].values()]
+        rows = list(zip(labels, *columns, strict=True))
+        results.show_table(("", *result["summary"]), rows)
     results.show_notes(result["warnings"])
+
+
+SIZES = ("common px", "difference px", "noise px", "ratio", "beyond noise px")
+
+
+def _sizes(facts: Mapping[str, Any]) -> tuple[str, ...]:
+    """Cells of `SIZES`."""
+    return (
+        _amount(facts["common"]),
+        f"{facts['difference_px']:.3g}",
+        f"{facts['expected_px']:.3g}",
+        results.with_error(facts["ratio"], facts["ratio_error"]),
+        _amount(facts["beyond_noise"]),
+    )
 
 
 def _sentences(components: Mapping[str, Any]) -> list[str]:
@@ -74,54 +105,6 @@ def _sentences(components: Mapping[str, Any]) -> list[str]:
         if facts["suspicion"] is not None:
             sentences.append(f"{name}: {facts['suspicion']}")
     return sentences
-
-
-def _show_totals(components: Mapping[str, Any]) -> None:
-    rows = [
-        (
-            name,
-            facts["pixels"],
-            results.with_error(facts["correlation"], facts["correlation_error"]),
-            results.with_error(facts["slope"], facts["slope_error"]),
-            _amount(facts["common"]),
-            f"{facts['difference_px']:.3g}",
-            f"{facts['expected_px']:.3g}",
-            results.with_error(facts["ratio"], facts["ratio_error"]),
-            _amount(facts["beyond_noise"]),
-        )
-        for name, facts in components.items()
-    ]
-    header = (
-        "", "pixels", "correlation", "slope", "common px", "difference px", "noise px", "ratio",
-        "beyond noise px",
-    )  # fmt: skip
-    results.show_table(header, rows)
-
-
-def _show_scales(facts: Mapping[str, Any]) -> None:
-    scales = facts["scales"]
-    rows = [
-        (
-            f"{scale['side_px']} px" + (" and larger" if scale is scales[-1] else ""),
-            _amount(scale["common"]),
-            f"{scale['difference_px']:.3g}",
-            f"{scale['expected_px']:.3g}",
-            results.with_error(scale["ratio"], scale["ratio_error"]),
-            _amount(scale["beyond_noise"]),
-        )
-        for scale in scales
-    ]
-    header = ("scale", "common px", "difference px", "noise px", "ratio", "beyond noise px")
-    results.show_table(header, rows)
-
-
-def _show_summary(summary: Mapping[str, Any], labels: list[str]) -> None:
-    click.echo("\neach map's own errors beyond noise, from the differences of all pairs, px")
-    rows = [
-        (label, *(_amount(facts["own"][n]) for facts in summary.values()))
-        for n, label in enumerate(labels)
-    ]
-    results.show_table(("", *summary), rows)
 
 
 def _amount(estimate: Mapping[str, float]) -> str:

@@ -7,17 +7,12 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
 from pixcal.stages.compare.agreement import (
-    Blocks,
+    Grouping,
     Part,
     Projection,
     VarianceEstimate,
-    beyond_noise,
-    common,
+    double,
     halve,
-    own,
-    part,
-    significance,
-    straight_line,
     strongest_period,
     three_cornered_hat,
 )
@@ -31,24 +26,15 @@ def plane(shape):
     return np.stack([np.ones(shape), x - shape[1] / 2, y - shape[0] / 2, np.cos(1.3 * x)])
 
 
-def blocks_of(maps, modes, good, noise=NOISE):
-    values = np.concatenate([maps, modes]) * good
-    variance = np.stack([np.full(good.shape, n**2) for n in noise]) * good
-    return Blocks(values, variance, good.astype(float))
-
-
 def taken_apart(maps, modes, good, levels=3):
     """Parts at blocks of 1, 2, 4, 8 pixels (the last with all larger ones), and all together."""
-    blocks = blocks_of(maps, modes, good)
-    groupings = [blocks.grouping()]
-    whole = blocks.along(1).along(2).grouping()
-    for _ in range(levels):
-        blocks = blocks.coarser()
-        groupings.append(blocks.grouping())
-    projection = Projection.of(groupings[0])
-    n = groupings[0].groups
+    variance = np.stack([np.full(good.shape, n**2) for n in NOISE])
+    sums = np.concatenate([maps, modes, variance, np.ones((1, *good.shape))]) * good
+    groupings, _ = double(sums, levels)
+    whole = Grouping.of(sums.sum(axis=(1, 2))[:, None])
+    projection, n = Projection.of(groupings[0]), groupings[0].groups
     pairs = zip(groupings, [*groupings[1:], whole], strict=True)
-    return [part(a, b, projection, n) for a, b in pairs], part(groupings[0], whole, projection, n)
+    return [projection.part(a, b, n) for a, b in pairs], projection.part(groupings[0], whole, n)
 
 
 def draw(rng, signal=6e-3, shape=SHAPE):
@@ -110,13 +96,13 @@ def test_significances_are_standard_normal_and_sizes_unbiased():
     z, pulls, slopes = [], [], []
     for _ in range(250):
         parts, total = taken_apart(draw(rng), modes, rng.random(SHAPE) > 0.02)
-        z.append([significance(p, 0.0) for p in parts])
-        first, second = own(total, 0.0)
-        shared, excess = common(total), beyond_noise(total, 0.0)
+        z.append([p.significance(0.0) for p in parts])
+        first, second = total.own(0.0)
+        shared, excess = total.common(), total.beyond_noise(0.0)
         pulls.append([e.variance / e.error for e in (first, second, excess)])
         pulls[-1].append((shared.variance - 36e-6) / shared.error)
-        line = straight_line(total)
-        slopes.append((line.slope - 1) / line.error)
+        line = total.line()
+        slopes.append((line.slope - 1) / line.slope_error)
     for values in (*np.array(z).T, *np.array(pulls).T, np.array(slopes)):
         # 250 draws: the mean is known to 0.063, the spread to 0.045.
         assert abs(values.mean()) < 0.25
@@ -129,13 +115,13 @@ def test_a_signal_of_one_side_is_found_there():
     y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
     maps[1] += 6e-4 * np.where((y // 4 + x // 4) % 2, 1.0, -1.0)
     parts, total = taken_apart(maps, plane(SHAPE), np.ones(SHAPE, bool))
-    assert [significance(p) > 5 for p in parts] == [False, False, True, False]
-    excess = beyond_noise(parts[2])
+    assert [p.significance() > 5 for p in parts] == [False, False, True, False]
+    excess = parts[2].beyond_noise()
     assert excess.variance == pytest.approx(36e-8, abs=3 * excess.error)
-    first, second = own(parts[2])
+    first, second = parts[2].own()
     assert second.variance == pytest.approx(36e-8, abs=4 * second.error)
     assert abs(first.variance) < 4 * first.error
-    assert beyond_noise(total).upper > excess.rms
+    assert total.beyond_noise().facts()["upper_px"] > excess.facts()["px"]
 
 
 def test_the_line_is_that_of_orthogonal_distances():
@@ -144,7 +130,7 @@ def test_the_line_is_that_of_orthogonal_distances():
     true = rng.normal(0, 3e-3, SHAPE)
     maps = np.stack([true + rng.normal(0, 8e-4, SHAPE), 1.3 * true + rng.normal(0, 1.1e-3, SHAPE)])
     _, total = taken_apart(maps, plane(SHAPE)[:1], np.ones(SHAPE, bool))
-    line = straight_line(total)
+    line = total.line()
     x, y = (m.ravel() - m.mean() for m in maps)
 
     def chi2(slope):
@@ -153,35 +139,39 @@ def test_the_line_is_that_of_orthogonal_distances():
     least = minimize_scalar(chi2, bracket=(1.0, 1.5), tol=1e-12)
     assert line.slope == pytest.approx(least.x, rel=1e-6)
     # One sigma away chi-square is higher by one; that leaves out the noise of the abscissae.
-    raised = chi2(line.slope + line.error) - least.fun
+    raised = chi2(line.slope + line.slope_error) - least.fun
     assert 1.0 < raised < 1.4
-    assert abs(line.slope - 1.3) < 4 * line.error
+    assert abs(line.slope - 1.3) < 4 * line.slope_error
     assert line.correlation == pytest.approx(np.corrcoef(*maps.reshape(2, -1))[0, 1])
 
 
 def test_no_line_where_nothing_is_common():
     rng = np.random.default_rng(1)
     _, total = taken_apart(draw(rng, signal=0.0), plane(SHAPE), np.ones(SHAPE, bool))
-    line = straight_line(total)
-    assert (line.slope, line.error) == (None, None)
+    line = total.line()
+    assert (line.slope, line.slope_error) == (None, None)
     assert abs(line.correlation) < 4 * line.correlation_error
 
 
 def test_the_accuracy_of_sigma_is_allowed_for():
     n = 100_000
     p = Part(n, n, 1.0, 1.0 + 2e-2 * 2, 0.0, (1.0, 1.0))
-    assert significance(p, 0.0) > 4
-    assert significance(p, 0.02) < 1
-    assert beyond_noise(p, 0.02).upper > beyond_noise(p, 0.0).upper
-    assert significance(Part(0, 0.5, 1, 1, 0, (1, 1))) == 0.0
+    assert p.significance(0.0) > 4
+    assert p.significance(0.02) < 1
+    upper = [p.beyond_noise(accuracy).facts()["upper_px"] for accuracy in (0.0, 0.02)]
+    assert upper[1] > upper[0]
+    assert Part(0, 0.5, 1, 1, 0, (1, 1)).significance() == 0.0
 
 
 def test_sizes_of_estimates():
-    assert VarianceEstimate(-1.0, 0.5).rms == 0
-    assert VarianceEstimate(4.0, 0.0).rms == 2
-    assert VarianceEstimate(4.0, 0.0).rms_error == 0
-    assert VarianceEstimate(1e-6, 1e-8).rms_error == pytest.approx(1e-8 / 2e-3, rel=0.01)
-    assert VarianceEstimate(0.0, 1.0).upper == pytest.approx(1.645**0.5, rel=1e-3)
+    def size(variance, error):
+        facts = VarianceEstimate(variance, error).facts()
+        return facts["px"], facts["error_px"], facts["upper_px"]
+
+    assert size(-1.0, 0.5)[0] == 0
+    assert size(4.0, 0.0) == (2, 0, 2)
+    assert size(1e-6, 1e-8)[1] == pytest.approx(1e-8 / 2e-3, rel=0.01)
+    assert size(0.0, 1.0)[2] == pytest.approx(1.645**0.5, rel=1e-3)
 
 
 def test_periods():
@@ -192,7 +182,7 @@ def test_periods():
     wave = strongest_period(1.5 * np.sin(2 * np.pi * x / 4 + 0.3) + noise, error)
     assert wave is not None
     assert wave.px == pytest.approx(4)
-    assert wave.amplitude == pytest.approx(1.5, abs=0.4)
+    assert wave.amplitude_px == pytest.approx(1.5, abs=0.4)
     assert wave.chance < 1e-6
     chances = []
     for _ in range(300):

@@ -10,6 +10,8 @@ from PIL import Image
 from pixcal.report.compare_figures import ComponentView, PairView, compare_figure
 from pixcal.report.drawing import png
 
+NOTHING = np.full(120, np.nan)
+
 
 def amount(px: float, error: float) -> dict[str, float]:
     return {
@@ -31,12 +33,19 @@ def a_component(shape: tuple[int, int] = (90, 120), **changes: Any) -> Component
     rng = np.random.default_rng(0)
     ny, nx = shape
     blocks = (-(-ny // 8), -(-nx // 8))
+    facts = {
+        "slope": changes.pop("slope", 1.02),
+        "scales": changes.pop("scales", (a_scale(1), a_scale(2, 4e-4), a_scale(4))),
+        "blocks": {"side_px": 8},
+    }
     settings: dict[str, Any] = {
-        "name": "delta_x", "window": shape, "picture": rng.poisson(2.0, (96, 96)), "reach": 0.01,
-        "slope": 1.02, "scales": (a_scale(1), a_scale(2, 4e-4), a_scale(4)), "side": 8,
+        "name": "delta_x", "window": shape, "facts": facts, "reach": 0.01,
+        "picture": rng.poisson(2.0, (96, 96)), "far": (),
         "shift": rng.normal(size=blocks), "scatter": rng.normal(size=blocks),
-        "columns": (rng.normal(0, 1e-4, nx), np.full(nx, 1e-4)),
-        "rows": (rng.normal(0, 1e-4, ny), np.full(ny, 1e-4)), "far": (),
+        "profiles": {
+            name: (rng.normal(0, 1e-4, n), np.full(n, 1e-4))
+            for name, n in (("columns", nx), ("rows", ny))
+        },
     }  # fmt: skip
     return ComponentView(**(settings | changes))
 
@@ -52,7 +61,7 @@ def a_view(*components: ComponentView) -> PairView:
         a_view(a_component(), a_component(name="delta_y", slope=None)),
         a_view(a_component((7, 200), name="delta_fringe", far=((3, 100),))),
         a_view(a_component(scales=(a_scale(1),), shift=np.full((12, 15), np.nan))),
-        a_view(a_component(columns=(np.full(120, np.nan), np.full(120, np.nan)))),
+        a_view(a_component(profiles=dict.fromkeys(("columns", "rows"), (NOTHING, NOTHING)))),
         a_view(a_component(picture=np.zeros((96, 96), int), reach=1.0)),
     ],
 )

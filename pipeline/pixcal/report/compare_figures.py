@@ -9,13 +9,11 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Rectangle
-from matplotlib.ticker import FixedLocator
 from numpy.typing import NDArray
 
 from pixcal.report.colours import BAND, BLUE, DIVERGING, GREEN, GREY, INK, RED, SEQUENTIAL
 from pixcal.report.drawing import (
     WIDE,
-    Unit,
     covered,
     finish,
     limits,
@@ -38,20 +36,15 @@ class ComponentView:
 
     name: str
     window: tuple[int, int]  # (y, x), px
+    facts: Mapping[str, Any]  # of ``compare.json``
     picture: NDArray[np.int64]  # (bin, bin) pixels by the second map (y) and the first (x)
     reach: float  # half width of the picture, px
-    slope: float | None  # of the second against the first
-    # `side_px`, `common`, `difference_px`, `expected_px` and so on
-    scales: tuple[Mapping[str, Any], ...]
-    side: int  # of the blocks, px
-    # shift, scatter: (y, x) sigma of each block: of its mean difference, and of its pixels'
-    # scatter
+    # (y, x) sigma of each block: of its mean difference, and of its pixels' scatter
     shift: F64
     scatter: F64
-    # columns, rows: (n,), (n,) float64: mean difference of each and its error, px
-    columns: tuple[F64, F64]
-    rows: tuple[F64, F64]
-    far: tuple[tuple[int, int], ...]  # (y, x) of pixels that disagree
+    # (n,), (n,) float64 of `columns` and `rows`: mean difference of each and its error, px
+    profiles: Mapping[str, tuple[F64, F64]]
+    far: Sequence[tuple[int, int]]  # (y, x) of pixels that disagree
 
 
 @dataclass(frozen=True)
@@ -60,7 +53,7 @@ class PairView:
 
     numbers: tuple[int, int]
     labels: tuple[str, str]
-    components: tuple[ComponentView, ...]
+    components: Sequence[ComponentView]
 
 
 def compare_figure(view: PairView) -> Figure:
@@ -75,9 +68,9 @@ def compare_figure(view: PairView) -> Figure:
         _against(left, component)
         _scales(middle, component)
         _places(top, right, component)
-        one, two = below.subplots(1, 2)
-        _profile(one, component.columns, "column x (px)", component)
-        _profile(two, component.rows, "row y (px)", component)
+        labels = {"columns": "column x (px)", "rows": "row y (px)"}
+        for axes, (name, label) in zip(below.subplots(1, 2), labels.items(), strict=True):
+            _profile(axes, component.profiles[name], label, component)
     return figure
 
 
@@ -90,90 +83,56 @@ def _against(axes: Axes, view: ComponentView) -> None:
         shown, origin="lower", extent=(-end, end, -end, end), cmap=colours,
         norm=LogNorm(1, max(2, int(view.picture.max()))), interpolation="nearest",
     )  # fmt: skip
-    line = np.array([-end, end])
+    line, slope = np.array([-end, end]), view.facts["slope"]
     axes.plot(line, line, color=GREY, ls="--", linewidth=1, label="equal")
-    if view.slope is not None:
-        axes.plot(
-            line, view.slope * line, color=RED, linewidth=1.3, label=f"slope {view.slope:.3f}"
-        )
-    axes.set_xlim(-end, end)
-    axes.set_ylim(-end, end)
+    if slope is not None:
+        axes.plot(line, slope * line, color=RED, linewidth=1.3, label=f"slope {slope:.3f}")
     axes.set(
+        xlim=(-end, end), ylim=(-end, end), title=f"{symbol}: pixels",
         xlabel=f"{symbol} in 1 ({unit.label})", ylabel=f"{symbol} in 2 ({unit.label})",
-        title=f"{symbol}: pixels",
     )  # fmt: skip
     axes.legend(fontsize=8, loc="upper left", framealpha=0.9)
 
 
 def _scales(axes: Axes, view: ComponentView) -> None:
     """Common part, difference and expected noise at each scale."""
-    sizes = [s[key] for s in view.scales for key in ("difference_px", "expected_px")]
-    unit = unit_for(sizes, "px")
-    at = np.arange(len(view.scales), dtype=float)
+    scales = view.facts["scales"]
+    unit = unit_for([s[key] for s in scales for key in ("difference_px", "expected_px")], "px")
 
-    def line(values: Sequence[float]) -> F64:
-        return np.array(values) * unit.factor
+    def line(key: str, of: str | None = None) -> F64:
+        return np.array([(s[of] if of else s)[key] for s in scales], float) * unit.factor
 
-    expected = line([s["expected_px"] for s in view.scales])
-    spread = line([s["expected_px"] * 2 * s["ratio_error"] for s in view.scales])
-    axes.fill_between(
-        at, np.maximum(expected - spread, 0), expected + spread, color=BAND, linewidth=0
-    )
+    at = np.arange(len(scales), dtype=float)
+    expected, difference = line("expected_px"), line("difference_px")
+    spread = expected * 2 * np.array([s["ratio_error"] for s in scales])
+    low, high = np.maximum(expected - spread, 0), expected + spread
+    axes.fill_between(at, low, high, color=BAND, linewidth=0)
     axes.plot(at, expected, color=GREEN, linewidth=1.5, label="difference that noise gives, ±2σ")
-    axes.plot(
-        at, line([s["difference_px"] for s in view.scales]), "o-", color=BLUE, markersize=6,
-        linewidth=1.2, label="difference",
-    )  # fmt: skip
-    significant = [_seen(s["common"]) for s in view.scales]
-    common = line([s["common"]["px"] for s in view.scales])
-    errors = line([s["common"]["error_px"] for s in view.scales])
-    axes.errorbar(
-        at[significant],
-        common[significant],
-        errors[significant],
-        fmt="s",
-        color=INK,
-        markersize=6,
-        label="common",
+    axes.plot(at, difference, "o-", color=BLUE, markersize=6, linewidth=1.2, label="difference")
+    common = line("px", "common")
+    seen = np.array(
+        [s["common"]["variance_px2"] > 2 * s["common"]["variance_error_px2"] for s in scales], bool
     )
-    _limits(axes, at, view.scales, "common", INK, unit)
-    _beyond(axes, at, view.scales, unit)
+    beyond = np.array([s["significance"] > 3 for s in scales], bool)
+    # Upper limits as arrows, where nothing is significant.
+    top = line("upper_px", "common")[~seen]
+    axes.plot(at[~seen], top, marker=r"$\downarrow$", color=INK, markersize=11, ls="none")
+    for which, key, marker, colour, label in (
+        (seen, "common", "s", INK, "common"),
+        (beyond, "beyond_noise", "D", RED, "difference beyond noise"),
+    ):
+        if which.any():
+            axes.errorbar(
+                at[which], line("px", key)[which], line("error_px", key)[which], fmt=marker,
+                color=colour, markersize=6, label=label,
+            )  # fmt: skip
     axes.set_yscale("log")
-    _round_off(axes, np.concatenate([expected, common[significant], line([s["difference_px"]
-               for s in view.scales])]))  # fmt: skip
-    names = [str(s["side_px"]) for s in view.scales]
-    names[-1] = f"≥{names[-1]}"
-    axes.xaxis.set_major_locator(FixedLocator(at.tolist()))
-    axes.set_xticklabels(names)
+    _round_off(axes, np.concatenate([expected, common[seen], difference]))
+    names = [str(s["side_px"]) for s in scales]
+    axes.set_xticks(at, [*names[:-1], f"≥{names[-1]}"])
     axes.set(xlabel="scale (px)", ylabel=f"rms at this scale ({unit.label})", title="by scale")
     finish(axes)
     axes.legend(fontsize=8, framealpha=0.9, loc="upper right")
-
-
-def _seen(estimate: Mapping[str, float]) -> bool:
-    return estimate["variance_px2"] > 2 * estimate["variance_error_px2"]
-
-
-def _limits(
-    axes: Axes, at: F64, scales: Sequence[Mapping[str, Any]], key: str, colour: str, unit: Unit
-) -> None:
-    """Upper limits as arrows, where nothing is significant."""
-    for x, scale in zip(at, scales, strict=True):
-        if not _seen(scale[key]):
-            top = scale[key]["upper_px"] * unit.factor
-            axes.plot(x, top, marker=r"$\downarrow$", color=colour, markersize=11, ls="none")
-
-
-def _beyond(axes: Axes, at: F64, scales: Sequence[Mapping[str, Any]], unit: Unit) -> None:
-    significant = [(x, s["beyond_noise"]) for x, s in zip(at, scales, strict=True)
-             if s["significance"] > 3]  # fmt: skip
-    if significant:
-        places, values = zip(*significant, strict=True)
-        axes.errorbar(
-            places, [v["px"] * unit.factor for v in values],
-            [v["error_px"] * unit.factor for v in values], fmt="D", color=RED, markersize=6,
-            label="difference beyond noise",
-        )  # fmt: skip
 
 
 def _round_off(axes: Axes, values: F64) -> None:
@@ -186,32 +145,27 @@ def _round_off(axes: Axes, values: F64) -> None:
 
 def _places(figure: SubFigure, axes: Axes, view: ComponentView) -> None:
     """Blocks: by how many sigma their means differ; those whose pixels scatter are framed."""
-    ny, nx = view.window
+    (ny, nx), side = view.window, view.facts["blocks"]["side_px"]
+    scattered = np.argwhere(np.nan_to_num(view.scatter) > SHIFT_SPAN)
     drawn = axes.imshow(
         np.ma.masked_invalid(view.shift), origin="lower", cmap=DIVERGING, aspect="equal",
         vmin=-SHIFT_SPAN, vmax=SHIFT_SPAN, interpolation="nearest",
-        extent=covered(view.shift.shape, view.side),
+        extent=covered(view.shift.shape, side),
     )  # fmt: skip
-    for y, x in np.argwhere(np.nan_to_num(view.scatter) > SHIFT_SPAN):
-        corner = x * view.side - 0.5, y * view.side - 0.5
-        axes.add_patch(_frame(corner, view.side))
+    for y, x in scattered:
+        corner = x * side - 0.5, y * side - 0.5
+        axes.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=INK, linewidth=1.1))
     for y, x in view.far[:MARKED]:
         axes.plot(x, y, "o", color=INK, markersize=5, fillstyle="none", markeredgewidth=0.9)
-    axes.set_xlim(-0.5, nx - 0.5)
-    axes.set_ylim(-0.5, ny - 0.5)
-    axes.set(xlabel="x (px)", ylabel="y (px)")
-    notes = [f"blocks of {view.side} px"]
+    axes.set(xlabel="x (px)", ylabel="y (px)", xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5))
+    notes = [f"blocks of {side} px"]
     if view.far:
         notes.append("○ pixels beyond 5σ")
-    if (np.nan_to_num(view.scatter) > SHIFT_SPAN).any():
+    if len(scattered):
         notes.append("□ scatter beyond 5σ")
     axes.set_title("\n".join(notes), fontsize=12 if len(notes) == 1 else 9)
     bar = figure.colorbar(drawn, ax=axes, pad=0.03, shrink=0.85, extend="both")
     bar.set_label("mean difference (σ)")
-
-
-def _frame(corner: tuple[float, float], side: int) -> Rectangle:
-    return Rectangle(corner, side, side, fill=False, edgecolor=INK, linewidth=1.1)
 
 
 def _profile(axes: Axes, profile: tuple[F64, F64], label: str, view: ComponentView) -> None:

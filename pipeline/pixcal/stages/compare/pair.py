@@ -1,8 +1,10 @@
 """Two sides along one direction, read tile by tile: the sums, then the pixels."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
-from itertools import product
+from functools import cached_property, partial, reduce
+from itertools import pairwise, product
+from operator import add
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +12,8 @@ from scipy.special import ndtr
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.stages.compare.agreement import Blocks, Grouping, Part, Projection, halve, part
-from pixcal.stages.compare.sides import Side, SideTile, Tile, Vector
+from pixcal.stages.compare.agreement import Grouping, Part, Projection, double, halve
+from pixcal.stages.compare.sides import Side, Tile, Vector
 
 F64 = NDArray[np.float64]
 
@@ -47,7 +49,7 @@ class Pair:
     @property
     def coarse(self) -> int:
         """Times that blocks are doubled inside a tile; a block of it is kept in memory."""
-        most = int(np.log2(_power_of_two(min(self.first.chunk))))
+        most = int(np.log2(min(self.tile_side)))
         return min(most, max(0, int(np.ceil(np.log2(max(self.window) / COARSE)))))
 
     @property
@@ -56,23 +58,34 @@ class Pair:
         side = _power_of_two(max(self.window) / SHOWN_BLOCKS)
         return max(side, LEAST_BLOCK, 1 << self.coarse)
 
-    def tiles(self) -> list[Tile]:
-        """The window cut along the chunks of the first side."""
-        rows, columns = (
-            [(a, min(a + step, n)) for a in range(0, n, step)]
-            for n, step in zip(self.window, self.tile_side, strict=True)
-        )
-        return list(product(rows, columns))
-
     @property
     def tile_side(self) -> tuple[int, int]:
         """A chunk of the first side, cut to a power of two so that blocks do not cross tiles."""
         cy, cx = self.first.chunk
         return _power_of_two(cy), _power_of_two(cx)
 
-    def read(self, tile: Tile) -> tuple[SideTile, SideTile]:
-        """Both sides of a tile."""
-        return self.first.read(tile, self.direction), self.second.read(tile, self.direction)
+    def tiles(self) -> list[Tile]:
+        """The window in tiles, row by row."""
+        rows, columns = (
+            [(start, min(start + step, length)) for start in range(0, length, step)]
+            for length, step in zip(self.window, self.tile_side, strict=True)
+        )
+        return list(product(rows, columns))
+
+    def together(self, pieces: Sequence[F64]) -> F64:
+        """Pieces (..., y, x) of all tiles side by side."""
+        columns = -(-self.window[1] // self.tile_side[1])
+        rows = range(0, len(pieces), columns)
+        return np.block([list(pieces[n : n + columns]) for n in rows])
+
+    def read(self, tile: Tile) -> F64:
+        """Sums over blocks of one pixel (k + 3, y, x); zero where either side has no offset."""
+        sides = [side.read(tile, self.direction) for side in (self.first, self.second)]
+        maps, variances = (np.stack([side[n] for side in sides]) for n in (0, 1))
+        good = np.isfinite(maps).all(axis=0) & (variances > 0).all(axis=0)
+        modes = [side[2] for side in sides]
+        sums = np.concatenate([maps, *modes, variances, np.ones((1, *good.shape))])
+        return np.where(good, sums, 0.0)
 
     def plan(self, runtime: Runtime) -> Runtime:
         """As many workers as the memory allows."""
@@ -81,11 +94,10 @@ class Pair:
             for side in (self.first, self.second)
             for s in side.sets_along(self.direction)
         )
-        maps = sum(len(side.sets) for side in (self.first, self.second))
-        batches = max(_batches(self.first), _batches(self.second))
-        pixels = int(np.prod(self.tile_side))
+        sets = (*self.first.sets, *self.second.sets)
+        batches = max(len(s.batches or ()) for s in sets)
         # The modes and their sums over blocks; each set's maps; its batches as read and as used.
-        task = pixels * (8 * (4 * k + 12 * maps) + 40 * batches)
+        task = int(np.prod(self.tile_side)) * (8 * (4 * k + 12 * len(sets)) + 40 * batches)
         blocks = np.prod([-(-n // 2**self.coarse) for n in self.window])
         held = int(8 * (k + 4) * (3 * blocks + 2 * sum(self.window)))
         plan = make_plan(f"the comparison of {self.name}", task, held, runtime)
@@ -97,47 +109,20 @@ def _power_of_two(value: float) -> int:
     return 1 << max(0, int(np.log2(value)))
 
 
-def _batches(side: Side) -> int:
-    return max(len(s.batches or ()) for s in side.sets)
-
-
-@dataclass(frozen=True)
-class Outlying:
-    """Which pixels to leave out: those whose difference is far off."""
-
-    projection: Projection
-    limit: float  # of the difference over its error
-
-    def keep(self, values: F64, variance: F64) -> NDArray[np.bool_]:
-        """Pixels to keep, from maps and modes (k, y, x) and the difference's variance."""
-        return np.abs(pull(self.projection, values, variance)) <= self.limit
-
-
-def pull(projection: Projection, values: F64, variance: F64) -> F64:
-    """Difference of the maps, less their modes, over its error; NaN where there is none."""
-    first, second = projection.residual(values)
-    good = variance > 0
-    return np.where(good, (second - first) / np.sqrt(np.where(good, variance, 1.0)), np.nan)
-
-
-def _values(pair: Pair, tile: Tile) -> tuple[F64, F64]:
-    """Maps and modes (k, y, x), and the variances (2, y, x); NaN where either side has none."""
-    one, two = pair.read(tile)
-    values = np.concatenate([one.delta[None], two.delta[None], one.modes, two.modes])
-    noise = np.stack([one.variance, two.variance])
-    lacking = ~(np.isfinite(values[:2]).all(axis=0) & (noise > 0).all(axis=0))
-    noise[:, lacking] = np.nan
-    return values, noise
+def pulls(projection: Projection, sums: F64) -> F64:
+    """Difference of the maps without their modes over its error (y, x); NaN where there is none."""
+    *_, difference = projection.difference(sums[:-3])
+    variance = np.where(sums[-1] > 0, sums[-3] + sums[-2], np.nan)
+    return np.asarray(difference / np.sqrt(variance))
 
 
 @dataclass(frozen=True)
 class PairSums:
     """Sums of one pass over both sides."""
 
-    fine: tuple[Grouping, ...]  # blocks of 1, 2, 4, ... pixels, up to the coarse ones
-    coarse: Blocks  # of the whole window
-    columns: Blocks  # columns, rows: of one column or row each
-    rows: Blocks
+    fine: list[Grouping]  # blocks of 1, 2, 4, ... pixels, up to the coarse ones
+    coarse: F64  # (k + 3, y, x) of the whole window
+    profiles: dict[str, F64]  # (k + 3, n) of the `columns` and of the `rows`
     levels: int  # times that blocks are doubled in all
 
     @property
@@ -153,89 +138,60 @@ class PairSums:
     @cached_property
     def whole(self) -> Grouping:
         """All pixels as one group."""
-        return self.coarse.along(1).along(2).grouping()
+        return Grouping.of(self.coarse.sum(axis=(1, 2))[:, None])
 
     def scales(self) -> list[tuple[int, Part]]:
         """Block side (px) and the maps at that scale; the last holds all larger scales."""
-        groupings = list(self.fine[: self.levels + 1])
-        blocks = self.coarse
-        while len(groupings) <= self.levels:
-            blocks = blocks.coarser()
-            groupings.append(blocks.grouping())
-        pairs = zip(groupings, [*groupings[1:], self.whole], strict=True)
+        further, _ = double(self.coarse, max(0, self.levels + 1 - len(self.fine)))
+        groupings = [*self.fine, *further[1:]][: self.levels + 1]
         return [
-            (1 << level, part(fine, coarse, self.projection, self.pixels))
-            for level, (fine, coarse) in enumerate(pairs)
+            (1 << level, self.projection.part(fine, coarse, self.pixels))
+            for level, (fine, coarse) in enumerate(pairwise([*groupings, self.whole]))
         ]
 
     def total(self) -> Part:
         """The maps at all scales."""
-        return part(self.fine[0], self.whole, self.projection, self.pixels)
+        return self.projection.part(self.fine[0], self.whole, self.pixels)
 
-    def of_means(self, blocks: Blocks) -> Part:
+    def of_means(self, sums: F64) -> Part:
         """The maps of the means of columns or rows."""
-        return part(blocks.grouping(), self.whole, self.projection, self.pixels)
+        return self.projection.part(Grouping.of(sums), self.whole, self.pixels)
 
-    def differences(self, blocks: Blocks) -> tuple[F64, F64]:
+    def differences(self, sums: F64) -> tuple[F64, F64]:
         """Mean difference, second less first, of each block and its error, px; NaN where empty."""
-        first, second = self.projection.residual(blocks.values)
-        there = blocks.count > 0
-        count = np.where(there, blocks.count, np.nan)
-        return (second - first) / count, np.sqrt(blocks.noise.sum(axis=0)) / count
+        *_, difference = self.projection.difference(sums[:-3])
+        count = np.where(sums[-1] > 0, sums[-1], np.nan)
+        return difference / count, np.sqrt(sums[-3] + sums[-2]) / count
 
 
-def read_sums(pair: Pair, outlying: Outlying | None, runtime: Runtime) -> PairSums:
+def read_sums(
+    pair: Pair, runtime: Runtime, keep: tuple[Projection, float] | None = None
+) -> PairSums:
     """Read both sides once.
 
     Parameters
     ----------
-    outlying : Outlying or None
-        Pixels to leave out.
+    keep : (Projection, float) or None
+        Leave out pixels whose difference, without these modes, is larger than so many errors.
     """
-    tiles = pair.tiles()
-    results = run_tasks(
-        partial(_sums_task, pair, outlying), tiles, runtime, label=f"sums {pair.name}"
-    )
-    fine = results[0][0]
-    for more, _, _, _ in results[1:]:
-        fine = tuple(a + b for a, b in zip(fine, more, strict=True))
-    ny, nx = pair.window
-    side = 1 << pair.coarse
-    k = len(results[0][1].values)
-    coarse = _empty(k, -(-ny // side), -(-nx // side))
-    columns, rows = _empty(k, 1, nx), _empty(k, ny, 1)
-    for ((y0, y1), (x0, x1)), (_, blocks, down, across) in zip(tiles, results, strict=True):
-        at = np.s_[y0 // side : -(-y1 // side), x0 // side : -(-x1 // side)]
-        for whole, piece, place in (
-            (coarse, blocks, at),
-            (columns, down, np.s_[:, x0:x1]),
-            (rows, across, np.s_[y0:y1, :]),
-        ):
-            whole.values[:, *place] += piece.values
-            whole.noise[:, *place] += piece.noise
-            whole.count[place] += piece.count
-    return PairSums(fine, coarse, columns, rows, pair.levels)
-
-
-def _empty(k: int, ny: int, nx: int) -> Blocks:
-    return Blocks(np.zeros((k, ny, nx)), np.zeros((2, ny, nx)), np.zeros((ny, nx)))
+    task = partial(_sums_task, pair, keep)
+    results = run_tasks(task, pair.tiles(), runtime, label=f"sums {pair.name}")
+    groupings, *pieces = zip(*results, strict=True)
+    fine = [reduce(add, level) for level in zip(*groupings, strict=True)]
+    coarse, columns, rows = (pair.together(p) for p in pieces)
+    profiles = {"columns": columns.sum(axis=1), "rows": rows.sum(axis=2)}
+    return PairSums(fine, coarse, profiles, pair.levels)
 
 
 def _sums_task(
-    pair: Pair, outlying: Outlying | None, tile: Tile
-) -> tuple[tuple[Grouping, ...], Blocks, Blocks, Blocks]:
-    values, noise = _values(pair, tile)
-    good = np.isfinite(noise).all(axis=0)
-    if outlying is not None:
-        good &= outlying.keep(values, noise.sum(axis=0))
-    pixels = Blocks(
-        np.where(good, values, 0.0), np.where(good, noise, 0.0), np.asarray(good, float)
-    )
-    blocks, groupings = pixels, [pixels.grouping()]
-    for _ in range(pair.coarse):
-        blocks = blocks.coarser()
-        groupings.append(blocks.grouping())
-    return tuple(groupings), blocks, pixels.along(1), pixels.along(2)
+    pair: Pair, keep: tuple[Projection, float] | None, tile: Tile
+) -> tuple[list[Grouping], F64, F64, F64]:
+    pixels = pair.read(tile)
+    if keep is not None:
+        projection, limit = keep
+        pixels = np.where(np.abs(pulls(projection, pixels)) <= limit, pixels, 0.0)
+    columns, rows = pixels.sum(axis=1, keepdims=True), pixels.sum(axis=2, keepdims=True)
+    return *double(pixels, pair.coarse), columns, rows
 
 
 @dataclass(frozen=True)
@@ -244,13 +200,11 @@ class Pixels:
 
     pulls: NDArray[np.int64]  # (bin,) histogram of differences over their errors, `PULLS`
     picture: NDArray[np.int64]  # (bin, bin) second map (y) against the first (x), within `reach`
-    reach: float  # px
-    far: tuple[tuple[int, int, float, float], ...]  # pixels beyond `DISAGREE`, farthest first
-    beyond: int  # how many there are
-    # squares, count: (y, x) sum of squared pulls of each coarse block and its pixels, those
-    # beyond left out
+    far: list[tuple[int, int, float, float]]  # y, x, difference, error of pixels beyond `DISAGREE`
+    beyond: int  # how many there are; the farthest of each tile are listed
+    # (2, y, x) sum of squared pulls of each coarse block and its pixels, those beyond left out
     squares: F64
-    count: F64
+    reach: float  # px
 
     @property
     def spread(self) -> float:
@@ -264,77 +218,34 @@ def read_pixels(pair: Pair, sums: PairSums, runtime: Runtime) -> Pixels:
     """Read both sides once more, with the modes known."""
     total = sums.total()
     reach = REACH * (max(total.first, total.second) / max(total.pixels, 1)) ** 0.5 or 1.0
-    tiles = pair.tiles()
-    pieces = run_tasks(
-        partial(_pixels_task, pair, sums.projection, reach), tiles, runtime,
-        label=f"pixels {pair.name}",
-    )  # fmt: skip
-    side = 1 << pair.coarse
-    squares, count = (np.zeros(sums.coarse.count.shape) for _ in range(2))
-    for ((y0, y1), (x0, x1)), piece in zip(tiles, pieces, strict=True):
-        at = np.s_[y0 // side : -(-y1 // side), x0 // side : -(-x1 // side)]
-        squares[at], count[at] = piece.squares, piece.count
+    task = partial(_pixels_task, pair, sums.projection, reach)
+    pieces = run_tasks(task, pair.tiles(), runtime, label=f"pixels {pair.name}")
     far = sorted((f for piece in pieces for f in piece.far), key=lambda f: -abs(f[2] / f[3]))
     return Pixels(
         np.sum([piece.pulls for piece in pieces], axis=0),
         np.sum([piece.picture for piece in pieces], axis=0),
-        reach, tuple(far), sum(piece.beyond for piece in pieces), squares, count,
-    )  # fmt: skip
+        far,
+        sum(piece.beyond for piece in pieces),
+        pair.together([piece.squares for piece in pieces]),
+        reach,
+    )
 
 
 def _pixels_task(pair: Pair, projection: Projection, reach: float, tile: Tile) -> Pixels:
-    values, noise = _values(pair, tile)
-    variance = noise.sum(axis=0)
-    first, second = projection.residual(values)
-    z = pull(projection, values, variance)
-    good = np.isfinite(z)
+    sums = pair.read(tile)
+    first, second, difference = projection.difference(sums[:-3])
+    error, z = np.sqrt(sums[-3] + sums[-2]), pulls(projection, sums)
+    good = sums[-1] > 0
     edges = np.linspace(-reach, reach, PICTURE + 1)
     picture, _, _ = np.histogram2d(second[good], first[good], (edges, edges))
-    beyond = np.flatnonzero(good & (np.abs(np.where(good, z, 0.0)) > DISAGREE))
-    farthest = beyond[np.argsort(-np.abs(z.ravel()[beyond]))][:LISTED]
+    far = np.abs(z) > DISAGREE
     (y0, _), (x0, _) = tile
-    far = []
-    for y, x in zip(*np.unravel_index(farthest, z.shape), strict=True):
-        difference, error = second[y, x] - first[y, x], variance[y, x] ** 0.5
-        far.append((int(y + y0), int(x + x0), float(difference), float(error)))
-    ends = np.clip(z[good], PULLS[0], PULLS[-1])
-    near = good & (np.abs(np.where(good, z, 0.0)) <= DISAGREE)
-    squares, count = np.where(near, z, 0.0) ** 2, np.asarray(near, float)
+    listed = [
+        (y0 + int(y), x0 + int(x), float(difference[y, x]), float(error[y, x]))
+        for y, x in sorted(np.argwhere(far).tolist(), key=lambda at: -abs(z[*at]))[:LISTED]
+    ]
+    squares = np.where(good & ~far, [z**2, np.ones_like(z)], 0.0)
     for _ in range(pair.coarse):
-        squares, count = halve(squares), halve(count)
-    return Pixels(
-        np.histogram(ends, PULLS)[0], picture.astype(np.int64), reach, tuple(far), len(beyond),
-        squares, count,
-    )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Places:
-    """Where the sides differ: blocks of the window."""
-
-    side: int  # of a block, px
-    # mean, error: (y, x) mean difference of a block's pixels and its error, px; NaN where empty
-    mean: F64
-    error: F64
-    squares: F64  # squares, count: (y, x) sum of squared pulls and pixels
-    count: F64
-
-    @classmethod
-    def of(cls, pair: Pair, sums: PairSums, pixels: Pixels) -> "Places":
-        """Put coarse blocks together."""
-        blocks, squares, count = sums.coarse, pixels.squares, pixels.count
-        for _ in range((pair.shown >> pair.coarse).bit_length() - 1):
-            blocks, squares, count = blocks.coarser(), halve(squares), halve(count)
-        return cls(pair.shown, *sums.differences(blocks), squares, count)
-
-    @property
-    def shift(self) -> F64:
-        """Mean difference over its error."""
-        return self.mean / self.error
-
-    @property
-    def scatter(self) -> F64:
-        """Excess scatter of a block's pixels over noise, sigma; NaN where empty."""
-        n = np.where(self.count > 0, self.count, np.nan)
-        chance = 2 / (9 * n)
-        return np.asarray(((self.squares / n) ** (1 / 3) - (1 - chance)) / np.sqrt(chance))
+        squares = halve(squares)
+    histogram = np.histogram(np.clip(z[good], PULLS[0], PULLS[-1]), PULLS)[0]
+    return Pixels(histogram, picture.astype(int), listed, int(far.sum()), squares, reach)

@@ -56,16 +56,12 @@ class ComparedSet:
     def delta(self, tile: Tile) -> tuple[F64, F64]:
         """Offset along the axis and its error (y, x), px; NaN where there is none."""
         if self.batches is None:
-            delta, sigma = (self._map(name, tile) for name in ("delta", "sigma"))
-            return delta, sigma
-        whole = (0, ArrayReader(self.folder / "batch_delta").shape[0])
-        chosen = list(self.batches)
+            return self._map("delta", tile), self._map("sigma", tile)
+        readers = [ArrayReader(self.folder / f"batch_{name}") for name in ("delta", "sigma")]
         delta, sigma = (
-            ArrayReader(self.folder / f"batch_{name}").read(whole, *tile)[chosen].astype(float)
-            for name in ("delta", "sigma")
+            r.read((0, r.shape[0]), *tile)[list(self.batches)].astype(float) for r in readers
         )
-        mean, error, _ = weighted_mean(delta, sigma)
-        return mean, error
+        return weighted_mean(delta, sigma)[:2]
 
     def modes(self, tile: Tile) -> F64:
         """What the fit took off the set's map, (mode, y, x), px but for a factor."""
@@ -80,15 +76,6 @@ class ComparedSet:
 
     def _map(self, name: str, tile: Tile) -> F64:
         return ArrayReader(self.folder / name).read(*tile).astype(float)
-
-
-@dataclass(frozen=True)
-class SideTile:
-    """A part of one side along one direction."""
-
-    delta: F64  # delta, variance: (y, x) px and px²; NaN where there is none
-    variance: F64
-    modes: F64  # (mode, y, x)
 
 
 @dataclass(frozen=True)
@@ -118,33 +105,33 @@ class Side:
         """Whether it measures both components."""
         return axes_span_plane(self.axes)
 
-    def sets_along(self, direction: Vector) -> tuple[ComparedSet, ...]:
+    def sets_along(self, direction: Vector) -> list[ComparedSet]:
         """The sets whose modes contribute along a direction."""
-        ones = np.ones((len(self.sets), 1))
-        shares = self._shares(self.axes, ones, direction)
-        return tuple(
-            s for s, share in zip(self.sets, shares[:, 0], strict=True) if abs(share) > PART_OF
-        )
+        shares = self._shares(self.axes, np.ones((len(self.sets), 1)), direction)
+        return [s for s, share in zip(self.sets, shares, strict=True) if abs(share) > PART_OF]
 
-    def read(self, tile: Tile, direction: Vector) -> SideTile:
-        """Offset along a unit vector (x, y), its variance, and its modes, on a tile."""
+    def read(self, tile: Tile, direction: Vector) -> tuple[F64, F64, F64]:
+        """Offset along a unit vector (x, y), its variance, and its modes, on a tile.
+
+        Returns
+        -------
+        delta, variance : (y, x) float64
+            px and px²; NaN where there is none.
+        modes : (mode, y, x) float64
+        """
         offsets = [s.delta(tile) for s in self.sets]
-        delta, sigma = (np.stack([f[n] for f in offsets]) for n in (0, 1))
+        delta, sigma = (np.stack(maps) for maps in zip(*offsets, strict=True))
         shares = self._shares([s.axis(tile) for s in self.sets], sigma, direction)
+        # A set without an offset at a pixel has no share in it.
+        parts = np.where(np.isfinite(sigma), [shares * delta, (shares * sigma) ** 2], 0.0)
         lacking = ~np.isfinite(shares).all(axis=0)
-        known = np.isfinite(sigma)
-        value = np.where(known, shares * np.where(known, delta, 0.0), 0.0).sum(axis=0)
-        variance = np.where(known, (shares * np.where(known, sigma, 0.0)) ** 2, 0.0).sum(axis=0)
+        value, variance = np.where(lacking, np.nan, parts.sum(axis=1))
         used = self.sets_along(direction)
-        modes = np.concatenate(
-            [
-                np.nan_to_num(share) * s.modes(tile)
-                for share, s in zip(shares, self.sets, strict=True)
-                if s in used
-            ]
-        )
-        return SideTile(
-            np.where(lacking, np.nan, value), np.where(lacking, np.nan, variance), modes
+        known = zip(np.nan_to_num(shares), self.sets, strict=True)
+        return (
+            value,
+            variance,
+            np.concatenate([share * s.modes(tile) for share, s in known if s in used]),
         )
 
     def _shares(self, axes: Sequence[Vector], sigma: F64, direction: Vector) -> F64:
@@ -154,8 +141,7 @@ class Side:
             unit = np.zeros_like(sigma)
             unit[n] = 1.0
             if self.both:
-                x, y = combine_sets(axes, unit, sigma)[0]
-                shares[n] = direction[0] * x + direction[1] * y
+                shares[n] = np.tensordot(direction, combine_sets(axes, unit, sigma)[0], 1)
             else:
                 # The mean of parallel sets has the sign of the first.
                 sign = np.sign(np.dot(axes[0], direction))
@@ -171,28 +157,23 @@ def whole_run(run: Path, label: str | None = None) -> Side:
     InputError
         If the run has not been fitted, or by a model that this comparison does not know.
     """
-    manifest = require(run, "fit")
-    result = read_json(run / "fit" / "fit.json")
+    key = require(run, "fit").key
+    fitted = read_json(run / "fit" / "fit.json")["sets"]
     acquisition = read_acquisition(run)
     group = run / "fit" / "fit.zarr"
-    first = ArrayReader(group / next(iter(result["sets"])) / "delta")
-    window = (first.shape[0], first.shape[1])
+    first = ArrayReader(group / next(iter(fitted)) / "delta")
+    (ny, nx), (cy, cx) = first.shape, first.chunks
     sets = tuple(
-        ComparedSet(name, group / name, fitted_shape(run, facts, acquisition, window))
-        for name, facts in result["sets"].items()
+        ComparedSet(name, group / name, fitted_shape(run, facts, acquisition, (ny, nx)))
+        for name, facts in fitted.items()
     )
-    about_sets = {
-        name: {key: facts[key] for key in ("frames", "interfringe_px", "model", "axis")}
-        for name, facts in result["sets"].items()
-    }
-    facts = {"run": str(run), "key": manifest.key, "sets": about_sets}
-    return Side(
-        label or run.name or str(run), run, manifest.key, sets, window,
-        (first.chunks[0], first.chunks[1]), facts,
-    )  # fmt: skip
+    said = ("frames", "interfringe_px", "model", "axis")
+    about_sets = {name: {key: facts[key] for key in said} for name, facts in fitted.items()}
+    facts = {"run": str(run), "key": key, "sets": about_sets}
+    return Side(label or run.name or str(run), run, key, sets, (ny, nx), (cy, cx), facts)
 
 
-def parts_of(run: Path, *, interleaved: bool) -> tuple[Side, Side]:
+def parts_of(run: Path, *, interleaved: bool) -> list[Side]:
     """Two parts of a run: the first and the second half of its batches, or every other one.
 
     Raises
@@ -202,28 +183,22 @@ def parts_of(run: Path, *, interleaved: bool) -> tuple[Side, Side]:
     """
     side = whole_run(run)
     labels = ("odd batches", "even batches") if interleaved else ("first half", "second half")
-    halves: list[list[ComparedSet]] = [[], []]
-    counts: list[dict[str, int]] = [{}, {}]
-    for s in side.sets:
-        count = ArrayReader(s.folder / "batch_count").read()
-        filled = np.flatnonzero(count > 0)
-        if len(filled) < 2:
+    counts = {s.name: ArrayReader(s.folder / "batch_count").read() for s in side.sets}
+    filled = {name: np.flatnonzero(count > 0) for name, count in counts.items()}
+    for name, batches in filled.items():
+        if len(batches) < 2:
             raise InputError(
-                f"{run}: set {s.name!r} has too few batches of frames ({len(filled)}) to be "
+                f"{run}: set {name!r} has too few batches of frames ({len(batches)}) to be "
                 "compared with itself; name two runs, or take more frames"
             )
-        middle = len(filled) // 2
-        chosen = (filled[::2], filled[1::2]) if interleaved else (filled[:middle], filled[middle:])
-        for n, batches in enumerate(chosen):
-            halves[n].append(replace(s, batches=tuple(int(b) for b in batches)))
-            counts[n][s.name] = int(count[batches].sum())
-    first, second = (
-        replace(
-            side,
-            label=f"{side.label}, {label}",
-            sets=tuple(sets),
-            facts=side.facts | {"part": label, "frames_of_part": frames},
-        )
-        for label, sets, frames in zip(labels, halves, counts, strict=True)
-    )
-    return first, second
+    parts = []
+    for n, label in enumerate(labels):
+        chosen = {
+            name: batches[n::2] if interleaved else np.split(batches, [len(batches) // 2])[n]
+            for name, batches in filled.items()
+        }
+        sets = tuple(replace(s, batches=tuple(chosen[s.name].tolist())) for s in side.sets)
+        frames = {name: int(counts[name][batches].sum()) for name, batches in chosen.items()}
+        facts = side.facts | {"part": label, "frames_of_part": frames}
+        parts.append(replace(side, label=f"{side.label}, {label}", sets=sets, facts=facts))
+    return parts

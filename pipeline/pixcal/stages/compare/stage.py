@@ -8,7 +8,7 @@ holds all larger ones). The sizes of the scales add up in squares. With three si
 ``summary`` says what each holds of its own (from the differences of all pairs).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -24,17 +24,8 @@ from pixcal.model.options import Compare
 from pixcal.report.compare_figures import ComponentView, PairView, compare_figure
 from pixcal.report.drawing import png
 from pixcal.stages.compare.agreement import VarianceEstimate, three_cornered_hat
-from pixcal.stages.compare.facts import describe, estimate_facts
-from pixcal.stages.compare.pair import (
-    DISAGREE,
-    Outlying,
-    Pair,
-    PairSums,
-    Pixels,
-    Places,
-    read_pixels,
-    read_sums,
-)
+from pixcal.stages.compare.facts import describe
+from pixcal.stages.compare.pair import DISAGREE, Pair, read_pixels, read_sums
 from pixcal.stages.compare.sides import Side, Vector, parts_of, whole_run
 from pixcal.storage.artefact import (
     MANIFEST,
@@ -78,8 +69,7 @@ def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Ma
     """
     _check_out(out)
     with damage_noted(*runs):
-        sides = _sides(runs, config)
-        return _run(sides, out, config, runtime)
+        return _run(_sides(runs, config), out, config, runtime)
 
 
 def _run(sides: Sequence[Side], out: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -95,7 +85,9 @@ def _run(sides: Sequence[Side], out: Path, config: Config, runtime: Runtime) -> 
         result, views = _compare_all(sides, components, config, runtime)
         for picture in out.glob("compare*.png"):
             picture.unlink()
-        for name, view in _names(views):
+        for view in views:
+            first, second = view.numbers
+            name = "compare.png" if len(views) == 1 else f"compare-{first}-{second}.png"
             aside = out / f".{name}.aside"
             aside.write_bytes(png(compare_figure(view)))
             aside.replace(out / name)
@@ -115,15 +107,9 @@ def _check_out(out: Path) -> None:
         raise InputError(f"--out {out}: holds something else of pixcal; choose another directory")
 
 
-def _names(views: Sequence[PairView]) -> list[tuple[str, PairView]]:
-    if len(views) == 1:
-        return [("compare.png", views[0])]
-    return [(f"compare-{v.numbers[0]}-{v.numbers[1]}.png", v) for v in views]
-
-
 def _sides(runs: Sequence[Path], config: Config) -> list[Side]:
     if len(runs) == 1:
-        return list(parts_of(runs[0], interleaved=config.split == "odd-even"))
+        return parts_of(runs[0], interleaved=config.split == "odd-even")
     # Runs of the same name in different places are told apart by their paths.
     alike = len({run.name for run in runs}) < len(runs)
     sides = [whole_run(run, str(run) if alike else None) for run in runs]
@@ -163,15 +149,14 @@ def _compare_all(
 ) -> tuple[dict[str, Any], list[PairView]]:
     pairs, views = [], []
     for i, j in combinations(range(len(sides)), 2):
-        by_component, parts = {}, []
-        for name, direction in components.items():
-            pair = Pair(sides[i], sides[j], name, direction)
-            facts, view = compare_pair(pair, config.sigma_accuracy, runtime)
-            by_component[name] = facts
-            parts.append(view)
-        pairs.append({"sides": [i, j], "components": by_component})
+        results = {
+            name: compare_pair(Pair(sides[i], sides[j], name, at), config.sigma_accuracy, runtime)
+            for name, at in components.items()
+        }
+        facts = {name: component for name, (component, _) in results.items()}
+        pairs.append({"sides": [i, j], "components": facts})
         labels = sides[i].label, sides[j].label
-        views.append(PairView((i + 1, j + 1), labels, tuple(parts)))
+        views.append(PairView((i + 1, j + 1), labels, [view for _, view in results.values()]))
     result = {
         "schema": SCHEMA,
         "pixcal": __version__,
@@ -196,57 +181,30 @@ def compare_pair(
         If they have too few pixels in common.
     """
     runtime = pair.plan(runtime)
-    everything = read_sums(pair, None, runtime)
-    if everything.pixels < FEWEST:
+    sums = read_sums(pair, runtime)
+    if sums.pixels < FEWEST:
         raise InputError(
-            f"{pair.first.run} and {pair.second.run}: {everything.pixels} pixels have {pair.name} "
-            f"in both; {FEWEST} are needed"
+            f"{pair.first.run} and {pair.second.run}: {sums.pixels} pixels have {pair.name} in "
+            f"both; {FEWEST} are needed"
         )
-    pixels = read_pixels(pair, everything, runtime)
+    pixels = read_pixels(pair, sums, runtime)
     # Where all pixels scatter more than noise, or are many, few of those far off are outliers.
-    chance = float(-ndtri(STRAY / everything.pixels))
+    chance = float(-ndtri(STRAY / sums.pixels))
     limit = max(DISAGREE, chance) * max(1.0, pixels.spread)
-    sums = everything
     if any(abs(d / e) > limit for _, _, d, e in pixels.far):
-        sums = read_sums(pair, Outlying(everything.projection, limit), runtime)
-    places = Places.of(pair, sums, pixels)
-    facts = describe(pair, sums, pixels, places, limit, accuracy)
-    return facts, _view(pair, sums, pixels, places, facts)
+        sums = read_sums(pair, runtime, (sums.projection, limit))
+    return describe(pair, sums, pixels, limit, accuracy)
 
 
-def _view(
-    pair: Pair, sums: PairSums, pixels: Pixels, places: Places, facts: dict[str, Any]
-) -> ComponentView:
-    profiles = [tuple(np.ravel(v) for v in sums.differences(b)) for b in (sums.columns, sums.rows)]
-    return ComponentView(
-        name=pair.name,
-        window=pair.window,
-        picture=pixels.picture,
-        reach=pixels.reach,
-        slope=facts["slope"],
-        scales=tuple(facts["scales"]),
-        side=places.side,
-        shift=places.shift,
-        scatter=places.scatter,
-        columns=(profiles[0][0], profiles[0][1]),
-        rows=(profiles[1][0], profiles[1][1]),
-        far=tuple((y, x) for y, x, d, e in pixels.far if abs(d / e) > DISAGREE),
-    )
-
-
-def _summary(pairs: list[dict[str, Any]], components: dict[str, Vector]) -> dict[str, Any]:
+def _summary(pairs: list[dict[str, Any]], components: Iterable[str]) -> dict[str, Any]:
     """Own errors of each side, from all pairs."""
-    numbers = [(p["sides"][0], p["sides"][1]) for p in pairs]
     summary: dict[str, Any] = {}
     for name in components:
-        excess = [
-            VarianceEstimate(e["variance_px2"], e["variance_error_px2"])
-            for e in (p["components"][name]["beyond_noise"] for p in pairs)
-        ]
-        summary[name] = {
-            "ratio": [p["components"][name]["ratio"] for p in pairs],
-            "own": [estimate_facts(e) for e in three_cornered_hat(numbers, excess)],
-        }
+        facts = [pair["components"][name] for pair in pairs]
+        beyond = (f["beyond_noise"] for f in facts)
+        excess = [VarianceEstimate(e["variance_px2"], e["variance_error_px2"]) for e in beyond]
+        own = three_cornered_hat([pair["sides"] for pair in pairs], excess)
+        summary[name] = {"ratio": [f["ratio"] for f in facts], "own": [e.facts() for e in own]}
     return summary
 
 
