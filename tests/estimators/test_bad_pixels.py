@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from pixcal.estimators.detector.bad_pixels import dead, hot, noisy, nonlinear
-from pixcal.estimators.detector.calibration import Rung
+from pixcal.estimators.detector.calibration import Rung, step_levels
 
 F64 = NDArray[np.float64]
 CLEAN = (1200, 1000)
@@ -90,15 +90,15 @@ def ladder(
 
 def test_a_clean_ladder_is_linear() -> None:
     rungs, _ = ladder(np.random.default_rng(5), CLEAN)
-    assert nonlinear(rungs, 0.03).sum() < FEW
+    assert nonlinear(rungs, step_levels(rungs), 0.03).sum() < FEW
     # Even without the allowance, by significance alone.
-    assert nonlinear(rungs, 1e-9).sum() < FEW
+    assert nonlinear(rungs, step_levels(rungs), 1e-9).sum() < FEW
 
 
 def test_a_curve_that_all_pixels_share_flags_none() -> None:
     rungs, _ = ladder(np.random.default_rng(6), (100, 100))
     bent = [Rung(r.exptime, 4, r.signal - 2e-6 * r.signal**2, r.variance) for r in rungs]
-    assert not nonlinear(bent, 0.03).any()
+    assert not nonlinear(bent, step_levels(bent), 0.03).any()
 
 
 def test_a_pixel_that_bends_is_nonlinear() -> None:
@@ -106,7 +106,7 @@ def test_a_pixel_that_bends_is_nonlinear() -> None:
     for rung in rungs:
         rung.signal[3, 4] *= 1 - 0.2 * rung.exptime
         rung.signal[5, 6] *= 1 - 0.005 * rung.exptime
-    assert np.argwhere(nonlinear(rungs, 0.03)).tolist() == [[3, 4]]
+    assert np.argwhere(nonlinear(rungs, step_levels(rungs), 0.03)).tolist() == [[3, 4]]
 
 
 def test_two_levels_do_not_tell() -> None:
@@ -114,8 +114,8 @@ def test_two_levels_do_not_tell() -> None:
     rungs[2].signal[3, 4] = rungs[3].signal[3, 4] = np.nan
     rungs[0].signal[3, 4] *= 2
     rungs[0].signal[5, 4] *= 2
-    assert np.argwhere(nonlinear(rungs, 0.03)).tolist() == [[5, 4]]
-    assert not nonlinear(rungs[:2], 0.03).any()
+    assert np.argwhere(nonlinear(rungs, step_levels(rungs), 0.03)).tolist() == [[5, 4]]
+    assert not nonlinear(rungs[:2], step_levels(rungs[:2]), 0.03).any()
 
 
 @pytest.mark.parametrize("columns", [3, 20, 70])
@@ -124,7 +124,7 @@ def test_columns_without_light_leave_the_others_linear(columns: int) -> None:
     rng = np.random.default_rng(9)
     for rung in rungs:
         rung.signal[:, :columns] = rng.normal(0, 2, (101, columns))
-    assert not nonlinear(rungs, 0.03)[:, columns:].any()
+    assert not nonlinear(rungs, step_levels(rungs), 0.03)[:, columns:].any()
 
 
 def test_colours_of_a_mosaic_are_not_dead() -> None:

@@ -9,7 +9,8 @@ from pixcal.estimators.detector.calibration import (
     Rung,
     dark_line,
     linearity,
-    response_rate,
+    relative_response,
+    step_levels,
     usual_variance,
 )
 from pixcal.kernels.robust import median_and_sigma
@@ -60,23 +61,26 @@ def test_a_pixel_without_samples_has_no_line() -> None:
     assert np.isfinite(line.rate).sum() == line.rate.size - 2
 
 
-def test_the_response_is_all_charge_over_all_time() -> None:
+def test_the_response_is_all_charge_over_all_light() -> None:
     rate = np.random.default_rng(1).normal(1e5, 1e3, SHAPE)
     times = (0.1, 0.2, 0.4)
     rungs = [Rung(t, n, rate * t, full(rate.mean() * t / n)) for t, n in zip(times, (3, 5, 7))]  # noqa: B905
-    found, error = response_rate(rungs)
-    np.testing.assert_allclose(found, rate)
+    levels = step_levels(rungs)
+    found, error = relative_response(rungs, levels)
+    np.testing.assert_allclose(found, rate / np.median(rate))
+    light = sum(level * n for level, n in zip(levels, (3, 5, 7)))  # noqa: B905
     seconds = sum(t * n for t, n in zip(times, (3, 5, 7)))  # noqa: B905
     # Poisson: the variance of the whole charge is that charge.
-    np.testing.assert_allclose(error, np.sqrt(rate.mean() * seconds) / seconds)
+    np.testing.assert_allclose(error, np.sqrt(rate.mean() * seconds) / light)
 
 
 def test_a_saturated_rung_does_not_count() -> None:
     short, long = full(1e4), full(4e4)
     long[3, 3] = np.nan
     short[5, 5] = long[5, 5] = np.nan
-    found, _ = response_rate([Rung(0.1, 4, short, full(1.0)), Rung(0.4, 4, long, full(1.0))])
-    assert found[3, 3] == pytest.approx(1e5)
+    rungs = [Rung(0.1, 4, short, full(1.0)), Rung(0.4, 4, long, full(1.0))]
+    found, _ = relative_response(rungs, step_levels(rungs))
+    assert found[3, 3] == pytest.approx(1)
     assert np.isnan(found[5, 5])
 
 
@@ -127,3 +131,25 @@ def test_median_and_sigma_of_a_gaussian_with_outliers() -> None:
     assert median == pytest.approx(5, abs=0.05)
     assert sigma == pytest.approx(3, rel=0.02)
     assert np.isnan(median_and_sigma(np.full(3, np.nan))).all()
+
+
+def test_a_lamp_that_changes_leaves_the_response_of_saturated_pixels() -> None:
+    pattern = np.random.default_rng(4).normal(1, 0.1, SHAPE)
+    rungs = [Rung(0.1, 2, light * pattern, full(1.0)) for light in (1e3, 2e3, 4e3)]
+    whole, _ = relative_response(rungs, step_levels(rungs))
+    for rung in rungs:
+        rung.signal[rung.signal > 4.3e3] = np.nan
+    assert np.isnan(rungs[2].signal).any()
+    found, _ = relative_response(rungs, step_levels(rungs))
+    np.testing.assert_allclose(found, whole)
+
+
+def test_levels_are_those_of_pixels_that_see_the_lamp() -> None:
+    signal = np.random.default_rng(5).normal(1e3, 10, SHAPE)
+    signal[:, :2] = np.random.default_rng(6).normal(0, 2, (len(signal), 2))
+    ended = np.where(signal > 100, np.nan, signal)
+    rungs = [Rung(0.1, 2, s, full(1.0)) for s in (signal, 2 * signal, ended)]
+    levels = step_levels(rungs)
+    assert levels[1] == pytest.approx(2 * levels[0])
+    assert levels[0] == pytest.approx(1e3, rel=0.01)
+    assert np.isnan(levels[2])

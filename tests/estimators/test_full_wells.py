@@ -4,8 +4,12 @@ import numpy as np
 import pytest
 
 from pixcal.estimators.detector.bad_pixels import nonlinear
-from pixcal.estimators.detector.calibration import Rung, response_rate
-from pixcal.estimators.detector.full_wells import unsaturated
+from pixcal.estimators.detector.calibration import (
+    Rung,
+    relative_response,
+    step_levels,
+    unsaturated,
+)
 
 SHAPE = (37, 53)
 GAIN = 0.75
@@ -29,10 +33,10 @@ def ladder(
 @pytest.mark.parametrize("spread", [0.0, 0.01])
 def test_full_pixels_neither_flatten_the_response_nor_are_nonlinear(spread: float) -> None:
     rungs, response = ladder(30_500.0, well_spread=spread)
-    assert nonlinear(rungs, 0.03).mean() > 0.05
+    assert nonlinear(rungs, step_levels(rungs), 0.03).mean() > 0.05
     kept = unsaturated(rungs)
-    assert not nonlinear(kept, 0.03).any()
-    rate, error = response_rate(kept)
+    assert not nonlinear(kept, step_levels(kept), 0.03).any()
+    rate, error = relative_response(kept, step_levels(kept))
     off = rate / np.median(rate) - response / np.median(response)
     assert np.std(off) == pytest.approx(np.median(error / rate), rel=0.1)
 

@@ -136,7 +136,7 @@ def noisy(
     return np.asarray(loud | telegraph | blinking)
 
 
-def nonlinear(rungs: Sequence[Rung], limit: float) -> Mask:
+def nonlinear(rungs: Sequence[Rung], levels: F64, limit: float) -> Mask:
     """Signal that does not follow that of the other pixels over a ladder of flats.
 
     The pixel's share of the median level of the rungs (of the same tile, so that the lamp's own
@@ -148,6 +148,8 @@ def nonlinear(rungs: Sequence[Rung], limit: float) -> Mask:
     ----------
     rungs : sequence of Rung
         Any number; with fewer than three for a pixel it is not flagged.
+    levels : (rung,) float64
+        Of the tile, as `step_levels` gives them.
     limit : float
         Largest relative change of the share.
     """
@@ -156,7 +158,7 @@ def nonlinear(rungs: Sequence[Rung], limit: float) -> Mask:
         return np.zeros(shape, np.bool_)
     signal = np.stack([rung.signal for rung in rungs])
     variance = np.stack([rung.variance for rung in rungs])
-    levels = np.array([median_and_sigma(s[lit(s)])[0] for s in signal])[:, None, None]
+    levels = levels[:, None, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         share = signal / levels
         error = np.sqrt(variance) / levels

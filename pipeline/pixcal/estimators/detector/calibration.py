@@ -1,18 +1,22 @@
 """Bias, dark current, response and linearity of a detector from its combined frames."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from pixcal.kernels.robust import median_and_sigma
+from pixcal.kernels.robust import lit, median_and_sigma
 
 F64 = NDArray[np.float64]
 
 MIN_RUNGS = 3  # fewest exposure times that tell a straight line from a bent one
+# Variance over the signal, in units of the least at lower levels, below which pixels are full. A
+# response that bends by a fifth lessens it to 0.64.
+COLLAPSED = 0.25
+NEARLY = 0.02  # relative distance from a pixel's own full well within which its signal is not used
 
 
 @dataclass(frozen=True)
@@ -90,27 +94,78 @@ def usual_variance(variance: NDArray[Any], dof: int) -> float:
     return median_and_sigma(variance)[0] * dof / float(chdtri(dof, 0.5))
 
 
-def response_rate(rungs: Sequence[Rung]) -> tuple[F64, F64]:
-    """Signal per second of flats, from all rungs on which a pixel is not saturated.
+def step_levels(rungs: Sequence[Rung]) -> F64:
+    """Median signal (rung,) of the pixels of a tile that see the lamp; NaN if most are saturated.
 
-    All charge over all time: the weights that photon noise asks for. The lamp's illumination
-    stays in it; it changes the mean intensity of a pixel, never its offset.
+    All levels are of the same pixels, and a saturated one is among the brightest: the median of the
+    others would be that of dim ones.
+    """
+    seen = lit(np.fmax.reduce([rung.signal for rung in rungs]))
+    if not seen.any():
+        return np.full(len(rungs), np.nan)
+    whole = (np.nan_to_num(rung.signal[seen], nan=np.inf) for rung in rungs)
+    levels = np.array([np.median(signal) for signal in whole])
+    return np.where(np.isfinite(levels), levels, np.nan)
+
+
+def relative_response(rungs: Sequence[Rung], levels: F64) -> tuple[F64, F64]:
+    """Signal of flats over that of the tile, from all steps at which a pixel is not saturated.
+
+    All charge over all light: the weights that photon noise asks for. The light is that of the
+    levels, since a lamp may change between exposures. Its illumination stays in the response; it
+    changes the mean intensity of a pixel, never its offset.
+
+    Parameters
+    ----------
+    rungs : sequence of Rung
+    levels : (rung,) float64
+        Of the tile, as `step_levels` gives them; a step whose level is NaN is not used.
 
     Returns
     -------
-    rate, error : (y, x) float64
-        ADU/s; NaN where no rung can be used.
+    response, error : (y, x) float64
+        NaN where no step can be used.
     """
-    frames = np.array([rung.frames for rung in rungs], float)[:, None, None]
-    times = np.array([rung.exptime for rung in rungs])[:, None, None]
-    signal = np.stack([rung.signal for rung in rungs])
-    variance = np.stack([rung.variance for rung in rungs])
-    used = np.isfinite(signal)
+    charge = variance = light = np.zeros(rungs[0].signal.shape)
+    for rung, level in zip(rungs, levels, strict=True):
+        used = np.isfinite(rung.signal) & np.isfinite(level)
+        light = light + np.where(used, rung.frames * level, 0.0)
+        charge = charge + np.where(used, rung.frames * rung.signal, 0.0)
+        variance = variance + np.where(used, rung.frames**2 * rung.variance, 0.0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        seconds = np.where(used, frames * times, 0.0).sum(axis=0)
-        rate: F64 = np.where(used, frames * signal, 0.0).sum(axis=0) / seconds
-        error: F64 = np.sqrt(np.where(used, frames**2 * variance, 0.0).sum(axis=0)) / seconds
-    return rate, error
+        return charge / light, np.sqrt(variance) / np.abs(light)
+
+
+def unsaturated(rungs: Sequence[Rung]) -> list[Rung]:
+    """Flats without the signal of full pixels, which becomes NaN.
+
+    A full well has no photon noise. It may be full far below the highest code, and read noise then
+    spreads the samples: no code piles up. Such samples would flatten the response and outweigh all
+    others by their small variance.
+
+    Parameters
+    ----------
+    rungs : sequence of Rung
+        Of the same pixels, in any order.
+    """
+    levels = step_levels(rungs)
+    seen = lit(np.fmax.reduce([rung.signal for rung in rungs]))
+    full, least = np.zeros(len(rungs), np.bool_), np.inf
+    for n in np.argsort(levels):
+        if not levels[n] > 0:
+            continue
+        noise = median_and_sigma(rungs[n].variance[seen] * rungs[n].frames)[0]
+        slope = noise / levels[n]
+        full[n] = np.isfinite(least) and slope < COLLAPSED * least
+        least = least if full[n] else min(least, slope)
+    if not full.any():
+        return list(rungs)
+    well = np.mean([rung.signal for rung, ended in zip(rungs, full, strict=True) if ended], axis=0)
+    limit = np.where(np.isfinite(well), (1 - NEARLY) * well, np.inf)
+    return [
+        replace(rung, signal=np.where(ended | (rung.signal > limit), np.nan, rung.signal))
+        for rung, ended in zip(rungs, full, strict=True)
+    ]
 
 
 @dataclass(frozen=True)

@@ -49,8 +49,8 @@ _MAPS: dict[str, tuple[Any, dict[str, Any]]] = {
 class Usual:
     """What is usual on the detector."""
 
-    # response, response_error: median response of the flats and its error in a pixel (ADU/s);
-    # NaN without flats
+    # response, response_error: median response of the flats, and its error in a pixel, over the
+    # mean light of the detector; NaN without flats
     response: float
     response_error: float
     # dark_rate, dark_rate_sigma: median and robust spread of the dark signal (ADU/s)
@@ -60,7 +60,9 @@ class Usual:
     bias: float  # median (ADU)
 
 
-def on_grid(folder: Place, shape: tuple[int, int], names: Sequence[str]) -> F64:
+def on_grid(
+    folder: Place, shape: tuple[int, int], names: Sequence[str], light: F64 | None = None
+) -> F64:
     """Maps that `measure` wrote, (name, pixel), of at most a million pixels on a regular grid.
 
     Parameters
@@ -71,6 +73,8 @@ def on_grid(folder: Place, shape: tuple[int, int], names: Sequence[str]) -> F64:
         Of the detector's window (y, x).
     names : sequence of str
         Of `STATISTICS`.
+    light : float64 array, optional
+        Of each tile, which its response is multiplied by.
     """
     reader = ArrayReader(folder / "maps")
     stride = int(np.ceil(np.sqrt(shape[0] * shape[1] / _SAMPLES)))
@@ -80,11 +84,14 @@ def on_grid(folder: Place, shape: tuple[int, int], names: Sequence[str]) -> F64:
         (y0, y1), (x0, x1) = extent(shape, index)
         block = reader.read((0, len(STATISTICS)), (y0, y1), (x0, x1))
         some = block[wanted, -y0 % stride :: stride, -x0 % stride :: stride]
-        parts.append(some.reshape(len(wanted), -1))
-    return np.concatenate(parts, axis=1).astype(float)
+        part = some.reshape(len(wanted), -1).astype(float)
+        if light is not None:
+            part[[name.startswith("response") for name in names]] *= light[index]
+        parts.append(part)
+    return np.concatenate(parts, axis=1)
 
 
-def usual(folder: Place, shape: tuple[int, int], gain: float) -> Usual:
+def usual(folder: Place, shape: tuple[int, int], gain: float, light: F64) -> Usual:
     """Medians of the maps that `measure` wrote.
 
     Parameters
@@ -93,12 +100,14 @@ def usual(folder: Place, shape: tuple[int, int], gain: float) -> Usual:
         As of `on_grid`.
     gain : float
         Rough guess (e-/ADU).
+    light : float64 array
+        Of each tile over that of the detector.
     """
     names = (
         "response", "response_error", "dark_rate", "dark_variance", "dark_charge", "dark_dof",
         "bias",
     )  # fmt: skip
-    response, error, rate, variance, charge, dof, bias = on_grid(folder, shape, names)
+    response, error, rate, variance, charge, dof, bias = on_grid(folder, shape, names, light)
     return Usual(
         median_and_sigma(response[response > 0])[0],
         median_and_sigma(error[error > 0])[0],
@@ -115,6 +124,7 @@ class Finishing:
     statistics: Place  # what `measure` wrote
     shape: tuple[int, int]  # of the detector's window (y, x)
     usual: Usual  # what is usual on the detector
+    light: F64  # of each tile over that of the detector
     gain: float  # to use (e-/ADU)
     read_noise: float  # of the detector (e-)
     read_dof: int  # degrees of freedom of each pixel's own; zero to use the detector's for all
@@ -150,7 +160,8 @@ def finish(job: Finishing, index: Index) -> F64:
     flat = np.ones_like(found["bias"])
     error = np.zeros_like(flat)
     if job.has_flat:
-        flat, error = (found[n] / job.usual.response for n in ("response", "response_error"))
+        light = job.light[index] / job.usual.response
+        flat, error = (light * found[name] for name in ("response", "response_error"))
     mask = _flags(job, found, flat, error)
     read = np.full_like(flat, job.read_noise)
     if job.read_dof:

@@ -45,6 +45,7 @@ class Summary:
 
     declared: Detector  # what its owner says
     usual: Usual  # medians of the maps
+    light: F64  # of each tile in the flats, over that of the detector
     # of a sample, rounding included, from differences of successive frames; its error (ADU)
     read_noise: tuple[float, float] | None
     before_rounding: tuple[float, float] | None  # the same without the rounding of the converter
@@ -175,24 +176,26 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     InputError
         If the flats hold no light.
     """
-    medians = usual(folder, job.shape, job.gain)
+    tables = ArrayReader(folder / "levels").read()
+    levels, usable = _rungs(tables, job)
+    sums = pair_sums(folder, job)
+    # Pixels that are full saturate the flats though no sample of the converter does.
+    well = saturation(transfer_points(sums[1]))
+    full = usable & (levels > (well[0] if well else math.inf))
+    usable &= ~full
+    light = _light(tables, levels, usable, job)
+    medians = usual(folder, job.shape, job.gain, light)
     if job.flat and not medians.response > _LIT * medians.response_error:
         if not math.isfinite(medians.response):
             raise InputError(
                 f"frames.flat: all flats are saturated (at {job.saturation:.0f} ADU); take them "
                 "again with less light, or list none"
             )
-        found = f"{medians.response:.2g} ± {medians.response_error:.2g} ADU/s in a pixel"
         raise InputError(
-            f"frames.flat: the flats hold no light ({found}); take them again, or list none"
+            f"frames.flat: the flats hold no light ({levels.max():.2g} ADU above the bias); take "
+            "them again, or list none"
         )
-    sums = pair_sums(folder, job)
-    levels, usable = _rungs(ArrayReader(folder / "levels").read(), job)
-    # Pixels that are full saturate the flats though no sample of the converter does.
-    well = saturation(transfer_points(sums[1]))
     top = float(np.fmin(job.saturation - medians.bias, well[0] if well else math.inf))
-    full = usable & (levels > top)
-    usable &= ~full
     straight = None
     times = np.array([group.exptime for group in job.flat])
     if job.flats_timed and job.flat and _one_lamp(times[usable], levels[usable]):
@@ -204,7 +207,7 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
         read_noise = (noise, read_variance[1] / (2 * noise) if noise else 0.0)
         own = _before_rounding(read_variance, folder, job) if job.quantum else read_noise
     gain = _gain(sums, own, top, job)
-    return Summary(declared, medians, read_noise, own, gain, levels, usable, full, straight)
+    return Summary(declared, medians, light, read_noise, own, gain, levels, usable, full, straight)
 
 
 def pair_sums(folder: Place, job: Measuring) -> F64:
@@ -271,6 +274,21 @@ def _rungs(tables: F64, job: Measuring) -> tuple[F64, NDArray[np.bool_]]:
     total = (weight * np.nan_to_num(level)).sum(axis=0)
     seen = weight.sum(axis=0)
     return np.divide(total, seen, out=np.zeros_like(total), where=seen > 0), usable
+
+
+def _light(tables: F64, levels: F64, usable: NDArray[np.bool_], job: Measuring) -> F64:
+    """Light of each tile over that of the detector, from the steps that most pixels have."""
+    if not job.flat:
+        return np.ones(grid(job.shape))
+    lost = tables[..., 2].sum(axis=(0, 1))
+    taken = usable if usable.any() else lost == lost.min()
+    frames = np.array([len(group.frames) for group in job.flat])
+    own = tables[..., 0]
+    weight = np.where(np.isfinite(own) & taken, frames, 0.0)
+    whole = (weight * levels).sum(axis=-1)
+    charge = (weight * np.nan_to_num(own)).sum(axis=-1)
+    share: F64 = np.divide(charge, whole, out=np.full_like(whole, np.nan), where=whole != 0)
+    return share
 
 
 def _one_lamp(times: F64, levels: F64) -> bool:

@@ -19,10 +19,11 @@ from pixcal.estimators.detector.calibration import (
     DarkLine,
     Rung,
     dark_line,
-    response_rate,
+    relative_response,
+    step_levels,
+    unsaturated,
     usual_variance,
 )
-from pixcal.estimators.detector.full_wells import unsaturated
 from pixcal.kernels.photon_transfer import COLUMNS, N_BINS, bin_pairs, pair_statistics
 from pixcal.kernels.robust import BATCH, Combination, Combined, lit, median_and_sigma
 from pixcal.model.flags import PixelFlag
@@ -40,8 +41,8 @@ STATISTICS = (
     "bias",  # ADU
     "dark_rate",  # ADU/s
     "dark_rate_error",  # of a pixel of unit variance, 1/s
-    "response",  # ADU/s
-    "response_error",  # ADU/s
+    "response",  # over that of the tile
+    "response_error",
     "read_variance",  # ADU², of the read noise series
     "dark_variance",  # ADU², of all frames without light
     "dark_dof",
@@ -146,9 +147,7 @@ def measure(job: Measuring, strip: Strip) -> None:
             _measure_rung(job, column, number, combination)
     for column in columns:
         if job.flat:
-            maps, rungs = column.maps, unsaturated(column.rungs)
-            maps["response"], maps["response_error"] = response_rate(rungs)
-            maps["flags"][nonlinear(rungs, job.limits.nonlinear)] += int(PixelFlag.NONLINEAR)
+            _measure_response(job, column)
         (y0, _), (x0, _) = extent(job.shape, column.index)
         block = np.stack([column.maps[name] for name in STATISTICS])
         job.writers["maps"].write((0, y0, x0), block.astype(np.float32))
@@ -184,24 +183,34 @@ def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined])
 
 
 def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined) -> None:
-    """A rung of the ladder of flats: median level (ADU), pixels, samples without weight."""
+    """A level of the flats, and how many of its samples have no weight."""
     group, line = job.flat[number], column.line
     exptime = group.exptime if job.flats_timed else 0.0
-    signal = np.where(found.seen == len(group.frames), found.mean, np.nan)
+    frames = len(group.frames)
+    signal = np.where(found.seen == frames, found.mean, np.nan)
+    column.levels[number, 1:] = signal.size, (frames - found.seen).sum()
+    # Few frames say little of one pixel's noise, and most pixels are like the others.
     seen = lit(signal)
     level = median_and_sigma(signal[seen])[0]
-    column.levels[number] = level, signal.size, (len(group.frames) - found.seen).sum()
-    # Few frames say little of one pixel's noise, and most pixels are like the others.
-    usual = usual_variance(found.variance[seen], len(group.frames) - 1)
+    usual = usual_variance(found.variance[seen], frames - 1)
     if usual < job.quantum**2:
         # Whole numbers that lie beside one another: their median variance may be nothing.
         usual = max(usual, float(found.variance[seen].mean()))
     usual = max(level, 0) / job.gain + job.read_noise**2 if np.isnan(usual) else usual
     brighter = np.fmax(signal / level, 1) if level > 0 else 1.0
-    variance = np.fmax(found.variance, usual * brighter) / len(group.frames)
+    variance = np.fmax(found.variance, usual * brighter) / frames
     if line is not None:
         variance = variance + column.noise * line.variance(exptime)
-    column.rungs.append(Rung(group.exptime, len(group.frames), signal, variance))
+    column.rungs.append(Rung(group.exptime, frames, signal, variance))
+
+
+def _measure_response(job: Measuring, column: _Column) -> None:
+    """Response and levels of the tile, and pixels that do not follow the others."""
+    maps, rungs = column.maps, unsaturated(column.rungs)
+    column.levels[:, 0] = step_levels(column.rungs)
+    levels = step_levels(rungs)
+    maps["response"], maps["response_error"] = relative_response(rungs, levels)
+    maps["flags"][nonlinear(rungs, levels, job.limits.nonlinear)] += int(PixelFlag.NONLINEAR)
 
 
 def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[Combined]:

@@ -193,6 +193,7 @@ def _calibrate(
         statistics=made.scratch / "statistics",
         shape=source.shape,
         usual=summary.usual,
+        light=summary.light,
         gain=gain,
         read_noise=read_noise,
         read_dof=frames - 1 if frames >= _MIN_READ_FRAMES else 0,
