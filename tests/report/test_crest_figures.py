@@ -20,17 +20,20 @@ def a_view(angle: float = 0.0, paths: int = 9, points: int = 7, **changes: Any) 
     along = 20.0 * along
     distance = np.linspace(384, 416, 5)
     bowl = 1 + (distance[:, None] - 400) ** 2 + np.linspace(-3, 3, 5) ** 2
-    settings: dict[str, Any] = {
-        "name": "vertical", "frame": (140, 230), "direction": (np.cos(angle), np.sin(angle)),
+    arrays: dict[str, Any] = {
         "x": across * np.cos(angle) - along * np.sin(angle),
         "y": across * np.sin(angle) + along * np.cos(angle),
         "k": 5 * k - 20, "used": np.ones(len(k), bool),
-        "sigma_px": np.full(len(k), 0.01), "residual_px": np.full(len(k), -0.02),
-        "fibres": (np.array([-500.0, 40.0]), np.array([800.0, 40.0])),
-        "extracts": (Extract(np.ones((40, 30)), (0, 0)), Extract(np.ones((40, 30)), (90, 200))),
         "distance": distance, "baseline": distance * 0.015,
         "ratio": 0.015 * (1 + np.linspace(-1e-5, 1e-5, 5)), "cost_baseline": bowl,
         "cost_ratio": bowl, "valley_ratio": np.full(5, 0.015), "valley_cost": bowl[:, 2],
+    }  # fmt: skip
+    arrays |= {name: changes.pop(name) for name in arrays.keys() & changes.keys()}
+    settings: dict[str, Any] = {
+        "name": "vertical", "frame": (140, 230), "direction": (np.cos(angle), np.sin(angle)),
+        "arrays": arrays, "sigma_px": np.full(len(k), 0.01), "residual_px": np.full(len(k), -0.02),
+        "fibres": (np.array([-500.0, 40.0]), np.array([800.0, 40.0])),
+        "extracts": (Extract(np.ones((40, 30)), (0, 0)), Extract(np.ones((40, 30)), (90, 200))),
         "best": (400.0, 6.0), "distance_sigma": 0.25, "distance_from_prior": False,
     }  # fmt: skip
     return CrestView(**(settings | changes))

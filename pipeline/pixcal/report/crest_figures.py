@@ -1,6 +1,8 @@
 """Crests and valleys of one fringe set, and the cost of the fit to them (paper, figures 16, 17)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
 from pixcal.report.colours import BLUE, GREY, INK, RED, SEQUENTIAL
-from pixcal.report.drawing import WIDE, finish, new_figure
+from pixcal.report.drawing import WIDE, covered, finish, new_figure
 
 F64 = NDArray[np.float64]
 
@@ -34,41 +36,34 @@ class CrestView:
     name: str
     frame: tuple[int, int]  # (y, x) size, px
     direction: tuple[float, float]  # along the fringe vector (x, y), any length
-    x: F64  # x, y: (point,) points, px
-    y: F64
-    k: NDArray[np.int64]  # (point,) paths they are on: crests even, valleys odd
-    used: NDArray[np.bool_]  # (point,) no outliers
+    # of ``crests.zarr``: the points (`x`, `y`, px, path `k`, `used`) and the maps of the cost
+    arrays: Mapping[str, NDArray[Any]]
     # sigma_px, residual_px: (point,) errors, and fit minus path, across the fringes, px
     sigma_px: F64
     residual_px: F64
     # (2,) float64, (2,) float64: (x, y) of fibres A and B projected on the detector, px
     fibres: tuple[F64, F64]
     extracts: tuple[Extract, ...]  # about the first and the last path
-    distance: F64  # distance, baseline, ratio: (n,) axes of the maps: mm, mm, 1
-    baseline: F64
-    ratio: F64
-    # cost_baseline, cost_ratio: (distance, other) maps of the cost: the other parameters those
-    # of the minimum, and fitted again
-    cost_baseline: F64
-    cost_ratio: F64
-    # valley_ratio, valley_cost: (distance,) the best ratio at each distance, and its cost
-    valley_ratio: F64
-    valley_cost: F64
     best: tuple[float, float]  # distance and baseline of the minimum, mm
     distance_sigma: float  # mm
     distance_from_prior: bool  # whether that is mostly the error of the bench's nominal value
 
     @property
-    def across(self) -> F64:
-        """Coordinates across the fringes, px."""
-        ux, uy = np.array(self.direction) / np.hypot(*self.direction)
-        return np.asarray(ux * self.x + uy * self.y)
+    def used(self) -> NDArray[np.bool_]:
+        """Points (point,) that are no outliers."""
+        return self.arrays["used"] > 0
 
-    @property
-    def along(self) -> F64:
-        """Coordinates along the fringes, px."""
+    @cached_property
+    def turned(self) -> tuple[F64, F64]:
+        """Coordinates (point,) across and along the fringes, px."""
         ux, uy = np.array(self.direction) / np.hypot(*self.direction)
-        return np.asarray(ux * self.y - uy * self.x)
+        x, y = self.arrays["x"], self.arrays["y"]
+        return ux * x + uy * y, ux * y - uy * x
+
+    def on(self, k: int) -> NDArray[np.intp]:
+        """Numbers of the points on a path, in their order along it."""
+        points = np.flatnonzero(self.arrays["k"] == k)
+        return points[np.argsort(self.turned[1][points])]
 
 
 def crest_figure(view: CrestView) -> Figure:
@@ -76,7 +71,7 @@ def crest_figure(view: CrestView) -> Figure:
     figure = new_figure(WIDE, 11.2)
     rows: Any = figure.subfigures(3, 1, height_ratios=[1.15, 1, 1])
     left, middle, right = rows[0].subplots(1, 3, width_ratios=[1, 1.7, 1])
-    first, last = outermost(view.k)
+    first, last = outermost(view.arrays["k"])
     _stretched(left, view, first, "first paths")
     _whole(middle, view, np.concatenate([first, last]))
     _stretched(right, view, last, "last paths")
@@ -108,19 +103,18 @@ def _colour(k: int) -> str:
 
 def _stretched(axes: Axes, view: CrestView, paths: NDArray[np.int64], title: str) -> None:
     """Shapes of some paths side by side: position across the fringes less its mean."""
-    chosen = {int(k): np.flatnonzero((view.k == k) & view.used) for k in paths}
-    reach = max([float(np.ptp(view.across[on])) for on in chosen.values() if len(on)], default=0.0)
+    across, along = view.turned
+    chosen = {int(k): (on := view.on(k))[view.used[on]] for k in paths}
+    reach = max([float(np.ptp(across[on])) for on in chosen.values() if len(on)], default=0.0)
     noise = float(np.median(view.sigma_px)) or 1e-6
     spacing = max(1.3 * reach, 12 * noise)
     for number, (k, on) in enumerate(chosen.items()):
-        on = on[np.argsort(view.along[on])]
-        middle = float(np.mean(view.across[on])) if len(on) else 0.0
-        at = view.across[on] - middle + number * spacing
+        at = across[on] - (across[on].mean() if len(on) else 0.0) + number * spacing
         axes.errorbar(
-            at, view.along[on], xerr=view.sigma_px[on], fmt="o", color=_colour(k),
-            markersize=3, linewidth=0.8,
+            at, along[on], xerr=view.sigma_px[on], fmt="o", color=_colour(k), markersize=3,
+            linewidth=0.8,
         )  # fmt: skip
-        axes.plot(at - view.residual_px[on], view.along[on], color=INK, linewidth=0.8)
+        axes.plot(at - view.residual_px[on], along[on], color=INK, linewidth=0.8)
     axes.set_xticks([n * spacing for n in range(len(chosen))], [str(k) for k in chosen])
     axes.set(xlabel="k", ylabel="along (px)", title=title)
     length = 10.0 ** np.floor(np.log10(max(0.6 * spacing, 1e-9)))
@@ -142,10 +136,10 @@ def _whole(axes: Axes, view: CrestView, paths: NDArray[np.int64]) -> None:
         [-0.5, nx - 0.5, nx - 0.5, -0.5, -0.5], [-0.5, -0.5, ny - 0.5, ny - 0.5, -0.5],
         color=GREY, linewidth=1,
     )  # fmt: skip
+    x, y = view.arrays["x"], view.arrays["y"]
     for k in paths:
-        on = np.flatnonzero(view.k == k)
-        on = on[np.argsort(view.along[on])]
-        axes.plot(view.x[on], view.y[on], ".-", color=_colour(int(k)), markersize=3, linewidth=0.7)
+        on = view.on(k)
+        axes.plot(x[on], y[on], ".-", color=_colour(int(k)), markersize=3, linewidth=0.7)
     for (x, y), label in zip(view.fibres, ("A", "B"), strict=True):
         axes.plot(x, y, "+", color=INK, markersize=9)
         axes.annotate(f"$s_{label}$", (x, y), xytext=(4, 4), textcoords="offset points", color=INK)
@@ -163,21 +157,21 @@ def _extract(axes: Axes, view: CrestView, extract: Extract, title: str) -> None:
     (y0, x0), (ny, nx) = extract.start, extract.image.shape
     axes.imshow(
         extract.image / 1e3, origin="lower", cmap="gray", interpolation="nearest",
-        extent=(x0 - 0.5, x0 + nx - 0.5, y0 - 0.5, y0 + ny - 0.5),
+        extent=covered(extract.image.shape, 1, extract.start),
     )  # fmt: skip
-    for k in np.unique(view.k):
-        on = np.flatnonzero(view.k == k)
-        on = on[np.argsort(view.along[on])]
-        axes.plot(view.x[on], view.y[on], color=_colour(int(k)), linewidth=1.2)
+    x, y, every = (view.arrays[name] for name in ("x", "y", "k"))
+    for k in np.unique(every):
+        axes.plot(x[view.on(k)], y[view.on(k)], color=_colour(int(k)), linewidth=1.2)
     for odd, label in ((0, "crest"), (1, "valley")):
-        on = view.k % 2 == odd
+        on = every % 2 == odd
         axes.plot(
-            view.x[on], view.y[on], "o", color=VALLEY if odd else CREST, markersize=6,
-            markeredgecolor="white", markeredgewidth=0.8, label=label,
+            x[on], y[on], "o", color=_colour(odd), markersize=6, markeredgecolor="white",
+            markeredgewidth=0.8, label=label,
         )  # fmt: skip
-    axes.set_xlim(x0 - 0.5, x0 + nx - 0.5)
-    axes.set_ylim(y0 - 0.5, y0 + ny - 0.5)
-    axes.set(xlabel="x (px)", ylabel="y (px)", title=title)
+    axes.set(
+        xlabel="x (px)", ylabel="y (px)", title=title, xlim=(x0 - 0.5, x0 + nx - 0.5),
+        ylim=(y0 - 0.5, y0 + ny - 0.5),
+    )  # fmt: skip
     axes.legend(loc="upper right", fontsize=8, framealpha=0.9)
 
 
@@ -197,21 +191,21 @@ def _pulls(axes: Axes, view: CrestView) -> None:
 
 
 def _map(figure: SubFigure, axes: Axes, view: CrestView, *, by_ratio: bool) -> None:
-    distance, baseline = view.best
+    arrays, (distance, baseline) = view.arrays, view.best
     middle = baseline / distance
     if by_ratio:
-        values, cost = 1e6 * (view.ratio / middle - 1), view.cost_ratio
+        values, cost = 1e6 * (arrays["ratio"] / middle - 1), arrays["cost_ratio"]
         label, at = "B/D − best (10⁻⁶)", 0.0
     else:
-        values, cost, label, at = view.baseline, view.cost_baseline, "B (mm)", baseline
+        values, cost, label, at = arrays["baseline"], arrays["cost_baseline"], "B (mm)", baseline
     reduced = np.maximum(cost, 1e-300) / max(int(view.used.sum()), 1)
     norm = LogNorm() if reduced.max() > 10 * reduced.min() else Normalize()
     drawn = axes.pcolormesh(
-        view.distance, values, reduced.T, norm=norm, cmap=SEQUENTIAL, shading="nearest"
+        arrays["distance"], values, reduced.T, norm=norm, cmap=SEQUENTIAL, shading="nearest"
     )
     if by_ratio:
-        trace = 1e6 * (view.valley_ratio / middle - 1)
-        axes.plot(view.distance, trace, color="white", linewidth=1, ls="--")
+        trace = 1e6 * (arrays["valley_ratio"] / middle - 1)
+        axes.plot(arrays["distance"], trace, color="white", linewidth=1, ls="--")
     axes.plot(distance, at, "x", color=RED, markersize=9, markeredgewidth=2)
     axes.set(xlabel="D (mm)", ylabel=label,
         title="cost per point, others " + ("refitted" if by_ratio else "held"),
@@ -223,8 +217,8 @@ def _map(figure: SubFigure, axes: Axes, view: CrestView, *, by_ratio: bool) -> N
 
 def _valley(axes: Axes, view: CrestView) -> None:
     """Cost along the bottom of the valley, above its least."""
-    above = view.valley_cost - view.valley_cost.min()
-    axes.plot(view.distance, above, ".-", color=BLUE, linewidth=1)
+    above = view.arrays["valley_cost"] - view.arrays["valley_cost"].min()
+    axes.plot(view.arrays["distance"], above, ".-", color=BLUE, linewidth=1)
     axes.axvline(view.best[0], color=RED, linewidth=1)
     axes.set_yscale("symlog", linthresh=1.0)
     axes.set_ylim(0, 1.3 * max(1.0, float(above.max())))

@@ -1,10 +1,12 @@
 """Fibre positions from crests and valleys (paper, section 6, equation 7, and figure 17)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import OptimizeResult, least_squares
 
 from pixcal.estimators.fringe_fit.models.hyperbolic import (
     PRIOR_BASELINE,
@@ -17,6 +19,8 @@ from pixcal.model.errors import InputError
 from pixcal.stages.crests.crests import CrestPaths
 
 F64 = NDArray[np.float64]
+# unknowns (n,) but the phase -> the geometry, and derivatives (6, n) of its parameters
+Parametrisation = Callable[[F64], tuple[Geometry, F64]]
 
 OUTLIER = 5.0  # points farther from the fit, in robust standard deviations, are left out
 MAP_POINTS = 400  # points that a cost map is computed with; its numbers are scaled to all of them
@@ -27,27 +31,27 @@ class Prior:
     """Prior knowledge of the geometry."""
 
     nominal: Geometry
-    # (6,) 1-sigma errors, mm, in the order of `PARAMETERS`; 0 holds a parameter, infinity frees
-    # it
+    # (6,) 1-sigma errors, mm, in the order of `PARAMETERS`; 0 holds a parameter, infinity frees it
     sigma: F64
 
     @classmethod
     def of_bench(cls, nominal: Geometry) -> "Prior":
         """The errors that the hyperbolic fit assumes of a bench's nominal values."""
         length = float(np.hypot(nominal.baseline_x, nominal.baseline_y))
-        return cls(
-            nominal,
-            np.array(
-                [PRIOR_CENTRE_MM, PRIOR_CENTRE_MM, PRIOR_DISTANCE * nominal.distance]
-                + [PRIOR_BASELINE * length] * 2
-                + [PRIOR_TILT * length]
-            ),
-        )
+        plane = [PRIOR_CENTRE_MM, PRIOR_CENTRE_MM, PRIOR_DISTANCE * nominal.distance]
+        baseline = [PRIOR_BASELINE * length, PRIOR_BASELINE * length, PRIOR_TILT * length]
+        return cls(nominal, np.array(plane + baseline))
 
     @classmethod
     def none(cls, nominal: Geometry) -> "Prior":
         """Nothing known: every parameter is free."""
         return cls(nominal, np.full(len(PARAMETERS), np.inf))
+
+    @property
+    def scale(self) -> F64:
+        """Scale of each unknown, mm."""
+        known = np.isfinite(self.sigma) & (self.sigma > 0)
+        return np.where(known, self.sigma, Prior.of_bench(self.nominal).sigma)
 
 
 @dataclass(frozen=True)
@@ -73,17 +77,16 @@ class CrestFit:
         """1-sigma errors, mm, in the order of `PARAMETERS`."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
+    @property
+    def from_prior(self) -> NDArray[np.bool_]:
+        """Parameters (6,) that the prior constrains more than the points."""
+        return np.asarray(self.sigma > np.sqrt(0.5) * self.prior.sigma)
+
 
 def relative_phase(paths: CrestPaths, geometry: Geometry) -> F64:
     """Model phase at the points, counted from the frame's centre, rad."""
     ry, rx = paths.reference
     return np.asarray(phase(paths.x, paths.y, geometry) - phase(rx, ry, geometry))
-
-
-def _jacobian(paths: CrestPaths, geometry: Geometry) -> F64:
-    ry, rx = paths.reference
-    here = phase_jacobian(paths.x, paths.y, geometry)
-    return np.asarray(here - phase_jacobian(rx, ry, geometry))
 
 
 def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -> CrestFit:
@@ -103,16 +106,17 @@ def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -
         If there are fewer points than unknowns, or they lie on fewer than three paths.
     """
     prior = Prior.none(start) if prior is None else prior
-    unknown = 1 + int(np.isinf(prior.sigma).sum())
-    if len(paths) <= unknown or len(np.unique(paths.k)) < 3:
+    unknown, number = 1 + int(np.isinf(prior.sigma).sum()), len(np.unique(paths.k))
+    if len(paths) <= unknown or number < 3:
         raise InputError(
-            f"too few fringes: {len(paths)} points on {len(np.unique(paths.k))} crests and "
-            f"valleys, {unknown} unknowns"
+            f"too few fringes: {len(paths)} points on {number} crests and valleys, {unknown} "
+            "unknowns"
         )
-    used, spread = np.ones(len(paths), bool), 1.0
-    geometry = start
+    used, spread, geometry = np.ones(len(paths), bool), 1.0, start
     for _ in range(4):
-        geometry, phase0, jacobian, steps = _minimise(paths.take(used), geometry, prior, spread)
+        some = paths.take(used)
+        solved, at = _minimise(replace(some, sigma=some.sigma * np.sqrt(spread)), geometry, prior)
+        geometry, phase0 = at(solved.x[1:])[0], float(solved.x[0])
         residual = phase0 + relative_phase(paths, geometry) - paths.k * np.pi
         pull = residual / paths.sigma
         chi2 = float((pull[used] ** 2).sum() / max(used.sum() - unknown, 1))
@@ -122,77 +126,63 @@ def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -
         used, spread = kept, max(1.0, chi2)
         if same:
             break
-    scale = _scale(prior)
-    free_ones = prior.sigma > 0
-    covariance = np.zeros((len(PARAMETERS), len(PARAMETERS)))
-    root = np.linalg.pinv(jacobian, rcond=1e-13)
-    inner = (root @ root.T)[1:, 1:] * np.outer(scale[free_ones], scale[free_ones])
-    covariance[np.ix_(free_ones, free_ones)] = inner
+    # From (phase, unknowns) to the parameters in mm.
+    root = at(solved.x[1:])[1] @ np.linalg.pinv(solved.jac, rcond=1e-13)[1:]
     return CrestFit(
-        geometry, phase0, covariance, used, residual, float((residual[used] ** 2).sum()),
-        chi2, spread, steps, prior,
+        geometry, phase0, root @ root.T, used, residual, float((residual[used] ** 2).sum()),
+        chi2, spread, int(solved.nfev), prior,
     )  # fmt: skip
-
-
-def _scale(prior: Prior) -> F64:
-    """Scale of each unknown, mm."""
-    usual = Prior.of_bench(prior.nominal).sigma
-    return np.where(np.isfinite(prior.sigma) & (prior.sigma > 0), prior.sigma, usual)
 
 
 def _minimise(
-    paths: CrestPaths, start: Geometry, prior: Prior, spread: float
-) -> tuple[Geometry, float, F64, int]:
-    """Geometry, phase, weighted Jacobian there (priors included), and evaluations."""
-    free = prior.sigma > 0
-    scale = _scale(prior)[free]
-    nominal = prior.nominal.vector()
-    origin = start.vector()
-    origin[~free] = nominal[~free]
-    precision = np.where(np.isfinite(prior.sigma[free]), scale / prior.sigma[free], 0.0)
-    weight = 1 / (paths.sigma * np.sqrt(spread))
-    target = paths.k * np.pi
+    paths: CrestPaths, start: Geometry, prior: Prior
+) -> tuple[OptimizeResult, Parametrisation]:
+    """Least squares over what the prior does not hold, in units of `Prior.scale`."""
+    free, nominal = prior.sigma > 0, prior.nominal.vector()
+    origin = np.where(free, start.vector(), nominal)
+    unit = np.diag(prior.scale)[:, free]
 
-    def at(c: F64) -> Geometry:
-        values = origin.copy()
-        values[free] += c[1:] * scale
-        return start.with_vector(values)
+    def at(c: F64) -> tuple[Geometry, F64]:
+        return start.with_vector(origin + unit @ c), unit
+
+    expected = ((nominal - origin) / prior.scale)[free]
+    precision = (prior.scale / np.where(free, prior.sigma, 1.0))[free]
+    shift = paths.k * np.pi - relative_phase(paths, start.with_vector(origin))
+    first = np.append(shift.mean(), np.zeros(free.sum()))
+    exact = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15, "max_nfev": 200}
+    return _least_squares(paths, at, first, expected, precision, **exact), at
+
+
+def _least_squares(
+    paths: CrestPaths, at: Parametrisation, start: F64, expected: F64, precision: F64, **limits: Any
+) -> OptimizeResult:
+    """Phase and unknowns that the points, and what is known of the unknowns, make likely.
+
+    Parameters
+    ----------
+    start : (1 + n,) float64
+    expected, precision : (n,) float64
+        Prior knowledge of the unknowns: expected values and inverse errors.
+    """
+    weight, (ry, rx) = 1 / paths.sigma, paths.reference
 
     def residual(c: F64) -> F64:
-        geometry = at(c)
-        shift = (geometry.vector() - nominal)[free] / scale
-        points = (c[0] + relative_phase(paths, geometry) - target) * weight
-        return np.concatenate([points, shift * precision])
+        points = c[0] + relative_phase(paths, at(c[1:])[0]) - paths.k * np.pi
+        return np.concatenate([points * weight, (c[1:] - expected) * precision])
 
     def derivative(c: F64) -> F64:
-        columns = _jacobian(paths, at(c))[:, free] * scale
-        points = np.column_stack([np.ones(len(paths)), columns]) * weight[:, None]
-        return np.vstack([points, np.column_stack([np.zeros(free.sum()), np.diag(precision)])])
+        geometry, chain = at(c[1:])
+        here = phase_jacobian(paths.x, paths.y, geometry) - phase_jacobian(rx, ry, geometry)
+        points = np.column_stack([np.ones(len(paths)), here @ chain]) * weight[:, None]
+        return np.vstack([points, np.diag(np.append(0.0, precision))[1:]])
 
-    offset = float(np.mean(target - relative_phase(paths, start.with_vector(origin))))
-    solution = least_squares(
-        residual, np.concatenate([[offset], np.zeros(free.sum())]), derivative,
-        method="lm", x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=200,
-    )  # fmt: skip
-    return at(solution.x), float(solution.x[0]), derivative(solution.x), int(solution.nfev)
-
-
-@dataclass(frozen=True)
-class CostMap:
-    """Cost of equation 7 around its minimum (paper, figure 17)."""
-
-    distance: F64  # (d,) mm
-    second: F64  # (s,) length of the baseline (mm), or its ratio to the distance
-    cost: F64  # (d, s) sum of `(residual / sigma)²`, priors of the re-fitted parameters included
-    # whether centre, direction and tilt of the baseline were fitted again at each place, as the
-    # phase always is; else they are those of the minimum
-    refitted: bool
+    return least_squares(residual, start, derivative, method="lm", x_scale="jac", **limits)
 
 
 def cost_map(
     paths: CrestPaths, fit: CrestFit, distance: F64, second: F64, *, ratio: bool, refit: bool
-) -> CostMap:
-    """Map of the cost over distance and baseline, or over distance and their ratio.
+) -> F64:
+    """Cost of equation 7 over distance and baseline, or over distance and their ratio (figure 17).
 
     Parameters
     ----------
@@ -204,15 +194,22 @@ def cost_map(
     second : (s,) float64
         B in mm or, with ``ratio``, B / D. B is the length in the detector's plane.
     refit : bool
-        See `CostMap`.
+        Whether centre, direction and tilt of the baseline are fitted again at each place, as the
+        phase always is; else they are those of the minimum.
+
+    Returns
+    -------
+    (d, s) float64
+        Sum of ``(residual / sigma)²``, priors of the parameters fitted again included.
     """
     few = _thinned(paths, fit)
-    cost = np.empty((len(distance), len(second)))
-    for i, d in enumerate(distance):
-        for j, value in enumerate(second):
-            length = float(value * d if ratio else value)
-            cost[i, j] = _least_cost(few, fit, float(d), length, refit=refit)[0]
-    return CostMap(distance, second, cost, refit)
+    lengths = np.multiply.outer(distance, second) if ratio else np.tile(second, (len(distance), 1))
+    return np.array(
+        [
+            [_least_cost(few, fit, float(d), float(length), refit=refit)[0] for length in row]
+            for d, row in zip(distance, lengths, strict=True)
+        ]
+    )
 
 
 def _thinned(paths: CrestPaths, fit: CrestFit) -> CrestPaths:
@@ -228,46 +225,34 @@ def _least_cost(
 ) -> tuple[float, float]:
     """Cost with the distance held, and the length too unless it is None; and that length.
 
-    Unknowns: phase, foot of the centre (x, y), direction, tilt, length of the baseline.
+    Unknowns beside the phase: foot of the centre (x, y), direction, tilt and length of the
+    baseline.
     """
-    best, nominal = fit.geometry, fit.prior.nominal.vector()
+    best, nominal, sigma = fit.geometry, fit.prior.nominal, fit.prior.sigma
     best_length = float(np.hypot(best.baseline_x, best.baseline_y))
     # With the ratio kept the phases hardly change: the way along the valley.
     first = best_length * distance / best.distance if length is None else length
-    angle = float(np.arctan2(best.baseline_y, best.baseline_x))
-    start = np.array([fit.phase0, best.centre_x, best.centre_y, angle, best.baseline_z, first])
-    sigma = fit.prior.sigma
-    free_length = np.inf if length is None else 0.0
-    known = np.array([np.inf, *sigma[:2], sigma[4] / best_length, sigma[5], free_length])
-    if not refit:
-        known[1:5] = 0
-    free = known > 0
-    precision = np.where(free & np.isfinite(known), 1 / np.where(free, known, 1.0), 0.0)
-    expected = np.array([0.0, *nominal[:2], np.arctan2(nominal[4], nominal[3]), nominal[5], 0.0])
-    target, weight = paths.k * np.pi, 1 / paths.sigma
+    angle = np.arctan2(best.baseline_y, best.baseline_x)
+    start = np.array([best.centre_x, best.centre_y, angle, best.baseline_z, first])
+    angle = np.arctan2(nominal.baseline_y, nominal.baseline_x)
+    expected = np.array([nominal.centre_x, nominal.centre_y, angle, nominal.baseline_z, 0.0])
+    known = np.array([*sigma[:2], sigma[4] / best_length, sigma[5], np.inf])
+    free = (known > 0) & ([refit] * 4 + [length is None])
 
-    def full(c: F64) -> tuple[F64, Geometry]:
+    def at(c: F64) -> tuple[Geometry, F64]:
         u = start.copy()
         u[free] = c
-        along = u[5] * np.cos(u[3]), u[5] * np.sin(u[3])
-        return u, best.with_vector([u[1], u[2], distance, *along, u[4]])
+        x, y, angle, tilt, b = u
+        cos, sin = np.cos(angle), np.sin(angle)
+        chain = np.zeros((len(PARAMETERS), len(u)))
+        chain[[0, 1, 5], [0, 1, 3]] = 1
+        chain[3:5, 2], chain[3:5, 4] = (-b * sin, b * cos), (cos, sin)
+        return best.with_vector([x, y, distance, b * cos, b * sin, tilt]), chain[:, free]
 
-    def residual(c: F64) -> F64:
-        u, geometry = full(c)
-        points = (u[0] + relative_phase(paths, geometry) - target) * weight
-        return np.concatenate([points, (u - expected) * precision])
-
-    def derivative(c: F64) -> F64:
-        u, geometry = full(c)
-        j = _jacobian(paths, geometry)
-        cos, sin = np.cos(u[3]), np.sin(u[3])
-        turn, stretch = u[5] * (cos * j[:, 4] - sin * j[:, 3]), cos * j[:, 3] + sin * j[:, 4]
-        columns = [np.ones(len(paths)), j[:, 0], j[:, 1], turn, j[:, 5], stretch]
-        rows = np.stack(columns, axis=1) * weight[:, None]
-        return np.vstack([rows, np.diag(precision)])[:, free]
-
-    solved = least_squares(residual, start[free], derivative, method="lm", x_scale="jac", ftol=1e-9)
-    return 2 * float(solved.cost), float(full(solved.x)[0][5])
+    first_guess = np.append(fit.phase0, start[free])
+    solved = _least_squares(paths, at, first_guess, expected[free], 1 / known[free], ftol=1e-9)
+    geometry = at(solved.x[1:])[0]
+    return 2 * float(solved.cost), float(np.hypot(geometry.baseline_x, geometry.baseline_y))
 
 
 def valley(paths: CrestPaths, fit: CrestFit, distance: F64) -> tuple[F64, F64]:

@@ -139,9 +139,16 @@ class Smooth:
         """Derivatives (by x, by y) at pixel coordinates, 1/px."""
         at = self.scaled(y, x)
         by_y, by_x = (polynomial.polyder(self.coefficients / self.scale, axis=n) for n in (0, 1))
-        return np.asarray(polynomial.polyval2d(*at, by_x)), np.asarray(
-            polynomial.polyval2d(*at, by_y)
-        )
+        values = [np.asarray(polynomial.polyval2d(*at, c), float) for c in (by_x, by_y)]
+        return values[0], values[1]
+
+    def plus(self, powers: list[tuple[int, int]], values: NDArray[Any]) -> "Smooth":
+        """The polynomial with terms added to it."""
+        size = max(max(powers)[0] + 1, len(self.coefficients))
+        total = np.zeros((size, size))
+        total[: len(self.coefficients), : len(self.coefficients)] = self.coefficients
+        np.add.at(total, tuple(np.transpose(powers)), values)
+        return replace(self, coefficients=total)
 
 
 @dataclass(frozen=True)
@@ -317,17 +324,17 @@ def find_crests(
         total += precision * residual
         weight += precision
     use = weight > 0
-    if use.sum() < MIN_POINTS:
-        raise InputError(_too_few(int(use.sum()), use.size))
+    _check(use)
     rest = np.where(use, total, 0.0) / np.where(use, weight, 1.0) + np.nan_to_num(phi[0])
     return _points(windows, carrier.phase, rest, weight, phi - np.nan_to_num(phi[0]), (kx, ky))
 
 
-def _too_few(windows: int, of: int) -> str:
-    return (
-        f"no fringes found in enough windows: {windows} of {of} show them, at least {MIN_POINTS} "
-        "are needed; give a shorter --segment, or more --frames"
-    )
+def _check(use: NDArray[np.bool_]) -> None:
+    if use.sum() < MIN_POINTS:
+        raise InputError(
+            f"no fringes found in enough windows: {use.sum()} of {use.size} show them, at least "
+            f"{MIN_POINTS} are needed; give a shorter --segment, or more --frames"
+        )
 
 
 def _wrapped(phase: F64) -> F64:
@@ -362,23 +369,13 @@ def _highest_degree(windows: Windows, number: int) -> int:
     return degree
 
 
-def _plus(before: Smooth, powers: list[tuple[int, int]], fit: NDArray[Any]) -> Smooth:
-    """The polynomial with terms added to it."""
-    size = max(max(powers)[0] + 1, len(before.coefficients))
-    coefficients = np.zeros((size, size))
-    coefficients[: len(before.coefficients), : len(before.coefficients)] = before.coefficients
-    for (i, j), c in zip(powers, fit, strict=True):
-        coefficients[i, j] += c
-    return Smooth(coefficients, before.centre, before.scale)
-
-
 def _brightened(windows: Windows, light: F64, sigma: F64, before: Smooth) -> Smooth:
     """Logarithm of the illumination: what it was times the light of the windows with fringes."""
     use = np.isfinite(sigma) & (light > 0)
     y, x = before.scaled(*(c[use] for c in windows.centres))
     basis, powers = _design(y, x, _highest_degree(windows, len(y)))
     fit = np.linalg.lstsq(basis, np.log(light[use]), rcond=1e-12)[0]
-    return _plus(before, powers, fit)
+    return before.plus(powers, fit)
 
 
 def _follow(windows: Windows, phase: F64, sigma: F64, before: Smooth) -> Smooth:
@@ -388,8 +385,7 @@ def _follow(windows: Windows, phase: F64, sigma: F64, before: Smooth) -> Smooth:
     cycle of the phases beyond: gaps are bridged, and single bad windows have no effect.
     """
     use = np.isfinite(sigma)
-    if use.sum() < MIN_POINTS:
-        raise InputError(_too_few(int(use.sum()), use.size))
+    _check(use)
     cy, cx = (c[use] for c in windows.centres)
     y, x = before.scaled(cy, cx)
     measured, precision = phase[use], 1 / sigma[use]
@@ -415,7 +411,7 @@ def _follow(windows: Windows, phase: F64, sigma: F64, before: Smooth) -> Smooth:
         if near.all():
             break
         reach *= 1.33
-    return _plus(before, powers, fit)
+    return before.plus(powers, fit)
 
 
 def _points(

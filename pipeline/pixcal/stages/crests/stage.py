@@ -12,7 +12,6 @@ in both. ``warnings`` are sentences. ``crests.zarr/<set name>`` holds the points
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,7 +31,6 @@ from pixcal.model.options import Crests
 from pixcal.report.crest_figures import CrestView, Extract, crest_figure, outermost
 from pixcal.report.drawing import png
 from pixcal.stages.crests.crest_fit import (
-    CostMap,
     CrestFit,
     Prior,
     cost_map,
@@ -127,11 +125,16 @@ def _measure(
         raise
     except InputError as error:
         raise InputError(f"{run_dir}: fringe set {name!r}: {error}") from error
-    maps = _cost_maps(paths, fit)
-    _write_arrays(made.folder / "crests.zarr" / name, paths, fit, maps)
+    arrays = _arrays(paths, fit)
+    folder = made.folder / "crests.zarr" / name
+    create_group(folder)
+    for array, (data, dims, attrs) in arrays.items():
+        write_array(folder / array, data, dims=dims, attrs=attrs)
+    maps = {array: data for array, (data, _, _) in arrays.items()}
+    picture = crest_figure(_view(name, source, frames[0], paths, fit, maps))
+    (made.folder / f"crests-{name}.png").write_bytes(png(picture))
+    costs = (maps["cost_baseline"], maps["cost_ratio"], maps["valley_cost"])
     other, note = _fitted_geometry(facts.get(name), nominal)
-    view = _view(name, source, frames[0], paths, fit, maps)
-    (made.folder / f"crests-{name}.png").write_bytes(png(crest_figure(view)))
     return {
         "frames": [n for n, phi in zip(frames, paths.phi, strict=True) if np.isfinite(phi)],
         "points": len(paths),
@@ -144,10 +147,7 @@ def _measure(
         "cost_rad2": fit.cost,
         "chi2_reduced": fit.chi2_reduced,
         "evaluations": fit.evaluations,
-        "unique_minimum": all(
-            falls_then_rises(cost)
-            for cost in (maps.baseline.cost, maps.ratio.cost, maps.valley_cost)
-        ),
+        "unique_minimum": all(falls_then_rises(cost) for cost in costs),
         "warnings": _warnings(fit),
         "agreement": None if other is None else _agreement(paths, fit, *other),
         "agreement_note": note,
@@ -174,20 +174,23 @@ def _extract(
     runtime: Runtime,
 ) -> CrestPaths:
     y, x = ((max(0, (n - SEED_PIXELS) // 2), min(n, (n + SEED_PIXELS) // 2)) for n in source.shape)
-    patch, good = read_patch(source, frames[0], y, x)
-    k = seed_vector(patch, good, nominal)
+    k = seed_vector(*read_patch(source, frames[0], y, x), nominal)
     number = int(np.prod(Windows.lay(source.shape, k, config.segment).shape))
     chunk = int(np.prod(source.signal.chunks)) * source.signal.dtype.itemsize
-    pixels = int(np.prod(source.signal.chunks[1:]))
     # Codes, packed and not, and a tile's maps; the sums, those on their way, and their solution.
-    plan = make_plan(
-        f"the crests of {name}",
-        3 * chunk + 40 * pixels,
-        4 * 8 * N_SUMS * number + FIGURE_BYTES,
-        runtime,
-    )
-    reader = _SetFrames(source, tuple(frames), runtime.with_workers(plan.workers), name)
-    paths = find_crests(reader, len(frames), source.shape, k, config.segment)
+    task = 3 * chunk + 40 * int(np.prod(source.signal.chunks[1:]))
+    held = 4 * 8 * N_SUMS * number + FIGURE_BYTES
+    runtime = runtime.with_workers(make_plan(f"the crests of {name}", task, held, runtime).workers)
+
+    def accumulate(frame: int, windows: Windows, carrier: CrestCarrier) -> F64:
+        task = partial(_row_task, source, frames[frame], windows, carrier)
+        sums = np.zeros((int(np.prod(windows.shape)), N_SUMS))
+        # In the order of the rows, whoever was first: the same sums to the last bit.
+        for index, part in run_tasks(task, range(source.grid[0]), runtime, label=f"crests {name}"):
+            sums[index] += part
+        return sums.reshape(*windows.shape, N_SUMS)
+
+    paths = find_crests(accumulate, len(frames), source.shape, k, config.segment)
     return paths if config.paths is None else paths.outermost(config.paths)
 
 
@@ -214,27 +217,6 @@ def _tile(source: ReducedSet, at: tuple[int, int], frame: int) -> tuple[F32, NDA
     return codes.astype(np.float32) * np.float32(coding.scale) + np.float32(coding.offset), good
 
 
-@dataclass(frozen=True)
-class _SetFrames:
-    """Frames of a reduced set, as `pixcal.stages.crests.crests.Accumulate`."""
-
-    source: ReducedSet
-    frames: tuple[int, ...]
-    runtime: Runtime
-    name: str
-
-    def __call__(self, frame: int, windows: Windows, carrier: CrestCarrier) -> F64:
-        task = partial(_row_task, self.source, self.frames[frame], windows, carrier)
-        label = f"crests {self.name}"
-        sums = np.zeros((*windows.shape, N_SUMS))
-        flat = sums.reshape(-1, N_SUMS)
-        # In the order of the rows, whoever was first: the same sums to the last bit.
-        rows = range(self.source.grid[0])
-        for index, part in run_tasks(task, rows, self.runtime, label=label):
-            flat[index] += part
-        return sums
-
-
 def _row_task(
     source: ReducedSet, frame: int, windows: Windows, carrier: CrestCarrier, row: int
 ) -> tuple[NDArray[np.int64], F64]:
@@ -254,57 +236,43 @@ def _row_task(
     return index, merged
 
 
-@dataclass(frozen=True)
-class _Maps:
-    """Figure 17: (D, B) with the others held, (D, B/D) with the others refitted, and its valley."""
+def _arrays(
+    paths: CrestPaths, fit: CrestFit
+) -> dict[str, tuple[NDArray[Any], tuple[str, ...], dict[str, str]]]:
+    """Arrays of ``crests.zarr`` with their axes and attributes: the points and figure 17.
 
-    baseline: CostMap
-    ratio: CostMap
-    valley_ratio: F64
-    valley_cost: F64
-
-
-def _cost_maps(paths: CrestPaths, fit: CrestFit) -> _Maps:
-    best = fit.geometry
-    length = float(np.hypot(best.baseline_x, best.baseline_y))
-    steps = np.linspace(-1, 1, MAP_SIDE)
-    distance = best.distance * (1 + MAP_REACH * steps)
-    ratio, cost = valley(paths, fit, distance)
-    middle = length / best.distance
+    That is the cost over (D, B) with the others held, over (D, B/D) with the others refitted, and
+    the valley of the latter.
+    """
+    distance, length = fit.geometry.distance, float(np.hypot(*fit.geometry.vector()[3:5]))
+    steps, middle = np.linspace(-1, 1, MAP_SIDE), length / distance
+    distances = distance * (1 + MAP_REACH * steps)
+    lengths = length * (1 + MAP_REACH * steps)
+    best, cost = valley(paths, fit, distances)
     # As wide as the valley wanders, and wide enough to see its walls.
-    reach = max(2 * float(np.max(np.abs(ratio - middle))), 1e-5 * middle)
-    lengths, ratios = length * (1 + MAP_REACH * steps), middle + reach * steps
-    return _Maps(
-        cost_map(paths, fit, distance, lengths, ratio=False, refit=False),
-        cost_map(paths, fit, distance, ratios, ratio=True, refit=True),
-        ratio,
-        cost,
-    )
-
-
-def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit, maps: _Maps) -> None:
-    create_group(folder)
+    ratios = middle + max(2 * float(np.max(np.abs(best - middle))), 1e-5 * middle) * steps
+    held = cost_map(paths, fit, distances, lengths, ratio=False, refit=False)
+    refitted = cost_map(paths, fit, distances, ratios, ratio=True, refit=True)
     points: dict[str, tuple[NDArray[Any], str]] = {
         "x": (paths.x, "pixel"), "y": (paths.y, "pixel"), "k": (paths.k, "1"),
         "sigma": (paths.sigma, "rad"), "residual": (fit.residual, "rad"),
         "used": (fit.used.astype(np.uint8), "1"),
     }  # fmt: skip
-    for array, (data, units) in points.items():
-        write_array(folder / array, data, dims=("point",), attrs={"units": units})
-    for axis, grid, units in (("baseline", maps.baseline, "mm"), ("ratio", maps.ratio, "1")):
-        note = "others refitted" if grid.refitted else "phase refitted, others held"
-        attrs = {"units": "1", "comment": note}
-        write_array(folder / f"cost_{axis}", grid.cost, dims=("distance", axis), attrs=attrs)
-        write_array(folder / axis, grid.second, dims=(axis,), attrs={"units": units})
-    distance = maps.baseline.distance
-    write_array(folder / "distance", distance, dims=("distance",), attrs={"units": "mm"})
-    write_array(folder / "valley_ratio", maps.valley_ratio, dims=("distance",))
-    write_array(folder / "valley_cost", maps.valley_cost, dims=("distance",))
-
-
-def _from_prior(fit: CrestFit) -> NDArray[np.bool_]:
-    """Parameters that the prior constrains more than the points."""
-    return np.asarray(fit.sigma > np.sqrt(0.5) * fit.prior.sigma)
+    return {
+        **{name: (data, ("point",), {"units": units}) for name, (data, units) in points.items()},
+        "cost_baseline": (
+            held, ("distance", "baseline"),
+            {"units": "1", "comment": "phase refitted, others held"},
+        ),
+        "baseline": (lengths, ("baseline",), {"units": "mm"}),
+        "cost_ratio": (
+            refitted, ("distance", "ratio"), {"units": "1", "comment": "others refitted"},
+        ),
+        "ratio": (ratios, ("ratio",), {"units": "1"}),
+        "distance": (distances, ("distance",), {"units": "mm"}),
+        "valley_ratio": (best, ("distance",), {}),
+        "valley_cost": (cost, ("distance",), {}),
+    }  # fmt: skip
 
 
 def _warnings(fit: CrestFit) -> list[str]:
@@ -321,14 +289,15 @@ def _warnings(fit: CrestFit) -> list[str]:
 
 
 def _geometry_facts(fit: CrestFit) -> dict[str, float]:
-    facts = {}
-    columns = (fit.geometry.vector(), fit.sigma, fit.prior.nominal.vector(), fit.prior.sigma)
-    for name, *values in zip(PARAMETERS, *columns, strict=True):
-        for suffix, value in zip(
-            ("_mm", "_sigma_mm", "_nominal_mm", "_prior_sigma_mm"), values, strict=True
-        ):
-            facts[name + suffix] = float(value)
-    return facts
+    columns = {
+        "_mm": fit.geometry.vector(), "_sigma_mm": fit.sigma,
+        "_nominal_mm": fit.prior.nominal.vector(), "_prior_sigma_mm": fit.prior.sigma,
+    }  # fmt: skip
+    return {
+        name + suffix: float(values[n])
+        for n, name in enumerate(PARAMETERS)
+        for suffix, values in columns.items()
+    }
 
 
 def _fitted_geometry(
@@ -363,9 +332,7 @@ def _agreement(paths: CrestPaths, fit: CrestFit, other: Geometry, sigma: F64) ->
                 "difference_sigma": float(d / s),
                 "from_prior": bool(prior),
             }
-            for name, d, s, prior in zip(
-                PARAMETERS, difference, both, _from_prior(fit), strict=True
-            )
+            for name, d, s, prior in zip(PARAMETERS, difference, both, fit.from_prior, strict=True)
         },
         "phase_rms_px": float(np.std(difference_rad) * px),
         "phase_max_px": float(np.max(np.abs(difference_rad - difference_rad.mean())) * px),
@@ -374,7 +341,12 @@ def _agreement(paths: CrestPaths, fit: CrestFit, other: Geometry, sigma: F64) ->
 
 
 def _view(
-    name: str, source: ReducedSet, frame: int, paths: CrestPaths, fit: CrestFit, maps: _Maps
+    name: str,
+    source: ReducedSet,
+    frame: int,
+    paths: CrestPaths,
+    fit: CrestFit,
+    arrays: Mapping[str, NDArray[Any]],
 ) -> CrestView:
     """What the figure shows."""
     best = fit.geometry
@@ -382,20 +354,12 @@ def _view(
     foot = np.array([best.centre_x, best.centre_y])
     half = np.array([best.baseline_x, best.baseline_y]) / 2
     return CrestView(
-        name=name, frame=paths.frame, direction=paths.vector,
-        x=paths.x, y=paths.y, k=paths.k, used=fit.used,
+        name=name, frame=paths.frame, direction=paths.vector, arrays=arrays,
         sigma_px=paths.sigma_px * np.sqrt(fit.spread), residual_px=fit.residual / paths.slope,
         fibres=((foot - half) / best.pitch, (foot + half) / best.pitch),
         extracts=tuple(_extract_at(source, frame, paths, k) for k in (first[0], last[-1])),
-        distance=maps.baseline.distance,
-        baseline=maps.baseline.second,
-        ratio=maps.ratio.second,
-        cost_baseline=maps.baseline.cost,
-        cost_ratio=maps.ratio.cost,
-        valley_ratio=maps.valley_ratio, valley_cost=maps.valley_cost,
-        best=(best.distance, float(np.hypot(best.baseline_x, best.baseline_y))),
-        distance_sigma=float(fit.sigma[2]),
-        distance_from_prior=bool(_from_prior(fit)[2]),
+        best=(best.distance, 2 * float(np.hypot(*half))),
+        distance_sigma=float(fit.sigma[2]), distance_from_prior=bool(fit.from_prior[2]),
     )  # fmt: skip
 
 
