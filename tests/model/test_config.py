@@ -11,8 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pixcal.model.config import MAX_CONFIG_BYTES, parse, quantity, read_yaml, to_plain, to_yaml
+from pixcal.model.config import parse, quantity, to_plain
 from pixcal.model.errors import InputError
+from pixcal.model.yaml_file import MAX_CONFIG_BYTES, read_yaml, to_yaml
 
 
 @dataclass(frozen=True)
@@ -150,6 +151,26 @@ def test_a_mistake_is_short_whatever_was_written() -> None:
         with pytest.raises(InputError) as caught:
             parse(Whole, {"count": 1} | data, "f")
         assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("cuont: 1\ncount: 2", 1),
+        ("count: 1\nratio: 2", 2),
+        ("count: 1\npair:\n  - 1\n  - 6", 2),
+        ("count: 1\nfirst:\n  weight_kg: 2\n", 2),
+        ("count: 1\nfirst:\n  name: a\n  weight_kg: x\n", 4),
+        ("count: 1\nparts:\n- name: a\n- name: b\n  weight: 3\n", 5),
+        ("mode: fast", None),
+    ],
+)
+def test_a_mistake_in_a_file_has_its_line(tmp_path: Path, text: str, line: int | None) -> None:
+    file = tmp_path / "c.yaml"
+    file.write_text(text)
+    with pytest.raises(InputError) as caught:
+        parse(Whole, read_yaml(file), str(file))
+    assert str(caught.value).endswith(f" (line {line})") == (line is not None)
 
 
 def test_mutable_defaults_are_refused() -> None:

@@ -4,11 +4,13 @@ The layout is fixed by the interface (schema ``pixcal/acquisition/1``).
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pixcal.model.config import parse, quantity, read_yaml
+from pixcal.model.config import parse, quantity
 from pixcal.model.errors import InputError
+from pixcal.model.yaml_file import read_yaml
 
 SCHEMA = "pixcal/acquisition/1"
 
@@ -46,6 +48,24 @@ def _check_globs(key: str, globs: tuple[str, ...]) -> None:
             )
 
 
+def check_set(name: str, baseline_mm: tuple[float, float]) -> None:
+    """Raise InputError if a fringe set, real or simulated, cannot have this name or baseline."""
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", name):
+        raise InputError(f"name: {name!r:.80} is not made of letters, digits, '-' and '_'")
+    if baseline_mm == (0.0, 0.0):
+        raise InputError(
+            "baseline_mm: both components are zero, so there are no fringes; give the vector "
+            "from fibre A to fibre B"
+        )
+
+
+def check_names(key: str, names: Sequence[str]) -> None:
+    """Raise InputError if two fringe sets have the same name."""
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"{key}: two sets are named {name!r}; rename one")
+
+
 @dataclass(frozen=True)
 class FringeSet:
     """One scan of the fringes of one pair of fibres."""
@@ -57,18 +77,12 @@ class FringeSet:
     )
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", self.name):
-            raise InputError(f"name: {self.name!r:.80} is not made of letters, digits, '-' and '_'")
+        check_set(self.name, self.baseline_mm)
         if re.fullmatch("mask|delta_(x|y|fringe)(_sigma)?", self.name):
             raise InputError(f"name: {self.name!r} is the name of a result; choose another")
         if not self.files:
             raise InputError("files: the list is empty")
         _check_globs("files", self.files)
-        if self.baseline_mm == (0.0, 0.0):
-            raise InputError(
-                "baseline_mm: both components are zero, so there are no fringes; give the vector "
-                "from fibre A to fibre B"
-            )
 
 
 @dataclass(frozen=True)
@@ -96,10 +110,7 @@ class Acquisition:
     frames: Frames = quantity()
 
     def __post_init__(self) -> None:
-        names = [s.name for s in self.frames.fringes]
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"frames.fringes: two sets are named {name!r}; rename one")
+        check_names("frames.fringes", [s.name for s in self.frames.fringes])
         if self.frames.fringes and self.optics is None:
             raise InputError("optics: missing; with fringes give its wavelength_nm and distance_mm")
         kinds = (self.frames.bias, self.frames.dark, self.frames.flat, self.frames.fringes)

@@ -1,13 +1,14 @@
 """A bench to simulate: everything ``pixcal simulate`` needs to know, schema ``pixcal/bench/1``."""
 
-import re
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from pixcal.model.config import parse, quantity, read_yaml
+from pixcal.model.acquisition import check_names, check_set
+from pixcal.model.config import parse, quantity
 from pixcal.model.errors import InputError
+from pixcal.model.yaml_file import read_yaml
 
 SCHEMA = "pixcal/bench/1"
 
@@ -190,16 +191,10 @@ class SimulatedSet:
     )
 
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}", self.name):
-            raise InputError(f"name: {self.name!r:.80} is not made of letters, digits, '-' and '_'")
+        check_set(self.name, self.baseline_mm)
         if self.name in CALIBRATIONS:
             raise InputError(
                 f"name: {self.name!r} is the folder of calibration frames; choose another"
-            )
-        if self.baseline_mm == (0.0, 0.0):
-            raise InputError(
-                "baseline_mm: both components are zero, so there are no fringes; give the vector "
-                "from fibre A to fibre B"
             )
         if self.phase_law == "ramp" and self.phase_step_rad == 0:
             raise InputError("phase_step_rad: zero, so the ramp never moves; give its step")
@@ -239,9 +234,7 @@ class SimulatedFrames:
 
     def __post_init__(self) -> None:
         names = [*CALIBRATIONS, *(s.name for s in self.fringes)]
-        for name in names:
-            if names.count(name) > 1:
-                raise InputError(f"fringes: two sets are named {name!r}; rename one")
+        check_names("fringes", names)
         for name in self.compress:
             if name not in names:
                 raise InputError(f"compress: {name!r} is not one of {', '.join(names)}")

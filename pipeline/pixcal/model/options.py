@@ -9,7 +9,7 @@ Beside those of `pixcal.model.config.quantity`, a field may say
 - ``metavar``, ``flag``, ``shown``: how help shows its value, its name, and a default of None.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,32 +22,10 @@ Region = tuple[int, int, int, int]
 MOST_ELECTRONS = 1e15  # the Poisson generator counts so far
 
 
-def _overwrite() -> Any:
-    return quantity(False, doc="Replace the ingested frames of another acquisition.", in_key=False)
-
-
-def _copy() -> Any:
-    doc = "Copy all samples into RUN, so that later steps do not need ACQ."
-    return quantity(False, doc=doc, in_key=False)
-
-
-def _cubes() -> Any:
-    doc = (
-        "Folder or URL (s3://bucket/prefix) for the large cubes, or RUN. "
-        "[default: the place used before, else RUN]"
-    )
-    return quantity(None, doc=doc, metavar="PLACE", in_key=False)
-
-
-def _gain() -> Any:
-    doc = "Gain to use: declared in acquisition.yaml or measured from the flats."
-    return quantity("declared", doc=doc)
-
-
-def _model() -> Any:
-    # The shapes of `pixcal.estimators.fringe_fit.models`.
-    doc = "Shape of the fringes: hyperbolic, straight (paraxial), or chosen from the data."
-    return quantity("auto", choices=("auto", "hyperbolic", "paraxial"), doc=doc)
+def _as_in(kind: type, name: str) -> Any:
+    """An option of another command as well."""
+    (option,) = (f for f in fields(kind) if f.name == name)
+    return field(default=option.default, metadata=option.metadata)
 
 
 def _python(default: Any, **meaning: Any) -> Any:
@@ -83,16 +61,30 @@ class Running:
 class Ingest:
     """Options of ``ingest``."""
 
-    overwrite: bool = _overwrite()
-    copy: bool = _copy()
-    cubes: StrPath | None = _cubes()
+    overwrite: bool = quantity(
+        False, in_key=False, doc="Replace the ingested frames of another acquisition."
+    )
+    copy: bool = quantity(
+        False,
+        in_key=False,
+        doc="Copy all samples into RUN, so that later steps do not need ACQ.",
+    )
+    cubes: StrPath | None = quantity(
+        None,
+        metavar="PLACE",
+        in_key=False,
+        doc="Folder or URL (s3://bucket/prefix) for the large cubes, or RUN. "
+        "[default: the place used before, else RUN]",
+    )
 
 
 @dataclass(frozen=True)
 class Reduce:
     """Options of ``reduce``."""
 
-    gain: Literal["declared", "measured"] = _gain()
+    gain: Literal["declared", "measured"] = quantity(
+        "declared", doc="Gain to use: declared in acquisition.yaml or measured from the flats."
+    )
     clip_sigma: float = _python(
         4.0, low=4, high=100, doc="Clipping of calibration frames, robust sigmas."
     )
@@ -114,7 +106,7 @@ class Reduce:
     rounding_share: float = _python(
         1e-3, above=0, high=1, doc="Share of the variance that rounding may add."
     )
-    cubes: StrPath | None = _cubes()
+    cubes: StrPath | None = _as_in(Ingest, "cubes")
 
 
 @dataclass(frozen=True)
@@ -133,7 +125,11 @@ class Sweep:
 class Fit(Sweep):
     """Options of ``fit``."""
 
-    model: str = _model()
+    model: str = quantity(
+        "auto",
+        choices=("auto", "hyperbolic", "paraxial"),  # as in pixcal.estimators.fringe_fit.models
+        doc="Shape of the fringes: hyperbolic, straight (paraxial), or chosen from the data.",
+    )
     with_diagnosis: bool = quantity(
         False,
         in_key=False,
@@ -300,11 +296,11 @@ class Simulate:
 class Run:
     """Options of ``run`` and of its steps."""
 
-    overwrite: bool = _overwrite()
-    copy: bool = _copy()
-    gain: Literal["declared", "measured"] = _gain()
-    model: str = _model()
-    cubes: StrPath | None = _cubes()
+    overwrite: bool = _as_in(Ingest, "overwrite")
+    copy: bool = _as_in(Ingest, "copy")
+    gain: Literal["declared", "measured"] = _as_in(Reduce, "gain")
+    model: str = _as_in(Fit, "model")
+    cubes: StrPath | None = _as_in(Ingest, "cubes")
     diagnosed: bool = quantity(
         True,
         flag="--diagnose/--no-diagnose",
