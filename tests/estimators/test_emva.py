@@ -7,6 +7,7 @@ from pixcal.estimators.detector.emva import (
     alternation,
     dark_slope,
     dynamic_range,
+    full_level,
     nonuniformity,
     saturation,
     spectrogram,
@@ -81,8 +82,10 @@ def test_saturation_is_where_the_variance_falls():
     variance = np.where(level < 3500, level / 2, 10.0)
     points = transfer_points(np.stack([dof, dof * level, dof * variance], axis=1))
     assert saturation(points) == pytest.approx((3400.0, 50.0))
+    assert full_level(points) == pytest.approx(3500.0)
     rising = transfer_points(np.stack([dof, dof * level, dof * level / 2], axis=1))
     assert saturation(rising) is None
+    assert full_level(rising) == np.inf
     np.testing.assert_allclose(points[:, 2], points[:, 1] * np.sqrt(2e-4))
 
 

@@ -19,12 +19,13 @@ DSNU, COLUMN, PRNU = 4.0, 1.5, 1.2
 """e- and e- of whole columns; per cent."""
 
 
-def write_camera(folder: Path, levels: tuple[float, ...], seed: int = 8) -> Path:
+def write_camera(folder: Path, levels: tuple[float, ...], seed: int = 8, overscan: int = 0) -> Path:
     """A 12-bit camera: bias, two series of darks at -10 C, a ladder of flats."""
     rng = np.random.default_rng(seed)
     offset = 200.3 * GAIN + DSNU * rng.standard_normal(SHAPE)
     offset += COLUMN * rng.standard_normal((1, SHAPE[1]))
     response = 1 + PRNU / 100 * rng.standard_normal(SHAPE)
+    response[:, :overscan] = 0
 
     def expose(name: str, count: int, electrons: float, seconds: float) -> None:
         charge = rng.poisson(electrons * response + DARK * seconds, (count, *SHAPE))
@@ -91,6 +92,17 @@ def test_a_ladder_that_saturates_gives_the_full_well(tmp_path: Path) -> None:
     # The variance is largest at the last level whose brightest samples alone are cut.
     assert found["value"] == pytest.approx(8600 / GAIN, rel=0.02)
     assert abs(found["value"] - FULL / GAIN) < 3 * found["error"] < 0.15 * FULL / GAIN
+
+
+def test_few_levels_one_of_full_pixels_give_the_gain_beside_an_overscan(tmp_path: Path) -> None:
+    acquisition = write_camera(tmp_path / "acq", (500, 6000, 11000), overscan=14)
+    reduced = pixcal.reduce(pixcal.ingest(acquisition, tmp_path / "run"))
+    gain = reduced.reduction["figures_of_merit"]["conversion_gain"]
+    assert abs(gain["value"] - GAIN) < 4 * gain["error"] < 0.04 * GAIN
+    assert reduced.reduction["gain_e_per_adu"]["chi2_reduced"] < 2
+    mask = np.asarray(reduced.detector["mask"])
+    assert (mask[:, :14] != 0).all()
+    assert (mask[:, 14:] != 0).mean() < 1e-4
 
 
 def camera_run(folder: Path, frames: dict[str, Any], seed: int = 4) -> dict[str, Any]:

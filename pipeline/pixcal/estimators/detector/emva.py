@@ -17,6 +17,8 @@ Measure = tuple[float, float]  # a value and its 1-sigma error
 
 # variance over its maximum below which samples saturate: noise alone does not fall so far
 _FALL = 0.8
+# the same of pixels that are full: their noise is that of the readout
+_FULL = 0.1
 _BLOCKS = 16
 
 
@@ -214,6 +216,16 @@ def saturation(points: F64) -> Measure | None:
         return None
     level = float(points[peak, 0])
     return level, float(fallen[0] - level) / 2
+
+
+def full_level(points: F64) -> float:
+    """Least level (ADU) of full pixels, whose noise is that of the readout; infinite without any.
+
+    Of few levels the curve's maximum may be far below.
+    """
+    peak = int(points[:, 1].argmax()) if len(points) else 0
+    full = points[peak + 1 :][points[peak + 1 :, 1] < _FULL * points[peak : peak + 1, 1], 0]
+    return float(full[0]) if len(full) else math.inf
 
 
 def dynamic_range(full_well: Measure, read_noise: Measure) -> tuple[float, float, float]:

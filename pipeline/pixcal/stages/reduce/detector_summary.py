@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.detector.calibration import Linearity, linearity
-from pixcal.estimators.detector.emva import saturation, transfer_points
+from pixcal.estimators.detector.emva import full_level, saturation, transfer_points
 from pixcal.kernels.photon_transfer import LADDER, GainFit, add_neighbours, fit_gain
 from pixcal.kernels.rounding import SHEPPARD, UNTOLD, noise_before_rounding
 from pixcal.model.acquisition import Detector
@@ -180,7 +180,8 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     levels, usable = _rungs(tables, job)
     sums = pair_sums(folder, job)
     # Pixels that are full saturate the flats though no sample of the converter does.
-    well = saturation(transfer_points(sums[1]))
+    points = transfer_points(sums[1])
+    well = saturation(points)
     full = usable & (levels > (well[0] if well else math.inf))
     usable &= ~full
     light = _light(tables, levels, usable, job)
@@ -195,7 +196,8 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
             f"frames.flat: the flats hold no light ({levels.max():.2g} ADU above the bias); take "
             "them again, or list none"
         )
-    top = float(np.fmin(job.saturation - medians.bias, well[0] if well else math.inf))
+    ends = full_level(points), math.inf if well is None else well[0]
+    top = float(np.fmin(job.saturation - medians.bias, ends[0] if ends[0] < math.inf else ends[1]))
     straight = None
     times = np.array([group.exptime for group in job.flat])
     if job.flats_timed and job.flat and _one_lamp(times[usable], levels[usable]):

@@ -249,6 +249,8 @@ def _pair_sums(job: Measuring, frames: F32, levels: F32, lamp: bool) -> F64:
             continue
         else:
             first, second = first * ((a + b) / (2 * a)), second * ((a + b) / (2 * b))
+            # Full pixels beside those of an overscan would pass for half-full ones without noise.
+            first[~lit(first + second)] = np.nan
         sums += bin_pairs(
             pair_statistics(
                 first, second, gain=gain, read_noise=job.read_noise, quantum=job.quantum
