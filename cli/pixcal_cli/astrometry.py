@@ -1,7 +1,6 @@
 """``pixcal astrometry``."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +31,7 @@ def astrometry(run: Path, config: Astrometry, runtime: "Runtime") -> None:
     with results.announce("astrometry", run / "astrometry"):
         stage.run(run, config, runtime)
     result = read_json(run / "astrometry" / "astrometry.json")
-    _show(result, [astuple(row) for row in stage.table(result)])
+    _show(result, stage.table(result))
     click.echo(f"  {run / 'products' / 'astrometry.png'}")
 
 
@@ -45,19 +44,15 @@ def _show(result: Mapping[str, Any], rows: Sequence[Sequence[str]]) -> None:
         f"{t['uas_per_px'] / 1e3:.3g} mas a pixel, {t['px_per_lambda_over_d']:.3g} px in λ/D; "
         f"photon noise alone {bound['px']:.3g} px, {bound['uas']:.3g} µas"
     )
-    cells = [("error of a centroid", "along", "perfect grid", "measured maps", "gain"), *rows]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for row in cells:
-        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        click.echo(f"  {line.rstrip()}")
+    header = ("error of a centroid", "along", "perfect grid", "measured maps", "gain")
+    results.show_table(header, rows)
     for name, axis in axes.items():
         need = axis["positions_to_target"]
         click.echo(
             f"  positions to {need['target_px']:.0e} px along {name}, if independent: "
             f"{_count(need['perfect'])} with a perfect grid, {_count(need['measured'])} with maps"
         )
-    for sentence in result["warnings"]:
-        click.echo(f"  note: {sentence}")
+    results.show_notes(result["warnings"])
 
 
 def _count(number: int | None) -> str:

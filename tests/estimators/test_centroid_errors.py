@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pixcal.estimators.star_centroids.errors import compare, running_means
+from pixcal.stages.astrometry.summary import compare, running_means
 
 F64 = NDArray[np.float64]
 

@@ -19,14 +19,23 @@ from pixcal.model.acquisition import Detector as Declared
 from pixcal.model.errors import InputError, PlanError
 from pixcal.report.drawing import png
 from pixcal.stages import astrometry
-from pixcal.stages.astrometry import Config, error_map, simulation, stage
-from pixcal.stages.astrometry.detector import PixelPositions, open_components
+from pixcal.stages.astrometry import Config, error_map, stage, stars
+from pixcal.stages.astrometry.detector import (
+    DegenerateModes,
+    PixelPositions,
+    free_from_modes,
+    open_components,
+)
 from pixcal.stages.astrometry.error_map import place_errors, tile_side
-from pixcal.stages.astrometry.modes import DegenerateModes
-from pixcal.stages.astrometry.simulation import KINDS, Observation, observe
+from pixcal.stages.astrometry.stars import (
+    KINDS,
+    Observation,
+    Telescope,
+    exposures,
+    observe,
+    star,
+)
 from pixcal.stages.astrometry.summary import scientific, table, with_error
-from pixcal.stages.astrometry.telescope import Telescope, exposures, star
-from pixcal.stages.astrometry.truth import free_from_modes
 from pixcal.stages.fitted_shape import fitted_shape
 from pixcal.storage.artefact import build, read_json, write_json
 from pixcal.storage.cube import ArrayReader
@@ -464,8 +473,8 @@ def test_no_place_for_a_star(tmp_path: Path) -> None:
 
 
 def test_masked_pixels_take_places_away(results: dict[str, dict[str, Any]]) -> None:
-    stars = results["drawn"]["stars"]
-    assert 0 < stars["number"] * stars["positions"] - stars["positions_used"] < 100
+    plan = results["drawn"]["stars"]
+    assert 0 < plan["number"] * plan["positions"] - plan["positions_used"] < 100
     assert any("too near to masked pixels" in w for w in results["drawn"]["warnings"])
     half = the_star().half
     inside = (SHAPE[0] - 2 * half) * (SHAPE[1] - 2 * half)
@@ -479,10 +488,10 @@ def test_tasks_stay_within_their_plan(case: Path, truth: bool) -> None:
     seen, config = the_star(), Config(positions=9, dither_px=60.0)
     planned, _ = stage.planned(SHAPE, modes, seen.side, config)
     plan = Observation(seen, 4, 9, 60.0)
-    core = simulation.core_weights(seen, detector.axes)
+    core = stars.core_weights(seen, detector.axes)
     tasks: list[Callable[[], Any]] = [
         lambda: place_errors(detector, seen, (0, SHAPE[0]), (0, SHAPE[1])),
-        lambda: simulation._star(detector, plan, core, 1),
+        lambda: stars.observe_star(detector, plan, core, 1),
     ]
     for task in tasks:
         task()

@@ -1,6 +1,6 @@
 """The figure of star centroids: a table, errors against electrons and positions, and error maps."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,7 +27,7 @@ class AstrometryView:
     result: Mapping[str, Any]  # `astrometry.json`
     target_px: float  # what the mission needs
     # rows: case, axis, error on a perfect grid, error with the maps, gain
-    table: tuple[tuple[str, ...], ...]
+    table: Sequence[Sequence[str]]
     photons: F64  # (2, n) electrons, and the bound of a centroid from photon noise, px
     weights: F64  # (y, x) what each pixel tells of the first axis of a star in the middle, sum 1
     # (grid, y, x) error along the first axis of a star in the middle of each pixel, px; NaN

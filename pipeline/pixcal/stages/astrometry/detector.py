@@ -3,20 +3,29 @@
 The true offsets of a real detector are not known, but the maps say what they may be: the measured
 offset and a draw of its error. That draw is what the maps do not know; a centroid that takes pixels
 where the maps say errs by it alone. Against a perfect grid such a detector is worse than the real
-one, its offsets holding the maps' errors twice (once in the maps, once in the draw):
-`errors` takes both off. Where a truth is given, it is the detector, less
-the modes that no fringes can tell from the bench.
+one, its offsets holding the maps' errors twice (once in the maps, once in the draw): `summary`
+subtracts both. Where a truth is given, it is the detector, without the modes that no fringes can
+tell from the bench (physics note, section 2).
+
+Smooth modes (a plane; what moving a fibre does to hyperbolic fringes) act on stars like distortion
+of the telescope, which a mission has to measure anyway. The fringe and its harmonic are lost to
+free intensities; over a large window they contain almost no part of the true offsets.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.fringe_fit.gauge import fringe_modes
+from pixcal.estimators.fringe_fit.models import FringeShape
+from pixcal.estimators.fringe_fit.models.paraxial import Paraxial
 from pixcal.model.errors import InputError
-from pixcal.stages.astrometry.modes import DegenerateModes
 from pixcal.storage.fits_map import FitsMap
 
 F64 = NDArray[np.float64]
@@ -25,11 +34,40 @@ Range = tuple[int, int]
 DRAW_TILE = 64  # side of the tiles of pixels that share a generator of errors, px
 LARGEST = 1.0  # an offset beyond is no offset; such a pixel is left out, px
 AXES = {"delta_x": ("x", (1.0, 0.0)), "delta_y": ("y", (0.0, 1.0))}
+ENOUGH = 4_000_000  # pixels that determine the modes; of larger detectors some bands are left out
+BAND = 16  # rows of a task of the fit of the modes
 
 
 def generator(seed: int, *key: int) -> np.random.Generator:
     """Random generator keyed by purpose and position, independent of the task."""
     return np.random.default_rng([seed, *key])
+
+
+@dataclass(frozen=True)
+class DegenerateModes:
+    """The modes of all sets' maps that are degenerate with the bench; the smooth ones first."""
+
+    shape: tuple[int, int]  # of the detector, (y, x)
+    sets: tuple[FringeShape, ...]  # as fitted
+
+    @property
+    def n_smooth(self) -> int:
+        """Number of smooth modes."""
+        return 3 + sum(len(s.names) - 1 for s in self.sets if not s.linear)
+
+    @property
+    def number(self) -> int:
+        """Number of modes."""
+        return self.n_smooth + 4 * len(self.sets)
+
+    def basis(self, y: Range, x: Range) -> F64:
+        """All modes (mode, y, x) on a part of the detector."""
+        rows, columns = np.arange(*y, dtype=float)[:, None], np.arange(*x, dtype=float)[None, :]
+        middle = (self.shape[0] - 1) / 2, (self.shape[1] - 1) / 2
+        plane = Paraxial(0.0, 0.0, 0.0, middle, max(self.shape) / 2).modes(rows, columns)
+        curved = [s.modes(rows, columns)[1:] for s in self.sets if not s.linear]
+        fringes = [fringe_modes(s.phase(rows, columns), np.asarray(1.0)) for s in self.sets]
+        return np.concatenate([plane, *curved, *map(np.stack, fringes)])
 
 
 @dataclass(frozen=True)
@@ -43,13 +81,16 @@ class Component:
     mask: FitsMap
     # the true offset is the sum of the maps times the numbers; empty where it is not known
     truth: tuple[tuple[float, FitsMap], ...] = ()
-    modes: DegenerateModes | None = None  # what the truth is freed from
+    # what the truth is freed from: modes, and the coefficient of each, px
+    removed: tuple[DegenerateModes, tuple[float, ...]] | None = None
 
     def true(self, y: Range, x: Range) -> F64:
-        """The true offset along the axis, modes included, px."""
-        return np.asarray(
-            sum(share * image.read(y, x).astype(float) for share, image in self.truth)
-        )
+        """The true offset along the axis, px."""
+        total = sum(share * image.read(y, x).astype(float) for share, image in self.truth)
+        if self.removed is not None:
+            modes, coefficients = self.removed
+            total = total - np.tensordot(coefficients, modes.basis(y, x), 1)
+        return np.asarray(total)
 
 
 @dataclass(frozen=True)
@@ -87,16 +128,16 @@ class PixelPositions:
 
     def patch(self, y: Range, x: Range) -> Patch:
         """A part, (start, stop) of rows and of columns; beyond the detector no pixel is good."""
-        ny, nx = self.shape
-        shape = (len(self.components), y[1] - y[0], x[1] - x[0])
-        part = Patch(np.zeros(shape), np.zeros(shape), np.zeros(shape[1:], bool))
-        here, across = (max(0, y[0]), min(ny, y[1])), (max(0, x[0]), min(nx, x[1]))
-        if here[0] >= here[1] or across[0] >= across[1]:
-            return part
-        at = tuple(slice(a - o, b - o) for (a, b), o in ((here, y[0]), (across, x[0])))
-        true, known, good = self._inside(here, across)
-        part.true[:, *at], part.known[:, *at], part.good[at] = true, known, good
-        return part
+        inside = [
+            (min(max(0, a), n), min(max(0, b), n))
+            for (a, b), n in zip((y, x), self.shape, strict=True)
+        ]
+        beyond = [(a - o, p - b) for (o, p), (a, b) in zip((y, x), inside, strict=True)]
+        if any(a == b for a, b in inside):
+            inside, beyond = [(0, 0), (0, 0)], [(0, y[1] - y[0]), (0, x[1] - x[0])]
+        true, known, good = self._inside(*inside)
+        wide = [(0, 0), *beyond]
+        return Patch(np.pad(true, wide), np.pad(known, wide), np.pad(good, beyond))
 
     def _inside(self, y: Range, x: Range) -> tuple[F64, F64, NDArray[np.bool_]]:
         known = np.stack([c.delta.read(y, x).astype(float) for c in self.components])
@@ -105,9 +146,6 @@ class PixelPositions:
             true = known + sigma * self._draw(y, x)
         else:
             true = np.stack([c.true(y, x) for c in self.components])
-            for component, values in zip(self.components, true, strict=True):
-                if component.modes is not None:
-                    values -= component.modes.on(y, x)
         flags = np.stack([c.mask.read(y, x) for c in self.components])
         with np.errstate(invalid="ignore"):
             fine = (np.abs(true) < LARGEST) & (np.abs(known) < LARGEST) & (flags == 0)
@@ -116,19 +154,16 @@ class PixelPositions:
 
     def _draw(self, y: Range, x: Range) -> F64:
         """Standard normals of the pixels, the same in every patch that holds them."""
-        out = np.empty((len(self.components), y[1] - y[0], x[1] - x[0]))
-        side = DRAW_TILE
-        for i in range(y[0] // side, -(-y[1] // side)):
-            for j in range(x[0] // side, -(-x[1] // side)):
-                normals = generator(self.seed, 1, i, j).standard_normal((len(out), side, side))
-                (a0, a1), (b0, b1) = (
-                    (max(start, n * side), min(stop, (n + 1) * side))
-                    for n, (start, stop) in ((i, y), (j, x))
-                )
-                out[:, a0 - y[0] : a1 - y[0], b0 - x[0] : b1 - x[0]] = normals[
-                    :, a0 - i * side : a1 - i * side, b0 - j * side : b1 - j * side
-                ]
-        return out
+        side, (rows, columns) = DRAW_TILE, [(a // DRAW_TILE, -(-b // DRAW_TILE)) for a, b in (y, x)]
+        size = (len(self.components), side, side)
+        tiles = [
+            [generator(self.seed, 1, i, j).standard_normal(size) for j in range(*columns)]
+            for i in range(*rows)
+        ]
+        (y0, y1), (x0, x1) = (
+            (a - side * n, b - side * n) for (a, b), (n, _) in ((y, rows), (x, columns))
+        )
+        return np.block(tiles)[:, y0:y1, x0:x1] if tiles else np.zeros((len(self.components), 0, 0))
 
 
 def open_components(run_dir: Path, fit: dict[str, Any], truth: Path | None) -> list[Component]:
@@ -139,7 +174,15 @@ def open_components(run_dir: Path, fit: dict[str, Any], truth: Path | None) -> l
     InputError
         If a map is missing or damaged, or the truth is not one of this detector.
     """
-    true = _open_truth(truth) if truth is not None else {}
+    true = {}
+    if truth is not None:
+        for name in AXES:
+            if not (truth / f"{name}.fits").exists():
+                raise InputError(
+                    f"--truth {truth}: no {name}.fits there; give what 'pixcal simulate' left "
+                    "beside the acquisition (ACQ-truth)"
+                )
+            true[name] = FitsMap.open(truth / f"{name}.fits")
     components = []
     for output in fit["outputs"]:
         file = run_dir / "products" / f"{output}.fits"
@@ -159,11 +202,48 @@ def open_components(run_dir: Path, fit: dict[str, Any], truth: Path | None) -> l
     return components
 
 
-def _open_truth(folder: Path) -> dict[str, FitsMap]:
-    for name in AXES:
-        if not (folder / f"{name}.fits").exists():
-            raise InputError(
-                f"--truth {folder}: no {name}.fits there; give what 'pixcal simulate' left beside "
-                "the acquisition (ACQ-truth)"
-            )
-    return {name: FitsMap.open(folder / f"{name}.fits") for name in AXES}
+def free_from_modes(
+    components: Sequence[Component], modes: DegenerateModes, runtime: Runtime
+) -> tuple[list[Component], dict[str, dict[str, float]]]:
+    """Fit the modes to truth minus maps, and remove them from the truth.
+
+    Returns
+    -------
+    list of Component
+    dict
+        For each component the rms (px) of the removed ``smooth`` and ``fringe`` modes.
+    """
+    ny, nx = modes.shape
+    # An odd step: bands must not keep pace with fringes.
+    step = (ny * nx // ENOUGH) | 1
+    bands = [(y, min(y + BAND, ny)) for y in range(0, ny, BAND * step)]
+    task = partial(_mode_sums, tuple(components), modes)
+    parts = run_tasks(task, bands, runtime, label="modes of the truth")
+    groups = {"smooth": slice(modes.n_smooth), "fringe": slice(modes.n_smooth, None)}
+    freed, removed = [], {}
+    for component, sums in zip(components, zip(*parts, strict=True), strict=True):
+        normal, right, count = (np.sum(part, axis=0) for part in zip(*sums, strict=True))
+        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+        # Modes of two sets overlap: of all combinations that do, the least.
+        fit = np.linalg.lstsq(normal / np.outer(scale, scale), right / scale, rcond=1e-10)[0]
+        c = fit / scale
+        freed.append(replace(component, removed=(modes, tuple(c.tolist()))))
+        removed[component.name] = {
+            group: float(np.sqrt(c[p] @ normal[p, p] @ c[p] / max(count, 1)))
+            for group, p in groups.items()
+        }
+    return freed, removed
+
+
+def _mode_sums(
+    components: tuple[Component, ...], modes: DegenerateModes, y: Range
+) -> list[tuple[F64, F64, int]]:
+    """Normal equations of the modes in truth minus map over a band, for each component."""
+    x = (0, modes.shape[1])
+    basis, sums = modes.basis(y, x), []
+    for component in components:
+        difference = component.true(y, x) - component.delta.read(y, x)
+        good = np.isfinite(difference) & (component.mask.read(y, x) == 0)
+        chosen = basis[:, good]
+        sums.append((chosen @ chosen.T, chosen @ difference[good], int(good.sum())))
+    return sums

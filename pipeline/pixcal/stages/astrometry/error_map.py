@@ -17,7 +17,7 @@ from scipy.fft import irfft2, next_fast_len, rfft2
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.star_centroids.centroids import Star
 from pixcal.stages.astrometry.detector import PixelPositions
-from pixcal.stages.astrometry.simulation import MOST_LOST
+from pixcal.stages.astrometry.stars import MOST_LOST
 from pixcal.storage.cube import ArrayWriter, create_array, create_group
 
 F64 = NDArray[np.float64]
@@ -42,17 +42,12 @@ class ErrorMaps:
     @property
     def mean_square(self) -> F64:
         """Over the whole detector, (grid, component), px²; NaN where no place counts."""
-        places = float(self.places.sum())
-        return np.asarray(
-            self.squares.sum(axis=(2, 3)) / places if places else self.squares * np.nan
-        )
+        return np.asarray(self.squares.sum(axis=(2, 3)) / (self.places.sum() or np.nan))
 
     @property
     def rms(self) -> F64:
         """Of each block, (grid, component, y, x), px; NaN where no place counts."""
-        empty = np.full(self.squares.shape, np.nan)
-        there = self.places > 0
-        return np.asarray(np.sqrt(np.divide(self.squares, self.places, out=empty, where=there)))
+        return np.sqrt(self.squares / np.where(self.places > 0, self.places, np.nan))
 
 
 def tile_side(shape: tuple[int, int]) -> tuple[int, int]:
@@ -83,13 +78,10 @@ def error_maps(folder: Path, detector: PixelPositions, star: Star, runtime: Runt
     parts = run_tasks(task, corners, runtime, label="error maps")
     for writer in writers:
         writer.finish()
-    places = np.zeros((-(-ny // block), -(-nx // block)))
-    squares = np.zeros((len(GRIDS), len(detector.components), *places.shape))
-    for (y, x), (square, count) in zip(corners, parts, strict=True):
-        i, j = y // block, x // block
-        at = (slice(i, i + count.shape[0]), slice(j, j + count.shape[1]))
-        squares[:, :, *at], places[at] = square, count
-    return ErrorMaps(squares, places, block)
+    columns = -(-nx // side)
+    sums = np.block([parts[n : n + columns] for n in range(0, len(parts), columns)])
+    squares = sums[:-1].reshape(len(GRIDS), -1, *sums.shape[1:])
+    return ErrorMaps(squares, sums[-1], block)
 
 
 def _tile(
@@ -99,14 +91,17 @@ def _tile(
     side: int,
     block: int,
     corner: tuple[int, int],
-) -> tuple[F64, F64]:
-    """Write a part of the maps; squares (grid, component, y, x) and places of its blocks."""
+) -> F64:
+    """Write a part of the maps; sums over its blocks (map + 1, y, x) of squares and of places."""
     y, x = ((a, min(a + side, n)) for a, n in zip(corner, detector.shape, strict=True))
     errors = place_errors(detector, star, y, x)
-    for writer, values in zip(writers, errors.reshape(-1, *errors.shape[2:]), strict=True):
+    maps = errors.reshape(-1, *errors.shape[2:])
+    for writer, values in zip(writers, maps, strict=True):
         writer.write(corner, values.astype(np.float32))
-    good = np.isfinite(errors[0, 0])
-    return _blocks(np.where(good, errors, 0.0) ** 2, block), _blocks(good.astype(float), block)
+    good = np.isfinite(maps[:1])
+    sums = np.concatenate([np.where(good, maps, 0.0) ** 2, good.astype(float)])
+    rows = np.add.reduceat(sums, range(0, sums.shape[1], block), axis=1)
+    return np.asarray(np.add.reduceat(rows, range(0, sums.shape[2], block), axis=2))
 
 
 def place_errors(
@@ -137,9 +132,3 @@ def place_errors(
         counts = counts & (kept >= 1 - MOST_LOST).all(axis=0)
         errors /= np.maximum(kept, 1 - MOST_LOST)
     return np.where(counts, errors, np.nan)
-
-
-def _blocks(values: F64, side: int) -> F64:
-    """Sums over blocks of the last two axes."""
-    across = np.add.reduceat(values, np.arange(0, values.shape[-1], side), axis=-1)
-    return np.asarray(np.add.reduceat(across, np.arange(0, values.shape[-2], side), axis=-2))

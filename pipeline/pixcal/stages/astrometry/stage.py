@@ -17,7 +17,6 @@ Values below the maps' own errors are null. ``astrometry.zarr`` holds the maps o
 """
 
 from collections.abc import Mapping
-from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,20 +28,31 @@ from pixcal import __version__
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime
 from pixcal.estimators.star_centroids.centroids import Star
-from pixcal.kernels.psf import Psf
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
 from pixcal.model.options import Astrometry
 from pixcal.report.astrometry_figures import AstrometryView, astrometry_figure
 from pixcal.report.drawing import png
-from pixcal.stages.astrometry.detector import Component, PixelPositions, generator, open_components
+from pixcal.stages.astrometry.detector import (
+    BAND,
+    Component,
+    DegenerateModes,
+    PixelPositions,
+    free_from_modes,
+    generator,
+    open_components,
+)
 from pixcal.stages.astrometry.error_map import ErrorMaps, error_maps, place_errors, tile_side
-from pixcal.stages.astrometry.modes import DegenerateModes
-from pixcal.stages.astrometry.simulation import Observation, core_weights, observe
+from pixcal.stages.astrometry.stars import (
+    Observation,
+    Telescope,
+    core_weights,
+    exposures,
+    observe,
+    star,
+)
 from pixcal.stages.astrometry.summary import TARGET_PX, axis_facts, table
-from pixcal.stages.astrometry.telescope import Telescope, exposures, star
-from pixcal.stages.astrometry.truth import BAND, free_from_modes
 from pixcal.stages.fitted_shape import fitted_shape
 from pixcal.storage.artefact import Build, Manifest, read_json, write_json
 from pixcal.storage.formats import STAGES
@@ -95,9 +105,14 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             inputs[component.delta.path.name] = file_digest(component.delta.path)
             for _, image in component.truth:
                 inputs[f"truth/{image.path.name}"] = file_digest(image.path)
+        shape = components[0].delta.shape
 
         def body(made: Build) -> None:
-            _measure(run_dir, made, components, fit, acquisition, telescope, config, runtime)
+            modes = None
+            if config.truth is not None:
+                sets = (fitted_shape(run_dir, s, acquisition, shape) for s in fit["sets"].values())
+                modes = DegenerateModes(shape, tuple(sets))
+            _measure(made, components, modes, acquisition, telescope, config, runtime)
 
         options = result_options(config) | {"truth": None}
         publish = partial(copy_products, run_dir, STAGE, "astrometry.*")
@@ -105,10 +120,9 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
 
 def _measure(
-    run_dir: Path,
     made: Build,
     components: list[Component],
-    fit: Mapping[str, Any],
+    modes: DegenerateModes | None,
     acquisition: Acquisition,
     telescope: Telescope,
     config: Config,
@@ -124,8 +138,6 @@ def _measure(
             f"--window: {observed.side} px{by_itself} do not fit maps of {shape[1]} × {shape[0]} "
             f"px (x × y); give an odd number up to {min(shape)}"
         )
-    sets = (fitted_shape(run_dir, s, acquisition, shape) for s in fit["sets"].values())
-    modes = DegenerateModes(shape, tuple(sets)) if config.truth is not None else None
     need = planned(shape, modes.number if modes else 0, observed.side, config)
     runtime = runtime.with_workers(make_plan("astrometry", *need, runtime).workers)
     removed = None
@@ -140,30 +152,58 @@ def _measure(
         )
     plan = Observation(observed, config.stars, config.positions, config.dither_px)
     errors = observe(detector, plan, runtime)
+    facts = _facts(detector, maps, plan, errors, removed, config)
     result = {
         "schema": SCHEMA,
         "pixcal": __version__,
-        "detector": _detector_facts(detector, maps, config, removed),
+        "detector": facts["detector"],
         "telescope": telescope.facts(),
-        "stars": {
-            "number": config.stars,
-            "positions": config.positions,
-            "positions_used": int(np.isfinite(errors).all(axis=(2, 3)).sum()),
-            "dither_px": config.dither_px,
-            "electrons": config.electrons,
+        "stars": facts["stars"]
+        | {
             "exposures": exposures(psf, config.electrons, acquisition.detector),
-            "background_e": config.background_e,
             "read_noise_e": acquisition.detector.read_noise_e,
-            "window_px": observed.side,
-            "seed": config.seed,
         },
         "axes": _axes(detector, observed, errors, maps, telescope),
     }
     result["warnings"] = _warnings(result)
     write_json(made.folder / "astrometry.json", result)
-    view = _view(result, detector, observed, maps, _curve(psf, half, acquisition, config))
+    # Photon noise (px, the mean of both axes) of other stars.
+    share = config.background_e / config.electrons
+    others = (star(psf, half, n, share * n, acquisition.detector) for n in CURVE)
+    photons = [np.sqrt(np.mean(other.bound() ** 2)) for other in others]
+    view = _view(result, detector, observed, maps, np.stack([CURVE, photons]))
     (made.folder / "astrometry.png").write_bytes(png(astrometry_figure(view)))
     made.summary = {"warnings": result["warnings"]}
+
+
+def _facts(
+    detector: PixelPositions,
+    maps: ErrorMaps,
+    plan: Observation,
+    errors: F64,
+    removed: dict[str, dict[str, float]] | None,
+    config: Config,
+) -> dict[str, dict[str, Any]]:
+    """What was simulated."""
+    return {
+        "detector": {
+            "pixels": "maps and a draw of their errors" if detector.drawn else "truth",
+            "truth": None if config.truth is None else str(config.truth),
+            "shape": list(detector.shape),
+            "places": int(maps.places.sum()),
+            "modes_removed_px": removed,
+        },
+        "stars": {
+            "number": plan.stars,
+            "positions": plan.positions,
+            "positions_used": int(np.isfinite(errors).all(axis=(2, 3)).sum()),
+            "dither_px": plan.dither,
+            "electrons": config.electrons,
+            "background_e": config.background_e,
+            "window_px": plan.star.side,
+            "seed": config.seed,
+        },
+    }
 
 
 def planned(shape: tuple[int, int], modes: int, side: int, config: Config) -> tuple[int, int]:
@@ -187,21 +227,6 @@ def planned(shape: tuple[int, int], modes: int, side: int, config: Config) -> tu
     )
     # All errors of the stars, and their copies while they are averaged.
     return task, FIGURE_BYTES + 4 * 8 * 12 * config.stars * config.positions
-
-
-def _detector_facts(
-    detector: PixelPositions,
-    maps: ErrorMaps,
-    config: Config,
-    removed: dict[str, dict[str, float]] | None,
-) -> dict[str, Any]:
-    return {
-        "pixels": "maps and a draw of their errors" if detector.drawn else "truth",
-        "truth": None if config.truth is None else str(config.truth),
-        "shape": list(detector.shape),
-        "places": int(maps.places.sum()),
-        "modes_removed_px": removed,
-    }
 
 
 def _axes(
@@ -252,15 +277,6 @@ def _warnings(result: Mapping[str, Any]) -> list[str]:
     return sentences
 
 
-def _curve(psf: Psf, half: int, acquisition: Acquisition, config: Config) -> F64:
-    """Photon noise (px, the mean of both axes) against electrons, (2, n)."""
-    bounds = [
-        star(psf, half, n, config.background_e * n / config.electrons, acquisition.detector).bound()
-        for n in CURVE
-    ]
-    return np.stack([CURVE, np.sqrt(np.mean(np.square(bounds), axis=1))])
-
-
 def _view(
     result: dict[str, Any], detector: PixelPositions, observed: Star, maps: ErrorMaps, photons: F64
 ) -> AstrometryView:
@@ -270,7 +286,7 @@ def _view(
     return AstrometryView(
         result=result,
         target_px=TARGET_PX,
-        table=tuple(astuple(row) for row in table(result)),
+        table=table(result),
         photons=photons,
         weights=core_weights(observed, detector.axes)[0],
         detail=place_errors(detector, observed, y, x)[:, 0],

@@ -1,23 +1,47 @@
-"""The errors of the stars as the numbers of ``astrometry.json``, and as a table."""
+"""The errors of the stars as the numbers of ``astrometry.json``, and as a table.
+
+On a detector that is the maps plus a draw of their errors, true offsets t, errors of the maps e and
+the draw d are independent, e and d alike. Stars fitted on a perfect grid err by K(t + e + d), with
+K the weights of the pixels; those fitted where the maps say by K d. So the mean square that the
+true offsets alone would give is that of the first less twice that of the second, whatever the
+pattern of the offsets.
+"""
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.star_centroids.errors import Comparison, Value, compare, running_means
-from pixcal.stages.astrometry.simulation import KINDS
+from pixcal.stages.astrometry.stars import KINDS
 
 F64 = NDArray[np.float64]
 
 TARGET_PX = 5e-5  # what a mission to Earth-like planets needs (paper, section 1)
+RESAMPLES = 300
+GRIDS = ("perfect", "measured")
+SEEN = 2.0  # a mean square is significant when it is so many of its errors above zero
 
 
-@dataclass(frozen=True)
-class Row:
+class Value(NamedTuple):
+    """A number and its 1-sigma error by resampling the stars; NaN where there is none."""
+
+    value: float
+    error: float
+
+
+class Comparison(NamedTuple):
+    """Root mean square errors of centroids, px, and the ratio of both."""
+
+    # perfect, measured: pixels taken for a perfect grid, and where the maps say. `perfect` is
+    # NaN where the scatter of the offsets is not significant above the maps' errors
+    perfect: Value
+    measured: Value
+    gain: Value
+
+
+class Row(NamedTuple):
     """A row of the table, as text."""
 
     case: str
@@ -25,6 +49,67 @@ class Row:
     perfect: str
     measured: str
     gain: str
+
+
+def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -> Comparison:
+    """Root mean squares of errors.
+
+    Parameters
+    ----------
+    perfect, measured : (star, position) float64
+        Errors, px; NaN where there is none.
+    noise : (star, position) float64
+        Errors whose mean square ``perfect`` holds twice without having it on a real detector: the
+        maps' own. Zeros where the detector is the truth.
+    rng : Generator
+        For resampling the stars.
+    """
+    columns = (perfect**2, measured**2, noise**2)
+    good = np.isfinite(perfect) & np.isfinite(measured)
+    sums = np.stack([np.where(good, c, 0.0).sum(axis=1) for c in columns] + [good.sum(axis=1)])
+    rms, stars = _roots(sums.sum(axis=1)), sums.shape[1]
+    picks = (np.bincount(rng.integers(0, stars, stars), minlength=stars) for _ in range(RESAMPLES))
+    again = np.array([_roots(sums @ pick) for pick in picks])
+    # Squares: their errors are meaningful where the root of one does not exist.
+    square_error = np.std(again[:, 3])
+    if not rms[3] > SEEN * square_error:
+        rms[0] = rms[2] = np.nan
+    return Comparison(*(Value(float(rms[n]), _spread(again[:, n])) for n in range(3)))
+
+
+def _roots(sums: F64) -> F64:
+    """Perfect, measured, gain, and the first one's square, from sums of squares and a count."""
+    perfect, measured, noise = sums[:3] / max(sums[3], 1)
+    square = perfect - 2 * noise
+    root = np.sqrt(square) if square > 0 else np.nan
+    other = np.sqrt(measured)
+    return np.array([root, other, root / other if other > 0 else np.nan, square])
+
+
+def _spread(values: F64) -> float:
+    """Standard deviation of the finite values."""
+    finite = values[np.isfinite(values)]
+    return float(np.std(finite)) if len(finite) > 1 else float("nan")
+
+
+def running_means(errors: F64, lengths: list[int]) -> list[F64]:
+    """Mean error of each star over its first positions, NaN left out.
+
+    Parameters
+    ----------
+    errors : (star, position) float64
+    lengths : list of int
+        Positions to average.
+
+    Returns
+    -------
+    list of (star, 1) float64
+        One for each length; NaN where a star has none.
+    """
+    good = np.isfinite(errors)
+    sums, counts = np.cumsum(np.where(good, errors, 0.0), axis=1), np.cumsum(good, axis=1)
+    means = sums / np.where(counts > 0, counts, np.nan)
+    return [means[:, n - 1 : n] for n in lengths]
 
 
 def axis_facts(
@@ -35,7 +120,7 @@ def axis_facts(
     Parameters
     ----------
     errors : (star, position, kind) float64
-        As `pixcal.stages.astrometry.simulation.observe` leaves them, px.
+        As `pixcal.stages.astrometry.stars.observe` leaves them, px.
     bound : float
         Cramér-Rao bound of one position, px.
     uas_per_px : float
@@ -49,47 +134,35 @@ def axis_facts(
         noise = of["measured"] if drawn else np.zeros_like(of["measured"])
         return compare(of["perfect" + suffix], of["measured" + suffix], noise, rng)
 
-    lengths = averaging_lengths(errors.shape[1])
+    # Powers of two, and the number of positions.
+    positions = errors.shape[1]
+    lengths = sorted({2**n for n in range(positions.bit_length())} | {positions})
     means = {kind: running_means(values, lengths) for kind, values in kinds.items()}
     averaged = [
         compared({kind: values[n] for kind, values in means.items()}, "_photons")
         for n in range(len(lengths))
     ]
-    pairs = {kind: np.diff(_paired(values[-1]), axis=1) for kind, values in means.items()}
+    # Two stars a row; an unpaired star is left out.
+    last = {kind: values[-1] for kind, values in means.items()}
+    pairs = {kind: v[1::2] - v[: len(v) // 2 * 2 : 2] for kind, v in last.items()}
     photons = compared(kinds, "_photons")
+    curve = {grid: np.array([getattr(c, grid) for c in averaged]) for grid in GRIDS}
     return {
         "floor": _facts(compared(kinds, ""), uas_per_px),
         "photon_bound": number(Value(bound, math.nan), uas_per_px),
         "photons": _facts(photons, uas_per_px),
         "averaged": _facts(averaged[-1], uas_per_px),
         "separation": _facts(compared(pairs, "_photons"), uas_per_px),
-        "averaging": {
-            "positions": lengths,
-            **{
-                f"{grid}{suffix}_px": [
-                    _finite(getattr(getattr(comparison, grid), field)) for comparison in averaged
-                ]
-                for grid in ("perfect", "measured")
-                for suffix, field in (("", "value"), ("_err", "error"))
-            },
+        "averaging": {"positions": lengths}
+        | {
+            f"{grid}{suffix}_px": [_finite(value) for value in curve[grid][:, n]]
+            for grid in GRIDS
+            for n, suffix in enumerate(("", "_err"))
         },
-        "positions_to_target": {
-            "target_px": TARGET_PX,
-            "perfect": _positions(photons.perfect.value),
-            "measured": _positions(photons.measured.value),
-        },
+        "positions_to_target": {"target_px": TARGET_PX}
+        | {grid: _positions(getattr(photons, grid).value) for grid in GRIDS},
         "second_order_px": _finite(_rms(kinds["perfect"] - kinds["linear"])),
     }
-
-
-def averaging_lengths(positions: int) -> list[int]:
-    """Powers of two, and the number of positions."""
-    return sorted({2**n for n in range(positions.bit_length())} | {positions})
-
-
-def _paired(values: F64) -> F64:
-    """Pairs of stars, one per row; an unpaired star is left out."""
-    return values[: len(values) // 2 * 2].reshape(-1, 2)
 
 
 def _rms(values: F64) -> float:
@@ -116,11 +189,8 @@ def number(value: Value, uas_per_px: float) -> dict[str, float | None]:
 
 
 def _facts(comparison: Comparison, uas_per_px: float) -> dict[str, Any]:
-    return {
-        "perfect": number(comparison.perfect, uas_per_px),
-        "measured": number(comparison.measured, uas_per_px),
-        "gain": {"value": _finite(comparison.gain.value), "err": _finite(comparison.gain.error)},
-    }
+    gain = {"value": _finite(comparison.gain.value), "err": _finite(comparison.gain.error)}
+    return {grid: number(getattr(comparison, grid), uas_per_px) for grid in GRIDS} | {"gain": gain}
 
 
 def table(result: Mapping[str, Any]) -> list[Row]:
