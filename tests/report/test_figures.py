@@ -1,5 +1,6 @@
 """Figures: valid pictures at any size, true colours, nothing global."""
 
+import base64
 import io
 import threading
 from typing import Any
@@ -8,10 +9,9 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
-from matplotlib.figure import Figure
 from PIL import Image
 
-from pixcal.report import detector_figures, map_figures, set_figures
+from pixcal.report import detector_figures, map_figures, map_panels, set_figures
 from pixcal.report.colours import DIVERGING, MASKED, PALETTE, SEQUENTIAL
 from pixcal.report.contents import FrameSeries, MapContents, SetContents
 from pixcal.report.drawing import png, span_scale, symmetric_scale, unit_for
@@ -41,8 +41,12 @@ def open_png(data: bytes) -> Image.Image:
     return picture.convert("RGB")
 
 
-def colours_of(figure: Figure) -> set[Any]:
-    return {c for _, c in open_png(png(figure)).getcolors(1 << 24) or ()}
+def picture_of(panel: map_panels.Panel) -> Image.Image:
+    return open_png(base64.b64decode(panel.src.removeprefix("data:image/png;base64,")))
+
+
+def colours_of(panel: map_panels.Panel) -> set[Any]:
+    return {c for _, c in picture_of(panel).getcolors(1 << 24) or ()}
 
 
 @pytest.mark.parametrize("shape", SIZES)
@@ -50,11 +54,33 @@ def test_maps_of_any_size_become_pictures(shape: tuple[int, int]) -> None:
     delta, sigma = a_map(shape), a_map(shape, 4e-4, 1e-5)
     for figure in (
         map_figures.offsets("delta_x", delta, sigma),
-        map_figures.errors_and_histogram([MapContents("delta_x", delta, sigma, None)]),
-        map_figures.errors_and_histogram([MapContents("delta_x", delta, sigma, None)] * 3),
-        map_figures.map_grid([("bias", "ADU", delta), ("flat", "1", sigma), ("dark", "e", sigma)]),
+        map_figures.histogram([MapContents("delta_x", delta, sigma, None)]),
+        map_figures.histogram([MapContents("delta_x", delta, sigma, None)] * 3),
     ):
         assert min(open_png(png(figure)).size) > 150
+    panel = map_panels.map_panel("bias", "ADU", delta)
+    assert picture_of(panel).size == delta.image.shape[::-1]
+    assert 0 < min(panel.width, panel.height) <= max(panel.width, panel.height) == map_panels.BOX
+    for at, _ in (*panel.x, *panel.y, *panel.colours):
+        assert 0 <= at <= map_panels.BOX
+
+
+def test_a_map_on_the_page_is_upright_and_has_the_colours_of_its_values() -> None:
+    values = np.linspace(0, 1, 12).reshape(3, 4)
+    values[2, 3] = np.nan
+    panel = map_panels.map_panel("", "", summarise(ArraySource(values.astype(np.float32))))
+    shown = np.asarray(picture_of(panel)).astype(int)
+    assert (shown[0, 3] == np.rint(255 * np.array(to_rgb(MASKED)))).all()
+    dark, bright = (np.rint(255 * np.array(SEQUENTIAL(n)[:3])) for n in (2, 78))
+    assert np.abs(shown[2, 0] - dark).max() < 12  # the lowest value is at the bottom left
+    assert np.abs(shown[0, 2] - bright).max() < 40
+
+
+def test_ticks_are_where_their_numbers_say() -> None:
+    for at, text in map_panels.ticks(-2.0, 6.0, 80.0, upwards=True):
+        assert at == pytest.approx(80 - 10 * (float(text.replace("−", "-")) + 2))
+    decades = map_panels.ticks(0.5, 2000.0, 100.0, upwards=False, log=True)
+    assert np.ptp(np.diff([at for at, _ in decades])) < 1e-9
 
 
 def test_long_profiles_are_drawn_as_ranges_that_hold_every_mean() -> None:
@@ -79,7 +105,11 @@ def test_spectra_of_any_size_become_pictures(shape: tuple[int, int]) -> None:
     made = spectrum(ArraySource(values), ArraySource(np.ones(shape)))
     assert made is not None
     vectors = {name: (1.26, 0.1 * n) for n, name in enumerate("abcdef")}
-    open_png(png(map_figures.power([with_spectrum("delta_y", made)], vectors)))
+    maps = [with_spectrum("delta_y", made)]
+    open_png(png(map_figures.power(maps, vectors)))
+    (panel,), legend = map_panels.spectra(maps, vectors)
+    assert picture_of(panel).size == made.power.shape[::-1]
+    assert len(panel.marks) == 4 * len(legend) == 4 * len(vectors)
 
 
 def test_the_fringe_is_marked_where_its_power_is() -> None:
@@ -87,8 +117,10 @@ def test_the_fringe_is_marked_where_its_power_is() -> None:
     y, x = np.mgrid[:128, :128]
     made = spectrum(ArraySource(np.sin(k[0] * x + k[1] * y)), ArraySource(np.full((128, 128), 0.1)))
     assert made is not None
-    axes = map_figures.power([with_spectrum("delta_x", made)], {"set": k}).axes[0]
-    (marks,) = (line.get_xydata() for line in axes.lines if "fringes" in str(line.get_label()))
+    (panel,), _ = map_panels.spectra([with_spectrum("delta_x", made)], {"set": k})
+    marks = np.array(
+        [(m.x / map_panels.BOX - 0.5, 0.5 - m.y / map_panels.BOX) for m in panel.marks if m.round]
+    )
     fy, fx = made.frequencies
     i, j = np.unravel_index(made.power.argmax(), made.power.shape)
     assert np.hypot(*(marks - (fx[j], fy[i])).T).min() < 1 / 128
@@ -98,8 +130,8 @@ def test_the_fringe_is_marked_where_its_power_is() -> None:
 def test_flags_keep_their_colours(shape: tuple[int, int]) -> None:
     values = np.zeros(shape, np.uint8)
     values[: shape[0] // 2] = 1
-    figure = map_figures.flags({"one": summarise_flags(ArraySource(values))})
-    shown = colours_of(figure)
+    (panel,), _ = map_panels.flags({"one": summarise_flags(ArraySource(values))})
+    shown = colours_of(panel)
     red = tuple(round(255 * v) for v in to_rgb("#d7301f"))
     assert (red in shown) == (max(shape) <= 400)  # shares, not flags, where blocks are averaged
 
@@ -107,8 +139,8 @@ def test_flags_keep_their_colours(shape: tuple[int, int]) -> None:
 def test_equal_masks_are_drawn_once() -> None:
     flags = summarise_flags(ArraySource(np.eye(30, dtype=np.uint8)))
     other = summarise_flags(ArraySource(2 * np.eye(30, dtype=np.uint8)))
-    axes = map_figures.flags({"a": flags, "b": flags, "c": other}).axes
-    assert [a.get_title() for a in axes if a.get_visible()] == ["a\nb", "c"]
+    panels, _ = map_panels.flags({"a": flags, "b": flags, "c": other})
+    assert [panel.title for panel in panels] == ["a, b", "c"]
 
 
 def a_set(frames: int, *, moving: bool) -> SetContents:
@@ -131,7 +163,7 @@ def test_runs_of_any_length_become_pictures(frames: int, moving: bool) -> None:
     assert len(figure.axes) == (6 if moving else 4)
     open_png(png(figure))
     for sets in ([fringes], [fringes] * 3):
-        open_png(png(set_figures.residuals(sets)))
+        open_png(png(set_figures.chi2(sets)))
 
 
 def test_long_runs_are_thinned_and_say_so() -> None:

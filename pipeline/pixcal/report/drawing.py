@@ -26,8 +26,6 @@ from pixcal.report.summary import MapSummary
 from pixcal.report.text import exact
 
 WIDE = 10.4  # width of a figure that takes the whole page, inches
-# room between a map and what is beside it, for a colour bar, its numbers and labels, inches
-BESIDE_BAR = 1.95
 DPI = 130
 # of titles at a fixed height: the labels around them need not be measured
 TITLE: dict[str, Any] = {"fontsize": 11, "y": 1.0}
@@ -144,61 +142,6 @@ def _margins(
         left / width, bottom / height, 1 - right / width, 1 - top / height,
         beside / wide, between / high,
     )  # fmt: skip
-
-
-def map_axes(
-    number: int, shape: tuple[int, int], *, curve: bool = False, top: float = 0.3
-) -> tuple[Figure, list[Axes], Axes | None]:
-    """Axes for maps with colour bars, two per row, and for a curve below them.
-
-    Parameters
-    ----------
-    number : int
-        Of maps; the curve is beside a single map.
-    shape : (int, int)
-        Rows and columns of a map.
-    top : float
-        Room above a map, inches.
-    """
-    tall = float(np.clip(3.2 * shape[0] / shape[1], 1.2, 4.4))
-    names: list[list[Any]] = [[n, n + 1 if n + 1 < number else "."] for n in range(0, number, 2)]
-    heights = [tall] * len(names)
-    if curve and number == 1:
-        names, heights = [[0, "curve"]], [max(tall, 3.2)]
-    elif curve:
-        names, heights = [*names, ["curve", "curve"]], [*heights, 3.0]
-    between, bottom, right = 0.6 + top, 0.6, 0.2 if curve and number == 1 else 1.2
-    height = sum(heights) + (len(heights) - 1) * between + bottom + top
-    figure = Figure(figsize=(WIDE, height), dpi=DPI)
-    _margins(figure, len(names), 2, 0.85, right, bottom, top, BESIDE_BAR, between)
-    axes: dict[Any, Axes] = figure.subplot_mosaic(names, height_ratios=heights)
-    return figure, [axes[n] for n in range(number)], axes.get("curve")
-
-
-def draw_panel(
-    figure: Figure, axes: Axes, summary: MapSummary, label: str, title: str = "",
-    *, scale: ColourScale | None = None, factor: float = 1.0,
-) -> None:  # fmt: skip
-    """A map with its axes, title and colour bar; by default its colours span its values.
-
-    Parameters
-    ----------
-    factor : float
-        What values are multiplied by; ``scale`` is in their unit after it.
-    """
-    scale = scale or span_scale(summary.image * factor)
-    drawn = draw_map(axes, summary, scale, factor)
-    square(axes, summary.shape)
-    axes.set(xlabel="x (px)", ylabel="y (px)")
-    axes.set_title(", ".join(filter(None, (title, block_note(summary)))), **TITLE)
-    add_bar(figure, axes, drawn, label, scale.beyond)
-
-
-def square(axes: Axes, shape: tuple[int, int]) -> None:
-    """Square pixels, unless the map is very elongated."""
-    ny, nx = shape
-    if max(ny, nx) <= 6 * min(ny, nx):
-        axes.set_aspect("equal")
 
 
 def place(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:

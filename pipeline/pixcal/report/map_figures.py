@@ -1,53 +1,39 @@
-"""Figures of maps: offsets with their profiles, errors, power spectra, levels, flags."""
+"""Figures of maps: offsets with their profiles, histograms, power spectra."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from pixcal.model.flags import PixelFlag
 from pixcal.report.colours import (
     BAND,
     BAR,
     BLUE,
-    FLAGS,
     GREY,
     INK,
     LINES,
-    MARKS,
-    SEQUENTIAL,
-    SEVERAL,
-    UNFLAGGED,
 )
-from pixcal.report.contents import MapContents, SetContents
+from pixcal.report.contents import MapContents
 from pixcal.report.drawing import (
     DPI,
-    TITLE,
     WIDE,
     Unit,
-    add_bar,
     axes_grid,
     block_note,
-    covered,
     draw_map,
-    draw_panel,
     finish,
     fit_box,
     limits,
-    map_axes,
     place,
-    square,
     symmetric_scale,
     unit_for,
 )
-from pixcal.report.summary import FlagSummary, MapSummary, Profile, Spectrum
-from pixcal.report.text import SYMBOLS, flag_name
+from pixcal.report.map_panels import folded
+from pixcal.report.summary import MapSummary, Profile, Spectrum
+from pixcal.report.text import SYMBOLS
 
 F64 = NDArray[np.float64]
 
@@ -155,14 +141,9 @@ def _nearby(values: F64) -> tuple[F64, F64, F64]:
     return low[groups], mean[groups], high[groups]
 
 
-def errors_and_histogram(maps: Sequence[MapContents]) -> Figure:
-    """The maps of errors, and the histograms of offsets and of errors."""
-    figure, panels, axes = map_axes(len(maps), maps[0].delta.shape, curve=True)
-    assert axes is not None
-    for panel, offset in zip(panels, maps, strict=True):
-        unit = unit_for([offset.sigma.median], "px")
-        label = f"σ of {SYMBOLS[offset.name]} ({unit.label})"
-        draw_panel(figure, panel, offset.sigma, label, factor=unit.factor)
+def histogram(maps: Sequence[MapContents]) -> Figure:
+    """Histograms of the offsets, beside normal distributions and the widths of the noise."""
+    figure, ((axes,),) = axes_grid((WIDE, 3.8))
     unit = unit_for([offset.delta.robust_std for offset in maps], "px")
     for offset, colour in zip(maps, LINES, strict=False):
         _histogram(axes, offset, unit, colour)
@@ -201,7 +182,7 @@ def _histogram(axes: Axes, offset: MapContents, unit: Unit, colour: str) -> None
 
 
 def power(maps: Sequence[MapContents], vectors: Mapping[str, tuple[float, float]]) -> Figure:
-    """Power spectra of maps in two dimensions, and their means over rings and along the axes.
+    """Power spectra of maps: means over rings, and cuts along the axes.
 
     Parameters
     ----------
@@ -210,62 +191,21 @@ def power(maps: Sequence[MapContents], vectors: Mapping[str, tuple[float, float]
     vectors : mapping
         Fringe vector (kx, ky), rad/px, of each set.
     """
-    top = 0.35 + 0.2 * max(len(vectors), 1)
-    figure, panels, axes = map_axes(len(maps), (1, 1), curve=True, top=top)
-    assert axes is not None
-    for panel, offset, colour in zip(panels, maps, LINES, strict=False):
+    figure, ((axes,),) = axes_grid((WIDE, 4.0), left=1.0)
+    for offset, colour in zip(maps, LINES, strict=False):
         assert offset.spectrum is not None
-        _spectrum_map(figure, panel, offset.spectrum, vectors)
         _spectrum_lines(axes, SYMBOLS[offset.name], offset.spectrum, colour)
-        panel.set_ylabel(f"{SYMBOLS[offset.name]}: fy (cycles/px)")
     for vector in vectors.values():
         for order in (1, 2):
-            f = _folded(np.array([order * v / (2 * np.pi) for v in vector]))
+            f = folded(np.array([order * v / (2 * np.pi) for v in vector]))
             axes.axvline(float(np.hypot(*f)), color=GREY, ls=":", linewidth=1)
     axes.set_yscale("log")
+    axes.set_ylim(top=30 * axes.get_ylim()[1])  # room for the legend
     axes.set_xlim(0, 0.5)
     axes.set(xlabel="spatial frequency (cycles/px)", ylabel="power (px² per (cycle/px)²)")
     finish(axes)
     axes.legend(fontsize=8.5, framealpha=0.9, ncols=len(maps), loc="upper right")
     return figure
-
-
-def _spectrum_map(
-    figure: Figure, axes: Axes, spectrum: Spectrum, vectors: Mapping[str, tuple[float, float]]
-) -> None:
-    relative = spectrum.power / spectrum.white if spectrum.white > 0 else spectrum.power
-    positive = relative[relative > 0]
-    low, high = np.percentile(positive, [1, 99.9]) if len(positive) else (0.1, 10.0)
-    fy, fx = spectrum.frequencies
-    drawn = axes.imshow(
-        np.where(relative > 0, relative, np.nan), origin="lower", aspect="equal",
-        interpolation="nearest", cmap=SEQUENTIAL, norm=LogNorm(low, max(high, 3 * low)),
-        extent=(*_edges(fx), *_edges(fy)),
-    )  # fmt: skip
-    for n, (label, vector) in enumerate(vectors.items()):
-        _mark(axes, vector, label, MARKS[n % len(MARKS)])
-    axes.set(xlabel="fx (cycles/px)", xlim=(-0.5, 0.5), ylim=(-0.5, 0.5))
-    add_bar(figure, axes, drawn, "power / white noise", "both")
-    if vectors:
-        axes.legend(
-            fontsize=9, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False,
-        )  # fmt: skip
-
-
-def _mark(axes: Axes, vector: tuple[float, float], label: str, colour: str) -> None:
-    for order, marker in ((1, "o"), (2, "s")):
-        f = np.array([order * v / (2 * np.pi) for v in vector])
-        both = _folded(np.stack([f, -f]))
-        axes.plot(
-            both[:, 0], both[:, 1], marker, color=colour, fillstyle="none", markersize=11,
-            markeredgewidth=1.6, ls="none",
-            label=f"{label}: {'fringes' if order == 1 else 'twice'}",
-        )  # fmt: skip
-
-
-def _folded(frequency: F64) -> F64:
-    """Frequencies as they appear on the grid of pixels, in ±1/2."""
-    return np.asarray((frequency + 0.5) % 1 - 0.5)
 
 
 def _spectrum_lines(axes: Axes, symbol: str, spectrum: Spectrum, colour: str) -> None:
@@ -281,100 +221,3 @@ def _spectrum_lines(axes: Axes, symbol: str, spectrum: Spectrum, colour: str) ->
     if spectrum.white > 0:
         label = f"{symbol}, white noise of σ"
         axes.axhline(spectrum.white, color=colour, ls=(0, (6, 3)), linewidth=1.6, label=label)
-
-
-def _edges(f: F64) -> tuple[float, float]:
-    half = 0.5 / len(f)
-    return float(f[0] - half), float(f[-1] + half)
-
-
-def map_grid(panels: Sequence[tuple[str, str, MapSummary]]) -> Figure:
-    """Maps two a row, each with its own scale: (title, unit, summary)."""
-    figure, axes, _ = map_axes(len(panels), panels[0][2].shape)
-    for panel, (title, unit, summary) in zip(axes, panels, strict=True):
-        draw_panel(figure, panel, summary, unit, title)
-    return figure
-
-
-def levels(sets: Sequence[SetContents]) -> Figure:
-    """Mean level and visibility of the sets, a row each."""
-    return map_grid(
-        [
-            panel
-            for s in sets
-            for panel in (
-                (f"{s.name}: mean level ι", "e⁻", s.iota),
-                (f"{s.name}: visibility α/ι", "α/ι", s.visibility),
-            )
-        ]
-    )
-
-
-def flags(masks: Mapping[str, FlagSummary]) -> Figure:
-    """Maps of flags side by side; those that are the same are drawn once.
-
-    Pixel by pixel each flag has its colour; of larger maps the share of masked pixels is shown.
-    """
-    panels = _merge_same(masks)
-    ny, nx = panels[0][1].shape
-    columns = min(3, max(2, len(panels)))
-    rows = -(-len(panels) // columns)
-    tall = float(np.clip(8.4 / columns * ny / nx, 1.4, 4.6))
-    whole = panels[0][1].block == 1
-    bottom, top = 1.0 if whole else 0.6, 0.15 + 0.2 * max(t.count("\n") + 1 for t, _ in panels)
-    height = rows * (tall + top) + (rows - 1) * 0.6 + bottom
-    figure, grid = axes_grid((WIDE, height), rows, columns,
-        right=0.2 if whole else 1.4, bottom=bottom, top=top, between=top + 0.6,
-    )  # fmt: skip
-    for axes in grid.ravel()[len(panels) :]:
-        axes.set_visible(False)
-    most = 100 * max(float(s.share.max()) for _, s in panels)
-    drawn = None
-    for axes, (title, summary) in zip(grid.ravel(), panels, strict=False):
-        drawn = _draw_classes(axes, summary) if whole else _draw_share(axes, summary, most)
-        axes.set(xlim=(-0.5, summary.shape[1] - 0.5), ylim=(-0.5, summary.shape[0] - 0.5))
-        square(axes, summary.shape)
-        axes.set_title(title, **TITLE)
-        axes.set(xlabel="x (px)", ylabel="y (px)")
-    if whole:
-        handles = [Patch(color=FLAGS[f.value], label=flag_name(f)) for f in PixelFlag]
-        handles.append(Patch(color=SEVERAL, label="several"))
-        figure.legend(handles=handles, loc="lower center", ncols=8, frameon=False, fontsize=9.5)
-    elif drawn is not None:
-        bar = figure.colorbar(
-            drawn, cax=place(figure, WIDE - 1.1, bottom, 0.2, height - bottom - top)
-        )
-        bar.set_label(f"masked (%)\nof {panels[0][1].block} × {panels[0][1].block} px")
-    return figure
-
-
-def _merge_same(masks: Mapping[str, FlagSummary]) -> list[tuple[str, FlagSummary]]:
-    merged: dict[tuple[bytes, tuple[int, ...]], tuple[list[str], FlagSummary]] = {}
-    for title, summary in masks.items():
-        key = (summary.image.tobytes(), tuple(summary.counts.values()))
-        merged.setdefault(key, ([], summary))[0].append(title)
-    return [("\n".join(titles), summary) for titles, summary in merged.values()]
-
-
-def _draw_classes(axes: Axes, summary: FlagSummary) -> ScalarMappable:
-    several = len(FLAGS) + 1
-    palette = ListedColormap([UNFLAGGED, *FLAGS.values(), SEVERAL])
-    return axes.imshow(
-        _classes(summary.image), cmap=palette, vmin=-0.5, vmax=several + 0.5, origin="lower",
-        aspect="auto", interpolation="nearest", extent=covered(summary.image.shape, 1),
-    )  # fmt: skip
-
-
-def _draw_share(axes: Axes, summary: FlagSummary, top: float) -> ScalarMappable:
-    return axes.imshow(
-        100 * summary.share, cmap=SEQUENTIAL, vmin=0, vmax=top or 1, origin="lower",
-        aspect="auto", interpolation="nearest",
-        extent=covered(summary.share.shape, summary.block),
-    )  # fmt: skip
-
-
-def _classes(image: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """0 for good, 1 + bit for one flag, one more than all bits for several."""
-    bits = np.unpackbits(image[..., None], axis=-1, bitorder="little").astype(np.int64)
-    count = bits.sum(axis=-1)
-    return np.where(count > 1, len(FLAGS) + 1, (bits * np.arange(1, 9)).sum(axis=-1))

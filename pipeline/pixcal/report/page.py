@@ -14,6 +14,7 @@ from pixcal.report import (
     diagnosis_maps,
     diagnosis_words,
     map_figures,
+    map_panels,
     set_figures,
     tables,
     text,
@@ -24,12 +25,12 @@ from pixcal.report.drawing import png
 
 # Each section is the template of its name.
 SECTIONS = {
-    "diagnosis": "Diagnosis: data compared with simulation",
     "maps": "Maps of the offsets",
+    "allan": "Allan deviation",
+    "diagnosis": "Diagnosis: data compared with simulation",
     "levels": "Level and visibility",
     "temporal": "Frame by frame",
     "noise": "Residuals",
-    "allan": "Allan deviation",
     "detector": "Detector",
     "masks": "Masks",
     "removed": "Removed modes",
@@ -97,7 +98,7 @@ def _fill(template: str, contents: Contents, **values: Any) -> str:
     )
     environment.filters |= FILTERS
     environment.globals |= {
-        "draw": _draw, "figures": FIGURES, "data": DATA,
+        "draw": _draw, "figures": FIGURES, "panels": vars(map_panels), "data": DATA,
         "NAMES": text.NAMES,
     }  # fmt: skip
     return environment.get_template(f"{template}.html.j2").render(run=contents, **values)

@@ -17,10 +17,8 @@ from pixcal.report.drawing import (
     WIDE,
     Unit,
     axes_grid,
-    draw_panel,
     finish,
     limits,
-    map_axes,
     plain_ticks,
     unit_for,
 )
@@ -110,12 +108,9 @@ def _dot(frames: int) -> float:
     return float(np.clip(70 / np.sqrt(max(frames, 1)), 1.2, 4.5))
 
 
-def residuals(sets: Sequence[SetContents]) -> Figure:
-    """Maps of the reduced chi-square, and their histograms against the expected distributions."""
-    figure, panels, axes = map_axes(len(sets), sets[0].chi2.shape, curve=True)
-    assert axes is not None
-    for panel, fringes in zip(panels, sets, strict=True):
-        draw_panel(figure, panel, fringes.chi2, "reduced χ²", f"set {fringes.name}")
+def chi2(sets: Sequence[SetContents]) -> Figure:
+    """Histograms of the reduced chi-square against the expected distributions."""
+    figure, ((axes,),) = axes_grid((WIDE, 3.8))
     ends = np.array(
         [_histogram(axes, s, LINES[n % len(LINES)]) for n, s in enumerate(sets)]
     )  # (set, 3): lowest, highest, tallest

@@ -1,12 +1,12 @@
 """Summary of the run: the precision reached, and the warnings."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from pixcal.report.contents import Contents, DiagnosisContents
+from pixcal.report.contents import Contents, DiagnosisContents, SetContents
 from pixcal.report.diagnosis_words import level, residual_gap
 from pixcal.report.text import NAMES, duration, number, share, with_error
 
@@ -15,7 +15,7 @@ TARGET_PX = 5e-5  # target precision of a calibration (paper, section 4.2)
 # a place of the fibres that a laboratory would notice: twice its 2 cm (paper, section 5.2)
 FAR_MM = 40.0
 
-GOOD, CHECK, BAD = "good", "check", "bad"
+GOOD, CHECK, BAD = SEVERITY = ("good", "check", "bad")
 
 
 @dataclass(frozen=True)
@@ -87,16 +87,13 @@ def cards(contents: Contents) -> Iterator[Card]:
             f"{number(sigma * contents.pitch_um * 1e3, 3)} nm; rms of the offsets: {spread} px",
             GOOD if np.isfinite(sigma) else BAD,
         )
-    for fringes in contents.sets:
-        ratio = _ratio(fringes.facts.get("sigma_median_px"), fringes.facts.get("crb_median_px"))
-        yield Card(
-            f"σ / Cramér–Rao bound, {fringes.name}",
-            number(ratio, 4),
-            "1 is the best that an unbiased estimator can reach",
-            _bound_level(ratio),
-        )
-        if fringes.allan is not None and fringes.allan.get("slope") is not None:
-            yield _allan_card(fringes.name, fringes.allan)
+    if contents.sets:
+        yield _bound_card(contents.sets)
+    slopes = {
+        s.name: s.allan for s in contents.sets if s.allan and s.allan.get("slope") is not None
+    }
+    if slopes:
+        yield _allan_card(slopes)
     if not contents.has_fringes:
         yield from _detector_cards(contents.detector.facts)
     if contents.diagnosis is not None:
@@ -122,18 +119,31 @@ def _diagnosis_card(diagnosis: DiagnosisContents) -> Card:
     return Card("diagnosis", verdict, f"{causes}. {detail}" if causes else detail, level(verdict))
 
 
-def _allan_card(name: str, measured: dict[str, Any]) -> Card:
-    knee = measured.get("knee_frames")
+def _bound_card(sets: Sequence[SetContents]) -> Card:
+    ratios = {
+        s.name: _ratio(s.facts.get("sigma_median_px"), s.facts.get("crb_median_px")) for s in sets
+    }
     return Card(
-        f"Allan slope, {name}",
-        with_error(measured["slope"], measured.get("slope_err")),
-        "−0.5 is white noise; "
-        + ("no knee" if knee is None else f"knee at {number(round(knee))} frames"),
-        GOOD if knee is None and _slope_is_white(measured) else CHECK,
+        "σ / Cramér–Rao bound",
+        ", ".join(number(ratio, 4) for ratio in ratios.values()),
+        f"{', '.join(ratios)}; no unbiased estimate reaches less than 1",
+        max((_bound_level(ratio) for ratio in ratios.values()), key=SEVERITY.index),
     )
 
 
-def _slope_is_white(measured: dict[str, Any]) -> bool:
+def _allan_card(slopes: Mapping[str, Mapping[str, Any]]) -> Card:
+    knees = {name: s["knee_frames"] for name, s in slopes.items() if s.get("knee_frames")}
+    at = ", ".join(f"knee of {name} at {number(round(k))} frames" for name, k in knees.items())
+    white = all(_slope_is_white(s) for s in slopes.values())
+    return Card(
+        "Allan slope",
+        ", ".join(with_error(s["slope"], s.get("slope_err")) for s in slopes.values()),
+        f"{', '.join(slopes)}; white noise: −0.5; {at or 'no knee'}",
+        GOOD if white and not knees else CHECK,
+    )
+
+
+def _slope_is_white(measured: Mapping[str, Any]) -> bool:
     error = measured.get("slope_err") or 0.0
     return bool(abs(measured["slope"] + 0.5) <= max(3 * error, 0.02))
 
@@ -170,8 +180,7 @@ def findings(contents: Contents) -> list[Finding]:
         else:
             effect = "an effect that depends on the fringe vector is present"
             made.append((BAD, f"{words} do not agree: {chi2}; {effect}"))
-    order = {BAD: 0, CHECK: 1, GOOD: 2}
-    ranked = sorted(made, key=lambda f: order[f[0]])
+    ranked = sorted(made, key=lambda f: -SEVERITY.index(f[0]))
     return [Finding(level, _sentence(text)) for level, text in ranked]
 
 
