@@ -81,7 +81,7 @@ def _show_sets(plan: Mapping[str, Any]) -> None:
         for name, s in plan["sets"].items()
     ]
     header = (
-        "set", "interfringe px", "mean e-", "visibility", "one frame px", "worst px", "frames",
+        "set", "fringe period px", "mean e-", "visibility", "one frame px", "worst px", "frames",
         "reach px", "worst px",
     )  # fmt: skip
     show_table(header, rows)

@@ -106,7 +106,7 @@ def show_fit(run: Path) -> None:
         "set",
         "model",
         "frames",
-        "interfringe px",
+        "fringe period px",
         "sigma px",
         "bound px",
         "sigma/bound",

@@ -23,9 +23,9 @@ from pixcal.storage.formats import STAGES
 DIAGNOSIS_FORMAT = STAGES["diagnose"].format
 
 SECTIONS = (
-    "diagnosis", "maps", "levels", "temporal", "noise", "allan", "detector", "masks", "removed",
+    "maps", "allan", "diagnosis", "levels", "temporal", "noise", "detector", "masks", "removed",
     "provenance",
-)  # fmt: skip
+)  # fmt: skip  # fmt: skip
 RUNTIME = Runtime(cluster="sync")
 NASTY = "<script>alert('x')</script> & \"quotes\""
 
