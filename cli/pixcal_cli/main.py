@@ -130,7 +130,7 @@ def invoke(args: Sequence[str]) -> int:
         code = _run(args)
         sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as raised:
-        # Libraries that are interrupted while they load tell of it as they like.
+        # Libraries that are interrupted while they load raise various errors.
         lost = isinstance(raised, ImportError) and _interrupted.is_set()
         error = KeyboardInterrupt() if lost else raised
         if os.environ.get("PIXCAL_DEBUG"):

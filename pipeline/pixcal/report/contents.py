@@ -127,7 +127,7 @@ class DiagnosisContents:
     curves: Sequence[dict[str, Any]]
     # words for effects, by name; of those that are not known there are none
     effects: Mapping[str, EffectWords]
-    # significance (sigma) from which a statistic counts as different, all being looked at
+    # significance (sigma) from which a statistic counts as different, given how many are tested
     noticed: float
 
 

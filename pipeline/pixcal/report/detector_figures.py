@@ -31,8 +31,8 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
     level, variance, error = level[shown], variance[shown], error[shown]
     line = level / curve["gain"] + curve["read_variance"]
     figure, ((left, right),) = axes_grid((WIDE, 3.9), 1, 2, width_ratios=[1.1, 1])
-    look = {"fmt": "o", "color": BLUE, "markersize": 3.5, "elinewidth": 1}
-    left.errorbar(level, variance, error, **look, label="pairs of flats")
+    style = {"fmt": "o", "color": BLUE, "markersize": 3.5, "elinewidth": 1}
+    left.errorbar(level, variance, error, **style, label="pairs of flats")
     at = np.geomspace(level.min(), level.max(), 200)
     left.plot(
         at, at / curve["gain"] + curve["read_variance"], color=INK, linewidth=1.2,
@@ -43,7 +43,7 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
     left.set(xscale="log", yscale="log", xlabel="level (ADU)", ylabel="variance (ADU²)")
     low, high = left.get_xlim()
     plain_ticks(left.xaxis, low, high, most=5)
-    right.errorbar(level, variance / line, error / line, **look)
+    right.errorbar(level, variance / line, error / line, **style)
     right.axhline(1, color=INK, linewidth=1.2)
     right.set(xlabel="level (ADU)", ylabel="variance over the line")
     right.margins(y=0.15)
@@ -92,8 +92,8 @@ def _spectra(axes: Axes, curves: Curves) -> None:
         part = curves[along]
         middle = float(np.median(part["amplitude"]))
         peaks.append(max(part["amplitude"]) > 10 * middle)
-        look: Any = {"color": colour, "zorder": 3 - middle / (1 + middle)}
-        axes.plot(part["frequency"], part["amplitude"], lw=0.9, label=f"along {along}", **look)
+        style: Any = {"color": colour, "zorder": 3 - middle / (1 + middle)}
+        axes.plot(part["frequency"], part["amplitude"], lw=0.9, label=f"along {along}", **style)
         if part["noise"] > 0:
             axes.axhline(part["noise"], color=colour, ls="--", linewidth=1)
     axes.set(xlim=(0, 0.5), xlabel="frequency (cycles/px)")

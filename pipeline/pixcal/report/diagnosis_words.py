@@ -64,17 +64,17 @@ def answer(diagnosis: DiagnosisContents) -> str:
     """The verdict as one sentence."""
     facts = diagnosis.facts
     gap, verdict = facts["gap"], facts["verdict"]
-    looked = facts.get("statistics", len(diagnosis.curves))
+    tested = facts.get("statistics", len(diagnosis.curves))
     count = differing(diagnosis)
     if verdict == "no gap":
         return (
-            f"No gap: on held-out frames, none of {looked} statistics differs significantly from "
+            f"No gap: on held-out frames, none of {tested} statistics differs significantly from "
             "the nominal simulation."
         )
     where = main_domains(gap)
     if verdict == "unexplained":
         return (
-            f"Unexplained: the data differ from the nominal simulation in {count} of {looked} "
+            f"Unexplained: the data differ from the nominal simulation in {count} of {tested} "
             f"statistics{where}. None of the {len(facts['candidates'])} effects considered "
             "closes the gap."
         )
@@ -84,7 +84,7 @@ def answer(diagnosis: DiagnosisContents) -> str:
     if verdict == "explained":
         return (
             f"Explained: {causes} account{'s' if one else ''} for the differences between the "
-            f"data and the nominal simulation, found in {count} of {looked} statistics. The "
+            f"data and the nominal simulation, found in {count} of {tested} statistics. The "
             f"{left}, measured on held-out frames."
         )
     return (

@@ -105,7 +105,7 @@ def axes_grid(
     top: float = 0.2,
     beside: float = 1.0,
     between: float = 0.75,
-    **look: Any,
+    **drawing: Any,
 ) -> tuple[Figure, NDArray[Any]]:
     """A figure and its grid of axes at fixed places: a computed layout takes half of the drawing.
 
@@ -117,7 +117,7 @@ def axes_grid(
         Of the grid.
     left, right, bottom, top, beside, between : float
         Margins, and gaps of columns and of rows, inches; labels have to fit.
-    **look
+    **drawing
         For ``Figure.subplots``.
 
     Returns
@@ -126,7 +126,7 @@ def axes_grid(
     """
     figure = Figure(figsize=size, dpi=DPI)
     _margins(figure, rows, columns, left, right, bottom, top, beside, between)
-    return figure, figure.subplots(rows, columns, squeeze=False, **look)
+    return figure, figure.subplots(rows, columns, squeeze=False, **drawing)
 
 
 def _margins(

@@ -107,8 +107,8 @@ def _profile(
     chance = np.where(means.count > 0, 2 * spread, np.nan) / np.sqrt(np.maximum(means.count, 1))
     fill = axes.fill_betweenx if upright else axes.fill_between
 
-    def line(values: F64, **look: Any) -> None:
-        axes.plot(*((values, at) if upright else (at, values)), **look)
+    def line(values: F64, **drawing: Any) -> None:
+        axes.plot(*((values, at) if upright else (at, values)), **drawing)
 
     if len(at) <= MEANS_DRAWN:
         fill(at, -chance, chance, color=BAND, linewidth=0, label="independent offsets, ±2σ")
@@ -119,9 +119,9 @@ def _profile(
         low, middle, high = _nearby(mean)
         fill(at, low, high, color=BAR, linewidth=0, label="lowest to highest nearby")
         line(middle, color=BLUE, linewidth=1.0, label="mean of those nearby")
-        look = {"color": INK, "linewidth": 1.0, "ls": "--"}
-        line(-chance, **look, label="independent offsets, ±2σ")
-        line(chance, **look)
+        drawing = {"color": INK, "linewidth": 1.0, "ls": "--"}
+        line(-chance, **drawing, label="independent offsets, ±2σ")
+        line(chance, **drawing)
     (axes.set_xlim if upright else axes.set_ylim)(*limits([mean, -chance, chance]))
     finish(axes)
 
@@ -215,8 +215,8 @@ def _spectrum_lines(axes: Axes, symbol: str, spectrum: Spectrum, colour: str) ->
         (fx, spectrum.power[my // 2], "-", "along fx (means of columns)"),
         (fy, spectrum.power[:, mx // 2], "--", "along fy (means of rows)"),
     ):
-        look: Any = {"color": colour, "linewidth": 0.8, "alpha": 0.7, "ls": style}
-        axes.plot(f[f > 0], cut[f > 0], label=f"{symbol} {label}", **look)
+        drawing: Any = {"color": colour, "linewidth": 0.8, "alpha": 0.7, "ls": style}
+        axes.plot(f[f > 0], cut[f > 0], label=f"{symbol} {label}", **drawing)
     axes.plot(*spectrum.radial(), color=colour, linewidth=2, label=f"{symbol}, mean over rings")
     if spectrum.white > 0:
         label = f"{symbol}, white noise of σ"

@@ -46,8 +46,8 @@ def temporal(sets: Sequence[SetContents]) -> Figure:
         step = -(-len(fringes.series.time) // POINTS)
         time, clock = _clock(fringes.series.time[::step])
         for axes, (label, values) in zip(column, _parameters(fringes, moving), strict=False):
-            look: Any = {"markersize": _dot(len(time)), "markeredgewidth": 0}
-            axes.plot(time, values[::step], "o", color=BLUE, **look)
+            drawing: Any = {"markersize": _dot(len(time)), "markeredgewidth": 0}
+            axes.plot(time, values[::step], "o", color=BLUE, **drawing)
             axes.set_ylabel(label)
             axes.set_ylim(*limits([values], 0.0))
             finish(axes)
@@ -167,8 +167,8 @@ def allan_figure(sets: Mapping[str, tuple[Facts, Facts]]) -> Figure:
     }
     unit = unit_for(np.concatenate([c["adev_px"] for c in curves.values()]), "px")
     for n, (name, curve) in enumerate(curves.items()):
-        look: Any = {"color": LINES[n % len(LINES)], "aside": 1.012 ** (n - (len(sets) - 1) / 2)}
-        _allan_lines(axes, below, name, *sets[name], curve, unit, **look)
+        drawing: Any = {"color": LINES[n % len(LINES)], "aside": 1.012 ** (n - (len(sets) - 1) / 2)}
+        _allan_lines(axes, below, name, *sets[name], curve, unit, **drawing)
     below.axhline(1, color=GREY, linewidth=1.5)
     axes.set(xscale="log", yscale="log")
     axes.xaxis.set_minor_locator(NullLocator())
@@ -194,7 +194,7 @@ def _allan_lines(
     frames, adev, white = curve["frames"], curve["adev_px"], curve["white_expected_px"]
     low, high = curve["adev_lo_px"], curve["adev_hi_px"]
     bars = np.nan_to_num(np.abs(np.stack([adev - low, high - adev])))
-    look: dict[str, Any] = {
+    drawing: dict[str, Any] = {
         "fmt": "o",
         "color": color,
         "elinewidth": 1.3,
@@ -203,8 +203,8 @@ def _allan_lines(
     }
     label = f"{name}: measured{_slope_label(measured)}"
     at = frames * aside
-    axes.errorbar(at, adev * unit.factor, bars * unit.factor, zorder=3, label=label, **look)
-    below.errorbar(at, adev / white, bars / white, **look)
+    axes.errorbar(at, adev * unit.factor, bars * unit.factor, zorder=3, label=label, **drawing)
+    below.errorbar(at, adev / white, bars / white, **drawing)
     law: dict[str, Any] = {"color": color, "linewidth": 1.5}
     first = color == LINES[0]  # the legend says once what styles of lines mean
     axes.plot(frames, white * unit.factor, label="square-root law from σ" if first else None, **law)

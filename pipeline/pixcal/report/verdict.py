@@ -287,7 +287,7 @@ def _bound_level(ratio: float | None) -> str:
     return CHECK if ratio is not None and ratio < 0.98 else _level(ratio, 1.1, 1.5)
 
 
-def _level(value: float | None, good: float, look: float) -> str:
+def _level(value: float | None, good: float, tolerable: float) -> str:
     if value is None or not np.isfinite(value):
         return CHECK
-    return GOOD if value <= good else CHECK if value <= look else BAD
+    return GOOD if value <= good else CHECK if value <= tolerable else BAD

@@ -182,7 +182,7 @@ def _action(cause: Json, correction: Json | None, with_maps: bool) -> str:
         text = f"{action.replace('fix the', 'fix on the')}: {why}" if why else str(action)
     if cause.get("would_decide"):
         others = " or ".join(cause["not_told_apart_from"])
-        text += f"; to tell it from {others}, retake with {', '.join(cause['would_decide'])}"
+        text += f"; to distinguish it from {others}, retake with {', '.join(cause['would_decide'])}"
     return text
 
 

@@ -82,7 +82,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
         def body(made: Build) -> None:
             contents = _collect(run_dir, manifests, runtime)
-            # What is there by now stays: the garbage collector need not look at it again and again.
+            # Objects that exist by now stay: the garbage collector skips them.
             gc.freeze()
             try:
                 page = render(contents)
