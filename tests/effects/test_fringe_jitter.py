@@ -127,3 +127,19 @@ def test_it_is_found_beside_a_drift(acquired: Acquired) -> None:
 
 def test_without_fringes_there_is_no_word(acquired: Acquired) -> None:
     assert FringeJitter.estimate(replace(acquired(), fringes={})) is None
+
+
+def test_what_frames_did_is_replayed(acquired: Acquired) -> None:
+    """The fast changes of the vectors, whatever their law; a drift beside them is left out."""
+    on = {"rms": [2e-5, 0.0], "vibration": [0.0, 3e-5], "vibration_hz": 1.1}
+    drift = {"ramp": [0.02, 0.02], "settle": [0, 0], "walk": [0, 0]}
+    again = FringeJitter().replayed(acquired(None, {"fringe_jitter": on, "fringe_drift": drift}))
+    assert again is not None
+    for track in again.along_x:
+        time = np.array(track.time_s)
+        slope = np.polyfit(time / 3600, track.value, 1)[0]
+        assert abs(slope) < 0.2 * 0.02
+        assert np.std(track.value) == pytest.approx(2e-5, rel=0.15)
+    for track in again.along_y:
+        assert np.std(track.value) == pytest.approx(3e-5 / np.sqrt(2), rel=0.15)
+    assert again.scaled(0.0).is_null

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.fringe_motion import slow_vectors
+from pixcal.estimators.frame_series.fringe_motion import vector_courses
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Stage
@@ -82,9 +82,9 @@ class FringeDrift(Effect):
 
     def replayed(self, evidence: Evidence) -> Self | None:
         """As in `Effect.replayed`: the slow part of each frame's own fringe vector."""
-        courses = slow_vectors(evidence)
+        courses = vector_courses(evidence)
         x, y = (
-            tuple(Track.of(name, time, vector[:, axis]) for name, time, vector in courses)
+            tuple(Track.of(name, time, vector[:, axis]) for name, time, vector, _ in courses)
             for axis in (0, 1)
         )
         return replace(self.scaled(0.0), along_x=x, along_y=y)

@@ -1,14 +1,18 @@
 """Fibres that shake: a fringe vector of its own in every frame."""
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.fringe_motion import vector_courses
 from pixcal.kernels.processes import swing
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.recording import Recording
+from pixcal.simulation.track import Track, at
 
 
 @dataclass(frozen=True)
@@ -27,7 +31,7 @@ class FringeJitter(Effect):
     acts_at = Stage.LIGHT
     order = 4
     domains = ("time", "space")
-    strengths = ("rms", "vibration")
+    strengths = ("rms", "vibration", "along_x", "along_y")
     absorbed_because = "the fit has a free fringe vector in each frame where it moves"
     frames_needed = ()
     sources = (
@@ -47,6 +51,8 @@ class FringeJitter(Effect):
         20.3, unit="Hz", low=0, high=1e4, doc="its frequency; frames see it folded below half "
         "their rate"
     )  # fmt: skip
+    along_x: tuple[Track, ...] = quantity((), unit="rad/px", doc="fast change of kx as measured")
+    along_y: tuple[Track, ...] = quantity((), unit="rad/px", doc="fast change of ky as measured")
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         drawn = recording.rng(self.name).standard_normal((recording.count, 2))
@@ -54,4 +60,15 @@ class FringeJitter(Effect):
         phase = 2 * np.pi * recording.rng(self.name, 1).random()
         swung = swing(time, self.vibration_hz, phase, recording.exptime_s)
         change = drawn * np.array(self.rms) + np.outer(swung, self.vibration)
+        name = recording.bench.frames.fringes[recording.number].name
+        change += np.stack([at(self.along_x, name, time), at(self.along_y, name, time)], axis=1)
         return replace(states, dkx=states.dkx + change[:, 0], dky=states.dky + change[:, 1])
+
+    def replayed(self, evidence: Evidence) -> Self | None:
+        """As in `Effect.replayed`: each frame's own fringe vector, but for its slow changes."""
+        courses = vector_courses(evidence)
+        x, y = (
+            tuple(Track.of(name, time, vector[:, axis]) for name, time, _, vector in courses)
+            for axis in (0, 1)
+        )
+        return replace(self.scaled(0.0), along_x=x, along_y=y)

@@ -24,6 +24,8 @@ TOLERANCE = 0.05
 """Share of what an effect does that its simulation may be wrong by."""
 ALLOWED = 2.0
 """Standard deviations that a value may be off by before it counts as a gap."""
+STANDS_OUT = 2.5
+"""Standard deviations from which one value of a curve is changed, whatever the others are."""
 CHANCE = 1e-3
 """Chance, of all statistics together, below which a difference is a gap."""
 
@@ -137,26 +139,51 @@ def expect_with(
     """
     nominal = expect_nominal(reference)
     scaled_ones = [reference.on_scale(s) for s in simulated]
-    mean, variance = dict(nominal.mean), dict(nominal.variance)
+    pairs: dict[Key, tuple[F64, F64]] = {}
     for key, values in reference.values.items():
         # An estimate may fail in a few simulations: the others tell what it is.
         having = [n for n, s in enumerate(scaled_ones) if key in s]
-        count = len(having)
-        if 2 * count <= len(simulated):
-            continue
-        own = np.stack([scaled_ones[n][key] for n in having])
-        same_seeds = values[having]
-        change = own - same_seeds
+        if 2 * len(having) > len(simulated):
+            pairs[key] = np.stack([scaled_ones[n][key] for n in having]), values[having]
+    mean, variance = dict(nominal.mean), dict(nominal.variance)
+    usual = _usual_scatter(pairs, nominal)
+    for key, (own, same_seeds) in pairs.items():
+        change, count, noise = own - same_seeds, len(own), nominal.noise[key]
+        paired = change.var(axis=0, ddof=1) if count > 1 else usual * noise
+        # What the same seeds do not have in common, in units of the noise: 2 is all of it.
+        apart = min(float(np.mean(paired / noise)), 2.0)
         shift = change.mean(axis=0)
-        mean[key] = nominal.mean[key] + shift
-        more = (TOLERANCE**2 + error**2) * shift**2
+        certain = _certain(shift, apart * noise / count)
+        mean[key] = nominal.mean[key] + certain * shift
+        more = (TOLERANCE**2 + error**2) * (certain * shift) ** 2 + certain * paired / count
         if count > 1:
-            paired = change.var(axis=0, ddof=1)
-            more += paired / count
-            # What the effects add to the scatter; what few seeds have by chance is not theirs.
-            more += np.maximum(own.var(axis=0, ddof=1) - same_seeds.var(axis=0, ddof=1), 0)
+            # What the effects add to the scatter, beyond what few seeds have by chance.
+            chance = noise * np.sqrt(4 * apart * (1 - apart / 4) / (count - 1))
+            excess = own.var(axis=0, ddof=1) - same_seeds.var(axis=0, ddof=1) - chance
+            more += np.maximum(excess, 0)
         variance[key] = nominal.variance[key] + more
     return replace(nominal, mean=mean, variance=variance)
+
+
+def _usual_scatter(pairs: Mapping[Key, tuple[F64, F64]], nominal: Expectation) -> float:
+    """Variance of changes that are chance alone, over the noise: that of most curves.
+
+    Effects that move the light change the noise of every sample a little, and so all curves.
+    """
+    sizes = [
+        float(np.mean((own - same) ** 2 / nominal.noise[key])) for key, (own, same) in pairs.items()
+    ]
+    return min(float(np.median(sizes)), 2.0) if sizes else 0.0
+
+
+def _certain(shift: F64, chance: F64) -> F64:
+    """Share (n,) of a curve's change that is the effects' (positive part of James and Stein).
+
+    Of the whole curve; and of values by themselves, where one stands out.
+    """
+    squares = shift**2 / np.maximum(chance, 1e-300)
+    whole = max(1 - 1 / max(float(np.mean(squares)), 1e-300), 0.0)
+    return np.maximum(whole, 1 - STANDS_OUT**2 / np.maximum(squares, STANDS_OUT**2))
 
 
 def _variance(values: F64, floor: float) -> F64:

@@ -30,6 +30,7 @@ SURE_HOP = 6.5
 SURE_STEP = 2.5  # standard deviations of a hop beside a slope, which tells half as well
 MOST_HOPS = 64
 OCTAVE = 1.4  # ratio of frequencies over which the power of a slow change hardly differs
+BESIDE = 3  # modes on either side, of which the power is that of a line
 # excess of the power over that of white noise, in errors, that is a slow change's
 SLOW_SIGMAS = 3.0
 
@@ -77,11 +78,12 @@ def _motion_of(evidence: Evidence) -> Motion | None:
     )
 
 
-def slow_vectors(evidence: Evidence) -> list[tuple[str, F64, F64]]:
-    """Of every set: name, times (t,), and slow change (t, 2) of the fringe vector, rad/px.
+def vector_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
+    """Of every set: name, times (t,), slow and fast change (t, 2) of the fringe vector, rad/px.
 
-    Cosine modes, each smaller than it was seen by the share of white noise in those of about its
-    frequency (Wiener); a walk has many of them, a ramp few.
+    Cosine modes, each smaller than it was seen by the share of noise in those of about its
+    frequency: a walk has many of them, a ramp few. What is fast keeps its power, what is slow is
+    as near to the truth as can be (Wiener).
     """
     found = []
     for fringes in evidence.fringes.values():
@@ -89,18 +91,38 @@ def slow_vectors(evidence: Evidence) -> list[tuple[str, F64, F64]]:
         if series is None:
             continue
         modes = cosine_modes(series.values)
-        noise = np.median(modes[len(modes) // 2 :] ** 2, axis=0) / MEDIAN
-        order = np.arange(len(modes))
-        first = np.floor((order + 1) / OCTAVE).astype(int)
-        last = np.minimum(np.ceil((order + 1) * OCTAVE).astype(int), len(modes))
-        sums = np.concatenate([np.zeros((1, 2)), np.cumsum(modes**2, axis=0)])
-        count = (last - first)[:, None]
-        power = (sums[last] - sums[first]) / count
-        slow = power > noise * (1 + SLOW_SIGMAS * np.sqrt(2 / count))
-        every = np.zeros_like(series.values)
-        every[1 : len(modes) + 1] = modes * np.where(slow, 1 - noise / power, 0)
-        found.append((series.name, series.time_s, idct(every, type=2, norm="ortho", axis=0)))
+        level = np.median(modes[len(modes) // 2 :] ** 2, axis=0) / MEDIAN
+        power, count = _around(modes, 1 / OCTAVE, OCTAVE)
+        slow = power > level * (1 + SLOW_SIGMAS * np.sqrt(2 / count))
+        slow = np.logical_and.accumulate(slow, axis=0)
+        near, few = _around(modes, 1.0, 1.0, beside=BESIDE)
+        noise = np.diag(series.noise) * np.mean(cosine_modes(series.apart) ** 2, axis=0)
+        noise /= np.diag(series.apart_noise)
+        near = np.where(near > level * (1 + SLOW_SIGMAS * np.sqrt(2 / few)), near, level)
+        shares = (
+            np.where(slow, 1 - level / power, 0),
+            np.where(slow, 0, np.sqrt(np.maximum(1 - noise / near, 0))),
+        )
+        nothing = np.zeros((1, 2))
+        courses = [
+            idct(np.vstack([nothing, modes * share]), type=2, norm="ortho", axis=0)
+            for share in shares
+        ]
+        found.append((series.name, series.time_s, courses[0], courses[1]))
     return found
+
+
+def _around(modes: F64, low: float, high: float, beside: int = 0) -> tuple[F64, F64]:
+    """Mean power (k, 2) of the modes in a range of factors on each one's frequency; and how many.
+
+    And of some more on either side.
+    """
+    order = np.arange(1, len(modes) + 1)
+    first = np.maximum(np.floor(order * low).astype(int) - beside, 1) - 1
+    last = np.minimum(np.ceil(order * high).astype(int) + beside, len(modes))
+    sums = np.concatenate([np.zeros((1, 2)), np.cumsum(modes**2, axis=0)])
+    count = (last - first)[:, None]
+    return (sums[last] - sums[first]) / count, count
 
 
 def ramps(series: FrameSeries) -> F64:

@@ -320,7 +320,11 @@ class NominalBench:
     def _of_measured_k(
         self, measured: Measured, bench: Bench, effects: Sequence[Effect]
     ) -> Measured:
-        """The bench whose fringe vectors are those that were measured when effects have acted."""
+        """The bench whose fringe vectors are those that were measured when effects have acted.
+
+        So is the phase that all pixels have in common: with fringes that lie elsewhere, the noise
+        of the same seed would be another one.
+        """
         rows = (0, bench.detector.shape[0])
         before, after = Camera(bench, rows, [measured]), Camera(bench, rows, [measured, *effects])
         sets = list(measured.sets)
@@ -337,8 +341,10 @@ class NominalBench:
                 dkx = np.angle(np.sum(turn[:, 1:] * turn[:, :-1].conj()))
                 n = recording.number
                 found, (kx, ky) = sets[n], sets[n].k
+                tilt = dkx * x + dky * y
+                tilt = tilt + np.angle(np.sum(turn * np.exp(-1j * tilt)))
                 # Of offsets too, which the effects see as places.
-                sets[n] = replace(found, psi=found.psi - dkx * x - dky * y, k=(kx - dkx, ky - dky))
+                sets[n] = replace(found, psi=found.psi - tilt, k=(kx - dkx, ky - dky))
         return replace(measured, sets=tuple(sets))
 
     def _electronics(self, measured: Measured, seed: int, own_seed: int, change: float) -> Measured:
