@@ -11,6 +11,7 @@ from pixcal.effects.contrast_noise import ContrastNoise
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import states_of
+from pixcal.simulation.frame_changes import FrameChanges
 from pixcal.simulation.recording import recordings
 
 Benches = Callable[..., Bench]
@@ -106,3 +107,16 @@ def test_what_looks_like_it_is_not_taken_for_it(acquired: Acquired, alike: dict[
     found = ContrastNoise.estimate(acquired(None, alike))
     assert found is not None
     assert found.significance < 4
+
+
+def test_random_changes_are_drawn_once_for_all_acquisitions_of_the_same_frames(
+    acquired: Acquired,
+) -> None:
+    one, other = acquired(), acquired({"seed": 72, "optics.visibility": 0.949})
+    for evidence in (one, other):
+        watched = FrameChanges(evidence).series(ContrastNoise())
+        found = [w.part(ContrastNoise()) for w in watched]
+    again = [w.part(ContrastNoise()) for w in FrameChanges(one).series(ContrastNoise())]
+    assert all(a is b for a, b in zip(found, again, strict=True))
+    slower = FrameChanges(acquired({"frames.period_s": 0.2})).series(ContrastNoise())[0]
+    assert slower.part(ContrastNoise()) is not found[0]

@@ -279,7 +279,9 @@ class Bench:
     seed: int = quantity(0, low=0, high=10**18, doc="of everything that changes between frames")
     shot_noise: bool = quantity(True, doc="false: the charge is its mean")
     effects: dict[str, Any] = field(
-        default_factory=dict, metadata={"doc": "effects to add: their names and parameters"}
+        default_factory=dict,
+        hash=False,
+        metadata={"doc": "effects to add: their names and parameters"},
     )
 
 

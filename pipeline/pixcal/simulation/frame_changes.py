@@ -6,7 +6,8 @@ is a part of the covariance of the series' cosine modes.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from pixcal.estimators.frame_series.series import FrameSeries
 from pixcal.estimators.frame_series.spectral_line import Line
 from pixcal.estimators.frame_series.variance_components import cosine_modes
 from pixcal.kernels.scene import FrameStates
+from pixcal.model.bench import Bench
 from pixcal.simulation.forward import ForwardModel
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import set_recordings
@@ -25,22 +27,23 @@ from pixcal.simulation.replica import set_recordings
 F64 = NDArray[np.float64]
 
 DRAWS = 64
+KEPT = 256  # parts that are not drawn again in the next simulation of the same frames
 AROUND = 1.1  # ratio of frequencies over which the power of a change hardly differs
 UNIT = 1e-3  # size at which a strength is looked at that is zero by default
 # factor on parameters to see what depends on them, and on frequencies, of which an exposure might
 # be whole periods
 OTHER = 1 / np.sqrt(2)
-LIGHT, MOTION = slice(0, 2), slice(2, 4)  # (B over its mean less one, log A/B), and (kx, ky)
+LIGHT, MOTION = (0, 1), (2, 3)  # (B over its mean less one, log A/B), and (kx, ky)
 
 
 @dataclass(frozen=True)
 class Watched:
     """A series that a model may change."""
 
-    series: FrameSeries
-    channels: slice
+    series: FrameSeries = field(compare=False)
+    channels: tuple[int, int]
     recording: Recording | None  # None: frames without light, which no state changes
-    frames: NDArray[np.intp]  # places of the series' values in the recording
+    frames: tuple[int, ...]  # places of the series' values in the recording
 
     def changes(self, model: ForwardModel, draws: int) -> F64:
         """Change of the series by each draw (r, t, 2)."""
@@ -54,11 +57,12 @@ class Watched:
             s = model.states(still, replace(self.recording, bench=replace(bench, seed=seed)))
             contrast = np.log(np.maximum(s.amplitude, 1e-9) / np.maximum(s.level, 1e-9))
             every = np.stack([s.level - 1, contrast, s.dkx, s.dky], axis=1)
-            out[:] = every[self.frames, self.channels]
+            out[:] = every[np.ix_(self.frames, self.channels)]
         return found
 
+    @lru_cache(maxsize=KEPT)  # noqa: B019
     def part(self, model: ForwardModel) -> F64:
-        """Covariance (t - 1, 2, 2) of the modes by a random model."""
+        """Covariance (t - 1, 2, 2) of the modes by a random model; the same for like frames."""
         modes = cosine_modes(self.changes(model, DRAWS).transpose(1, 0, 2))
         modes -= modes.mean(axis=1, keepdims=True)
         power = np.einsum("kra,krb->kab", modes, modes) / (DRAWS - 1)
@@ -109,13 +113,13 @@ def strengths_of(
 ) -> list[Strength]:
     """Strengths of a model that change some series."""
     start, found = _heard(start), []
-    for field in [f for f in start.strengths if f not in leave]:
-        values = getattr(start, field)
+    for name in [f for f in start.strengths if f not in leave]:
+        values = getattr(start, name)
         for place, value in enumerate(values if isinstance(values, tuple) else (values,)):
             at = place if isinstance(values, tuple) else None
             if isinstance(value, float):
-                own = with_number(start.scaled(0.0), field, at, value or UNIT)
-                found += _strength(every, own, field, at, value or UNIT)
+                own = with_number(start.scaled(0.0), name, at, value or UNIT)
+                found += _strength(every, own, name, at, value or UNIT)
     return found
 
 
@@ -159,17 +163,18 @@ class FrameChanges:
         recordings = set_recordings(evidence)
         light, motion = light_of(evidence), motion_of(evidence)
 
-        def watched(series: FrameSeries, channels: slice) -> Watched:
+        def watched(series: FrameSeries, channels: tuple[int, int]) -> Watched:
             recording, first = recordings[series.name]
+            recording = replace(recording, bench=_rounded(recording.bench))
             time_s = evidence.fringes[series.name].time_s
             places = np.searchsorted(time_s, series.time_s - 1e-9)
-            return Watched(series, channels, recording, first + places)
+            return Watched(series, channels, recording, tuple((first + places).tolist()))
 
         self.light, self.crossed = light, motion is not None and motion.crossed
         self._every = [[watched(s, MOTION) for s in motion.series]] if motion else []
         self._lines: list[Line | None] = [motion.line] if motion else []
         if light is not None:
-            dark = [Watched(s, LIGHT, None, np.arange(len(s))) for s in light.dark]
+            dark = [Watched(s, LIGHT, None, tuple(range(len(s)))) for s in light.dark]
             self._every.append([*(watched(s, LIGHT) for s in light.sets), *dark])
             self._lines.append(light.line)
 
@@ -187,6 +192,24 @@ class FrameChanges:
             if any(w.changes(of.model, 1).any() for w in every):
                 return line
         return None
+
+
+def _rounded(bench: Bench) -> Bench:
+    """A bench that all simulations of an acquisition share: states do not ask for its electronics.
+
+    Of what is measured, the visibility bounds the contrast.
+    """
+    visibility = max(round(bench.optics.visibility, 2), 0.01)
+    return replace(
+        bench,
+        detector=replace(
+            bench.detector, gain_e_per_adu=1.0, read_noise_e=0.0, saturation_adu=None, bias_adu=0.0
+        ),
+        optics=replace(bench.optics, visibility=visibility),
+        frames=replace(
+            bench.frames, fringes=tuple(replace(s, peak_e=1.0) for s in bench.frames.fringes)
+        ),
+    )
 
 
 def unit_of(model: ForwardModel, name: str) -> str:
