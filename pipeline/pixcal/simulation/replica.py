@@ -264,44 +264,66 @@ def _of_stack(
 
 def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:
     """What effects ask a bench for; its own pixels and light are those of `Fitted`."""
-    shape, top = evidence.good.shape, min(evidence.saturation_adu, TOP_ADU)
     exposures = [s.exptime_s for s in sets if np.isfinite(s.exptime_s)]
-    exposure = max([*exposures[:1], LEAST_S])
-    period = max(_period(sets[0].time_s) if sets else 0.0, exposure)
     contrast = [np.median(np.hypot(*s.theta[1:])[s.good] / s.theta[0][s.good]) for s in sets]
-    light = [float(np.median(s.theta[0][s.good])) for s in sets]
-    return Bench(
-        schema=SCHEMA,
-        detector=SimulatedDetector(
-            shape=(shape[0], shape[1]),
+    return plain_bench(
+        evidence,
+        SimulatedDetector(
+            shape=evidence.good.shape,
             pitch_um=evidence.pitch_um,
             gain_e_per_adu=evidence.gain,
             read_noise_e=evidence.amplifier_noise,
             chip=sets[0].window if sets else None,
             origin_px=evidence.origin if sets else None,
-            saturation_adu=top,
-            bias_adu=float(np.clip(np.median(evidence.bias), 0, top - 1)),
+            saturation_adu=min(evidence.saturation_adu, TOP_ADU),
         ),
+        float(np.mean(contrast)) if contrast else 1.0,
+        (max([*exposures[:1], LEAST_S]), _period(sets[0].time_s) if sets else 0.0),
+        [(s.name, s.baseline_mm, len(s.g), 2 * float(np.median(s.theta[0][s.good]))) for s in sets],
+    )
+
+
+def plain_bench(
+    evidence: Evidence,
+    detector: SimulatedDetector,
+    visibility: float,
+    times_s: tuple[float, float],
+    sets: Sequence[tuple[str, tuple[float, float], int, float]],
+) -> Bench:
+    """What effects ask a bench for, where its pixels and light come from an acquisition.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        Tells bias, laser and distance.
+    detector : SimulatedDetector
+        The rest of the detector.
+    visibility : float
+    times_s : (float, float)
+        Exposure time and period.
+    sets : sequence of (str, (float, float), int, float)
+        Name, baseline (mm), frames and brightest fringe (e-) of each fringe set.
+    """
+    exposure, period = times_s
+    bias = float(np.clip(np.median(evidence.bias), 0, detector.top_adu - 1))
+    return Bench(
+        schema=SCHEMA,
+        detector=replace(detector, bias_adu=bias),
         optics=SimulatedOptics(
             wavelength_nm=evidence.wavelength_nm,
             distance_mm=evidence.distance_mm,
             beam_radius_mm=1e4,
-            visibility=float(np.clip(np.mean(contrast), 0.01, 1.0)) if contrast else 1.0,
+            visibility=float(np.clip(visibility, 0.01, 1.0)),
             fringes="straight",
         ),
         frames=SimulatedFrames(
             exptime_s=exposure,
-            period_s=period,
+            period_s=max(period, exposure),
             flats=(ExposureStep(exposure, 1),),
             flat_rate_e_s=1.0,
             fringes=tuple(
-                SimulatedSet(
-                    name=s.name,
-                    baseline_mm=s.baseline_mm,
-                    count=len(s.g),
-                    peak_e=float(np.clip(2 * level, 1.0, 1e7)),
-                )
-                for s, level in zip(sets, light, strict=True)
+                SimulatedSet(name, baseline, count, float(np.clip(peak, 1.0, 1e7)))
+                for name, baseline, count, peak in sets
             ),
         ),
     )

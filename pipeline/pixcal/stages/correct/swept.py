@@ -14,7 +14,7 @@ from pixcal.kernels.crosstalk import FILL_REACH, filled
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.correct.surroundings import BEYOND, CLOSED, Sides, usable
-from pixcal.stages.diagnose.undone_maps import undone_on_samples
+from pixcal.stages.diagnose.undone import undone_on_samples
 from pixcal.stages.evidence import Part, fitted_theta
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json

@@ -9,17 +9,10 @@ from numpy.typing import NDArray
 from pixcal.estimators.detector.flat_ladder import light_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.bench import (
-    SCHEMA,
-    Bench,
-    ExposureStep,
-    SimulatedDetector,
-    SimulatedFrames,
-    SimulatedOptics,
-    SimulatedSet,
-)
+from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.model.errors import InputError
 from pixcal.simulation.recording import Recording
+from pixcal.simulation.replica import plain_bench
 from pixcal.stages.diagnose.nominal import SetTruth
 from pixcal.stages.diagnose.parts import Half, Table, groups
 
@@ -41,51 +34,35 @@ def bench_of(
     InputError
         If the light goes beyond what a converter of 16 bits can give.
     """
-    top = _top(acquisition, evidence, sets, dtypes)
-    d, o, shape = acquisition.detector, acquisition.fibres, evidence.good.shape
+    d = acquisition.detector
     listed = [f"fringes/{s.name}" for s in acquisition.frames.fringes]
     table = tables[listed[0]] if listed else next(iter(tables.values()))
     times = np.array(table["time_s"], float)
     exposure = max(float(table["exptime_s"][0] or 0.0), 1e-6)
     period = float(np.median(np.diff(times))) if len(times) > 1 else exposure
     contrast = [float(np.median(s.contrast)) for s in sets]
-    return Bench(
-        schema=SCHEMA,
-        detector=SimulatedDetector(
-            shape=(shape[0], shape[1]),
-            pitch_um=d.pitch_um,
-            gain_e_per_adu=evidence.gain,
-            read_noise_e=evidence.amplifier_noise,
-            name=d.name,
-            chip=whole,
-            origin_px=evidence.origin,
-            saturation_adu=top,
-            full_well_e=d.full_well_e,
-            bias_adu=float(np.clip(np.median(evidence.bias), 0, top - 1)),
-        ),
-        optics=SimulatedOptics(
-            wavelength_nm=o.wavelength_nm,
-            distance_mm=o.distance_mm,
-            beam_radius_mm=1e4,
-            visibility=float(np.clip(np.mean(contrast), 0.01, 1.0)) if contrast else 1.0,
-            fringes="straight",
-        ),
-        frames=SimulatedFrames(
-            exptime_s=exposure,
-            period_s=max(period, exposure),
-            flats=(ExposureStep(exposure, 1),),
-            flat_rate_e_s=1.0,
-            fringes=tuple(
-                SimulatedSet(
-                    name=s.name,
-                    baseline_mm=s.baseline_mm,
-                    count=len(tables[f"fringes/{s.name}"]["time_s"]),
-                    peak_e=float(np.clip(np.max(truth.light * (1 + truth.contrast)), 1.0, 1e7)),
-                )
-                for s, truth in zip(acquisition.frames.fringes, sets, strict=True)
-            ),
-        ),
+    detector = SimulatedDetector(
+        shape=evidence.good.shape,
+        pitch_um=d.pitch_um,
+        gain_e_per_adu=evidence.gain,
+        read_noise_e=evidence.amplifier_noise,
+        name=d.name,
+        chip=whole,
+        origin_px=evidence.origin,
+        saturation_adu=_top(acquisition, evidence, sets, dtypes),
+        full_well_e=d.full_well_e,
     )
+    listed_sets = [
+        (
+            s.name,
+            s.baseline_mm,
+            len(tables[f"fringes/{s.name}"]["time_s"]),
+            float(np.max(truth.light * (1 + truth.contrast))),
+        )
+        for s, truth in zip(acquisition.frames.fringes, sets, strict=True)
+    ]
+    visibility = float(np.mean(contrast)) if contrast else 1.0
+    return plain_bench(evidence, detector, visibility, (exposure, period), listed_sets)
 
 
 def recordings_of(

@@ -33,8 +33,7 @@ from pixcal.stages import reduce
 from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
-from pixcal.stages.diagnose.undone import IntensityBeforeEffects
-from pixcal.stages.diagnose.undone_maps import undone_on_samples
+from pixcal.stages.diagnose.undone import IntensityBeforeEffects, undone_on_samples
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -12,7 +12,7 @@ from pixcal.estimators.maps.corrected import phase_change, straight_modes
 from pixcal.kernels.crosstalk import filled
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.diagnose.nominal import FittedSet
-from pixcal.stages.diagnose.undone_maps import undone_on_samples
+from pixcal.stages.diagnose.undone import undone_on_samples
 from pixcal.stages.treatment import treatment_of
 from pixcal.storage.artefact import MANIFEST, read_json
 

@@ -1,20 +1,24 @@
-"""How much light there was before the effects that act on samples.
+"""Light and maps as they were before the effects that act on samples.
 
 The nominal bench is measured from frames that have the effects in them; simulated with the same
 effects, it must start from the light as it was before they acted.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.model.bench import SimulatedDetector
-from pixcal.simulation.effect import Effect
+from pixcal.simulation.effect import Effect, FringeMaps
 
 PHASES = 16
 """Of a fringe that is undone sample by sample."""
+MAP_PHASES = 12
+"""Frames, spread over a fringe, of which an effect on samples is undone."""
+LEAST_SIGNAL = 1.0
+"""Of a sample (e-), below which its shot noise is not taken."""
 ACROSS = 9
 """Pixels along the side of a frame whose level is undone."""
 
@@ -53,3 +57,22 @@ class IntensityBeforeEffects:
         if found is start:
             return levels
         return np.asarray(found[:, ACROSS // 2, ACROSS // 2], float)
+
+
+def undone_on_samples(effect: Effect, maps: FringeMaps) -> FringeMaps | None:
+    """Maps that a fit finds in frames without noise that an effect was undone on.
+
+    None where the effect is not one of samples.
+    """
+    phi = 2 * np.pi * np.arange(MAP_PHASES) / MAP_PHASES
+    frames = np.stack([np.ones(MAP_PHASES), np.cos(phi), np.sin(phi)])
+    flat = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat
+    charge = np.einsum("mt,myx->tyx", frames, maps.theta * flat)
+    undone = effect.undo_samples(charge.astype(np.float32))
+    if undone is None:
+        return None
+    weight = 1 / np.maximum(charge, LEAST_SIGNAL)
+    normal = np.einsum("mt,nt,tyx->yxmn", frames, frames, weight)
+    right = np.einsum("mt,tyx->yxm", frames, weight * undone)
+    theta = np.moveaxis(np.linalg.solve(normal, right[..., None])[..., 0], -1, 0)
+    return replace(maps, theta=theta)
