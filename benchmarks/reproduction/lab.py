@@ -15,7 +15,7 @@ from pixcal.model.bench import Bench, load_bench
 from pixcal.model.yaml_file import to_yaml
 from pixcal.stages import allan, crests, fit, ingest, reduce, simulate
 from pixcal.stages.fit.sweep import load_run
-from pixcal.stages.fit.sweep import nominal_vector as declared_vector
+from pixcal.stages.fitted_shape import nominal_vector as declared_vector
 from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
 from truth import Truth

@@ -75,9 +75,9 @@ def test_fibres_are_found_from_a_wrong_start_over_the_full_detector():
     reference = ((shape[0] - 1) / 2, (shape[1] - 1) / 2)
     kx, ky = (float(v) for v in fringe_vector(reference[1], reference[0], truth))
     planes, grid = planes_of(truth, (kx, ky), reference, shape, 341, noise=7e-3)
-    start = Start(
-        (kx, ky), reference, 4160.0, unwrap(planes, grid), 632.8e-6, 4.4e-3, 400.0, (6.0, 0.0)
-    )
+    centre = (reference[1] * 4.4e-3, reference[0] * 4.4e-3)
+    nominal = Geometry(632.8e-6, 4.4e-3, *centre, 400.0, 6.0, 0.0)
+    start = Start((kx, ky), reference, 4160.0, unwrap(planes, grid), nominal)
     shape_found = fringe_models()["hyperbolic"].start(start)
     found = shape_found.geometry
     assert found.distance == pytest.approx(410.0, abs=0.5)
@@ -92,7 +92,8 @@ def test_fibres_are_found_from_a_wrong_start_over_the_full_detector():
 
 @pytest.mark.parametrize("name", sorted(fringe_models()))
 def test_modes_are_the_derivatives_of_the_phase(name):
-    start = Start((1.2, 0.1), (30.0, 40.0), 50.0, [], 632.8e-6, 4.4e-3, 400.0, (6.0, 0.5))
+    nominal = Geometry(632.8e-6, 4.4e-3, 40 * 4.4e-3, 30 * 4.4e-3, 400.0, 6.0, 0.5)
+    start = Start((1.2, 0.1), (30.0, 40.0), 50.0, [], nominal)
     shape = fringe_models()[name].start(start)
     y, x = np.array([0.0, 300.0, 61.0]), np.array([5.0, -100.0, 900.0])
     modes = shape.modes(y, x)

@@ -26,10 +26,10 @@ F64 = NDArray[np.float64]
 N_SUMS = 11
 # determinant over the product of the diagonal: without three phases it is zero up to rounding
 SINGULAR = 1e-9
-_FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
+FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def _sweep_row(
     codes: Any, row: int, scale: float, offset: float, fill: float, g: Any,
     dk: Any, y: float, x0: float,
@@ -186,14 +186,15 @@ def frame_sums(
                 codes[t, first:stop], s, o, f, g[t, 0], g[t, 1], g[t, 2],
                 h0, h1, h2, reads, shots, turn, w, wr,
             )  # fmt: skip
-            _add_pixels(h0, h1, h2, turn, w, wr, ys, xs, normal[t], right[t])
+            add_normal(h0, h1, h2, turn, w, ys, xs, normal[t])
+            add_right(h0, h1, h2, turn, wr, ys, xs, right[t])
 
 
 # Loops of their own: one with all of this needs more registers than there are, and takes thrice as
 # long.
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def _turn_pixels(t1: Any, t2: Any, kx: float, ky: float, y: Any, x: Any, h1: Any, h2: Any) -> None:
     one, two, half = np.float32(1), np.float32(2), np.float32(0.5)
     sixth, fourth = np.float32(1 / 6), np.float32(1 / 24)
@@ -213,7 +214,7 @@ def _turn_pixels(t1: Any, t2: Any, kx: float, ky: float, y: Any, x: Any, h1: Any
         h2[i] = t2[i] * co - t1[i] * si
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def _weigh_pixels(
     codes: Any, s: float, o: float, f: float, g0: float, c1: float, c2: float,
     h0: Any, h1: Any, h2: Any, read: Any, shot: Any, turn: Any, w: Any, wr: Any,
@@ -228,14 +229,15 @@ def _weigh_pixels(
         wr[i] = weight * (s * code + o - model)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _add_pixels(
-    h0: Any, h1: Any, h2: Any, turn: Any, w: Any, wr: Any, y: Any, x: Any, normal: Any, right: Any
-) -> None:
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def add_normal(h0: Any, h1: Any, h2: Any, turn: Any, w: Any, y: Any, x: Any, normal: Any) -> None:
+    """Add pixels to the normal matrix (15 numbers) of g and dk; as in `frame_sums`, by pixel.
+
+    ``turn`` is the derivative of the model with respect to the phase, ``w`` the weight.
+    """
     zero = np.float32(0)
     q00 = q01 = q02 = q0x = q0y = zero
     q11 = q12 = q1x = q1y = q22 = q2x = q2y = qxx = qxy = qyy = zero
-    r0 = r1 = r2 = rx = ry = zero
     for i in range(w.size):
         a0, a1, a2 = h0[i], h1[i], h2[i]
         ax, ay = turn[i] * x[i], turn[i] * y[i]
@@ -255,15 +257,26 @@ def _add_pixels(
         qxx += wx * ax
         qxy += wx * ay
         qyy += w[i] * ay * ay
-        r0 += wr[i] * a0
-        r1 += wr[i] * a1
-        r2 += wr[i] * a2
-        rx += wr[i] * ax
-        ry += wr[i] * ay
     for k, q in enumerate(
         (q00, q01, q02, q0x, q0y, q11, q12, q1x, q1y, q22, q2x, q2y, qxx, qxy, qyy)
     ):
         normal[k] += q
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def add_right(
+    h0: Any, h1: Any, h2: Any, turn: Any, weighted: Any, y: Any, x: Any, right: Any
+) -> None:
+    """Add pixels to the right-hand sides (5) of g and dk; ``weighted`` is weight times residual."""
+    r0 = r1 = r2 = rx = ry = np.float32(0)
+    for i in range(weighted.size):
+        value = weighted[i]
+        turned = value * turn[i]
+        r0 += value * h0[i]
+        r1 += value * h1[i]
+        r2 += value * h2[i]
+        rx += turned * x[i]
+        ry += turned * y[i]
     for k, r in enumerate((r0, r1, r2, rx, ry)):
         right[k] += r
 
@@ -353,7 +366,7 @@ def _fringe(
     return s * m2 - c * m1, c * m2 + s * m1, variance
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def _close_pixels(
     n00: Any, n01: Any, n02: Any, n11: Any, n12: Any, n22: Any, b0: Any, b1: Any, b2: Any,
     m1: Any, m2: Any, turn: Any, sigma: Any,

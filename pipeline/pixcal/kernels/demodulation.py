@@ -13,6 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pixcal.kernels.normal_matrix import symmetric
+
 F64 = NDArray[np.float64]
 
 N_TERMS = 12
@@ -125,17 +127,14 @@ def solve_windows(sums: F64) -> tuple[F64, F64, F64]:
     phase, background = np.zeros(len(sums)), np.zeros(len(sums))
     sigma = np.full(len(sums), np.inf)
     use = np.flatnonzero(count >= 3 * N_TERMS)
-    rows, columns = np.triu_indices(N_TERMS)
-    normal = np.empty((len(use), N_TERMS, N_TERMS))
-    triangle = sums[use, : len(rows)]
-    normal[:, rows, columns] = triangle
-    normal[:, columns, rows] = triangle
+    size = N_TERMS * (N_TERMS + 1) // 2
+    normal = symmetric(sums[use, :size])
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-300))
     normal /= scale[:, :, None] * scale[:, None, :]
     # Far below rounding of good windows; those that it changes get errors beyond use.
     normal += 1e-13 * np.eye(N_TERMS)
     inverse = np.linalg.inv(normal)
-    right = sums[use, len(rows) : len(rows) + N_TERMS] / scale
+    right = sums[use, size : size + N_TERMS] / scale
     solved = np.einsum("nij,nj->ni", inverse, right)
     rest = sums[use, -2] - np.einsum("ni,ni->n", solved, right)
     # The difference of two large numbers keeps so many digits.

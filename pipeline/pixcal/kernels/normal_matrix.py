@@ -1,11 +1,21 @@
 """Inverses of normal matrices whose parameters have any units and may be undetermined."""
 
+import math
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
+
+
+def symmetric(packed: NDArray[Any]) -> F64:
+    """Symmetric matrices (..., n, n) from their upper triangles (..., n (n + 1) / 2), by row."""
+    n = math.isqrt(2 * packed.shape[-1])
+    place = np.empty((n, n), np.intp)
+    rows, columns = np.triu_indices(n)
+    place[rows, columns] = place[columns, rows] = np.arange(packed.shape[-1])
+    return np.asarray(packed[..., place], np.float64)
 
 
 def root_diagonal(normal: NDArray[Any]) -> F64:

@@ -21,7 +21,7 @@ def damped_walk(normals: F64, keep: float) -> F64:
     keep : float
         Correlation of neighbours, 0 (white) to below 1.
     """
-    if not len(normals):
+    if not keep or not len(normals):
         return normals
     # Here: scipy.signal takes most of a second to import, and few runs need it.
     from scipy.signal import lfilter

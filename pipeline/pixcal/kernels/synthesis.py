@@ -15,10 +15,12 @@ called in compiled code (8 through NumPy), 0.5 ns for shot noise out of it, 9 ns
 
 import math
 from enum import IntEnum
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numba import njit
+from numpy.random.bit_generator import ISeedSequence
 from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
@@ -49,8 +51,23 @@ class Stream(IntEnum):
 
 def generator(seed: int, stream: Stream, *key: int) -> np.random.Generator:
     """The random generator of one purpose and place; the same whoever asks, in whatever order."""
-    sequence = np.random.SeedSequence(seed, spawn_key=(int(stream), *key))
-    return np.random.Generator(np.random.PCG64(sequence))
+    seeded = np.random.PCG64(_Seed.of(seed, int(stream), *key))  # type: ignore[arg-type]
+    return np.random.Generator(seeded)
+
+
+class _Seed(ISeedSequence):
+    """Seed of a generator. Mixing it takes as long as some thousand normals: it is kept."""
+
+    def __init__(self, seed: int, *key: int) -> None:
+        self.words = np.random.SeedSequence(seed, spawn_key=key).generate_state(4, np.uint64)
+
+    @classmethod
+    @lru_cache(maxsize=4096)
+    def of(cls, seed: int, *key: int) -> "_Seed":
+        return cls(seed, *key)
+
+    def generate_state(self, n_words: int, dtype: Any = np.uint32) -> Any:
+        return self.words
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

@@ -1,4 +1,4 @@
-"""The fringes of a set as a run fitted them."""
+"""The fringes of a set: nominal, and as a run fitted them."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,9 +7,24 @@ from typing import Any
 from pixcal.estimators.fringe_fit.models import FringeShape
 from pixcal.estimators.fringe_fit.models.hyperbolic import Hyperbolic
 from pixcal.estimators.fringe_fit.models.paraxial import Paraxial
-from pixcal.kernels.optics import PARAMETERS, Geometry
+from pixcal.kernels.optics import PARAMETERS, Geometry, paraxial_vector
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.errors import InputError
+
+
+def nominal_geometry(
+    acquisition: Acquisition, name: str, reference: tuple[float, float] = (0.0, 0.0)
+) -> Geometry:
+    """Nominal geometry of a set, the fibres' centre before a point (y, x) of the window, px."""
+    (baseline,) = (s.baseline_mm for s in acquisition.frames.fringes if s.name == name)
+    optics, pitch = acquisition.fibres, acquisition.detector.pitch_um * 1e-3
+    centre = (reference[1] * pitch, reference[0] * pitch)
+    return Geometry(optics.wavelength_nm * 1e-6, pitch, *centre, optics.distance_mm, *baseline)
+
+
+def nominal_vector(acquisition: Acquisition, name: str) -> tuple[float, float]:
+    """Nominal fringe vector (kx, ky) of a set in rad/px (paper, equation 4)."""
+    return paraxial_vector(nominal_geometry(acquisition, name))
 
 
 def fitted_shape(

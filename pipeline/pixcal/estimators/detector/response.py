@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline
 from pixcal.estimators.diagnosis.distortions import distortion_sums, fit_distortions
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.boundaries import REACH, boundary_shifts, moved_charge
+from pixcal.kernels.normal_matrix import inverse_normal
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -256,7 +257,7 @@ def boundaries_beside(
         information = UNIT**2 / known[1]
         normal = normal + information * np.outer(mean, mean)
         right = right + information * known[0] / UNIT * mean
-    inverse, only = _inverse(normal), _inverse(normal[:powers, :powers])
+    inverse, only = inverse_normal(normal), inverse_normal(normal[:powers, :powers])
     gain = float(right @ inverse @ right - right[:powers] @ only @ right[:powers])
     size, variance = float(mean @ inverse @ right), float(mean @ inverse @ mean)
     return Beside(UNIT * size, UNIT**2 * variance, max(gain, 0.0), len(sums))
@@ -279,12 +280,6 @@ def _joint(sums: Sequence[tuple[F64, F64]], powers: int, at: int) -> tuple[F64, 
     return joint, right
 
 
-def _inverse(normal: F64) -> F64:
-    scale = 1 / np.sqrt(np.diag(normal))
-    scaled = np.linalg.pinv(normal * np.outer(scale, scale), rcond=1e-9, hermitian=True)
-    return np.asarray(scaled * np.outer(scale, scale))
-
-
 def _alone(
     sums: Sequence[tuple[F64, F64]], powers: int, at: int
 ) -> tuple[float, float, float, float, float, float]:
@@ -297,7 +292,7 @@ def _alone(
     sizes = rights / information
     gain = float(sizes @ rights)
     joint, right = _joint(sums, powers, at)
-    beside = float(right @ _inverse(joint) @ right) - gain
+    beside = float(right @ inverse_normal(joint) @ right) - gain
     ratio = float(sizes[-1] / sizes[0])
     relative = 1 / np.sqrt(information) / sizes
     error = abs(ratio) * float(np.linalg.norm(relative)) if len(sums) > 1 else 0.0

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid
+from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.kernels.two_way import turn
 
 F32 = NDArray[np.float32]
@@ -93,11 +94,10 @@ class Freedom:
     @cached_property
     def pixel_inverse(self) -> F64:
         """Inverse (n, k, k) of the pixels' normal matrices for their functions of time."""
-        k, n = len(self.of_time), self.weight.shape[1]
+        k = len(self.of_time)
         upper = np.triu_indices(k)
         products = self.of_time[upper[0]] * self.of_time[upper[1]]
-        normal = np.empty((n, k, k))
-        normal[:, upper[0], upper[1]] = normal[:, upper[1], upper[0]] = (products @ self.weight).T
+        normal = symmetric((products @ self.weight).T)
         # A pixel with hardly a sample has no parameters.
         trace = np.einsum("nii->n", normal)[:, None, None]
         return np.linalg.inv(normal + (_NEGLIGIBLE * trace + 1e-30) * np.eye(k))
@@ -107,10 +107,8 @@ class Freedom:
         """Covariance (t, 7, 7) of the frames' share of the maps and slopes, from the noise."""
         upper = np.triu_indices(7)
         products = self.of_place[upper[0]] * self.of_place[upper[1]]
-        packed = self.weight @ products.T
-        normal = np.empty((len(packed), 7, 7))
-        normal[:, upper[0], upper[1]] = normal[:, upper[1], upper[0]] = packed
-        inverse = _inverse(self._slopes @ normal @ self._slopes.swapaxes(1, 2))
+        normal = symmetric(self.weight @ products.T)
+        inverse = inverse_normal(self._slopes @ normal @ self._slopes.swapaxes(1, 2), 1e-7)
         return self._slopes.swapaxes(1, 2) @ inverse @ self._slopes
 
     def left_over(self, change: F32) -> F32:
@@ -162,13 +160,6 @@ class Freedom:
         return taken
 
 
-def _inverse(normal: F64) -> F64:
-    """Inverse of symmetric matrices (n, k, k), without the directions that nothing constrains."""
-    scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-30))
-    both = scale[:, :, None] * scale[:, None, :]
-    return np.asarray(np.linalg.pinv(normal / both, rcond=1e-7, hermitian=True) / both)
-
-
 def fit_distortions(
     sets: Sequence[FringeEvidence],
     distortion: Distortion,
@@ -201,7 +192,7 @@ def fit_distortions(
     """
     fits = [_SetFit(fringes, distortion, count, margin) for fringes in sets]
     known, information = (np.zeros(count), np.zeros(count)) if prior is None else prior
-    covariance = _inverse((sum(fit.normal for fit in fits) + np.diag(information))[None])[0]
+    covariance = inverse_normal(sum(fit.normal for fit in fits) + np.diag(information), 1e-7)
     sizes = np.zeros(count)
     for _ in range(_ROUNDS):
         right = sum(fit.right(sizes) for fit in fits) + information * (known - sizes)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.estimators.fringe_fit.tile import Coding
 from pixcal.kernels.bilinear import frame_sums
+from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -320,12 +321,6 @@ def free_frames(
         np.ascontiguousarray(theta[:, good], np.float32), read_variance[good].astype(np.float32),
         shot_factor[good].astype(np.float32), packed, right,
     )  # fmt: skip
-    normal = np.zeros((n, 5, 5))
-    upper = np.triu_indices(5)
-    normal[:, upper[0], upper[1]] = packed
-    normal[:, upper[1], upper[0]] = packed
-    scale = np.sqrt(np.maximum(np.einsum("tii->ti", normal), 1e-30))
-    both = scale[:, :, None] * scale[:, None, :]
-    covariance = np.linalg.pinv(normal / both, rcond=1e-10, hermitian=True) / both
+    covariance = inverse_normal(symmetric(packed), 1e-10)
     step = np.einsum("tij,tj->ti", covariance, right)
     return np.hstack([start, turned]) + step, covariance

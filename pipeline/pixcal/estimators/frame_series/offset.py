@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import STRIPE, FringeEvidence, Stack
 from pixcal.estimators.frame_series.variance_components import Modes, cosine_modes, walk_power
+from pixcal.kernels.normal_matrix import inverse_normal
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -150,9 +151,7 @@ def _sums(pattern: F32, weight: F32, residual: F32, mask: NDArray[np.bool_]) -> 
 
 def _constant(normal: F64, right: F64) -> tuple[F64, F64]:
     """Last coefficient (t,) of a weighted fit of patterns, and its variance."""
-    scale = np.sqrt(np.maximum(np.einsum("tii->ti", normal), 1e-30))
-    inverse = np.linalg.pinv(normal / (scale[:, :, None] * scale[:, None]), hermitian=True)
-    last = inverse[:, -1] / (scale * scale[:, -1:])
+    last = inverse_normal(normal, 1e-15)[:, -1]
     return np.einsum("ti,ti->t", last, right), last[:, -1]
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.maps.map_fit import centred
-from pixcal.kernels.normal_matrix import inverse_normal
+from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.kernels.row_sums import MODES, row_sums
 
 F32 = NDArray[np.float32]
@@ -158,7 +158,7 @@ def rows_of(
         found.g[inside].astype(np.float32), theta.astype(np.float32), y, x,
     )  # fmt: skip
     free = MODES if np.any(found.dk) else 3
-    covariance = inverse_normal(inner[:, :free, :free], 1e-10)
+    covariance = inverse_normal(symmetric(inner)[:, :free, :free], 1e-10)
     # What the modes of each frame absorb, (y, t modes).
     across = across[:, :, :free]
     taken = across @ covariance

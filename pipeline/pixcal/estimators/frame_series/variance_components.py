@@ -18,7 +18,7 @@ from scipy.optimize import brentq
 from scipy.special import ndtri_exp
 
 from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
-from pixcal.kernels.variance_sums import gram, sandwich, trace_products
+from pixcal.kernels.variance_sums import trace_products
 
 F64 = NDArray[np.float64]
 
@@ -171,7 +171,8 @@ class _State:
         inverse = np.linalg.inv(root)
         self.weight = np.einsum("nba,nbc->nac", inverse, inverse)
         self.weighted = np.einsum("nab,nbp->nap", self.weight, modes.known)
-        normal = gram(modes.known, self.weighted)
+        shapes = modes.known.shape[-1]
+        normal = modes.known.reshape(-1, shapes).T @ self.weighted.reshape(-1, shapes)
         self.spread = inverse_normal(normal)
         self.beta = self.spread @ np.einsum("nap,na->p", self.weighted, modes.values)
         rest = modes.values - np.einsum("nap,p->na", modes.known, self.beta)
@@ -189,7 +190,7 @@ class _State:
         """Slope of the log-likelihood (m,)."""
         seen = self.pull[:, :, None] * self.pull[:, None, :]
         # What the fit of the known shapes takes away of the scatter.
-        lost = sandwich(self.weighted, self.spread)
+        lost = (self.weighted @ self.spread) @ self.weighted.swapaxes(1, 2)
         more = self.modes.flat @ (seen - self.weight + lost).ravel()
         return np.asarray(self.modes.share * more / 2)
 

@@ -26,7 +26,7 @@ from pixcal.estimators.fringe_fit.gauge import gauge_matrix
 from pixcal.estimators.fringe_fit.tile import Coding, Tile
 from pixcal.estimators.fringe_fit.tile_fit import fit_tile, residual_chi2
 from pixcal.kernels.bilinear import frame_sums
-from pixcal.kernels.normal_matrix import inverse_normal
+from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.errors import InputError
 
 F32 = NDArray[np.float32]
@@ -359,10 +359,7 @@ class Scout:
 
         every = self.each(sums_of, range(len(self.tiles)))
         packed, right = (np.sum(sums, axis=0) for sums in zip(*every, strict=True))
-        normal = np.zeros((n, 5, 5))
-        upper = np.triu_indices(5)
-        normal[:, upper[0], upper[1]] = packed
-        normal[:, upper[1], upper[0]] = packed
+        normal = symmetric(packed)
         size = 5 if moving else 3
         step = np.zeros((n, 5))
         step[:, :size] = np.einsum(

@@ -31,7 +31,8 @@ from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
 from pixcal.stages.fit.maps import Totals, write_maps
 from pixcal.stages.fit.products import header_of, publish_maps
 from pixcal.stages.fit.sweep import Config as SweepConfig
-from pixcal.stages.fit.sweep import load_run, nominal_vector, sweep_set
+from pixcal.stages.fit.sweep import load_run, sweep_set
+from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.treatment import HYPERBOLIC, SUFFIX, Treatments, treatments

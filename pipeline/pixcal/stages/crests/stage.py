@@ -23,7 +23,7 @@ from pixcal import __version__
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels.demodulation import N_SUMS
-from pixcal.kernels.optics import PARAMETERS, Geometry, phase, phase_jacobian
+from pixcal.kernels.optics import PARAMETERS, Geometry, paraxial_vector, phase, phase_jacobian
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
@@ -47,7 +47,8 @@ from pixcal.stages.crests.crests import (
     seed_vector,
     tile_sums,
 )
-from pixcal.stages.fit.sweep import load_run, nominal_vector
+from pixcal.stages.fit.sweep import load_run
+from pixcal.stages.fitted_shape import nominal_geometry
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import MANIFEST, Build, Manifest, read_json, write_json
 from pixcal.storage.cube import create_group, write_array
@@ -117,9 +118,10 @@ def _measure(
     source = ReducedSet(run_dir / "reduce" / "reduced.zarr" / name)
     count = min(config.frames, source.n_frames)
     frames = np.unique(np.linspace(0, source.n_frames - 1, count).astype(int)).tolist()
-    nominal = _nominal(acquisition, name, source)
+    ny, nx = source.shape
+    nominal = nominal_geometry(acquisition, name, ((ny - 1) / 2, (nx - 1) / 2))
     try:
-        paths = _extract(source, frames, nominal_vector(acquisition, name), name, config, runtime)
+        paths = _extract(source, frames, paraxial_vector(nominal), name, config, runtime)
         fit = fit_crests(paths, nominal, Prior.of_bench(nominal))
     except DamagedError:
         raise
@@ -152,17 +154,6 @@ def _measure(
         "agreement": None if other is None else _agreement(paths, fit, *other),
         "agreement_note": note,
     }
-
-
-def _nominal(acquisition: Acquisition, name: str, source: ReducedSet) -> Geometry:
-    """The bench's nominal geometry: the fibres' centre before the middle of the window."""
-    (baseline,) = (s.baseline_mm for s in acquisition.frames.fringes if s.name == name)
-    pitch = acquisition.detector.pitch_um * 1e-3
-    ny, nx = source.shape
-    return Geometry(
-        acquisition.fibres.wavelength_nm * 1e-6, pitch, (nx - 1) / 2 * pitch, (ny - 1) / 2 * pitch,
-        acquisition.fibres.distance_mm, *baseline,
-    )  # fmt: skip
 
 
 def _extract(

@@ -14,6 +14,7 @@ from pixcal.estimators.fringe_fit.smooth import Polynomial
 from pixcal.estimators.fringe_fit.tile_sums import Carrier, TileSums
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.errors import InputError
+from pixcal.stages.fitted_shape import nominal_geometry
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.place import Local
@@ -197,16 +198,13 @@ def _start(
     acquisition: Acquisition,
     name: str,
 ) -> Start:
-    (baseline,) = (s.baseline_mm for s in acquisition.frames.fringes if s.name == name)
+    reference = (float(facts["reference"][0]), float(facts["reference"][1]))
     return Start(
         k=(float(facts["k"][0]), float(facts["k"][1])),
-        reference=(float(facts["reference"][0]), float(facts["reference"][1])),
+        reference=reference,
         scale=max(source.shape) / 2,
         planes=planes,
-        wavelength_mm=acquisition.fibres.wavelength_nm * 1e-6,
-        pitch_mm=acquisition.detector.pitch_um * 1e-3,
-        distance_mm=acquisition.fibres.distance_mm,
-        baseline_mm=baseline,
+        nominal=nominal_geometry(acquisition, name, reference),
     )
 
 

@@ -26,6 +26,7 @@ from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Sweep
 from pixcal.stages.fit.scouting import CACHE_BYTES, read_frames, scout_set
+from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import (
     Build,
@@ -50,17 +51,6 @@ BATCH_DTYPE = "<f2"
 
 
 Config = Sweep
-
-
-def nominal_vector(acquisition: Acquisition, name: str) -> tuple[float, float]:
-    """Nominal fringe vector (kx, ky) of a set in rad/px (paper, equation 4)."""
-    (baseline,) = (s.baseline_mm for s in acquisition.frames.fringes if s.name == name)
-    optics = acquisition.fibres
-    per_mm = (
-        2 * np.pi * acquisition.detector.pitch_um * 1e3
-        / (optics.wavelength_nm * optics.distance_mm)
-    )  # fmt: skip
-    return baseline[0] * per_mm, baseline[1] * per_mm
 
 
 def load_run(run_dir: Path) -> Acquisition:

@@ -15,6 +15,8 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from pixcal.kernels.optics import Geometry
+
 F64 = NDArray[np.float64]
 
 
@@ -28,10 +30,7 @@ class Start:
     # unwrapped `geometry.TilePlane` of every tile, relative to the carrier `k . (r -
     # reference)`
     planes: Sequence[Any]
-    wavelength_mm: float  # wavelength_mm, pitch_mm, distance_mm: nominal optics
-    pitch_mm: float
-    distance_mm: float
-    baseline_mm: tuple[float, float]  # nominal baseline (x, y)
+    nominal: Geometry  # of the bench, the fibres' centre before the reference
 
 
 class FringeShape(ABC):

@@ -38,20 +38,15 @@ class Hyperbolic(FringeShape):
     @classmethod
     def start(cls, start: Start) -> Self:
         """Fit to the phases and slopes of the tiles, with the priors."""
-        ry, rx = start.reference
-        bx, by = start.baseline_mm
-        length = float(np.hypot(bx, by))
-        nominal = Geometry(
-            start.wavelength_mm, start.pitch_mm, rx * start.pitch_mm, ry * start.pitch_mm,
-            start.distance_mm, bx, by,
-        )  # fmt: skip
+        nominal = start.nominal
+        length = float(np.hypot(nominal.baseline_x, nominal.baseline_y))
         sigma = np.array(
-            [PRIOR_CENTRE_MM, PRIOR_CENTRE_MM, PRIOR_DISTANCE * start.distance_mm]
+            [PRIOR_CENTRE_MM, PRIOR_CENTRE_MM, PRIOR_DISTANCE * nominal.distance]
             + [PRIOR_BASELINE * length] * 2
             + [PRIOR_TILT * length]
         )
         # The measured fringe vector gives the baseline over the distance at once.
-        per_mm = nominal.wavenumber * start.pitch_mm / start.distance_mm
+        per_mm = nominal.wavenumber * nominal.pitch / nominal.distance
         first = nominal.vector()
         first[3:5] = np.array(start.k) / per_mm
         shape = cls(
