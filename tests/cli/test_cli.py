@@ -520,18 +520,28 @@ def test_what_is_up_to_date_is_left_alone(bench_run: Path) -> None:
     assert products() == before
 
 
+@pytest.mark.quick(1)
+@pytest.mark.parametrize(
+    ("stages", "files"),
+    [(STAGES[:4], ("fit.json", "allan.json")), (STAGES, ("fit.json", "diagnosis.json"))],
+    ids=["to allan", "all"],
+)
 def test_the_steps_one_by_one_give_the_same(
-    bench_run: Path, monkeypatch: pytest.MonkeyPatch
+    bench_run: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    stages: list[str],
+    files: tuple[str, ...],
 ) -> None:
     """Also with another number of workers and other memory; progress goes to stderr only."""
     monkeypatch.setattr(report_page, "png", lambda figure: b"")
-    for line in ("ingest ACQ --out STEPS", *(f"{stage} STEPS" for stage in STAGES[1:])):
+    steps = f"STEPS-{len(stages)}"
+    for line in (f"ingest ACQ --out {steps}", *(f"{stage} {steps}" for stage in stages[1:])):
         out, err = typed(bench_run, f"{line} --cluster sync --memory 1GiB")
-        assert out.startswith(f"{line.split()[0]}: STEPS/{line.split()[0]} (written)\n")
+        assert out.startswith(f"{line.split()[0]}: {steps}/{line.split()[0]} (written)\n")
         assert "━" not in out
         assert "━" in err
-    one, other = bench_run / "RUN/products", bench_run / "STEPS/products"
-    for name in ("fit.json", "allan.json", "diagnosis.json"):
+    one, other = bench_run / "RUN/products", bench_run / steps / "products"
+    for name in files:
         assert (one / name).read_bytes() == (other / name).read_bytes()
     for name, hdu in product(("delta_x.fits", "delta_y.fits"), (0, "SIGMA", "MASK")):
         maps = [fits.getdata(folder / name, hdu) for folder in (one, other)]

@@ -156,6 +156,7 @@ def test_a_walk_is_found(
     assert found.significance > 5
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("count", [{"bias": 29}, {"bias": 29, "dark": 11}])
 def test_what_a_walk_explains_as_well_is_no_ramp(
     acquired: Callable[..., Evidence], count: dict[str, int]

@@ -63,7 +63,8 @@ def test_polarisation_goes_either_way_slowly_and_never_beyond_all_the_light(
     assert clipped.max() == pytest.approx(1 / 0.95)
 
 
-@pytest.mark.parametrize("vibration", [0.015, 0.05, 0.2])
+@pytest.mark.quick(1)
+@pytest.mark.parametrize("vibration", [0.05, 0.015, 0.2])
 def test_a_vibration_is_found(acquired: Acquired, vibration: float) -> None:
     found = ContrastNoise.estimate(acquired(None, contrast(vibration_rad=vibration)))
     assert found is not None
@@ -92,6 +93,7 @@ def test_it_is_found_beside_a_laser_that_changes(acquired: Acquired) -> None:
     assert abs(found.effect.vibration_rad - 0.1) < 4 * found.errors["vibration_rad"] < 0.03
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "alike",
     [

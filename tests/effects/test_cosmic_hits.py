@@ -82,6 +82,7 @@ def test_charge_stops_at_the_full_well(make_effect_bench: Callable[..., Bench]) 
     assert np.count_nonzero(frames > 1380) > 20
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("rate", "charge"), [(2_000.0, 70.0), (20_000.0, 120.0)])
 def test_rate_and_charge_are_found(
     acquired: Callable[..., Evidence], rate: float, charge: float

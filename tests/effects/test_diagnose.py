@@ -419,6 +419,7 @@ def test_windows_that_are_tried_do_not_overlap(shape: tuple[int, int]) -> None:
     assert len(tried) == (4 if min(shape) > 288 else 2)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "effect",
     [

@@ -56,6 +56,7 @@ def test_offsets_do_not_move(acquired: Callable[..., Evidence]) -> None:
         assert moved.std() < 0.5 * np.median(noise)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("pixel_rms", [5e-4, 2e-3])
 def test_its_size_is_found(acquired: Callable[..., Evidence], pixel_rms: float) -> None:
     on = {"pixel_rms": pixel_rms, "smooth_rms": 2.5 * pixel_rms, "scale_px": 4.0}
@@ -76,6 +77,7 @@ CROSSED = {"parent": "crossed"}
 """Other ghosts move mean light and fringes alike, as a flat does; their phase tells."""
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("other", ["ipc", "nonlinearity", "ghost_fringes", "straylight"])
 def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: str) -> None:
     found = FlatError.estimate(acquired(None, {other: CROSSED if other == "ghost_fringes" else {}}))

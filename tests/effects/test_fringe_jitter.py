@@ -62,6 +62,7 @@ def test_frames_turn_about_the_middle_of_the_window(make_effect_bench: Benches) 
     np.testing.assert_allclose(edge, 0.95 * 45_000 / 1.95 * np.abs(change) * 33, rtol=0.15)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("rms", [(6e-6, 4e-6), (2.5e-5, 2.5e-5), (3e-4, 1e-4)])
 def test_its_size_is_found(acquired: Acquired, rms: tuple[float, float]) -> None:
     found = FringeJitter.estimate(acquired(None, {"fringe_jitter": {"rms": list(rms)}}))
@@ -93,6 +94,7 @@ def test_a_vibration_is_found_folded_below_half_the_frame_rate(
         assert abs(found.effect.rms[axis]) < 4 * found.errors[f"rms[{axis}]"]
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "alike",
     [

@@ -15,6 +15,7 @@ from pixcal.simulation.recording import recordings
 SHAPE = {"detector.shape": [41, 53]}
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("relative", [-0.4, 0.15, 2.0])
 def test_without_shot_noise_all_frames_stay(
     make_effect_bench: Callable[..., Bench], relative: float
@@ -56,6 +57,7 @@ def parts(evidence: Evidence) -> dict[str, Evidence]:
     }
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("relative", [-0.1, 0.03, 0.15])
 def test_its_size_is_found(acquired: Callable[..., Evidence], relative: float) -> None:
     errors = {}
@@ -77,6 +79,7 @@ def test_nothing_is_found_where_the_gain_is_right(acquired: Callable[..., Eviden
         assert found.significance < 3
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("other", ["ipc", "brighter_fatter", "row_noise", "nonlinearity"])
 def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: str) -> None:
     found = GainError.estimate(acquired(None, {other: {}}))

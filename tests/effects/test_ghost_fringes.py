@@ -94,6 +94,7 @@ def test_frames_hold_it(make_effect_bench: Callable[..., Bench]) -> None:
             assert wave == pytest.approx(expected, abs=0.003)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("parent", "share", "in_flats"),
     [
@@ -138,6 +139,7 @@ def test_it_is_found_with_its_parent(
         assert parent in found.law
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("other", ["ipc", "nonlinearity", "flat_error"])
 def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: str) -> None:
     found = GhostFringes.estimate(acquired(None, {other: {}}))

@@ -52,6 +52,7 @@ def test_maps_lose_what_the_mean_width_takes() -> None:
     np.testing.assert_allclose(seen[1:], theta[1:] * transfer(1.2, 0.9) * transfer(0.3, 0.5))
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(("width", "rms"), [(0.95, 0.005), (0.95, 0.02), (0.6, 0.01)])
 def test_width_and_scatter_are_found(
     acquired: Callable[..., Evidence], width: float, rms: float
@@ -68,6 +69,7 @@ def test_width_and_scatter_are_found(
     assert found.significance > 5
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("other", ["ipc", "ghost_fringes", "nonlinearity", "flat_error", "lag"])
 def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: str) -> None:
     found = IntraPixelResponse.estimate(acquired(None, {other: {}}))

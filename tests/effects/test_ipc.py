@@ -269,6 +269,7 @@ def test_level_dependent_shares_are_undone_too() -> None:
 # Measurement.
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "truth",
     [Ipc(), Ipc().scaled(0.3), Ipc.nearest(0.005)],

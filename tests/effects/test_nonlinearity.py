@@ -101,6 +101,7 @@ def test_fringes_get_the_harmonics_of_the_polynomial(
     assert third.min() > 5
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("truth", [Nonlinearity(), Nonlinearity(0.003, 0.0)])
 def test_its_coefficients_are_found(acquired: Callable[..., Evidence], truth: Nonlinearity) -> None:
     effects = {"nonlinearity": {"quadratic": truth.quadratic, "cubic": truth.cubic}}

@@ -92,6 +92,7 @@ def test_steps_are_found_from_gaps(step: float) -> None:
     assert abs(found - step) < 2 * error < 2e-3 * step
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "given",
     [
@@ -172,6 +173,7 @@ def test_wrong_bits_are_found_where_only_shot_noise_spans_a_step(
     assert even.significance < 4
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "other",
     [{"nonlinearity": {}}, {"row_noise": {"row_rms": 5.0}}, {"intensity_noise": {"rms": 0.02}}],

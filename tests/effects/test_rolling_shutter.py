@@ -45,6 +45,7 @@ def test_calibration_frames_are_left_alone(make_effect_bench: Callable[..., Benc
     )
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("line", "delay"), [(0.1, 0.0), (1.2, 0.0), (5.0, 100.0), (5.0, LATE + 100.0)]
 )
@@ -59,6 +60,7 @@ def test_its_times_are_found(acquired: Callable[..., Evidence], line: float, del
     assert found.significance > 10
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("other", ["lag", "fringe_jitter", "intensity_noise"])
 def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: str) -> None:
     found = RollingShutter.estimate(acquired(None, {other: {}}))
@@ -106,6 +108,7 @@ def test_rows_are_turned_by_a_share_of_the_last_step(
     np.testing.assert_array_equal(on[0], plain[0])
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("share", [SETTLING, tuple(np.linspace(0.01, -0.01, 9))])
 @pytest.mark.parametrize("origin", [None, 0.0])
 def test_a_modulator_that_settles_is_found(

@@ -65,6 +65,7 @@ def within(found: dict[str, float], errors: dict[str, float], truth: dict[str, f
     return all(abs(found[name] - value) < 3 * errors[name] for name, value in truth.items())
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("case", CASES)
 def test_its_parameters_follow_from_its_forward_model(
     case: str, run_with: Callable[[str], Path]

@@ -43,6 +43,7 @@ BUMP = {"share": 0.0, "slope_per_px": [0.0, 0.0], "bump": 0.04, "bump_centre_px"
         "bump_radius_px": 18.0}  # fmt: skip
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("bump", [0.04, 0.004])
 def test_a_bump_is_found(acquired: Callable[..., Evidence], bump: float) -> None:
     """But for what two beams can make: a quadratic surface in the logarithm."""

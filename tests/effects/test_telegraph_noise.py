@@ -59,6 +59,7 @@ def test_it_belongs_to_the_pixels_of_the_chip(make_effect_bench: Callable[..., B
     assert np.array_equal(lively[0][50:97, 80:133], lively[1])
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "truth",
     [

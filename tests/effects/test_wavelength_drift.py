@@ -89,7 +89,8 @@ def test_a_walk_is_found(acquired: Acquired) -> None:
     assert found.significance > 5
 
 
-@pytest.mark.parametrize(("hop", "rate"), [(3e-5, 400.0), (6e-5, 250.0), (3e-4, 250.0)])
+@pytest.mark.quick(1)
+@pytest.mark.parametrize(("hop", "rate"), [(3e-4, 250.0), (3e-5, 400.0), (6e-5, 250.0)])
 def test_hops_are_found(acquired: Acquired, hop: float, rate: float) -> None:
     found = WavelengthDrift.estimate(acquired(None, drift(hop=hop, hops_per_h=rate)))
     assert found is not None

@@ -59,6 +59,7 @@ def test_deviations_by_chance_are_as_rare_as_they_are_called() -> None:
     assert kstest(chance, "uniform").pvalue > 1e-3
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("alike", [0.0, 0.6, 0.95, 1.0])
 def test_the_chance_of_a_curve_is_uniform_however_alike_its_values_are(alike: float) -> None:
     def curves(rng: np.random.Generator) -> dict[Key, Curve]:

@@ -90,6 +90,7 @@ WHITE_CASES: dict[str, tuple[int, int, dict[str, Any]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("name", WHITE_CASES)
 def test_white_noise_is_found_white(name: str) -> None:
     n, pixels, options = WHITE_CASES[name]

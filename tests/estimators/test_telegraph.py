@@ -27,6 +27,7 @@ def jumping(
     return series
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("amplitude", "switching_s"), [(1.0, 0.8), (1.5, 0.8), (3.0, 0.4), (10.0, 1.5)]
 )

@@ -68,6 +68,7 @@ def axes_titled(figure: Figure, word: str) -> list[Any]:
     return [axes for axes in figure.axes if word in axes.get_title()]
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "view",
     [

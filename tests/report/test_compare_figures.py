@@ -54,6 +54,7 @@ def a_view(*components: ComponentView) -> PairView:
     return PairView((1, 2), ("monday", "tuesday"), components or (a_component(),))
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "view",
     [

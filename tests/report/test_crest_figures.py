@@ -45,6 +45,7 @@ def picture(view: CrestView) -> Image.Image:
     return opened.convert("RGB")
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "view",
     [

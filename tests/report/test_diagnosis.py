@@ -474,6 +474,7 @@ def picture(figure: Any) -> Any:
     return np.asarray(Image.open(io.BytesIO(png(figure))).convert("RGB"))
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize(
     "changes",
     [

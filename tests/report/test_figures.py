@@ -24,7 +24,7 @@ from pixcal.report.summary import (
     summarise_flags,
 )
 
-SIZES = [(67, 131), (131, 67), (1, 1), (2, 300), (900, 7), (450, 500), (3, 1700)]
+SIZES = [(67, 131), (1, 1), (131, 67), (2, 300), (900, 7), (450, 500), (3, 1700)]
 
 
 def a_map(shape: tuple[int, int], level: float = 0.0, spread: float = 4e-3) -> MapSummary:
@@ -49,6 +49,7 @@ def colours_of(panel: map_panels.Panel) -> set[Any]:
     return {c for _, c in picture_of(panel).getcolors(1 << 24) or ()}
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("shape", SIZES)
 def test_maps_of_any_size_become_pictures(shape: tuple[int, int]) -> None:
     delta, sigma = a_map(shape), a_map(shape, 4e-4, 1e-5)
@@ -155,6 +156,7 @@ def a_set(frames: int, *, moving: bool) -> SetContents:
     return SetContents("name", facts, level, a_map((40, 50), 0.9, 1e-3), chi2, flags, series)
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("frames", [1, 2, 97, 20_001])
 @pytest.mark.parametrize("moving", [False, True])
 def test_runs_of_any_length_become_pictures(frames: int, moving: bool) -> None:

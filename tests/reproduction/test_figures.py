@@ -91,6 +91,7 @@ def test_figure_5_bends_by_the_next_order(laboratory: Lab) -> None:
         np.testing.assert_allclose(edge.bend, edge.expected, rtol=0.01)
 
 
+@pytest.mark.long
 def test_figure_9_lies_on_the_bound(laboratory: Lab) -> None:
     bench = resized(laboratory.bench("figure-09"), side=44, frames=200)
     scene = laboratory.scene("scene", bench)
@@ -123,6 +124,7 @@ def test_figure_10_has_no_systematics(laboratory: Lab) -> None:
     assert found.phi_error.std() == pytest.approx(found.phi_bound, rel=0.25)
 
 
+@pytest.mark.long
 def test_figure_11_falls_with_the_root_of_the_frames(laboratory: Lab) -> None:
     bench = resized(laboratory.bench("figure-11"), side=32, frames=1200)
     scene = laboratory.scene("scene", in_files_of(bench, 100))
@@ -180,6 +182,7 @@ def test_fringes_that_are_left_are_measured() -> None:
     assert figure_14.fringes_left(smooth, (0.7, 0.0)) < 1e-4
 
 
+@pytest.mark.long
 def test_figure_16_finds_the_fibres(laboratory: Lab) -> None:
     bench = laboratory.bench("figure-16")
     detector = replace(bench.detector, shape=(500, 700), chip=(500, 700))

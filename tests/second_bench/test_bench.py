@@ -145,6 +145,7 @@ def test_moving_borders_make_no_charge_and_widen_a_bright_spot(case: str) -> Non
     assert min(after[15, 20], after[17, 20], after[16, 19], after[16, 21]) > 1e3
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize("case", ["lag/linear", "lag/exponentials", "lag/traps"])
 def test_what_a_frame_leaves_behind_comes_later(case: str) -> None:
     bench = made(case, strength=1.0)

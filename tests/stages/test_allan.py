@@ -163,6 +163,7 @@ def test_the_main_curve_of_a_region(tmp_path: Path) -> None:
     assert [same[key] for key in PER_LENGTH] == [found[key] for key in PER_LENGTH]
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("chunks", [(5, 7), (4, 32), (23, 31)])
 def test_results_do_not_depend_on_the_tiling(tmp_path: Path, chunks: tuple[int, int]) -> None:
     maps = noise()

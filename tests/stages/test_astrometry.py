@@ -367,6 +367,7 @@ def test_a_part_of_the_detector_is_a_part_of_the_whole(case: Path) -> None:
     assert np.all(other.true != whole.true[:, :10, :10])
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "runtime", [Runtime("threads", workers=3), Runtime("processes", workers=2)]
 )

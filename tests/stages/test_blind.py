@@ -545,6 +545,7 @@ KERNEL = drawn("ipc", 0.04)
 WANDERING = drawn("hyperbolic_fringes", 60.0)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("truth", "named", "before"),
     [

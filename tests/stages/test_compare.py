@@ -410,6 +410,7 @@ def test_masked_pixels_of_either_side_do_not_count(make: Any, tmp_path: Path) ->
     assert facts["rows"]["worst"]["at"] != 5
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "runtime", [Runtime("threads", workers=3), Runtime("processes", workers=2)]
 )

@@ -153,6 +153,7 @@ def test_what_the_fit_wrote_is_untouched(coupled):
     assert left == {"delta_x_corrected.fits", "delta_y_corrected.fits", "correction.json"}
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("runtime", [Runtime("threads", workers=2), Runtime("processes", 2)])
 def test_the_same_bits_however_it_runs(coupled, tmp_path, runtime):
     _, run, *_ = coupled

@@ -127,6 +127,7 @@ def test_what_is_on_the_disk(fitted: Path) -> None:
     assert read_json(fitted / "crests" / "crests.json")["schema"] == "pixcal/crests/1"
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "runtime", [Runtime("threads", workers=3), Runtime("processes", workers=2)]
 )

@@ -7,6 +7,7 @@ from pixcal.effects.quantisation import Quantisation
 from pixcal.estimators.diagnosis.gap import flagged
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize(
     "detector",
     [

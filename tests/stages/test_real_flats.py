@@ -170,6 +170,7 @@ def test_a_curve_that_all_pixels_share_is_no_defect(tmp_path: Path) -> None:
     assert any("straight line over exposure time" in warning for warning in report["warnings"])
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("gain", [1.0, 1.06])
 @pytest.mark.parametrize("quadratic", [0.0, -0.02])
 def test_gain_is_told_by_noise_and_response_by_levels(gain: float, quadratic: float) -> None:

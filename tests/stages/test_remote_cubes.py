@@ -342,6 +342,7 @@ def shell(*args: str, **env: str | None) -> subprocess.CompletedProcess[str]:
 NO_CREDENTIALS = {"AWS_ACCESS_KEY_ID": None, "AWS_SECRET_ACCESS_KEY": None}
 
 
+@pytest.mark.quick(2)
 @pytest.mark.parametrize(
     ("place", "env", "says"),
     [
