@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.random.bit_generator import ISeedSequence
 from numpy.typing import NDArray
 
 Float32 = NDArray[np.float32]
@@ -51,15 +50,15 @@ class Stream(IntEnum):
 
 def generator(seed: int, stream: Stream, *key: int) -> np.random.Generator:
     """The random generator of one purpose and place; the same whoever asks, in whatever order."""
-    seeded = np.random.PCG64(_Seed.of(seed, int(stream), *key))  # type: ignore[arg-type]
-    return np.random.Generator(seeded)
+    return np.random.Generator(np.random.PCG64(_Seed.of(seed, int(stream), *key)))
 
 
-class _Seed(ISeedSequence):
+class _Seed(np.random.SeedSequence):
     """Seed of a generator. Mixing it takes as long as some thousand normals: it is kept."""
 
     def __init__(self, seed: int, *key: int) -> None:
-        self.words = np.random.SeedSequence(seed, spawn_key=key).generate_state(4, np.uint64)
+        super().__init__(seed, spawn_key=key)
+        self.words = super().generate_state(4, np.uint64)
 
     @classmethod
     @lru_cache(maxsize=4096)
@@ -67,6 +66,7 @@ class _Seed(ISeedSequence):
         return cls(seed, *key)
 
     def generate_state(self, n_words: int, dtype: Any = np.uint32) -> Any:
+        """The words that PCG64 asks for, always four of 64 bits."""
         return self.words
 
 

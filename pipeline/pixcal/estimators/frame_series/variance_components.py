@@ -171,8 +171,7 @@ class _State:
         inverse = np.linalg.inv(root)
         self.weight = np.einsum("nba,nbc->nac", inverse, inverse)
         self.weighted = np.einsum("nab,nbp->nap", self.weight, modes.known)
-        shapes = modes.known.shape[-1]
-        normal = modes.known.reshape(-1, shapes).T @ self.weighted.reshape(-1, shapes)
+        normal = np.tensordot(modes.known, self.weighted, axes=((0, 1), (0, 1)))
         self.spread = inverse_normal(normal)
         self.beta = self.spread @ np.einsum("nap,na->p", self.weighted, modes.values)
         rest = modes.values - np.einsum("nap,p->na", modes.known, self.beta)
