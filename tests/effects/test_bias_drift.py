@@ -277,6 +277,19 @@ def test_a_walk_of_the_fringe_runs_alone_is_found(acquired: Callable[..., Eviden
     assert {track.set for track in again.tracks} == set(evidence.fringes)
 
 
+def test_a_ramp_that_begins_anew_with_each_run_is_found(
+    acquired: Callable[..., Evidence],
+) -> None:
+    found = BiasDrift.estimate(acquired(None, {"bias_drift": RUN | {"run_ramp_e_h": -4000.0}}))
+    assert found is not None
+    assert isinstance(found.effect, BiasDrift)
+    assert found.law == "ramp of each run of fringes"
+    assert found.significance > 8
+    error = found.errors["run_ramp_e_h"]
+    assert error < 800
+    assert abs(found.effect.run_ramp_e_h + 4000) < 4 * error
+
+
 @pytest.mark.parametrize("other", ["intensity_noise", "contrast_noise"])
 def test_light_that_changes_is_no_drift_of_the_runs(
     acquired: Callable[..., Evidence], other: str
@@ -301,7 +314,9 @@ def test_a_track_takes_the_place_of_the_laws_in_its_run_alone(
     make_effect_bench: Callable[..., Bench],
 ) -> None:
     bench = make_effect_bench({"detector.shape": [20, 24]})
-    law = BiasDrift(**RUN | {"ramp_e_h": 1e4, "walk_e_h": 300.0, "run_walk_e_h": 300.0})
+    law = BiasDrift(
+        **RUN | {"ramp_e_h": 1e4, "walk_e_h": 300.0, "run_walk_e_h": 300.0, "run_ramp_e_h": 1e4}
+    )
     both = replace(law, tracks=(Track("vertical", (0.0,), (50.0,)),))
     for r in recordings(bench):
         plain, by_law, on = (frames_of(bench, r, e) for e in ((), (law,), (both,)))

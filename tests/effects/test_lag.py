@@ -105,9 +105,10 @@ def test_noise_is_drawn_once_for_a_frame_wherever_one_begins(
 
 
 FULL = Lag(0.03, 0.0, 0.0, (2.0, 1.2, 0.8, 0.3), 40_000.0, (0.6, 0.3, 0.1))
+TRAPS = Lag(0.03, 1.5, 0.0, capacity_e=900.0)
 
 
-@pytest.mark.parametrize("lag", [Lag(0.02, 0.0, 0.0), Lag(0.05, 1.5, 0.0), FULL])
+@pytest.mark.parametrize("lag", [Lag(0.02, 0.0, 0.0), Lag(0.05, 1.5, 0.0), FULL, TRAPS])
 def test_frames_are_restored(make_effect_bench: Callable[..., Bench], lag: Lag) -> None:
     bench = quiet(make_effect_bench(SMALL))
     fringes = of_kind(bench, "fringes")
@@ -216,3 +217,36 @@ def test_traps_that_fill_up_are_measured_without_their_law(
     assert even is not None
     assert isinstance(even.effect, Lag)
     assert even.effect.bands == even.effect.later == ()
+
+
+def test_traps_take_no_more_than_they_have_room_for(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    """Under steady light full traps take what they gave back; after it all comes out."""
+    lag = Lag(0.03, 1.5, 0.0, capacity_e=500.0)
+    charge = np.zeros((40, 1, 1), np.float32)
+    charge[:20] = 40_000
+    lost, released = lag.lost(charge)
+    assert lost[0, 0, 0] == pytest.approx(500)
+    np.testing.assert_allclose(lost[1:20], 0, atol=1e-3)
+    np.testing.assert_allclose(released[1:20], 500 * (1 - np.exp(-1 / 1.5)), rtol=1e-5)
+    assert lost.sum() == pytest.approx(0, abs=0.1)
+    # Faint light never fills them.
+    faint = np.full((40, 1, 1), 1000, np.float32)
+    unlimited = replace(lag, capacity_e=1e7)
+    np.testing.assert_allclose(lag.lost(faint)[0], unlimited.lost(faint)[0], rtol=1e-5)
+
+
+@pytest.mark.long
+def test_traps_that_have_a_capacity_are_found(acquired: Callable[..., Evidence]) -> None:
+    truth = Lag(0.01, 1.5, 0.0, capacity_e=250.0)
+    given = {"share": 0.01, "decay_frames": 1.5, "spread": 0.0, "capacity_e": 250.0}
+    found = Lag.estimate(acquired(None, {"lag": given}))
+    assert found is not None
+    lag = found.effect
+    assert isinstance(lag, Lag)
+    assert lag.capacity_e == pytest.approx(250, rel=0.1)
+    rng = np.random.default_rng(5)
+    charge = rng.uniform(0, 45e3, (30, 200, 1)).astype(np.float32)
+    wanted, got = truth.lost(charge)[0], lag.lost(charge)[0]
+    assert np.sqrt(np.mean((got - wanted) ** 2)) < 0.05 * np.sqrt(np.mean(wanted**2))

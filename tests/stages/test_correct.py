@@ -20,7 +20,7 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages import correct, fit
-from pixcal.stages.correct.gain import repeating
+from pixcal.stages.correct.gain import repeating, worsened
 from pixcal.stages.correct.restored_set import RestoredSet
 from pixcal.stages.correct.swept import undone
 from pixcal.stages.correct.uncertainty import moved
@@ -467,3 +467,26 @@ def test_from_python(coupled, tmp_path):
     (again / "products" / "correction.json").unlink()
     pixcal.fit(again, with_diagnosis=True, runtime=SYNC)
     assert (again / "products" / "correction.json").exists()
+
+
+def _pattern(before: float, after: float) -> dict[str, float]:
+    return {"period_px": 4, "before_px": before, "after_px": after, "chance_px": 1e-4}
+
+
+def test_a_correction_that_leaves_a_larger_pattern_is_refused() -> None:
+    good = {"pixels": 10_000, "rows": _pattern(3e-3, 1e-4), "columns": _pattern(1e-4, 2e-4)}
+    assert worsened({"vertical": good}, []) == ""
+    assert worsened({"vertical": good | {"rows": None}}, []) == ""
+    bad = good | {"columns": _pattern(1e-4, 1e-3)}
+    assert "pattern of columns grows" in worsened({"vertical": good, "horizontal": bad}, [])
+
+
+def test_a_correction_that_moves_sets_apart_is_refused() -> None:
+    sets = {n: {"pixels": 10_000, "rows": None, "columns": None} for n in ("short", "long")}
+    pair = {
+        "sets": ["short", "long"], "before_px": 1.2e-3, "before_expected_px": 1e-3,
+        "after_px": 1.0e-3, "after_expected_px": 1e-3,
+    }  # fmt: skip
+    assert worsened(sets, [pair]) == ""
+    assert worsened(sets, [pair | {"after_px": 1.21e-3}]) == ""
+    assert "apart" in worsened(sets, [pair | {"after_px": 1.3e-3}])

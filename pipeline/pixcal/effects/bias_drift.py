@@ -53,9 +53,9 @@ class BiasDrift(Effect):
     """A constant added to all pixels of a frame; time runs from the acquisition's first frame.
 
     Slow changes are those of the temperature: a ramp, a settling after power-on, a random walk that
-    goes on through all frames, or one that begins anew with each run of fringes, when the readout
-    settles to its pace. ``tracks`` are offsets of fringe runs as
-    measured, in place of the laws.
+    goes on through all frames. A ramp or walk may also begin anew with each run of fringes, when
+    the readout settles to its pace. ``tracks`` are offsets of fringe runs as measured, in place of
+    the laws.
     The fit takes up by B, the intensity of a frame, as much of an offset as looks like light; the
     rest is pattern, where the light is uneven or samples were divided by a flat. Maps alone do not
     tell: the fit's mean intensity hides a constant offset, and nothing else is constant in time.
@@ -66,7 +66,8 @@ class BiasDrift(Effect):
     acts_at = Stage.READOUT
     order = 3
     domains = ("time", "noise")
-    strengths = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e", "run_walk_e_h", "tracks")
+    strengths = ("jitter_rms", "ramp_e_h", "walk_e_h", "settle_e", "run_walk_e_h",
+                 "run_ramp_e_h", "tracks")  # fmt: skip
     absorbed_because = "the free intensity of each frame absorbs a level common to all pixels"
     frames_needed = ("dark",)
     sources = (
@@ -85,6 +86,9 @@ class BiasDrift(Effect):
     settle_s: float = quantity(600.0, unit="s", above=0, high=1e7, doc="time constant of the decay")
     run_walk_e_h: float = quantity(
         0.0, unit="e-/h^0.5", low=0, high=1e6, doc="random walk that begins with each fringe run"
+    )
+    run_ramp_e_h: float = quantity(
+        0.0, unit="e-/h", low=-1e6, high=1e6, doc="steady change that begins with each fringe run"
     )
     tracks: tuple[Track, ...] = quantity((), unit="e-", doc="offsets of fringe runs as measured")
 
@@ -121,6 +125,7 @@ class BiasDrift(Effect):
         if any(track.set == name for track in self.tracks):
             return float(at(self.tracks, name, time)) + self.jitter_rms * rng.standard_normal()
         offset = self.offset(shot.time_s, shot.bench.seed, rng)
+        offset += self.run_ramp_e_h * time / HOUR_S
         if self.run_walk_e_h:
 
             def normal(level: int, place: int) -> float:
@@ -160,22 +165,34 @@ class BiasDrift(Effect):
 
     @classmethod
     def _in_runs(cls, evidence: Evidence) -> Estimate | None:
-        """A walk of each run of fringes by itself, from B and A of its frames."""
+        """A walk or ramp of each run of fringes by itself, from B and A of its frames."""
         light = light_of(evidence)
         if light is None:
             return None
         light = replace(light, dark=())
-        modes, at = light.modes(LIGHT_PARTS), LIGHT_PARTS.index("offset_walk")
-        there, none = estimate_components(modes), estimate_components(modes, absent=(at - 1, at))
-        walk, error = there.root(at)
+        at = LIGHT_PARTS.index("offset_walk")
+
+        def found(ramp: bool) -> tuple[Components, Components]:
+            modes = light.modes(LIGHT_PARTS, ramp)
+            return estimate_components(modes), estimate_components(modes, absent=(at - 1, at))
+
+        (there, none), (sloped, _) = found(False), found(True)
         chance = joint_log_chance(there, none, there.size[-2:])
+        # What both explain is given to the walk, which allows for more.
+        rise = max(sloped.profile - there.profile, 0.0)
+        law, ramp, ramp_error = "random walk", 0.0, 0.0
+        if np.sqrt(2 * rise) > STEADY:
+            law, there = "ramp", sloped
+            ramp = float(there.beta[0]) * HOUR_S
+            ramp_error = float(np.sqrt(there.shape_covariance((at,))[0, 0])) * HOUR_S
+        walk, error = there.root(at)
         per_hour = float(np.sqrt(HOUR_S))
         return Estimate(
-            cls(0.0, 0.0, 0.0, 0.0, run_walk_e_h=min(walk * per_hour, 1e6)),
-            {"run_walk_e_h": error * per_hour},
-            sigmas(chance),
+            cls(0.0, 0.0, 0.0, 0.0, run_walk_e_h=min(walk * per_hour, 1e6), run_ramp_e_h=ramp),
+            {"run_walk_e_h": error * per_hour, "run_ramp_e_h": ramp_error},
+            sigmas(log_chance_of_any([chance, log_chance(rise)])),
             "the mean level changes from frame to frame while the fringe amplitude does not",
-            law="random walk of each run of fringes",
+            law=f"{law} of each run of fringes",
         )
 
     @classmethod

@@ -1,7 +1,7 @@
 """Charge that stays behind in the pixel and comes out with later frames."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from pixcal.estimators.detector.flat_ladder import flicker
-from pixcal.estimators.detector.levels_of_lag import BANDS, in_bands, shares_by_level
 from pixcal.estimators.detector.noiseless_charge import missing_noise
+from pixcal.estimators.detector.traps import BANDS, LossFit, in_bands
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
-from pixcal.estimators.diagnosis.middle import middle
+from pixcal.estimators.diagnosis.middle import MOST, middle
+from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
-from pixcal.kernels.transfer import left_behind
+from pixcal.kernels.transfer import fill_traps, left_behind
 from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
@@ -40,6 +41,10 @@ _CLEAR = 4.0
 # chi-squares from which releases, or the level, are taken as they come
 _NOT_EXPONENTIAL, _NOT_EVEN = 40.0, 25.0
 _TURNS = 3  # of the inverse: each gains a factor of the share
+# trials for traps that fill up: what they keep from frame to frame, and hold at most, over what
+# they would take of full scale
+_KEEPS, _ROOMS = (0.3, 0.6), (0.1, 0.2, 0.4, 0.7)
+_STEPS = 12  # of all parameters of such traps
 
 
 @dataclass(frozen=True)
@@ -47,8 +52,9 @@ class Lag(Effect):
     """Incomplete transfer: each electron stays behind with a chance of ``share``.
 
     It comes out with the next frame, or over several. No charge is lost, and before the first frame
-    of a recording the pixels were dark and empty. Traps that fill up take another share of each
-    band of the level.
+    of a recording the pixels were dark and empty. A barrier may hold back another share of each
+    band of the level; traps take charge as long as they have room (`capacity_e`), so that what they
+    hold of earlier frames limits what they take.
 
     A fit of the fringes takes up what all pixels have in common: the frame before is a sum of the
     same maps, so every frame only gets another amplitude and phase. So maps show nothing of it;
@@ -100,24 +106,35 @@ class Lag(Effect):
     quiet: float = quantity(
         0.0, low=0, high=1, doc="part of what comes out that has no shot noise of its own"
     )
+    capacity_e: float = quantity(
+        0.0, unit="e-", low=0, high=1e7, doc="that a pixel holds back at most, of all frames; it "
+        "comes out as decay_frames says; 0: no limit"
+    )  # fmt: skip
 
     @property
     def releases(self) -> F64:
         """Share of what stayed behind that comes out 1, 2, ... frames later; their sum is one."""
-        if sum(self.later) > 0:
+        if sum(self.later) > 0 and not self.capacity_e:
             return np.array(self.later) / sum(self.later)
         if not self.decay_frames:
             return np.ones(1)
-        keep = np.exp(-1 / self.decay_frames)
+        keep = self._keep
         count = int(np.ceil(np.log(TAIL) / np.log(keep)))
-        releases: F64 = (1 - keep) * keep ** np.arange(count)
+        releases = (1 - keep) * keep ** np.arange(count, dtype=float)
         return np.asarray(releases / releases.sum())
 
     @property
     def frames_back(self) -> int:
         return len(self.releases)
 
+    @property
+    def _keep(self) -> float:
+        """Part of what is held that stays for another frame."""
+        return float(np.exp(-1 / self.decay_frames)) if self.decay_frames else 0.0
+
     def charge(self, charge: F32, shot: Shot) -> F32:
+        if self.capacity_e:
+            return self._with_traps(charge, shot)
         found = charge - self._left_behind(charge, shot, shot.frame)
         for back, release in enumerate(self.releases, start=1):
             before = shot.charge(shot.frame - back)
@@ -126,6 +143,51 @@ class Lag(Effect):
             stayed = self._left_behind(before, shot, shot.frame - back, 1 - self.quiet)
             found += np.float32(release) * stayed
         return found
+
+    def _with_traps(self, charge: F32, shot: Shot) -> F32:
+        """A frame without what traps take of it, and with what they give back of earlier ones."""
+        scale = _shares(self, shot.bench.detector, shot.rows) / np.float32(self.share)
+        held = np.zeros_like(charge)
+        for back in range(self.frames_back, 0, -1):
+            before = shot.charge(shot.frame - back)
+            if before is not None:
+                held = self._held(held, before, scale)
+        left = np.float32(self._keep) * held
+        after = self._held(held, charge, scale)
+        found = charge + (held - after)
+        if shot.bench.shot_noise:
+            noisy = after - left + np.float32(1 - self.quiet) * (held - left)
+            found += np.sqrt(np.maximum(noisy, 0)) * shot.normals(self.name)
+        return np.asarray(found)
+
+    def _held(self, held: F32, charge: F32, scale: F32) -> F32:
+        """Mean of what traps hold after a frame, e-."""
+        full = np.float32(self._keep) * held + scale * self._left(np.maximum(charge, 0))
+        return np.asarray(np.minimum(full, scale * np.float32(self.capacity_e)))
+
+    def lost(self, charge: F32) -> tuple[F32, F32]:
+        """Mean net loss of frames, and what comes out with them of what was left of earlier ones.
+
+        Parameters
+        ----------
+        charge : (t, ...) float32
+            e-, in the order of time without gaps; the first one after darkness.
+
+        Returns
+        -------
+        lost, released : (t, ...) float32
+            e-.
+        """
+        taken = self._left(charge)
+        released = np.zeros_like(taken)
+        if self.capacity_e:
+            lost = np.empty_like(taken)
+            flat = [part.reshape(len(charge), -1) for part in (taken, lost, released)]
+            fill_traps(flat[0], self._keep, self.capacity_e, *flat[1:])
+            return lost, released
+        for back, release in enumerate(self.releases, start=1):
+            released[back:] += np.float32(release) * taken[:-back]
+        return taken - released, released
 
     def _left_behind(self, charge: F32, shot: Shot, frame: int, noisy: float = 1.0) -> F32:
         """Electrons of a frame that stay: each by its own chance, so that noise stays white."""
@@ -161,15 +223,20 @@ class Lag(Effect):
         (t, y, x) float32
             e-; the scatter of the share from pixel to pixel is left.
         """
+        if not self.bands and not self.capacity_e:
+            return self._restored_exactly(frames)
+        found = frames
+        for _ in range(_TURNS + 1):
+            found = frames + self.lost(found)[0]
+        return found
+
+    def _restored_exactly(self, frames: F32) -> F32:
         found = np.empty_like(frames)
         for n, frame in enumerate(frames):
             late = np.zeros_like(frame)
             for back, release in enumerate(self.releases[:n], start=1):
                 late += np.float32(release) * self._left(found[n - back])
-            share = np.float32(self.share)
-            found[n] = (frame - late) / (1 - share)
-            for _ in range(_TURNS if self.bands else 0):
-                found[n] = (frame - late + self._left(found[n]) - share * found[n]) / (1 - share)
+            found[n] = (frame - late) / np.float32(1 - self.share)
         return found
 
     @classmethod
@@ -208,16 +275,21 @@ class Lag(Effect):
             size = max(rms, np.sqrt(uneven_error) / (1 - keep))
             spread_error = uneven_error / (1 - keep) ** 2 / (2 * size)
             spread_error = float(np.hypot(spread_error, spread * share_error) / share)
-        bands, of_bands = _by_level(
-            part, cls(share, found.decay_frames, later=later, level_e=level_e), sigmas
-        )
-        whole = cls(share, found.decay_frames, 0.0, bands, level_e, later)
+        whole = cls(share, found.decay_frames, 0.0, (), level_e, later)
+        of_level: dict[str, float] = {}
+        if sigmas > _CLEAR:
+            whole, of_level = _by_level(part, whole)
         quiet, quiet_error = _quiet(part, whole) if sigmas > _CLEAR else (0.0, 1.0)
         decay = -1 / np.log(keep) if keep else 0.0
         decay_error = keep_error * decay**2 / keep if keep else -1 / np.log(min(keep_error, 0.9))
         return Estimate(
-            cls(
-                share, min(float(decay), _MAX_DECAY), min(spread, 1.0), bands, level_e, later, quiet
+            replace(
+                whole,
+                decay_frames=whole.decay_frames
+                if whole.capacity_e
+                else min(float(decay), _MAX_DECAY),
+                spread=min(spread, 1.0),
+                quiet=quiet,
             ),
             {
                 "share": share_error,
@@ -225,7 +297,7 @@ class Lag(Effect):
                 "spread": min(spread_error, 1.0),
                 "quiet": quiet_error,
             }
-            | of_bands,
+            | of_level,
             sigmas_of_best(sigmas, uneven / uneven_error),
             "the contrast falls with the step of the phase since the frame before"
             + (", and pixels keep it unevenly" if uneven > _CLEAR * uneven_error else ""),
@@ -346,30 +418,64 @@ def _freely(
     return total, float(np.sqrt(covariance.sum())), tuple(map(float, kept / total))
 
 
-def _by_level(
-    evidence: Evidence, lag: Lag, sigmas: float
-) -> tuple[tuple[float, ...], dict[str, float]]:
-    """Share in bands of the level over the mean one, with errors, where it is not the same."""
-    if sigmas < _CLEAR:
-        return (), {}
-    shares, covariance, against = shares_by_level(
-        evidence, lag.share, lag.releases[:LAGS], lag.level_e
+def _by_level(evidence: Evidence, lag: Lag) -> tuple[Lag, dict[str, float]]:
+    """The lag with what it does at each level, and errors of that, where it is not the same at all.
+
+    Either a share of each band of the level stays, whatever stayed before, or traps fill up.
+    """
+    fit = LossFit(middle(evidence, MOST // 2), lag.level_e)
+
+    def banded(shares: F64, charge: F32) -> F32:
+        return _banded(lag, shares).lost(charge)[0]
+
+    even = np.full(len(BANDS), lag.share)
+    fit.weigh(banded, even)
+    found = fit.fit(banded, even, 2)
+    errors = np.sqrt(np.diag(found.covariance))
+    away = found.value - even
+    if float(away @ inverse_normal(found.covariance) @ away) < _NOT_EVEN:
+        return lag, {}
+
+    def trapped(values: F64, charge: F32) -> F32:
+        return _trapped(lag, values).lost(charge)[0]
+
+    full = lag.share * lag.level_e
+    starts = [(*even, keep, room * full) for keep in _KEEPS for room in _ROOMS]
+    best = min(starts, key=lambda start: fit.chi2(trapped, start))
+    traps = fit.fit(trapped, best, _STEPS // 2)
+    fit.weigh(trapped, traps.value)
+    traps = fit.fit(trapped, traps.value, _STEPS)
+    if traps.chi2 > fit.chi2(banded, found.value) - _NOT_EVEN:
+        relative = {f"bands[{n}]": float(e / lag.share) for n, e in enumerate(errors)}
+        return _banded(lag, found.value), relative
+    errors = np.sqrt(np.diag(traps.covariance))
+    of_traps = _trapped(lag, traps.value)
+    scale = (*(1 / of_traps.share for _ in BANDS), of_traps.decay_frames**2 / of_traps._keep, 1)
+    names = (*(f"bands[{n}]" for n in range(len(BANDS))), "decay_frames", "capacity_e")
+    return of_traps, {n: float(e * s) for n, e, s in zip(names, errors, scale, strict=True)}
+
+
+def _banded(lag: Lag, shares: F64) -> Lag:
+    """The lag with a share of each band of the level."""
+    return replace(lag, bands=tuple(float(v) for v in np.clip(shares / lag.share, 0, 100)))
+
+
+def _trapped(lag: Lag, values: F64) -> Lag:
+    """Traps that take shares of the bands of the level, keep a part, and hold so much at most."""
+    *shares, keep, most = values
+    decay = -1 / np.log(np.clip(keep, 1e-3, np.exp(-1 / _MAX_DECAY)))
+    share = float(np.mean(np.maximum(shares, 0)))
+    traps = replace(
+        lag, share=min(share, 0.5), decay_frames=float(decay), capacity_e=float(most), later=()
     )
-    if against < _NOT_EVEN:
-        return (), {}
-    errors = np.sqrt(np.diag(covariance)) / lag.share
-    bands = tuple(float(v) for v in np.clip(shares / lag.share, 0, 100))
-    return bands, {f"bands[{n}]": float(e) for n, e in enumerate(errors)}
+    return _banded(traps, np.array(shares))
 
 
 def _quiet(evidence: Evidence, lag: Lag) -> tuple[float, float]:
     """Part of what comes out that has no shot noise, and its error; zero unless it shows."""
 
     def comes_out(_: FringeEvidence, signal: F32) -> F32:
-        stayed, late = lag._left(signal), np.zeros_like(signal)
-        for back, release in enumerate(lag.releases, start=1):
-            late[back:] += np.float32(release) * stayed[:-back]
-        return late
+        return lag.lost(signal)[1]
 
     part, error = missing_noise(evidence, comes_out)
     return float(np.clip(part, 0, 1)) if part > _CLEAR * error else 0.0, min(error, 1.0)

@@ -37,3 +37,34 @@ def left_behind(charge: F32, share: F32, begins: F32, weights: F32, normal: F32,
             mean = share[y, x] * told
             scatter = np.sqrt(max(mean * (one - share[y, x]), zero))
             out[y, x] = min(max(mean + scatter * normal[y, x], zero), max(charge[y, x], zero))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def fill_traps(taken: F32, keep: float, most: float, lost: F32, released: F32) -> None:
+    """What traps take from each frame and give back, as they fill and empty.
+
+    Of what they hold they keep a part from frame to frame; they take a frame's share of the charge
+    as long as there is room.
+
+    Parameters
+    ----------
+    taken : (t, n) float32
+        Charge that empty traps would take, e-; before the first frame they are empty.
+    keep : float
+        Part of what is held that stays for another frame.
+    most : float
+        That traps hold, e-.
+    lost : (t, n) float32
+        Net loss of each frame, e-.
+    released : (t, n) float32
+        What comes out with each frame, e-.
+    """
+    part, full = np.float32(keep), np.float32(most)
+    held = np.zeros(taken.shape[1], np.float32)
+    for t in range(taken.shape[0]):
+        for n in range(taken.shape[1]):
+            left = part * held[n]
+            after = min(left + taken[t, n], full)
+            lost[t, n] = after - held[n]
+            released[t, n] = held[n] - left
+            held[n] = after

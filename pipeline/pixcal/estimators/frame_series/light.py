@@ -48,16 +48,25 @@ class FrameLight:
     level: dict[str, float]  # mean signal of each set, e-
     line: Line | None = None  # the strongest in B, sure or not
 
-    def modes(self, parts: Sequence[str]) -> Modes:
+    def modes(self, parts: Sequence[str], ramp: bool = False) -> Modes:
         """Cosine modes of all series, with the parts that kinds of change have in them.
 
         ``power``, ``contrast`` or ``offset`` (white), with ``_walk`` (a random walk; 1/s) or
         ``_smooth`` (ramps and settlings: the square of a walk's spectrum); offsets in e-², the
-        others relative.
+        others relative. With ``ramp``, an offset that rises with the time of each series (e-/s) is
+        their known shape.
         """
         return assemble(
-            [*self.sets, *self.dark], lambda s: np.stack([self.part(name, s) for name in parts])
+            [*self.sets, *self.dark],
+            lambda s: np.stack([self.part(name, s) for name in parts]),
+            self._ramp if ramp else None,
         )
+
+    def _ramp(self, series: FrameSeries) -> F64:
+        """Change (t, 2, 1) of the two quantities of a series by an offset of 1 e-/s."""
+        level = self.level.get(series.name)
+        both = np.array([1.0, 0.0]) if level is None else np.array([1.0, -1.0]) / level
+        return np.asarray(series.time_s[:, None, None] * both[:, None])
 
     def part(self, name: str, series: FrameSeries) -> F64:
         """Covariance (t - 1, 2, 2) of the modes of a series for a unit of a kind of change."""

@@ -24,6 +24,7 @@ F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 PERIOD = 4  # rows or columns after which patterns repeat (paper, section 5.1: period of four rows)
+WORSE = 4.0  # errors from which a pattern, or a disagreement of sets, is larger than before
 ALIGNED = 0.985  # cosine between the axes of sets that see the same offsets (10 degrees)
 
 
@@ -107,6 +108,41 @@ def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
         for n, (a, b, _) in enumerate(maps.pairs)
     ]
     return {"sets": {name: _described(total) for name, total in sets.items()}, "pairs": pairs}
+
+
+def worsened(sets: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> str:
+    """Where the corrected maps are worse than those before; empty where they are not.
+
+    A wrong correction leaves a periodic pattern in a map, or sets apart that see the same offsets.
+
+    Parameters
+    ----------
+    sets, pairs
+        As in ``correction.json``.
+    """
+    for name, facts in sets.items():
+        for lines in ("rows", "columns"):
+            own = facts[lines]
+            if own is None or None in (own["before_px"], own["after_px"]):
+                continue
+            if own["after_px"] > np.hypot(own["before_px"], WORSE * own["chance_px"]):
+                return (
+                    f"in set {name} the pattern of {lines} grows from {own['before_px']:.2g} to "
+                    f"{own['after_px']:.2g} px"
+                )
+    for pair in pairs:
+        excess = {
+            when: pair[f"{when}_px"] ** 2 - pair[f"{when}_expected_px"] ** 2
+            for when in ("before", "after")
+        }
+        pixels = min(sets[name]["pixels"] for name in pair["sets"])
+        chance = pair["after_expected_px"] ** 2 * np.sqrt(2 / max(pixels, 1))
+        if excess["after"] > max(excess["before"], 0.0) + WORSE * chance:
+            return (
+                f"the offsets of {' and '.join(pair['sets'])} are {pair['after_px']:.2g} px apart, "
+                f"{pair['before_px']:.2g} px before"
+            )
+    return ""
 
 
 def _batches(folder: Path) -> int:

@@ -21,7 +21,7 @@ from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Fit
 from pixcal.stages import fit
 from pixcal.stages.correct.again import measured_again
-from pixcal.stages.correct.gain import Maps, measure_gain
+from pixcal.stages.correct.gain import Maps, measure_gain, worsened
 from pixcal.stages.correct.restored_set import RestoredSet
 from pixcal.stages.correct.sides import sides_of
 from pixcal.stages.correct.swept import Swept
@@ -58,8 +58,9 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     Raises
     ------
     InputError
-        If the run was not diagnosed, or not as it is reduced now; if an effect that was found is of
-        the user's own and its file was not given, or undoes what it should not.
+        If the run was not diagnosed, or not as it is reduced now; if the correction makes a map
+        worse, by its periodic patterns or the agreement of sets along one axis; if an effect that
+        was found is of the user's own and its file was not given, or undoes what it should not.
     """
     diagnosed = require(run_dir, "diagnose")
     if diagnosed.inputs["reduce"] != require(run_dir, "reduce").key:
@@ -131,6 +132,11 @@ def _correct(
     }
     if plan.changes:
         result |= _corrected_maps(run_dir, made, plan, acquisition, runtime)
+        if worse := worsened(result["sets"], result["pairs"]):
+            raise InputError(
+                f"{run_dir}: correction refused: {worse}; use the maps as fitted, and record a "
+                "second baseline along each axis to measure the effect better"
+            )
     write_json(made.folder / "correction.json", result)
     made.summary = {"outputs": result["outputs"], "undone": [e.name for e in plan.undone]}
 

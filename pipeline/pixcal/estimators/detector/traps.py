@@ -1,0 +1,205 @@
+"""What stays behind of a frame's charge, from its forward model.
+
+A share that is the same at all levels and does not depend on what stayed before only changes
+amplitude and phase of the frames, which the fit takes up: the contrast of each frame shows it. All
+else leaves harmonics of the phases of these frames in the residuals. Both are fitted at once, by
+Gauss-Newton steps on the loss that a model predicts, beside a bent response of the frame itself.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pixcal.estimators.diagnosis.distortions import Freedom
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.kernels.normal_matrix import inverse_normal
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+BANDS = (0.0, 0.125, 0.25, 0.5)  # where bands of the level begin, over the full scale
+STEP = 0.03  # relative step of a parameter for its derivative
+SLOW = (2, 1)  # powers of the time, and harmonics of the phase, that the contrast is free to have
+UNKNOWN = 6  # first frames, whose past is not known
+CONVERGED = 1.0  # fall in chi-square that a step must bring
+# lengths of a step that are tried: where room is short, samples that fill it change with the step
+LENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25)
+
+
+def in_bands(level: F32, level_e: float) -> list[F32]:
+    """Electrons of a signal in each band; their sum is the signal, where it is positive."""
+    begins = [np.float32(b * level_e) for b in BANDS]
+    ends = [*begins[1:], np.float32(np.inf)]
+    return [np.clip(level, b, e) - b for b, e in zip(begins, ends, strict=True)]
+
+
+@dataclass(frozen=True)
+class FittedLoss:
+    """Parameters of a loss of charge."""
+
+    value: F64  # (p,)
+    covariance: F64  # (p, p), from the noise of samples and of the contrast
+    chi2: float
+
+
+class LossFit:
+    """Fringe frames of an acquisition, ready to be held against losses of charge.
+
+    Parameters
+    ----------
+    evidence : Evidence
+        With fringes.
+    level_e : float
+        Full scale of the bands of the response, e-.
+    """
+
+    def __init__(self, evidence: Evidence, level_e: float) -> None:
+        self._sets = [_Set(evidence, fringes, level_e) for fringes in evidence.fringes.values()]
+
+    def fit(
+        self, lost: Callable[[F64, F32], F32], start: Sequence[float] | F64, rounds: int
+    ) -> FittedLoss:
+        """Gauss-Newton steps of the parameters of a loss.
+
+        Parameters
+        ----------
+        lost : callable
+            Charge (t, n), e-, that frames lose, from the parameters and the charge of the frames.
+        start : (p,) float64
+            Parameters, none of them zero: derivatives are taken by a share of each.
+        rounds : int
+            Steps at most.
+        """
+        value = np.array(start, float)
+        rests = self._rests(lost, value)
+        chi2 = sum(rest.chi2 for rest in rests)
+        for _ in range(rounds + 1):
+            normal, right = self._sums(lost, value, rests)
+            covariance = inverse_normal(normal)[: len(value), : len(value)]
+            step = (inverse_normal(normal) @ right)[: len(value)]
+            gain = 0.0
+            for factor in LENGTHS:
+                # A part of a step that would change the sign is no step of this model.
+                moved = value + factor * step
+                moved = np.where(value * moved > 0, moved, value / 2)
+                tried = self._rests(lost, moved)
+                fall = chi2 - sum(rest.chi2 for rest in tried)
+                if fall <= gain and gain > 0:
+                    break
+                if fall > gain:
+                    best, of_best, gain = moved, tried, fall
+            if gain <= 0:
+                break
+            value, rests, chi2 = best, of_best, chi2 - gain
+            if gain < CONVERGED:
+                break
+        return FittedLoss(value, covariance, chi2)
+
+    def chi2(self, lost: Callable[[F64, F32], F32], value: Sequence[float] | F64) -> float:
+        """Of a loss as it is."""
+        return sum(rest.chi2 for rest in self._rests(lost, np.array(value)))
+
+    def weigh(self, lost: Callable[[F64, F32], F32], value: Sequence[float] | F64) -> None:
+        """Take what a loss leaves of the contrast for its noise."""
+        for one, rest in zip(self._sets, self._rests(lost, np.array(value)), strict=True):
+            one.contrast_error *= 1.4826 * float(np.median(np.abs(rest.contrast[UNKNOWN:])))
+
+    def _rests(self, lost: Callable[[F64, F32], F32], value: F64) -> list["_Rest"]:
+        return [one.rest(lost(value, one.level)) for one in self._sets]
+
+    def _sums(
+        self, lost: Callable[[F64, F32], F32], value: F64, rests: Sequence["_Rest"]
+    ) -> tuple[F64, F64]:
+        """Least-squares sums of a step of the parameters, then of a bent response."""
+        slopes: list[list[_Rest]] = []
+        for n, size in enumerate(value):
+            near = value.copy()
+            near[n] += STEP * size
+            moved = self._rests(lost, near)
+            slopes.append([a.less(b, 1 / (STEP * size)) for a, b in zip(rests, moved, strict=True)])
+        count = len(value) + len(BANDS) - 1
+        normal, right = np.zeros((count, count)), np.zeros(count)
+        for number, (one, rest) in enumerate(zip(self._sets, rests, strict=True)):
+            every = [slope[number] for slope in slopes] + one.bent
+            for i, a in enumerate(every):
+                right[i] += a.dot(rest)
+                for j, b in enumerate(every[: i + 1]):
+                    normal[i, j] += a.dot(b)
+        return np.tril(normal) + np.tril(normal, -1).T, right
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """What is left of residuals (t, n), over their noise, and of the contrast (t,), over its."""
+
+    samples: F32
+    contrast: F64
+
+    @property
+    def chi2(self) -> float:
+        return self.dot(self)
+
+    def dot(self, other: "_Rest") -> float:
+        samples = np.einsum("tn,tn->t", self.samples, other.samples).sum(dtype=float)
+        return float(samples + self.contrast @ other.contrast)
+
+    def less(self, other: "_Rest", scale: float) -> "_Rest":
+        """Difference to another one, scaled."""
+        samples = np.float32(scale) * (self.samples - other.samples)
+        return _Rest(samples, scale * (self.contrast - other.contrast))
+
+
+class _Set:
+    """One fringe set.
+
+    Attributes
+    ----------
+    level : (t, n) float32
+        Charge of the good pixels, e-.
+    contrast_error : float
+        Of a frame's contrast, relative.
+    """
+
+    def __init__(self, evidence: Evidence, fringes: FringeEvidence, level_e: float) -> None:
+        self._freedom = freedom = Freedom(fringes)
+        self._flat = evidence.flat[freedom.good].astype(np.float32)
+        self.level: F32 = freedom.of_good(evidence.level(fringes, np.nan_to_num(fringes.model)))
+        b, c, s = fringes.free[:, :3].T
+        amplitude = np.hypot(c, s)
+        self._to_contrast = np.stack([-1 / b, c / amplitude**2, s / amplitude**2], axis=1)
+        time, phase = np.linspace(-1, 1, len(b)), np.arctan2(s, c)
+        slow = [time**n for n in range(SLOW[0] + 1)]
+        for n in range(1, SLOW[1] + 2):
+            slow += [np.cos(n * phase), np.sin(n * phase)]
+        self._slow = np.linalg.svd(np.stack(slow).T, full_matrices=False)[0]
+        self._contrast = self._without_slow(np.log(amplitude / b))
+        self.contrast_error = 1.4826 * float(np.median(np.abs(self._contrast)))
+        self._residual = freedom.left_over(freedom.of_good(fringes.residual))
+        self._sigma = np.sqrt(freedom.weight)
+        self._sigma[:UNKNOWN] = 0
+        self._bands = in_bands(self.level, level_e)[1:]
+
+    @cached_property
+    def bent(self) -> list["_Rest"]:
+        """What bands of the response leave."""
+        return [self._of_change(part / self._flat) for part in self._bands]
+
+    def rest(self, lost: F32) -> _Rest:
+        """Residuals and contrast without a loss (t, n), e-."""
+        change = self._of_change(-lost / self._flat)
+        samples = self._sigma * self._residual - change.samples
+        return _Rest(samples, self._contrast / self.contrast_error - change.contrast)
+
+    def _of_change(self, change: F32) -> _Rest:
+        left = self._freedom.left_over(change)
+        weighted = self._freedom.weight * change
+        of_frames = weighted @ self._freedom.of_place.T
+        moved = np.einsum("tij,tj->ti", self._freedom.frame_covariance[:, :3], of_frames)
+        contrast = np.einsum("ti,ti->t", self._to_contrast, moved)
+        return _Rest(self._sigma * left, self._without_slow(contrast) / self.contrast_error)
+
+    def _without_slow(self, values: F64) -> F64:
+        return np.asarray(values - self._slow @ (self._slow.T @ values))
