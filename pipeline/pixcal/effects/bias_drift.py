@@ -180,16 +180,17 @@ class BiasDrift(Effect):
         chance = joint_log_chance(there, none, there.size[-2:])
         # What both explain is given to the walk, which allows for more.
         rise = max(sloped.profile - there.profile, 0.0)
-        law, ramp, ramp_error = "random walk", 0.0, 0.0
+        law, ramp, errors = "random walk", 0.0, {}
         if np.sqrt(2 * rise) > STEADY:
             law, there = "ramp", sloped
             ramp = float(there.beta[0]) * HOUR_S
-            ramp_error = float(np.sqrt(there.shape_covariance((at,))[0, 0])) * HOUR_S
+            own = float(np.sqrt(there.shape_covariance((at,))[0, 0]))
+            errors = {"run_ramp_e_h": own * HOUR_S}
         walk, error = there.root(at)
         per_hour = float(np.sqrt(HOUR_S))
         return Estimate(
             cls(0.0, 0.0, 0.0, 0.0, run_walk_e_h=min(walk * per_hour, 1e6), run_ramp_e_h=ramp),
-            {"run_walk_e_h": error * per_hour, "run_ramp_e_h": ramp_error},
+            {"run_walk_e_h": error * per_hour} | errors,
             sigmas(log_chance_of_any([chance, log_chance(rise)])),
             "the mean level changes from frame to frame while the fringe amplitude does not",
             law=f"{law} of each run of fringes",

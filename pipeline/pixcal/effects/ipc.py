@@ -5,7 +5,7 @@ acts on collected charge, shot noise included, so the noise of neighbours become
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.crosstalk.dense import dense_kernel
 from pixcal.estimators.crosstalk.joined import Kernel, measure
-from pixcal.estimators.crosstalk.maps import map_periods
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import (
     Coupling,
@@ -134,7 +133,7 @@ class Ipc(Effect):
         """Kernel from hot pixels in darks, the noise of flats and fringes, and the maps, joined.
 
         Couplings, their periods (up to 8 rows by 8 columns) and their reach (up to 5 pixels) are
-        found by evidence. The details hold what each way of measuring gives for each coupling.
+        found by evidence.
         """
         kernel = measure(evidence)
         if kernel is None:
@@ -145,19 +144,7 @@ class Ipc(Effect):
             errors |= {f"couplings[{n}].per_ke": kernel.per_ke_error for n in range(len(sigma))}
         return Estimate(
             cls(kernel.couplings), errors, kernel.significance, _why(kernel),
-            {
-                "by": {
-                    way: [
-                        {"share": float(k), "error": float(s)}
-                        for k, s in zip(shares, own, strict=True)
-                    ]
-                    for way, (shares, own) in kernel.by.items()
-                },
-                "covariance": kernel.covariance.tolist(),
-                "hot_pixels": kernel.hot_pixels,
-                "per_ke": kernel.per_ke,
-                "map_periods": map_periods(evidence),
-            },
+            {"covariance": kernel.covariance.tolist()},
             law=f"a kernel of {len(kernel.couplings)} couplings, all significant",
             in_full=cls(_worth_it(kernel.whole)) if kernel.whole else None,
         )  # fmt: skip
@@ -187,7 +174,7 @@ class Ipc(Effect):
             lambda flat: uncouple(flat, self._at_small_signals, maps.origin),
         )
 
-    def measured_again(self, parts: Sequence[Evidence]) -> Estimate | None:
+    def measured_again(self, parts: Iterable[Evidence]) -> Estimate | None:
         """All couplings within two pixels, and those found beyond, of the period that was found.
 
         Shares that the frames do not show are shrunk by their errors, not dropped: of many small
@@ -276,6 +263,6 @@ def _why(kernel: Kernel) -> str:
         return "neither neighbours of hot pixels, nor noise that neighbours share, stand out"
     rows = max(c.every_rows for c in kernel.couplings)
     columns = max(c.every_columns for c in kernel.couplings)
-    ways = " and ".join(way for way in kernel.by if way != "maps")
+    ways = " and ".join(kernel.by)
     repeats = f"repeating every {rows} rows and {columns} columns"
     return f"{len(kernel.couplings)} couplings, {repeats}, in {ways}"

@@ -8,7 +8,7 @@ to the maps of a fit, and how that is undone.
 import dataclasses
 import re
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
@@ -203,12 +203,12 @@ class Effect(ForwardModel):
         """
         return None
 
-    def measured_again(self, parts: Sequence[Evidence]) -> Estimate | None:
+    def measured_again(self, parts: Iterable[Evidence]) -> Estimate | None:
         """The effect as a correction needs it, from all frames; None if it is as good as it is.
 
         Parameters
         ----------
-        parts : sequence of Evidence
+        parts : iterable of Evidence
             Of the same pixels, with different frames; calibration frames are in the first.
         """
         return None

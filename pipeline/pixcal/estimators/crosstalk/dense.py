@@ -4,7 +4,7 @@ Noise that neighbours share, hot pixels and the pattern of the maps are joined a
 of the same shares (`pixcal.estimators.crosstalk.shrinkage`).
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from math import lcm
 
@@ -40,8 +40,7 @@ class Dense:
     covariance: F64  # (n, n) of their shares
     # rms of the true pattern of offsets that the data ask for beside the couplings
     pattern_px: float
-    # mapping of str to ((n, n), (n,) float64) least-squares sums of each way of measuring
-    ways: Mapping[str, Sums]
+    ways: tuple[str, ...]  # of measuring
 
     @property
     def shares(self) -> F64:
@@ -122,38 +121,48 @@ class Frames:
             found = shrinkage.solve(normal, right, maps)
             shares = found[0]
         assert found is not None
-        if maps is not None:
-            ways["maps"] = _without_pattern(maps, len(every), found[2])
         couplings = tuple(
             replace(c, share=float(k), per_ke=per_ke) for c, k in zip(every, shares, strict=True)
         )
-        return Dense(couplings, found[1], found[2], ways)
+        return Dense(couplings, found[1], found[2], (*ways, *["maps"] * (maps is not None)))
 
 
 def frames_of(
-    parts: Sequence[Evidence], steps: tuple[Place, ...], known: Sequence[Coupling] = ()
+    parts: Iterable[Evidence],
+    steps_in: Callable[[Place], tuple[Place, ...]],
+    known: Sequence[Coupling] = (),
 ) -> Frames | None:
     """What some parts of the frames tell together; None without light and dark signal.
 
     Parameters
     ----------
-    parts : sequence of Evidence
-        Of the same pixels, with different frames.
-    steps : tuple of (int, int)
+    parts : iterable of Evidence
+        Of the same pixels, with different frames; each is needed only once.
+    steps_in : callable
+        Steps (dy, dx) of the couplings in a window of some rows and columns.
     known : sequence of Coupling
         By which the charge collected follows from what is read.
     """
-    noise = _sum([products(part, steps, known) for part in parts])
-    hot = hot_pixels(parts[0], steps, known)
-    return None if noise is None and hot is None else Frames(parts[0], noise, hot, steps)
+    noise: list[Products | None] = []
+    first: Evidence | None = None
+    for part in parts:
+        if first is None:
+            steps = steps_in((part.good.shape[0], part.good.shape[1]))
+            first, hot = part.without_frames(), hot_pixels(part, steps, known)
+        noise.append(products(part, steps, known))
+        del part  # the next one is read only then
+    total = _sum(noise)
+    if first is None or (total is None and hot is None):
+        return None
+    return Frames(first, total, hot, steps)
 
 
-def dense_kernel(parts: Sequence[Evidence], start: Sequence[Coupling]) -> Dense | None:
+def dense_kernel(parts: Iterable[Evidence], start: Sequence[Coupling]) -> Dense | None:
     """Measure all couplings of the period of a kernel that was found.
 
     Parameters
     ----------
-    parts : sequence of Evidence
+    parts : iterable of Evidence
         Of the same pixels, with different frames.
     start : sequence of Coupling
         As found: they give the period and any coupling beyond `WITHIN`.
@@ -163,12 +172,12 @@ def dense_kernel(parts: Sequence[Evidence], start: Sequence[Coupling]) -> Dense 
     Dense or None
         None where there are more than `MOST_SHARES` couplings.
     """
-    one = parts[0]
     far = {(c.dy, c.dx) for c in start} | {(-c.dy, -c.dx) for c in start}
-    steps = within((one.good.shape[0], one.good.shape[1]), far)
     rows, columns = (lcm(*(getattr(c, n) for c in start)) for n in ("every_rows", "every_columns"))
-    frames = frames_of(parts, steps, start)
-    return None if frames is None else frames.kernel(Classes(rows, columns, one.origin), start)
+    frames = frames_of(parts, lambda shape: within(shape, far), start)
+    if frames is None:
+        return None
+    return frames.kernel(Classes(rows, columns, frames.evidence.origin), start)
 
 
 def within(shape: Place, far: Collection[Place] = ()) -> tuple[Place, ...]:
@@ -182,14 +191,6 @@ def _any_gain(sums: Sums, noise: Products, shares: F64) -> Sums:
     slope = normal @ shares
     inner = shares @ slope + (noise.shot / noise.shot_error) ** 2
     return normal - np.outer(slope, slope) / inner, right - slope * (shares @ right) / inner
-
-
-def _without_pattern(maps: Sums, size: int, pattern_px: float) -> Sums:
-    """Sums of the shares alone, a true pattern of that rms being free."""
-    normal, right = maps
-    inner = normal[size:, size:] + np.eye(len(right) - size) / pattern_px**2
-    taken = np.linalg.solve(inner, normal[size:, :size]).T
-    return normal[:size, :size] - taken @ normal[size:, :size], right[:size] - taken @ right[size:]
 
 
 def _sum(found: Sequence[Products | None]) -> Products | None:

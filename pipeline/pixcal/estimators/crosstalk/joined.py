@@ -1,6 +1,6 @@
 """The kernel: what darks, noise and maps say together, and each by itself."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,6 @@ from pixcal.model.errors import InputError
 F64 = NDArray[np.float64]
 
 LEVEL_STEPS = 10  # steps of a level dependence
-LARGEST = 0.1  # how large a share may well be
 CERTAIN = 5.0  # sigmas beyond which a level dependence is taken
 # sigmas beyond which a coupling is told of: of a hundred that are none, one in twenty kernels
 THERE = 3.5
@@ -32,10 +31,7 @@ class Kernel:
     couplings: tuple[Coupling, ...]
     covariance: F64  # (n, n) of their shares
     significance: float  # of the strongest, in sigmas, corrected for all that was tried
-    # mapping of str to ((n,), (n,) float64) shares and errors of each way of measuring by
-    # itself
-    by: Mapping[str, tuple[F64, F64]]
-    hot_pixels: int  # used
+    by: tuple[str, ...]  # ways of measuring
     # per_ke, per_ke_error: relative change of the shares with the source's signal as hot pixels
     # show it, 1/ke-, where they fall; the error infinite where they cannot tell
     per_ke: float
@@ -56,12 +52,11 @@ def measure(evidence: Evidence) -> Kernel | None:
     """
     shape = (evidence.good.shape[0], evidence.good.shape[1])
     every = links(shape)
-    frames = frames_of([evidence], every) if every else None
+    frames = frames_of([evidence], lambda _: every) if every else None
     if frames is None:
         return None
     found = choose(frames.measured(()), visibility_pattern(evidence))
-    pixels = 0 if frames.hot is None else len(frames.hot.y)
-    none = Kernel((), np.zeros((0, 0)), found.significance, {}, pixels, 0.0, np.inf)
+    none = Kernel((), np.zeros((0, 0)), found.significance, (), 0.0, np.inf)
     if not found.links:
         return none
     near = within(shape, {every[n] for n in found.links})
@@ -70,7 +65,7 @@ def measure(evidence: Evidence) -> Kernel | None:
     per_ke, error = 0.0, np.inf
     for _ in range(2):
         # The second time with the charge as it was collected, and all hot pixels.
-        own = frames_of([evidence], near, known)
+        own = frames_of([evidence], lambda _: near, known)
         dense = None if own is None else own.kernel(found.classes, known, per_ke)
         if own is None or dense is None:
             raise InputError(
@@ -122,15 +117,11 @@ def _told(dense: Dense, about: Kernel) -> Kernel:
     for n, (column, own) in enumerate(zip(basis.T > 0, np.diag(covariance), strict=True)):
         each = float(np.diag(dense.covariance)[column].mean())
         covariance[n, n] = max(own, each) if column.sum() > 1 else own
-    by = {}
-    for way, (normal, right) in dense.ways.items():
-        own = np.linalg.inv(basis.T @ normal @ basis + np.eye(len(couplings)) / LARGEST**2)
-        by[way] = (own @ basis.T @ right, np.sqrt(np.diag(own)))
     return replace(
         about,
         couplings=tuple(replace(c, share=float(k)) for c, k in zip(couplings, shares, strict=True)),
         covariance=covariance,
-        by=by,
+        by=dense.ways,
         whole=dense.couplings,
     )
 

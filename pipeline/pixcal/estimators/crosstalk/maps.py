@@ -15,7 +15,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.crosstalk.links import MAX_PERIOD, MIN_REPEATS, REACH, Classes
+from pixcal.estimators.crosstalk.links import REACH, Classes
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid, polynomial_basis
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
@@ -110,35 +110,3 @@ def response_slopes(
     inside = np.zeros(shape, bool)
     inside[rows : rows + classes.rows, columns : columns + classes.columns] = True
     return _slope_at(k, couplings, inside, (0, 0))
-
-
-def map_periods(evidence: Evidence) -> dict[str, dict[str, tuple[int, int]]]:
-    """Period (rows, columns) of delta and visibility of each set; 1 where there is none."""
-    good = good_in_all(evidence)
-    if good.sum() < MIN_PIXELS:
-        return {}
-    found = {}
-    for name, fringes in evidence.fringes.items():
-        smooth = smooth_modes([fringes], good)
-        maps = {"delta": fringes.delta[good], "visibility": log_visibility(fringes.theta, good)}
-        found[name] = {
-            kind: _period(without(values, smooth), good, fringes.origin)
-            for kind, values in maps.items()
-        }
-    return found
-
-
-def _period(values: F64, good: Mask, first: tuple[int, int]) -> tuple[int, int]:
-    y, x = np.nonzero(good)
-    z = values / values.std()
-    best = []
-    for axis in range(2):
-        scores = [0.0]
-        for n in range(2, min(MAX_PERIOD, good.shape[axis] // MIN_REPEATS) + 1):
-            classes = Classes(n, 1, first) if axis == 0 else Classes(1, n, first)
-            number = classes.of(y, x)
-            count = np.maximum(np.bincount(number, minlength=n), 1)
-            power = float((np.bincount(number, z, n) ** 2 / count).sum())
-            scores.append(power - (n - 1) * 2 * np.log(len(z)))
-        best.append(1 + int(np.argmax(scores)))
-    return best[0], best[1]

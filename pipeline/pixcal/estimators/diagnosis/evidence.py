@@ -1,7 +1,7 @@
 """What a part of an acquisition tells about its effects: samples, maps, frames, side by side."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar, cast
 
@@ -265,6 +265,14 @@ class Evidence:
     def _saturated(self, stack: Stack) -> float:
         """Share of the samples of good pixels."""
         return float((stack.adu[:, self.good] >= self.saturation_adu).mean())
+
+    def without_frames(self) -> "Evidence":
+        """The maps alone: fringe sets without samples, and no calibration frames."""
+        fringes = {
+            name: replace(f, electrons=f.electrons[:0], adu=f.adu[:0])
+            for name, f in self.fringes.items()
+        }
+        return replace(self, fringes=fringes, stacks=())
 
     def of_kind(self, kind: str) -> tuple[Stack, ...]:
         """Stacks of a kind, by exposure time."""

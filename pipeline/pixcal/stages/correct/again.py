@@ -37,15 +37,14 @@ def measured_again(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatme
     if not remeasured:
         return plan
     try:
-        parts = tuple(_parts(run_dir, runtime))
-        refined = {t.effect.name: _again(t, parts) for t in remeasured}
+        refined = {t.effect.name: _again(t, _parts(run_dir, runtime)) for t in remeasured}
     except (InputError, FileNotFoundError, np.linalg.LinAlgError):
         # Frames are missing, or too large: what the diagnosis found is good, only less precise.
         return plan
     return Treatments(tuple(refined.get(t.effect.name, t) for t in plan.every))
 
 
-def _again(treatment: Treatment, parts: tuple[Evidence, ...]) -> Treatment:
+def _again(treatment: Treatment, parts: Iterator[Evidence]) -> Treatment:
     estimate = treatment.effect.measured_again(parts)
     if estimate is None:
         return treatment
@@ -70,9 +69,10 @@ def _parts(run_dir: Path, runtime: Runtime) -> Iterator[Evidence]:
     frames = max(1, SAMPLES // pixels)
     number = min(MOST_PARTS, -(-min(counts) // frames))
     samples = min(frames, min(counts)) * pixels
-    held = EVIDENCE_BYTES * samples * len(counts) * number
+    held = EVIDENCE_BYTES * samples * len(counts)
     make_plan("measuring effects again", ESTIMATE_BYTES * samples, held, runtime)
     ends = np.linspace(0, min(min(counts), number * frames), number + 1).astype(int)
     for first, last in pairwise(ends.tolist()):
         evidence = load_evidence(run_dir, part, slice(first, last))
         yield evidence if first == 0 else replace(evidence, stacks=())
+        del evidence  # one at a time
