@@ -151,18 +151,17 @@ class Lag(Effect):
         for back in range(self.frames_back, 0, -1):
             before = shot.charge(shot.frame - back)
             if before is not None:
-                held = self._held(held, before, scale)
-        left = np.float32(self._keep) * held
-        after = self._held(held, charge, scale)
-        found = charge + (held - after)
-        if shot.bench.shot_noise:
-            noisy = after - left + np.float32(1 - self.quiet) * (held - left)
-            found += np.sqrt(np.maximum(noisy, 0)) * shot.normals(self.name)
-        return np.asarray(found)
+                held = self._held(held, before, scale, shot, shot.frame - back, 1 - self.quiet)
+        return np.asarray(charge + held - self._held(held, charge, scale, shot, shot.frame))
 
-    def _held(self, held: F32, charge: F32, scale: F32) -> F32:
-        """Mean of what traps hold after a frame, e-."""
-        full = np.float32(self._keep) * held + scale * self._left(np.maximum(charge, 0))
+    def _held(
+        self, held: F32, charge: F32, scale: F32, shot: Shot, frame: int, noisy: float = 1.0
+    ) -> F32:
+        """What traps hold after a frame, e-: each electron is caught by its own chance."""
+        taken = scale * self._left(np.maximum(charge, 0))
+        if shot.bench.shot_noise and noisy > 0:
+            taken += np.sqrt(np.float32(noisy) * taken) * shot.normals(self.name, frame)
+        full = np.float32(self._keep) * held + np.maximum(taken, 0)
         return np.asarray(np.minimum(full, scale * np.float32(self.capacity_e)))
 
     def lost(self, charge: F32) -> tuple[F32, F32]:
@@ -432,8 +431,10 @@ def _by_level(evidence: Evidence, lag: Lag) -> tuple[Lag, dict[str, float]]:
     fit.weigh(banded, even)
     found = fit.fit(banded, even, 2)
     errors = np.sqrt(np.diag(found.covariance))
-    away = found.value - even
-    if float(away @ inverse_normal(found.covariance) @ away) < _NOT_EVEN:
+    precision = inverse_normal(found.covariance)
+    # The contrast tells the common share to its square, which steps about a model leave out.
+    away = found.value - (precision @ found.value).sum() / precision.sum()
+    if float(away @ precision @ away) < _NOT_EVEN:
         return lag, {}
 
     def trapped(values: F64, charge: F32) -> F32:
