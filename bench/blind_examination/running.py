@@ -16,9 +16,9 @@ from pathlib import Path
 from blind_examination.benches import LAYOUTS, MOST_SETS
 from blind_examination.manifest import RUNS, read_manifest
 from blind_examination.options import RunConfig
-from pixcal.engine.parcel import code_digest
 from pixcal.engine.plan import BASE_BYTES, make_plan
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.model.code import code_digest
 from pixcal.model.errors import ClusterError, DamagedError, PlanError
 from pixcal.stages import correct, diagnose, ingest, reduce
 from pixcal.stages.diagnose.look import ESTIMATE_BYTES, EVIDENCE_BYTES

@@ -15,6 +15,7 @@ import pytest
 
 from pixcal import __version__
 from pixcal.model.errors import DamagedError, InputError
+from pixcal.storage import artefact
 from pixcal.storage.artefact import (
     MANIFEST,
     Manifest,
@@ -54,8 +55,13 @@ def test_a_complete_artefact(tmp_path: Path) -> None:
     assert not list((tmp_path / ".partial").iterdir())
 
 
-def test_the_key_depends_on_everything_and_on_nothing_else(tmp_path: Path) -> None:
+def test_the_key_depends_on_everything_and_on_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     key = artefact_key("fit", 1, CONFIG, INPUTS)
+    with monkeypatch.context() as patch:
+        patch.setattr(artefact, "__version__", "0.0.7")
+        later = artefact_key("fit", 1, CONFIG, INPUTS)
     assert key == artefact_key("fit", 1, dict(reversed(CONFIG.items())), INPUTS)
     others = [
         artefact_key("fit2", 1, CONFIG, INPUTS),
@@ -63,8 +69,9 @@ def test_the_key_depends_on_everything_and_on_nothing_else(tmp_path: Path) -> No
         artefact_key("fit", 1, CONFIG | {"limit": 1.6}, INPUTS),
         artefact_key("fit", 1, CONFIG | {"more": None}, INPUTS),
         artefact_key("fit", 1, CONFIG, INPUTS | {"reduce": "abd"}),
+        later,
     ]
-    assert len({key, *others}) == 6
+    assert len({key, *others}) == 7
     assert digest((1, 2)) == digest([1, 2]), "a tuple is read back as a list"
     complete(tmp_path)
     assert up_to_date(tmp_path, "fit", key) is not None

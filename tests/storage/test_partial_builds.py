@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pixcal.storage import artefact
 from pixcal.storage.artefact import build, lock, read_manifest
 from pixcal.storage.cube import create_array, create_group
 
@@ -39,6 +40,18 @@ def test_an_unfinished_build_removes_nothing(tmp_path: Path) -> None:
     with build(tmp_path, "fit", 1, {"number": 1}, {}) as made:
         assert made.resumed
         assert made.journal() == {"one step"}
+
+
+def test_a_build_is_not_resumed_by_other_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or one artefact would hold tiles of two versions."""
+    left = cut_short(tmp_path, "fit", 1)
+    monkeypatch.setattr(artefact, "code_digest", lambda: "edited")
+    with build(tmp_path, "fit", 1, {"number": 1}, {}) as made:
+        assert not made.resumed
+        assert made.journal() == set()
+    assert not left.exists()
 
 
 @pytest.mark.parametrize("array", ["signal", "c"])

@@ -1,6 +1,5 @@
 """Tasks made ready for other processes, and what those do with them."""
 
-import hashlib
 import pickle
 import platform
 import time
@@ -21,6 +20,7 @@ from threadpoolctl import threadpool_limits
 
 import pixcal
 from pixcal.engine.malloc import keep_freed_memory
+from pixcal.model.code import code_digest
 from pixcal.model.errors import ClusterError, InputError
 
 PATIENCE_S = 1.0  # time in which a file made on one machine must show on the others
@@ -160,16 +160,6 @@ def _see(paths: tuple[Path, ...]) -> None:
                     "the disk with the data, under the same path"
                 )
             time.sleep(0.1)
-
-
-@lru_cache(maxsize=1)
-def code_digest() -> str:
-    """Of the program's own files: whether two processes or results are of the same code."""
-    code = hashlib.sha256()
-    root = Path(pixcal.__file__).parent
-    for file in sorted(root.rglob("[a-z_]*.py")):
-        code.update(f"{file.relative_to(root).as_posix()}\0".encode() + file.read_bytes())
-    return code.hexdigest()[:16]
 
 
 @lru_cache(maxsize=1)

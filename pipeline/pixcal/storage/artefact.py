@@ -2,8 +2,9 @@
 
 An artefact is a directory ``RUN/<stage>`` with a ``manifest.json``. It is built aside, in
 ``RUN/.partial/<stage>-<key>``, and renamed when complete, so that a directory that exists is whole.
-The key is a digest of everything the result depends on: a build with the same key that was killed
-is found again and resumed. Unfinished builds with other keys are removed when one completes.
+The key is a digest of everything the result depends on: options, inputs, format, and the version of
+pixcal. A build with the same key that was killed is found again and resumed, if it was begun by the
+same code to the letter. Unfinished builds with other keys are removed when one completes.
 
 The manifest is sealed, and holds a digest of every other file but the chunks of arrays, which have
 checksums of their own. What turns out to be damaged is noted in the artefact (`lock`): it is not up
@@ -21,6 +22,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
+from pixcal import __version__
+from pixcal.model.code import code_digest
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.storage.cube_place import POINTER, cubes_of, remove_cubes, settle, settled
 from pixcal.storage.folder import DISK_FULL, flush
@@ -147,7 +150,7 @@ def _boot() -> str:
 
 def artefact_key(stage: str, format: int, config: dict[str, Any], inputs: dict[str, str]) -> str:
     """Digest of what a stage's result depends on."""
-    return digest(stage, format, config, inputs)
+    return digest(stage, format, __version__, config, inputs)
 
 
 def up_to_date(run: Path, stage: str, key: str) -> Manifest | None:
@@ -191,7 +194,7 @@ def build(
         If ``cubes`` cannot be written.
     """
     key = artefact_key(stage, format, config, inputs)
-    folder = run / ".partial" / f"{stage}-{key[:_KEY_IN_NAME]}"
+    folder = run / ".partial" / f"{stage}-{digest(key, code_digest())[:_KEY_IN_NAME]}"
     if folder.is_dir() and not (settled(folder, run, cubes) and _whole(folder)):
         _discard(folder, run)
     resumed = folder.is_dir()
