@@ -8,7 +8,7 @@ import click
 
 from pixcal.model.options import Astrometry
 from pixcal.storage.artefact import read_json
-from pixcal_cli import results
+from pixcal_cli import printing, results
 from pixcal_cli.click_options import command
 
 if TYPE_CHECKING:
@@ -45,14 +45,14 @@ def _show(result: Mapping[str, Any], rows: Sequence[Sequence[str]]) -> None:
         f"photon noise alone {bound['px']:.3g} px, {bound['uas']:.3g} µas"
     )
     header = ("error of a centroid", "along", "perfect grid", "measured maps", "gain")
-    results.show_table(header, rows)
+    printing.show_table(header, rows)
     for name, axis in axes.items():
         need = axis["positions_to_target"]
         click.echo(
             f"  positions to {need['target_px']:.0e} px along {name}, if independent: "
             f"{_count(need['perfect'])} with a perfect grid, {_count(need['measured'])} with maps"
         )
-    results.show_notes(result["warnings"])
+    printing.show_notes(result["warnings"])
 
 
 def _count(number: int | None) -> str:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from blind_examination.options import MakeConfig, RunConfig, ScoreConfig
-from pixcal_cli import results
+from pixcal_cli import printing
 from pixcal_cli.click_options import PATH, command, examples
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def make(folder: Path, sealed: Path, config: MakeConfig, runtime: "Runtime") -> 
 
     examination = stage.make(folder, sealed, config, runtime)
     click.echo(f"cases in {folder}: {config.cases}; their truth in {sealed}")
-    results.show_notes(examination.notes)
+    printing.show_notes(examination.notes)
 
 
 @command(
@@ -90,7 +90,7 @@ def _show(result: Mapping[str, Any]) -> None:
             rows.append(
                 (part, facts["title"], question, f"{count['right']}/{count['of']}", interval)
             )
-    results.show_table(("part", "", "question", "right", "95 % interval"), rows)
+    printing.show_table(("part", "", "question", "right", "95 % interval"), rows)
     wrong = [f"{c['case']}: {c['why']}" for c in result["cases"] if not c["right"]]
     missing = [f"not diagnosed yet: {len(result['missing'])} of {result['made']} cases"]
-    results.show_notes([*wrong, *(missing if result["missing"] else []), *result["notes"]])
+    printing.show_notes([*wrong, *(missing if result["missing"] else []), *result["notes"]])

@@ -9,7 +9,7 @@ import click
 
 from pixcal.model.options import Budget
 from pixcal_cli.click_options import PATH, bench_argument, config_options, examples
-from pixcal_cli.results import show_notes, show_table
+from pixcal_cli.printing import show_notes, show_table
 
 LIMITS = {
     "photons": "photons",

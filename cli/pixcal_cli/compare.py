@@ -8,7 +8,7 @@ import click
 
 from pixcal.model.options import Compare
 from pixcal.storage.artefact import read_json
-from pixcal_cli import results
+from pixcal_cli import printing, results
 from pixcal_cli.click_options import PATH, Command, command
 
 if TYPE_CHECKING:
@@ -59,26 +59,26 @@ def _show(result: Mapping[str, Any]) -> None:
             (
                 name,
                 facts["pixels"],
-                results.with_error(facts["correlation"], facts["correlation_error"]),
-                results.with_error(facts["slope"], facts["slope_error"]),
+                printing.with_error(facts["correlation"], facts["correlation_error"]),
+                printing.with_error(facts["slope"], facts["slope_error"]),
                 *_sizes(facts),
             )
             for name, facts in components.items()
         ]
-        results.show_table(("", "pixels", "correlation", "slope", *SIZES), rows)
+        printing.show_table(("", "pixels", "correlation", "slope", *SIZES), rows)
         for name, facts in components.items():
             click.echo(f"\n  {name} by scale")
             *smaller, last = [f"{scale['side_px']} px" for scale in facts["scales"]]
             sides = [*smaller, f"{last} and larger"]
             sizes = zip(sides, map(_sizes, facts["scales"]), strict=True)
-            results.show_table(("scale", *SIZES), [(side, *row) for side, row in sizes])
-        results.show_notes(_sentences(components))
+            printing.show_table(("scale", *SIZES), [(side, *row) for side, row in sizes])
+        printing.show_notes(_sentences(components))
     if result["summary"] is not None:
         click.echo("\neach map's own errors beyond noise, from the differences of all pairs, px")
         columns = [map(_amount, facts["own"]) for facts in result["summary"].values()]
         rows = list(zip(labels, *columns, strict=True))
-        results.show_table(("", *result["summary"]), rows)
-    results.show_notes(result["warnings"])
+        printing.show_table(("", *result["summary"]), rows)
+    printing.show_notes(result["warnings"])
 
 
 SIZES = ("common px", "difference px", "noise px", "ratio", "beyond noise px")
@@ -90,7 +90,7 @@ def _sizes(facts: Mapping[str, Any]) -> tuple[str, ...]:
         _amount(facts["common"]),
         f"{facts['difference_px']:.3g}",
         f"{facts['expected_px']:.3g}",
-        results.with_error(facts["ratio"], facts["ratio_error"]),
+        printing.with_error(facts["ratio"], facts["ratio_error"]),
         _amount(facts["beyond_noise"]),
     )
 

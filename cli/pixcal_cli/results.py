@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import click
 
 from pixcal.storage.artefact import MANIFEST, read_json
 from pixcal.storage.cube_place import cubes_of
+from pixcal_cli.printing import number, show_notes, show_table, with_error
 
 
 @contextmanager
@@ -62,9 +63,9 @@ def show_reduce(run: Path) -> None:
     rows = [
         (
             label,
-            _number(facts[key]["declared"]),
+            number(facts[key]["declared"]),
             with_error(facts[key]["measured"], facts[key]["error"]),
-            _number(facts[key]["used"]),
+            number(facts[key]["used"]),
         )
         for label, key in (("gain e-/ADU", "gain_e_per_adu"), ("read noise e-", "read_noise_e"))
     ]
@@ -94,11 +95,11 @@ def show_fit(run: Path) -> None:
             name,
             fitted["model"],
             fitted["frames"],
-            _number(fitted["interfringe_px"], 5),
-            _number(fitted["sigma_median_px"], 3),
-            _number(fitted["crb_median_px"], 3),
-            _number(_ratio(fitted["sigma_median_px"], fitted["crb_median_px"]), 3),
-            _number(fitted["chi2_reduced"], 4),
+            number(fitted["interfringe_px"], 5),
+            number(fitted["sigma_median_px"], 3),
+            number(fitted["crb_median_px"], 3),
+            number(_ratio(fitted["sigma_median_px"], fitted["crb_median_px"]), 3),
+            number(fitted["chi2_reduced"], 4),
         )
         for name, fitted in sets.items()
     ]
@@ -145,7 +146,7 @@ def show_correction(run: Path) -> None:
         ["residual px: error of the offsets from the uncertainty of the effects' parameters"]
     )
     for pair in correction["pairs"]:
-        expected = _number(pair["after_expected_px"], 3)
+        expected = number(pair["after_expected_px"], 3)
         apart = _before_after(pair["before_px"], pair["after_px"])
         sets = " and ".join(pair["sets"])
         click.echo(f"  difference between {sets}: {apart} px ({expected} px expected from noise)")
@@ -159,9 +160,9 @@ def _gain_row(name: str, facts: Mapping[str, Any]) -> tuple[str, ...]:
     rows = facts["rows"]
     return (
         name,
-        _number(facts["change"]["rms_px"], 3),
-        _number(facts["change"]["max_px"], 3),
-        _number(math.hypot(*left) if left else None, 3),
+        number(facts["change"]["rms_px"], 3),
+        number(facts["change"]["max_px"], 3),
+        number(math.hypot(*left) if left else None, 3),
         _before_after(facts["sigma_median_px"]["before"], facts["sigma_median_px"]["after"]),
         _before_after(facts["chi2_reduced"]["before"], facts["chi2_reduced"]["after"], 4),
         "-" if rows is None else _before_after(rows["before_px"], rows["after_px"]),
@@ -169,7 +170,7 @@ def _gain_row(name: str, facts: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _before_after(before: float | None, after: float | None, digits: int = 3) -> str:
-    return f"{_number(before, digits)} → {_number(after, digits)}"
+    return f"{number(before, digits)} → {number(after, digits)}"
 
 
 def show_allan(run: Path) -> None:
@@ -190,10 +191,10 @@ def _allan_row(curve: Mapping[str, Any]) -> tuple[str, ...]:
     knee = curve["knee_frames"]
     return (
         with_error(curve["slope"], curve["slope_err"]),
-        "none" if knee is None else f"{_number(knee)} frames",
+        "none" if knee is None else f"{number(knee)} frames",
         str(curve["frames"][-1]),
         with_error(curve["adev_px"][-1], curve["adev_err_px"][-1]),
-        _number(curve["white_expected_px"][-1], 3),
+        number(curve["white_expected_px"][-1], 3),
     )
 
 
@@ -227,9 +228,9 @@ def show_diagnosis(run: Path) -> None:
         (
             f"{entry['domain']}: {entry['title']}",
             entry["place"],
-            f"{_number(entry['measured'], 3)} {entry['unit']}".strip(),
-            _number(entry["simulated"], 3),
-            _number(entry["after"], 3),
+            f"{number(entry['measured'], 3)} {entry['unit']}".strip(),
+            number(entry["simulated"], 3),
+            number(entry["after"], 3),
             f"{entry['significance']:.1f}",
         )
         for entry in gap["where"][:MOST_ROWS]
@@ -304,37 +305,6 @@ def _ratio(a: float | None, b: float | None) -> float | None:
     return a / b if a is not None and b else None
 
 
-def _number(value: float | None, digits: int = 4) -> str:
-    return "-" if value is None else f"{value:.{digits}g}"
-
-
 def _figure(value: float, error: float | None) -> str:
     """As `with_error`; a large number without error not as a power of ten."""
     return f"{value:.0f}" if error is None and value >= 1e4 else with_error(value, error)
-
-
-def with_error(value: float | None, error: float | None) -> str:
-    """The value rounded to two digits of its error."""
-    if value is None or not error:
-        return _number(value)
-    decimals = max(0, 1 - math.floor(math.log10(abs(error))))
-    return f"{value:.{decimals}f} ± {error:.{decimals}f}"
-
-
-def show_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
-    """Print columns below their titles."""
-    cells = [header, *([_text(value) for value in row] for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for row in cells:
-        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-        click.echo(f"  {line.rstrip()}")
-
-
-def show_notes(sentences: Sequence[str]) -> None:
-    """Print notes, a line each."""
-    for sentence in sentences:
-        click.echo(f"  note: {sentence}")
-
-
-def _text(value: Any) -> str:
-    return "-" if value is None else str(value)

@@ -171,6 +171,8 @@ def test_what_is_left_is_taken_back_and_workers_are_idle(
     cluster: Any, tmp_path: Path, cause: str
 ) -> None:
     expected: type[BaseException] = ValueError if cause == "failure" else KeyboardInterrupt
+    # Tests that a shell starts in the background ignore Ctrl-C, and so does what they start.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     if cause != "failure":
         me = threading.main_thread().ident
         assert me is not None

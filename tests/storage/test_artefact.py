@@ -22,12 +22,12 @@ from pixcal.storage.artefact import (
     artefact_key,
     build,
     digest,
-    lock,
     read_json,
     read_manifest,
     up_to_date,
     write_json,
 )
+from pixcal.storage.lock import lock
 from pixcal.storage.stage import require
 
 CONFIG = {"model": "paraxial", "limit": 1.5}
@@ -134,7 +134,8 @@ def test_a_journal_cut_at_any_byte_holds_only_what_was_done(tmp_path: Path) -> N
 WORK = """
 import sys, time
 from pathlib import Path
-from pixcal.storage.artefact import build, lock
+from pixcal.storage.artefact import build
+from pixcal.storage.lock import lock
 run = Path(sys.argv[1])
 with lock(run), build(run, "fit", 1, {"model": "paraxial", "limit": 1.5}, {"reduce": "abc"}) as b:
     (b.folder / "data").write_text("by the other")
@@ -249,7 +250,8 @@ def test_killed_at_any_time_the_artefact_is_whole(tmp_path: Path) -> None:
     loop = """
 import sys, itertools
 from pathlib import Path
-from pixcal.storage.artefact import build, lock, read_manifest
+from pixcal.storage.artefact import build, read_manifest
+from pixcal.storage.lock import lock
 run = Path(sys.argv[1])
 found = read_manifest(run / "fit")
 for n in itertools.count(found.config["n"] + 1 if found else 0):

@@ -16,14 +16,13 @@ from pixcal.storage import artefact
 from pixcal.storage.artefact import (
     MANIFEST,
     build,
-    damage_noted,
-    lock,
     read_json,
     read_manifest,
     up_to_date,
     write_json,
 )
 from pixcal.storage.cube import ArrayReader, create_array, create_group, write_array
+from pixcal.storage.lock import damage_noted, lock
 from pixcal.storage.products import is_whole, read_map, write_map
 from pixcal.storage.stage import require
 

@@ -7,9 +7,8 @@ import pytest
 from astropy.io import fits
 
 from pixcal.model.errors import DamagedError
-from pixcal.storage.fits_map import FitsMap
 from pixcal.storage.manifest import file_digest
-from pixcal.storage.products import write_map
+from pixcal.storage.products import FitsMap, write_map
 
 SHAPE = (61, 67)
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from pixcal.storage import artefact
-from pixcal.storage.artefact import build, lock, read_manifest
+from pixcal.storage.artefact import build, read_manifest
 from pixcal.storage.cube import create_array, create_group
+from pixcal.storage.lock import lock
 
 
 def complete(run: Path, stage: str, number: int) -> None:

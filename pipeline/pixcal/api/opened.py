@@ -10,17 +10,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.api.picture import Picture
+from pixcal.api.maps import OffsetMap, Picture
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import StrPath
 from pixcal.model.errors import InputError
-from pixcal.storage.artefact import damage_noted, read_json
+from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
+from pixcal.storage.lock import damage_noted
 from pixcal.storage.products import read_map
 from pixcal.storage.stage import read_acquisition, require
 
 if TYPE_CHECKING:
-    from astropy.nddata import CCDData
+    pass
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -28,58 +29,6 @@ U8 = NDArray[np.uint8]
 
 DETECTOR_MAPS = ("bias", "dark_rate", "flat", "read_noise", "mask")
 SERIES = ("time", "B", "A", "phi", "dkx", "dky")
-
-
-@dataclass(frozen=True)
-class OffsetMap:
-    """A map of offsets, as the product of the same name holds it.
-
-    Attributes
-    ----------
-    name : str
-        ``delta_x``, ``delta_y`` or ``delta_fringe``.
-    delta, sigma : (y, x) float32
-        Offset from the perfect grid and its 1-sigma error, px; NaN where masked. Positive: the
-        pixel responds at larger x (y).
-    mask : (y, x) uint8
-        Bits of `pixcal.PixelFlag`; 0 is a good pixel.
-    header : dict
-        Primary header of the FITS file: fringe vectors, frames, the modes that were removed.
-    """
-
-    name: str
-    delta: F32 = field(repr=False)
-    sigma: F32 = field(repr=False)
-    mask: U8 = field(repr=False)
-    header: dict[str, Any] = field(repr=False)
-
-    @property
-    def good(self) -> NDArray[np.bool_]:
-        """(y, x): pixels that have an offset."""
-        return np.equal(self.mask, 0)
-
-    def ccddata(self) -> "CCDData":
-        """The map as astropy's ``CCDData``: with its errors, mask, flags and header."""
-        from astropy.nddata import CCDData, StdDevUncertainty  # here: slow to import
-
-        return CCDData(
-            self.delta,
-            unit="pixel",
-            uncertainty=StdDevUncertainty(self.sigma),
-            mask=~self.good,
-            flags=self.mask,
-            meta=dict(self.header),
-        )
-
-    def picture(self) -> Picture:
-        """The map with the means of its columns and rows, as the report shows it."""
-        # Here: matplotlib takes longer to import than all else.
-        from pixcal.report.drawing import png
-        from pixcal.report.map_figures import offsets
-        from pixcal.report.summary import ArraySource, summarise
-
-        delta, sigma = (summarise(ArraySource(values)) for values in (self.delta, self.sigma))
-        return Picture(png(offsets(self.name, delta, sigma)))
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ it gives that worker's tasks to others (`distributed.scheduler.allowed-failures`
 """
 
 import logging
-import pickle
 import signal
 import sys
 import threading
@@ -14,7 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from itertools import islice
 from pathlib import Path
 from tempfile import NamedTemporaryFile
@@ -33,7 +32,7 @@ AHEAD = 4  # tasks handed to the scheduler for each thread: it takes a while to 
 # tasks handed over however few threads there are: a cluster that grows does so by demand
 LEAST_AHEAD = 32
 LOOK_S = 5.0  # time between two looks at how many threads there are
-# by these a run directory that is worked on is known (`pixcal.storage.artefact`)
+# by these a run directory that is worked on is known (`pixcal.storage.lock`)
 HELD = (".lock", ".partial")
 
 Ended = Callable[[int, Any], None]
@@ -207,7 +206,7 @@ class _Tasks:
     ) -> None:
         self._client, self._address, self._job, self._items = client, address, job, items
         self._name = name
-        self._do = partial(pickle.loads, buffers=[job.function])
+        self._do = job.do()
         self._waiting = iter(range(len(items)))
         self._running: set[Future] = set()
         self._room, self._look_again = 0, 0.0

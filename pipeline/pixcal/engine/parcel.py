@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from importlib.metadata import version
 from io import BytesIO
 from pathlib import Path
@@ -76,6 +76,10 @@ class Job:
     versions: dict[str, str] = field(default_factory=dict, compare=False)
     name: str = field(default_factory=lambda: uuid4().hex)
 
+    def do(self) -> Callable[[bytes], Any]:
+        """What does a task of the job, given as `RemoteTask.dumps`, wherever that is called."""
+        return partial(pickle.loads, buffers=[self.function])
+
     def __reduce__(self) -> tuple[Any, ...]:
         function = pickle.PickleBuffer(self.function)
         return Job, (function, self.paths, self.at_once, self.versions, self.name)
@@ -96,7 +100,7 @@ class RemoteTask:
         return call, (self.job, self.item)
 
     def dumps(self) -> bytes:
-        """For ``pickle.loads(…, buffers=[job.function])``, whose value is the task's result."""
+        """For `Job.do`, whose value is the task's result."""
         apart: list[pickle.PickleBuffer] = []
         return pickle.dumps(self, protocol=5, buffer_callback=apart.append)
 

@@ -8,10 +8,18 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, TypeVar
 
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from threadpoolctl import ThreadpoolController
 
 from pixcal.engine.local import run_here, run_in_processes, run_in_threads
-from pixcal.engine.progress import Progress
 from pixcal.model.errors import InputError
 from pixcal.model.options import Running
 
@@ -116,13 +124,24 @@ def run_tasks(
         Results in the order of the items.
     """
     results: dict[int, R] = {}
-    with Progress(label, len(items), quiet=runtime.quiet) as progress, one_blas_thread():
+    progress = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        console=Console(file=sys.stderr),
+        disable=runtime.quiet,
+    )
+    shown = progress.add_task(label, total=len(items))
+    with progress, one_blas_thread():
 
         def ended(number: int, result: R) -> None:
             results[number] = result
             if done is not None:
                 done(number, result)
-            progress.advance()
+            progress.advance(shown)
 
         if runtime.remote:
             # Here, not at the top: it takes long to import, and starts threads.

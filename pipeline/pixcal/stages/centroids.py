@@ -17,9 +17,8 @@ from pixcal.estimators.star_centroids.correction import (
 from pixcal.model.errors import InputError
 from pixcal.stages.advice import maps_to_use
 from pixcal.storage.artefact import read_json
-from pixcal.storage.distortion import distortion, write_distortion
 from pixcal.storage.products import read_map
-from pixcal.storage.tables import column, read_table, write_table
+from pixcal.storage.star_files import column, distortion, read_table, write_distortion, write_table
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]

@@ -39,13 +39,13 @@ from pixcal.storage.artefact import (
     MANIFEST,
     Manifest,
     artefact_key,
-    lock,
     read_manifest,
     write_json,
     write_manifest,
 )
 from pixcal.storage.fits_out import COMPRESSED, FrameWriter
 from pixcal.storage.formats import STAGES, Stage
+from pixcal.storage.lock import lock
 from pixcal.storage.manifest import file_digest
 
 # maps that are told; read noise and gain of a simulated detector are the same in all pixels

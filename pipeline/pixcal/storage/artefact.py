@@ -7,16 +7,15 @@ pixcal. A build with the same key that was killed is found again and resumed, if
 same code to the letter. Unfinished builds with other keys are removed when one completes.
 
 The manifest is sealed, and holds a digest of every other file but the chunks of arrays, which have
-checksums of their own. What turns out to be damaged is noted in the artefact (`lock`): it is not up
-to date from then on, and its stage makes it again.
+checksums of their own. What turns out to be damaged is noted in the artefact
+(`pixcal.storage.lock`): it is not up to date from then on, and its stage makes it again.
 """
 
-import fcntl
 import json
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -24,10 +23,9 @@ from typing import Any, Protocol
 
 from pixcal import __version__
 from pixcal.model.code import code_digest
-from pixcal.model.errors import DamagedError, InputError
-from pixcal.storage.cube_place import POINTER, cubes_of, remove_cubes, settle, settled
-from pixcal.storage.folder import DISK_FULL, flush
-from pixcal.storage.formats import STAGES
+from pixcal.model.errors import DamagedError
+from pixcal.storage.cube_place import cubes_of, remove_cubes, settle, settled
+from pixcal.storage.folder import flush
 from pixcal.storage.manifest import (
     DAMAGE,
     JOURNAL,
@@ -56,11 +54,9 @@ __all__ = [
     "Workspace",
     "artefact_key",
     "build",
-    "damage_noted",
     "damaged_files",
     "digest",
     "file_digest",
-    "lock",
     "read_json",
     "read_manifest",
     "up_to_date",
@@ -111,7 +107,7 @@ class Build:
 
     def discard(self) -> None:
         """Remove all that was written: the next run begins again."""
-        _discard(self.folder, self.folder.parents[1])
+        discard(self.folder, self.folder.parents[1])
 
     def journal(self) -> set[str]:
         """Steps noted as done by an earlier, interrupted build.
@@ -196,7 +192,7 @@ def build(
     key = artefact_key(stage, format, config, inputs)
     folder = run / ".partial" / f"{stage}-{digest(key, code_digest())[:_KEY_IN_NAME]}"
     if folder.is_dir() and not (settled(folder, run, cubes) and _whole(folder)):
-        _discard(folder, run)
+        discard(folder, run)
     resumed = folder.is_dir()
     folder.mkdir(parents=True, exist_ok=True)
     settle(folder, run, cubes)
@@ -213,14 +209,14 @@ def build(
     final = run / stage
     old = run / ".partial" / f"{stage}-replaced"
     if old.exists():
-        _discard(old, run)
+        discard(old, run)
     if final.exists():
         final.rename(old)
     folder.rename(final)
     # Only now: killed before, the build is resumed, with every step noted as done.
-    _tidy(final)
+    tidy(final)
     for left in [old, *folder.parent.glob(f"{stage}-{'[0-9a-f]' * _KEY_IN_NAME}")]:
-        _discard(left, run)
+        discard(left, run)
 
 
 def _whole(folder: Path) -> bool:
@@ -234,106 +230,13 @@ def _whole(folder: Path) -> bool:
     return all(chunks_whole(place) for place in places if isinstance(place, Path))
 
 
-def _discard(folder: Path, run: Path) -> None:
+def discard(folder: Path, run: Path) -> None:
     """Remove an artefact that is of no use any more, and its cubes elsewhere."""
     remove_cubes(folder, run)
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def _tidy(folder: Path) -> None:
+def tidy(folder: Path) -> None:
     """Remove from a complete artefact what only its build needed."""
     (folder / JOURNAL).unlink(missing_ok=True)
     shutil.rmtree(folder / SCRATCH, ignore_errors=True)
-
-
-def _settle_killed(run: Path) -> None:
-    """End what a kill left half-done: artefacts put aside, or not cleaned up."""
-    for old in run.glob(".partial/*-replaced"):
-        final = run / old.name.removesuffix("-replaced")
-        if final.exists():
-            _discard(old, run)
-        else:
-            old.rename(final)
-    for manifest in run.glob(f"*/{MANIFEST}"):
-        _tidy(manifest.parent)
-
-
-def _note_damage(run: Path, error: DamagedError) -> None:
-    """See to it that what is damaged is made again by the next run of its stage."""
-    if _name_within(run / "products", error.path) is not None:
-        error.advice = f"write it again with '{STAGES['fit'].typed(run)}'"
-        return
-    for folder in [*run.glob(".partial/*/"), *(file.parent for file in run.glob(f"*/{MANIFEST}"))]:
-        name = _name_within(folder, error.path)
-        if name is None:
-            continue
-        if folder.parent != run:
-            _discard(folder, run)
-            error.advice = "run the same command again"
-            return
-        if name != POINTER and folder.name in STAGES:
-            error.advice = f"make it again with '{STAGES[folder.name].typed(run)}'"
-        with suppress(OSError):
-            write_json(folder / DAMAGE, {"files": sorted({*damaged_files(folder), name})})
-
-
-def _name_within(folder: Path, path: str) -> str | None:
-    """Name of a file relative to an artefact, or to its cubes elsewhere; None when not of it."""
-    try:
-        cubes = cubes_of(folder)
-    except DamagedError:
-        cubes = folder
-    for place in (folder, folder.absolute(), cubes):
-        if path.startswith(f"{place}/"):
-            return path.removeprefix(f"{place}/")
-    return None
-
-
-@contextmanager
-def damage_noted(*runs: Path) -> Iterator[None]:
-    """Do what `lock` does about damage, for runs that are only read."""
-    try:
-        yield
-    except DamagedError as error:
-        for run in runs:
-            with suppress(InputError, OSError), lock(run):
-                _note_damage(run, error)
-        raise
-
-
-@contextmanager
-def lock(run: Path) -> Iterator[None]:
-    """Hold a run directory: a second process on it is refused, not mixed in.
-
-    When something of the run that the block reads turns out to be damaged, that is noted: the
-    artefact is not up to date any more, an unfinished build is removed.
-
-    Raises
-    ------
-    InputError
-        If another process holds it, or the directory cannot be written.
-    """
-    try:
-        run.mkdir(parents=True, exist_ok=True)
-        handle = (run / ".lock").open("w")
-    except (FileExistsError, NotADirectoryError) as error:
-        raise InputError(f"{run}: not a directory; choose another RUN") from error
-    except RecursionError as error:  # folder in folder is made
-        raise InputError(f"{run}: nested too deeply; choose another RUN") from error
-    except OSError as error:
-        if error.errno in DISK_FULL:
-            raise
-        raise InputError(
-            f"{run}: cannot be written ({error.strerror}); choose another place"
-        ) from error
-    with handle:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise InputError(f"{run}: another pixcal is working there; wait for it") from error
-        _settle_killed(run)
-        try:
-            yield
-        except DamagedError as error:
-            _note_damage(run, error)
-            raise

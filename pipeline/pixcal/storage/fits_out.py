@@ -14,6 +14,8 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from pixcal.storage.folder import aside_of, written_aside
+
 Cards = Mapping[str, Any]  # header keywords: a value, or (value, comment)
 
 BLOCK = 2880
@@ -43,7 +45,7 @@ class FrameWriter:
         """
         header = _header(shape, dtype, cards or {}).tostring(padding=True).encode("ascii")
         writer = cls(path, shape, dtype, len(header))
-        with _aside(path).open("wb") as file:
+        with aside_of(path).open("wb") as file:
             file.write(header)
             file.flush()
             os.posix_fallocate(file.fileno(), 0, writer.file_bytes)
@@ -77,27 +79,26 @@ class FrameWriter:
         stored = data ^ _SIGN if self.dtype == "uint16" else data
         body = stored.astype(stored.dtype.newbyteorder(">"), order="C").data.cast("B")
         at = self.data_at + (plane * ny + row) * nx * data.itemsize
-        with _aside(self.path).open("r+b", buffering=0) as file:
+        with aside_of(self.path).open("r+b", buffering=0) as file:
             while body:
                 done = os.pwrite(file.fileno(), body, at)
                 body, at = body[done:], at + done
 
     def finish(self) -> Path:
         """Put the file in place, once all rows are written."""
-        _settle(_aside(self.path), self.path)
-        return self.path
+        with written_aside(self.path, durable=True):
+            return self.path
 
     def finish_compressed(self) -> Path:
         """Put the file in place tile-compressed (RICE, lossless for integers), as ``.fits.fz``."""
-        aside, packed = _aside(self.path), self.path.with_name(self.path.stem + COMPRESSED)
-        with fits.open(aside, memmap=False) as file:
+        plain, packed = aside_of(self.path), self.path.with_name(self.path.stem + COMPRESSED)
+        with written_aside(packed, durable=True) as aside, fits.open(plain, memmap=False) as file:
             image = file[0]
             tile = (1,) * (len(self.shape) - 2) + (min(16, self.shape[-2]), self.shape[-1])
             fits.CompImageHDU(
                 image.data, image.header, compression_type="RICE_1", tile_shape=tile
-            ).writeto(_aside(packed), overwrite=True)
-        _settle(_aside(packed), packed)
-        aside.unlink()
+            ).writeto(aside, overwrite=True)
+        plain.unlink()
         return packed
 
 
@@ -114,13 +115,3 @@ def _header(shape: tuple[int, ...], dtype: str, cards: Cards) -> fits.Header:
     for key, card in cards.items():
         header[key] = card
     return header
-
-
-def _aside(path: Path) -> Path:
-    return path.with_name(f".{path.name}.aside")
-
-
-def _settle(aside: Path, path: Path) -> None:
-    with aside.open("rb") as file:
-        os.fsync(file.fileno())
-    aside.replace(path)

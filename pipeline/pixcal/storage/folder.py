@@ -3,7 +3,7 @@
 import errno
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -74,7 +74,7 @@ class LocalFolder:
         written = []
         for name, content in files:
             file = self.path / name
-            aside = _aside(file)
+            aside = aside_of(file)
             # Most folders are there: to make sure of it first would take as long as the rest.
             try:
                 out = aside.open("wb")
@@ -105,11 +105,33 @@ class LocalFolder:
         files = [self.path / name for name in names]
         for file in files:
             file.unlink(missing_ok=True)
-            _aside(file).unlink(missing_ok=True)
+            aside_of(file).unlink(missing_ok=True)
         folders = {up for file in files for up in file.parents if up.is_relative_to(self.path)}
         for folder in sorted(folders, reverse=True):
             with suppress(OSError):
                 folder.rmdir()
+
+
+@contextmanager
+def written_aside(path: Path, *, durable: bool = False) -> Iterator[Path]:
+    """Another name to write a file under; it takes its own when the block ends.
+
+    Parameters
+    ----------
+    durable : bool
+        It is on the disk then, not on its way to it.
+    """
+    aside = aside_of(path)
+    yield aside
+    if durable:
+        with aside.open("rb") as file:
+            os.fsync(file.fileno())
+    aside.replace(path)
+
+
+def aside_of(path: Path) -> Path:
+    """The hidden name under which a file is written."""
+    return path.with_name(f".{path.name}.aside")
 
 
 def flush(folder: Path) -> None:
@@ -158,10 +180,6 @@ def read_file(path: str, size: int, later: str | None = None) -> bytes:
         return body
     finally:
         os.close(handle)
-
-
-def _aside(file: Path) -> Path:
-    return file.with_name(f".{file.name}.aside")
 
 
 @dataclass(frozen=True)

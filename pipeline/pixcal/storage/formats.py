@@ -1,6 +1,6 @@
 """The kinds of artefacts and the format that each is written in, said once.
 
-Another layout on the disk is another format; `docs/architecture.md` describes them all.
+Another layout on the disk is another format; `docs/reference/run-directory.md` describes them all.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The table of the frames of an array: their order, their times, the facts of their headers."""
+"""Files of frames, whatever their format, and the table of the frames of an array."""
 
 import re
 from collections.abc import Sequence
@@ -6,7 +6,32 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
 
+from pixcal.model.errors import InputError
+from pixcal.storage import fits_in
 from pixcal.storage.fits_in import FrameFile
+from pixcal.storage.pictures import inspect_picture, is_picture
+from pixcal.storage.sources import HEADERS, SourceFile
+
+
+def inspect(source: SourceFile) -> FrameFile:
+    """Read what a file says of its frames, and hold it against the file's length.
+
+    Raises
+    ------
+    InputError
+        Naming the file: of no format that is known, damaged, or of frames that cannot be used.
+    """
+    with source.open() as handle:
+        start = handle.read(8)
+    if is_picture(start):
+        return inspect_picture(source)
+    if source.header:
+        raise InputError(
+            f"{source.path}: {HEADERS} names it, but FITS files have headers of their own; "
+            f"remove it from {HEADERS}"
+        )
+    return fits_in.inspect(source)
+
 
 TimeSource = Literal["header", "frame_period_s", "exptime_s", "number"]
 

@@ -5,7 +5,7 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from pixcal.storage.folder import UrlFolder, open_folder
+from pixcal.storage.folder import UrlFolder, open_folder, written_aside
 from pixcal.storage.place import Place, UrlPath
 
 
@@ -34,11 +34,8 @@ def _link(file: Path, target: Path) -> None:
         target.hardlink_to(file)
     except OSError:
         # Not on this file system, not across two of them, or too many names already.
-        aside = target.with_name(f".{target.name}.aside")
-        shutil.copyfile(file, aside)
-        with aside.open("rb") as copy:
-            os.fsync(copy.fileno())
-        aside.replace(target)
+        with written_aside(target, durable=True) as aside:
+            shutil.copyfile(file, aside)
 
 
 def copy_files(source: Place, target: Place, names: Sequence[str]) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 from pixcal import __version__
 from pixcal.model.errors import DamagedError
-from pixcal.storage.folder import INDEX
+from pixcal.storage.folder import INDEX, written_aside
 from pixcal.storage.memory import MemoryPath
 from pixcal.storage.place import Local
 
@@ -72,13 +72,9 @@ def write_json(path: Local, data: Any) -> None:
     if isinstance(path, MemoryPath):
         path.keep(_json(data).encode())
         return
-    aside = path.with_name(f".{path.name}.aside")
     text = _json(data)
-    with aside.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    aside.replace(path)
+    with written_aside(path, durable=True) as aside:
+        aside.write_text(text, encoding="utf-8")
 
 
 def read_json(path: Local) -> Any:
@@ -89,21 +85,16 @@ def read_json(path: Local) -> Any:
     DamagedError
         If the file is missing or does not parse.
     """
-    return _parse(path, _text(path))
+    return _read(path)[1]
 
 
-def _text(path: Local) -> str:
+def _read(path: Local) -> tuple[str, Any]:
+    """Text of a JSON file, and what it says."""
     try:
-        return path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
+        return text, json.loads(text)
     except OSError as error:
         raise DamagedError(f"{path}: cannot be read ({error.strerror})", path) from error
-    except ValueError as error:
-        raise DamagedError(f"{path}: damaged ({error})", path) from error
-
-
-def _parse(path: Local, text: str) -> Any:
-    try:
-        return json.loads(text)
     except ValueError as error:
         raise DamagedError(f"{path}: damaged ({error})", path) from error
 
@@ -126,8 +117,7 @@ def read_manifest(folder: Local) -> Manifest | None:
     path = folder / MANIFEST
     if not path.exists():
         return None
-    text = _text(path)
-    data = _parse(path, text)
+    text, data = _read(path)
     try:
         sealed = data.pop("seal", None) is not None
         if sealed and text != _json(data | {"seal": digest(data)}):

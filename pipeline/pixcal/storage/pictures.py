@@ -1,7 +1,7 @@
 """Frames in TIFF and PNG files, read by Pillow: greyscale, one frame a page.
 
 Such files have no FITS header. Exposure times are taken from ``headers.csv``
-(`pixcal.storage.header_table`), else from the EXIF tag ExposureTime.
+(`pixcal.storage.sources`), else from the EXIF tag ExposureTime.
 """
 
 import os

@@ -1,6 +1,5 @@
 """How every stage of a run works: what it needs is there, then lock, key, build and products."""
 
-import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -10,8 +9,10 @@ from typing import Any
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.model.errors import DamagedError, InputError
-from pixcal.storage.artefact import Build, artefact_key, build, lock, up_to_date
+from pixcal.storage.artefact import Build, artefact_key, build, up_to_date
+from pixcal.storage.folder import written_aside
 from pixcal.storage.formats import STAGES, Stage
+from pixcal.storage.lock import lock
 from pixcal.storage.manifest import Manifest, check_intact, read_json, read_manifest
 from pixcal.storage.place import Local, Place
 
@@ -70,7 +71,7 @@ def working(run: Path, *needed: str) -> Iterator[dict[str, str]]:
     Raises
     ------
     InputError
-        As of `require` and `pixcal.storage.artefact.lock`.
+        As of `require` and `pixcal.storage.lock.lock`.
     """
     for name in needed:
         require(run, name)
@@ -134,8 +135,5 @@ def copy_products(run: Path, stage: Stage, pattern: str) -> None:
     for other in {file.name for file in products.glob(pattern)} - {file.name for file in files}:
         (products / other).unlink()
     for file in files:
-        aside = products / f".{file.name}.aside"
-        shutil.copyfile(file, aside)
-        with aside.open("rb") as copy:
-            os.fsync(copy.fileno())
-        aside.replace(products / file.name)
+        with written_aside(products / file.name, durable=True) as aside:
+            shutil.copyfile(file, aside)

@@ -26,7 +26,7 @@ from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.estimators.fringe_fit.models import FringeShape
 from pixcal.estimators.fringe_fit.models.paraxial import Paraxial
 from pixcal.model.errors import InputError
-from pixcal.storage.fits_map import FitsMap
+from pixcal.storage.products import FitsMap
 
 F64 = NDArray[np.float64]
 Range = tuple[int, int]

@@ -31,13 +31,12 @@ from pixcal.storage.artefact import (
     MANIFEST,
     Manifest,
     artefact_key,
-    damage_noted,
-    lock,
     read_manifest,
     write_json,
     write_manifest,
 )
 from pixcal.storage.formats import STAGES
+from pixcal.storage.lock import damage_noted, lock
 
 STAGE = STAGES["compare"]
 SCHEMA = "pixcal/compare/1"

@@ -36,9 +36,10 @@ from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.treatment import HYPERBOLIC, SUFFIX, Treatments, treatments
-from pixcal.storage.artefact import Build, Manifest, lock, read_json, write_json
+from pixcal.storage.artefact import Build, Manifest, read_json, write_json
 from pixcal.storage.cube import create_group
 from pixcal.storage.formats import STAGES
+from pixcal.storage.lock import lock
 from pixcal.storage.products import Card, is_whole
 from pixcal.storage.stage import make, require
 

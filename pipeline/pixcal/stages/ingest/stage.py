@@ -27,16 +27,16 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import DamagedError, InputError, RemoteError
 from pixcal.model.options import Ingest
 from pixcal.stages.ingest.arrays import FRAMES_A_PIECE, Writers, find_kept, take_over
-from pixcal.storage.artefact import Build, Manifest, lock, read_manifest, write_json, write_manifest
+from pixcal.storage.artefact import Build, Manifest, read_manifest, write_json, write_manifest
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.cube_place import base_of, chosen_base, cubes_of
 from pixcal.storage.fits_in import FrameFile
 from pixcal.storage.fits_rows import BAND, read_rows, unpack, unpack_bytes
 from pixcal.storage.folder import transit_bytes
 from pixcal.storage.formats import STAGES
-from pixcal.storage.frame_files import inspect
 from pixcal.storage.frame_reader import describe
-from pixcal.storage.frames import Frame, columns, tabulate
+from pixcal.storage.frames import Frame, columns, inspect, tabulate
+from pixcal.storage.lock import lock
 from pixcal.storage.place import Place
 from pixcal.storage.sources import SourceFile, find_sources, fingerprint
 from pixcal.storage.stage import make

@@ -1,13 +1,21 @@
-"""Tables of sources, in every format of astropy: CSV, ECSV, FITS, VOTable."""
+"""Files of star positions: tables in every format of astropy, and distortions of a FITS WCS.
+
+Offsets are a distortion that FITS readers know: lookup tables before all other transformations,
+``D2IMDIS1`` and ``D2IMDIS2`` of the headers, with their tables in ``D2IMARR`` (Calabretta et al.
+2004, "Representations of distortions in FITS world coordinate systems"; as astropy reads them).
+"""
 
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from astropy.table import Table
+from astropy.wcs import WCS, DistortionLookupTable
 from numpy.typing import NDArray
 
+from pixcal import __version__
 from pixcal.model.errors import InputError
+from pixcal.storage.folder import written_aside
 
 
 def read_table(path: Path) -> Table:
@@ -65,3 +73,32 @@ def write_table(table: Table, path: Path, *, overwrite: bool) -> None:
     if path.suffix.lower() not in kinds:
         raise InputError(f"{path}: write a name that ends in {', '.join(kinds)}")
     table.write(path, format=kinds[path.suffix.lower()], overwrite=overwrite)
+
+
+def distortion(correction: NDArray[np.float32]) -> WCS:
+    """A WCS whose step from detector to image adds a correction to pixel coordinates.
+
+    Parameters
+    ----------
+    correction : (2, y, x) float32
+        What to add to x and y, px, in the middle of each pixel; linear between them.
+    """
+    _, ny, nx = correction.shape
+    wcs = WCS(naxis=2)
+    wcs.pixel_shape = (nx, ny)
+    # A pixel of the table is a pixel of the detector, both counted from 1.
+    tables = [
+        DistortionLookupTable(np.ascontiguousarray(part), (1.0, 1.0), (1.0, 1.0), (1.0, 1.0))
+        for part in correction
+    ]
+    wcs.det2im1, wcs.det2im2 = tables
+    return wcs
+
+
+def write_distortion(wcs: WCS, path: Path, history: str) -> None:
+    """Write a WCS with its tables as a FITS file; one that is there is replaced."""
+    hdus = wcs.to_fits(relax=True)
+    hdus[0].header["CREATOR"] = (f"pixcal {__version__}", "program that wrote this file")
+    hdus[0].header.add_history(history)
+    with written_aside(path) as aside:
+        hdus.writeto(aside, overwrite=True)

@@ -1,0 +1,35 @@
+"""Numbers, tables and notes on stdout."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import click
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """The value with some digits; a dash where there is none."""
+    return "-" if value is None else f"{value:.{digits}g}"
+
+
+def with_error(value: float | None, error: float | None) -> str:
+    """The value rounded to two digits of its error."""
+    if value is None or not error:
+        return number(value)
+    decimals = max(0, 1 - math.floor(math.log10(abs(error))))
+    return f"{value:.{decimals}f} ± {error:.{decimals}f}"
+
+
+def show_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print columns below their titles."""
+    cells = [header, *(["-" if value is None else str(value) for value in row] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for row in cells:
+        line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+        click.echo(f"  {line.rstrip()}")
+
+
+def show_notes(sentences: Sequence[str]) -> None:
+    """Print notes, a line each."""
+    for sentence in sentences:
+        click.echo(f"  note: {sentence}")
