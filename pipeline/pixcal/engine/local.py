@@ -1,14 +1,18 @@
-"""Tasks on this machine: one after the other, in threads, or in processes of their own."""
+"""Tasks on this machine: one after the other, or by Dask's schedulers in threads or processes."""
 
 import os
 import signal
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import lru_cache, partial
 from multiprocessing import get_context, parent_process
 from typing import Any
+
+import dask.multiprocessing
+import dask.threaded
+from dask.callbacks import Callback
 
 from pixcal.engine.parcel import Job, RemoteTask, pack
 from pixcal.model.errors import ClusterError
@@ -28,8 +32,10 @@ def run_in_threads(
     function: Callable[[Any], Any], items: Sequence[Any], workers: int, ended: Ended
 ) -> None:
     """Do the tasks in threads; when one fails, or at Ctrl-C, those that have begun still end."""
+    # Bound to the function: inside a graph Dask would take some items for keys or tasks.
+    tasks = {number: partial(function, item) for number, item in enumerate(items)}
     with ThreadPoolExecutor(workers) as pool:
-        _run(pool, {number: partial(function, item) for number, item in enumerate(items)}, ended)
+        _run_graph(tasks, ended, dask.threaded.get, num_workers=workers, pool=pool)
 
 
 def run_in_processes(
@@ -54,11 +60,16 @@ def run_in_processes(
         ended(number, result)
 
     while left:
+        pool = _process_pool(workers)
         # As bytes: the pool itself pickles by an older protocol.
         do = job.do()
         tasks = {n: partial(do, RemoteTask(job, pack(item)).dumps()) for n, item in left.items()}
         try:
-            _run(_process_pool(workers), tasks, noted)
+            # One by one: a task is noted when it ends, not when some others do.
+            _run_graph(
+                tasks, noted, dask.multiprocessing.get,
+                num_workers=workers, pool=pool, chunksize=1,
+            )  # fmt: skip
         except BrokenProcessPool as error:
             _process_pool.cache_clear()
             deaths += 1
@@ -68,19 +79,25 @@ def run_in_processes(
                     "memory?); give fewer --workers"
                 ) from error
         except BaseException:
+            # What has begun ends while this process holds its lock: two must not write one chunk.
             _process_pool.cache_clear()
+            pool.shutdown(cancel_futures=True)
             raise
 
 
-def _run(pool: Executor, tasks: Mapping[int, Callable[[], Any]], ended: Ended) -> None:
-    numbers = {pool.submit(task): number for number, task in tasks.items()}
-    try:
-        for future in as_completed(list(numbers)):
-            ended(numbers.pop(future), future.result())
-    except BaseException:
-        # What has begun ends while this process holds its lock: two must not write one chunk.
-        pool.shutdown(cancel_futures=True)
-        raise
+def _run_graph(
+    tasks: Mapping[int, Callable[[], Any]], ended: Ended, get: Callable[..., Any], **options: Any
+) -> None:
+    names = {f"task-{number}": number for number in tasks}
+    graph = {name: (tasks[number],) for name, number in names.items()}
+
+    def posttask(key: Any, result: Any, _dsk: Any, _state: Any, _worker: Any) -> None:
+        if key in names:
+            ended(names[key], result)
+
+    # Given, not looked up by name: for that Dask would import distributed.
+    with Callback(posttask=posttask):
+        get(graph, list(names), **options)
 
 
 @lru_cache(maxsize=1)
