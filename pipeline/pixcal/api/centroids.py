@@ -4,15 +4,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from pixcal.model.arrays import F64
 from pixcal.model.config import StrPath
 from pixcal.model.errors import InputError
 
 if TYPE_CHECKING:
     from astropy.wcs import WCS
-
-F64 = NDArray[np.float64]
 
 
 def correct_centroids(

@@ -5,15 +5,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pixcal.model.arrays import F32, U8, Mask
 from pixcal.model.config import StrPath
 
 if TYPE_CHECKING:
     from astropy.nddata import CCDData
-
-F32 = NDArray[np.float32]
-U8 = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -63,7 +60,7 @@ class OffsetMap:
     header: dict[str, Any] = field(repr=False)
 
     @property
-    def good(self) -> NDArray[np.bool_]:
+    def good(self) -> Mask:
         """(y, x): pixels that have an offset."""
         return np.equal(self.mask, 0)
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pixcal.api.maps import OffsetMap, Picture
 from pixcal.model.acquisition import Acquisition
+from pixcal.model.arrays import F32, F64, U8
 from pixcal.model.config import StrPath
 from pixcal.model.errors import InputError
 from pixcal.storage.artefact import read_json
@@ -23,9 +24,6 @@ from pixcal.storage.stage import read_acquisition, require
 if TYPE_CHECKING:
     pass
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-U8 = NDArray[np.uint8]
 
 DETECTOR_MAPS = ("bias", "dark_rate", "flat", "read_noise", "mask")
 SERIES = ("time", "B", "A", "phi", "dkx", "dky")

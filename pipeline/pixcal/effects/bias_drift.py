@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import idct
 
 from pixcal.estimators.detector.noiseless_charge import noiseless_level
@@ -31,13 +30,11 @@ from pixcal.estimators.frame_series.variance_components import (
 from pixcal.kernels.processes import brownian
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.kernels.synthesis import Stream, generator
+from pixcal.model.arrays import F32, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.shot import Shot
 from pixcal.simulation.track import Track, at
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 HOUR_S = 3600.0
 STEADY = 3.0  # the same for a ramp and a walk; below, a walk explains the frames as well

@@ -3,18 +3,16 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.detector.neighbours import shared_charge
 from pixcal.estimators.detector.response import Boundaries, boundaries_alone, boundaries_beside
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.middle import middle
 from pixcal.kernels.boundaries import REACH, area_changes, boundary_shifts, moved_charge
+from pixcal.model.arrays import F32, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
-
-F32 = NDArray[np.float32]
 
 LEVEL = 5e4  # electrons at which powers of the level are one
 POWERS = 3  # of the response that is free beside
@@ -68,7 +66,7 @@ class BrighterFatter(Effect):
         return REACH
 
     @property
-    def _shifts(self) -> NDArray[np.float64]:
+    def _shifts(self) -> F64:
         return self.shift_px_per_e * boundary_shifts(self.falloff_px)
 
     def charge(self, charge: F32, shot: Shot) -> F32:

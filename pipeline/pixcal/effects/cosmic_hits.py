@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.optimize import brentq
 from scipy.special import ndtr
@@ -12,17 +11,15 @@ from scipy.special import ndtr
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.significance import sigmas_of_count
 from pixcal.kernels.tracks import add_tracks, draw_tracks
+from pixcal.model.arrays import F32, F64, Indices, Mask
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-
 MARGIN_PX = 16  # how far beside the window tracks may begin
 THRESHOLD = 6.5  # standard deviations of the noise from which a sample is an outlier
 JOINED = 3.0  # standard deviations from which samples join outliers that lie near each other
-Samples = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]
+Samples = tuple[Indices, Indices, Indices]
 
 _STRAGGLING = 0.15
 _DRAWN = 1500
@@ -204,7 +201,7 @@ def _search(residual: F32, sigma: F32, exposure: float) -> _Search:
     )
 
 
-def _hits(outliers: NDArray[np.bool_], joined: NDArray[np.bool_]) -> list[Samples]:
+def _hits(outliers: Mask, joined: Mask) -> list[Samples]:
     """The samples (frame, row, column) of each group of outliers that lie together in a frame.
 
     Fainter samples join what noise tears apart of a long track.

@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.map_fit import (
@@ -15,14 +14,11 @@ from pixcal.estimators.maps.map_fit import (
 )
 from pixcal.estimators.maps.ring_power import Ring, ring_power
 from pixcal.kernels.scene import TILE, DetectorMaps, LightMaps, Rows, chip_map
+from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 WAVES = 6  # plane waves that make up the smooth part
 SMOOTH_SEEN = 3.0  # standard deviations of the smooth part from which its scale is fitted

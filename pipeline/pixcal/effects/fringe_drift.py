@@ -4,17 +4,15 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.fringe_motion import vector_courses
 from pixcal.kernels.scene import FrameStates
+from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.track import Track, at
-
-F64 = NDArray[np.float64]
 
 HOUR_S = 3600.0
 TRACKS = ("along_x", "along_y")

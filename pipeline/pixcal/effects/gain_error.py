@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.detector.flat_ladder import ladder_response
 from pixcal.estimators.detector.transfer_curve import (
@@ -17,13 +16,11 @@ from pixcal.estimators.detector.transfer_curve import (
 )
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.scene import DetectorMaps, Rows
+from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 _DISAGREE = 2.5
 _MIN_FRAMES = 8

@@ -5,17 +5,14 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.maps.map_waves import WaveFit, find_waves
 from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows
+from pixcal.model.arrays import C128, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
-
-F64 = NDArray[np.float64]
-C128 = NDArray[np.complex128]
 
 PARENTS = ("modulated", "fixed", "both", "crossed")
 BOTH = "ghosts of both fibres"

@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.map_fit import (
@@ -19,13 +18,12 @@ from pixcal.kernels import optics
 from pixcal.kernels.optics import Geometry
 from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows, geometry
 from pixcal.kernels.significance import sigmas_of_chi2
+from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
-
-F64 = NDArray[np.float64]
 
 _ITERATIONS = 4
 # chi-square by which positions of their own must fit the sets better than a common one,

@@ -4,19 +4,16 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.map_fit import gauge_terms, half_theta, neighbour_products, without
 from pixcal.kernels import optics
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.scene import TILE, DetectorMaps, LightMaps, Rows, chip_map, geometry
+from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
-
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 REPEAT = 0.002  # to what part the visibility of two pairs of fibres is taken to be the same
 _MIN_PIXELS = 200

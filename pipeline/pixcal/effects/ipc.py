@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.crosstalk.dense import dense_kernel
 from pixcal.estimators.crosstalk.joined import Kernel, measure
@@ -25,13 +24,11 @@ from pixcal.kernels.crosstalk import (
     uncouple,
     uncouple_fringes,
 )
+from pixcal.model.arrays import F32, F64
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.shot import Shot
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 LEAST_SHARE = 2e-5  # couplings below do not move offsets by what matters, and take time
 MIN_FLAT = 0.01  # least response that maps are divided by

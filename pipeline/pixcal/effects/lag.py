@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from pixcal.estimators.detector.flat_ladder import flicker
@@ -18,13 +17,11 @@ from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
 from pixcal.kernels.transfer import fill_traps, left_behind
+from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 TAIL = 1e-3  # share of the charge left behind whose release is brought forward to the last frame
 LAGS = 6  # frames back that are looked at

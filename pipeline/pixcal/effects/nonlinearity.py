@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.detector.flat_ladder import ladder_response
 from pixcal.estimators.detector.neighbours import shared_charge
@@ -15,14 +14,12 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.middle import middle
 from pixcal.kernels.boundaries import boundary_shifts
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
+from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 FALLOFF_PX = 0.5  # of the shift of boundaries by the brighter-fatter effect beside the response
 # levels, as shares of the brightest, at which a response is measured

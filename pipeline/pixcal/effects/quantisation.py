@@ -5,7 +5,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.detector.code_density import (
     LEAST_NOISE,
@@ -19,12 +18,10 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.variance_components import sigmas
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_best, sigmas_of_chi2
 from pixcal.kernels.synthesis import Stream, generator
+from pixcal.model.arrays import F32, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 # A step between codes moves by less than a code, so that only its neighbours need be asked
 FARTHEST = 0.98

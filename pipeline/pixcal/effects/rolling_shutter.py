@@ -3,20 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.frame_series.row_ramp import RowRamp, enough_for_rows, enough_frames
 from pixcal.estimators.frame_series.row_settling import find_settling, profile, steps_of
 from pixcal.kernels.synthesis import illuminate
+from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 FEWEST = 4  # rows at which a profile of the settling is given
 # relative error of the slope: what the frames' own parameters absorb is known to about that

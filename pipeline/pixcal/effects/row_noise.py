@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.frame_series.line_noise import (
@@ -14,12 +13,10 @@ from pixcal.estimators.frame_series.line_noise import (
 )
 from pixcal.kernels.flicker import flicker, flicker_power
 from pixcal.kernels.significance import sigmas_of_best
+from pixcal.model.arrays import F32, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 FREEDOM = 3  # parameters of a pixel in the fit of the fringes
 TURNS = 2.0  # fringes along a row from which its mean tells nothing of them

@@ -4,19 +4,16 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.map_fit import MapFit, MapPart, fit_maps, gauge_terms, polynomial
 from pixcal.estimators.maps.structure import legendre, legendre_at
 from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows
 from pixcal.kernels.significance import sigmas_of_chi2
+from pixcal.model.arrays import F64, Mask
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 DEGREE = 8  # of the polynomials that a measured pattern is made of
 BEAMS = 2  # degree of what two Gaussian beams do to the logarithm of the visibility
@@ -157,7 +154,7 @@ class Straylight(Effect):
         )
 
 
-def _usable(found: FringeEvidence) -> NDArray[np.bool_]:
+def _usable(found: FringeEvidence) -> Mask:
     alpha = np.hypot(found.theta[1], found.theta[2])
     return np.asarray(found.good & (alpha > 0) & (found.theta[0] > 0))
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.detector.telegraph.find import Telegraph, find_telegraph
 from pixcal.estimators.detector.telegraph.moments import Series
@@ -13,13 +12,11 @@ from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.scene import TILE, chip_map
 from pixcal.kernels.synthesis import BLOCK_ROWS
+from pixcal.model.arrays import F32, F64, U8, Indices
 from pixcal.model.bench import SimulatedDetector
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 HARMONICS = 5  # of the phase that are taken out of fringe residuals before they count as noise
 _MIN_FRAMES = 10
@@ -125,7 +122,7 @@ def _estimate(cls: type[TelegraphNoise], found: Telegraph) -> Estimate:
 @lru_cache(maxsize=4)
 def _pixels(
     detector: SimulatedDetector, block: int, share: float, shape: float
-) -> tuple[NDArray[np.intp], NDArray[np.intp], F32]:
+) -> tuple[Indices, Indices, F32]:
     """Rows and columns of the pixels of a block that have it, and amplitudes of mean one."""
     rows = block * BLOCK_ROWS, min((block + 1) * BLOCK_ROWS, detector.shape[0])
 
@@ -141,7 +138,7 @@ def _pixels(
 
 
 @lru_cache(maxsize=4)
-def _states(seed: int, frames: int, pixels: int, keep: float) -> NDArray[np.uint8]:
+def _states(seed: int, frames: int, pixels: int, keep: float) -> U8:
     """Whether each pixel is in its upper level, in bits: (frame, pixel / 8)."""
     rng = np.random.default_rng(seed)
     up = np.zeros(pixels, bool)

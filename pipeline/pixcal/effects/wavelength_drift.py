@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.fringe_motion import Hop, Motion, colour_of, motion_of
@@ -15,8 +14,6 @@ from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.frame_fit import fit_frames
 from pixcal.simulation.recording import Recording
-
-F64 = NDArray[np.float64]
 
 HOUR_S = 3600.0
 # scatter about two levels, over that from frame to frame, up to which there are no more

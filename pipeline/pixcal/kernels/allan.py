@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 # series whose running sums are held at the same time: they stay in the processor's cache
 PIXELS_AT_ONCE = 128

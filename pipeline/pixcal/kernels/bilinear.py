@@ -17,10 +17,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64
 
 # sums kept for each pixel: 6 normal, 3 right-hand, weighted square of the residual, samples
 N_SUMS = 11

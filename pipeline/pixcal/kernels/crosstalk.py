@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
 
-F64 = NDArray[np.float64]
 Place = tuple[slice, slice]
 
 # most steps of the inverse; each gains a factor of one over the shares that leave a pixel

@@ -14,8 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from pixcal.kernels.normal_matrix import symmetric
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64, Mask
 
 N_TERMS = 12
 # where the terms of cos P and sin P begin; the first of each is that of the window's centre
@@ -35,7 +34,7 @@ def _horner(coefficients: F64, x: float) -> float:
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def window_sums(
     signal: NDArray[Any],
-    good: NDArray[np.bool_],
+    good: Mask,
     start: tuple[int, int],
     layout: F64,
     first: tuple[int, int],

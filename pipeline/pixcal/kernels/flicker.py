@@ -1,9 +1,8 @@
 """Flicker (1/f) noise along a line of samples, of the same power in every octave of frequency."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 SPAN = 4  # periods up to so many lengths of the line are there
 

@@ -4,11 +4,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from pixcal.model.arrays import F32, I64, Mask
 
 N_SUMS = 7  # for each step: number, normal matrix (11, 12, 22), right-hand side (1, 2), square
 
@@ -22,7 +19,7 @@ def product_sums(
     good: Mask,
     of_time: F32,
     of_pixels: F32,
-    steps: NDArray[np.int64],
+    steps: I64,
     taken: F32,
     limit: float,
 ) -> Any:

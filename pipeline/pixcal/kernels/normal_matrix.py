@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 
 def symmetric(packed: NDArray[Any]) -> F64:

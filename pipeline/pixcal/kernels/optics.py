@@ -12,9 +12,11 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from pixcal.model.arrays import F64
+
+Array = F64
 
 # parameters of `phase_jacobian`, in its order; all in mm
 PARAMETERS = ("centre_x", "centre_y", "distance", "baseline_x", "baseline_y", "baseline_z")

@@ -19,12 +19,9 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from pixcal.kernels.robust import clipped_variance_factor
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64
 
 BLOCK = 16  # pixels along each side of a block
 LADDER = 4  # groups of flats from which the curve may bend

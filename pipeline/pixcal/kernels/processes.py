@@ -3,9 +3,8 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 # longest time of `brownian`, s (half a year), and its halvings (to 16 ms)
 HORIZON, LEVELS = 2.0**24, 30

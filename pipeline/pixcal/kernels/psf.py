@@ -17,11 +17,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.ndimage import spline_filter
 from scipy.special import j1
 
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 # knots of the spline in lambda / D: the table is good to 1e-6 of its peak (see the tests)
 KNOTS = 24

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
+from pixcal.model.arrays import F32
 
 FILL = 65535  # code of a sample without weight
 _DIGITS = 7

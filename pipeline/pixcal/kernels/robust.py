@@ -22,8 +22,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64, Mask
 
 BATCH = 64  # frames that are looked at together
 _LEVEL_PIXELS = 4096
@@ -275,7 +274,7 @@ class Combination:
         return np.array([r if r > 0 else np.nan for r in ratios], np.float32)
 
 
-def lit(signal: NDArray[Any]) -> NDArray[np.bool_]:
+def lit(signal: NDArray[Any]) -> Mask:
     """Pixels of a tile that see the lamp; those of an overscan do not."""
     finite = signal[np.isfinite(signal)]
     bright = float(np.percentile(finite, _BRIGHT)) if finite.size else np.inf

@@ -8,11 +8,10 @@ All in units of the step.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 SHEPPARD = 1 / 12  # variance that rounding adds to noise of a step or more
 UNTOLD = 0.35  # noise below which levels that are all alike do not tell it

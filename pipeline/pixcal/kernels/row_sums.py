@@ -2,12 +2,9 @@
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from pixcal.kernels.bilinear import FAST, add_normal, add_right
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64
 
 MODES = 5  # light, cosine, sine, and the turns of the fringe vector along x and y
 

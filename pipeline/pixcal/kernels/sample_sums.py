@@ -4,11 +4,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from pixcal.model.arrays import F32, F64, Indices, Mask
 
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 
@@ -129,7 +126,7 @@ def frame_means(values: Any, good: Mask) -> F64:
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
-def neighbour_products(values: F32, pairs: F32, steps: NDArray[np.intp], every: int = 1) -> F64:
+def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) -> F64:
     """Sums of the products of samples with those some rows and columns on, all steps in one sweep.
 
     Parameters

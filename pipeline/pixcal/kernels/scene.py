@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pixcal.kernels import optics
 from pixcal.kernels.synthesis import BLOCK_ROWS, Float32, Stream, fill_normal, generator, turns
+from pixcal.model.arrays import F64, U8
 from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.model.flags import PixelFlag
 
@@ -37,7 +38,7 @@ class DetectorMaps:
     """e- rms."""
     adu_per_e: Float32
     """The inverse of the gain, ADU/e-."""
-    mask: NDArray[np.uint8]
+    mask: U8
     """`PixelFlag.HOT` and `PixelFlag.DEAD`."""
 
 
@@ -159,9 +160,7 @@ def geometry(bench: Bench, number: int) -> optics.Geometry:
     )
 
 
-def fibre_light(
-    bench: Bench, number: int, rows: Rows
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def fibre_light(bench: Bench, number: int, rows: Rows) -> tuple[F64, F64]:
     """Light of fibres A and B alone on rows of the window, in units of the peak of A, (y, x).
 
     Gaussian beams, taken at the centres of the pixels of the perfect grid.
@@ -233,15 +232,15 @@ def light_maps(
 class FrameStates:
     """What changes from frame to frame of a fringe set; arrays over its frames."""
 
-    phi: NDArray[np.float64]
+    phi: F64
     """Phase, rad."""
-    level: NDArray[np.float64]
+    level: F64
     """B, mean 1."""
-    amplitude: NDArray[np.float64]
+    amplitude: F64
     """A, mean 1."""
-    dkx: NDArray[np.float64]
+    dkx: F64
     """Change of the fringe vector along x, rad/px, about the window's centre."""
-    dky: NDArray[np.float64]
+    dky: F64
     """Change of the fringe vector along y, rad/px."""
 
     def turns(self, frame: int, shape: tuple[int, int], rows: Rows) -> tuple[Float32, Float32]:

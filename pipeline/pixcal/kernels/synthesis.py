@@ -22,7 +22,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Float32 = NDArray[np.float32]
+from pixcal.model.arrays import F32, U16
+
+Float32 = F32
 
 # Rows of the window that share a noise generator. Another number would be other noise.
 BLOCK_ROWS = 64
@@ -85,8 +87,8 @@ def illuminate(
     alpha_cos: Float32,
     level: float,
     amplitude: float,
-    column_turn: NDArray[np.float32],
-    row_turn: NDArray[np.float32],
+    column_turn: F32,
+    row_turn: F32,
     out: Float32,
 ) -> None:
     """Mean electrons from the light: ``B iota + A alpha sin(psi + phi)`` (physics note, section 1).
@@ -218,7 +220,7 @@ def amplify(
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def convert(adu: Float32, top: int, out: NDArray[np.uint16]) -> None:
+def convert(adu: Float32, top: int, out: U16) -> None:
     """Codes of the converter, rounded and clipped to 0 and ``top`` (ADU)."""
     low, high, half = np.float32(0), np.float32(top), np.float32(0.5)
     for i in range(out.shape[0]):

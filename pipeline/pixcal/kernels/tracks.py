@@ -9,10 +9,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64
 
 STEPS_PER_PX = 4  # points of a track that stand for a pixel of its length
 GRAZING = 0.02  # least cosine to the layer's normal: no track is longer than 50 times the depth

@@ -2,9 +2,8 @@
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
+from pixcal.model.arrays import F32
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

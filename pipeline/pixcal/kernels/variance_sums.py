@@ -5,9 +5,8 @@ Compiled: they are small and mostly zeros, and NumPy takes four to ten times as 
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]

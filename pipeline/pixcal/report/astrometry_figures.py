@@ -8,12 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.transforms import Bbox
-from numpy.typing import NDArray
 
+from pixcal.model.arrays import F64
 from pixcal.report.colours import BLUE, DIVERGING, GREEN, GREY, INK, RED, SEQUENTIAL
 from pixcal.report.drawing import WIDE, Unit, finish, new_figure, unit_for
-
-F64 = NDArray[np.float64]
 
 PERFECT, MEASURED = RED, BLUE
 LABELS = {"perfect": "perfect grid", "measured": "measured maps"}

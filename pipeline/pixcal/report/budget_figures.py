@@ -8,13 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
-from numpy.typing import NDArray
 
+from pixcal.model.arrays import F64
 from pixcal.report.colours import BAR, BLUE, GREEN, GREY, INK, MARKS, RED
 from pixcal.report.drawing import WIDE, finish, new_figure, plain_ticks
 from pixcal.report.text import duration, number
-
-F64 = NDArray[np.float64]
 
 COLOURS = (BLUE, GREEN, *MARKS)
 

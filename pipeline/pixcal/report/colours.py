@@ -3,9 +3,8 @@
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import ListedColormap, to_rgb
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 LEVELS = 81  # steps of a colour scale: with all others they fit the 256 colours of a small PNG
 

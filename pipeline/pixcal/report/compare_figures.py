@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure, SubFigure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
+from pixcal.model.arrays import F64, I64
 from pixcal.report.colours import BAND, BLUE, DIVERGING, GREEN, GREY, INK, RED, SEQUENTIAL
 from pixcal.report.drawing import (
     WIDE,
@@ -22,8 +22,6 @@ from pixcal.report.drawing import (
     unit_for,
 )
 from pixcal.report.text import SYMBOLS
-
-F64 = NDArray[np.float64]
 
 SHIFT_SPAN = 5.0  # sigma at which the colours of the map of differences end
 MARKED = 200  # most disagreeing pixels that are marked
@@ -37,7 +35,7 @@ class ComponentView:
     name: str
     window: tuple[int, int]  # (y, x), px
     facts: Mapping[str, Any]  # of ``compare.json``
-    picture: NDArray[np.int64]  # (bin, bin) pixels by the second map (y) and the first (x)
+    picture: I64  # (bin, bin) pixels by the second map (y) and the first (x)
     reach: float  # half width of the picture, px
     # (y, x) sigma of each block: of its mean difference, and of its pixels' scatter
     shift: F64

@@ -5,11 +5,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pixcal.model.arrays import F64
 from pixcal.report.summary import FlagSummary, MapSummary, Spectrum
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,9 @@ from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
+from pixcal.model.arrays import F64, I64, Indices, Mask
 from pixcal.report.colours import BLUE, GREY, INK, RED, SEQUENTIAL
 from pixcal.report.drawing import WIDE, covered, finish, new_figure
-
-F64 = NDArray[np.float64]
 
 SHOWN_PATHS = 4  # paths of each end (paper, figure 16)
 LONG_TITLE = 10  # points, so that numbers of many digits stay within their panel
@@ -49,7 +48,7 @@ class CrestView:
     distance_from_prior: bool  # whether that is mostly the error of the bench's nominal value
 
     @property
-    def used(self) -> NDArray[np.bool_]:
+    def used(self) -> Mask:
         """Points (point,) that are no outliers."""
         return self.arrays["used"] > 0
 
@@ -60,7 +59,7 @@ class CrestView:
         x, y = self.arrays["x"], self.arrays["y"]
         return ux * x + uy * y, ux * y - uy * x
 
-    def on(self, k: int) -> NDArray[np.intp]:
+    def on(self, k: int) -> Indices:
         """Numbers of the points on a path, in their order along it."""
         points = np.flatnonzero(self.arrays["k"] == k)
         return points[np.argsort(self.turned[1][points])]
@@ -86,7 +85,7 @@ def crest_figure(view: CrestView) -> Figure:
     return figure
 
 
-def outermost(k: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def outermost(k: I64) -> tuple[I64, I64]:
     """Numbers of the paths to show, of the first and of the last.
 
     Paths through a corner of a turned frame are too short to show their shape.
@@ -101,7 +100,7 @@ def _colour(k: int) -> str:
     return VALLEY if k % 2 else CREST
 
 
-def _stretched(axes: Axes, view: CrestView, paths: NDArray[np.int64], title: str) -> None:
+def _stretched(axes: Axes, view: CrestView, paths: I64, title: str) -> None:
     """Shapes of some paths side by side: position across the fringes less its mean."""
     across, along = view.turned
     chosen = {int(k): (on := view.on(k))[view.used[on]] for k in paths}
@@ -129,7 +128,7 @@ def _stretched(axes: Axes, view: CrestView, paths: NDArray[np.int64], title: str
     finish(axes, grid=False)
 
 
-def _whole(axes: Axes, view: CrestView, paths: NDArray[np.int64]) -> None:
+def _whole(axes: Axes, view: CrestView, paths: I64) -> None:
     """The outermost paths over the whole frame, and the fibres before it."""
     ny, nx = view.frame
     axes.plot(

@@ -8,15 +8,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from pixcal.model.arrays import F64
 from pixcal.report.colours import BAND, BLUE, GREY, INK, RED
 from pixcal.report.contents import DiagnosisContents
 from pixcal.report.curve_places import axis_label, places
 from pixcal.report.diagnosis_words import DETECTOR, effect_title, percent, unit
 from pixcal.report.drawing import TITLE, WIDE, Unit, axes_grid, finish, plain_ticks, unit_for
-
-F64 = NDArray[np.float64]
 
 ROOM = 50  # letters that fit below a panel; where names of places have more, they are turned
 SPAN = 12.0  # ratio of values from which an axis is logarithmic

@@ -9,12 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
 from pixcal.report.colours import DIVERGING, GREY, INK
 from pixcal.report.drawing import TITLE, WIDE, axes_grid
-
-F64 = NDArray[np.float64]
 
 CELLS = "cell of 4 × 4"  # `x_label` of curves whose values are cells of the window
 ASIDE = 3.0  # standard deviations below which a map is not worth looking at

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from pixcal.model.arrays import F64
 from pixcal.report.colours import (
     BAND,
     BAR,
@@ -34,8 +34,6 @@ from pixcal.report.drawing import (
 from pixcal.report.map_panels import folded
 from pixcal.report.summary import MapSummary, Profile, Spectrum
 from pixcal.report.text import SYMBOLS
-
-F64 = NDArray[np.float64]
 
 MEANS_DRAWN = 800  # most means of a profile that are drawn one by one
 

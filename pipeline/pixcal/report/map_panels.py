@@ -14,6 +14,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator
 from numpy.typing import NDArray
 from PIL import Image
 
+from pixcal.model.arrays import F64, U8
 from pixcal.model.flags import PixelFlag
 from pixcal.report.colours import FLAGS, LEVELS, MARKS, MASKED, SEQUENTIAL, SEVERAL, UNFLAGGED
 from pixcal.report.contents import MapContents, SetContents
@@ -21,7 +22,6 @@ from pixcal.report.drawing import block_note, covered, fit_box, span_scale, unit
 from pixcal.report.summary import FlagSummary, MapSummary, Spectrum
 from pixcal.report.text import SYMBOLS, exact, flag_name
 
-F64 = NDArray[np.float64]
 Ticks = list[tuple[float, str]]  # places (page px) and their numbers
 Legend = list[tuple[str, str]]  # colours and what they mean
 
@@ -75,16 +75,14 @@ def data_url(picture: Image.Image) -> str:
     return "data:image/png;base64," + base64.b64encode(out.getvalue()).decode("ascii")
 
 
-def _image(classes: NDArray[np.uint8], colours: Sequence[str]) -> str:
+def _image(classes: U8, colours: Sequence[str]) -> str:
     """Numbers of colours (y upwards) as a picture."""
     picture = Image.fromarray(np.ascontiguousarray(classes[::-1]))
     picture.putpalette([round(255 * v) for c in colours for v in to_rgb(c)])
     return data_url(picture)
 
 
-def scaled(
-    image: NDArray[np.floating], low: float, high: float, *, log: bool = False
-) -> NDArray[np.uint8]:
+def scaled(image: NDArray[np.floating], low: float, high: float, *, log: bool = False) -> U8:
     """Number of the colour of each value; the one after the last where there is no value."""
     ends = np.log([low, high]) if log else np.array([low, high])
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -266,7 +264,7 @@ def _flags(title: str, summary: FlagSummary, most: float) -> Panel:
     )
 
 
-def _classes(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def _classes(image: U8) -> U8:
     """0 for good, 1 + bit for one flag, one more than all bits for several."""
     bits = np.unpackbits(image[..., None], axis=-1, bitorder="little").astype(np.uint8)
     several = np.uint8(len(FLAGS) + 1)

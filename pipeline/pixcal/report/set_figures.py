@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
-from numpy.typing import NDArray
 from scipy.special import gammaln, xlogy
 
+from pixcal.model.arrays import F64
 from pixcal.report.colours import BAR, BLUE, GREY, INK, LINES
 from pixcal.report.contents import SetContents
 from pixcal.report.drawing import (
@@ -24,7 +24,6 @@ from pixcal.report.drawing import (
 )
 from pixcal.report.text import with_error
 
-F64 = NDArray[np.float64]
 Facts = Mapping[str, Any]
 
 ALLAN_COLUMNS = (
@@ -243,7 +242,7 @@ def _floats(values: Any) -> F64:
     return np.array([np.nan if v is None else v for v in values or ()], dtype=float)
 
 
-def _reduced_chi2_density(at: NDArray[np.float64], freedom: int) -> NDArray[np.float64]:
+def _reduced_chi2_density(at: F64, freedom: int) -> F64:
     """Probability density of a chi-square of many degrees of freedom over their number."""
     half = freedom / 2
     return np.asarray(half * np.exp(xlogy(half - 1, half * at) - half * at - gammaln(half)))

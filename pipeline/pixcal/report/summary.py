@@ -13,9 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.kernels.robust import median_and_sigma
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64, I64, U8, Mask
 
 SHOWN_PIXELS = 400  # most blocks along the longer side of a map on the page
 SAMPLE = 1_000_000  # most pixels of a histogram
@@ -77,7 +75,7 @@ class Profile:
 
     mean: F64  # (n,) NaN where no pixel is good
     scatter: F64  # (n,) standard deviation of the pixels that were averaged
-    count: NDArray[np.int64]  # (n,) how many they were
+    count: I64  # (n,) how many they were
 
     @property
     def error(self) -> F64:
@@ -132,7 +130,7 @@ def block_mean(values: NDArray[Any], side: int) -> F32:
     return _ratio(total, count).astype(np.float32)
 
 
-def _block_sums(values: NDArray[Any], good: NDArray[np.bool_], side: int) -> tuple[F64, F64]:
+def _block_sums(values: NDArray[Any], good: Mask, side: int) -> tuple[F64, F64]:
     edges = [np.arange(0, n, side) for n in values.shape]
 
     def sums(data: NDArray[Any]) -> F64:
@@ -304,7 +302,7 @@ class FlagSummary:
 
     shape: tuple[int, int]
     block: int
-    image: NDArray[np.uint8]  # (y, x) flags of any pixel of each block
+    image: U8  # (y, x) flags of any pixel of each block
     share: F32  # (y, x) share of each block's pixels that have any flag
     masked: int  # pixels with any flag
     counts: dict[int, int] = field(default_factory=dict)  # pixels that have each bit set

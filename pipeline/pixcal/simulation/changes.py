@@ -20,11 +20,10 @@ from pixcal.estimators.diagnosis.deviations import (
     is_smooth,
 )
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.model.arrays import F32
 from pixcal.simulation.forward import ForwardModel, Stage
 from pixcal.simulation.replica import Replica
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 Key = tuple[str | int, str]
 """Fringe set or number of a stack, and which of its deviations."""
 Draw = dict[Key, NDArray[Any]]

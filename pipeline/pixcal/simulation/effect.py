@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.model.arrays import F32, F64
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.changes import Template, Way
@@ -23,10 +23,6 @@ from pixcal.simulation.forward import DOMAINS, ForwardModel, Stage
 from pixcal.simulation.frame_changes import acts_on_frames_alone
 from pixcal.simulation.frame_fit import fit_frames
 from pixcal.simulation.score import score, score_again
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-
 
 __all__ = ["DOMAINS", "Effect", "Estimate", "FringeMaps", "Stage"]
 

@@ -12,7 +12,6 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.kernels import synthesis
 from pixcal.kernels.scene import (
@@ -24,11 +23,11 @@ from pixcal.kernels.scene import (
     light_maps,
 )
 from pixcal.kernels.synthesis import BLOCK_ROWS
+from pixcal.model.arrays import F32, U16
 from pixcal.model.bench import Bench
 from pixcal.simulation.forward import ForwardModel
 from pixcal.simulation.recording import Recording
 
-F32 = NDArray[np.float32]
 K = TypeVar("K", tuple[int, int], tuple[int, str])
 
 
@@ -63,9 +62,7 @@ class Camera:
         for effect in self.effects:
             self.maps = effect.detector(self.maps, bench, self.rows)
 
-    def expose(
-        self, recording: Recording, frames: range
-    ) -> Iterator[tuple[int, NDArray[np.uint16]]]:
+    def expose(self, recording: Recording, frames: range) -> Iterator[tuple[int, U16]]:
         """Frames as the camera reads them.
 
         Parameters
@@ -244,7 +241,7 @@ class _Chain:
             self._kept_normals.keep(key, drawn)
         return drawn
 
-    def samples(self, frame: int) -> NDArray[np.uint16]:
+    def samples(self, frame: int) -> U16:
         """Codes of a frame."""
         synthesis.convert(self.adu(frame), self.camera.bench.detector.top_adu, self._samples)
         return self._samples
@@ -287,9 +284,7 @@ def states_of(recording: Recording, effects: Sequence[ForwardModel]) -> FrameSta
     return states
 
 
-def frames_of(
-    bench: Bench, recording: Recording, effects: Sequence[ForwardModel] = ()
-) -> NDArray[np.uint16]:
+def frames_of(bench: Bench, recording: Recording, effects: Sequence[ForwardModel] = ()) -> U16:
     """All frames (time, y, x) of a recording, in memory."""
     shape = bench.detector.shape
     out = np.empty((recording.count, *shape), np.uint16)

@@ -11,16 +11,11 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, ClassVar, Self
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
+from pixcal.model.arrays import F32
 from pixcal.model.bench import Bench
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.shot import Shot
-
-F32 = NDArray[np.float32]
-
 
 DOMAINS = ("space", "time", "intensity", "noise")
 """Where an effect may show."""

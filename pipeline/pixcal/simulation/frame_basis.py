@@ -7,7 +7,6 @@ vector, but for those that are the effect's own.
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.frame_series.fringe_motion import motion_part, ramps, ramps_and_colour
 from pixcal.estimators.frame_series.light import LIGHT_PARTS
@@ -18,9 +17,8 @@ from pixcal.estimators.frame_series.variance_components import (
     cosine_modes,
     estimate_components,
 )
+from pixcal.model.arrays import F64
 from pixcal.simulation.frame_changes import DRAWS, LIGHT, FrameChanges, Strength, Watched, unit_of
-
-F64 = NDArray[np.float64]
 
 MOTION_PARTS = ("jitter_x", "jitter_y", "walk_x", "walk_y", "walk_k")
 SAME = 0.8  # share of a nuisance that the effect explains, from which it is the effect's own

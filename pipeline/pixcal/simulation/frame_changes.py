@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.fringe_motion import motion_of
@@ -19,12 +18,11 @@ from pixcal.estimators.frame_series.series import FrameSeries
 from pixcal.estimators.frame_series.spectral_line import Line
 from pixcal.estimators.frame_series.variance_components import cosine_modes
 from pixcal.kernels.scene import FrameStates
+from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench
 from pixcal.simulation.forward import ForwardModel
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import set_recordings
-
-F64 = NDArray[np.float64]
 
 DRAWS = 64
 KEPT = 256  # parts that are not drawn again in the next simulation of the same frames

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from pixcal.estimators.diagnosis.evidence import Evidence
@@ -37,8 +36,6 @@ from pixcal.simulation.frame_changes import (
     strengths_of,
     with_number,
 )
-
-F64 = NDArray[np.float64]
 
 ALIKE = (
     "; with fringes of one direction, motion of the fibres along the fringe axis and drift of the "

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
+from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import (
     SCHEMA,
     Bench,
@@ -26,9 +26,6 @@ from pixcal.model.bench import (
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.forward import ForwardModel, Stage
 from pixcal.simulation.recording import Recording
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 LEAST_S = 1e-6
 """Exposure time and period where none is known."""

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from pixcal.estimators.diagnosis.evidence import Evidence
@@ -27,11 +26,10 @@ from pixcal.estimators.frame_series.variance_components import (
     sigmas,
 )
 from pixcal.kernels.normal_matrix import inverse_normal
+from pixcal.model.arrays import F64
 from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way, dot
 from pixcal.simulation.forward import ForwardModel
 from pixcal.simulation.frame_changes import with_number
-
-F64 = NDArray[np.float64]
 
 STEP = 1.1
 """Factor on a parameter for its derivative."""

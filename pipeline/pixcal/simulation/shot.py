@@ -3,13 +3,11 @@
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
+from pixcal.model.arrays import F32
 from pixcal.model.bench import Bench
 from pixcal.simulation.recording import Recording
-
-F32 = NDArray[np.float32]
 
 
 class Shot(Protocol):

@@ -5,11 +5,9 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

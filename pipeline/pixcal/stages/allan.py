@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal import __version__
 from pixcal.engine.plan import make_plan
@@ -34,6 +33,7 @@ from pixcal.estimators.frame_series.stability import (
 )
 from pixcal.kernels.allan import allan_deviation, averaging_lengths, disjoint_differences
 from pixcal.kernels.quantiles import quantiles_of_parts
+from pixcal.model.arrays import F32, F64, I64, Mask
 from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Allan, Region
@@ -54,8 +54,6 @@ NOISE_LEVELS = (np.arange(64) + 0.5) / 64
 
 Range = tuple[int, int]
 Tile = tuple[Range, Range]
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 
 Config = Allan
@@ -285,7 +283,7 @@ def _measure_region(
 
 def _sums(
     folder: Path, batches: Batches, lengths: tuple[int, ...], region: Region, runtime: Runtime
-) -> tuple[NDArray[np.int64], list[F64]]:
+) -> tuple[I64, list[F64]]:
     """Pixels of a region that have each batch, and for each length their products."""
     if not lengths:
         return ArrayReader(batches.folder / "batch_count").read().astype(np.int64), []
@@ -301,7 +299,7 @@ def _sums(
 
 def _sums_task(
     batches: Batches, lengths: tuple[int, ...], expected: Path, square: Tile
-) -> tuple[NDArray[np.int64], list[F64]]:
+) -> tuple[I64, list[F64]]:
     """Pixels that have each batch, and the products of differences that pixels may share."""
     counts = np.zeros(batches.n, np.int64)
     grams: list[Any] = [0.0] * len(lengths)
@@ -317,7 +315,7 @@ def _sums_task(
     return counts, grams
 
 
-def _has_difference(present: NDArray[np.bool_], m: int) -> bool:
+def _has_difference(present: Mask, m: int) -> bool:
     return bool(np.isin(2 * m, np.convolve(present, np.ones(2 * m, int), "valid")))
 
 

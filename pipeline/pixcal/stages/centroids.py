@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from astropy.wcs import WCS
-from numpy.typing import NDArray
 
 from pixcal.estimators.star_centroids.centroids import Star
 from pixcal.estimators.star_centroids.correction import (
@@ -14,14 +13,13 @@ from pixcal.estimators.star_centroids.correction import (
     correction_map,
     gaussian_star,
 )
+from pixcal.model.arrays import F32, F64
 from pixcal.model.errors import InputError
 from pixcal.stages.advice import maps_to_use
 from pixcal.storage.artefact import read_json
 from pixcal.storage.products import read_map
 from pixcal.storage.star_files import column, distortion, read_table, write_distortion, write_table
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 FWHMS = (0.5, 50.0)
 
 

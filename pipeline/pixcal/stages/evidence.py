@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, free_frames
 from pixcal.estimators.fringe_fit.fringes import grid
+from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 from pixcal.stages.fit.scouting import read_frames
 from pixcal.stages.reduce.ingested import Ingested
@@ -20,7 +20,6 @@ from pixcal.storage.stage import read_acquisition, require
 # rows and columns of the window: ((y0, y1), (x0, x1))
 Part = tuple[tuple[int, int], tuple[int, int]]
 
-F64 = NDArray[np.float64]
 
 MAX_SAMPLES = 1 << 26  # samples of a set that are taken into memory (some ten bytes each)
 

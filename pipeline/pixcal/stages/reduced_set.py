@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.tile import Coding, Tile
+from pixcal.model.arrays import F64, U8, U16
 from pixcal.storage.cube import ArrayReader, CachedReader
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.place import Local, Place
@@ -86,7 +86,7 @@ class ReducedSet:
             float(attrs["scale_factor"]), float(attrs["add_offset"]), int(attrs["_FillValue"])
         )
 
-    def time_s(self) -> NDArray[np.float64]:
+    def time_s(self) -> F64:
         """Time of each frame, s."""
         return ArrayReader(self.place / "time").read().astype(float)
 
@@ -107,27 +107,25 @@ class ReducedSet:
             self.mask(tile) == 0,
         )
 
-    def mask(self, tile: tuple[int, int]) -> NDArray[np.uint8]:
+    def mask(self, tile: tuple[int, int]) -> U8:
         """Flags of a tile's pixels."""
         y, x = self.ranges(tile)
         return self._maps["mask"].read(y, x).astype(np.uint8)
 
-    def codes(self, tile: tuple[int, int], block: int, *, keep: bool = False) -> NDArray[np.uint16]:
+    def codes(self, tile: tuple[int, int], block: int, *, keep: bool = False) -> U16:
         """Codes (t, y, x) of one block of frames of a tile."""
         index = (block, *tile)
         chunk = self.signal.keep(index) if keep else self.signal.read_chunk(index)
         return self._inside(chunk, tile, block)
 
-    def blocks(self, tile: tuple[int, int]) -> Iterator[NDArray[np.uint16]]:
+    def blocks(self, tile: tuple[int, int]) -> Iterator[U16]:
         """Codes of a tile, block after block; each is overwritten by the next."""
         # Fresh memory for every chunk would cost more than decoding it.
         buffer = np.empty(self.signal.chunks, self.signal.dtype)
         for block in range(self.n_blocks):
             yield self._inside(self.signal.read_chunk((block, *tile), buffer), tile, block)
 
-    def _inside(
-        self, chunk: NDArray[np.uint16], tile: tuple[int, int], block: int
-    ) -> NDArray[np.uint16]:
+    def _inside(self, chunk: U16, tile: tuple[int, int], block: int) -> U16:
         """The part of a chunk that lies in the window and the run."""
         y, x = self.ranges(tile)
         n = min(self.block, self.n_frames - block * self.block)

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.effects import known_effects, parse_effects
 from pixcal.engine.plan import make_plan
@@ -27,6 +26,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels import optics, synthesis
 from pixcal.kernels.scene import DetectorMaps, Rows, geometry
 from pixcal.model import acquisition as described
+from pixcal.model.arrays import U16
 from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
@@ -75,9 +75,7 @@ Effects = tuple[Effect, ...]
 class Exposes(Protocol):
     """Some rows of a bench, as `Camera`."""
 
-    def expose(
-        self, recording: Recording, frames: range
-    ) -> Iterator[tuple[int, NDArray[np.uint16]]]:
+    def expose(self, recording: Recording, frames: range) -> Iterator[tuple[int, U16]]:
         """Frames as in `Camera.expose`."""
 
 

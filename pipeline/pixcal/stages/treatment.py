@@ -5,15 +5,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pixcal.effects import known_effects, parse_effects
+from pixcal.model.arrays import F64
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
-
-F64 = NDArray[np.float64]
 
 # the shape of fringes (`pixcal.estimators.fringe_fit.models`) beside straight ones
 HYPERBOLIC = "hyperbolic"

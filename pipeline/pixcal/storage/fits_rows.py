@@ -17,6 +17,7 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from pixcal.model.arrays import F32, F64
 from pixcal.model.errors import InputError
 from pixcal.storage.cube import CHUNK
 from pixcal.storage.fits_in import Coding, FrameFile, damaged_gzip
@@ -36,7 +37,7 @@ def bands(rows: tuple[int, int]) -> list[tuple[int, int]]:
 
 def read_rows(
     file: FrameFile, planes: Sequence[int], rows: tuple[int, int], out: NDArray[Any] | None = None
-) -> NDArray[np.float64]:
+) -> F64:
     """Read rows of some planes of a plain file, each byte once.
 
     Parameters
@@ -106,7 +107,7 @@ def _read_exactly(handle: io.FileIO, start: int, raw: NDArray[Any], path: Path) 
         raise unreadable(path, error) from error
 
 
-def _scale(raw: NDArray[Any], coding: Coding) -> NDArray[np.float32]:
+def _scale(raw: NDArray[Any], coding: Coding) -> F32:
     values = raw.astype(np.float64)
     values *= coding.bscale
     values += coding.bzero

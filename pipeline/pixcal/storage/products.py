@@ -17,6 +17,7 @@ from astropy.utils.exceptions import AstropyUserWarning
 from numpy.typing import NDArray
 
 from pixcal import __version__
+from pixcal.model.arrays import F32, U8
 from pixcal.model.errors import DamagedError
 from pixcal.model.flags import PixelFlag
 from pixcal.storage.fits_out import BLOCK
@@ -133,9 +134,9 @@ class Rows(Protocol):
 
 def write_map(
     path: Path,
-    data: Rows | NDArray[np.float32],
-    sigma: Rows | NDArray[np.float32],
-    mask: Rows | NDArray[np.uint8],
+    data: Rows | F32,
+    sigma: Rows | F32,
+    mask: Rows | U8,
     cards: Sequence[Card],
     history: Sequence[str] = (),
 ) -> None:
@@ -222,7 +223,7 @@ def _checked(path: Path) -> Iterator[fits.HDUList]:
 
 def read_map(
     path: Path,
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], dict[str, Any]]:
+) -> tuple[F32, F32, U8, dict[str, Any]]:
     """Read a map written by `write_map`: data, sigma, mask, primary header.
 
     Raises

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 from astropy.wcs import WCS, DistortionLookupTable
-from numpy.typing import NDArray
 
 from pixcal import __version__
+from pixcal.model.arrays import F32, F64
 from pixcal.model.errors import InputError
 from pixcal.storage.folder import written_aside
 
@@ -40,7 +40,7 @@ def read_table(path: Path) -> Table:
         ) from error
 
 
-def column(table: Table, name: str, path: Path, option: str) -> NDArray[np.float64]:
+def column(table: Table, name: str, path: Path, option: str) -> F64:
     """Numbers of a column; NaN where it is masked.
 
     Raises
@@ -75,7 +75,7 @@ def write_table(table: Table, path: Path, *, overwrite: bool) -> None:
     table.write(path, format=kinds[path.suffix.lower()], overwrite=overwrite)
 
 
-def distortion(correction: NDArray[np.float32]) -> WCS:
+def distortion(correction: F32) -> WCS:
     """A WCS whose step from detector to image adds a correction to pixel coordinates.
 
     Parameters

@@ -20,15 +20,12 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
 from pixcal.estimators.crosstalk.links import Place
 from pixcal.estimators.crosstalk.residuals import STRIDE, UNIT, Residuals, all_residuals
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64
 
 MIN_CHARGE = 0.1  # charge (10⁴ e-) of the least light whose noise can tell
 TINY = np.float32(1e-20)

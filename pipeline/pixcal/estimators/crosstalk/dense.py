@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from math import lcm
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pixcal.estimators.crosstalk.covariance import Products, products
@@ -22,8 +21,8 @@ from pixcal.estimators.crosstalk.shrinkage import Shrinkage
 from pixcal.estimators.crosstalk.support import coupling_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling, outflow
+from pixcal.model.arrays import F64
 
-F64 = NDArray[np.float64]
 Sums = tuple[F64, F64]
 
 WITHIN = 2  # rows and columns of the kernel about its middle

@@ -12,15 +12,13 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, median_filter
 
 from pixcal.estimators.crosstalk.links import REACH, Classes, Place
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling, couple, outflow
 from pixcal.kernels.robust import median_and_sigma
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64, Indices, Mask
 
 MIN_SIGMAS = 40.0  # dark signal of a hot pixel over the noise of the others
 OVERLAP = 0.01  # another hot pixel near the receiver, of this share of the source, spoils it
@@ -39,8 +37,8 @@ MOST = 4000  # hot pixels used, the brightest
 class HotPixels:
     """What each hot pixel shows of each link, both ways."""
 
-    y: NDArray[np.intp]  # y, x: (h,)
-    x: NDArray[np.intp]
+    y: Indices  # y, x: (h,)
+    x: Indices
     charge: F64  # (h,) 10³ e- at the longest dark exposure, less the background
     # value, sigma: (h, link, 2) share read at `+step` and at `-step`, and its error (infinite
     # where spoilt)
@@ -123,7 +121,7 @@ class ClassShares:
     product: F64
     count: F64  # hot pixels used
 
-    def without(self, some: NDArray[np.bool_]) -> "ClassShares":
+    def without(self, some: Mask) -> "ClassShares":
         """The same with some of no weight."""
         return replace(
             self,
@@ -199,8 +197,8 @@ def hot_pixels(
 
 def _given(
     warm: F64,
-    y: NDArray[np.intp],
-    x: NDArray[np.intp],
+    y: Indices,
+    x: Indices,
     links: tuple[Place, ...],
     known: Sequence[Coupling],
     first: Place,
@@ -220,7 +218,7 @@ def _given(
     return got, shares
 
 
-def _unsaturated(evidence: Evidence) -> NDArray[np.bool_]:
+def _unsaturated(evidence: Evidence) -> Mask:
     """Pixels far from saturation in every dark."""
     usable = np.ones(evidence.good.shape, bool)
     for stack in evidence.of_kind("dark"):
@@ -228,9 +226,7 @@ def _unsaturated(evidence: Evidence) -> NDArray[np.bool_]:
     return usable
 
 
-def _patches(
-    rest: F64, warm: F64, y: NDArray[np.intp], x: NDArray[np.intp], overlap: float
-) -> tuple[F64, NDArray[np.bool_]]:
+def _patches(rest: F64, warm: F64, y: Indices, x: Indices, overlap: float) -> tuple[F64, Mask]:
     """Surroundings (h, row, column) of hot pixels within `REACH`, and where they can be trusted.
 
     That is where no other hot pixel is near that has ``overlap`` times the charge. Flags do not
@@ -247,7 +243,7 @@ def _patches(
         return near, (near < OWN_RING * charge) & (strongest < overlap * charge)
 
 
-def _surroundings(values: F64, y: NDArray[np.intp], x: NDArray[np.intp], size: int) -> F64:
+def _surroundings(values: F64, y: Indices, x: Indices, size: int) -> F64:
     """Values (h, row, column) up to ``size`` pixels around pixels; NaN beyond the border."""
     step = np.arange(2 * size + 1)
     padded = np.pad(values, size, constant_values=np.nan)

@@ -8,14 +8,12 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.crosstalk.covariance import NORMAL, TERMS, Products
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels
 from pixcal.estimators.crosstalk.links import Classes, Place, class_sums, sums_of
 from pixcal.estimators.crosstalk.residuals import UNIT
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64, Indices, Mask
 
 # how large the covariance of neighbours over the square of their charge may well be, 1/e-
 BRIGHTER_FATTER = 1e-6
@@ -44,7 +42,7 @@ class Information:
             {way: r[link] for way, r in self.right.items()},
         )
 
-    def only(self, unknowns: NDArray[np.intp]) -> "Information":
+    def only(self, unknowns: Indices) -> "Information":
         """Of some of the unknowns, the others being zero."""
         at = np.ix_(unknowns, unknowns)
         return Information(
@@ -113,7 +111,7 @@ class Measured:
         return {"covariance": normal}, {"covariance": right}
 
 
-def _backed(value: F64, normal: F64, right: F64) -> NDArray[np.bool_]:
+def _backed(value: F64, normal: F64, right: F64) -> Mask:
     """Whether the noise shows shares (link, class, 2) and agrees with their values."""
     apart = np.kron(np.eye(value.shape[1]), [[1.0, -1.0], [-1.0, 1.0]]) / ONE_WAY**2
     covariance = np.linalg.inv(normal + apart + np.eye(len(apart)) / LARGEST**2)

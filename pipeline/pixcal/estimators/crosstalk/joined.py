@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtrc
 
 from pixcal.estimators.crosstalk.dense import Dense, Frames, frames_of, within
@@ -13,9 +12,8 @@ from pixcal.estimators.crosstalk.pattern import visibility_pattern
 from pixcal.estimators.crosstalk.support import Choice, choose
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling
+from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
-
-F64 = NDArray[np.float64]
 
 LEVEL_STEPS = 10  # steps of a level dependence
 CERTAIN = 5.0  # sigmas beyond which a level dependence is taken

@@ -4,11 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.kernels.crosstalk import Coupling
+from pixcal.model.arrays import F64, Indices
 
-F64 = NDArray[np.float64]
 Place = tuple[int, int]
 
 REACH = 5  # rows and columns within which couplings are looked for
@@ -41,7 +40,7 @@ class Classes:
         """Number of classes."""
         return self.rows * self.columns
 
-    def of(self, y: NDArray[np.intp], x: NDArray[np.intp]) -> NDArray[np.intp]:
+    def of(self, y: Indices, x: Indices) -> Indices:
         """Class of pixels of the arrays."""
         row, column = (y + self.first[0]) % self.rows, (x + self.first[1]) % self.columns
         return np.asarray(row * self.columns + column)
@@ -61,7 +60,7 @@ class Classes:
         ]
         return sorted(found, key=lambda classes: classes.count)
 
-    def groups_of(self, finer: "Classes") -> NDArray[np.intp]:
+    def groups_of(self, finer: "Classes") -> Indices:
         """Own class of each class of a finer period, which this one divides."""
         row, column = np.divmod(np.arange(finer.count), finer.columns)
         return np.asarray(row % self.rows * self.columns + column % self.columns)

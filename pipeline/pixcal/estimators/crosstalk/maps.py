@@ -13,17 +13,13 @@ Couplings that are known already are undone on the maps; what is left is linear 
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.crosstalk.links import REACH, Classes
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid, polynomial_basis
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.kernels.crosstalk import Coupling, outflow
-
-F64 = NDArray[np.float64]
-C128 = NDArray[np.complex128]
-Mask = NDArray[np.bool_]
+from pixcal.model.arrays import C128, F64, Mask
 
 WIDTH = 0.01  # how much the pixels of a class may well be wider than others, px
 DEGREE = 3  # of the polynomial that takes up what is smooth

@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.crosstalk.links import Classes
 from pixcal.estimators.crosstalk.maps import (
@@ -26,9 +25,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.corrected import phase_change
 from pixcal.kernels.crosstalk import Coupling, filled, uncouple_fringes
 from pixcal.kernels.robust import median_and_sigma
-
-F64 = NDArray[np.float64]
-C128 = NDArray[np.complex128]
+from pixcal.model.arrays import C128, F64, Mask
 
 CLIP = 5.0  # offsets and visibilities beyond so many robust deviations do not count
 
@@ -120,7 +117,7 @@ def _of_set(
     found: FringeEvidence,
     couplings: Sequence[Coupling],
     classes: Classes,
-    good: NDArray[np.bool_],
+    good: Mask,
     smooth: F64,
     members: F64,
 ) -> _Pattern:

@@ -11,14 +11,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.crosstalk import Coupling, filled, noise_shares, uncouple, uncouple_fringes
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64, Indices
 
 UNIT = 1e4  # electrons that charge is counted in; variances are in 10⁴ e-²
 CLIP = 6.0  # residuals beyond so many sigmas (particles, telegraph noise) do not count
@@ -75,7 +72,7 @@ def all_residuals(evidence: Evidence, known: Sequence[Coupling]) -> Iterator[Res
             yield _of_fringes(fringes, known, kept)
 
 
-def _spread(frames: int, pixels: int) -> NDArray[np.intp]:
+def _spread(frames: int, pixels: int) -> Indices:
     few = max(MIN_FRAMES, MOST // pixels)
     return np.unique(np.linspace(0, frames - 1, min(frames, few)).astype(int))
 

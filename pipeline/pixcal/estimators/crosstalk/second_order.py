@@ -4,14 +4,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.crosstalk.covariance import NORMAL, TERMS, Products
 from pixcal.estimators.crosstalk.links import Place
 from pixcal.estimators.crosstalk.residuals import UNIT
 from pixcal.kernels.crosstalk import Coupling, outflow
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 
 def to_first_order(

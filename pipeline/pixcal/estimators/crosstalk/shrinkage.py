@@ -10,12 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from pixcal.estimators.crosstalk.links import Place
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64, Indices
 
 TURNS = 60  # of expectation and maximisation
 # size of a part of a share, and of a true pattern (px), that one value more is taken to have
@@ -28,7 +26,7 @@ class Shrinkage:
     """Parts of shares, and which of them are of one size."""
 
     basis: F64  # (share, part) shares are this times their parts
-    group: NDArray[np.intp]  # (part,)
+    group: Indices  # (part,)
     classes: int
 
     @classmethod

@@ -10,15 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtri, ndtri_exp
 
 from pixcal.estimators.crosstalk.information import Measured
 from pixcal.estimators.crosstalk.links import Classes, Place, periods
 from pixcal.kernels.crosstalk import Coupling
+from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
-
-F64 = NDArray[np.float64]
 
 FALSE_ALARM = 0.01  # chance that noise alone gives any coupling
 # Share of the looks that are as good as independent: periods have pixels in common. Measured: it

@@ -8,10 +8,8 @@ themselves respond differently the noise follows the light, and does not step.
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from pixcal.model.arrays import F64, Mask
 
 MOST = 7  # boundaries that are looked for along each axis
 NARROWEST = 8  # rows or columns of an amplifier at least

@@ -7,14 +7,11 @@ the frames can do: on a perfect detector fewer than one pixel in 10⁵ is flagge
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from pixcal.estimators.detector.calibration import MIN_RUNGS, Rung
 from pixcal.kernels.robust import lit, median_and_sigma
-
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from pixcal.model.arrays import F64, Mask
 
 NEIGHBOURS = 16  # pixels along each side of the blocks whose median a response is compared with
 

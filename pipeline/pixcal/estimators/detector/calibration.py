@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from pixcal.kernels.robust import lit, median_and_sigma
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64, Mask
 
 MIN_RUNGS = 3  # fewest exposure times that tell a straight line from a bent one
 # Variance over the signal, in units of the least at lower levels, below which pixels are full. A
@@ -181,7 +180,7 @@ class Linearity:
     intercept: float
 
 
-def linearity(exptimes: F64, levels: F64, used: NDArray[np.bool_]) -> Linearity | None:
+def linearity(exptimes: F64, levels: F64, used: Mask) -> Linearity | None:
     """Line through the levels of a ladder of flats that makes the relative distances least.
 
     Parameters

@@ -14,7 +14,7 @@ from scipy.ndimage import minimum_filter1d, uniform_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.special import log_ndtr
 
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64, I64, Mask
 
 MAX_CODES = 1 << 17
 FEWEST_COUNTS = 5.0  # expected counts of a code that counts
@@ -38,7 +38,7 @@ LEAST_NOISE = 1.4
 LOWEST_RIPPLE = 1 / 16  # turns a code
 
 
-def histogram(frames: Iterable[NDArray[np.generic]], good: NDArray[np.bool_]) -> F64 | None:
+def histogram(frames: Iterable[NDArray[np.generic]], good: Mask) -> F64 | None:
     """Counts of the codes 0, 1, ... of frames (t, y, x); None where samples are no codes.
 
     Samples at either end may have been clipped, so they do not count.
@@ -96,7 +96,7 @@ def converter_counts(counts: F64, step: float) -> F64:
     return np.asarray(np.bincount(number, weights=counts))
 
 
-def _period(codes: NDArray[np.int64], there: NDArray[np.bool_]) -> float:
+def _period(codes: I64, there: Mask) -> float:
     """Step of a comb, by its spectrum about the frequency that the share of its teeth tells."""
     share = float(there.mean())
     value = there - share
@@ -122,7 +122,7 @@ def _highest(power: Callable[[float], float], start: float, width: float) -> flo
     return float(found.x)
 
 
-def _agreement(codes: NDArray[np.int64], there: NDArray[np.bool_], step: float) -> float:
+def _agreement(codes: I64, there: Mask, step: float) -> float:
     """Share of the gaps that a step foresees, less that of codes it says cannot come."""
     # The next multiple rounds to the code, or just so: halves go either way.
     distance = np.abs(codes - np.rint(codes / step) * step)
@@ -147,11 +147,11 @@ class Ripple:
 class CodeWidths:
     """Relative widths of codes, less one and less what a local fit takes."""
 
-    number: NDArray[np.int64]  # (n,) of the converter's codes
+    number: I64  # (n,) of the converter's codes
     width: F64  # (n,)
     variance: F64  # (n,) of the counts by chance, relative
     kernel: F64  # (m,) what multiplies the true widths: one less the local fit
-    gap: NDArray[np.bool_]  # of every code, whether the local fit does without it
+    gap: Mask  # of every code, whether the local fit does without it
 
     def kept(self, frequency: float) -> float:
         """Share of a line's amplitude that the local fit leaves; frequency in turns a code."""
@@ -308,7 +308,7 @@ def code_widths(counts: F64, noise: float, first: float = 0.0) -> CodeWidths | N
     return CodeWidths(number, width, variance[used] / calm[used] ** 2, kernel, gap)
 
 
-def _carried_over(counts: F64) -> NDArray[np.bool_]:
+def _carried_over(counts: F64) -> Mask:
     """Codes that never come, and the one before, where a bit weighs some codes too little.
 
     One or more, just below a multiple of `CARRY`, among codes that do come.

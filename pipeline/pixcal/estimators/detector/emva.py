@@ -10,9 +10,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64, Mask
+
 Measure = tuple[float, float]  # a value and its 1-sigma error
 
 # variance over its maximum below which samples saturate: noise alone does not fall so far
@@ -35,7 +35,7 @@ class Nonuniformity:
     pixel: Measure
 
 
-def nonuniformity(first: F64, second: F64, good: NDArray[np.bool_]) -> Nonuniformity:
+def nonuniformity(first: F64, second: F64, good: Mask) -> Nonuniformity:
     """Nonuniformity that two averages of independent frames have in common.
 
     Parameters
@@ -66,7 +66,7 @@ def nonuniformity(first: F64, second: F64, good: NDArray[np.bool_]) -> Nonunifor
     )
 
 
-def _filled(values: F64, good: NDArray[np.bool_]) -> F64:
+def _filled(values: F64, good: Mask) -> F64:
     """The map less its mean; a bad pixel is what its row and its column let expect."""
     count = np.maximum(good.sum(axis=1), 1), np.maximum(good.sum(axis=0), 1)
     values = np.where(good, values - values[good].mean(), 0.0)
@@ -89,7 +89,7 @@ def _root(variance: float, error: float) -> Measure:
     return (value, error / (2 * value)) if variance > error else (value, math.sqrt(error))
 
 
-def alternation(first: F64, second: F64, good: NDArray[np.bool_], *, axis: int) -> Measure:
+def alternation(first: F64, second: F64, good: Mask, *, axis: int) -> Measure:
     """By how much every second row (axis 0) or column (axis 1) is higher than those between.
 
     Parameters
@@ -114,7 +114,7 @@ def alternation(first: F64, second: F64, good: NDArray[np.bool_], *, axis: int) 
     return abs(float(blocks.mean())), float(blocks.std(ddof=1)) / math.sqrt(len(blocks))
 
 
-def without_trend(values: F64, good: NDArray[np.bool_]) -> F64:
+def without_trend(values: F64, good: Mask) -> F64:
     """A flat field over its mean, less one, less the quadratic polynomial of an uneven lamp.
 
     Parameters
@@ -147,7 +147,7 @@ class Spectrogram:
     noise: float  # the same of the noise in the map
 
 
-def spectrogram(first: F64, second: F64, good: NDArray[np.bool_], *, axis: int) -> Spectrogram:
+def spectrogram(first: F64, second: F64, good: Mask, *, axis: int) -> Spectrogram:
     """Spectrum of the mean of two averages along an axis (1: along the rows), and its noise.
 
     Parameters

@@ -8,12 +8,10 @@ noise of the flats bends with it, as far as that is precise enough to tell; else
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.detector.transfer_curve import TransferCurve, transfer_curve
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 MIN_RUNGS = 3  # fewest levels of flats that tell a curve from a line
 LAMP = 1e-3  # relative error of the light of a flat at least, its exposure time included

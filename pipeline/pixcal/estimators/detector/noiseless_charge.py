@@ -3,12 +3,10 @@
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.normal_matrix import inverse_normal
-
-F32 = NDArray[np.float32]
+from pixcal.model.arrays import F32
 
 _CLIP = 25.0  # squares of residuals, over their variance, that are left to particles and the like
 

@@ -10,12 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import digamma, polygamma
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from pixcal.model.arrays import F32, F64, Mask
 
 FEWEST = 8  # frames that tell pixels apart
 OUTLIER = 4.0  # standard deviations of all pixels beyond which a pixel's own variance is believed

@@ -9,16 +9,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from pixcal.estimators.diagnosis.distortions import distortion_sums, fit_distortions
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.boundaries import REACH, boundary_shifts, moved_charge
 from pixcal.kernels.normal_matrix import inverse_normal
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64
 
 UNIT = 1e-7  # shift of boundaries (px per electron) that is fitted as one
 # in equal steps of the logarithm, nearly; what the boundaries' shift may fall by is looked for

@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.kernels.noise_sums import product_sums
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64, Mask
 
 STEPS = np.array([(0, 0), (0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)])
 """Rows and columns from a pixel to itself and to those that it may share its noise with."""
@@ -81,7 +79,7 @@ def _transfer_curve(evidence: Evidence) -> TransferCurve | None:
     return TransferCurve(*at_zero, *rise, top, level, share, error)
 
 
-def shared_steps(evidence: Evidence) -> NDArray[np.bool_]:
+def shared_steps(evidence: Evidence) -> Mask:
     """Which of `STEPS` count: where flats told the gain, only those found to share noise.
 
     The others would add nothing but their own noise.
@@ -92,9 +90,7 @@ def shared_steps(evidence: Evidence) -> NDArray[np.bool_]:
     return np.array([(int(y), int(x)) in counted for y, x in STEPS])
 
 
-def shot_share(
-    sums: Iterable[F64], counted: NDArray[np.bool_] | None = None
-) -> tuple[float, float] | None:
+def shot_share(sums: Iterable[F64], counted: Mask | None = None) -> tuple[float, float] | None:
     """Noise that grows with the level over that expected, with its error; None without samples.
 
     ``counted`` tells which of `STEPS` to add to the first, all by default.
@@ -159,7 +155,7 @@ def _of_stack(stack: Stack, evidence: Evidence) -> F64 | None:
 
 def residual_sums(
     rest: F32, model: F32, shot_factor: F64, read: F64,
-    good: NDArray[np.bool_], of_time: NDArray[np.floating], of_pixels: NDArray[np.floating],
+    good: Mask, of_time: NDArray[np.floating], of_pixels: NDArray[np.floating],
     taken: F64,
 ) -> F64:  # fmt: skip
     """Sums of `product_sums` of residuals (t, y, x), e-, for each of `STEPS`."""

@@ -11,14 +11,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.normal_matrix import inverse_normal
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64
 
 BANDS = (0.0, 0.125, 0.25, 0.5)  # where bands of the level begin, over the full scale
 STEP = 0.03  # relative step of a parameter for its derivative

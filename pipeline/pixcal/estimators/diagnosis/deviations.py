@@ -29,10 +29,7 @@ from pixcal.estimators.diagnosis.pair_sums import pair_sums, pair_variance, take
 from pixcal.estimators.diagnosis.test_statistics.look import Look
 from pixcal.estimators.fringe_fit.tile import Coding
 from pixcal.estimators.maps.structure import flattened, without_outliers
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from pixcal.model.arrays import F32, F64, Indices, Mask
 
 WILD = 8.0
 """Standard deviations beyond which a residual is an outlier."""
@@ -328,7 +325,7 @@ def band_power(series: F64, *, squares: bool = True) -> F64:
     return np.asarray(np.add.reduceat(power, _octaves(power.shape[1]), axis=1))
 
 
-def _octaves(modes: int) -> NDArray[np.intp]:
+def _octaves(modes: int) -> Indices:
     starts = 2 ** np.arange(2, max(int(np.log2(max(modes, 8))), 3)) - 4
     return np.asarray(starts[starts < modes])
 

@@ -11,15 +11,12 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.kernels.two_way import turn
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64, Mask
 
 Distortion = Callable[[FringeEvidence, F32, F64], tuple[F32, Iterable[F32]]]
 
@@ -137,9 +134,7 @@ class Freedom:
         rest[self.weight == 0] = 0
         return rest
 
-    def taken_by_frames(
-        self, frames: slice, one: NDArray[np.bool_], other: NDArray[np.bool_]
-    ) -> F32:
+    def taken_by_frames(self, frames: slice, one: Mask, other: Mask) -> F32:
         """Covariance that the free frames take off the residuals of pairs of pixels.
 
         Parameters

@@ -12,9 +12,8 @@ from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.estimators.fringe_fit.tile import Coding
 from pixcal.kernels.bilinear import frame_sums
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
+from pixcal.model.arrays import F32, F64, Mask
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 T = TypeVar("T")
 
 STRIPE = 4
@@ -86,7 +85,7 @@ class FringeEvidence:
     theta: F64
     sigma: F64
     delta: F64
-    good: NDArray[np.bool_]
+    good: Mask
     read_variance: F64
     shot_factor: F64
     start_s: float = np.nan
@@ -210,7 +209,7 @@ class Evidence:
     bias: F64
     dark_rate: F64
     flat: F64
-    good: NDArray[np.bool_]
+    good: Mask
     saturation_adu: float
     pitch_um: float
     wavelength_nm: float
@@ -281,7 +280,7 @@ class Evidence:
         )
 
 
-def stripes(shape: tuple[int, ...]) -> NDArray[np.bool_]:
+def stripes(shape: tuple[int, ...]) -> Mask:
     """One half of a window by stripes of rows (columns if rows are few), to broadcast to (y, x).
 
     The sequence of Thue and Morse: it has no period that a fringe could fall in with.
@@ -299,7 +298,7 @@ def free_frames(
     theta: F64,
     read_variance: F64,
     shot_factor: F64,
-    good: NDArray[np.bool_],
+    good: Mask,
 ) -> tuple[F64, F64]:
     """Parameters of every frame by itself, the pixels being known, and their covariance.
 

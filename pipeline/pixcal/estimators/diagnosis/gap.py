@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri_exp, stdtr
 
 from pixcal.estimators.diagnosis.test_statistics import Curve, Key
 from pixcal.estimators.diagnosis.test_statistics.signature import statistic_named
+from pixcal.model.arrays import F64
 
-F64 = NDArray[np.float64]
 Curves = Mapping[Key, Curve]
 
 TOLERANCE = 0.05

@@ -6,13 +6,9 @@ is that of lines; pairs a few pixels apart, and samples a few frames apart, hold
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.test_statistics.look import neighbour_sums
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from pixcal.model.arrays import F32, F64, Mask
 
 DIAGONAL = ((1, 1), (1, -1), (1, 2), (1, -2), (2, 1), (2, -1))
 """Rows and columns to neighbours in other rows and other columns."""

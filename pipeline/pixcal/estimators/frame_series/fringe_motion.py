@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import idct
 
 from pixcal.estimators.diagnosis.evidence import Evidence
@@ -21,8 +20,7 @@ from pixcal.estimators.frame_series.series import (
 )
 from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
 from pixcal.estimators.frame_series.variance_components import cosine_modes, walk_power
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 CROSSED = 0.5  # sine of the angle between fringes from which they count as different
 HOP_WINDOWS = (2, 4, 8, 16, 32)  # frames before and after, of which the means are compared

@@ -10,11 +10,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.kernels.two_states import likely_states
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 ROUNDS = 200
 SETTLED = 1e-4  # growth of the log-likelihood at which they end

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, stripes
 from pixcal.estimators.frame_series.series import (
@@ -25,8 +24,7 @@ from pixcal.estimators.frame_series.variance_components import (
     walk_power,
 )
 from pixcal.kernels.significance import SIGNIFICANT
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 FEWEST_DARK = 12  # frames without light from which their offset is learnt
 IMBALANCE = 0.02, 0.15  # least and most difference of the fibres' powers over their sum

@@ -10,10 +10,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64, I64, Mask
 
 BLOCKS, LEAST_BLOCK = 16, 4  # blocks of a row at most, and pixels of a block at least
 FEWEST_BLOCKS = 4
@@ -33,7 +31,7 @@ class LineSpectrum:
     pair_noise: float  # the same, as products of distant blocks see it, e-²
 
     @property
-    def modes(self) -> NDArray[np.int64]:
+    def modes(self) -> I64:
         """Numbers of the modes."""
         return np.arange(1, self.lines // 2 + 1)
 
@@ -43,7 +41,7 @@ class LineSpectrum:
         return np.asarray(2 * square / self.dof)
 
 
-def line_spectrum(residual: F32, good: NDArray[np.bool_], fitted: int = 1) -> LineSpectrum | None:
+def line_spectrum(residual: F32, good: Mask, fitted: int = 1) -> LineSpectrum | None:
     """Spectrum of what rows have in common; None where rows or frames are too few.
 
     Parameters

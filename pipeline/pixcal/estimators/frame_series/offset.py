@@ -11,14 +11,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import STRIPE, FringeEvidence, Stack
 from pixcal.estimators.frame_series.variance_components import Modes, cosine_modes, walk_power
 from pixcal.kernels.normal_matrix import inverse_normal
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64, Mask
 
 FEWEST = 8  # frames from which something is learnt; of fewer, chance is not what it is taken for
 FEWEST_PIXELS = 16  # in each quarter
@@ -47,9 +44,7 @@ class OffsetSeries:
         return len(self.values)
 
 
-def dark_offsets(
-    stack: Stack, good: NDArray[np.bool_], gain: float, read_noise: float
-) -> OffsetSeries | None:
+def dark_offsets(stack: Stack, good: Mask, gain: float, read_noise: float) -> OffsetSeries | None:
     """Of frames without light, in e-; None where they are too few."""
     masks = _quarters(good)
     if len(stack.adu) < FEWEST or masks is None:
@@ -127,7 +122,7 @@ def offset_modes(every: Sequence[OffsetSeries], shapes: Sequence[F64]) -> Modes:
     )
 
 
-def _quarters(good: NDArray[np.bool_]) -> list[NDArray[np.bool_]] | None:
+def _quarters(good: Mask) -> list[Mask] | None:
     """Good pixels of the four quarters, as `CONTRASTS` takes them."""
     ny, nx = good.shape
     rows, columns = _half(ny)[:, None], _half(nx)
@@ -135,12 +130,12 @@ def _quarters(good: NDArray[np.bool_]) -> list[NDArray[np.bool_]] | None:
     return masks if min(int(mask.sum()) for mask in masks) >= FEWEST_PIXELS else None
 
 
-def _half(count: int) -> NDArray[np.bool_]:
+def _half(count: int) -> Mask:
     """Every other stripe, in the order of Thue and Morse."""
     return np.asarray(np.bitwise_count(np.arange(count) // STRIPE) % 2 == 0)
 
 
-def _sums(pattern: F32, weight: F32, residual: F32, mask: NDArray[np.bool_]) -> tuple[F64, F64]:
+def _sums(pattern: F32, weight: F32, residual: F32, mask: Mask) -> tuple[F64, F64]:
     """Normal matrices (t, n, n) and right sides (t, n) of a fit of patterns to the residual."""
     used = np.flatnonzero(mask)
     own, w, rest = (np.take(a, used, axis=1) for a in (pattern, weight, residual))

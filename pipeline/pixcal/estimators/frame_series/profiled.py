@@ -5,11 +5,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.frame_series.variance_components import Components
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 FARTHEST = 3.0  # largest error of the logarithm of a parameter: beyond, it is not known
 HALVINGS = 4  # of the distance to the values on either side

@@ -4,15 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.maps.map_fit import centred
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.kernels.row_sums import MODES, row_sums
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64
 
 _MIN_FRAMES = 12
 _MIN_PIXELS = 80

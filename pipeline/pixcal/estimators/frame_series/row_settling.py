@@ -8,14 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.frame_series.row_ramp import INSIDE, rows_of
 from pixcal.kernels.significance import sigmas_of_chi2
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 KNOTS = 9  # rows at equal distances at which the profile is given
 ORIGINS = 8  # phases tried as the one where the modulator's range begins

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import idct
 from scipy.ndimage import median_filter
 
@@ -19,8 +18,7 @@ from pixcal.estimators.frame_series.variance_components import (
     cosine_modes,
     estimate_components,
 )
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64, Mask
 
 FEWEST = 32  # frames of a set from which something is learnt
 HARMONICS = 10  # of the phase, that are no noise
@@ -101,7 +99,7 @@ def _rows(free: F64, *columns: int) -> F64:
     return jacobian
 
 
-def _lit(found: FringeEvidence) -> NDArray[np.bool_]:
+def _lit(found: FringeEvidence) -> Mask:
     """Frames with light, fringes and samples in both halves of the pixels."""
     usable = np.ones(len(found.free), bool)
     for free, covariance in ((found.free, found.free_covariance), *found.halves):

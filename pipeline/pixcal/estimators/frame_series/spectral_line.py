@@ -4,14 +4,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import idct
 
 from pixcal.estimators.frame_series.series import FrameSeries, without
 from pixcal.estimators.frame_series.variance_components import cosine_modes, log_chance, sigmas
 from pixcal.kernels.significance import SIGNIFICANT
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 FINER = 8  # frequencies looked at for each that a series tells apart
 SLOWEST = 4.0  # fewest swings of a line within a run; what is slower is drift

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq, least_squares
 
 from pixcal.kernels.allan import allan_deviation
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64, Mask
 
 SEED = 20250611
 MAX_DRAWS = 1 << 18
@@ -42,7 +41,7 @@ class White:
 
 
 @lru_cache(maxsize=2)
-def _draws(present: bytes, lengths: tuple[int, ...]) -> NDArray[np.float32]:
+def _draws(present: bytes, lengths: tuple[int, ...]) -> F32:
     """Estimates (length, pixel) for unit white noise, over the true deviation."""
     there = np.frombuffer(present, dtype=bool)
     pixels = min(MAX_DRAWS, MAX_SAMPLES // len(there))
@@ -58,7 +57,7 @@ def _draws(present: bytes, lengths: tuple[int, ...]) -> NDArray[np.float32]:
 
 
 def white_population(
-    present: NDArray[np.bool_], lengths: Sequence[int], noise: NDArray[np.floating] | None = None
+    present: Mask, lengths: Sequence[int], noise: NDArray[np.floating] | None = None
 ) -> White:
     """Simulate pixels with white noise.
 

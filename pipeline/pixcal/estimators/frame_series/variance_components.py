@@ -12,15 +12,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import dct
 from scipy.optimize import brentq
 from scipy.special import ndtri_exp
 
 from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
 from pixcal.kernels.variance_sums import trace_products
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 MAX_STEPS = 60
 CONVERGED = 1e-5  # growth of the log-likelihood at which scoring ends

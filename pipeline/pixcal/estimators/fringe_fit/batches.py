@@ -4,7 +4,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
+
+from pixcal.model.arrays import F64, I32
 
 DEFAULT_FRAMES = 500  # frames of a batch in a long run (paper, section 4.3)
 MIN_FRAMES = 16  # fewest frames of a batch: each pixel has three unknowns of its own there
@@ -19,16 +20,16 @@ class Batches:
     period_s: float  # time from frame to frame
     # first frame and the one after the last of each batch; empty for a gap
     ranges: tuple[tuple[int, int], ...]
-    time: NDArray[np.float64]  # (batch,) centre of each batch, seconds from the first frame
+    time: F64  # (batch,) centre of each batch, seconds from the first frame
     note: str = ""  # what a reader should know, or ""
 
     @property
-    def count(self) -> NDArray[np.int32]:
+    def count(self) -> I32:
         """Frames in each batch."""
         return np.array([b - a for a, b in self.ranges], dtype=np.int32)
 
 
-def plan_batches(time_s: NDArray[np.float64], frames: int | None = None) -> Batches:
+def plan_batches(time_s: F64, frames: int | None = None) -> Batches:
     """Divide a run into batches.
 
     Frames fall into slots of the median period, so that a pause of the camera shows as slots

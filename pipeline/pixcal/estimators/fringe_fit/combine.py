@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 
 def axes_span_plane(axes: Sequence[tuple[float, float]]) -> bool:

@@ -3,9 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from pixcal.model.arrays import F32, U8
 from pixcal.model.flags import PixelFlag
-
-F32 = NDArray[np.float32]
 
 # largest error of a phase: beyond it errors are no longer Gaussian, and 6 sigma are seen (with 0.3
 # rad one pixel in 500 was further from the truth)
@@ -17,7 +16,7 @@ CHANCE = 6.0  # errors by which a visibility may be larger still by chance
 
 
 def fit_flags(
-    mask: NDArray[np.uint8],
+    mask: U8,
     iota: F32,
     alpha: F32,
     sigma: F32,
@@ -25,7 +24,7 @@ def fit_flags(
     count: F32,
     noise: float,
     chi2_limit: float,
-) -> NDArray[np.uint8]:
+) -> U8:
     """Flags of pixels: those of the reduction, and NO_DATA and BAD_FIT of the fit.
 
     Parameters

@@ -6,15 +6,13 @@ from math import gcd
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 from scipy.optimize import minimize
 
+from pixcal.model.arrays import C128, F32, F64, Mask
 from pixcal.model.errors import InputError
 
-F64 = NDArray[np.float64]
-C128 = NDArray[np.complex128]
-Phases = TypeVar("Phases", NDArray[np.float32], NDArray[np.float64])
+Phases = TypeVar("Phases", F32, F64)
 MIN_FRINGES = 1.5  # fewest fringes across a window for a peak to be looked for
 # fewest fringes for maps with honest errors: with 1.3 to 1.8 the gauge takes true offsets for
 # fringes, and errors were 2 to 4 times what SIGMA says (measured on 80 x 80 px)
@@ -74,9 +72,7 @@ def grid(shape: tuple[int, int]) -> tuple[F64, F64]:
     return y, x
 
 
-def find_fringe_vector(
-    maps: F64, good: NDArray[np.bool_], nominal: tuple[float, float]
-) -> tuple[float, float]:
+def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> tuple[float, float]:
     """Fringe vector of a tile, from maps that hold fringes of any amplitude and phase.
 
     The highest peak of the summed power spectra, refined on the continuous spectrum; its sign is
@@ -191,7 +187,7 @@ class SmoothPhasor:
 
 
 def smooth_phasor(
-    phasor: C128, good: NDArray[np.bool_], k: tuple[float, float], degree: int = 3
+    phasor: C128, good: Mask, k: tuple[float, float], degree: int = 3
 ) -> SmoothPhasor:
     """Smooth version of a phasor map alpha exp(i psi) / iota.
 

@@ -10,10 +10,8 @@ They are chosen so that the phase map holds none of these fringes.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-F64 = NDArray[np.float64]
-C128 = NDArray[np.complex128]
+from pixcal.model.arrays import C128, F64, Mask
 
 # modes of the phase map that a free intensity and amplitude in each frame leave open
 FRINGE_MODES = ("cos(psi)*iota/alpha", "sin(psi)*iota/alpha", "cos(2*psi)", "sin(2*psi)")
@@ -32,7 +30,7 @@ def fringe_modes(psi: F64, ratio: F64) -> list[F64]:
     return [ratio * np.cos(psi), ratio * np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)]
 
 
-def gauge_matrix(tiles: list[tuple[F64, NDArray[np.bool_], C128]]) -> F64:
+def gauge_matrix(tiles: list[tuple[F64, Mask, C128]]) -> F64:
     """Change of theta that takes the fringe-frequency modes out of the phase maps.
 
     Parameters

@@ -4,12 +4,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.fringes import grid
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64, Mask
 
 MAX_PIXELS = 1024  # pixels that a tile's plane is laid through
 
@@ -35,7 +32,7 @@ def tile_plane(
     phase: F32,
     sigma: F32,
     ratio: F32,
-    good: NDArray[np.bool_],
+    good: Mask,
     slope: tuple[float, float],
     centre: tuple[float, float],
 ) -> TilePlane:

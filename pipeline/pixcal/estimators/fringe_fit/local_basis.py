@@ -9,11 +9,9 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.fringes import grid
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 # as the polynomial that shapes are judged by, which a window of one tile must hold as well
 DEGREE = 5

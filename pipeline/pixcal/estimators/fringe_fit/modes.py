@@ -7,7 +7,6 @@ is the same however the work was shared out.
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.gauge import FRINGE_MODES
 from pixcal.estimators.fringe_fit.geometry import TilePlane
@@ -15,8 +14,7 @@ from pixcal.estimators.fringe_fit.local_basis import SCALE_PX, expand, powers
 from pixcal.estimators.fringe_fit.models import FringeShape
 from pixcal.estimators.fringe_fit.tile_sums import N_LOCAL, Carrier, TileSums
 from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 TILES_AT_ONCE = 256  # tiles whose modes are held together
 

@@ -1,15 +1,12 @@
 """Weighted sums of a tile's pixels: the whole run's and the present batch's."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.tile import Coding, Tile
 from pixcal.estimators.fringe_fit.tile_fit import accumulate
 from pixcal.kernels.bilinear import N_SUMS, close_batch, solve_pixels
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64, U16
 
 
 class PixelSums:
@@ -28,7 +25,7 @@ class PixelSums:
         self.total: F64 = np.zeros((N_SUMS, *tile.shape))
         self.part: F64 = np.zeros((N_SUMS, *tile.shape))
 
-    def add(self, codes: NDArray[np.uint16], at: slice) -> None:
+    def add(self, codes: U16, at: slice) -> None:
         """Add the codes (t, y, x) of the frames ``at``."""
         part = FrameParameters(self.frames.g[at], self.frames.dk[at], self.frames.reference)
         accumulate(self.tile, [codes], self.coding, part, self.model, self.part)

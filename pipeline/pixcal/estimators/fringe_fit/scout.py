@@ -12,7 +12,6 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from pixcal.estimators.fringe_fit.fringes import (
@@ -27,13 +26,12 @@ from pixcal.estimators.fringe_fit.tile import Coding, Tile
 from pixcal.estimators.fringe_fit.tile_fit import fit_tile, residual_chi2
 from pixcal.kernels.bilinear import frame_sums
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
+from pixcal.model.arrays import C128, F32, F64, U16, Indices, Mask
 from pixcal.model.errors import InputError
 
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Pixels = NDArray[np.intp] | slice
+Pixels = Indices | slice
 # flat numbers of pixels of a tile, and their codes (t, p)
-Samples = tuple[NDArray[np.intp], NDArray[np.uint16]]
+Samples = tuple[Indices, U16]
 Each = Callable[[Callable[[int], Any], Sequence[int]], list[Any]]
 
 # pixels that frames are solved with: their noise then adds some 2e-4 to a map's variance
@@ -93,7 +91,7 @@ class Scout:
     noise: float = 1.0  # usual reduced chi-square of the pixels
     theta: list[F64] = field(default_factory=list)  # list of (3, y, x) float64: of each tile
 
-    def prime(self, codes: Sequence[NDArray[np.uint16]]) -> FrameParameters:
+    def prime(self, codes: Sequence[U16]) -> FrameParameters:
         """Learn the pixels of the tiles from frames spread over the run.
 
         Parameters
@@ -131,9 +129,7 @@ class Scout:
         self.noise = noise / (1 - 2 / (9 * (n_frames - 3))) ** 3
         return frames
 
-    def solve(
-        self, codes: Sequence[NDArray[np.uint16]], start: FrameParameters | None = None
-    ) -> FrameParameters:
+    def solve(self, codes: Sequence[U16], start: FrameParameters | None = None) -> FrameParameters:
         """Parameters of further frames, the pixels of the tiles being known.
 
         Parameters
@@ -150,7 +146,7 @@ class Scout:
             frames, _, _ = self._frame_step(samples, frames, self.moving)
         return frames
 
-    def _samples(self, codes: Sequence[NDArray[np.uint16]]) -> list[Samples]:
+    def _samples(self, codes: Sequence[U16]) -> list[Samples]:
         """Of each tile, the samples that frames are solved with."""
 
         def taken(n: int) -> Samples:
@@ -182,12 +178,12 @@ class Scout:
                 "bias frames and the level of the light"
             )
 
-    def _picked(self, tile: Tile) -> NDArray[np.intp]:
+    def _picked(self, tile: Tile) -> Indices:
         """Flat numbers of the good pixels that frames are solved with."""
         good = np.flatnonzero(tile.good)
         return good[_scattered(len(good), max(1, MAX_PIXELS // len(self.tiles)))]
 
-    def _electrons(self, codes: NDArray[np.uint16], picked: Pixels) -> F32:
+    def _electrons(self, codes: U16, picked: Pixels) -> F32:
         """Samples (t, p) in electrons, for first values that know no weights.
 
         Most samples without weight are saturated: the brightest of the pixel stands for them. A
@@ -202,7 +198,7 @@ class Scout:
             electrons = np.where(lost, electrons.max(axis=0), electrons)
         return np.asarray(electrons, np.float32)
 
-    def _drop_odd_levels(self, codes: Sequence[NDArray[np.uint16]]) -> None:
+    def _drop_odd_levels(self, codes: Sequence[U16]) -> None:
         """Leave out pixels whose mean light is far from that of most: few would outweigh all."""
 
         def drop(n: int) -> None:
@@ -217,7 +213,7 @@ class Scout:
 
         self.each(drop, range(len(self.tiles)))
 
-    def _subspace(self, codes: Sequence[NDArray[np.uint16]]) -> F64:
+    def _subspace(self, codes: Sequence[U16]) -> F64:
         """First frame parameters: rank three, then turned by means of the fringe vector."""
 
         def gram_of(n: int) -> F64:
@@ -287,9 +283,7 @@ class Scout:
         amplitude = np.hypot(g[:, 1], g[:, 2]).mean()
         return np.array([g[:, 0].mean(), amplitude, amplitude])
 
-    def _settled(
-        self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters, most: int
-    ) -> FrameParameters:
+    def _settled(self, codes: Sequence[U16], frames: FrameParameters, most: int) -> FrameParameters:
         """Turns until they change the frames no more than their noise allows."""
         for _ in range(most):
             before = frames
@@ -301,13 +295,11 @@ class Scout:
                 break
         return frames
 
-    def _refine(
-        self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters
-    ) -> tuple[FrameParameters, F64]:
+    def _refine(self, codes: Sequence[U16], frames: FrameParameters) -> tuple[FrameParameters, F64]:
         """One turn: pixels from frames, gauge, frames from pixels; with their normal matrices."""
         before: Sequence[F64 | None] = self.theta or [None] * len(self.tiles)
 
-        def fit(n: int) -> tuple[F64, NDArray[np.complex128]]:
+        def fit(n: int) -> tuple[F64, C128]:
             return fit_tile(self.tiles[n], [codes[n]], self.coding, frames, self.k, before[n])
 
         thetas, smooths = zip(*self.each(fit, range(len(self.tiles))), strict=True)
@@ -371,9 +363,7 @@ class Scout:
         )
         return moved, step, normal
 
-    def _motion_significance(
-        self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters
-    ) -> float:
+    def _motion_significance(self, codes: Sequence[U16], frames: FrameParameters) -> float:
         """Mean of dk' C^-1 dk / 2 over frames: that of the samples' noise without motion."""
         _, step, normal = self._frame_step(self._samples(codes), frames, moving=True)
         seen = normal[:, 0, 0] > 0
@@ -384,7 +374,7 @@ class Scout:
             np.einsum("ti,tij,tj->t", dk, inverse_normal(covariance, 1e-10), dk).mean() / 2
         )
 
-    def _noise(self, codes: Sequence[NDArray[np.uint16]], frames: FrameParameters) -> float:
+    def _noise(self, codes: Sequence[U16], frames: FrameParameters) -> float:
         """Usual reduced chi-square of the pixels."""
 
         def chi2(n: int) -> float:
@@ -394,7 +384,7 @@ class Scout:
         return float(np.median(self.each(chi2, seen)))
 
 
-def _like_most(theta: F64, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _like_most(theta: F64, good: Mask) -> Mask:
     """Those of the pixels (y, x) with about the visibility of the others.
 
     Others have the wrong bias: the weights of their samples, too, and all frames would feel it.
@@ -406,7 +396,7 @@ def _like_most(theta: F64, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 @lru_cache(maxsize=64)
-def _scattered(n: int, wanted: int) -> NDArray[np.intp]:
+def _scattered(n: int, wanted: int) -> Indices:
     """Some of ``n`` numbers, at random: at even steps pixels may all have the same phase."""
     if wanted >= n:
         return np.arange(n)
@@ -418,7 +408,7 @@ def _parts(n: int) -> list[slice]:
     return [slice(first, min(first + 1024, n)) for first in range(0, n, 1024)]
 
 
-def _taken(codes: NDArray[np.uint16], picked: Pixels) -> NDArray[np.uint16]:
+def _taken(codes: U16, picked: Pixels) -> U16:
     """Samples (t, p) of some pixels; of all of them no copy."""
     flat = codes.reshape(len(codes), -1)
     if isinstance(picked, slice):

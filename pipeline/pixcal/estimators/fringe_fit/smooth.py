@@ -6,7 +6,8 @@ from typing import Self
 import numpy as np
 
 from pixcal.estimators.fringe_fit.local_basis import DEGREE, powers
-from pixcal.estimators.fringe_fit.models import F64, FringeShape, Start
+from pixcal.estimators.fringe_fit.models import FringeShape, Start
+from pixcal.model.arrays import F64
 
 
 @dataclass(frozen=True)

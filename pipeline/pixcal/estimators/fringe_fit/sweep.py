@@ -4,16 +4,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.batches import Batches
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, SmoothPhasor, plane_wave, wrapped
 from pixcal.estimators.fringe_fit.pixel_sums import PixelSums
 from pixcal.estimators.fringe_fit.tile import Coding, Tile
 from pixcal.estimators.fringe_fit.tile_fit import start_model
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64, U16
 
 # pixels of a tile for which the Cramér-Rao bound is worked out, where there are few tiles
 BOUND_PIXELS = 128
@@ -50,7 +47,7 @@ def frames_to_prime(frames: FrameParameters, block: int) -> int:
 
 def sweep_tile(
     tile: Tile,
-    blocks: Iterable[NDArray[np.uint16]],
+    blocks: Iterable[U16],
     coding: Coding,
     frames: FrameParameters,
     k: tuple[float, float],
@@ -72,7 +69,7 @@ def sweep_tile(
     bound_pixels : int
         Pixels for which to work out the Cramér-Rao bound.
     """
-    held: list[NDArray[np.uint16]] = []
+    held: list[U16] = []
     sums: _BatchSums | None = None
     position = 0
     for block in blocks:
@@ -117,7 +114,7 @@ class _BatchSums:
         self.ends = {b: n for n, (a, b) in enumerate(batches.ranges) if b > a}
         self.cuts = sorted({a for a, b in batches.ranges if b > a} | set(self.ends))
 
-    def add(self, block: NDArray[np.uint16], position: int) -> None:
+    def add(self, block: U16, position: int) -> None:
         stop = position + len(block)
         cuts = [c for c in self.cuts if position < c < stop]
         for a, b in zip([position, *cuts], [*cuts, stop], strict=True):

@@ -2,10 +2,7 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
-F32 = NDArray[np.float32]
+from pixcal.model.arrays import F32, Mask
 
 
 @dataclass(frozen=True)
@@ -25,7 +22,7 @@ class Tile:
     x: tuple[int, int]
     read: F32  # read, shot: (y, x) variance of a sample: `shot * model + read` (e-²)
     shot: F32
-    good: NDArray[np.bool_]  # (y, x) pixels to learn from
+    good: Mask  # (y, x) pixels to learn from
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -3,19 +3,16 @@
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, SmoothPhasor, smooth_phasor
 from pixcal.estimators.fringe_fit.tile import Coding, Tile
 from pixcal.kernels.bilinear import N_SUMS, solve_pixels, sweep_block
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import C128, F32, F64, U16
 
 
 def residual_chi2(
     tile: Tile,
-    codes: NDArray[np.uint16],
+    codes: U16,
     coding: Coding,
     frames: FrameParameters,
     theta: F64,
@@ -29,7 +26,7 @@ def residual_chi2(
 
 def accumulate(
     tile: Tile,
-    blocks: Sequence[NDArray[np.uint16]],
+    blocks: Sequence[U16],
     coding: Coding,
     frames: FrameParameters,
     theta: F32,
@@ -78,7 +75,7 @@ def accumulate(
 
 def start_model(
     tile: Tile,
-    blocks: Sequence[NDArray[np.uint16]],
+    blocks: Sequence[U16],
     coding: Coding,
     frames: FrameParameters,
     k: tuple[float, float],
@@ -118,7 +115,7 @@ def start_model(
 
 
 def _unweighted_pixels(
-    tile: Tile, blocks: Sequence[NDArray[np.uint16]], coding: Coding, frames: FrameParameters
+    tile: Tile, blocks: Sequence[U16], coding: Coding, frames: FrameParameters
 ) -> F64:
     """Pixels (3, y, x) by least squares in which all samples count alike."""
     nothing = np.zeros((3, *tile.shape), np.float32)
@@ -128,12 +125,12 @@ def _unweighted_pixels(
 
 def fit_tile(
     tile: Tile,
-    blocks: Sequence[NDArray[np.uint16]],
+    blocks: Sequence[U16],
     coding: Coding,
     frames: FrameParameters,
     k: tuple[float, float],
     start: F64 | None = None,
-) -> tuple[F64, NDArray[np.complex128]]:
+) -> tuple[F64, C128]:
     """Weighted fit of every pixel of a tile: theta (3, y, x) and the smooth phasor (y, x)."""
     model, smooth = start_model(tile, blocks, coding, frames, k, start)
     sums = accumulate(tile, blocks, coding, frames, model)

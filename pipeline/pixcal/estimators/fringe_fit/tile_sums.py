@@ -4,15 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.fringes import plane_wave, wrapped
 from pixcal.estimators.fringe_fit.gauge import FRINGE_MODES
 from pixcal.estimators.fringe_fit.geometry import TilePlane
 from pixcal.estimators.fringe_fit.local_basis import polynomials, powers
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64, Mask
 
 # modes of a tile: the polynomials, then the fringes that free intensities leave open
 N_LOCAL = len(powers()) + len(FRINGE_MODES)
@@ -83,7 +80,7 @@ def local_modes(carrier: Carrier, plane: TilePlane, shape: tuple[int, int]) -> F
 def sum_row(
     phase: F32,
     sigma: F32,
-    good: NDArray[np.bool_],
+    good: Mask,
     batches: F32,
     carrier: Carrier,
     plane: TilePlane,

@@ -7,13 +7,11 @@ their sum, then `offsets` of each.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.estimators.fringe_fit.modes import solve_modes
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 
 def phase_change(before: F64, after: F64) -> F64:

@@ -8,14 +8,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid, polynomial_basis
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
-
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from pixcal.model.arrays import F64, Indices, Mask
 
 BLOCK = 8  # pixels along the side of a block
 _CLIP = 5.0
@@ -28,7 +25,7 @@ class MapPart:
 
     signals: F64  # (pixel, n) what one unit of each parameter does to the map
     data: F64  # (pixel,)
-    block: NDArray[np.intp]  # (pixel,) number of the block that a pixel lies in
+    block: Indices  # (pixel,) number of the block that a pixel lies in
     dof: int  # pixels less the terms that were taken off
 
     @classmethod

@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri_exp
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
@@ -25,9 +24,7 @@ from pixcal.estimators.maps.map_fit import (
 )
 from pixcal.estimators.maps.structure import PERIODS
 from pixcal.kernels.significance import sigmas_of_chi2
-
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from pixcal.model.arrays import F64, Mask
 
 # periods in the window: no wave is looked for closer than that to what the fit leaves open
 NEAR = 1.5

@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import j0
 
 from pixcal.estimators.maps.map_fit import polynomial, without
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 SHORTEST = 1.25  # scale, px: a shorter wave is no more than two or three pixels from crest to crest
 # windows are this many times as wide as the longest scale: longer waves are parabolas there

@@ -4,12 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial.legendre import legvander
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-F64 = NDArray[np.float64]
-C128 = NDArray[np.complex128]
-Mask = NDArray[np.bool_]
+from pixcal.model.arrays import C128, F64, Mask
 
 DEGREE = 3  # of a smooth surface
 PERIODS = (2, 3, 4, 5, 6, 8)  # of rows and columns: those of readout circuits

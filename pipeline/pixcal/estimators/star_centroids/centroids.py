@@ -14,13 +14,12 @@ mean displacement, each pixel counting by what it tells of the position, P_x² /
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.kernels.normal_matrix import root_diagonal
 from pixcal.kernels.psf import Psf
+from pixcal.model.arrays import F64, Mask
 
-F64 = NDArray[np.float64]
-Good = NDArray[np.bool_]
+Good = Mask
 # least variance of a pixel, as a share of the star's electrons: dark rings weigh no more
 TINY = 1e-9
 MAX_STEPS = 50
@@ -164,7 +163,7 @@ class Star:
         return self.psf.at(x + dx - a, y + dy - b)
 
 
-def _solved(normal: F64, right: F64) -> tuple[F64, NDArray[np.bool_]]:
+def _solved(normal: F64, right: F64) -> tuple[F64, Mask]:
     """Solutions (n, m) of normal equations, and which there are; the others are zero."""
     scale = root_diagonal(normal)
     unit = normal / (scale[:, :, None] * scale[:, None, :])

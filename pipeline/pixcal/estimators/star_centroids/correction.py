@@ -16,8 +16,7 @@ from scipy.special import erf
 
 from pixcal.estimators.star_centroids.centroids import Star
 from pixcal.kernels.psf import MARGIN, Psf
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F32, F64
 
 # share of a star's weights on pixels without an offset beyond which it is not corrected
 MOST_UNKNOWN = 0.1
@@ -105,7 +104,7 @@ def correct_centroids(
     return Corrected(corrected, error)
 
 
-def correction_map(offsets: NDArray[np.floating], star: Star | None) -> NDArray[np.float32]:
+def correction_map(offsets: NDArray[np.floating], star: Star | None) -> F32:
     """Correction of the centroid of a star centred on each pixel.
 
     Parameters

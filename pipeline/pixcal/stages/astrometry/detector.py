@@ -19,16 +19,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.estimators.fringe_fit.models import FringeShape
 from pixcal.estimators.fringe_fit.models.paraxial import Paraxial
+from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
 from pixcal.storage.products import FitsMap
 
-F64 = NDArray[np.float64]
 Range = tuple[int, int]
 
 DRAW_TILE = 64  # side of the tiles of pixels that share a generator of errors, px
@@ -101,7 +100,7 @@ class Patch:
     # `good`
     true: F64
     known: F64
-    good: NDArray[np.bool_]  # (y, x) pixels whose offset is known
+    good: Mask  # (y, x) pixels whose offset is known
 
 
 @dataclass(frozen=True)
@@ -139,7 +138,7 @@ class PixelPositions:
         wide = [(0, 0), *beyond]
         return Patch(np.pad(true, wide), np.pad(known, wide), np.pad(good, beyond))
 
-    def _inside(self, y: Range, x: Range) -> tuple[F64, F64, NDArray[np.bool_]]:
+    def _inside(self, y: Range, x: Range) -> tuple[F64, F64, Mask]:
         known = np.stack([c.delta.read(y, x).astype(float) for c in self.components])
         if self.drawn:
             sigma = np.stack([c.sigma.read(y, x).astype(float) for c in self.components])

@@ -11,16 +11,14 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft2, next_fast_len, rfft2
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.star_centroids.centroids import Star
+from pixcal.model.arrays import C128, F64
 from pixcal.stages.astrometry.detector import PixelPositions
 from pixcal.stages.astrometry.stars import MOST_LOST
 from pixcal.storage.cube import ArrayWriter, create_array, create_group
-
-F64 = NDArray[np.float64]
 
 TILE = 512  # side of a task's part of the map, about, px
 SHOWN = 96  # most blocks along the longer side of the pictures of the whole detector
@@ -116,7 +114,7 @@ def place_errors(
     weights = np.einsum("ka,abyx,lb->klyx", axes, star.weights(np.zeros(2)), axes)
     kernels = np.conj(rfft2(weights, size))
 
-    def sums(kernel: NDArray[np.complex128], values: F64) -> F64:
+    def sums(kernel: C128, values: F64) -> F64:
         """Sum of the values about each place, (kernel of sums) weighted."""
         spectrum = np.einsum("kl...,l...->k...", kernel, rfft2(values, size))
         return np.asarray(irfft2(spectrum, size)[:, : shape[0], : shape[1]])

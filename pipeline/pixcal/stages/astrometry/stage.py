@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal import __version__
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime
 from pixcal.estimators.star_centroids.centroids import Star
 from pixcal.model.acquisition import Acquisition
+from pixcal.model.arrays import F64
 from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
 from pixcal.model.options import Astrometry
@@ -70,8 +70,6 @@ _BYTES_PER_PIXEL_AND_MODE = 13  # what each mode adds where there is a truth (me
 _BYTES_PER_FITTED_MODE = 28
 # peak of a task of the stars, for each pixel of a star's windows (measured)
 _BYTES_PER_WINDOW_PIXEL = 200
-
-F64 = NDArray[np.float64]
 
 
 STAGE = STAGES["astrometry"]

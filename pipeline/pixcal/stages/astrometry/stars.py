@@ -5,16 +5,14 @@ from dataclasses import asdict, dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.star_centroids.centroids import Star
 from pixcal.kernels.psf import Psf, diffraction_psf
 from pixcal.model.acquisition import Detector as Declared
+from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 from pixcal.stages.astrometry.detector import PixelPositions, generator
-
-F64 = NDArray[np.float64]
 
 FULL_WELL_E = 50_000.0  # where the acquisition declares none (paper, table 1)
 WINDOW = 4.0  # half of the default window, in lambda / D: three dark rings

@@ -12,11 +12,9 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pixcal.model.arrays import F64
 from pixcal.stages.astrometry.stars import KINDS
-
-F64 = NDArray[np.float64]
 
 TARGET_PX = 5e-5  # what a mission to Earth-like planets needs (paper, section 1)
 RESAMPLES = 300

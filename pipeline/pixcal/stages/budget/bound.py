@@ -13,9 +13,9 @@ whose limits are iota at full contrast without read noise, and alpha² / (2 s) a
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 NODES = 9  # places of the quadrature over the changes from frame to frame
 TURN = 720  # steps of a turn where a mean over the phase has no closed form

@@ -10,12 +10,12 @@ from functools import cached_property
 from math import ceil
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from pixcal.estimators.fringe_fit.combine import axes_span_plane
 from pixcal.kernels.optics import fringe_vector
 from pixcal.kernels.scene import fibre_light, geometry
+from pixcal.model.arrays import F64, I64
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.stages.budget.bound import (
@@ -26,7 +26,6 @@ from pixcal.stages.budget.bound import (
     unweighted_variance,
 )
 
-F64 = NDArray[np.float64]
 Shares = Sequence[float] | F64
 
 SAMPLES = 96  # pixels along each side of the grid: light changes little from one to the next
@@ -174,7 +173,7 @@ class SetBound:
         return WeightErrors.of(float(self.iota[n]), float(self.alpha[n]), self.variance)
 
 
-def grid(shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def grid(shape: tuple[int, int]) -> tuple[I64, I64]:
     """Columns and rows of a window at which its bound is taken, the outermost among them."""
     rows, columns = (
         np.unique(np.linspace(0, n - 1, min(n, SAMPLES)).round().astype(np.int64)) for n in shape

@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal import __version__
 from pixcal.estimators.fringe_fit.fringes import HONEST_FRINGES
+from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
@@ -47,8 +47,6 @@ PRECISION_PX = 5e-5  # what the paper asks for (section 1)
 SAMPLE_BYTES = 2  # of a sample as a camera writes it
 MARGIN = 4.0  # standard deviations that the brightest fringe should keep below the end of the range
 DOMINANT = 1.5  # a factor of the frames below this does not limit a set: photons do
-
-F64 = NDArray[np.float64]
 
 
 Config = Budget

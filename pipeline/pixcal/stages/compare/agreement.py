@@ -21,12 +21,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from pixcal.kernels.normal_matrix import inverse_normal
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 RCOND = 1e-8  # modes of the two sides that are alike to this (in their squares) count as one
 SEEN = 5.0  # sigma at which a covariance is a signal that a line can be drawn through

@@ -3,14 +3,12 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammainc, ndtr, ndtri
 
+from pixcal.model.arrays import F64
 from pixcal.report.compare_figures import ComponentView
 from pixcal.stages.compare.agreement import Part, halve, strongest_period
 from pixcal.stages.compare.pair import DISAGREE, Pair, PairSums, Pixels
-
-F64 = NDArray[np.float64]
 
 CLAIM = 1e-3  # chance of a false claim of a difference, of all that is looked at together
 # kinds of evidence: scales, columns, rows, means of blocks, scatter in blocks, single pixels

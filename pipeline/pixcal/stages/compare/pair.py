@@ -7,15 +7,13 @@ from itertools import pairwise, product
 from operator import add
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.model.arrays import F64, I64
 from pixcal.stages.compare.agreement import Grouping, Part, Projection, double, halve
 from pixcal.stages.compare.sides import Side, Tile, Vector
-
-F64 = NDArray[np.float64]
 
 COARSE = 256  # most blocks along the longer side that are kept in memory
 SHOWN_BLOCKS = 16  # blocks along the longer side of the map of differences, or up to twice as many
@@ -198,8 +196,8 @@ def _sums_task(
 class Pixels:
     """The pixels one by one."""
 
-    pulls: NDArray[np.int64]  # (bin,) histogram of differences over their errors, `PULLS`
-    picture: NDArray[np.int64]  # (bin, bin) second map (y) against the first (x), within `reach`
+    pulls: I64  # (bin,) histogram of differences over their errors, `PULLS`
+    picture: I64  # (bin, bin) second map (y) against the first (x), within `reach`
     far: list[tuple[int, int, float, float]]  # y, x, difference, error of pixels beyond `DISAGREE`
     beyond: int  # how many there are; the farthest of each tile are listed
     # (2, y, x) sum of squared pulls of each coarse block and its pixels, those beyond left out

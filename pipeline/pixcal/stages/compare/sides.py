@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.combine import (
     axes_span_plane,
@@ -20,13 +19,13 @@ from pixcal.estimators.fringe_fit.combine import (
 )
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.estimators.fringe_fit.models import FringeShape
+from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 from pixcal.stages.fitted_shape import fitted_shape
 from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.stage import read_acquisition, require
 
-F64 = NDArray[np.float64]
 Range = tuple[int, int]
 Tile = tuple[Range, Range]
 Vector = tuple[float, float]

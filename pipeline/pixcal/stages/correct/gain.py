@@ -11,17 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.model.arrays import F64, Mask
 from pixcal.stages.correct.swept import HALVES
 from pixcal.stages.correct.undoing import mean_of
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.cube import ArrayReader
-
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 PERIOD = 4  # rows or columns after which patterns repeat (paper, section 5.1: period of four rows)
 WORSE = 4.0  # errors from which a pattern, or a disagreement of sets, is larger than before

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.tile import Coding
+from pixcal.model.arrays import F32, U16
 from pixcal.simulation.effect import Effect
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.cube import ArrayReader
-
-F32 = NDArray[np.float32]
 
 STRETCH = 1.25  # range of the codes over that of the set: undoing may take samples beyond it
 FRAME_BYTES = 40  # arrays of a frame while effects are undone on it
@@ -63,7 +62,7 @@ class RestoredSet(ReducedSet):
     def _maps_of_charge(self) -> dict[str, ArrayReader]:
         return {name: ArrayReader(self.calibration / name) for name in ("flat", "dark_rate")}
 
-    def codes(self, tile: tuple[int, int], block: int, *, keep: bool = False) -> NDArray[np.uint16]:
+    def codes(self, tile: tuple[int, int], block: int, *, keep: bool = False) -> U16:
         """Codes (t, y, x) of one block of frames of a tile, of `coding`."""
         if keep:
             self.signal.keep((block, *tile))
@@ -87,12 +86,12 @@ class RestoredSet(ReducedSet):
             out[n] = self._restored(frame, flat, dark)[inside]
         return out
 
-    def blocks(self, tile: tuple[int, int]) -> Iterator[NDArray[np.uint16]]:
+    def blocks(self, tile: tuple[int, int]) -> Iterator[U16]:
         """Codes of a tile, block after block."""
         for block in range(self.n_blocks):
             yield self.codes(tile, block)
 
-    def _restored(self, codes: NDArray[Any], flat: F32, dark: F32) -> NDArray[np.uint16]:
+    def _restored(self, codes: NDArray[Any], flat: F32, dark: F32) -> U16:
         """Codes (y, x) of `coding` of a frame, from the stored ones."""
         stored, new = super().coding, self.coding
         missing = codes == stored.fill

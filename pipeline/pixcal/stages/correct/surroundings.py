@@ -9,13 +9,11 @@ the chip, where nothing comes from beyond: the maps tell, side by side.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pixcal.model.arrays import F64, U8, Mask
 from pixcal.model.flags import PixelFlag
 from pixcal.simulation.effect import FringeMaps
 
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 # top, bottom, left and right of the window, rows counted from the top
 Sides = tuple[bool, bool, bool, bool]
 
@@ -62,7 +60,7 @@ def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, scatter: float) -> 
     return variants
 
 
-def usable(theta: F64, mask: NDArray[np.uint8]) -> Mask:
+def usable(theta: F64, mask: U8) -> Mask:
     """Pixels (y, x) whose fitted signal is usable, flagged or not."""
     return np.asarray(np.isfinite(theta).all(axis=0) & (mask & UNKNOWN == 0))
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pixcal.estimators.fringe_fit.tile_sums import Carrier
 from pixcal.estimators.maps.corrected import phase_change
 from pixcal.kernels.crosstalk import FILL_REACH, filled
+from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.correct.surroundings import BEYOND, CLOSED, Sides, usable
@@ -19,9 +20,6 @@ from pixcal.stages.evidence import Part, fitted_theta
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
-
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 HALVES = 2  # parts of the frames that are corrected each for itself
 

@@ -6,21 +6,18 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.effects import parse_effects
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.fringe_fit.modes import solve_modes
 from pixcal.estimators.maps.corrected import phase_change, straight_modes
+from pixcal.model.arrays import F64, Mask
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.correct.swept import Swept, maps_of, undone
 from pixcal.stages.fit.scouting import scout_tiles
-
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 # peak of a tile's task for each of its pixels, those around it included (measured),
 PIXEL_BYTES = 500

@@ -14,7 +14,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
@@ -23,6 +22,7 @@ from pixcal.estimators.fringe_fit.fringes import wrapped
 from pixcal.estimators.fringe_fit.geometry import tile_plane
 from pixcal.estimators.fringe_fit.tile_sums import TileSums, sum_row
 from pixcal.estimators.maps.corrected import phase_change
+from pixcal.model.arrays import F32, F64, Mask
 from pixcal.simulation.effect import FringeMaps
 from pixcal.stages.correct.surroundings import disturbed, scatter_of
 from pixcal.stages.correct.swept import HALVES, Swept, border_change, maps_of, padded, undone
@@ -32,10 +32,6 @@ from pixcal.stages.fit.sweep import BATCH_MAPS
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
 from pixcal.storage.links import link_files
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 SAME = ("chi2", "mask", "g", "dk", "time")  # arrays of a sweep that stay
 

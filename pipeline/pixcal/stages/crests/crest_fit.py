@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult, least_squares
 
 from pixcal.estimators.fringe_fit.models.hyperbolic import (
@@ -15,10 +14,10 @@ from pixcal.estimators.fringe_fit.models.hyperbolic import (
     PRIOR_TILT,
 )
 from pixcal.kernels.optics import PARAMETERS, Geometry, phase, phase_jacobian
+from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
 from pixcal.stages.crests.crests import CrestPaths
 
-F64 = NDArray[np.float64]
 # unknowns (n,) but the phase -> the geometry, and derivatives (6, n) of its parameters
 Parametrisation = Callable[[F64], tuple[Geometry, F64]]
 
@@ -62,7 +61,7 @@ class CrestFit:
     phase0: float  # phase at the frame's centre, rad
     # (6, 6) mm², in the order of `PARAMETERS`, scaled by the spread; zero for what was held
     covariance: F64
-    used: NDArray[np.bool_]  # (point,) points that are no outliers
+    used: Mask  # (point,) points that are no outliers
     residual: F64  # (point,) phase of the fit minus k pi, rad
     cost: float  # equation 7: sum of the squared residuals of the points used, rad²
     chi2_reduced: float  # the same weighted, for each degree of freedom
@@ -78,7 +77,7 @@ class CrestFit:
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
     @property
-    def from_prior(self) -> NDArray[np.bool_]:
+    def from_prior(self) -> Mask:
         """Parameters (6,) that the prior constrains more than the points."""
         return np.asarray(self.sigma > np.sqrt(0.5) * self.prior.sigma)
 

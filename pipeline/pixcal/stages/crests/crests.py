@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.fringes import find_fringe_vector
 from pixcal.kernels.demodulation import N_SUMS, solve_windows, window_sums
+from pixcal.model.arrays import F64, I64, Mask
 from pixcal.model.errors import InputError
 
-F64 = NDArray[np.float64]
 Vector = tuple[float, float]
 
 # Fewest across a window. Half an odd number: points of neighbours lie on crest and valley.
@@ -175,7 +175,7 @@ class CrestPaths:
     x: F64  # x, y: (point,) r_jk, pixel coordinates
     y: F64
     # (point,) number of the path, consistent over the frame; grows along the fringe vector
-    k: NDArray[np.int64]
+    k: I64
     sigma: F64  # (point,) 1-sigma error of the phase there, rad, from the scatter of the samples
     slope: F64  # (point,) length of the local fringe vector, rad/px
     # (frame,) phase of each frame relative to the first, rad; NaN where a frame has no fringes
@@ -214,7 +214,7 @@ class CrestPaths:
         return self.take(np.isin(self.k, ends))
 
 
-def seed_vector(patch: NDArray[Any], good: NDArray[np.bool_], nominal: Vector) -> Vector:
+def seed_vector(patch: NDArray[Any], good: Mask, nominal: Vector) -> Vector:
     """Fringe vector (kx, ky), rad/px, of a patch (y, x) of a frame; its sign is the nominal one's.
 
     Raises
@@ -241,7 +241,7 @@ def seed_vector(patch: NDArray[Any], good: NDArray[np.bool_], nominal: Vector) -
 
 def tile_sums(
     signal: NDArray[Any],
-    good: NDArray[np.bool_],
+    good: Mask,
     start: tuple[int, int],
     windows: Windows,
     carrier: CrestCarrier,
@@ -329,7 +329,7 @@ def find_crests(
     return _points(windows, carrier.phase, rest, weight, phi - np.nan_to_num(phi[0]), (kx, ky))
 
 
-def _check(use: NDArray[np.bool_]) -> None:
+def _check(use: Mask) -> None:
     if use.sum() < MIN_POINTS:
         raise InputError(
             f"no fringes found in enough windows: {use.sum()} of {use.size} show them, at least "

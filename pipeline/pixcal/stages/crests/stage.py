@@ -25,6 +25,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels.demodulation import N_SUMS
 from pixcal.kernels.optics import PARAMETERS, Geometry, paraxial_vector, phase, phase_jacobian
 from pixcal.model.acquisition import Acquisition
+from pixcal.model.arrays import F32, F64, I64, Mask
 from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Crests
@@ -62,8 +63,6 @@ MAP_REACH = 0.04  # how far the maps go from the minimum, as a share of distance
 NOTABLE_CHI2 = 3.0  # from here on the reduced chi-square of the points is pointed out
 FIGURE_BYTES = 128 << 20  # Matplotlib and one figure
 
-F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
 Range = tuple[int, int]
 
 
@@ -185,7 +184,7 @@ def _extract(
     return paths if config.paths is None else paths.outermost(config.paths)
 
 
-def read_patch(source: ReducedSet, frame: int, y: Range, x: Range) -> tuple[F32, NDArray[np.bool_]]:
+def read_patch(source: ReducedSet, frame: int, y: Range, x: Range) -> tuple[F32, Mask]:
     """Electrons (y, x) of a part of one frame, and its good samples."""
     values = np.zeros((y[1] - y[0], x[1] - x[0]), np.float32)
     good = np.zeros(values.shape, bool)
@@ -200,7 +199,7 @@ def read_patch(source: ReducedSet, frame: int, y: Range, x: Range) -> tuple[F32,
     return values, good
 
 
-def _tile(source: ReducedSet, at: tuple[int, int], frame: int) -> tuple[F32, NDArray[np.bool_]]:
+def _tile(source: ReducedSet, at: tuple[int, int], frame: int) -> tuple[F32, Mask]:
     """Electrons and good samples of a tile of one frame."""
     coding = source.coding
     codes = source.codes(at, frame // source.block)[frame % source.block]
@@ -210,7 +209,7 @@ def _tile(source: ReducedSet, at: tuple[int, int], frame: int) -> tuple[F32, NDA
 
 def _row_task(
     source: ReducedSet, frame: int, windows: Windows, carrier: CrestCarrier, row: int
-) -> tuple[NDArray[np.int64], F64]:
+) -> tuple[I64, F64]:
     """Numbers and sums of the windows that a row of tiles touches."""
     numbers, parts = [], []
     for column in range(source.grid[1]):

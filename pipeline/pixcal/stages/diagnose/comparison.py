@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.gap import (
     Expectation,
@@ -17,10 +16,9 @@ from pixcal.estimators.diagnosis.gap import (
     remaining,
 )
 from pixcal.estimators.diagnosis.test_statistics import Key
+from pixcal.model.arrays import F64
 from pixcal.stages.diagnose.shrinkage import Trial, differing
 from pixcal.stages.diagnose.trial import Curves, Effects
-
-F64 = NDArray[np.float64]
 
 LAW_ERROR = 0.25
 """Relative error of an effect's law: a second cause needs evidence that another law of the first

@@ -4,19 +4,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.detector.flat_ladder import light_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.acquisition import Acquisition
+from pixcal.model.arrays import F64, Indices
 from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.model.errors import InputError
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import plain_bench
 from pixcal.stages.diagnose.nominal import SetTruth
 from pixcal.stages.diagnose.parts import Half, Table, groups
-
-F64 = NDArray[np.float64]
 
 
 def bench_of(
@@ -71,7 +69,7 @@ def recordings_of(
     tables: Mapping[str, Table],
     evidence: Sequence[Evidence],
     halves: Sequence[Half],
-) -> tuple[list[Recording], list[tuple[str, NDArray[np.intp]]], dict[int, F64]]:
+) -> tuple[list[Recording], list[tuple[str, Indices]], dict[int, F64]]:
     """Recordings, where their frames are, and the light of the frames of flats by their number.
 
     In electrons for unit response; NaN in frames that are not looked at.
@@ -121,7 +119,7 @@ def _light(
     evidence: Sequence[Evidence],
     halves: Sequence[Half],
     name: str,
-    numbers: NDArray[np.intp],
+    numbers: Indices,
     exposure_and_step: tuple[float, int],
 ) -> F64:
     """Light (t,) of flats of an exposure time (s; zero: unknown) and a step of the lamp."""

@@ -4,14 +4,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.detector.flat_ladder import LAMP, flicker, ladder, straight_line
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.model.arrays import F64
 from pixcal.simulation.recording import Recording
 from pixcal.stages.diagnose.undone import IntensityBeforeEffects
-
-F64 = NDArray[np.float64]
 
 SERIES = 8
 """Frames of a series whose light is taken as it was in each; of fewer it is drawn."""

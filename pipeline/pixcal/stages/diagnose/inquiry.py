@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence
@@ -22,6 +21,7 @@ from pixcal.estimators.diagnosis.gap import (
 from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
 from pixcal.kernels.significance import SIGNIFICANT
+from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Again, Effect, Estimate
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
@@ -31,8 +31,6 @@ from pixcal.stages.diagnose.result import by_domain
 from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Search
 from pixcal.stages.diagnose.trial import OF_ESTIMATE, Curves, Effects, Signature, Trials, estimate
 from pixcal.stages.diagnose.windows import whole_of
-
-F64 = NDArray[np.float64]
 
 REFERENCES = 16
 """Simulations of the nominal bench."""

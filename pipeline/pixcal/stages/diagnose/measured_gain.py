@@ -4,16 +4,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.kernels.photon_transfer import LADDER, neighbour_noise
+from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import Recording
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 DECLARED_ERROR = 0.01
 """Relative error that a declared gain may well have."""
@@ -108,7 +105,7 @@ def photon_transfer_change(
 def _moments(
     camera: Camera,
     recording: Recording,
-    good: NDArray[np.bool_],
+    good: Mask,
     neighbours: Sequence[tuple[int, int]],
 ) -> tuple[float, float]:
     """Mean and variance in time of good pixels, ADU; common changes of frames taken off."""

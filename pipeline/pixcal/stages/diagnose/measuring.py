@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from pixcal.estimators.detector.amplifiers import relative_gain
@@ -18,6 +17,7 @@ from pixcal.kernels.rounding import level_before_rounding
 from pixcal.kernels.sample_sums import calm_residuals, pixel_moments
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.model.acquisition import Acquisition
+from pixcal.model.arrays import F32, F64, Indices, Mask
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.description import bench_of, recordings_of
 from pixcal.stages.diagnose.flat_light import FlatLight
@@ -31,9 +31,6 @@ from pixcal.stages.diagnose.nominal import (
     light_surface,
 )
 from pixcal.stages.diagnose.parts import Half, Table
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 HOT = 40.0
 """Robust standard deviations of the dark current beyond which a pixel is hot."""
@@ -189,7 +186,7 @@ def _fitted(
     )
 
 
-def excess_scatter(found: Sequence[FringeEvidence], good: NDArray[np.bool_]) -> float:
+def excess_scatter(found: Sequence[FringeEvidence], good: Mask) -> float:
     """By how much offsets of independent frames differ over what their errors allow; at least 1.
 
     Effects that differ from frame to frame add to the errors of the offsets. Taken for true ones,
@@ -239,9 +236,7 @@ def _uncoupled(dark: F64) -> F64:
     return np.where(beside, np.median(dark), dark)
 
 
-def _set_truth(
-    found: Sequence[FringeEvidence], frames: Sequence[NDArray[np.intp]], count: int
-) -> SetTruth:
+def _set_truth(found: Sequence[FringeEvidence], frames: Sequence[Indices], count: int) -> SetTruth:
     """Straight, steady fringes with the offsets that can be true ones."""
     one = found[0]
     good = np.all([f.good for f in found], axis=0)
@@ -263,14 +258,14 @@ def _set_truth(
     )
 
 
-def _contrast(found: FringeEvidence, good: NDArray[np.bool_]) -> F64:
+def _contrast(found: FringeEvidence, good: Mask) -> F64:
     """Contrast (y, x) of the frames, smooth over the window."""
     surface = contrast_surface(found.theta, good)
     of_frames = np.median(np.hypot(found.g[:, 1], found.g[:, 2]) / found.g[:, 0])
     return np.asarray(surface * of_frames)
 
 
-def _phases(found: Sequence[FringeEvidence], frames: Sequence[NDArray[np.intp]], count: int) -> F64:
+def _phases(found: Sequence[FringeEvidence], frames: Sequence[Indices], count: int) -> F64:
     """Phase (t,) of every frame of a set, counted from the first part's maps; NaN where unknown."""
     phi = np.full(count, np.nan)
     first = found[0].theta[2] + 1j * found[0].theta[1]
@@ -281,9 +276,7 @@ def _phases(found: Sequence[FringeEvidence], frames: Sequence[NDArray[np.intp]],
     return phi
 
 
-def _gain(
-    evidence: Sequence[Evidence], flat: F64, good: NDArray[np.bool_], with_flats: bool
-) -> MeasuredGain:
+def _gain(evidence: Sequence[Evidence], flat: F64, good: Mask, with_flats: bool) -> MeasuredGain:
     """Gain as flats and declaration tell together, and of each amplifier where flats show steps."""
     amplifiers = np.ones(good.shape)
     noise = [n for e in evidence for n in _noise_ratios(e)]

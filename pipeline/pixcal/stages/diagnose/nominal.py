@@ -15,7 +15,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.fringe_fit.fringes import grid
@@ -24,6 +23,7 @@ from pixcal.estimators.maps.structure import OffsetModel, smooth_surface, true_o
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
 from pixcal.model.acquisition import Acquisition
+from pixcal.model.arrays import F32, F64, Indices, Mask
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, FringeMaps, Stage
 from pixcal.simulation.exposure import Camera
@@ -34,9 +34,6 @@ from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
 from pixcal.stages.diagnose.undone import IntensityBeforeEffects, undone_on_samples
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 TWO_BEAMS = 2
 """Degree, over a window, of the logarithm of the contrast of two Gaussian beams (their intensities'
@@ -138,12 +135,12 @@ class Measured(Effect):
         return FrameStates(phi, np.ones(count), np.ones(count), still, still)
 
 
-def light_surface(theta: F64, good: NDArray[np.bool_]) -> F64:
+def light_surface(theta: F64, good: Mask) -> F64:
     """Mean light (y, x) of a fit's maps, smooth over the window."""
     return smooth_surface(np.where(good, theta[0], np.nan), good)
 
 
-def contrast_surface(theta: F64, good: NDArray[np.bool_]) -> F64:
+def contrast_surface(theta: F64, good: Mask) -> F64:
     """Contrast (y, x) of a fit's maps as two Gaussian beams can make it over a window."""
     alpha = np.hypot(*theta[1:])
     used = good & (alpha > 0) & (theta[0] > 0)
@@ -254,7 +251,7 @@ class NominalBench:
     gain: MeasuredGain
     fits: tuple[FittedSet, ...]
     recordings: tuple[Recording, ...]
-    places: tuple[tuple[str, NDArray[np.intp]], ...]
+    places: tuple[tuple[str, Indices], ...]
 
     def simulate(
         self,
@@ -396,7 +393,7 @@ class NominalBench:
         return replace(self.measured, maps=maps, sets=tuple(sets))
 
 
-def _runs(numbers: NDArray[np.intp]) -> list[tuple[int, int]]:
+def _runs(numbers: Indices) -> list[tuple[int, int]]:
     """Ranges (first, one after the last) of numbers that follow one another."""
     if not len(numbers):
         return []

@@ -5,18 +5,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.modes import solve_modes
 from pixcal.estimators.maps.corrected import phase_change, straight_modes
 from pixcal.kernels.crosstalk import filled
+from pixcal.model.arrays import F64
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.diagnose.nominal import FittedSet
 from pixcal.stages.diagnose.undone import undone_on_samples
 from pixcal.stages.treatment import treatment_of
 from pixcal.storage.artefact import MANIFEST, read_json
-
-F64 = NDArray[np.float64]
 
 
 def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.acquisition import Acquisition
+from pixcal.model.arrays import Indices
 from pixcal.stages import evidence, reduce
 from pixcal.stages.evidence import Part
 from pixcal.stages.in_memory import run_in_memory
@@ -33,7 +34,7 @@ class Half:
         Numbers of the frames (ascending) by name of the array, e.g. ``bias``, ``fringes/vertical``.
     """
 
-    frames: Mapping[str, NDArray[np.intp]]
+    frames: Mapping[str, Indices]
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class Raw:
         return found
 
 
-def groups(table: Table) -> list[NDArray[np.intp]]:
+def groups(table: Table) -> list[Indices]:
     """Numbers of the frames of each exposure time and lamp, in ascending order; unknown last."""
     exposures = np.array([np.inf if t is None else t for t in table["exptime_s"]], float)
     steps = np.array(table.get("step") or np.zeros(len(exposures)), int)

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr
 
 from pixcal import __version__
@@ -18,14 +17,13 @@ from pixcal.estimators.diagnosis.gap import (
 )
 from pixcal.estimators.diagnosis.test_statistics import DETECTOR, Curve, Key
 from pixcal.estimators.diagnosis.test_statistics.signature import statistic_named
+from pixcal.model.arrays import F64
 from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place
 from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
 from pixcal.stages.diagnose.deciding import recommend_frames
 from pixcal.stages.diagnose.shrinkage import Shrinkage, Trial, differing, shrinkage
-
-F64 = NDArray[np.float64]
 
 SCHEMA = "pixcal/diagnosis/1"
 EXPLAINED = 0.15

@@ -9,11 +9,11 @@ effects, tells how much of a candidate's significance these produce.
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.gap import Reference
 from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.kernels.significance import SIGNIFICANT
+from pixcal.model.arrays import F64
 from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.candidates import (
     Accepted,
@@ -34,8 +34,6 @@ from pixcal.stages.diagnose.rejection import (
 )
 from pixcal.stages.diagnose.shrinkage import LEAST, Trial
 from pixcal.stages.diagnose.trial import Curves, Effects
-
-F64 = NDArray[np.float64]
 
 MIN_SIGMA_IN_GAP = 1.5
 """Significance that an estimate needs where there is a gap, instead of `SIGNIFICANT`,"""

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.gap import (
     Difference,
@@ -16,9 +15,8 @@ from pixcal.estimators.diagnosis.gap import (
     remaining,
 )
 from pixcal.estimators.diagnosis.test_statistics import Key
+from pixcal.model.arrays import F64
 from pixcal.stages.diagnose.trial import Effects
-
-F64 = NDArray[np.float64]
 
 LEAST = 5.0
 """By which an effect must raise the log-likelihood of unseen data."""

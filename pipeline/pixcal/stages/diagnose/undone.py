@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pixcal.model.arrays import F64
 from pixcal.model.bench import SimulatedDetector
 from pixcal.simulation.effect import Effect, FringeMaps
 
@@ -21,8 +21,6 @@ LEAST_SIGNAL = 1.0
 """Of a sample (e-), below which its shot noise is not taken."""
 ACROSS = 9
 """Pixels along the side of a frame whose level is undone."""
-
-F64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pixcal.model.arrays import Indices
 from pixcal.stages.diagnose.parts import Half, Table, groups
 from pixcal.stages.evidence import Part
 
@@ -90,7 +90,7 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
     return Split(Half(learn), Half(test))
 
 
-def _halves(frames: NDArray[np.intp], most: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _halves(frames: Indices, most: int) -> tuple[Indices, Indices]:
     if len(frames) < FEWEST:
         return frames, frames
     middle = len(frames) // 2

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.geometry import TilePlane, unwrap
 from pixcal.estimators.fringe_fit.models import FringeShape, Start, fringe_models
@@ -13,13 +12,12 @@ from pixcal.estimators.fringe_fit.modes import ModeBasis
 from pixcal.estimators.fringe_fit.smooth import Polynomial
 from pixcal.estimators.fringe_fit.tile_sums import Carrier, TileSums
 from pixcal.model.acquisition import Acquisition
+from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
 from pixcal.stages.fitted_shape import nominal_geometry
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.place import Local
-
-F64 = NDArray[np.float64]
 
 MAX_STEPS = 8
 """Gauss-Newton steps of a shape; it is nearly linear (physics note, section 4)."""

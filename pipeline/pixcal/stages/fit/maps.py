@@ -7,7 +7,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
@@ -15,14 +14,12 @@ from pixcal.estimators.fringe_fit.combine import axes_span_plane, combine_parall
 from pixcal.estimators.fringe_fit.fringes import wrapped
 from pixcal.estimators.fringe_fit.models import FringeShape
 from pixcal.estimators.fringe_fit.tile_sums import local_modes
+from pixcal.model.arrays import F32, F64, U8
 from pixcal.stages.fit.fringe_set import FittedSet
 from pixcal.stages.fit.scouting import read_frames
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
 from pixcal.storage.links import link_files
 from pixcal.storage.place import Local
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 SAME_AS_SWEPT = ("iota", "alpha", "chi2", "mask")
 """Maps of a set that are those of its sweep."""
@@ -199,7 +196,7 @@ class SetOffsets:
 
     delta: F32
     sigma: F32
-    flags: NDArray[np.uint8]
+    flags: U8
     modes: F64
     k: float
     scale: np.float32
@@ -210,7 +207,7 @@ def offsets(fitted: FittedSet, at: tuple[int, int], removed: F64) -> SetOffsets:
     source = fitted.source
     y, x = source.ranges(at)
     plane = fitted.planes[at[0] * source.grid[1] + at[1]]
-    flags: NDArray[np.uint8] = ArrayReader(fitted.swept / "mask").read(y, x)
+    flags: U8 = ArrayReader(fitted.swept / "mask").read(y, x)
     phase = ArrayReader(fitted.swept / "phase").read(y, x)
     shape = (phase.shape[0], phase.shape[1])
     modes = local_modes(fitted.carrier, plane, shape)

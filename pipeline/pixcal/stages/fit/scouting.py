@@ -6,12 +6,12 @@ from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, one_blas_thread, run_tasks
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.scout import Scout, in_turn
+from pixcal.model.arrays import U16, Indices
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader, write_array
@@ -37,7 +37,7 @@ class Lookout:
     places: list[tuple[int, int]]
     keep: bool
 
-    def codes(self, block: int) -> list[NDArray[np.uint16]]:
+    def codes(self, block: int) -> list[U16]:
         """Codes (t, y, x) of a block of frames, for each place."""
         return [self.source.codes(at, block, keep=self.keep) for at in self.places]
 
@@ -135,7 +135,7 @@ def scout_set(
     write_json(folder / "scout.json", facts)
 
 
-def _look(lookout: Lookout, wanted: tuple[int, NDArray[np.intp]]) -> list[NDArray[np.uint16]]:
+def _look(lookout: Lookout, wanted: tuple[int, Indices]) -> list[U16]:
     block, frames = wanted
     return [codes[frames] for codes in lookout.codes(block)]
 
@@ -144,7 +144,7 @@ def _solve_block(lookout: Lookout, scout: Scout, block: int) -> FrameParameters:
     return scout.solve(lookout.codes(block))
 
 
-def _first_look(source: ReducedSet, blocks: int) -> list[tuple[int, NDArray[np.intp]]]:
+def _first_look(source: ReducedSet, blocks: int) -> list[tuple[int, Indices]]:
     """Blocks spread over the run and frames of each, as many in all as in ``blocks`` whole ones."""
     wanted = min(source.n_blocks, max(blocks, LOOKS))
     each = max(1, source.block * max(1, min(blocks, wanted)) // wanted)

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
@@ -22,6 +21,7 @@ from pixcal.estimators.fringe_fit.sweep import BOUND_PIXELS, TileMaps, frames_to
 from pixcal.estimators.fringe_fit.tile import Tile
 from pixcal.estimators.fringe_fit.tile_sums import Carrier, TileSums, sum_row
 from pixcal.model.acquisition import Acquisition
+from pixcal.model.arrays import F64, Mask
 from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Sweep
@@ -260,7 +260,7 @@ def _sweep_task(job: _Job, at: tuple[int, int]) -> None:
     writers["sums"].write((*at, 0), _sums(job, tile, maps, flags == 0)[None, None])
 
 
-def _sums(job: _Job, tile: Tile, maps: TileMaps, good: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _sums(job: _Job, tile: Tile, maps: TileMaps, good: Mask) -> F64:
     """Sums of the tile's phases for the shapes that will be fitted to them."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = maps.iota / maps.alpha

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from pixcal.engine.plan import Plan, make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.acquisition import Acquisition, load_acquisition
+from pixcal.model.arrays import F64
 from pixcal.model.config import to_plain
 from pixcal.model.errors import DamagedError, InputError, RemoteError
 from pixcal.model.options import Ingest
@@ -387,7 +388,7 @@ def _read_block(
     unpacked: Mapping[str, FrameFile],
     rows: tuple[int, int],
     out: NDArray[Any] | None,
-) -> NDArray[np.float64]:
+) -> F64:
     found, at = [], 0
     for file, group in groupby(block, key=lambda frame: frame.file):
         planes = [frame.plane for frame in group]

@@ -9,18 +9,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.detector.bad_pixels import dead, hot, noisy
 from pixcal.estimators.detector.calibration import usual_variance
 from pixcal.kernels.robust import median_and_sigma
+from pixcal.model.arrays import F64, U8
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.columns import Index, extent, indices
 from pixcal.stages.reduce.frame_statistics import STATISTICS, Limits
 from pixcal.storage.cube import CHUNK, ArrayReader, ArrayWriter, create_array, create_group
 from pixcal.storage.place import Place
-
-F64 = NDArray[np.float64]
 
 _SAMPLES = 1 << 20
 _FLAT_FLOOR = 0.05
@@ -185,7 +183,7 @@ def finish(job: Finishing, index: Index) -> F64:
     return np.array([flat.min(), flat.max(), bias.max(), rate.max()])
 
 
-def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> NDArray[np.uint8]:
+def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U8:
     mask = found["flags"].astype(np.uint8)
     limits, medians = job.limits, job.usual
     # A sample that lies on a change of code is one of two, however little noise it has.

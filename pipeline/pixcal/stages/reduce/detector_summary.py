@@ -5,21 +5,19 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.detector.calibration import Linearity, linearity
 from pixcal.estimators.detector.emva import full_level, saturation, transfer_points
 from pixcal.kernels.photon_transfer import LADDER, GainFit, add_neighbours, fit_gain
 from pixcal.kernels.rounding import SHEPPARD, UNTOLD, noise_before_rounding
 from pixcal.model.acquisition import Detector
+from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
 from pixcal.stages.reduce.calibration import Usual, on_grid, usual
 from pixcal.stages.reduce.columns import grid
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.place import Place
-
-F64 = NDArray[np.float64]
 
 ROUNDING_ADU = math.sqrt(SHEPPARD)
 """Noise of a converter that rounds to whole ADU."""
@@ -53,8 +51,8 @@ class Summary:
     levels: F64  # (rung,) of the ladder of flats (ADU above bias and dark)
     # usable, full: (rung,) rungs without saturation; those with full pixels though the
     # converter does not saturate
-    usable: NDArray[np.bool_]
-    full: NDArray[np.bool_]
+    usable: Mask
+    full: Mask
     linearity: Linearity | None  # of the usable rungs
 
     def gain_to_use(self, choice: str) -> float:
@@ -264,7 +262,7 @@ def _gain(
     return replace(fitted, neighbours=tuple(added))
 
 
-def _rungs(tables: F64, job: Measuring) -> tuple[F64, NDArray[np.bool_]]:
+def _rungs(tables: F64, job: Measuring) -> tuple[F64, Mask]:
     """Level of each rung (ADU) over the columns that have one on all rungs, and which to use."""
     if not job.flat:
         return np.zeros(0), np.zeros(0, np.bool_)
@@ -278,7 +276,7 @@ def _rungs(tables: F64, job: Measuring) -> tuple[F64, NDArray[np.bool_]]:
     return np.divide(total, seen, out=np.zeros_like(total), where=seen > 0), usable
 
 
-def _light(tables: F64, levels: F64, usable: NDArray[np.bool_], job: Measuring) -> F64:
+def _light(tables: F64, levels: F64, usable: Mask, job: Measuring) -> F64:
     """Light of each tile over that of the detector, from the steps that most pixels have."""
     if not job.flat:
         return np.ones(grid(job.shape))

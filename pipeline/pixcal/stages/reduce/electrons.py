@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.kernels.quantise import FILL, Scale, coefficients, encode, extremes
+from pixcal.model.arrays import F32, U16
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.calibration import FLAG_ATTRS
 from pixcal.stages.reduce.columns import Index, Strip, blocks, extent, grid
@@ -20,8 +21,6 @@ from pixcal.storage.cube import (
 )
 from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import Place
-
-F32 = NDArray[np.float32]
 
 
 def convert_bytes(itemsize: int, width: int) -> int:
@@ -159,7 +158,7 @@ class _Column:
         self.lost = np.zeros_like(self.saturated)
         self.total = self.largest = 0
 
-    def add(self, first: int, samples: NDArray[Any], codes: NDArray[np.uint16]) -> None:
+    def add(self, first: int, samples: NDArray[Any], codes: U16) -> None:
         """Write the chunk that begins at a frame."""
         fringes = self.job.fringes
         (y0, _), (x0, _) = fringes.extent(self.index)

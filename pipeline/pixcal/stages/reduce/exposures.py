@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from pixcal.model.arrays import F32
 
 _SAME = 1e-3
 """Exposure times are the same within this relative distance: cameras write what they measured."""
@@ -31,7 +32,7 @@ class Exposures:
     known: bool = True
     # exposure times (s) of the frames of each set, float32, zero where dark is not to be
     # scaled
-    fringes: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    fringes: dict[str, F32] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)  # sentences
 
     @property

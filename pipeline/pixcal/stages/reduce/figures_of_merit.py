@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime
 from pixcal.estimators.detector.emva import (
@@ -25,6 +24,7 @@ from pixcal.estimators.detector.emva import (
     without_trend,
 )
 from pixcal.kernels.photon_transfer import BLOCK, LAGS, add_neighbours
+from pixcal.model.arrays import F64, Mask
 from pixcal.stages.reduce.detector_summary import Summary, pair_sums
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.halves import Window, frames_of, middle_of, read_halves
@@ -32,7 +32,6 @@ from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.artefact import Build, write_json
 from pixcal.storage.cube import CHUNK, ArrayReader
 
-F64 = NDArray[np.float64]
 Json = dict[str, Any]
 
 _TOLD = 1.6
@@ -214,9 +213,7 @@ _ALTERNATING_SHARE = 0.04
 """Of the variance of the map that its square is at least."""
 
 
-def _spread(
-    found: Json, curves: Json, name: str, unit: str, halves: F64, good: NDArray[np.bool_]
-) -> None:
+def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: Mask) -> None:
     """Standard deviations, spectra and profiles of a pair of maps."""
     spread: Nonuniformity = nonuniformity(halves[0], halves[1], good)
     said = ["quadratic trend of the lamp removed"] if name == "prnu" else []
@@ -272,7 +269,7 @@ def _dark_current(found: Json, made: Build, source: Ingested, scale: float, midd
     found["dark_current"] = _figure("dark current", unit, (scale * float(rate), error), note)
 
 
-def _dark_means(source: Ingested, middle: Window, good: NDArray[np.bool_]) -> tuple[F64, F64]:
+def _dark_means(source: Ingested, middle: Window, good: Mask) -> tuple[F64, F64]:
     """Exposure time (s) and mean (ADU) of each frame without light, over some rows."""
     (y0, y1), columns = middle
     rows = y0 + (y1 - y0) // CHUNK[1] // 2 * CHUNK[1]

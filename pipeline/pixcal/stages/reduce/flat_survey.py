@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pixcal.model.arrays import F64, I64
 from pixcal.storage.frame_reader import Reader
-
-F64 = NDArray[np.float64]
 
 ROWS = 64
 """Rows that are looked at, in the middle of the frames."""
@@ -93,7 +92,7 @@ def _rows(frames: Reader, begin: int, end: int) -> NDArray[Any]:
     return read
 
 
-def _pile(tops: Sequence[tuple[int, NDArray[np.int64], float]]) -> float | None:
+def _pile(tops: Sequence[tuple[int, I64, float]]) -> float | None:
     """Highest code, if there are far more samples than just below it."""
     if not tops:
         return None

@@ -26,6 +26,7 @@ from pixcal.estimators.detector.calibration import (
 )
 from pixcal.kernels.photon_transfer import COLUMNS, N_BINS, bin_pairs, pair_statistics
 from pixcal.kernels.robust import BATCH, Combination, Combined, lit, median_and_sigma
+from pixcal.model.arrays import F32, F64
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.columns import Index, Strip, extent, grid
 from pixcal.stages.reduce.exposures import Group
@@ -33,9 +34,6 @@ from pixcal.stages.reduce.ingested import MOST_ADU
 from pixcal.storage.cube import CHUNK, ArrayWriter, create_array, create_group
 from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import Place
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
 
 STATISTICS = (
     "bias",  # ADU

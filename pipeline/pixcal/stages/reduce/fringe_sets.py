@@ -5,11 +5,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels.quantise import Scale, choose_scale
+from pixcal.model.arrays import I64
 from pixcal.stages.reduce.columns import indices, run_noted, strip_width, strips
 from pixcal.stages.reduce.electrons import (
     Converting,
@@ -23,8 +21,6 @@ from pixcal.stages.reduce.electrons import (
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.artefact import Workspace
 from pixcal.storage.cube import ArrayReader
-
-F64 = NDArray[np.float64]
 
 _CONVERTERS = (8, 10, 12, 14)
 
@@ -133,7 +129,7 @@ def _possible_range(
     return low / flat, gain * source.saturation(name) / flat
 
 
-def _describe_counts(counts: NDArray[np.int64], scale: Scale) -> dict[str, Any]:
+def _describe_counts(counts: I64, scale: Scale) -> dict[str, Any]:
     saturated, lost, weighted, total = (int(counts[..., n].sum()) for n in range(4))
     return {
         "samples": saturated + lost + weighted,

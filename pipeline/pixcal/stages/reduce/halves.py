@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.detector.emva import Measure
+from pixcal.model.arrays import F64, Mask
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.detector_summary import Summary
 from pixcal.stages.reduce.exposures import Group
@@ -18,7 +19,6 @@ from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import CHUNK, ArrayReader
 
-F64 = NDArray[np.float64]
 Window = tuple[tuple[int, int], tuple[int, int]]
 """First row and the one after the last; the same of columns."""
 
@@ -35,7 +35,7 @@ class Halves:
 
     dark: F64 | None  # (2, y, x) without light, shortest exposure
     flat: F64 | None  # (2, y, x) near half of the saturation, the former subtracted
-    good: NDArray[np.bool_]  # (y, x)
+    good: Mask  # (y, x)
 
 
 def middle_of(shape: tuple[int, int]) -> Window:

@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp, softmax
 
 from pixcal.estimators.detector.telegraph.moments import Moments
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64, Indices
 
 AMPLITUDES = np.geomspace(0.1, 300, 90)  # amplitudes over the common noise that are looked at
 _DRAWN = 600
@@ -96,7 +94,7 @@ def _levels(keep: float, count: int) -> tuple[F64, F64]:
     return chances, products
 
 
-def joined(pixels: NDArray[np.intp], parts: Sequence[Moments], classes: Iterable[Classes]) -> F64:
+def joined(pixels: Indices, parts: Sequence[Moments], classes: Iterable[Classes]) -> F64:
     """Logarithms (pixel, class) of the likelihood ratios of all series together."""
     total = np.zeros((len(pixels), len(AMPLITUDES)))
     for m, one in zip(parts, classes, strict=True):

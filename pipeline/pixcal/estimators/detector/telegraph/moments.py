@@ -9,10 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import chdtri
 
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64, Indices
 
 NOISY = 3.0  # excess of the variance, in its own sigmas, from which a pixel's noise is looked at
 _OUTLIER = 5.0
@@ -24,7 +23,7 @@ class Series:
     """Noise of pixels in frames that follow one another."""
 
     noise: F64  # (t, n) over the common noise, about the pixel's mean; NaN where there is none
-    pixel: NDArray[np.intp]  # (n,) which pixels
+    pixel: Indices  # (n,) which pixels
     sigma: float  # the common noise, e-
     period_s: float  # from frame to frame; nan when unknown
 
@@ -33,7 +32,7 @@ class Series:
 class Moments:
     """Of the noise of each pixel of a series, in units of the common noise."""
 
-    pixel: NDArray[np.intp]
+    pixel: Indices
     count: F64
     """Samples."""
     variance: F64
@@ -48,7 +47,7 @@ class Moments:
     frames: int
     """That most pixels have."""
 
-    def of(self, pixels: NDArray[np.intp]) -> "Moments":
+    def of(self, pixels: Indices) -> "Moments":
         """Of some pixels (ascending) alone."""
         own = np.isin(self.pixel, pixels)
         names = ("pixel", "count", "variance", "kurtosis", "neighbours")

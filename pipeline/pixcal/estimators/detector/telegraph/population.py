@@ -10,14 +10,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize
 from scipy.special import expit, gammaln, xlogy
 
 from pixcal.estimators.detector.telegraph.classes import AMPLITUDES, Classes, Mixture, joined
 from pixcal.estimators.detector.telegraph.moments import Moments
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64, Indices
 
 _USUAL, _MOST = 1.5, 4.0  # logarithm of the shape: what is usual, and the most that is tried
 _CLEAR = 8.0  # by which another shape than the exponential's must be likelier
@@ -39,7 +37,7 @@ class Population:
     shape_error: float
     unit: float  # noise that `AMPLITUDES` are over, e-
     weight: F64  # (class,) share of the pixels in each class of amplitudes
-    pixels: NDArray[np.intp]  # (n,) all that there are
+    pixels: Indices  # (n,) all that there are
     chance: F64  # (n,) that each is one of them
 
 

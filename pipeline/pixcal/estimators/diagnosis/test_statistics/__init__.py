@@ -13,12 +13,10 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.test_statistics.look import Look
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 DETECTOR = "detector"
 """Stands for the name of a set where a curve is of the detector or of several sets."""

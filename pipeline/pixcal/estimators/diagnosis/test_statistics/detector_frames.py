@@ -10,7 +10,8 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
-from pixcal.estimators.diagnosis.test_statistics.look import F32, F64, STEPS, Mask, neighbour_sums
+from pixcal.estimators.diagnosis.test_statistics.look import STEPS, neighbour_sums
+from pixcal.model.arrays import F32, F64, Mask
 
 REPEATS = (1, 2, 3, 4)
 """Rows or columns between two that may share noise."""

@@ -16,10 +16,7 @@ from pixcal.kernels.sample_sums import (
     neighbour_products,
     pixel_moments,
 )
-
-F32 = NDArray[np.float32]
-F64 = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from pixcal.model.arrays import F32, F64, Indices, Mask
 
 WILD = 8.0
 """Standard deviations beyond which a residual counts as an outlier and no more."""
@@ -93,7 +90,7 @@ class Look:
         return neighbour_sums(self.residual, self.good, STEPS, self.thinned)
 
     @cached_property
-    def remainders(self) -> NDArray[np.intp] | None:
+    def remainders(self) -> Indices | None:
         """How often codes of good pixels have each remainder on division by `CODES`.
 
         None where what the camera wrote is not whole numbers.

@@ -9,16 +9,14 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
 from pixcal.estimators.diagnosis.test_statistics.look import (
     CELLS,
-    F32,
-    F64,
     LEVELS,
     STEPS,
     Look,
-    Mask,
     by_cell,
     neighbour_sums,
 )
 from pixcal.kernels.sample_sums import count_beyond
+from pixcal.model.arrays import F32, F64, Mask
 
 OUTLIERS = (5.0, 7.0, 10.0)
 LEAST_DARKS = 5

@@ -6,8 +6,9 @@ from itertools import combinations
 import numpy as np
 
 from pixcal.estimators.diagnosis.test_statistics import Curve, statistic
-from pixcal.estimators.diagnosis.test_statistics.look import F64, Look
+from pixcal.estimators.diagnosis.test_statistics.look import Look
 from pixcal.estimators.maps.structure import flattened
+from pixcal.model.arrays import F64
 
 SAME = 0.98
 """Cosine of the angle below which two sets measure along the same axis."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
-from pixcal.estimators.diagnosis.test_statistics.look import CELLS, F64, Look, by_cell
+from pixcal.estimators.diagnosis.test_statistics.look import CELLS, Look, by_cell
 from pixcal.estimators.maps.structure import (
     PERIODS,
     fit_terms,
@@ -14,6 +14,7 @@ from pixcal.estimators.maps.structure import (
     redness,
     repeats,
 )
+from pixcal.model.arrays import F64
 
 UNITS = {"offset": "px", "contrast": "", "light": ""}
 LINES = {0: "rows", 1: "columns"}

@@ -8,8 +8,9 @@ from scipy.fft import dct
 from pixcal.estimators.detector.flat_ladder import light_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
-from pixcal.estimators.diagnosis.test_statistics.look import F64, Look
+from pixcal.estimators.diagnosis.test_statistics.look import Look
 from pixcal.kernels.sample_sums import frame_means
+from pixcal.model.arrays import F64
 
 SERIES = {
     "intensity": ("intensity", ""),

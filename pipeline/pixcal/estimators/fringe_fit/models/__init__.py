@@ -13,11 +13,9 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.kernels.optics import Geometry
-
-F64 = NDArray[np.float64]
+from pixcal.model.arrays import F64
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,9 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from scipy.optimize import least_squares
 
-from pixcal.estimators.fringe_fit.models import F64, FringeShape, Start
+from pixcal.estimators.fringe_fit.models import FringeShape, Start
 from pixcal.kernels.optics import PARAMETERS, Geometry, fringe_vector, phase, phase_jacobian
+from pixcal.model.arrays import F64
 
 # the foot of the fibres' centre: the laboratory places it to less than 2 cm (paper, 5.2)
 PRIOR_CENTRE_MM = 20.0

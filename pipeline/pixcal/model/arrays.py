@@ -1,0 +1,14 @@
+"""Arrays by the type of their numbers; shapes and units stand in the docstrings."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+C128 = NDArray[np.complex128]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
