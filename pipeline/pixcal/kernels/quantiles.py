@@ -6,8 +6,7 @@ import numpy as np
 
 from pixcal.model.arrays import F32, F64
 
-_DIGIT = 16
-"""Bits that are counted at a time."""
+_DIGIT = 16  # bits that are counted at a time
 
 
 def quantiles_of_parts(

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.kernels import optics
-from pixcal.kernels.synthesis import BLOCK_ROWS, Float32, Stream, fill_normal, generator, turns
-from pixcal.model.arrays import F64, U8
+from pixcal.kernels.synthesis import BLOCK_ROWS, Stream, fill_normal, generator, turns
+from pixcal.model.arrays import F32, F64, U8
 from pixcal.model.bench import Bench, SimulatedDetector
 from pixcal.model.flags import PixelFlag
 
@@ -24,22 +24,14 @@ Piece = tuple[slice, slice]
 class DetectorMaps:
     """The truth of the pixels of some rows of the window, each of shape (y, x)."""
 
-    delta_x: Float32
-    """Offset along x, px."""
-    delta_y: Float32
-    """Offset along y, px."""
-    response: Float32
-    """Relative, mean 1."""
-    bias: Float32
-    """ADU."""
-    dark_rate: Float32
-    """e-/s."""
-    read_noise: Float32
-    """e- rms."""
-    adu_per_e: Float32
-    """The inverse of the gain, ADU/e-."""
-    mask: U8
-    """`PixelFlag.HOT` and `PixelFlag.DEAD`."""
+    delta_x: F32  # offset along x, px
+    delta_y: F32  # offset along y, px
+    response: F32  # relative, mean 1
+    bias: F32  # ADU
+    dark_rate: F32  # e-/s
+    read_noise: F32  # e- rms
+    adu_per_e: F32  # the inverse of the gain, ADU/e-
+    mask: U8  # `PixelFlag.HOT` and `PixelFlag.DEAD`
 
 
 def detector_maps(detector: SimulatedDetector, rows: Rows) -> DetectorMaps:
@@ -61,7 +53,7 @@ def chip_map(
     rows: Rows,
     effect: str,
     draw: Callable[[np.random.Generator], NDArray[Any]],
-) -> Float32:
+) -> F32:
     """What an effect does to each pixel of the chip, on rows of the window (first, one after).
 
     Parameters
@@ -102,7 +94,7 @@ def _shift(part: slice, by: int) -> slice:
 def _chip_tile(d: SimulatedDetector, ty: int, tx: int) -> DetectorMaps:
     """Maps of one tile of the chip, drawn whole so that every window sees the same pixels."""
 
-    def normal(stream: Stream, rms: float) -> Float32:
+    def normal(stream: Stream, rms: float) -> F32:
         values = np.empty(TILE, np.float32)
         fill_normal(generator(d.seed, stream, ty, tx), values)
         return values * np.float32(rms)
@@ -129,7 +121,7 @@ def _chip_tile(d: SimulatedDetector, ty: int, tx: int) -> DetectorMaps:
     )
 
 
-def _stitches(d: SimulatedDetector, ty: int, tx: int) -> tuple[Float32, Float32]:
+def _stitches(d: SimulatedDetector, ty: int, tx: int) -> tuple[F32, F32]:
     """Offsets (dx, dy) in px of the stitching blocks under a tile of the chip."""
     y = np.arange(ty * TILE[0], (ty + 1) * TILE[0]) // d.stitch_px[0]
     x = np.arange(tx * TILE[1], (tx + 1) * TILE[1]) // d.stitch_px[1]
@@ -193,9 +185,9 @@ def electrons_per_unit(bench: Bench, number: int) -> float:
 class LightMaps:
     """Response to the fringes of rows of the window, as `synthesis.illuminate` takes it; e-."""
 
-    iota: Float32
-    alpha_sin: Float32
-    alpha_cos: Float32
+    iota: F32
+    alpha_sin: F32
+    alpha_cos: F32
 
 
 def light_maps(
@@ -232,18 +224,13 @@ def light_maps(
 class FrameStates:
     """What changes from frame to frame of a fringe set; arrays over its frames."""
 
-    phi: F64
-    """Phase, rad."""
-    level: F64
-    """B, mean 1."""
-    amplitude: F64
-    """A, mean 1."""
-    dkx: F64
-    """Change of the fringe vector along x, rad/px, about the window's centre."""
-    dky: F64
-    """Change of the fringe vector along y, rad/px."""
+    phi: F64  # phase, rad
+    level: F64  # B, mean 1
+    amplitude: F64  # A, mean 1
+    dkx: F64  # change of the fringe vector along x, rad/px, about the window's centre
+    dky: F64  # change of the fringe vector along y, rad/px
 
-    def turns(self, frame: int, shape: tuple[int, int], rows: Rows) -> tuple[Float32, Float32]:
+    def turns(self, frame: int, shape: tuple[int, int], rows: Rows) -> tuple[F32, F32]:
         """Phase of a frame along columns and rows, as `synthesis.illuminate` takes it."""
         x = np.arange(shape[1]) - (shape[1] - 1) / 2
         y = np.arange(*rows) - (shape[0] - 1) / 2

@@ -24,8 +24,6 @@ from numpy.typing import NDArray
 
 from pixcal.model.arrays import F32, U16
 
-Float32 = F32
-
 # Rows of the window that share a noise generator. Another number would be other noise.
 BLOCK_ROWS = 64
 # mean (e-) below which the Poisson quantile is found by summing the distribution
@@ -73,7 +71,7 @@ class _Seed(np.random.SeedSequence):
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def fill_normal(rng: np.random.Generator, out: Float32) -> None:
+def fill_normal(rng: np.random.Generator, out: F32) -> None:
     """Fill a 2-D array with standard normals: those of ``rng.standard_normal``, rounded."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
@@ -82,14 +80,14 @@ def fill_normal(rng: np.random.Generator, out: Float32) -> None:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def illuminate(
-    iota: Float32,
-    alpha_sin: Float32,
-    alpha_cos: Float32,
+    iota: F32,
+    alpha_sin: F32,
+    alpha_cos: F32,
     level: float,
     amplitude: float,
     column_turn: F32,
     row_turn: F32,
-    out: Float32,
+    out: F32,
 ) -> None:
     """Mean electrons from the light: ``B iota + A alpha sin(psi + phi)`` (physics note, section 1).
 
@@ -115,9 +113,7 @@ def illuminate(
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def collect(
-    light: Float32, dark: Float32, normal: Float32, shot: bool, full_well: float, out: Float32
-) -> None:
+def collect(light: F32, dark: F32, normal: F32, shot: bool, full_well: float, out: F32) -> None:
     """Charge of each pixel: whole electrons when there is shot noise.
 
     The Poisson variate is the quantile of its distribution at the probability of a standard normal
@@ -191,12 +187,12 @@ def poisson_quantile(mean: float, w: float) -> int:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def amplify(
-    signal: Float32,
-    bias: Float32,
-    normal: Float32,
-    read_noise: Float32,
-    adu_per_e: Float32,
-    out: Float32,
+    signal: F32,
+    bias: F32,
+    normal: F32,
+    read_noise: F32,
+    adu_per_e: F32,
+    out: F32,
 ) -> None:
     """Electrons in ADU, with read noise and bias.
 
@@ -220,7 +216,7 @@ def amplify(
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def convert(adu: Float32, top: int, out: U16) -> None:
+def convert(adu: F32, top: int, out: U16) -> None:
     """Codes of the converter, rounded and clipped to 0 and ``top`` (ADU)."""
     low, high, half = np.float32(0), np.float32(top), np.float32(0.5)
     for i in range(out.shape[0]):
@@ -230,7 +226,7 @@ def convert(adu: Float32, top: int, out: U16) -> None:
 
 def block_normals(
     rows: tuple[int, int], columns: int, seed: int, key: tuple[int, ...], count: int = 2
-) -> list[Float32]:
+) -> list[F32]:
     """Standard normals for some rows of the window, whichever blocks they lie in.
 
     Parameters
@@ -262,6 +258,6 @@ def block_normals(
     return [array[skip : skip + last - first] for array in blocks]
 
 
-def turns(angles: NDArray[Any]) -> Float32:
+def turns(angles: NDArray[Any]) -> F32:
     """cos and sin of angles (rad) as `illuminate` takes them, shape (2, n)."""
     return np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)

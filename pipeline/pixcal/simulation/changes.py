@@ -24,39 +24,24 @@ from pixcal.model.arrays import F32
 from pixcal.simulation.forward import ForwardModel, Stage
 from pixcal.simulation.replica import Replica
 
-Key = tuple[str | int, str]
-"""Fringe set or number of a stack, and which of its deviations."""
+Key = tuple[str | int, str]  # fringe set or number of a stack, and which of its deviations
 Draw = dict[Key, NDArray[Any]]
 
 SEEDS = (1, 2)
-SCATTER_SEEDS = range(3, 11)
-"""Of draws by which it is told how much one differs from another."""
-FRAMES = 4
-"""Calibration frames of an exposure time that are looked at."""
-MIXED = 64
-"""Frames of a recording on which a model's hold on the noise is looked at."""
-COMMON = 0.5
-"""Share of a change that two draws have in common where it is none of chance."""
+SCATTER_SEEDS = range(3, 11)  # of draws by which it is told how much one differs from another
+FRAMES = 4  # calibration frames of an exposure time that are looked at
+MIXED = 64  # frames of a recording on which a model's hold on the noise is looked at
+COMMON = 0.5  # share of a change that two draws have in common where it is none of chance
 LINEAR = ("residual", "frames", "maps")
 
 
 @dataclass(frozen=True)
 class Way:
-    """How a model shows.
+    """How a model shows."""
 
-    Attributes
-    ----------
-    random : bool
-        Its change is another one with other random numbers, and zero on average.
-    mixes : bool
-        It makes the noise of samples correlated.
-    keys : tuple of Key
-        Deviations that it changes.
-    """
-
-    random: bool
-    mixes: bool
-    keys: tuple[Key, ...]
+    random: bool  # its change is another one with other random numbers, and zero on average
+    mixes: bool  # it makes the noise of samples correlated
+    keys: tuple[Key, ...]  # deviations that it changes
 
 
 @dataclass(frozen=True)

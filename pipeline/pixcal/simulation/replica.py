@@ -27,25 +27,13 @@ from pixcal.simulation.exposure import Camera
 from pixcal.simulation.forward import ForwardModel, Stage
 from pixcal.simulation.recording import Recording
 
-LEAST_S = 1e-6
-"""Exposure time and period where none is known."""
+LEAST_S = 1e-6  # exposure time and period where none is known
 TOP_ADU = 65535.0
 
 
 @dataclass(frozen=True)
 class Fitted(ForwardModel):
-    """The light and the pixels of an acquisition, as its fit has them.
-
-    Attributes
-    ----------
-    maps : DetectorMaps
-    theta : tuple of (3, y, x) float64
-        Maps of each fringe set, e-, through the pixels' response.
-    k : tuple of (float, float)
-        Fringe vector of each, rad/px.
-    frames : tuple of FrameStates
-        Of each set, from the first frame of its recording on.
-    """
+    """The light and the pixels of an acquisition, as its fit has them."""
 
     name = " fitted"
     title = "as fitted"
@@ -55,9 +43,9 @@ class Fitted(ForwardModel):
     sources = ()
 
     maps: DetectorMaps
-    theta: tuple[F64, ...]
-    k: tuple[tuple[float, float], ...]
-    frames: tuple[FrameStates, ...]
+    theta: tuple[F64, ...]  # maps of each fringe set, e-, through the pixels' response
+    k: tuple[tuple[float, float], ...]  # fringe vector of each, rad/px
+    frames: tuple[FrameStates, ...]  # of each set, from the first frame of its recording on
 
     @property
     def is_null(self) -> bool:

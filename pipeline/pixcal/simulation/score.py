@@ -31,50 +31,31 @@ from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way, dot
 from pixcal.simulation.forward import ForwardModel
 from pixcal.simulation.frame_changes import with_number
 
-STEP = 1.1
-"""Factor on a parameter for its derivative."""
+STEP = 1.1  # factor on a parameter for its derivative
+# factors on the default of a parameter that is no strength, where the score test is made too, and
+# on the best of them
 GRID = ((1 / 9, 1 / 3, 3.0, 9.0), (1 / 1.7, 1.7))
-"""Factors on the default of a parameter that is no strength, where the score test is made too, and
-on the best of them."""
-HINT = 2.0
-"""Standard deviations from which parameters are fitted."""
-ROUNDS = 4
-"""Steps, each halved up to"""
-HALVINGS = 4
-"""times, until the misfit falls by less than"""
+HINT = 2.0  # standard deviations from which parameters are fitted
+ROUNDS = 4  # steps, each halved up to
+HALVINGS = 4  # times, until the misfit falls by less than
 CONVERGED = 0.05
-MOST = 3.0
-"""Factor by which a step changes a parameter at most."""
-TELLING = 0.02
-"""Share of the information from which a deviation is looked at again."""
-SINGULAR = 1e-6
-"""Share of the largest eigenvalue below which parameters are not told apart."""
+MOST = 3.0  # factor by which a step changes a parameter at most
+TELLING = 0.02  # share of the information from which a deviation is looked at again
+SINGULAR = 1e-6  # share of the largest eigenvalue below which parameters are not told apart
 RANDOM = "what it adds, at random, to the second moments of frames, by its forward model"
 STEADY = "what it changes in frames and maps, beyond what the fit absorbs, by its forward model"
 
 
 @dataclass(frozen=True)
 class Scored:
-    """What the forward model lets know of an effect's parameters.
-
-    Attributes
-    ----------
-    model : ForwardModel
-    errors : dict
-        1-sigma errors of the parameters that were fitted.
-    significance : float
-    why : str
-    way : Way
-        How it shows, in the deviations that tell most.
-    template : Template, optional
-        What it changes of them, where that holds for other frames too: second moments.
-    """
+    """What the forward model lets know of an effect's parameters."""
 
     model: Any
-    errors: dict[str, float]
+    errors: dict[str, float]  # 1-sigma errors of the parameters that were fitted
     significance: float
     why: str
-    way: Way
+    way: Way  # how it shows, in the deviations that tell most
+    # what it changes of them, where that holds for other frames too: second moments
     template: Template | None = None
 
 

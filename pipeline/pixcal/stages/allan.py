@@ -64,17 +64,12 @@ class Batches:
     """The batch maps of one fringe set, as the fit left them."""
 
     folder: Path
-    n: int
-    """Batches, gaps included."""
+    n: int  # batches, gaps included
     window: tuple[int, int]
-    chunks: tuple[int, int]
-    """Of the fit's maps, (rows, columns)."""
-    frames: int
-    """Frames of a batch."""
-    step_s: float
-    """From one batch to the next, seconds."""
-    note: str
-    """What the fit says of them, or ""."""
+    chunks: tuple[int, int]  # of the fit's maps, (rows, columns)
+    frames: int  # frames of a batch
+    step_s: float  # from one batch to the next, seconds
+    note: str  # what the fit says of them, or ""
 
     @classmethod
     def open(cls, folder: Path, facts: dict[str, Any]) -> "Batches":

@@ -31,19 +31,15 @@ from pixcal.estimators.fringe_fit.tile import Coding
 from pixcal.estimators.maps.structure import flattened, without_outliers
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
-WILD = 8.0
-"""Standard deviations beyond which a residual is an outlier."""
-HARMONICS = 2
-"""Of the phase, with which parameters of the frames may go for reasons of the fit."""
+WILD = 8.0  # standard deviations beyond which a residual is an outlier
+HARMONICS = 2  # of the phase, with which parameters of the frames may go for reasons of the fit
+# of the smooth surface that maps of the nominal bench may have
 DEGREES = {"offset": 3, "contrast": 2, "light": 3}
-"""Of the smooth surface that maps of the nominal bench may have."""
 MAPS = tuple(DEGREES)
-AROUND = 5
-"""Pixels along the side of a pixel's surroundings."""
+AROUND = 5  # pixels along the side of a pixel's surroundings
+# share of the changes of pixels by which they may differ from those of their surroundings
 ALONE = 0.5
-"""Share of the changes of pixels by which they may differ from those of their surroundings."""
-KNOWN = 0.02
-"""Relative error of the variance that the noise model gives to parameters of a frame."""
+KNOWN = 0.02  # relative error of the variance that the noise model gives to parameters of a frame
 
 
 @dataclass(frozen=True)

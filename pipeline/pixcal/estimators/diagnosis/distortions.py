@@ -20,15 +20,15 @@ from pixcal.model.arrays import F32, F64, Mask
 
 Distortion = Callable[[FringeEvidence, F32, F64], tuple[F32, Iterable[F32]]]
 
+# of the alternating projections: with the weights of fringes of full contrast 0.5 % of the rest
+# still lies in directions that are free, and half as much with each turn more
 _TURNS = 4
-"""Of the alternating projections: with the weights of fringes of full contrast 0.5 % of the rest
-still lies in directions that are free, and half as much with each turn more."""
 
 _INDEPENDENT = 1e-3
 _NEGLIGIBLE = 1e-6
 
+# steps, all with the slopes of no distortion; each gains a factor of the distortion's size
 _ROUNDS = 3
-"""Steps, all with the slopes of no distortion; each gains a factor of the distortion's size."""
 
 
 class Freedom:

@@ -19,14 +19,11 @@ from pixcal.model.arrays import F64
 
 Curves = Mapping[Key, Curve]
 
-TOLERANCE = 0.05
-"""Share of what an effect does that its simulation may be wrong by."""
-ALLOWED = 2.0
-"""Standard deviations that a value may be off by before it counts as a gap."""
+TOLERANCE = 0.05  # share of what an effect does that its simulation may be wrong by
+ALLOWED = 2.0  # standard deviations that a value may be off by before it counts as a gap
+# standard deviations from which one value of a curve is changed, whatever the others are
 STANDS_OUT = 2.5
-"""Standard deviations from which one value of a curve is changed, whatever the others are."""
-CHANCE = 1e-3
-"""Chance, of all statistics together, below which a difference is a gap."""
+CHANCE = 1e-3  # chance, of all statistics together, below which a difference is a gap
 
 
 def scaled(values: F64, usual: F64) -> F64:
@@ -38,20 +35,12 @@ def scaled(values: F64, usual: F64) -> F64:
 
 @dataclass(frozen=True)
 class Reference:
-    """What the nominal bench lets expect: simulations with different seeds, on their scales.
+    """What the nominal bench lets expect: simulations with different seeds, on their scales."""
 
-    Attributes
-    ----------
-    usual : mapping
-        Median (n,) of each curve that is a power; None for the others.
-    values : mapping
-        (simulation, n) of each curve, in the order of the seeds.
-    independent : mapping
-        As how many independent values each curve's are, `independent_values`.
-    """
-
+    # median (n,) of each curve that is a power; None for the others
     usual: Mapping[Key, F64 | None]
-    values: Mapping[Key, F64]
+    values: Mapping[Key, F64]  # (simulation, n) of each curve, in the order of the seeds
+    # as how many independent values each curve's are, `independent_values`
     independent: Mapping[Key, float]
 
     @classmethod
@@ -92,23 +81,14 @@ class Reference:
 
 @dataclass(frozen=True)
 class Expectation:
-    """What a bench, nominal or with effects, lets expect of every curve.
+    """What a bench, nominal or with effects, lets expect of every curve."""
 
-    Attributes
-    ----------
-    mean, variance : mapping
-        (n,) on the reference's scales; the variance of a value of the data about the mean.
-    noise : mapping
-        Variance (n,) of the nominal bench alone.
-    independent : mapping
-        As of the reference.
-    dof : int
-    """
-
+    # mean, variance: (n,) on the reference's scales; the variance of a value of the data about the
+    # mean
     mean: Mapping[Key, F64]
     variance: Mapping[Key, F64]
-    noise: Mapping[Key, F64]
-    independent: Mapping[Key, float]
+    noise: Mapping[Key, F64]  # variance (n,) of the nominal bench alone
+    independent: Mapping[Key, float]  # as of the reference
     dof: int
 
 
@@ -219,22 +199,14 @@ def independent_values(values: F64, floor: float = 0.0) -> float:
 
 @dataclass(frozen=True)
 class Difference:
-    """One curve of the data against an expectation.
+    """One curve of the data against an expectation."""
 
-    Attributes
-    ----------
-    sigmas : (n,) float64
-        Signed; of a normal, as rare as the deviation is.
-    log_chance : float
-        Logarithm of the chance that any of the curve's values is as far off; uniform (its
-        exponential) where there is no gap.
-    excess : float
-        Squares of the deviations, as far as they are beyond `ALLOWED` standard deviations, over
-        the nominal noise.
-    """
-
-    sigmas: F64
+    sigmas: F64  # (n,) signed; of a normal, as rare as the deviation is
+    # logarithm of the chance that any of the curve's values is as far off; uniform (its
+    # exponential) where there is no gap
     log_chance: float
+    # squares of the deviations, as far as they are beyond `ALLOWED` standard deviations, over the
+    # nominal noise
     excess: float
 
     @property
@@ -310,17 +282,10 @@ def _log_density(values: F64, expected: Expectation, key: Key) -> float:
 
 @dataclass(frozen=True)
 class Gap:
-    """How much of the gap is left, against the nominal bench's.
+    """How much of the gap is left, against the nominal bench's."""
 
-    Attributes
-    ----------
-    total : float
-        1: all of it; 0: none.
-    weights, left : mapping
-        Of each curve: its weight, and the share of its excess that is left.
-    """
-
-    total: float
+    total: float  # 1: all of it; 0: none
+    # weights, left: of each curve: its weight, and the share of its excess that is left
     weights: Mapping[Key, float]
     left: Mapping[Key, float]
 

@@ -6,11 +6,9 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 
-MOST = 1 << 21
-"""Samples of a set that are looked at where every one costs some hundred operations."""
+MOST = 1 << 21  # samples of a set that are looked at where every one costs some hundred operations
 
-LEAST = 32
-"""Pixels that stay along each side, and frames, if there are as many."""
+LEAST = 32  # pixels that stay along each side, and frames, if there are as many
 
 
 def middle(evidence: Evidence, samples: int = MOST) -> Evidence:

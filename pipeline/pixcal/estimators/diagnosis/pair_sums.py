@@ -10,8 +10,8 @@ import numpy as np
 from pixcal.estimators.diagnosis.test_statistics.look import neighbour_sums
 from pixcal.model.arrays import F32, F64, Mask
 
+# rows and columns to neighbours in other rows and other columns
 DIAGONAL = ((1, 1), (1, -1), (1, 2), (1, -2), (2, 1), (2, -1))
-"""Rows and columns to neighbours in other rows and other columns."""
 FRAMES_APART = (1, 2, 3, 4)
 
 

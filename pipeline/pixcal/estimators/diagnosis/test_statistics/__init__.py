@@ -18,61 +18,36 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.test_statistics.look import Look
 from pixcal.model.arrays import F64
 
+# stands for the name of a set where a curve is of the detector or of several sets
 DETECTOR = "detector"
-"""Stands for the name of a set where a curve is of the detector or of several sets."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Values of a statistic.
+    """Values of a statistic."""
 
-    Attributes
-    ----------
-    x : (n,) float64
-    value : (n,) float64
-        In the statistic's unit; its square where the statistic is a power.
-    """
-
-    x: F64
-    value: F64
+    x: F64  # (n,)
+    value: F64  # (n,) in the statistic's unit; its square where the statistic is a power
 
 
-Key = tuple[str, str]
-"""Name of a statistic and of the fringe set (or `DETECTOR`)."""
+Key = tuple[str, str]  # name of a statistic and of the fringe set (or `DETECTOR`)
 
 
 @dataclass(frozen=True)
 class Statistic:
-    """A way of looking at data.
-
-    Attributes
-    ----------
-    name, title : str
-    domain : str
-        ``space``, ``time``, ``intensity`` or ``noise``.
-    unit, x_label : str
-    kind : str
-        ``linear``, or ``power``: mean squares, which are compared by their logarithms.
-    of_set : bool
-        Looks at one fringe set; else at all of the evidence,
-    of_all : bool
-        or at all fringe sets together.
-    floor : float
-        Least standard deviation that chance has, where simulations may all be alike.
-    measure : callable
-        From a `Look` (of a set), those of all sets, or `Evidence`; None where there is nothing to
-        look at.
-    """
+    """A way of looking at data."""
 
     name: str
     title: str
-    domain: str
+    domain: str  # `space`, `time`, `intensity` or `noise`
     unit: str
     x_label: str
-    kind: str
-    of_set: bool
-    of_all: bool
-    floor: float
+    kind: str  # `linear`, or `power`: mean squares, which are compared by their logarithms
+    of_set: bool  # looks at one fringe set; else at all of the evidence,
+    of_all: bool  # or at all fringe sets together
+    floor: float  # least standard deviation that chance has, where simulations may all be alike
+    # from a `Look` (of a set), those of all sets, or `Evidence`; None where there is nothing to
+    # look at
     measure: Callable[[Any], Curve | None]
 
 

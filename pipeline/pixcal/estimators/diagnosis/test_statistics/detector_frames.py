@@ -13,11 +13,9 @@ from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statis
 from pixcal.estimators.diagnosis.test_statistics.look import STEPS, neighbour_sums
 from pixcal.model.arrays import F32, F64, Mask
 
-REPEATS = (1, 2, 3, 4)
-"""Rows or columns between two that may share noise."""
+REPEATS = (1, 2, 3, 4)  # rows or columns between two that may share noise
 WILD = 8.0
-BANDS = 4
-"""Of the spectrum, from the size of the window to two pixels."""
+BANDS = 4  # of the spectrum, from the size of the window to two pixels
 
 
 def differences(evidence: Evidence, stack: Stack) -> F32:

@@ -18,19 +18,12 @@ from pixcal.kernels.sample_sums import (
 )
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
-WILD = 8.0
-"""Standard deviations beyond which a residual counts as an outlier and no more."""
+WILD = 8.0  # standard deviations beyond which a residual counts as an outlier and no more
 
 
 @dataclass(frozen=True)
 class Look:
-    """A fringe set of some evidence, and what several statistics need of it.
-
-    Attributes
-    ----------
-    found : FringeEvidence
-    evidence : Evidence
-    """
+    """A fringe set of some evidence, and what several statistics need of it."""
 
     found: FringeEvidence
     evidence: Evidence
@@ -144,16 +137,12 @@ class Look:
         }
 
 
-LEVELS = 8
-"""Bins of level."""
-CODES = 64
-"""Codes whose remainders are told apart, a power of two."""
-CELLS = 4
-"""Cells of the window along each side."""
+LEVELS = 8  # bins of level
+CODES = 64  # codes whose remainders are told apart, a power of two
+CELLS = 4  # cells of the window along each side
+# rows and columns to a neighbour
 STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4), (4, 0))
-"""Rows and columns to a neighbour."""
-MOST = 120
-"""Frames for statistics of pairs of pixels."""
+MOST = 120  # frames for statistics of pairs of pixels
 
 
 def neighbour_sums(

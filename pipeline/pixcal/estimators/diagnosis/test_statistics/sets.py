@@ -10,8 +10,7 @@ from pixcal.estimators.diagnosis.test_statistics.look import Look
 from pixcal.estimators.maps.structure import flattened
 from pixcal.model.arrays import F64
 
-SAME = 0.98
-"""Cosine of the angle below which two sets measure along the same axis."""
+SAME = 0.98  # cosine of the angle below which two sets measure along the same axis
 
 
 @statistic(

@@ -15,8 +15,7 @@ from pixcal.estimators.diagnosis.test_statistics import (
     known_statistics,
 )
 
-STRAIGHT = 10.0
-"""Standard deviations beyond which they count by their logarithm."""
+STRAIGHT = 10.0  # standard deviations beyond which they count by their logarithm
 _PREFIX, _INFIX = "estimate_of_", "_in_"
 
 
@@ -46,5 +45,4 @@ def statistic_named(name: str) -> Statistic:
     return Statistic(name, title, domain, "σ", "", "linear", False, False, FLOOR, nothing)
 
 
-FLOOR = 0.7
-"""Of a significance, by chance, at least."""
+FLOOR = 0.7  # of a significance, by chance, at least

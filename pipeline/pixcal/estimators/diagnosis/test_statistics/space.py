@@ -24,8 +24,7 @@ VARIATION = {
     "light": "large-scale variation",
 }
 BINS = 6
-FLOOR = 0.3
-"""Least standard deviation of a term over the one that the map's own scatter gives."""
+FLOOR = 0.3  # least standard deviation of a term over the one that the map's own scatter gives
 
 
 def _repeats(name: str, axis: int) -> Statistic:

@@ -20,9 +20,9 @@ SERIES = {
 }
 LAGS = (1, 2, 3, -1, -2)
 BATCHES = 8
+# smallest singular value, of the largest, of shapes that a sequence of phases can tell apart: a
+# ramp of equal steps, or four of them, cannot tell all
 DISTINCT = 0.05
-"""Smallest singular value, of the largest, of shapes that a sequence of phases can tell apart: a
-ramp of equal steps, or four of them, cannot tell all."""
 
 
 def _spectrum(name: str) -> Statistic:
