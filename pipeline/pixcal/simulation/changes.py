@@ -73,12 +73,7 @@ class Template:
 
 
 class Changes:
-    """Deviations of some evidence, and what forward models make of them.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    """
+    """Deviations of some evidence, and what forward models make of them."""
 
     def __init__(self, evidence: Evidence) -> None:
         self._evidence, self._replica = evidence, Replica(evidence)

@@ -36,10 +36,8 @@ class Camera:
 
     Parameters
     ----------
-    bench : Bench
     rows : tuple of int
         First row of the window and the one after the last; any rows give the same samples.
-    effects : sequence of ForwardModel
     noise : bool
         False: no shot noise and no read noise.
     """
@@ -67,7 +65,6 @@ class Camera:
 
         Parameters
         ----------
-        recording : Recording
         frames : range
             Numbers within the recording.
 

@@ -106,7 +106,6 @@ class FrameBasis:
 
         Parameters
         ----------
-        strengths : sequence of Strength
         shapes : mapping
             Shape parameters, by the field of the strength.
         start, steps

@@ -63,7 +63,6 @@ def fit_frames(
     ----------
     kind : type
         The effect's class.
-    evidence : Evidence
     leave : sequence of str
         Strengths that are not looked at.
     """

@@ -79,12 +79,7 @@ class Fitted(ForwardModel):
 
 
 class Replica:
-    """The frames of some evidence, taken again.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    """
+    """The frames of some evidence, taken again."""
 
     def __init__(self, evidence: Evidence) -> None:
         sets = list(evidence.fringes.values())
@@ -283,7 +278,6 @@ def plain_bench(
         Tells bias, laser and distance.
     detector : SimulatedDetector
         The rest of the detector.
-    visibility : float
     times_s : (float, float)
         Exposure time and period.
     sets : sequence of (str, (float, float), int, float)

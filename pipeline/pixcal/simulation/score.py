@@ -66,7 +66,6 @@ def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
     ----------
     kind : type
         The effect's class.
-    evidence : Evidence
 
     Returns
     -------
@@ -99,10 +98,8 @@ def score_again(
 
     Parameters
     ----------
-    model : ForwardModel
     way : Way
         How it shows.
-    evidence : Evidence
     template : Template, optional
         What it changes; made anew where it is not of these pixels.
     """

@@ -30,13 +30,9 @@ class Advice:
 
 
 def advice(run_dir: Path) -> Advice:
-    """What the fit, the diagnosis and the correction say together.
+    """What the fit, the diagnosis and the correction of a run say together.
 
-    Parameters
-    ----------
-    run_dir : Path
-        A run. Without a diagnosis there are sentences on the fitted maps only, without a fit the
-        causes alone.
+    Without a diagnosis there are sentences on the fitted maps only, without a fit the causes alone.
     """
     fit = _artefact(run_dir, "fit", "fit.json") or {"outputs": [], "sets": {}}
     diagnosis = _artefact(run_dir, "diagnose", "diagnosis.json")
@@ -51,13 +47,7 @@ def advice(run_dir: Path) -> Advice:
 
 
 def maps_to_use(run_dir: Path) -> dict[str, Path]:
-    """The products to use, by the names of their maps: corrected ones where there are any.
-
-    Raises
-    ------
-    InputError
-        If the run was not fitted.
-    """
+    """The products to use, by the names of their maps: corrected ones where there are any."""
     require(run_dir, "fit")
     source: Json = read_json(run_dir / "fit" / "fit.json")
     correction, suffix = _correction(run_dir), ""

@@ -37,11 +37,6 @@ def read_offsets(run_dir: Path) -> Offsets:
     """The maps of a run to use: corrected ones where there are any.
 
     With a single fringe axis the offsets along it; those across it are taken as zero.
-
-    Raises
-    ------
-    InputError
-        If the run was not fitted.
     """
     files = maps_to_use(run_dir)
     maps = {name: read_map(path)[:2] for name, path in files.items()}
@@ -61,13 +56,7 @@ def read_offsets(run_dir: Path) -> Offsets:
 
 
 def star_of(offsets: Offsets, fwhm_px: float, electrons: float | None) -> Star:
-    """A star of some width.
-
-    Raises
-    ------
-    InputError
-        If the width is out of range.
-    """
+    """A star of some width; refused if that is out of range."""
     low, high = FWHMS
     if not low <= fwhm_px <= high:
         raise InputError(f"--fwhm: {fwhm_px:g} px; give a width from {low:g} to {high:g} px")

@@ -38,19 +38,8 @@ def run(
 ) -> Done:
     """Run all steps; a diagnosis or correction that is impossible is not an error.
 
-    Parameters
-    ----------
-    acquisition, out : Path
-        As of ingest.
-    step : callable
-        Each step runs inside its context.
-    note : callable
-        Is told what was not possible, in a sentence.
-
-    Raises
-    ------
-    InputError
-        Naming the file, key or option that is wrong.
+    Each step runs inside the context that ``step`` gives; ``note`` is told, in a sentence, what was
+    not possible.
     """
     of_fit = fit.Config(model=config.model)
     with step("ingest", out / "ingest"):

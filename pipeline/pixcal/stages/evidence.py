@@ -25,16 +25,7 @@ MAX_SAMPLES = 1 << 26  # samples of a set that are taken into memory (some ten b
 
 
 def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice(None)) -> Evidence:
-    """Evidence of a part of the window; without one, of the whole window.
-
-    Parameters
-    ----------
-    run_dir : Path
-        A run that was reduced, and fitted where it has fringes.
-    part : ((int, int), (int, int)), optional
-        Rows and columns.
-    frames : slice
-        Frames of each fringe set to take.
+    """Evidence of some frames of a part of the window; without one, of the whole window.
 
     Raises
     ------

@@ -30,21 +30,9 @@ def nominal_vector(acquisition: Acquisition, name: str) -> tuple[float, float]:
 def fitted_shape(
     run: Path, facts: Mapping[str, Any], acquisition: Acquisition, window: tuple[int, int]
 ) -> FringeShape:
-    """The fringes of a set as fitted, from pixel (0, 0).
+    """The fringes of a set as fitted, from pixel (0, 0) of a window (y, x) px.
 
-    Parameters
-    ----------
-    run : Path
-        For messages.
-    facts : mapping
-        What ``fit.json`` says of the set.
-    window : (int, int)
-        (y, x), px.
-
-    Raises
-    ------
-    InputError
-        If they were fitted by a model that is not known here.
+    ``facts`` is what ``fit.json`` says of the set; ``run`` is for messages.
     """
     phase, origin = facts["phase_at_origin_rad"], (0.0, 0.0)
     if facts["model"] == "paraxial":

@@ -30,28 +30,16 @@ def run_in_memory(
     reduction: reduce.Config,
     sweep: Sweep = NO_BATCHES,
 ) -> MemoryPath:
-    """A run of frames that are at hand, with straight fringes.
+    """A run of frames that are at hand, with straight fringes, as a run directory.
+
+    Its arrays are those of the stages; by default nothing is fitted to batches of frames.
 
     Parameters
     ----------
-    acquisition : Acquisition
     frames : mapping
         (t, y, x) in ADU by name of the array, ``bias`` or ``fringes/vertical``.
     tables : mapping
         What is known of each frame, in columns, as in ``frames.json``.
-    reduction : reduce.Config
-    sweep : Sweep
-        By default nothing is fitted to batches of frames.
-
-    Returns
-    -------
-    MemoryPath
-        As a run directory, for `pixcal.stages.evidence`: its arrays are those of the stages.
-
-    Raises
-    ------
-    InputError
-        If the frames cannot be reduced or fitted.
     """
     run = MemoryPath()
     for name, samples in frames.items():

@@ -15,13 +15,7 @@ from pixcal.storage.place import Local, Place
 
 @dataclass
 class ReducedSet:
-    """A reduced cube and what is needed to weight its samples.
-
-    Parameters
-    ----------
-    folder : Path or MemoryPath
-        ``RUN/reduce/reduced.zarr/<set name>``.
-    """
+    """A reduced cube, ``RUN/reduce/reduced.zarr/<set name>``, and how its samples are weighted."""
 
     folder: Local
 

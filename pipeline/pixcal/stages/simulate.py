@@ -86,19 +86,10 @@ Span = tuple[Recording, range, dict[int, FrameWriter]]
 
 
 def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Simulate a bench.
+    """Simulate a bench (schema ``pixcal/bench/1``).
 
-    Parameters
-    ----------
-    bench : Path
-        Bench file (schema ``pixcal/bench/1``).
-    out : Path
-        Directory of the acquisition. It appears when it is complete.
-
-    Returns
-    -------
-    Manifest
-        The acquisition's; its key is a digest, so that it tells nothing of the truth.
+    The directory appears when it is complete. The key of its manifest is a digest, so that it tells
+    nothing of the truth.
 
     Raises
     ------
@@ -140,16 +131,9 @@ def _resolved(folder: Path, option: str) -> Path:
 def acquire(
     bench: Bench, effects: Effects, folder: Path, runtime: Runtime, camera: Cameras = Camera
 ) -> None:
-    """Write an acquisition, without manifest or truth.
+    """Write an acquisition into an empty folder, without manifest or truth.
 
-    Parameters
-    ----------
-    effects : tuple of Effect
-        Of the camera; those named in the bench are not looked at.
-    folder : Path
-        Empty.
-    camera : callable
-        Makes the frames of some rows, called with bench, rows and effects.
+    With these effects, whatever the bench names; ``camera`` makes the frames of some rows.
     """
     recorded = recordings(bench)
     runtime = _fitting(bench, recorded, effects, runtime)

@@ -122,19 +122,12 @@ def treatments(
         Of ``diagnosis.json``.
     nominal : mapping
         Parameters of the effects that the nominal bench had, by name.
-    model : str
-        Shape of the fringes that the fit was asked for.
-    models : mapping
-        The one that was fitted, by fringe set.
+    model, models : str, mapping
+        Shape of the fringes that the fit was asked for, and those fitted, by fringe set.
     own : sequence of Path
-        Files with effects of the user's own.
+        Files with effects of the user's own; one that is not known is refused.
     where : Path
         The diagnosis, for messages.
-
-    Raises
-    ------
-    InputError
-        If an effect is not known: it is of the user's own, and its file has not been given.
     """
     known = known_effects(own)
     entries: list[tuple[str, str, Any, Mapping[str, float]]]

@@ -61,7 +61,6 @@ def choose(measured: Measured, pattern: Callable[[Classes], float]) -> Choice:
 
     Parameters
     ----------
-    measured : Measured
     pattern : callable
         Fall in chi-square of the maps where pixels of each class of a period have a visibility of
         their own (`pixcal.estimators.crosstalk.pattern.visibility_pattern`).

@@ -54,14 +54,7 @@ Change = dict[str, NDArray[Any]]
 
 
 class _Deviations:
-    """What fringes and calibration frames have in common.
-
-    Attributes
-    ----------
-    linear, quadratic : tuple of str
-        Names of the deviations.
-    good : (y, x) bool
-    """
+    """What fringes and calibration frames have in common."""
 
     linear: tuple[str, ...]
     quadratic: tuple[str, ...]
@@ -93,11 +86,7 @@ class _Deviations:
     def pairs_between(self, noise: F32, other: F32, per_adu: F32) -> F64:
         """Change of ``pairs`` where noise (t, y, x) of the first frames, ADU, becomes another.
 
-        Parameters
-        ----------
-        noise, other : (t, y, x) float32
-        per_adu : (y, x) float32
-            Reduced electrons of an ADU.
+        An ADU is ``per_adu`` (y, x) reduced electrons.
         """
         before, after = (
             pair_sums(self.over_noise((values * per_adu)[:, self.good]), self.good)
@@ -111,13 +100,7 @@ class _Deviations:
 
 
 class SetDeviations(_Deviations):
-    """A fringe set against the nominal bench.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    found : FringeEvidence
-    """
+    """A fringe set against the nominal bench."""
 
     linear = ("residual", "frames", "maps")
     quadratic = ("pairs", "power")
@@ -214,8 +197,6 @@ class SetDeviations(_Deviations):
         constant, relative : (y, x) float64
             What bias and darks that changed with them take off every frame, e-; and by how much the
             flats did, relative.
-        names : sequence of str
-            Which.
         """
         found, good = self.found, self.good
         changed = np.take(samples.reshape(len(samples), -1), np.flatnonzero(good), axis=1)
@@ -258,13 +239,7 @@ class SetDeviations(_Deviations):
 
 
 class StackDeviations(_Deviations):
-    """Calibration frames of one kind and exposure time against the nominal bench.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    stack : Stack
-    """
+    """Calibration frames of one kind and exposure time against the nominal bench."""
 
     linear = ("residual", "maps")
     quadratic = ("pairs",)

@@ -39,7 +39,6 @@ class Freedom:
 
     Parameters
     ----------
-    fringes : FringeEvidence
     harmonics : int
         Highest harmonic of the phase that a pixel is free to have.
     margin : int
@@ -109,17 +108,9 @@ class Freedom:
         return self._slopes.swapaxes(1, 2) @ inverse @ self._slopes
 
     def left_over(self, change: F32) -> F32:
-        """What the fit leaves of a change of the samples.
+        """What the fit leaves of a change (t, n) of the samples of the good pixels, e-.
 
-        Parameters
-        ----------
-        change : (t, n) float32
-            Of the good pixels, e-; not used where a sample has no weight.
-
-        Returns
-        -------
-        (t, n) float32
-            Zero where a sample has no weight.
+        Zero where a sample has no weight.
         """
         rest = np.where(self.weight > 0, change, np.float32(0))
         k, n = len(self.of_time), rest.shape[1]
@@ -135,18 +126,9 @@ class Freedom:
         return rest
 
     def taken_by_frames(self, frames: slice, one: Mask, other: Mask) -> F32:
-        """Covariance that the free frames take off the residuals of pairs of pixels.
+        """Covariance (t, pair), e-², that the free frames take off residuals of pairs of pixels.
 
-        Parameters
-        ----------
-        frames : slice
-        one, other : (y, x) bool
-            Good pixels, and as many others, in the same order.
-
-        Returns
-        -------
-        (t, pair) float32
-            e-².
+        These are good pixels (y, x), and as many others, in the same order.
         """
         a, b = self.of_place[:, one[self.good]], self.of_place[:, other[self.good]]
         pairs = (a[:, None] * b[None]).reshape(len(a) ** 2, -1)
@@ -163,27 +145,20 @@ def fit_distortions(
     margin: int = 0,
     prior: tuple[F64, F64] | None = None,
 ) -> tuple[F64, F64]:
-    """Sizes of distortions that all sets have in common.
+    """Sizes (count,) of distortions that all sets have in common, and their covariance.
+
+    That is from the noise of the samples.
 
     Parameters
     ----------
-    sets : sequence of FringeEvidence
     distortion : callable
         From a set, its signal (t, y, x) without distortion and the sizes, what is added to the
         signal (t, y, x), and its derivative by each size.
-    count : int
-        Number of sizes.
     margin : int
         Pixels along the edges that are not used.
     prior : (float64 array, float64 array), optional
         Values of the sizes that are known otherwise, and their information (inverse variance; zero
         of those that are not known).
-
-    Returns
-    -------
-    sizes : (count,) float64
-    covariance : (count, count) float64
-        From the noise of the samples.
     """
     fits = [_SetFit(fringes, distortion, count, margin) for fringes in sets]
     known, information = (np.zeros(count), np.zeros(count)) if prior is None else prior
@@ -200,10 +175,7 @@ def distortion_sums(
 ) -> tuple[F64, F64]:
     """Normal matrix (count, count) and right-hand side (count,) about no distortion.
 
-    Parameters
-    ----------
-    sets, distortion, count, margin
-        As of `fit_distortions`. What holds for all sizes together holds for any of them.
+    Parameters as of `fit_distortions`. What holds for all sizes together holds for any of them.
     """
     normal, right = np.zeros((count, count)), np.zeros(count)
     for fringes in sets:
@@ -215,10 +187,7 @@ def distortion_sums(
 class _SetFit:
     """One set: its residuals, and what its fit took up of the distortion.
 
-    Attributes
-    ----------
-    normal : (count, count) float64
-        Normal matrix of the sizes where there is no distortion.
+    ``normal`` is the normal matrix of the sizes where there is no distortion.
     """
 
     def __init__(

@@ -236,12 +236,9 @@ class Evidence:
         return signal * self.flat.astype(np.float32) + dark.astype(np.float32)
 
     def dark_noise(self, stack: Stack) -> tuple[F32, F32]:
-        """Samples of darks less the median of each pixel and of each frame, and their sigma.
+        """Darks (t, y, x) less the median of each pixel and of each frame, and their sigma, e-.
 
-        Returns
-        -------
-        rest, sigma : (t, y, x) float32
-            e-; NaN in pixels with flags.
+        NaN in pixels with flags.
         """
         rest = (stack.adu - np.median(stack.adu, axis=0)) * self.gain
         rest = np.where(self.good, rest, np.nan)
@@ -300,22 +297,15 @@ def free_frames(
     shot_factor: F64,
     good: Mask,
 ) -> tuple[F64, F64]:
-    """Parameters of every frame by itself, the pixels being known, and their covariance.
+    """Parameters (t, 5) of every frame by itself, the pixels being known, and their covariance.
 
     Parameters
     ----------
     codes : (t, y, x) uint16 or float32
         Samples as they are stored, or in electrons.
-    coding : Coding
     g, dk : (t, 3), (t, 2) float64
         Start, at the middle of the part.
     theta, read_variance, shot_factor, good
-        As in `FringeEvidence`.
-
-    Returns
-    -------
-    free : (t, 5) float64
-    covariance : (t, 5, 5) float64
         As in `FringeEvidence`.
     """
     n, used = len(g), np.flatnonzero(good)

@@ -106,15 +106,10 @@ def expect_nominal(reference: Reference) -> Expectation:
 def expect_with(
     reference: Reference, simulated: Sequence[Curves], error: float = 0.0
 ) -> Expectation:
-    """What a bench with effects lets expect.
+    """What a bench with effects, of this relative ``error`` of their strength, lets expect.
 
-    Parameters
-    ----------
-    reference : Reference
-    simulated : sequence of Curves
-        With the first seeds of the reference, in the same order: what differs is due to effects.
-    error : float
-        Relative error of the effects' strength.
+    The simulations have the first seeds of the reference, in the same order: what differs is due to
+    effects.
     """
     nominal = expect_nominal(reference)
     scaled_ones = [reference.on_scale(s) for s in simulated]
@@ -176,14 +171,9 @@ def _variance(values: F64, floor: float) -> F64:
 def independent_values(values: F64, floor: float = 0.0) -> float:
     """As how many independent values those of a curve are, when the least likely one is looked at.
 
-    Each simulation is held against the others. Of n independent values the least chance u has
-    -log(1 - u) distributed as an exponential with the mean 1 / n, whose likelihood gives n.
-
-    Parameters
-    ----------
-    values : (simulation, n) float64
-    floor : float
-        Least standard deviation.
+    Each of the simulations (simulation, n) is held against the others. Of n independent values the
+    least chance u has -log(1 - u) distributed as an exponential with the mean 1 / n, whose
+    likelihood gives n. The standard deviation is at least ``floor``.
     """
     count, n = values.shape
     if n == 1 or count < 3:

@@ -12,14 +12,7 @@ LEAST = 32  # pixels that stay along each side, and frames, if there are as many
 
 
 def middle(evidence: Evidence, samples: int = MOST) -> Evidence:
-    """Pixels about the middle of the part; of very long sets also the first frames only.
-
-    Parameters
-    ----------
-    evidence : Evidence
-    samples : int
-        That a fringe set may have.
-    """
+    """Pixels about the middle of the part; of very long sets also the first frames only."""
     ny, nx = evidence.good.shape
     longest = max((len(f.g) for f in evidence.fringes.values()), default=1)
     shrink = min(1.0, float(np.sqrt(samples / (longest * ny * nx))))

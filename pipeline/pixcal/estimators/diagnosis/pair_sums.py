@@ -16,19 +16,11 @@ FRAMES_APART = (1, 2, 3, 4)
 
 
 def pair_sums(values: F32, good: Mask) -> F64:
-    """Sums over frames of products of two samples.
+    """Sums (n,) over frames of products of two residuals (t, y, x) over their noise.
 
-    Parameters
-    ----------
-    values : (t, y, x) float32
-        Residuals over their noise; zero where there is no weight.
-    good : (y, x) bool
-
-    Returns
-    -------
-    (n,) float64
-        Pairs of columns within rows, of rows within columns, of column sums and of row sums (of
-        different rows and columns), neighbours of `DIAGONAL`, samples of `FRAMES_APART`.
+    Pairs of columns within rows, of rows within columns, of column sums and of row sums (of
+    different rows and columns), neighbours of `DIAGONAL`, samples of `FRAMES_APART`. Values are
+    zero where there is no weight.
     """
     count, ny, nx = values.shape
     rows = values.reshape(-1, nx)
@@ -89,7 +81,6 @@ def taken_by_fit(place: F32, covariance: F64, of_time: F32, good: Mask) -> F64:
         Of their shares in a frame: mean over the frames.
     of_time : (k, t) float32
         Orthonormal functions of time that a pixel is free to have.
-    good : (y, x) bool
     """
     count, shape = of_time.shape[1], good.shape
     size, axes = np.linalg.eigh(covariance)

@@ -44,7 +44,6 @@ def best_shape(fit: Fit, trials: F64, steady: bool, start: Components | None = N
 
     Parameters
     ----------
-    fit : callable
     trials : (n,) float64
         In equal steps of the logarithm.
     steady : bool

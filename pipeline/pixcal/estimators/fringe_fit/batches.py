@@ -30,17 +30,11 @@ class Batches:
 
 
 def plan_batches(time_s: F64, frames: int | None = None) -> Batches:
-    """Divide a run into batches.
+    """Divide a run into batches, by the time (t,) of its frames.
 
     Frames fall into slots of the median period, so that a pause of the camera shows as slots
-    without frames, and every batch spans the same time.
-
-    Parameters
-    ----------
-    time_s : (t,) float64
-        Time of each frame, not decreasing.
-    frames : int, optional
-        Frames of a batch; by default 500, or what leaves some 24 batches of a shorter run.
+    without frames, and every batch spans the same time. By default it has 500 frames, or what
+    leaves some 24 batches of a shorter run.
     """
     n = len(time_s)
     length = frames or max(MIN_FRAMES, min(DEFAULT_FRAMES, n // WANTED))

@@ -71,14 +71,9 @@ def combine_parallel(
 
 
 def weighted_mean(values: F64, sigma: F64) -> tuple[F64, F64, F64]:
-    """Mean of maps (n, ...) weighted by 1 / sigma²; NaN do not count.
+    """Mean of maps (n, ...) weighted by 1 / sigma², its error, and the disagreement (chi-square).
 
-    Returns
-    -------
-    mean, error : (...) float64
-        NaN where there is no value.
-    chi2 : (...) float64
-        Disagreement of the maps.
+    NaN do not count; the mean is NaN where there is no value.
     """
     good = np.isfinite(values) & np.isfinite(sigma) & (sigma > 0)
     w = np.where(good, 1 / np.where(good, sigma, 1.0) ** 2, 0.0)

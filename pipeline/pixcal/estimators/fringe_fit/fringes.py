@@ -73,7 +73,7 @@ def grid(shape: tuple[int, int]) -> tuple[F64, F64]:
 
 
 def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> tuple[float, float]:
-    """Fringe vector of a tile, from maps that hold fringes of any amplitude and phase.
+    """Fringe vector (kx, ky), rad/px, of a tile, from maps with fringes of any amplitude and phase.
 
     The highest peak of the summed power spectra, refined on the continuous spectrum; its sign is
     that of the nominal vector.
@@ -85,12 +85,7 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
     good : (y, x) bool
         Pixels to use.
     nominal : (float, float)
-        Fringe vector (kx, ky) of the bench's nominal geometry, rad/px.
-
-    Returns
-    -------
-    (float, float)
-        (kx, ky) in rad/px.
+        Fringe vector of the bench's nominal geometry, rad/px.
 
     Raises
     ------
@@ -189,21 +184,11 @@ class SmoothPhasor:
 def smooth_phasor(
     phasor: C128, good: Mask, k: tuple[float, float], degree: int = 3
 ) -> SmoothPhasor:
-    """Smooth version of a phasor map alpha exp(i psi) / iota.
+    """Smooth version of a noisy phasor map alpha exp(i psi) / iota (y, x), from its good pixels.
 
-    The fringe vector is first corrected by the mean phase step from pixel to pixel, then a complex
-    polynomial is fitted to the map turned back by it, leaving outliers out.
-
-    Parameters
-    ----------
-    phasor : (y, x) complex128
-        Visibility times exp(i psi), noisy.
-    good : (y, x) bool
-        Pixels to use.
-    k : (float, float)
-        Fringe vector (kx, ky) to start from, rad/px.
-    degree : int
-        Of the polynomial; lowered for tiles of few pixels.
+    The fringe vector k (rad/px) is first corrected by the mean phase step from pixel to pixel, then
+    a complex polynomial, of a lower degree for tiles of few pixels, is fitted to the map turned
+    back by it, leaving outliers out.
     """
     shape = (phasor.shape[0], phasor.shape[1])
     kx, ky = k

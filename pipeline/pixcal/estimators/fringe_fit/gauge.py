@@ -18,31 +18,20 @@ FRINGE_MODES = ("cos(psi)*iota/alpha", "sin(psi)*iota/alpha", "cos(2*psi)", "sin
 
 
 def fringe_modes(psi: F64, ratio: F64) -> list[F64]:
-    """The four fringe-frequency modes of the phase map.
-
-    Parameters
-    ----------
-    psi : (...) float64
-        Phase of the fringes (rad).
-    ratio : (...) float64
-        iota / alpha.
-    """
+    """The four fringe-frequency modes of the phase map, from psi (rad) and iota / alpha."""
     return [ratio * np.cos(psi), ratio * np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)]
 
 
 def gauge_matrix(tiles: list[tuple[F64, Mask, C128]]) -> F64:
-    """Change of theta that takes the fringe-frequency modes out of the phase maps.
+    """Change Q (3, 3) of theta that takes the fringe-frequency modes out of the phase maps.
+
+    The mended parameters are ``Q @ theta``, the mended frames ``g @ inv(Q)``.
 
     Parameters
     ----------
     tiles : list of (theta, good, smooth)
         For each tile: theta (3, y, x), the pixels to use (y, x), and the smooth phasor
         alpha exp(i psi) / iota (y, x) about which the modes are taken.
-
-    Returns
-    -------
-    (3, 3) float64
-        Q: the mended parameters are ``Q @ theta``, the mended frames ``g @ inv(Q)``.
     """
     rows, rights, light_rows, light_rights = [], [], [], []
     for theta, good, smooth in tiles:

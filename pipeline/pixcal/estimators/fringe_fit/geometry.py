@@ -40,12 +40,8 @@ def tile_plane(
 
     Parameters
     ----------
-    phase, sigma : (y, x) float32
-        Phase relative to the carrier and its error, rad.
-    ratio : (y, x) float32
-        iota / alpha.
-    good : (y, x) bool
-        Pixels to use.
+    phase, sigma, ratio : (y, x) float32
+        Phase relative to the carrier and its error, rad; iota / alpha.
     slope : (float, float)
         Of the phase along x and y, rad/px, so near that no turn is missed over the tile.
     centre : (float, float)
@@ -76,18 +72,11 @@ def tile_plane(
 
 
 def unwrap(planes: Sequence[TilePlane], grid_shape: tuple[int, int]) -> list[TilePlane]:
-    """Add whole turns so that neighbouring tiles agree where they meet.
+    """Add whole turns to planes, row by row, so that neighbouring tiles agree where they meet.
 
     Outwards from the tile nearest to the middle, each is joined to a neighbour by their planes,
     followed from both sides. Tiles that no neighbour joins (a band without good pixels lies
     between) are joined to the nearest tile across the gap.
-
-    Parameters
-    ----------
-    planes : sequence of TilePlane
-        Row by row.
-    grid_shape : (int, int)
-        Rows and columns of tiles.
     """
     rows, columns = grid_shape
     table = np.array(planes, dtype=object).reshape(rows, columns)

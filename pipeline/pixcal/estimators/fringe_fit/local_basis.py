@@ -44,18 +44,9 @@ def _nodes() -> tuple[F64, F64, F64]:
 
 
 def expand(function: Callable[[F64, F64], F64], centres: F64) -> F64:
-    """Coefficients of functions about the centres of tiles.
+    """Coefficients (tile, ..., term) of functions about the centres (tile, 2) of tiles, (y, x) px.
 
-    Parameters
-    ----------
-    function : callable
-        Takes coordinates y and x (n,), px, and gives values (..., n).
-    centres : (tile, 2) float64
-        (y, x), px.
-
-    Returns
-    -------
-    (tile, ..., term) float64
+    A function takes coordinates y and x (n,), px, and gives values (..., n).
     """
     y, x, fit = _nodes()
     at_y = (centres[:, :1] + SCALE_PX * y).ravel()

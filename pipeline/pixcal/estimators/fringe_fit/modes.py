@@ -73,17 +73,11 @@ class ModeBasis:
         return normal, rights, square
 
     def removed(self, planes: list[TilePlane], coefficients: F64) -> F64:
-        """What to take off each tile's phases, in its local modes.
+        """What to take off each tile's phases, in its local modes: (tile, local, 1 + batch).
 
-        Parameters
-        ----------
-        coefficients : (mode, 1 + batch) float64
-            Of the run's phases relative to the shape, and of the batches' relative to the run's.
-
-        Returns
-        -------
-        (tile, local, 1 + batch) float64
-            The first column is relative to the tile's plane and holds the shape as well.
+        By the coefficients (mode, 1 + batch) of the run's phases relative to the shape, and of the
+        batches' relative to the run's. The first column is relative to the tile's plane and holds
+        the shape as well.
         """
         removed = np.empty((len(planes), N_LOCAL, coefficients.shape[1]))
         for first in range(0, len(planes), TILES_AT_ONCE):
@@ -96,14 +90,9 @@ class ModeBasis:
     def solve(self, normal: F64, right: F64, spread: float) -> F64:
         """Coefficients (mode, n) of maps from their sums, with what the shape knows beforehand.
 
-        Parameters
-        ----------
-        normal : (mode, mode) float64
-        right : (mode, n) float64
-            The first map is the whole run's; the prior's offset acts on it alone, the others are
-            differences from it.
-        spread : float
-            Variance of the map over that of its noise: true offsets act as noise here.
+        The first map is the whole run's; the prior's offset acts on it alone, the others are
+        differences from it. ``spread`` is the variance of the map over that of its noise: true
+        offsets act as noise here.
         """
         precision = self._precision(spread)
         offset = np.zeros(len(precision))

@@ -10,15 +10,7 @@ from pixcal.model.arrays import F32, F64, U16
 
 
 class PixelSums:
-    """Sums that grow block by block.
-
-    Parameters
-    ----------
-    tile, coding, frames
-        As in `pixcal.estimators.fringe_fit.tile_fit.accumulate`.
-    model : (3, y, x) float32
-        Start model.
-    """
+    """Sums that grow block by block, about a start model (3, y, x)."""
 
     def __init__(self, tile: Tile, coding: Coding, frames: FrameParameters, model: F32) -> None:
         self.tile, self.coding, self.frames, self.model = tile, coding, frames, model

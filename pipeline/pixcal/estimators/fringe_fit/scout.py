@@ -68,8 +68,6 @@ class Scout:
     ----------
     tiles : sequence of Tile
         The first is the one whose fringe vector is sought.
-    coding : Coding
-        Of the stored samples.
     nominal : (float, float)
         Nominal fringe vector (kx, ky), rad/px.
     reference : (float, float)
@@ -92,17 +90,12 @@ class Scout:
     theta: list[F64] = field(default_factory=list)  # list of (3, y, x) float64: of each tile
 
     def prime(self, codes: Sequence[U16]) -> FrameParameters:
-        """Learn the pixels of the tiles from frames spread over the run.
+        """Learn the pixels of the tiles from frames spread over the run; parameters of these.
 
         Parameters
         ----------
         codes : sequence of (t, y, x) arrays
             The same frames for each tile.
-
-        Returns
-        -------
-        FrameParameters
-            Of these frames.
 
         Raises
         ------
@@ -130,14 +123,9 @@ class Scout:
         return frames
 
     def solve(self, codes: Sequence[U16], start: FrameParameters | None = None) -> FrameParameters:
-        """Parameters of further frames, the pixels of the tiles being known.
+        """Parameters of further frames (t, y, x), the same for each tile whose pixels are known.
 
-        Parameters
-        ----------
-        codes : sequence of (t, y, x) arrays
-            The same frames for each tile.
-        start : FrameParameters, optional
-            Where to start; else from an unweighted fit.
+        By default they start from an unweighted fit.
         """
         samples = self._samples(codes)
         frames = self._unweighted(samples) if start is None else start

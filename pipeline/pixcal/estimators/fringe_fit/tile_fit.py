@@ -81,10 +81,11 @@ def start_model(
     k: tuple[float, float],
     start: F64 | None = None,
 ) -> tuple[F32, SmoothPhasor]:
-    """Smooth model of a tile, for weights that do not know the pixel's own noise.
+    """Smooth model (3, y, x) of a tile, for weights that do not know the pixel's own noise.
 
     The phase and the visibility are smooth over the tile; the level is the pixel's own, known to a
-    part in a thousand, and only scales all the weights of that pixel together.
+    part in a thousand, and only scales all the weights of that pixel together. With it the smooth
+    alpha exp(i psi) / iota.
 
     Parameters
     ----------
@@ -94,13 +95,6 @@ def start_model(
         Fringe vector near the tile, rad/px.
     start : (3, y, x) float64, optional
         The pixels as they are known; else from an unweighted fit.
-
-    Returns
-    -------
-    theta : (3, y, x) float32
-        The model.
-    smooth : SmoothPhasor
-        Of alpha exp(i psi) / iota.
     """
     theta = _unweighted_pixels(tile, blocks, coding, frames) if start is None else start
     iota = theta[0]

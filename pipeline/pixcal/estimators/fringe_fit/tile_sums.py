@@ -91,8 +91,6 @@ def sum_row(
     ----------
     phase, sigma : (y, x) float32
         Phases relative to the carrier and their errors, rad.
-    good : (y, x) bool
-        Pixels that count.
     batches : (batch, y, x) float32
         Phases of the batches relative to the whole run's, rad; NaN in gaps.
     plane : TilePlane

@@ -23,13 +23,8 @@ def phase_change(before: F64, after: F64) -> F64:
 def straight_modes(theta: F64, k: tuple[float, float]) -> F64:
     """Modes (7, y, x) that a fit of straight fringes with free intensities takes off.
 
-    1, x, y, and the fringes at the fringe frequency and twice it (physics note, section 2).
-
-    Parameters
-    ----------
-    theta : (3, y, x) float64
-    k : (float, float)
-        Fringe vector (kx, ky), rad/px.
+    1, x, y, and the fringes of theta (3, y, x) at the fringe frequency k (rad/px) and twice it
+    (physics note, section 2).
     """
     shape = (theta.shape[1], theta.shape[2])
     y, x = np.broadcast_arrays(*grid(shape))
@@ -41,17 +36,10 @@ def straight_modes(theta: F64, k: tuple[float, float]) -> F64:
 
 
 def phase_sums(modes: F64, delta: F64, sigma: F64, change: F64, k: float) -> tuple[F64, F64]:
-    """Least-squares sums (mode, mode), (mode, 1) of a piece's phases after a change.
+    """Least-squares sums (mode, mode), (mode, 1) of a piece's phases after a change (y, x), rad.
 
-    Parameters
-    ----------
-    modes : (mode, y, x) float64
-    delta, sigma : (y, x) float64
-        Offset and its error, px; NaN where masked.
-    change : (y, x) float64
-        Of the phase, rad.
-    k : float
-        Length of the fringe vector, rad/px.
+    Of modes (mode, y, x) in offsets and their errors (y, x), px, NaN where masked; k is the length
+    of the fringe vector, rad/px.
     """
     good = np.isfinite(delta) & np.isfinite(change) & (sigma > 0)
     good_modes = modes[:, good]

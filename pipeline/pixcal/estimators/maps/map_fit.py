@@ -30,14 +30,9 @@ class MapPart:
 
     @classmethod
     def of(cls, signals: F64, data: F64, free: F64, good: Mask) -> "MapPart":
-        """A map whose free terms are taken off, from data and from signals; outliers left out.
+        """Data (y, x) and signals (n, y, x) whose free terms (m, y, x) are taken off.
 
-        Parameters
-        ----------
-        signals : (n, y, x) float64
-        data : (y, x) float64
-        free : (m, y, x) float64
-        good : (y, x) bool
+        Outliers are left out.
         """
         use = good
         for _ in range(2):

@@ -43,12 +43,10 @@ class Ring:
 
 
 def ring_power(power: F64) -> Ring:
-    """Fit a ring to the cross power of two maps from which parabolas were taken.
+    """Fit a ring to the cross power (y, x) of two maps from which parabolas were taken.
 
-    Parameters
-    ----------
-    power : (y, x) float64
-        Real part of ``fft2(a) * conj(fft2(b))`` over pixels squared: its sum is the mean product.
+    That is the real part of ``fft2(a) * conj(fft2(b))`` over pixels squared: its sum is the mean
+    product.
     """
     shape = (power.shape[0], power.shape[1])
     scales, templates = _templates(shape)

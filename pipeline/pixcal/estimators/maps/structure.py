@@ -130,19 +130,9 @@ class OffsetModel:
 
 
 def true_offsets(delta: F64, sigma: F64, psi: F64) -> OffsetModel:
-    """Part a measured map of offsets.
+    """Part a map of offsets with their errors (y, x), px, NaN where there is none; psi in rad.
 
-    Parameters
-    ----------
-    delta, sigma : (y, x) float64
-        Offset and its error, px; NaN where there is none.
-    psi : (y, x) float64
-        Phase of the fringes, rad.
-
-    Returns
-    -------
-    Offsets
-        ``kept`` is shrunk by the share of its scatter that is noise; zero where there is none.
+    What is ``kept`` is shrunk by the share of its scatter that is noise; zero where there is none.
     """
     bending = legendre(delta.shape, DEGREE)
     lines = []

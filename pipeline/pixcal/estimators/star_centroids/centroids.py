@@ -43,23 +43,17 @@ class Star:
         return 2 * self.half + 1
 
     def expected(self, place: F64, offsets: F64) -> F64:
-        """Mean electrons in the window.
+        """Mean electrons (n, side, side) in the windows.
 
-        Parameters
-        ----------
-        place : (n, 2) float64
-            (x, y) of each star from the middle of its window's middle pixel, px.
-        offsets : (n, 2, side, side) float64
-            (dx, dy) of the pixels, px.
-
-        Returns
-        -------
-        (n, side, side) float64
+        Of stars at places (n, 2), (x, y) from the middle of the window's middle pixel, px, with
+        offsets (n, 2, side, side) of the pixels, px.
         """
         return np.asarray(self.electrons * self._at(place, offsets)[0] + self.background)
 
     def fit(self, data: F64, offsets: F64, good: Good) -> F64:
-        """Fit each star, starting from the middle of its window.
+        """Fit each star from the middle of its window: a, b (px), N, B (e-), (n, 4).
+
+        NaN where the fit does not end.
 
         Parameters
         ----------
@@ -69,11 +63,6 @@ class Star:
             Where the fit takes the pixels to lie, (dx, dy), px.
         good : (n, side, side) bool
             Pixels to use.
-
-        Returns
-        -------
-        (n, 4) float64
-            a, b (px), N, B (e-); NaN where the fit does not end.
         """
         # What pixels that are not used hold may be anything.
         data, offsets = np.where(good, data, 0.0), np.where(good[:, None], offsets, 0.0)
@@ -106,10 +95,7 @@ class Star:
     def bound(self, place: F64 | None = None) -> F64:
         """Cramér-Rao bound of the centroid (x, y), px, with N and B fitted.
 
-        Parameters
-        ----------
-        place : (2,) float64, optional
-            Of the star from the middle of its pixel, px; by default the rms over a pixel.
+        For a star so far (x, y) from the middle of its pixel, px; by default the rms over a pixel.
         """
         if place is not None:
             return np.asarray(np.sqrt(np.diag(np.linalg.inv(self.information(place)))[:2]))

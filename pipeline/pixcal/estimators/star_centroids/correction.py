@@ -26,17 +26,10 @@ _FAINT = 1e12  # variance of a pixel beside which that of the star's own light d
 
 
 def gaussian_star(fwhm: float, electrons: float | None, read_noise: float) -> Star:
-    """A star with the shape of a Gaussian, averaged over square pixels.
+    """A Gaussian star of a full width at half maximum, px, averaged over square pixels.
 
-    Parameters
-    ----------
-    fwhm : float
-        Full width at half maximum, px.
-    electrons : float or None
-        Of the star, which set the weights of its fit by photon noise; None where all pixels of the
-        fit count alike.
-    read_noise : float
-        Of a pixel, e-.
+    Its ``electrons`` set the weights of its fit by photon noise; None where all pixels of the fit
+    count alike. ``read_noise`` in e-.
     """
     sigma = fwhm * _SIGMA_OF_FWHM
     half = max(2, math.ceil(4 * sigma))
@@ -73,8 +66,6 @@ def correct_centroids(
         (x, y) as measured on a perfect grid, px.
     offsets, sigma : (2, y, x)
         Offsets along x and y and their errors, px; NaN where unknown.
-    star : Star
-        How stars look, and with what weights they were fitted.
     """
     _, ny, nx = offsets.shape
     corrected = np.full(place.shape, np.nan)
@@ -105,18 +96,9 @@ def correct_centroids(
 
 
 def correction_map(offsets: NDArray[np.floating], star: Star | None) -> F32:
-    """Correction of the centroid of a star centred on each pixel.
+    """Correction (2, y, x) of the centroid of a star centred on each pixel, or of the pixels.
 
-    Parameters
-    ----------
-    offsets : (2, y, x)
-        Along x and y, px; NaN, where unknown, counts as 0.
-    star : Star or None
-        None for the pixels' own places.
-
-    Returns
-    -------
-    (2, y, x) float32
+    Offsets (2, y, x) along x and y are in px; NaN, where unknown, counts as 0.
     """
     known = np.nan_to_num(offsets.astype(np.float32))
     if star is None:

@@ -206,11 +206,7 @@ def free_from_modes(
 ) -> tuple[list[Component], dict[str, dict[str, float]]]:
     """Fit the modes to truth minus maps, and remove them from the truth.
 
-    Returns
-    -------
-    list of Component
-    dict
-        For each component the rms (px) of the removed ``smooth`` and ``fringe`` modes.
+    For each component the rms (px) of the removed ``smooth`` and ``fringe`` modes comes with it.
     """
     ny, nx = modes.shape
     # An odd step: bands must not keep pace with fringes.

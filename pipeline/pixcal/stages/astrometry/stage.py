@@ -207,14 +207,8 @@ def _facts(
 def planned(shape: tuple[int, int], modes: int, side: int, config: Config) -> tuple[int, int]:
     """Bytes of a task and of what this process holds.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Of the detector.
-    modes : int
-        That a truth is freed from; 0 without one.
-    side : int
-        Of a star's window, px.
+    Of a detector of shape (y, x), freed from so many ``modes`` of the truth (0 without one), for
+    stars in windows of ``side`` px.
     """
     per_pixel = _BYTES_PER_PIXEL + _BYTES_PER_PIXEL_AND_MODE * modes
     reach = min(int(2 * config.dither_px) + 1, max(shape)) + side

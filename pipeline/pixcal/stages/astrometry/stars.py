@@ -87,13 +87,10 @@ class Observation:
 
 
 def observe(detector: PixelPositions, plan: Observation, runtime: Runtime) -> F64:
-    """Observe and fit stars all over the detector.
+    """Observe and fit stars all over the detector: errors (star, position, kind, component), px.
 
-    Returns
-    -------
-    (star, position, kind, component) float64
-        Errors of the centroids along the components' axes, px; NaN at places that are not used,
-        and where a fit has failed.
+    They are along the components' axes; NaN at places that are not used, and where a fit has
+    failed.
     """
     batches = [range(n, min(n + BATCH, plan.stars)) for n in range(0, plan.stars, BATCH)]
     errors = run_tasks(partial(_batch, detector, plan), batches, runtime, label="stars")
@@ -112,13 +109,7 @@ def _batch(detector: PixelPositions, plan: Observation, stars: range) -> F64:
 
 
 def observe_star(detector: PixelPositions, plan: Observation, core: F64, number: int) -> F64:
-    """Errors (position, kind, component) of one star, px.
-
-    Parameters
-    ----------
-    core : (component, y, x) float64
-        From `core_weights`.
-    """
+    """Errors (position, kind, component) of one star, px; ``core`` is that of `core_weights`."""
     star, half, axes = plan.star, plan.star.half, detector.axes
     rng = generator(detector.seed, 2, number)
     # The whole window lies on the detector.

@@ -50,17 +50,10 @@ class Row(NamedTuple):
 
 
 def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -> Comparison:
-    """Root mean squares of errors.
+    """Root mean squares of errors (star, position), px, NaN where there are none.
 
-    Parameters
-    ----------
-    perfect, measured : (star, position) float64
-        Errors, px; NaN where there is none.
-    noise : (star, position) float64
-        Errors whose mean square ``perfect`` holds twice without having it on a real detector: the
-        maps' own. Zeros where the detector is the truth.
-    rng : Generator
-        For resampling the stars.
+    ``noise`` are errors whose mean square ``perfect`` holds twice without having it on a real
+    detector: the maps' own. It is zero where the detector is the truth.
     """
     columns = (perfect**2, measured**2, noise**2)
     good = np.isfinite(perfect) & np.isfinite(measured)
@@ -91,18 +84,9 @@ def _spread(values: F64) -> float:
 
 
 def running_means(errors: F64, lengths: list[int]) -> list[F64]:
-    """Mean error of each star over its first positions, NaN left out.
+    """Mean (star, 1) of the errors (star, position) of each star over its first positions.
 
-    Parameters
-    ----------
-    errors : (star, position) float64
-    lengths : list of int
-        Positions to average.
-
-    Returns
-    -------
-    list of (star, 1) float64
-        One for each length; NaN where a star has none.
+    NaN are left out, and stand where a star has none.
     """
     good = np.isfinite(errors)
     sums, counts = np.cumsum(np.where(good, errors, 0.0), axis=1), np.cumsum(good, axis=1)
@@ -121,8 +105,6 @@ def axis_facts(
         As `pixcal.stages.astrometry.stars.observe` leaves them, px.
     bound : float
         Cramér-Rao bound of one position, px.
-    uas_per_px : float
-        Plate scale.
     drawn : bool
         Whether the detector is the maps and a draw of their errors.
     """

@@ -36,14 +36,9 @@ class FrameSpread:
 
     @classmethod
     def normal(cls, level_rms: float, contrast_rms: float, visibility: float) -> "FrameSpread":
-        """Normal changes of light and contrast, clipped as `pixcal.kernels.scene` does.
+        """Normal changes of light and contrast, relative, clipped as `pixcal.kernels.scene` does.
 
-        Parameters
-        ----------
-        level_rms, contrast_rms : float
-            Relative, from frame to frame.
-        visibility : float
-            Mean contrast of equal beams: no frame has more than 1.
+        No frame has more contrast than 1, ``visibility`` being the mean of equal beams.
         """
         x, u = np.polynomial.hermite_e.hermegauss(NODES if level_rms else 1)
         y, v = np.polynomial.hermite_e.hermegauss(NODES if contrast_rms else 1)
@@ -62,14 +57,8 @@ def phase_information(
 ) -> F64:
     """Information of one frame on a pixel's phase, 1/rad², at any phases that are uniform.
 
-    Parameters
-    ----------
-    iota, alpha : array_like
-        Mean and amplitude at B = A = 1, e-.
-    variance : float
-        Of a sample without light, e-².
-    frames : FrameSpread, optional
-        Over which to average.
+    Of mean and amplitude ``iota``, ``alpha`` (e-, at B = A = 1) and the ``variance`` (e-²) of a
+    sample without light, averaged over the frames' spread.
     """
     spread = frames or FrameSpread.steady()
     total = np.asarray(iota, float)[..., None] * spread.level + variance
@@ -96,22 +85,9 @@ def unweighted_variance(
 def sampling_loss(iota: float, alpha: float, variance: float, phases: F64) -> tuple[float, float]:
     """Frames needed with given phases, over those with uniform ones: median and worst fringe phase.
 
-    A few phases, taken again and again, leave some pixels with less than others, and make iota,
-    alpha and phase mix.
-
-    Parameters
-    ----------
-    iota, alpha : float
-        e-.
-    variance : float
-        e-².
-    phases : (t,) float64
-        Of the frames, rad.
-
-    Returns
-    -------
-    (float, float)
-        Infinite where the phases do not determine the three unknowns.
+    A few phases (t,) rad, taken again and again, leave some pixels with less than others, and make
+    iota, alpha and phase mix; infinite where they do not determine the three. Other parameters as
+    `phase_information`.
     """
     psi = 2 * np.pi * np.arange(TURN) / TURN
     information = np.zeros((TURN, 3, 3))

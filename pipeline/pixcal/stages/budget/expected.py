@@ -59,14 +59,7 @@ class SetBound:
 
     @classmethod
     def of(cls, bench: Bench, number: int, contrast: float = 1.0) -> "SetBound":
-        """For a set of a bench.
-
-        Parameters
-        ----------
-        number : int
-            Of the set.
-        contrast : float
-            Times the bench's visibility.
+        """For a set of a bench, by its number, with ``contrast`` times the bench's visibility.
 
         Raises
         ------
@@ -194,14 +187,9 @@ class JoinedBound:
         return ("delta_x", "delta_y") if both else ("delta_fringe",)
 
     def variance(self, frames: Shares, *, worst: bool = False) -> F64:
-        """Of each component (component, pixel), px².
+        """Variance of each component (component, pixel), px², with so many frames of each set.
 
-        Parameters
-        ----------
-        frames : (set,) float
-            Of each set; shares of one frame will do.
-        worst : bool
-            At the least favourable fringe phases.
+        Shares of one frame will do; with ``worst`` at the least favourable fringe phases.
         """
         xx, xy, yy = np.zeros((3, len(self.sets[0].iota)))
         for n, s in zip(frames, self.sets, strict=True):

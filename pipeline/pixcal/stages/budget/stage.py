@@ -53,7 +53,7 @@ Config = Budget
 
 
 def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, Any]:
-    """Work out the budget of a bench.
+    """Work out the budget of a bench: the contents of ``budget.json``.
 
     Parameters
     ----------
@@ -61,11 +61,6 @@ def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, 
         As ``pixcal simulate`` takes it.
     out : Path, optional
         Directory for ``budget.json`` and ``budget.png``.
-
-    Returns
-    -------
-    dict
-        The contents of ``budget.json``.
 
     Raises
     ------

@@ -218,13 +218,7 @@ class Period(NamedTuple):
 
 
 def strongest_period(difference: F64, sigma: F64) -> Period | None:
-    """The strongest wave of a profile (n,) whose errors are known; None where it is too short.
-
-    Parameters
-    ----------
-    difference, sigma : (n,) float64
-        px; NaN where there is no value.
-    """
+    """Strongest wave of a profile (n,) px with its errors; None if it is too short."""
     good = np.isfinite(difference) & np.isfinite(sigma) & (sigma > 0)
     n = len(difference)
     if good.sum() < 8:
@@ -243,14 +237,8 @@ def three_cornered_hat(
 ) -> list[VarianceEstimate]:
     """Own errors of three or more maps, from the differences of all pairs.
 
-    A difference's variance beyond noise is the sum of those of its maps (Gray and Allan 1974).
-
-    Parameters
-    ----------
-    pairs : sequence of (int, int)
-        Numbers of the maps of each pair.
-    excess : sequence of VarianceEstimate
-        From `Part.beyond_noise`, of each pair.
+    A difference's variance beyond noise (`Part.beyond_noise`) is the sum of those of its maps (Gray
+    and Allan 1974).
     """
     design = np.zeros((len(pairs), 1 + max(map(max, pairs))))
     np.put_along_axis(design, np.array(pairs), 1.0, axis=1)

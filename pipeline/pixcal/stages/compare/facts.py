@@ -20,16 +20,10 @@ LISTED = 10  # most blocks, and most pixels, that are named
 def describe(
     pair: Pair, sums: PairSums, pixels: Pixels, limit: float, accuracy: float
 ) -> tuple[dict[str, Any], ComponentView]:
-    """Results and figure of one component.
+    """Results and figure of one component, its sums without the outlying pixels.
 
-    Parameters
-    ----------
-    sums : PairSums
-        Without the outlying pixels.
-    limit : float
-        Sigma beyond which pixels were left out.
-    accuracy : float
-        Relative error of SIGMA to tolerate.
+    Those are off by more than ``limit`` sigma; ``accuracy`` is the relative error of SIGMA to
+    tolerate.
     """
     known, (ny, nx) = int(pixels.pulls.sum()), pair.window
     profiles = {name: sums.differences(s) for name, s in sums.profiles.items()}

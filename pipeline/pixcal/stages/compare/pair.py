@@ -167,10 +167,8 @@ def read_sums(
 ) -> PairSums:
     """Read both sides once.
 
-    Parameters
-    ----------
-    keep : (Projection, float) or None
-        Leave out pixels whose difference, without these modes, is larger than so many errors.
+    With ``keep`` pixels are left out whose difference, without these modes, is larger than so many
+    errors.
     """
     task = partial(_sums_task, pair, keep)
     results = run_tasks(task, pair.tiles(), runtime, label=f"sums {pair.name}")

@@ -110,13 +110,9 @@ class Side:
         return [s for s, share in zip(self.sets, shares, strict=True) if abs(share) > PART_OF]
 
     def read(self, tile: Tile, direction: Vector) -> tuple[F64, F64, F64]:
-        """Offset along a unit vector (x, y), its variance, and its modes, on a tile.
+        """Offset along a unit vector (x, y), px, its variance, px², and its modes, on a tile.
 
-        Returns
-        -------
-        delta, variance : (y, x) float64
-            px and px²; NaN where there is none.
-        modes : (mode, y, x) float64
+        (y, x), NaN where there is none, and (mode, y, x).
         """
         offsets = [s.delta(tile) for s in self.sets]
         delta, sigma = (np.stack(maps) for maps in zip(*offsets, strict=True))
@@ -149,13 +145,7 @@ class Side:
 
 
 def whole_run(run: Path, label: str | None = None) -> Side:
-    """A fitted run as a side.
-
-    Raises
-    ------
-    InputError
-        If the run has not been fitted, or by a model that this comparison does not know.
-    """
+    """A fitted run as a side."""
     key = require(run, "fit").key
     fitted = read_json(run / "fit" / "fit.json")["sets"]
     acquisition = read_acquisition(run)

@@ -172,13 +172,7 @@ def _compare_all(
 def compare_pair(
     pair: Pair, accuracy: float, runtime: Runtime
 ) -> tuple[dict[str, Any], ComponentView]:
-    """Compare two sides along one direction: results and figure.
-
-    Raises
-    ------
-    InputError
-        If they have too few pixels in common.
-    """
+    """Compare two sides along one direction: results and figure."""
     runtime = pair.plan(runtime)
     sums = read_sums(pair, runtime)
     if sums.pixels < FEWEST:

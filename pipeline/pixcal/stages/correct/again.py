@@ -25,10 +25,7 @@ MOST_PARTS = 4  # times that many at most
 def measured_again(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatments:
     """The same treatments, with effects on maps remeasured on all frames where possible.
 
-    Parameters
-    ----------
-    runtime : Runtime
-        Its memory: where it does not suffice, effects stay as the diagnosis found them.
+    Where the memory does not suffice, effects stay as the diagnosis found them.
     """
     remeasured = [t for t in plan.every if t.how == "undone on maps" and t.origin == "diagnosis"]
     remeasured = [

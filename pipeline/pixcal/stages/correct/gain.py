@@ -79,13 +79,7 @@ class TileGain:
 
 
 def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
-    """Statistics of the sets and of pairs of sets, for ``correction.json``.
-
-    Returns
-    -------
-    dict
-        ``sets``: by name; ``pairs``: of sets along one axis.
-    """
+    """Statistics of ``sets``, by name, and of ``pairs`` of sets along one axis."""
     ny, nx = maps.source.shape
     cy, cx = maps.source.signal.chunks[1:]
     variants = HALVES + maps.effects
@@ -111,11 +105,6 @@ def worsened(sets: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> str
     """Where the corrected maps are worse than those before; empty where they are not.
 
     A wrong correction leaves a periodic pattern in a map, or sets apart that see the same offsets.
-
-    Parameters
-    ----------
-    sets, pairs
-        As in ``correction.json``.
     """
     for name, facts in sets.items():
         for lines in ("rows", "columns"):

@@ -32,7 +32,7 @@ class RestoredSet(ReducedSet):
     calibration : Path
         ``calibration.zarr``: samples were divided by its flat, after its dark signal was taken off.
     exptime_s : (t,) float32
-        Exposure time of each frame.
+        Of each frame.
     """
 
     effects: tuple[Effect, ...]

@@ -98,13 +98,9 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
 
 def attempt(run_dir: Path, config: Config, runtime: Runtime) -> str | None:
-    """As `run`, but a correction that is impossible is not an error.
+    """As `run`, but what makes a correction impossible is returned, not raised.
 
-    Returns
-    -------
-    str or None
-        Why there are no corrected maps, where they cannot be made; those of another fit are
-        removed.
+    Corrected maps of another fit are removed then.
     """
     try:
         run(run_dir, config, runtime)

@@ -39,14 +39,8 @@ def scatter_of(phase: F64) -> float:
 def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, scatter: float) -> list[FringeMaps]:
     """The maps with unknown pixels perturbed by their errors, in the patterns of `SIGNS`.
 
-    Parameters
-    ----------
-    unknown : (y, x) bool
-        Inside the window: their light may be anything from none to twice that around them.
-    beyond : (y, x) bool
-        Beyond the window: their light is known, their offsets are not.
-    scatter : float
-        Of the offsets, as phases, rad.
+    Pixels (y, x) that are ``unknown`` may have any light from none to twice that around them; those
+    ``beyond`` the window have known light, and unknown offsets of a ``scatter`` in phase, rad.
     """
     y, x = np.indices(unknown.shape)
     y, x = y + maps.origin[0], x + maps.origin[1]
@@ -68,13 +62,8 @@ def usable(theta: F64, mask: U8) -> Mask:
 def border_misfit(theta: F64, k: tuple[float, float], good: Mask) -> float:
     """Chi-square of the first line of pixels against an extrapolation of the next ones.
 
-    Parameters
-    ----------
-    theta : (3, line, pixel) float64
-        Maps of the strip along a side, the line at the border first.
-    k : (float, float)
-        Fringe vector along the lines and from line to line, rad/px.
-    good : (line, pixel) bool
+    Of maps (3, line, pixel) of the strip along a side, the line at the border first; ``k`` is along
+    the lines and from line to line, rad/px.
     """
     lines, pixels = good.shape
     y, x = np.arange(lines)[:, None], np.arange(pixels)

@@ -105,11 +105,8 @@ class Swept:
 def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
     """Fitted maps of a part; unknown pixels are interpolated.
 
-    Returns
-    -------
-    maps : FringeMaps
-    good, known : (y, x) bool
-        Pixels that have an offset, and those whose light is known, flagged ones included.
+    With them, (y, x), pixels that have an offset, and those whose light is known, flagged ones
+    included.
     """
     there = swept.within(part)
     theta = fitted_theta(swept.folder, there, swept.carrier.reference)
@@ -128,11 +125,7 @@ def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
 def free_of_samples(swept: Swept, part: Part) -> tuple[FringeMaps, Mask]:
     """Parameters that a fit of a part would give without the effects on samples.
 
-    Returns
-    -------
-    maps : FringeMaps
-    good : (y, x) bool
-        Pixels that have an offset.
+    With them pixels (y, x) that have an offset.
     """
     maps, good, _ = maps_of(swept.as_read, part)
     for effect in swept.samples:
@@ -162,10 +155,7 @@ def padded(values: NDArray[Any], swept: Swept, part: Part, fill: float = np.nan)
 def undone(maps: FringeMaps, effects: Sequence[Effect]) -> tuple[FringeMaps, list[F64]]:
     """Maps without effects, and by how much each has moved the phase (y, x), rad.
 
-    Raises
-    ------
-    InputError
-        If an effect gives back what is no map of the same pixels.
+    An effect that gives back what is no map of the same pixels is refused.
     """
     steps = []
     for effect in effects:

@@ -27,13 +27,7 @@ TILES = 9  # tiles, spread over the window, that tell for all: errors of paramet
 
 
 def moved(effect: Effect, errors: Mapping[str, float]) -> list[Effect]:
-    """The effect with each of its parameters in turn off by its error.
-
-    Parameters
-    ----------
-    errors : mapping
-        1-sigma errors by the parameters' names, such as ``couplings[0].share``.
-    """
+    """The effect with each parameter in turn off by its error; names as ``couplings[0].share``."""
     variants: list[Effect] = []
     for name, error in errors.items():
         for step in (error, -error):
@@ -60,10 +54,7 @@ def _add(plain: Any, path: Sequence[str], step: float) -> None:
 def parameter_errors(swept: Swept, runtime: Runtime) -> dict[str, float | None]:
     """Rms (px) of what the errors of each effect's parameters leave in the offsets of a set.
 
-    Returns
-    -------
-    dict
-        By effect; None where no errors are given.
+    None where no errors are given.
     """
     tiles = scout_tiles(swept.source.grid, TILES)
     plan = make_plan("errors of the parameters", task_bytes(swept), 0, runtime)
@@ -105,16 +96,8 @@ def left_over(swept: Swept, maps: FringeMaps, good: Mask, inside: tuple[slice, s
 
     Where their covariance is known and the effect tells what each does (`Effect.phase_slopes`), all
     together; else parameters are moved one by one, and what each does is added in squares. Modes
-    that the fit removes are taken off, tile by tile.
-
-    Parameters
-    ----------
-    maps : FringeMaps
-        Of a tile and its surroundings, with the effects.
-    good : (y, x) bool
-        Pixels that have an offset.
-    inside : (slice, slice)
-        The tile.
+    that the fit removes are taken off, tile by tile: ``inside`` the maps of a tile and its
+    surroundings.
     """
     variances = []
     for effect in swept.effects:

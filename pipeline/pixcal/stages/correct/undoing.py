@@ -37,20 +37,7 @@ SAME = ("chi2", "mask", "g", "dk", "time")  # arrays of a sweep that stay
 
 
 def undo_on_maps(swept: Swept, target: Path, runtime: Runtime, name: str) -> None:
-    """Write a set's sweep without effects.
-
-    Parameters
-    ----------
-    target : Path
-        Folder to make.
-    name : str
-        Of the set.
-
-    Raises
-    ------
-    InputError
-        If an effect gives back what is no map.
-    """
+    """Write a set's sweep without effects to a new folder."""
     create_group(target)
     for array in SAME:
         link_files(swept.folder / array, target / array)

@@ -155,13 +155,9 @@ def _minimise(
 def _least_squares(
     paths: CrestPaths, at: Parametrisation, start: F64, expected: F64, precision: F64, **limits: Any
 ) -> OptimizeResult:
-    """Phase and unknowns that the points, and what is known of the unknowns, make likely.
+    """Phase and unknowns (1 + n,) that the points, and prior knowledge of the unknowns, suggest.
 
-    Parameters
-    ----------
-    start : (1 + n,) float64
-    expected, precision : (n,) float64
-        Prior knowledge of the unknowns: expected values and inverse errors.
+    That is their expected values and inverse errors, (n,).
     """
     weight, (ry, rx) = 1 / paths.sigma, paths.reference
 
@@ -255,18 +251,9 @@ def _least_cost(
 
 
 def valley(paths: CrestPaths, fit: CrestFit, distance: F64) -> tuple[F64, F64]:
-    """Best ratio B / D and its cost with the distance held (paper, figure 17, right).
+    """Best ratio B / D and its cost, (d,), with the distance (d,) mm held (figure 17, right).
 
     The other parameters are fitted again, with the priors that `cost_map` takes.
-
-    Parameters
-    ----------
-    distance : (d,) float64
-        mm.
-
-    Returns
-    -------
-    ratio, cost : (d,) float64
     """
     few = _thinned(paths, fit)
     results = [_least_cost(few, fit, float(d), None, refit=True) for d in distance]

@@ -57,13 +57,7 @@ class Windows:
 
     @classmethod
     def lay(cls, frame: tuple[int, int], k: Vector, segment: int | None = None) -> Self:
-        """Windows over a frame for a fringe vector (kx, ky), rad/px.
-
-        Raises
-        ------
-        InputError
-            If there is not room for two windows across the fringes.
-        """
+        """Windows over a frame for a fringe vector (kx, ky), rad/px."""
         ny, nx = frame
         length = float(np.hypot(*k))
         ux, uy = k[0] / length, k[1] / length
@@ -215,13 +209,7 @@ class CrestPaths:
 
 
 def seed_vector(patch: NDArray[Any], good: Mask, nominal: Vector) -> Vector:
-    """Fringe vector (kx, ky), rad/px, of a patch (y, x) of a frame; its sign is the nominal one's.
-
-    Raises
-    ------
-    InputError
-        If the patch has no good samples or holds no fringes.
-    """
+    """Fringe vector (kx, ky), rad/px, of a patch (y, x) of a frame; its sign is the nominal's."""
     if good.sum() < MIN_POINTS**2:
         raise InputError("no fringes found: too few good samples at the middle of the frame")
     level = float(patch[good].mean())
@@ -246,22 +234,9 @@ def tile_sums(
     windows: Windows,
     carrier: CrestCarrier,
 ) -> tuple[tuple[int, int], F64]:
-    """Sums of the windows that a tile touches.
+    """Sums (across, along, N_SUMS) of the windows that a tile touches, and the first one's numbers.
 
-    Parameters
-    ----------
-    signal : (y, x) float
-        Electrons.
-    good : (y, x) bool
-        Samples to use.
-    start : (int, int)
-        (y, x) of the first pixel.
-
-    Returns
-    -------
-    first : (int, int)
-        Number across and along of the first window.
-    sums : (across, along, N_SUMS) float64
+    Of electrons (y, x) and the samples to use, from pixel ``start`` (y, x) of the frame on.
     """
     ny, nx = signal.shape
     (i0, i1), (j0, j1) = windows.touched((start[0], start[0] + ny), (start[1], start[1] + nx))

@@ -150,10 +150,7 @@ def neighbour_sums(
 ) -> tuple[F64, F64]:
     """Products of samples (t, y, x) with those of neighbours, where both pixels are good.
 
-    Returns
-    -------
-    sums, count : (step, y) float64
-        By the row of the first pixel, and of how many pairs.
+    Their sums (step, y) by the row of the first pixel, and of how many pairs.
     """
     ny, nx = good.shape
     pairs = np.zeros((len(steps), ny, nx), np.float32)

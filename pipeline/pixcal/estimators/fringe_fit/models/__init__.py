@@ -76,10 +76,7 @@ class FringeShape(ABC):
     def facts(self, covariance: F64) -> dict[str, Any]:
         """Parameters with 1-sigma errors in natural units, for ``fit.json``.
 
-        Parameters
-        ----------
-        covariance : (mode, mode) float64
-            Of the coefficients.
+        From the covariance (mode, mode) of the coefficients.
         """
         return {}
 
