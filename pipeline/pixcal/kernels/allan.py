@@ -13,13 +13,7 @@ PIXELS_AT_ONCE = 128
 
 
 def averaging_lengths(n_batches: int) -> tuple[int, ...]:
-    """Octaves and what lies between them (1, 2, 3, 4, 6, 8, 12, …), up to a third of the batches.
-
-    Parameters
-    ----------
-    n_batches : int
-        Length of the series, gaps included.
-    """
+    """Octaves and what lies between (1, 2, 3, 4, 6, 8, 12, …), up to a third of the batches."""
     octaves = [1 << n for n in range(n_batches.bit_length())]
     lengths = sorted({*octaves, *(3 * m for m in octaves)})
     return tuple(m for m in lengths if m <= n_batches // 3)

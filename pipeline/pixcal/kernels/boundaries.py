@@ -143,11 +143,7 @@ def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0) -> F32:
 def boundary_pushes(charge: F32, shifts: F64) -> tuple[F32, F32]:
     """Mean shift (px) of the boundaries to the right of and below each pixel, in frames (t, y, x).
 
-    Parameters
-    ----------
-    charge : (t, y, x) float32
-    shifts
-        As in `moved_charge`.
+    The charge is in e-; shifts are as in `moved_charge`.
     """
     x, y = zip(*(_pushes(frame, shifts) for frame in charge), strict=True)
     return np.stack(x), np.stack(y)

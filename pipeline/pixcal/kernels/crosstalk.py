@@ -65,14 +65,9 @@ class Coupling:
         return replace(self, share=self.share * factor)
 
     def places(self, shape: tuple[int, int], first: tuple[int, int]) -> tuple[Place, Place]:
-        """Sources and receivers on a piece of the window, where both lie on it.
+        """Sources and receivers on a piece (y, x) of the window, where both lie on it.
 
-        Parameters
-        ----------
-        shape : (int, int)
-            Rows and columns of the piece.
-        first : (int, int)
-            Its first row and column in the window.
+        ``first`` are its first row and column in the window.
         """
         rows = _spans(shape[0], first[0], self.every_rows, self.row, self.dy)
         columns = _spans(shape[1], first[1], self.every_columns, self.column, self.dx)
@@ -218,12 +213,7 @@ def noise_shares(
 def filled(theta: F64, k: tuple[float, float]) -> F64:
     """Maps with pixels that have no data (NaN) taken from their neighbours, turned as fringes are.
 
-    Parameters
-    ----------
-    theta : (3, y, x) float64
-        (iota, alpha sin psi, alpha cos psi).
-    k : (float, float)
-        Fringe vector (kx, ky), rad/px.
+    Of theta (3, y, x), by the fringe vector k, rad/px.
     """
     good = np.isfinite(theta).all(axis=0)
     if good.all() or not good.any():

@@ -27,10 +27,7 @@ def root_diagonal(normal: NDArray[Any]) -> F64:
 def inverse_normal(normal: NDArray[Any], rcond: float = 1e-9) -> F64:
     """Inverse (..., n, n) of symmetric matrices; zero along what they do not determine.
 
-    Parameters
-    ----------
-    rcond : float
-        Eigenvalues below this share of the largest, at unit diagonal, count as zero.
+    Eigenvalues below a share ``rcond`` of the largest, at unit diagonal, count as zero.
     """
     scale = root_diagonal(normal)
     both = scale[..., :, None] * scale[..., None, :]

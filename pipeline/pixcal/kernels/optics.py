@@ -135,18 +135,7 @@ def fringe_vector(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[Array
 
 
 def phase_jacobian(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
-    """Derivative of `phase` with respect to the geometry.
-
-    Parameters
-    ----------
-    x, y : array_like
-        Pixel coordinates, px.
-
-    Returns
-    -------
-    ndarray of float64
-        Broadcast shape + (6,): rad/mm, last axis in the order of `PARAMETERS`.
-    """
+    """Derivative (..., 6), rad/mm, of `phase` by the geometry's `PARAMETERS`, in their order."""
     path = _Paths(x, y, geometry)
     bx, by, bz = geometry.baseline_x, geometry.baseline_y, geometry.baseline_z
     (ax, ay, az), (ex, ey, ez) = path.ua, path.ub
@@ -195,16 +184,9 @@ class _Paths:
 
 
 def gaussian_beam(x: ArrayLike, y: ArrayLike, centre: tuple[float, float], radius: float) -> Array:
-    """Intensity of a Gaussian beam relative to its peak.
+    """Intensity of a Gaussian beam at x, y relative to its peak, all in px.
 
-    Parameters
-    ----------
-    x, y : array_like
-        Pixel coordinates, px.
-    centre : tuple of float
-        Peak (x, y), px.
-    radius : float
-        Where the intensity has fallen to 1/e², px.
+    At the radius it has fallen to 1/e².
     """
     # A product of two exponentials: with x a row and y a column only their sides are computed.
     across = np.exp(-2 * ((np.asarray(x, float) - centre[0]) / radius) ** 2)

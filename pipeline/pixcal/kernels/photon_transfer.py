@@ -150,17 +150,9 @@ def pair_statistics(
 
 
 def bin_pairs(blocks: F64) -> F64:
-    """Sums over blocks of similar level.
+    """Sums (N_BINS, COLUMNS) over blocks of similar level, of what `pair_statistics` gives.
 
-    Parameters
-    ----------
-    blocks : (block, COLUMNS) float64
-        As `pair_statistics` gives them.
-
-    Returns
-    -------
-    (N_BINS, COLUMNS) float64
-        Degrees of freedom; the same times level, variance and covariances. May be added.
+    Degrees of freedom; the same times level, variance and covariances. May be added.
     """
     dof, level, *_ = blocks.T
     bins = np.minimum(2 * np.sqrt(np.maximum(level, 0)), N_BINS - 1).astype(int)
@@ -169,19 +161,10 @@ def bin_pairs(blocks: F64) -> F64:
 
 
 def neighbour_noise(frames: F32, lags: Sequence[tuple[int, int]]) -> float:
-    """Variance of good pixels in time with that which neighbours share.
+    """Variance of good pixels (t, y, x) in time with that which neighbours share; NaN is not used.
 
-    Parameters
-    ----------
-    frames : (t, y, x) float32
-        Of the same scene; NaN where a pixel is not to be used.
-    lags : sequence of (int, int)
-        Rows and columns to the neighbours that count, each pair once.
-
-    Returns
-    -------
-    float
-        Mean square about each pixel's mean, plus twice the covariance at each lag.
+    Mean square about each pixel's mean, plus twice the covariance at each lag (rows, columns),
+    which has each pair once.
     """
     noise = frames - frames.mean(axis=0)
     total = float(np.nanmean(noise**2))

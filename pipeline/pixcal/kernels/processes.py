@@ -13,12 +13,7 @@ HORIZON, LEVELS = 2.0**24, 30
 def damped_walk(normals: F64, keep: float) -> F64:
     """First-order autoregression of unit variance: a random walk that is drawn back to zero.
 
-    Parameters
-    ----------
-    normals : (t,) float64
-        Independent standard normals.
-    keep : float
-        Correlation of neighbours, 0 (white) to below 1.
+    From independent standard normals (t,); ``keep`` is the correlation of neighbours, 0 to below 1.
     """
     if not keep or not len(normals):
         return normals
@@ -31,13 +26,9 @@ def damped_walk(normals: F64, keep: float) -> F64:
 
 
 def swing(time_s: F64, hz: float, phase: float, exptime_s: float = 0.0) -> F64:
-    """Sine of unit amplitude, as its mean over an exposure that starts at each time.
+    """Sine of unit amplitude, as its mean over an exposure that starts at each time (t,), s.
 
-    Parameters
-    ----------
-    time_s : (t,) float64
-    hz, phase : float
-        Frequency, and phase at time zero, rad.
+    ``phase`` is that at time zero, rad.
     """
     middle = 2 * np.pi * hz * (time_s + exptime_s / 2) + phase
     return np.asarray(np.sinc(hz * exptime_s) * np.sin(middle))
@@ -68,12 +59,6 @@ RAMP = 0.8  # mean of exp(i step) from which phases are a ramp; of random phases
 
 
 def ramp_step(phase: F64) -> float:
-    """Step (rad) of phases that rise by equal steps; zero where they do not.
-
-    Parameters
-    ----------
-    phase : (t,) float64
-        rad.
-    """
+    """Step (rad) of phases (t,) that rise by equal steps; zero where they do not."""
     mean = np.exp(1j * np.diff(phase)).mean() if len(phase) > 1 else 0.0
     return float(np.angle(mean)) if abs(mean) > RAMP else 0.0

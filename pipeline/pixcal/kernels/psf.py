@@ -66,7 +66,7 @@ class Psf:
 
 
 def diffraction_psf(sampling: float, obscuration: float, half: int) -> Psf:
-    """The pattern of a telescope, averaged over square pixels.
+    """The pattern of a telescope, averaged over square pixels, up to so far (px) from the star.
 
     Parameters
     ----------
@@ -74,8 +74,6 @@ def diffraction_psf(sampling: float, obscuration: float, half: int) -> Psf:
         q, pixels in lambda / D.
     obscuration : float
         Diameter of the central obscuration over that of the aperture, 0 to below 1.
-    half : int
-        Half of the window's side, px: the table is for pixels so far from the star.
     """
     step = sampling / KNOTS
     side = math.ceil((half + MARGIN) / step) + 3
@@ -93,20 +91,7 @@ def diffraction_psf(sampling: float, obscuration: float, half: int) -> Psf:
 
 
 def intensity(radius: F64, sampling: float, obscuration: float) -> F64:
-    """The pattern itself, of unit total.
-
-    Parameters
-    ----------
-    radius : (...) float64
-        From the star, px.
-    sampling, obscuration : float
-        As in `diffraction_psf`.
-
-    Returns
-    -------
-    (...) float64
-        1/px².
-    """
+    """The pattern itself at radii (...) px, of unit total, 1/px²; as `diffraction_psf`."""
     z = np.pi * radius / sampling
     open_area = 1 - obscuration**2
     amplitude = (_jinc(z) - obscuration**2 * _jinc(obscuration * z)) / open_area

@@ -14,19 +14,8 @@ def quantiles_of_parts(
 ) -> tuple[F64, int]:
     """Quantiles of positive numbers in parts, the same as `numpy.quantile` gives of all at once.
 
-    Parameters
-    ----------
-    parts : callable
-        Gives the parts, (n,) float32 each, above zero and finite; called twice.
-    levels : sequence of float
-        Between 0 and 1.
-
-    Returns
-    -------
-    (level,) float64
-        Empty if there are no numbers.
-    int
-        How many numbers there are.
+    With them, empty if there are no numbers, how many there are. ``parts`` is called twice, and
+    gives the parts, (n,) float32 each, above zero and finite.
     """
     # The bits of positive floats, as integers, are in the order of their values.
     counts = np.zeros(1 << _DIGIT, np.int64)

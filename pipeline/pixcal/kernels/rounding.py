@@ -26,18 +26,7 @@ _SLOPE_STEP = 1e-3
 
 
 def rounded_moments(level: F64, sigma: float) -> tuple[F64, F64]:
-    """Mean and variance of normal numbers of some levels that were rounded.
-
-    Parameters
-    ----------
-    level : (n,) float64
-    sigma : float
-        Noise before rounding.
-
-    Returns
-    -------
-    mean, variance : (n,) float64
-    """
+    """Mean and variance (n,) of normals of some levels (n,) and a noise, once rounded."""
     whole = np.rint(level)
     if sigma >= SMOOTH:
         return level, np.full(level.shape, sigma**2 + SHEPPARD)
@@ -51,14 +40,7 @@ def rounded_moments(level: F64, sigma: float) -> tuple[F64, F64]:
 
 
 def level_before_rounding(mean: F64, sigma: float) -> F64:
-    """Levels whose rounded samples have some means.
-
-    Parameters
-    ----------
-    mean : ndarray of float64
-    sigma : float
-        Noise before rounding.
-    """
+    """Levels whose rounded samples have some means, with this noise before rounding."""
     if sigma >= SMOOTH:
         return mean
     level = np.linspace(-0.5, 0.5, _FRACTIONS + 1)

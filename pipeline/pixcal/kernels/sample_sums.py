@@ -12,19 +12,9 @@ _FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def calm_residuals(rest: F32, variance: F32, good: Mask, limit: float) -> tuple[F32, F32]:
-    """Residuals over their noise, and as they are; zero for outliers and without weight.
+    """Residuals (t, y, x) over their noise, and as they are; zero for outliers and without weight.
 
-    Parameters
-    ----------
-    rest, variance : (t, y, x) float32
-        Residuals, NaN without weight, and their variance.
-    good : (y, x) bool
-    limit : float
-        Standard deviations beyond which a residual is an outlier.
-
-    Returns
-    -------
-    calm, kept : (t, y, x) float32
+    They are NaN without weight, and outliers beyond a limit in standard deviations.
     """
     calm, kept = np.empty_like(rest), np.empty_like(rest)
     most, zero = np.float32(limit), np.float32(0)

@@ -24,13 +24,8 @@ def sigmas_of_chi2(value: float, dof: int) -> float:
 def sigmas_of_count(count: int, expected: float) -> float:
     """Standard deviations of a normal that are as rare as more events than these.
 
-    Half of the chance of just as many counts as more: so that none, where none are expected, is no
-    deviation at all.
-
-    Parameters
-    ----------
-    expected : float
-        Mean of the Poisson distribution, above zero.
+    Of a Poisson distribution with an expected number above zero. Half of the chance of just as many
+    counts as more: so that none, where none are expected, is no deviation at all.
     """
     log_equal = float(xlogy(count, expected) - gammaln(count + 1) - expected)
     log_chance = log_equal + math.log(0.5)
@@ -41,13 +36,7 @@ def sigmas_of_count(count: int, expected: float) -> float:
 
 
 def sigmas_of_best(*sigmas: float) -> float:
-    """Standard deviations that the largest of several independent normals is worth.
-
-    Parameters
-    ----------
-    *sigmas : float
-        Each a standard normal under chance.
-    """
+    """Standard deviations that the largest of several independent standard normals is worth."""
     chance = float(log_ndtr(-max(sigmas)))
     # One minus the chance that none of them is as large.
     none = len(sigmas) * math.log1p(-math.exp(min(chance, -1e-300)))

@@ -61,17 +61,9 @@ class Camera:
             self.maps = effect.detector(self.maps, bench, self.rows)
 
     def expose(self, recording: Recording, frames: range) -> Iterator[tuple[int, U16]]:
-        """Frames as the camera reads them.
+        """Frames of these numbers as the camera reads them: the number and samples, uint16 (y, x).
 
-        Parameters
-        ----------
-        frames : range
-            Numbers within the recording.
-
-        Yields
-        ------
-        tuple
-            Number of the frame and its samples, uint16 (y, x), ADU; the array is used again.
+        ADU; the array is used again.
         """
         chain = _Chain(self, recording)
         skip = self.inside[0] - self.rows[0]

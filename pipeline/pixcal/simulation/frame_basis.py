@@ -104,12 +104,7 @@ class FrameBasis:
     ) -> Components:
         """Sizes of strengths: the random ones come first in ``size``, the steady ones in ``beta``.
 
-        Parameters
-        ----------
-        shapes : mapping
-            Shape parameters, by the field of the strength.
-        start, steps
-            As of `estimate_components`.
+        Shape parameters are by the field of the strength; the rest is as of `estimate_components`.
         """
         own = [(s.steady, self.own(s, shapes.get(s.field))) for s in strengths]
         parts = [*(v for steady, v in own if not steady), *self._nuisances.values()]

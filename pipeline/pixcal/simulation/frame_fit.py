@@ -59,12 +59,7 @@ def fit_frames(
 ) -> FrameFit | None:
     """Parameters of a model of whole frames; None where the series show nothing of it.
 
-    Parameters
-    ----------
-    kind : type
-        The effect's class.
-    leave : sequence of str
-        Strengths that are not looked at.
+    Strengths to ``leave`` are not looked at.
     """
     changes = evidence.once("changes of frames", make=lambda: FrameChanges(evidence))
     every = changes.series(kind())

@@ -107,18 +107,13 @@ class Replica:
         of : str or int
             Name of a fringe set, or number of a stack.
         models : sequence of ForwardModel
-            What acts on them.
+            What acts on them; refused where a model and the bench do not go together.
         noise : bool
             With shot and read noise.
         seed : int
             Of all that is random.
         most : int, optional
             Frames.
-
-        Raises
-        ------
-        InputError
-            If a model and the bench do not go together.
         """
         detector = replace(self._bench.detector, seed=seed)
         bench = replace(self._bench, seed=seed, detector=detector)

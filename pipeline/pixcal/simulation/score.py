@@ -62,20 +62,8 @@ class Scored:
 def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
     """Parameters of an effect, and how far it is from nothing.
 
-    Parameters
-    ----------
-    kind : type
-        The effect's class.
-
-    Returns
-    -------
-    Scored or None
-        None where the effect changes nothing that these frames show.
-
-    Raises
-    ------
-    NotImplementedError
-        If none of the effect's strengths is a number.
+    None where the effect changes nothing that these frames show; NotImplementedError if none of its
+    strengths is a number.
     """
     start = kind()
     names = tuple(n for n in kind.strengths if isinstance(getattr(start, n), float))
@@ -96,12 +84,7 @@ def score_again(
 ) -> float:
     """Significance of an effect in other frames, with the parameters that it has.
 
-    Parameters
-    ----------
-    way : Way
-        How it shows.
-    template : Template, optional
-        What it changes; made anew where it is not of these pixels.
+    Its template is made anew where it is not of these pixels.
     """
     changes = _changes(evidence)
     fit = _Fit(changes, way, ())

@@ -55,11 +55,7 @@ def products(
 ) -> Products | None:
     """Sum the products of neighbours over all frames; None where no frames have light.
 
-    Parameters
-    ----------
-    links : sequence of (int, int)
-    known : sequence of Coupling
-        What is known of the couplings, by which the charge collected follows from what is read.
+    By the couplings that are known the charge collected follows from what is read.
     """
     ny, nx = evidence.good.shape
     steps = np.array(links, int).reshape(-1, 2)

@@ -81,20 +81,10 @@ class Frames:
     def kernel(
         self, classes: Classes, known: Sequence[Coupling], per_ke: float = 0.0
     ) -> "Dense | None":
-        """All couplings of the steps for the classes of a period.
+        """All couplings of the steps for the classes of a period; None for more than `MOST_SHARES`.
 
-        Parameters
-        ----------
-        known : sequence of Coupling
-            To start from.
-        per_ke : float
-            Relative change of the shares with the signal, 1/ke-; with it maps do not count, which
-            are those of one level.
-
-        Returns
-        -------
-        Dense or None
-            None where there are more than `MOST_SHARES` couplings.
+        Known couplings are started from. With ``per_ke``, a relative change of the shares with the
+        signal (1/ke-), maps do not count, which are those of one level.
         """
         every = tuple(
             coupling_of(classes, *divmod(u, 2), step)
@@ -157,7 +147,7 @@ def frames_of(
 
 
 def dense_kernel(parts: Iterable[Evidence], start: Sequence[Coupling]) -> Dense | None:
-    """Measure all couplings of the period of a kernel that was found.
+    """Measure all couplings of the period of a kernel; None for more than `MOST_SHARES`.
 
     Parameters
     ----------
@@ -165,11 +155,6 @@ def dense_kernel(parts: Iterable[Evidence], start: Sequence[Coupling]) -> Dense 
         Of the same pixels, with different frames.
     start : sequence of Coupling
         As found: they give the period and any coupling beyond `WITHIN`.
-
-    Returns
-    -------
-    Dense or None
-        None where there are more than `MOST_SHARES` couplings.
     """
     far = {(c.dy, c.dx) for c in start} | {(-c.dy, -c.dx) for c in start}
     rows, columns = (lcm(*(getattr(c, n) for c in start)) for n in ("every_rows", "every_columns"))

@@ -49,12 +49,8 @@ class HotPixels:
     def corrected(self, outflow: F64, per_ke: float) -> "HotPixels":
         """Shares of what a hot pixel had, at small signals; they were measured of what it kept.
 
-        Parameters
-        ----------
-        outflow : (y, x) float64
-            Share that each pixel gives away, at small signals.
-        per_ke : float
-            Relative change of shares with the charge, 1/ke-.
+        Each pixel gives away the share ``outflow`` (y, x), which changes with the charge by
+        ``per_ke``, 1/ke-.
         """
         lost = outflow[self.y, self.x]
         charge = self.charge / (1 - lost * (1 + per_ke * self.charge))
@@ -153,12 +149,8 @@ def hot_pixels(
 ) -> HotPixels | None:
     """Find hot pixels and what their neighbours show; None where no dark signal was measured.
 
-    Parameters
-    ----------
-    links : sequence of (int, int)
-    known : sequence of Coupling
-        What is known of the couplings: with it a receiver is freed of what other hot pixels give,
-        and need not be left out.
+    By the couplings that are known a receiver is freed of what other hot pixels give, and need not
+    be left out.
     """
     exposures = [s.exptime_s for s in evidence.of_kind("dark") if np.isfinite(s.exptime_s)]
     if not exposures or not np.any(evidence.dark_rate):

@@ -91,14 +91,9 @@ def _slope_at(
 def response_slopes(
     k: tuple[float, float], couplings: Sequence[Coupling], classes: Classes
 ) -> C128:
-    """Derivative (n, class) of the log of what couplings multiply the fringe by.
+    """Derivative (n, class) of the log of what couplings multiply the fringe k (rad/px) by.
 
-    Parameters
-    ----------
-    k : (float, float)
-        Fringe vector (kx, ky), rad/px.
-    couplings : sequence of Coupling
-        Of the period of the classes.
+    The couplings are of the period of the classes.
     """
     reach = max(max(abs(c.dy), abs(c.dx)) for c in couplings)
     rows, columns = (period * -(-reach // period) for period in (classes.rows, classes.columns))

@@ -51,20 +51,10 @@ class _Pattern:
 def pattern_information(
     evidence: Evidence, couplings: Sequence[Coupling], classes: Classes
 ) -> tuple[F64, F64] | None:
-    """Least-squares sums of the shares and of a true pattern of the offsets.
+    """Least-squares sums (m, m), (m,) of the shares and of a true pattern of the offsets.
 
-    Parameters
-    ----------
-    couplings : sequence of Coupling
-        As known; the sums are linear about them.
-    classes : Classes
-        Of pixels, of the period of the couplings.
-
-    Returns
-    -------
-    normal, right : (n + 2 c, n + 2 c), (n + 2 c,) float64
-        Of n shares, then of the true mean offset along x and along y of each of c classes, px.
-        None without fringes.
+    About the couplings as known, for classes of pixels of their period. First n shares, then the
+    true mean offset along x and along y of each class, px; None without fringes.
     """
     good = good_in_all(evidence)
     sets = list(evidence.fringes.values())
@@ -90,11 +80,8 @@ def pattern_information(
 def visibility_pattern(evidence: Evidence) -> Callable[[Classes], float]:
     """How well a period describes the visibility of the pixels.
 
-    Returns
-    -------
-    callable
-        Fall in chi-square, of all sets together, if each class of a period has its own mean of
-        the logarithm of the visibility.
+    Gives the fall in chi-square, of all sets together, if each class of a period has its own mean
+    of the logarithm of the visibility.
     """
     good = good_in_all(evidence)
     sets = list(evidence.fringes.values())

@@ -55,13 +55,7 @@ class Residuals:
 
 
 def all_residuals(evidence: Evidence, known: Sequence[Coupling]) -> Iterator[Residuals]:
-    """Residuals of each sequence of frames.
-
-    Parameters
-    ----------
-    known : sequence of Coupling
-        What is known of the couplings, by which the charge collected follows from what is read.
-    """
+    """Residuals of each sequence of frames; known couplings give the charge collected."""
     shape = (evidence.good.shape[0], evidence.good.shape[1])
     kept = noise_shares(known, shape, evidence.origin)[0].astype(np.float32)
     for stack in evidence.stacks:

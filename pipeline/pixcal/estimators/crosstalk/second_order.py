@@ -19,15 +19,8 @@ def to_first_order(
 
     A pixel keeps less than all of its charge, so that ``k (1 - outflow)`` is measured; a third
     pixel that gives to both partners adds the product of its shares; a share that changes with the
-    charge adds to the square of it; and all are measured in the shot noise of a pixel.
-
-    Parameters
-    ----------
-    couplings : sequence of Coupling
-        As known.
-    links : sequence of (int, int)
-    first : (int, int)
-        First row and column of the arrays in the window.
+    charge adds to the square of it; and all are measured in the shot noise of a pixel. ``first``
+    are the first row and column of the arrays in the window.
     """
     shape = (found.right.shape[-2], found.right.shape[-1])
     right = found.right / found.shot

@@ -49,12 +49,8 @@ class Shrinkage:
     ) -> tuple[F64, F64, float]:
         """Shares, their covariance, and the rms of a true pattern.
 
-        Parameters
-        ----------
-        normal, right : (n, n), (n,) float64
-            Least-squares sums of the shares.
-        maps : ((m, m), (m,) float64), optional
-            The same of the shares and a true pattern of the offsets, as maps tell.
+        From least-squares sums (n, n), (n,) of the shares, and those of the shares and a true
+        pattern of the offsets, as maps tell.
         """
         n, parts = self.basis.shape
         free = 0 if maps is None else 2 * self.classes

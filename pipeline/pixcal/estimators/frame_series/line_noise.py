@@ -44,13 +44,8 @@ class LineSpectrum:
 def line_spectrum(residual: F32, good: Mask, fitted: int = 1) -> LineSpectrum | None:
     """Spectrum of what rows have in common; None where rows or frames are too few.
 
-    Parameters
-    ----------
-    residual : (t, y, x) float32
-        e-, without what is constant in time; NaN where there is no sample.
-    good : (y, x) bool
-    fitted : int
-        Parameters of each pixel that were fitted to the frames.
+    Of residuals (t, y, x), e-, without what is constant in time, NaN where there is no sample,
+    after so many parameters of each pixel were fitted to the frames.
     """
     frames, lines, width = residual.shape
     lines -= lines % 2
@@ -104,10 +99,7 @@ class LineNoise:
 def fit_lines(spectra: Sequence[LineSpectrum], shapes: Sequence[F64]) -> LineNoise:
     """Sizes of kinds of noise by their spectra: least squares, weights by what is found.
 
-    Parameters
-    ----------
-    shapes : sequence of (m, n) float64
-        Of each spectrum, power of unit sizes.
+    The shapes (m, n) of each spectrum are the power of unit sizes.
     """
     power = np.concatenate([s.power for s in spectra])
     shape = np.concatenate(list(shapes), axis=1)

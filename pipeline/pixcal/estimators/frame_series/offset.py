@@ -89,10 +89,8 @@ def fringe_offsets(found: FringeEvidence, flat: F64) -> OffsetSeries | None:
 def offset_modes(every: Sequence[OffsetSeries], shapes: Sequence[F64]) -> Modes:
     """All series for `estimate_components`; offsets white and walking (e-², e-²/s) come first.
 
-    Parameters
-    ----------
-    shapes : sequence of (t, q) float64
-        Of each series, known changes of the offset; their coefficients, common to all, come first.
+    The coefficients of known changes (t, q) of the offset of each series, common to all, come
+    first.
     """
     widths = [s.nuisance.shape[1] for s in every]
     q = shapes[0].shape[1]

@@ -40,16 +40,10 @@ class Profiled:
 
 
 def best_shape(fit: Fit, trials: F64, steady: bool, start: Components | None = None) -> Profiled:
-    """The best of some values, and between them.
+    """The best of some values (n,), in equal steps of the logarithm, and between them.
 
-    Parameters
-    ----------
-    trials : (n,) float64
-        In equal steps of the logarithm.
-    steady : bool
-        Whether it is one of known shapes, whose likelihoods are compared without restriction.
-    start : Components, optional
-        Sizes at which known shapes are tried at first.
+    Likelihoods of a steady one, of known shapes, are compared without restriction; known shapes are
+    tried at first at the sizes of the start.
     """
 
     def high(found: Components) -> float:

@@ -109,14 +109,8 @@ def estimate_components(
 ) -> Components:
     """Sizes of the parts by restricted maximum likelihood.
 
-    Parameters
-    ----------
-    absent : sequence of int
-        Parts that are held at zero.
-    start : Components, optional
-        Of the same parts, to begin with.
-    steps : int
-        At most; with none the sizes are those of the start, and only the known shapes are fitted.
+    Parts that are ``absent`` are held at zero. After no steps the sizes are those of the start, and
+    only the known shapes are fitted.
     """
     free = np.ones(len(modes.parts), bool)
     free[list(absent)] = False
@@ -207,10 +201,7 @@ def _log_determinant(matrix: F64) -> float:
 def signed_sigmas(growth: float, size: float) -> float:
     """Standard deviations by which one part is there; negative where its size is below zero.
 
-    Parameters
-    ----------
-    growth : float
-        Of the log-likelihood when the part is let in.
+    From the growth of the log-likelihood when the part is let in.
     """
     return float(np.copysign(np.sqrt(max(2 * growth, 0.0)), size))
 
@@ -229,12 +220,7 @@ def log_chance(growth: float, pairs: int = 1) -> float:
 def joint_log_chance(full: Components, less: Components, sizes: F64) -> float:
     """Logarithm of the chance of two parts that are not there coming out as they did.
 
-    Parameters
-    ----------
-    full, less : Components
-        With the two parts and without.
-    sizes : (2,) float64
-        Of the two, in ``full``.
+    From fits with and without them, and their sizes (2,) in the former.
     """
     growth = full.likelihood - less.likelihood
     # One time in four both come out below nothing.

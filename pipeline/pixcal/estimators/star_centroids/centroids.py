@@ -104,20 +104,11 @@ class Star:
         return np.asarray(np.sqrt(np.mean([self.bound(p) ** 2 for p in places], axis=0)))
 
     def weights(self, place: F64, good: Good | None = None) -> F64:
-        """Change of the fitted centroid per displacement of each pixel.
+        """Error of the fitted centroid (x, y) per displacement (x, y) of each pixel.
 
-        Parameters
-        ----------
-        place : (2,) float64
-            Of the star from the middle of its pixel, (x, y), px.
-        good : (side, side) bool, optional
-            Pixels that the fit uses; all by default.
-
-        Returns
-        -------
-        (2, 2, side, side) float64
-            Error of the centroid (x, y) for each pixel's displacement (x, y) that the fit does not
-            know; a displacement common to all moves the centroid by its opposite.
+        The fit does not know of them; one common to all moves the centroid by its opposite. (2, 2,
+        side, side), for a star so far (x, y) from the middle of its pixel, px, fitted with all or
+        the good pixels.
         """
         jacobian, weight, slopes = self._of_pixels(place, good)
         covariance = np.linalg.inv(np.einsum("iyx,jyx,yx->ij", jacobian, jacobian, weight))
