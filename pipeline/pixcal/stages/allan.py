@@ -55,7 +55,6 @@ NOISE_LEVELS = (np.arange(64) + 0.5) / 64
 Range = tuple[int, int]
 Tile = tuple[Range, Range]
 
-
 Config = Allan
 
 

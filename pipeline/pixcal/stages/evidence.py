@@ -20,7 +20,6 @@ from pixcal.storage.stage import read_acquisition, require
 # rows and columns of the window: ((y0, y1), (x0, x1))
 Part = tuple[tuple[int, int], tuple[int, int]]
 
-
 MAX_SAMPLES = 1 << 26  # samples of a set that are taken into memory (some ten bytes each)
 
 

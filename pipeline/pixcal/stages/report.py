@@ -57,7 +57,6 @@ from pixcal.storage.stage import copy_products, make, require, working
 SHOWN_STAGES = ("ingest", "reduce", "sweep", "fit", "allan", "diagnose", "corrected")
 FIGURE_BYTES = 192 << 20  # Matplotlib, one figure and the page
 
-
 STAGE = STAGES["report"]
 Config = Report
 

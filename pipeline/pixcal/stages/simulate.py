@@ -65,9 +65,7 @@ _BYTES_PER_COMPRESSED_SAMPLE = 10
 
 _MJD_EPOCH = datetime(1858, 11, 17)
 
-
 Config = Simulate
-
 
 Effects = tuple[Effect, ...]
 

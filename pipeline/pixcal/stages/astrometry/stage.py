@@ -71,7 +71,6 @@ _BYTES_PER_FITTED_MODE = 28
 # peak of a task of the stars, for each pixel of a star's windows (measured)
 _BYTES_PER_WINDOW_PIXEL = 200
 
-
 STAGE = STAGES["astrometry"]
 Config = Astrometry
 

@@ -48,7 +48,6 @@ SAMPLE_BYTES = 2  # of a sample as a camera writes it
 MARGIN = 4.0  # standard deviations that the brightest fringe should keep below the end of the range
 DOMINANT = 1.5  # a factor of the frames below this does not limit a set: photons do
 
-
 Config = Budget
 
 

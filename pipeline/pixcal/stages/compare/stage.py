@@ -46,7 +46,6 @@ FEWEST = 50  # pixels in common that are needed
 PARALLEL_DEG = 10.0  # axes of single sets that differ by more have nothing in common
 NOTED_DEG = 0.5  # from here on it is said that the axes differ
 
-
 Config = Compare
 
 

@@ -45,7 +45,6 @@ from pixcal.storage.stage import make, require
 
 Json = dict[str, Any]
 
-
 Config = Fit
 
 

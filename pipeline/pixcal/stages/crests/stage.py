@@ -65,7 +65,6 @@ FIGURE_BYTES = 128 << 20  # Matplotlib and one figure
 
 Range = tuple[int, int]
 
-
 Config = Crests
 
 
