@@ -2,7 +2,7 @@
 
 And ``pixcal/__init__.pyi``, from the options of the commands.
 
-A page names what follows: ``<!-- commands -->`` the help of all commands, to its end;
+A page names what follows: ``<!-- commands: run fit -->`` the help of commands, to its end;
 ``<!-- file: examples/glow.py -->`` a fenced block; ``<!-- keys: SimulatedOptics -->`` a table, of
 the parameters of an effect as well; ``<!-- effects -->`` that of all effects, as they act.
 """
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import typing
+from collections.abc import Sequence
 from pathlib import Path
 
 import click
@@ -33,7 +34,7 @@ from pixcal_cli.main import cli
 
 DOCS = Path(__file__).parents[1] / "docs"
 LAYERS = DOCS / "pictures" / "layers.svg"
-COMMANDS = re.compile(r"(<!-- commands -->\n).*\Z", re.DOTALL)
+COMMANDS = re.compile(r"(<!-- commands: ([\w ]+) -->\n).*\Z", re.DOTALL)
 FILES = re.compile(r"(<!-- file: (.+?) -->\n\n```[^\n]*\n).*?(```\n)", re.DOTALL)
 TABLES = re.compile(r"(<!-- keys: (\w+) -->\n\n)(?:\|.*\n)*")
 EFFECTS = re.compile(r"(<!-- effects -->\n\n)(?:\|.*\n)*")
@@ -71,10 +72,12 @@ def commands_of(group: click.Group = cli, words: str = "pixcal") -> list[str]:
     return found
 
 
-def help_of_all() -> str:
-    """A section for each command."""
+def help_of(names: Sequence[str]) -> str:
+    """A section for each command and those below it."""
     sections = []
     for words in commands_of():
+        if words.split()[1] not in names:
+            continue
         more = f"{SEE[words]}\n\n" if words in SEE else ""
         sections.append(f"\n## {words}\n\n{more}```text\n{help_text(words).rstrip()}\n```\n")
     return "".join(sections)
@@ -124,7 +127,7 @@ def _default(value: object) -> str:
 
 def filled(text: str) -> str:
     """A page with its marked blocks and tables as they should be."""
-    text = COMMANDS.sub(lambda found: found[1] + help_of_all(), text)
+    text = COMMANDS.sub(lambda found: found[1] + help_of(found[2].split()), text)
     text = FILES.sub(lambda found: found[1] + _content(found[2]) + found[3], text)
     text = EFFECTS.sub(lambda found: found[1] + effect_table(), text)
     return TABLES.sub(lambda found: found[1] + key_table(found[2]), text)

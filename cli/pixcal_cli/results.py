@@ -236,7 +236,8 @@ def show_diagnosis(run: Path) -> None:
         for entry in gap["where"][:MOST_ROWS]
     ]
     if rows:
-        show_table(("statistic", "where", "measured", "nominal", "with causes", "sigma"), rows)
+        columns = ("statistic", "where", "measured", "nominal", "with causes", "significance σ")
+        show_table(columns, rows)
         if len(gap["where"]) > MOST_ROWS:
             click.echo(f"  and {len(gap['where']) - MOST_ROWS} more in diagnosis.json")
     if diagnosis["more_would_tell"]:

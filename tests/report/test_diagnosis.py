@@ -231,7 +231,7 @@ def test_causes_come_with_their_numbers() -> None:
     assert "residual gap is 3.0\u00a0% (90\u00a0% interval 1.0 to 6.0\u00a0%)" in shown.answer
     assert [row[:4] for row in table(shown, "Causes").rows] == [
         ["1. what lag is (lag)", "80\u00a0% [75, 83]", "61\u00a0%", "< 10⁻¹²"],
-        ["2. what mine is (mine)", "20\u00a0% [75, 83]", "5.0\u00a0%", "3.0 × 10⁻⁴"],
+        ["2. what mine is (mine)", "20\u00a0% [75, 83]", "5.0\u00a0%", "3.0\u00a0×\u00a010⁻⁴"],
     ]
     assert "Charge stays. Evidence: frames follow others." in text_of(shown)
     assert list(table(shown, "Parameters of lag").rows) == [
@@ -298,7 +298,7 @@ def test_values_that_hardly_differ_are_shown_with_the_digits_that_tell() -> None
     shown = diagnosis(contents(a_diagnosis(curves=(curve,))))
     (row,) = table(shown, "Statistics that differ").rows
     assert row[3:5] == ["1.00120 px", "1.00070"]
-    assert row[5] == "+9.0"
+    assert row[5] == "9.0"
 
 
 @pytest.mark.usefixtures("without_figures")
@@ -316,8 +316,8 @@ def test_what_remains_is_named_and_what_is_new_is_a_warning() -> None:
     assert "31\u00a0% (90\u00a0% interval 25 to 36\u00a0%), mostly in time, " in shown.answer
     rest = table(shown, "Statistics that still differ")
     assert [row[1] for row in rest.rows] == ["title of stays", "title of new"]
-    assert rest.rows[0][-2:] == ["+8.0", "79\u00a0%"]
-    assert rest.rows[1][-2:] == ["−6.0", "new"]
+    assert rest.rows[0][-2:] == ["8.0", "79\u00a0%"]
+    assert rest.rows[1][-2:] == ["5.0", "new"]
     assert "Of these, 1 did not differ before" in text_of(shown)
 
 

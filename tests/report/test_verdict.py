@@ -1,5 +1,6 @@
 """The verdict: numbers as they are, and worries where there is cause."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -136,3 +137,16 @@ def test_warnings_are_sentences_and_worries_come_first() -> None:
         (f.level for f in found), key=("bad", "check", "good").index
     )
     assert "The lamp flickers." in [f.text for f in found]
+
+
+def test_a_finding_on_several_sets_is_one_sentence() -> None:
+    one = contents({"sigma_median_px": 2.6e-4, "fringe_vector_moves": True})
+    other = contents({"sigma_median_px": 2.8e-4, "fringe_vector_moves": True})
+    both = replace(one, sets=(one.sets[0], replace(other.sets[0], name="other")))
+    texts = [f.text for f in findings(both)]
+    assert (
+        "All sets: the fringe vector varies from frame to frame; it was fitted in each frame."
+    ) in texts
+    (bound,) = (text for text in texts if "Cramér–Rao" in text)
+    assert bound.endswith("1.300 for s and 1.400 for other.")
+    assert len(texts) == len(findings(one))

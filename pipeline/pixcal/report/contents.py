@@ -121,12 +121,14 @@ class DiagnosisContents:
     """What ``pixcal diagnose`` found."""
 
     facts: dict[str, Any]  # `diagnosis.json`
-    # `curves.json`: each statistic as measured, as simulated, and with the effects
+    # of `curves.json`: each statistic as measured, as simulated, and with the effects
     curves: Sequence[dict[str, Any]]
     # words for effects, by name; of those that are not known there are none
     effects: Mapping[str, EffectWords]
-    # significance (sigma) from which a statistic counts as different, given how many are tested
+    # significance (sigma) from which a statistic counts as different; that of the curves allows
+    # for how many were tested
     noticed: float
+    settled: bool = False  # whether no cause asks for anything to be done
 
 
 @dataclass(frozen=True)

@@ -184,8 +184,8 @@ def worst_of_each_domain(curves: Sequence[Facts]) -> tuple[list[Facts], list[Fac
 
 def statistics(title: str, curves: Sequence[Facts], causes: Any) -> Table:
     """A row for each statistic: its worst value, measured and simulated."""
-    after = ["with causes", "σ", "residual"] if causes else []
-    header = ["domain", "statistic", "where", "measured", "nominal", "σ", *after]
+    after = ["with causes", "significance (σ)", "residual"] if causes else []
+    header = ["domain", "statistic", "where", "measured", "nominal", "significance (σ)", *after]
     return Table(title, header, [_row(c, bool(causes)) for c in curves])
 
 
@@ -200,12 +200,12 @@ def _row(curve: Facts, causes: bool) -> list[str]:
         of + place(curve, at),
         f"{number(measured, digits)} {unit(curve['unit'])}".strip(),
         number(nominal, digits),
-        _sigma(curve["z"][at]),
+        f"{curve['significance']:.1f}",
     ]
     if causes:
         left = percent(curve["left"]) if curve["in_gap"] else "new"
         after = number(curve["with_effects"]["value"][at], digits)
-        row += [after, _sigma(curve["z_after"][at]), left]
+        row += [after, f"{curve['significance_after']:.1f}", left]
     return row
 
 

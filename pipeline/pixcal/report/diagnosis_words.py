@@ -55,9 +55,13 @@ def effect_title(diagnosis: DiagnosisContents, name: str) -> str:
     return f"{title} ({name})" if title else name
 
 
-def level(verdict: str) -> str:
-    """Severity of a verdict; a cause that was identified still affects the data."""
-    return {"no gap": "good", "unexplained": "bad"}.get(verdict, "check")
+def level(diagnosis: DiagnosisContents) -> str:
+    """Severity of a verdict; causes that were identified may ask for something to be done."""
+    verdict = diagnosis.facts["verdict"]
+    if verdict == "unexplained":
+        return "bad"
+    settled = verdict == "no gap" or (verdict == "explained" and diagnosis.settled)
+    return "good" if settled else "check"
 
 
 def answer(diagnosis: DiagnosisContents) -> str:

@@ -45,7 +45,8 @@ def unit_for(values: Any, name: str) -> Unit:
     top = float(np.max(finite[np.isfinite(finite)], initial=0.0))
     if top == 0 or top >= 0.1:
         return Unit(1.0, name)
-    return Unit(1e3, f"10⁻³ {name}") if top >= 1e-4 else Unit(1e6, f"10⁻⁶ {name}")
+    factor, power = (1e3, "10⁻³") if top >= 1e-4 else (1e6, "10⁻⁶")
+    return Unit(factor, f"{power} {name}".rstrip())
 
 
 @dataclass(frozen=True)

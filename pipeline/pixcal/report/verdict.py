@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pixcal.report.contents import Contents, DiagnosisContents, SetContents
-from pixcal.report.diagnosis_words import level, residual_gap
+from pixcal.report.diagnosis_words import level, listed, residual_gap
 from pixcal.report.text import NAMES, duration, number, share, with_error
 
 TARGET_PX = 5e-5  # target precision of a calibration (paper, section 4.2)
@@ -82,7 +82,7 @@ def cards(contents: Contents) -> Iterator[Card]:
     for offset in contents.offsets:
         sigma, spread = offset.sigma.median, number(offset.delta.robust_std, 3)
         yield Card(
-            f"median σ of {NAMES[offset.name]}",
+            f"median σ of {NAMES[offset.name]}, as fitted",
             f"{number(sigma, 3)} px",
             f"{number(sigma * contents.pitch_um * 1e3, 3)} nm; rms of the offsets: {spread} px",
             GOOD if np.isfinite(sigma) else BAD,
@@ -116,7 +116,7 @@ def _diagnosis_card(diagnosis: DiagnosisContents) -> Card:
     verdict, gap = diagnosis.facts["verdict"], diagnosis.facts["gap"]
     causes = ", ".join(c["effect"] for c in diagnosis.facts["causes"])
     detail = "no significant difference" if verdict == "no gap" else f"The {residual_gap(gap)}"
-    return Card("diagnosis", verdict, f"{causes}. {detail}" if causes else detail, level(verdict))
+    return Card("diagnosis", verdict, f"{causes}. {detail}" if causes else detail, level(diagnosis))
 
 
 def _bound_card(sets: Sequence[SetContents]) -> Card:
@@ -169,8 +169,7 @@ def findings(contents: Contents) -> list[Finding]:
         made.append((CHECK, "there are no flat frames: the flat is taken as 1 everywhere"))
     if contents.has_fringes and not contents.sets:
         made.append((CHECK, "the fit has not been run: there are no maps of offsets yet"))
-    for s in contents.sets:
-        made += [(level, f"set {s.name}: {text}") for level, text in _of_set(s.facts, s.allan)]
+    made += _of_sets(contents.sets)
     consistency = (contents.fit or {}).get("sets_chi2_reduced")
     if consistency is not None:
         words = "fringe sets that measure the same offsets"
@@ -189,22 +188,41 @@ def _sentence(text: str) -> str:
     return text[:1].upper() + text[1:].rstrip(".") + "."
 
 
-Said = Iterator[tuple[str, str]]  # severity and sentence
+# severity, sentence with a `{}` for each value, and the values
+Said = Iterator[tuple[str, str, *tuple[str, ...]]]
+
+
+def _of_sets(sets: Sequence[SetContents]) -> Iterator[tuple[str, str]]:
+    """Findings on all fringe sets, each sentence once."""
+    said: dict[tuple[str, str], dict[str, tuple[str, ...]]] = {}
+    for s in sets:
+        for severity, text, *values in _of_set(s.facts, s.allan):
+            said.setdefault((severity, text), {})[s.name] = tuple(values)
+    for (severity, text), by_set in said.items():
+        columns = list(zip(*by_set.values(), strict=True))
+        alike = all(len(set(column)) == 1 for column in columns)
+        for n, column in enumerate(columns):
+            each = [f"{v} for {name}" for name, v in zip(by_set, column, strict=True)]
+            columns[n] = column if alike else (listed(each),)
+        text = text.format(*(column[0] for column in columns)) if columns else text
+        names = "all sets" if len(by_set) == len(sets) > 1 else f"set {', '.join(by_set)}"
+        yield severity, f"{names}: {text}" if alike else text
 
 
 def _of_set(facts: dict[str, Any], allan: dict[str, Any] | None) -> Said:
     ratio = _ratio(facts.get("sigma_median_px"), facts.get("crb_median_px"))
     if ratio is not None:
-        frames = f"its {number(facts.get('frames'))} frames"
-        level = _bound_level(ratio)
-        yield level, f"the errors are {number(ratio, 4)} times the Cramér–Rao bound of {frames}"
+        text = "errors over the Cramér–Rao bound of the same frames: {}"
+        yield _bound_level(ratio), text, number(ratio, 4)
     scale = facts.get("sigma_scale")
     if scale is not None and abs(scale - 1) > 0.02:
         yield (
             _level(abs(scale - 1), 0.02, 0.3),
-            f"the variance of the residuals is {number(scale**2, 4)} times that of the declared "
-            f"noise; all errors were multiplied by {number(scale, 4)}. The gain or the read noise "
-            "may be wrong, or the model incomplete",
+            "variance of the residuals over that of the declared noise: {}; all errors were "
+            "multiplied by its root, {}. The gain or the read noise may be wrong, or the model "
+            "incomplete",
+            number(scale**2, 4),
+            number(scale, 4),
         )
     if facts.get("period_note"):
         yield CHECK, facts["period_note"]
@@ -220,8 +238,10 @@ def _of_set(facts: dict[str, Any], allan: dict[str, Any] | None) -> Said:
 
 def _of_geometry(facts: dict[str, Any]) -> Said:
     """Why the fringes are hyperbolic, and whether the fitted bench geometry is plausible."""
-    why = f" ({facts['evidence']})" if facts.get("evidence") else ""
-    yield GOOD, f"the fringes were fitted as hyperbolic{why}"
+    if facts.get("evidence"):
+        yield GOOD, "the fringes were fitted as hyperbolic: {}", facts["evidence"]
+    else:
+        yield GOOD, "the fringes were fitted as hyperbolic"
     geometry = facts.get("geometry", {})
     for axis in ("x", "y"):
         centre = geometry.get(f"centre_{axis}_mm")
@@ -230,10 +250,11 @@ def _of_geometry(facts: dict[str, Any]) -> Said:
             continue
         yield (
             CHECK,
-            f"the fit places the fibres {number(abs(centre - nominal))} mm from their nominal "
-            f"position along {axis}. If the bench is better aligned than that, smooth structure "
-            "of the detector (steps between stitched blocks) was fitted as curvature of the "
-            "fringes: fit with --model paraxial and compare",
+            f"the fit places the fibres {{}} from their nominal position along {axis}. If the "
+            "bench is better aligned than that, smooth structure of the detector (steps between "
+            "stitched blocks) was fitted as curvature of the fringes: fit with --model paraxial "
+            "and compare",
+            f"{number(abs(centre - nominal))} mm",
         )
 
 
@@ -249,14 +270,15 @@ def _of_allan(measured: dict[str, Any] | None) -> Said:
     if (knee := measured.get("knee_frames")) is not None:
         yield (
             CHECK,
-            f"beyond {number(round(knee))} frames the Allan deviation no longer falls {law}: the "
-            "bench or the detector drifts",
+            f"beyond {{}} the Allan deviation no longer falls {law}: the bench or the detector "
+            "drifts",
+            f"{number(round(knee))} frames",
         )
     elif _slope_is_white(measured):
         yield GOOD, f"the Allan deviation falls {law}, over all averaging lengths"
     else:
         slope = with_error(measured["slope"], measured.get("slope_err"))
-        yield CHECK, f"the Allan deviation falls with slope {slope}, not −0.5"
+        yield CHECK, "the Allan deviation falls with slope {}, not −0.5", slope
 
 
 def _of_target(facts: dict[str, Any]) -> Said:
@@ -273,8 +295,8 @@ def _of_target(facts: dict[str, Any]) -> Said:
     time = f" ({duration(needed * pace)} at this rate)" if pace else ""
     yield (
         GOOD,
-        f"the target of {target} needs {number(needed, 2)} frames{time}, if the square-root law "
-        "holds that long",
+        f"the target of {target} needs {{}}, if the square-root law holds that long",
+        f"{number(needed, 2)} frames{time}",
     )
 
 

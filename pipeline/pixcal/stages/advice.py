@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from pixcal.effects import known_effects, parse_effects
-from pixcal.model.errors import InputError
-from pixcal.stages.treatment import SUFFIX, treatment_of
+from pixcal.effects import known_effects
+from pixcal.report.text import number, with_error
+from pixcal.stages.treatment import SUFFIX, fitted_shapes, treatment_of_kind
 from pixcal.storage.artefact import MANIFEST, read_json
 from pixcal.storage.stage import require
 
@@ -27,6 +27,7 @@ class Advice:
 
     sentences: tuple[str, ...]  # which maps to use, and what limits them; none without maps
     rows: tuple[tuple[str, str, str, str], ...]  # a row for each cause, under `HEADER`
+    settled: bool = True  # whether no cause asks for anything to be done
 
 
 def advice(run_dir: Path) -> Advice:
@@ -38,12 +39,18 @@ def advice(run_dir: Path) -> Advice:
     diagnosis = _artefact(run_dir, "diagnose", "diagnosis.json")
     correction = _correction(run_dir)
     sigma = _sigma(fit, correction)
-    rows = tuple(_row(c, correction, sigma) for c in (diagnosis["causes"] if diagnosis else ()))
+    causes = diagnosis["causes"] if diagnosis else ()
+    shapes = fitted_shapes(run_dir)
+    rows = tuple(
+        (c["effect"], size_of(c), _moved(c, sigma), _action(c, correction, shapes, bool(sigma)))
+        for c in causes
+    )
+    settled = all(_settled(c, correction, bool(sigma)) for c in causes)
     if not fit["outputs"]:
-        return Advice((), rows)
+        return Advice((), rows, settled)
     names = " and ".join(path.name for path in maps_to_use(run_dir).values())
     use = f"Use {names}{_as_what(diagnosis, correction)}."
-    return Advice((use, _limit(sigma, diagnosis, correction)), rows)
+    return Advice((use, _limit(sigma, diagnosis, correction)), rows, settled)
 
 
 def maps_to_use(run_dir: Path) -> dict[str, Path]:
@@ -108,7 +115,7 @@ def _limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json 
     """What limits the maps: the largest bias, or noise."""
     made = correction if correction is not None and correction["outputs"] else None
     least = min(sigma.values(), default=math.nan)
-    noise = ", ".join(f"{s:.2g} px ({name})" for name, s in sigma.items())
+    noise = ", ".join(f"{number(s, 2)} px ({name})" for name, s in sigma.items())
     biases = {
         cause["effect"]: _on_map(cause)["rms_px"]
         for cause in (diagnosis or {}).get("causes", ())
@@ -116,10 +123,8 @@ def _limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json 
     }
     largest = max(biases, key=lambda name: biases[name], default="")
     if biases.get(largest, 0.0) > MATTERS * least:
-        return (
-            f"Limited by {largest}, which moves offsets by {biases[largest]:.2g} px rms; the "
-            f"noise is {noise}."
-        )
+        moved = f"{number(biases[largest], 2)} px rms"
+        return f"Limited by {largest}, which moves offsets by {moved}; the noise is {noise}."
     if diagnosis is not None and diagnosis["verdict"] in ("unexplained", "partly explained"):
         return (
             f"The noise is {noise}. Part of the gap has no known cause, so the maps may be biased."
@@ -129,20 +134,9 @@ def _limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json 
     if kept > MATTERS * least:
         return (
             f"Limited by noise, {noise}, which includes the error of the correction, up to "
-            f"{kept:.2g} px rms."
+            f"{number(kept, 2)} px rms."
         )
     return f"Limited by photon and read noise: {noise}. More frames reduce it."
-
-
-def _row(
-    cause: Json, correction: Json | None, sigma: Mapping[str, float]
-) -> tuple[str, str, str, str]:
-    return (
-        cause["effect"],
-        size_of(cause),
-        _moved(cause, sigma),
-        _action(cause, correction, bool(sigma)),
-    )
 
 
 def _moved(cause: Json, sigma: Mapping[str, float]) -> str:
@@ -150,38 +144,54 @@ def _moved(cause: Json, sigma: Mapping[str, float]) -> str:
     if not sigma:
         return "no maps"
     rms, most = _on_map(cause)["rms_px"], _on_map(cause)["max_px"]
-    return (
-        f"{rms:.2g} px rms ({rms / min(sigma.values()):.2g} σ), {most:.2g} max" if rms else "none"
-    )
+    if not rms:
+        return "none"
+    in_sigma = number(rms / min(sigma.values()), 2)
+    return f"{number(rms, 2)} px rms ({in_sigma} σ), {number(most, 2)} px maximum"
 
 
-def _action(cause: Json, correction: Json | None, with_maps: bool) -> str:
+def _treated(cause: Json, correction: Json | None) -> Json | None:
+    """Entry of an effect in the correction, where there is one."""
+    entries = (correction or {}).get("effects", ())
+    return next((e for e in entries if e["effect"] == cause["effect"]), None)
+
+
+def _settled(cause: Json, correction: Json | None, with_maps: bool) -> bool:
+    """Whether nothing remains to be done about an effect."""
+    action, treated = _on_map(cause)["action"], _treated(cause, correction)
+    done = not with_maps or (treated is not None and _corrects(treated["treatment"]))
+    return bool(action == "unaffected" or (action == "corrected" and done))
+
+
+def _action(
+    cause: Json, correction: Json | None, shapes: tuple[str, Mapping[str, str]], with_maps: bool
+) -> str:
     """How an effect was treated, or what to do about it."""
-    action = _on_map(cause)["action"]
-    treated = {e["effect"]: e for e in (correction or {}).get("effects", ())}.get(cause["effect"])
-    why = treated["why"] if treated else _reason(cause)
-    if not with_maps and action in ("corrected", "unaffected"):
-        ends = "corrected for it" if action == "corrected" else f"unaffected: {why}"
-        text = f"maps of offsets measured with this detector would be {ends}"
-    elif action == "corrected":
-        done = treated is not None and _corrects(treated["treatment"])
-        text = "maps corrected" if done else "NOT corrected: run 'pixcal fit RUN --with-diagnosis'"
+    action, treated = _on_map(cause)["action"], _treated(cause, correction)
+    why = treated["why"] if treated else _reason(cause["effect"], *shapes)
+    because = f": {why}" if why else ""
+    if action == "corrected":
+        if not with_maps:
+            text = "maps of offsets measured with this detector would be corrected for it"
+        elif _settled(cause, correction, with_maps):
+            text = "maps corrected"
+        else:
+            text = "NOT corrected: run 'pixcal fit RUN --with-diagnosis'"
     elif action == "unaffected":
-        text = f"maps unaffected: {why}"
+        maps = "maps" if with_maps else "maps of offsets measured with this detector would be"
+        text = f"{maps} unaffected{because}"
     else:
-        text = f"{action.replace('fix the', 'fix on the')}: {why}" if why else str(action)
+        text = action.replace("fix the", "fix on the") + because
     if cause.get("would_decide"):
         others = " or ".join(cause["not_told_apart_from"])
         text += f"; to distinguish it from {others}, retake with {', '.join(cause['would_decide'])}"
     return text
 
 
-def _reason(cause: Json) -> str:
-    try:
-        (effect,) = parse_effects({cause["effect"]: cause["parameters"]}, "diagnosis")
-    except InputError:
-        return ""  # An effect of the user's own.
-    return treatment_of(effect, "auto", {}).why
+def _reason(effect: str, model: str, models: Mapping[str, str]) -> str:
+    """Why an effect is treated as it is; nothing on an effect of the user's own."""
+    kind = known_effects().get(effect)
+    return treatment_of_kind(kind, model, models)[1] if kind else ""
 
 
 def size_of(cause: Json) -> str:
@@ -206,26 +216,32 @@ def _strength(cause: Json, name: str, unit: str) -> str:
     if not isinstance(value, Sequence) or not value:
         return ""
     if isinstance(value[0], Mapping):
-        return _parts(name, value, unit)
+        if "value" not in value[0]:
+            return _parts(name, value)
+        axis = "" if name.endswith("tracks") else label
+        return f"{axis}{_replay(value, unit)}"
     numbers = [abs(v) for v in value if isinstance(v, int | float)]
     return f"{label}up to {_measured(max(numbers), None, unit)}" if any(numbers) else ""
 
 
 def _measured(value: float, error: float | None, unit: str) -> str:
-    scale, unit = (100, "%") if not unit else (1, unit)
-    more = f" ± {scale * error:.2g}" if error else ""
-    return f"{scale * value:.3g}{more} {unit}"
+    scale, unit = (100, "%") if not unit else (1, unit.replace("e-", "e⁻"))
+    text = with_error(scale * value, scale * error) if error else number(float(scale * value))
+    return f"{text} {unit}"
 
 
-def _parts(name: str, parts: Sequence[Json], unit: str) -> str:
-    """Size of a list of like parts; of a replay, which has a value for each frame, the rms."""
-    if "value" in parts[0]:
-        values = [float(v) for part in parts for v in part["value"]]
-        rms = math.hypot(*values) / math.sqrt(max(len(values), 1))
-        return f"{_measured(rms, None, unit)} rms, frame by frame"
+def _replay(tracks: Sequence[Json], unit: str) -> str:
+    """The rms of a change that has a value for each frame."""
+    values = [float(v) for track in tracks for v in track["value"]]
+    rms = math.hypot(*values) / math.sqrt(max(len(values), 1))
+    return f"{_measured(rms, None, unit)} rms, frame by frame"
+
+
+def _parts(name: str, parts: Sequence[Json]) -> str:
+    """How many parts there are and the largest share; nothing where they have none."""
     largest = max(map(_share, parts))
-    number = f"{len(parts)} {name if len(parts) > 1 else name.removesuffix('s')}"
-    return f"{number}, largest {100 * largest:.2g} %" if largest else number
+    number_of = f"{len(parts)} {name if len(parts) > 1 else name.removesuffix('s')}"
+    return f"{number_of}, largest {100 * largest:.2g} %" if largest else ""
 
 
 def _share(part: Json) -> float:

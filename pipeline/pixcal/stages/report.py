@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import log_ndtr
 
 from pixcal.effects import effects
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.diagnosis.gap import CHANCE, sigmas_of
+from pixcal.estimators.diagnosis.gap import CHANCE, sigmas_among, sigmas_of
 from pixcal.model.config import result_options
 from pixcal.model.options import Report
 from pixcal.report.contents import (
@@ -122,7 +123,11 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
             for name, of_set in (fit["sets"].items() if fit else ())
         ),
         flags=results.get("flags/products"),
-        diagnosis=_diagnosis(run_dir / "diagnose") if "diagnose" in manifests else None,
+        diagnosis=(
+            _diagnosis(run_dir / "diagnose", settled=summary.settled)
+            if "diagnose" in manifests
+            else None
+        ),
         warnings=_warnings(manifests, facts),
         advice=summary.sentences,
         causes=(HEADER, *summary.rows) if summary.rows else (),
@@ -221,11 +226,14 @@ def _set(
 # The diagnosis
 
 
-def _diagnosis(folder: Path) -> DiagnosisContents:
+def _diagnosis(folder: Path, *, settled: bool) -> DiagnosisContents:
     facts, curves = read_json(folder / "diagnosis.json"), read_json(folder / "curves.json")
-    chance = np.log(CHANCE / max(facts["statistics"], 1))
+    for curve in curves:
+        # In the file the significance is that of the statistic by itself.
+        for key in ("significance", "significance_after"):
+            curve[key] = sigmas_among(float(log_ndtr(-curve[key])), facts["statistics"])
     words = {name: _effect_words(kind) for name, kind in effects().items()}
-    return DiagnosisContents(facts, curves, words, sigmas_of(chance))
+    return DiagnosisContents(facts, curves, words, sigmas_of(np.log(CHANCE)), settled)
 
 
 def _effect_words(kind: type[Effect]) -> EffectWords:

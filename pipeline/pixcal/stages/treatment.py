@@ -10,6 +10,7 @@ from pixcal.model.arrays import F64
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
+from pixcal.storage.artefact import MANIFEST, read_json
 
 # the shape of fringes (`pixcal.estimators.fringe_fit.models`) beside straight ones
 HYPERBOLIC = "hyperbolic"
@@ -144,17 +145,28 @@ def treatments(
     effects = []
     for origin, name, parameters, errors in entries:
         (effect,) = parse_effects({name: parameters}, str(where), known)
-        effects.append(Treatment(effect, origin, errors, *_treated(effect, model, models)))
+        effects.append(
+            Treatment(effect, origin, errors, *treatment_of_kind(type(effect), model, models))
+        )
     return Treatments(tuple(effects))
 
 
 def treatment_of(effect: Effect, model: str, models: Mapping[str, str]) -> Treatment:
     """What to do about an effect that a diagnosis found; parameters as in `treatments`."""
-    return Treatment(effect, "diagnosis", {}, *_treated(effect, model, models))
+    return Treatment(effect, "diagnosis", {}, *treatment_of_kind(type(effect), model, models))
 
 
-def _treated(effect: Effect, model: str, models: Mapping[str, str]) -> tuple[str, str]:
-    kind = type(effect)
+def fitted_shapes(run_dir: Path) -> tuple[str, Mapping[str, str]]:
+    """Shape of the fringes that was asked for, and the one fitted to each set."""
+    if not (run_dir / "fit" / MANIFEST).exists():
+        return "auto", {}
+    sets = read_json(run_dir / "fit" / "fit.json")["sets"]
+    asked = read_json(run_dir / "fit" / MANIFEST)["config"].get("model", "auto")
+    return asked, {name: facts["model"] for name, facts in sets.items()}
+
+
+def treatment_of_kind(kind: type[Effect], model: str, models: Mapping[str, str]) -> tuple[str, str]:
+    """How a kind of effect is treated, and why; parameters as in `treatments`."""
     if kind.undo is not Effect.undo:
         return "undone on maps", "it acts on the three maps of a fit alike"
     if kind.undo_samples is not Effect.undo_samples:

@@ -248,6 +248,11 @@ def sigmas_of(log_chance: float) -> float:
     return float(-ndtri_exp(min(log_chance, -1e-300)))
 
 
+def sigmas_among(log_chance: float, tested: int) -> float:
+    """Significance (sigma) of one of several statistics tested, given its own log chance."""
+    return max(sigmas_of(log_chance + float(np.log(max(tested, 1)))), 0.0)
+
+
 def log_likelihood(data: Mapping[Key, F64], expected: Expectation) -> float:
     """Logarithm of the chance density (Student's) of the data, of all curves together."""
     return sum(_log_density(data[key], expected, key) for key in expected.mean if key in data)

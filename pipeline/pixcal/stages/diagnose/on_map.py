@@ -1,6 +1,6 @@
 """What each cause does to the map of offsets: how far it moves them, and what is to be done."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,7 @@ from pixcal.model.arrays import F64
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.diagnose.nominal import FittedSet
 from pixcal.stages.diagnose.undone import undone_on_samples
-from pixcal.stages.treatment import treatment_of
-from pixcal.storage.artefact import MANIFEST, read_json
+from pixcal.stages.treatment import fitted_shapes, treatment_of
 
 
 def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str, Any]:
@@ -31,7 +30,7 @@ def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str
     run_dir : Path
         Whose fit tells the shape of the fringes that was fitted.
     """
-    action = treatment_of(effect, *_shapes(run_dir)).action
+    action = treatment_of(effect, *fitted_shapes(run_dir)).action
     square, count, most = 0.0, 0, 0.0
     for fit in fits if action != "unaffected" else ():
         change = _change(effect, fit)
@@ -40,15 +39,6 @@ def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str
         most = max(most, float(np.max(np.abs(change), initial=0.0)))
     rms = float(np.sqrt(square / count)) if count else 0.0
     return {"rms_px": _rounded(rms), "max_px": _rounded(most), "action": action}
-
-
-def _shapes(run_dir: Path) -> tuple[str, Mapping[str, str]]:
-    """Shape of the fringes that was asked for, and the one fitted to each set."""
-    if not (run_dir / "fit" / MANIFEST).exists():
-        return "auto", {}
-    sets = read_json(run_dir / "fit" / "fit.json")["sets"]
-    asked = read_json(run_dir / "fit" / MANIFEST)["config"].get("model", "auto")
-    return asked, {name: facts["model"] for name, facts in sets.items()}
 
 
 def _change(effect: Effect, fit: FittedSet) -> F64:

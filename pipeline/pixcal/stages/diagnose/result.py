@@ -13,6 +13,7 @@ from pixcal.estimators.diagnosis.gap import (
     Reference,
     flagged,
     likelier,
+    sigmas_among,
     sigmas_of,
 )
 from pixcal.estimators.diagnosis.test_statistics import DETECTOR, Curve, Key
@@ -108,9 +109,7 @@ def by_domain(
     for domain in DOMAINS:
         keys = [k for k in before if statistic_named(k[0]).domain == domain]
         found[domain] = [
-            _rounded(max(sigmas_of(min(one[k].log_chance for k in keys) + np.log(len(keys))), 0.0))
-            if keys
-            else 0.0
+            _rounded(sigmas_among(min(one[k].log_chance for k in keys), len(keys))) if keys else 0.0
             for one in (before, after)
         ]
     return found
@@ -274,8 +273,6 @@ def _where(final: Shrinkage, curves: Mapping[Key, dict[str, Any]]) -> list[dict[
 def _entry(key: Key, final: Shrinkage, curve: Mapping[str, Any]) -> dict[str, Any]:
     at = final.before[key].worst if key in final.where else final.after[key].worst
     set_name = "" if key[1] == DETECTOR else f"set {key[1]}, "
-    # Of chance, all statistics being looked at.
-    log_chance = final.before[key].log_chance + np.log(len(final.before))
     return {
         "domain": curve["domain"],
         "statistic": key[0],
@@ -287,7 +284,7 @@ def _entry(key: Key, final: Shrinkage, curve: Mapping[str, Any]) -> dict[str, An
         "after": curve["with_effects"]["value"][at],
         "z": _rounded(float(final.before[key].sigmas[at])),
         "z_after": _rounded(float(final.after[key].sigmas[at])),
-        "significance": _rounded(max(sigmas_of(log_chance), 0.0)),
+        "significance": _rounded(sigmas_among(final.before[key].log_chance, len(final.before))),
         "left": _rounded(final.gap.left.get(key, 0.0)),
         "place": set_name + place(curve, at),
     }
