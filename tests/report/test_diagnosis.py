@@ -240,8 +240,9 @@ def test_causes_come_with_their_numbers() -> None:
     units = table(shown, "Differences in physical units (1σ intervals)")
     assert units.header[2:] == ["measured", "nominal", "with causes", "lag only", "mine only"]
     assert list(units.rows[0])[2:] == [
-        "0.00200", "3.00 × 10⁻⁵ [2.00 × 10⁻⁵, 4.00 × 10⁻⁵]", "0.00190 [0.00180, 0.00210]",
-        "0.00170", "4.00 × 10⁻⁵",
+        "0.00200", "3.00\u00a0×\u00a010⁻⁵ [2.00\u00a0×\u00a010⁻⁵, 4.00\u00a0×\u00a010⁻⁵]",
+        "0.00190 [0.00180, 0.00210]",
+        "0.00170", "4.00\u00a0×\u00a010⁻⁵",
     ]  # fmt: skip
     assert shown.plates == [
         "The gap", "Evidence for what lag is (lag)", "Evidence for what mine is (mine)",
