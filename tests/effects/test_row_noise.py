@@ -12,7 +12,7 @@ from pixcal.effects.row_noise import RowNoise
 from pixcal.effects.telegraph_noise import TelegraphNoise
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.line_noise import line_spectrum
-from pixcal.kernels.flicker import flicker, flicker_power
+from pixcal.kernels.processes import flicker, flicker_power
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect
 from pixcal.simulation.exposure import frames_of

@@ -16,7 +16,7 @@ from pixcal.estimators.frame_series.series import (
 )
 from pixcal.estimators.frame_series.spectral_line import cleared_of_line, find_line
 from pixcal.estimators.frame_series.variance_components import walk_power
-from pixcal.estimators.fringe_fit.tile import Coding
+from pixcal.estimators.fringe_fit.tile_fit import Coding
 
 T = 297
 SHAPE = (61, 67)

@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
-from pixcal.estimators.fringe_fit.pixel_sums import PixelSums
-from pixcal.estimators.fringe_fit.tile import Coding, Tile
-from pixcal.estimators.fringe_fit.tile_fit import start_model
+from pixcal.estimators.fringe_fit.tile_fit import Coding, PixelSums, Tile, start_model
 
 CODING = Coding(1.5, -300.0, 65535)
 

@@ -7,10 +7,8 @@ import pytest
 
 from pixcal.estimators.fringe_fit import scout as scouting
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, find_fringe_vector, smooth_phasor
-from pixcal.estimators.fringe_fit.pixel_sums import phase_sigma
 from pixcal.estimators.fringe_fit.scout import Scout
-from pixcal.estimators.fringe_fit.tile import Coding, Tile
-from pixcal.estimators.fringe_fit.tile_fit import accumulate, start_model
+from pixcal.estimators.fringe_fit.tile_fit import Coding, Tile, accumulate, phase_sigma, start_model
 from pixcal.kernels.bilinear import solve_pixels
 from pixcal.model.errors import InputError
 

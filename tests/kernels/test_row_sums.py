@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 
 from pixcal.kernels.normal_matrix import symmetric
-from pixcal.kernels.row_sums import row_sums
+from pixcal.kernels.sample_sums import row_sums
 
 
 def test_the_sums_are_those_of_numpy() -> None:

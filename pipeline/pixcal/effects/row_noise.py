@@ -11,7 +11,7 @@ from pixcal.estimators.frame_series.line_noise import (
     fit_lines,
     line_spectrum,
 )
-from pixcal.kernels.flicker import flicker, flicker_power
+from pixcal.kernels.processes import flicker, flicker_power
 from pixcal.kernels.significance import sigmas_of_best
 from pixcal.model.arrays import F32, F64
 from pixcal.model.config import quantity

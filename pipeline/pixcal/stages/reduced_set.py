@@ -6,7 +6,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pixcal.estimators.fringe_fit.tile import Coding, Tile
+from pixcal.estimators.fringe_fit.tile_fit import Coding, Tile
 from pixcal.model.arrays import F64, U8, U16
 from pixcal.storage.cube import ArrayReader, CachedReader
 from pixcal.storage.cube_place import cubes_of

@@ -27,7 +27,7 @@ from pixcal.estimators.diagnosis.evidence import (
 )
 from pixcal.estimators.diagnosis.pair_sums import pair_sums, pair_variance, taken_by_fit
 from pixcal.estimators.diagnosis.test_statistics.look import Look
-from pixcal.estimators.fringe_fit.tile import Coding
+from pixcal.estimators.fringe_fit.tile_fit import Coding
 from pixcal.estimators.maps.structure import flattened, without_outliers
 from pixcal.model.arrays import F32, F64, Indices, Mask
 

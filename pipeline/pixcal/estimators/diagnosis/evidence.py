@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.fringes import grid
-from pixcal.estimators.fringe_fit.tile import Coding
+from pixcal.estimators.fringe_fit.tile_fit import Coding
 from pixcal.kernels.bilinear import frame_sums
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import F32, F64, Mask

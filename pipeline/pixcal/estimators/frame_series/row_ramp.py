@@ -8,7 +8,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.maps.map_fit import centred
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
-from pixcal.kernels.row_sums import MODES, row_sums
+from pixcal.kernels.sample_sums import MODES, row_sums
 from pixcal.model.arrays import F32, F64
 
 _MIN_FRAMES = 12

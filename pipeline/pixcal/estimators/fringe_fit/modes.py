@@ -10,9 +10,15 @@ import numpy as np
 
 from pixcal.estimators.fringe_fit.gauge import FRINGE_MODES
 from pixcal.estimators.fringe_fit.geometry import TilePlane
-from pixcal.estimators.fringe_fit.local_basis import SCALE_PX, expand, powers
 from pixcal.estimators.fringe_fit.models import FringeShape
-from pixcal.estimators.fringe_fit.tile_sums import N_LOCAL, Carrier, TileSums
+from pixcal.estimators.fringe_fit.tile_sums import (
+    N_LOCAL,
+    SCALE_PX,
+    Carrier,
+    TileSums,
+    expand,
+    powers,
+)
 from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
 from pixcal.model.arrays import F64
 

@@ -22,8 +22,7 @@ from pixcal.estimators.fringe_fit.fringes import (
     smooth_phasor,
 )
 from pixcal.estimators.fringe_fit.gauge import gauge_matrix
-from pixcal.estimators.fringe_fit.tile import Coding, Tile
-from pixcal.estimators.fringe_fit.tile_fit import fit_tile, residual_chi2
+from pixcal.estimators.fringe_fit.tile_fit import Coding, Tile, fit_tile, residual_chi2
 from pixcal.kernels.bilinear import frame_sums
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.model.arrays import C128, F32, F64, U16, Indices, Mask

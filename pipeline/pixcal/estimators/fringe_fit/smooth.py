@@ -5,8 +5,8 @@ from typing import Self
 
 import numpy as np
 
-from pixcal.estimators.fringe_fit.local_basis import DEGREE, powers
 from pixcal.estimators.fringe_fit.models import FringeShape, Start
+from pixcal.estimators.fringe_fit.tile_sums import DEGREE, powers
 from pixcal.model.arrays import F64
 
 

@@ -7,9 +7,7 @@ import numpy as np
 
 from pixcal.estimators.fringe_fit.batches import Batches
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, SmoothPhasor, plane_wave, wrapped
-from pixcal.estimators.fringe_fit.pixel_sums import PixelSums
-from pixcal.estimators.fringe_fit.tile import Coding, Tile
-from pixcal.estimators.fringe_fit.tile_fit import start_model
+from pixcal.estimators.fringe_fit.tile_fit import Coding, PixelSums, Tile, start_model
 from pixcal.model.arrays import F32, F64, U16
 
 # pixels of a tile for which the Cramér-Rao bound is worked out, where there are few tiles

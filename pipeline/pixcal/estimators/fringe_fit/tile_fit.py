@@ -1,13 +1,83 @@
 """Pixels of a tile by weighted least squares, the frames being known."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, SmoothPhasor, smooth_phasor
-from pixcal.estimators.fringe_fit.tile import Coding, Tile
-from pixcal.kernels.bilinear import N_SUMS, solve_pixels, sweep_block
-from pixcal.model.arrays import C128, F32, F64, U16
+from pixcal.kernels.bilinear import N_SUMS, close_batch, solve_pixels, sweep_block
+from pixcal.model.arrays import C128, F32, F64, U16, Mask
+
+
+@dataclass(frozen=True)
+class Coding:
+    """Electrons of a code: ``scale * code + offset``; ``fill`` marks a sample without weight."""
+
+    scale: float
+    offset: float
+    fill: int
+
+
+@dataclass
+class Tile:
+    """A part of the window."""
+
+    y: tuple[int, int]  # y, x: first pixel and the one after the last, along each axis
+    x: tuple[int, int]
+    read: F32  # read, shot: (y, x) variance of a sample: `shot * model + read` (e-²)
+    shot: F32
+    good: Mask  # (y, x) pixels to learn from
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(y, x) size."""
+        return self.y[1] - self.y[0], self.x[1] - self.x[0]
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        """Centre (y, x) in pixels of the window."""
+        return (self.y[0] + self.y[1] - 1) / 2, (self.x[0] + self.x[1] - 1) / 2
+
+
+class PixelSums:
+    """Sums that grow block by block, about a start model (3, y, x)."""
+
+    def __init__(self, tile: Tile, coding: Coding, frames: FrameParameters, model: F32) -> None:
+        self.tile, self.coding, self.frames, self.model = tile, coding, frames, model
+        self.total: F64 = np.zeros((N_SUMS, *tile.shape))
+        self.part: F64 = np.zeros((N_SUMS, *tile.shape))
+
+    def add(self, codes: U16, at: slice) -> None:
+        """Add the codes (t, y, x) of the frames ``at``."""
+        part = FrameParameters(self.frames.g[at], self.frames.dk[at], self.frames.reference)
+        accumulate(self.tile, [codes], self.coding, part, self.model, self.part)
+
+    def close(self) -> tuple[F32, F32]:
+        """End the batch: its phase relative to the start model and the error, each (y, x), rad.
+
+        Its sums go to the run's.
+        """
+        turn, sigma = np.empty((2, *self.tile.shape), np.float32)
+        part, total = (a.reshape(N_SUMS, -1) for a in (self.part, self.total))
+        close_batch(part, total, self.model.reshape(3, -1), turn.ravel(), sigma.ravel())
+        return turn, sigma
+
+    def finish(self) -> tuple[F64, F64, F64, F64]:
+        """End the run: theta (3, y, x); phase errors, chi-square and samples, each (y, x)."""
+        self.total += self.part
+        step, covariance, chi2 = solve_pixels(self.total)
+        theta = self.model + step
+        return theta, phase_sigma(theta, covariance), chi2, self.total[10]
+
+
+def phase_sigma(theta: F64, covariance: F64) -> F64:
+    """Error of the phase (rad) from the covariance (6, ...) of theta (3, ...)."""
+    _, s, c = theta
+    _, _, _, v11, v12, v22 = covariance
+    with np.errstate(divide="ignore", invalid="ignore"):
+        variance = (c * c * v11 - 2 * c * s * v12 + s * s * v22) / (s * s + c * c) ** 2
+        return np.asarray(np.sqrt(variance))
 
 
 def residual_chi2(

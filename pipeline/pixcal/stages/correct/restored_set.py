@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.fringe_fit.tile import Coding
+from pixcal.estimators.fringe_fit.tile_fit import Coding
 from pixcal.model.arrays import F32, U16
 from pixcal.simulation.effect import Effect
 from pixcal.stages.reduced_set import ReducedSet

@@ -18,7 +18,7 @@ from pixcal.estimators.fringe_fit.fit_flags import fit_flags, usual_chi2
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.geometry import tile_plane
 from pixcal.estimators.fringe_fit.sweep import BOUND_PIXELS, TileMaps, frames_to_prime, sweep_tile
-from pixcal.estimators.fringe_fit.tile import Tile
+from pixcal.estimators.fringe_fit.tile_fit import Tile
 from pixcal.estimators.fringe_fit.tile_sums import Carrier, TileSums, sum_row
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F64, Mask
