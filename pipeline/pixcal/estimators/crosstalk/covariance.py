@@ -27,6 +27,9 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F32, F64
 
+Frames = tuple[F32, F32, F32]
+"""Factor, charge over sigma, and one over sigma, all (t, y, x)."""
+
 MIN_CHARGE = 0.1  # charge (10⁴ e-) of the least light whose noise can tell
 TINY = np.float32(1e-20)
 TERMS = 5  # D, D', 1, D D', D² + D'²
@@ -69,11 +72,13 @@ def products(
             own, own_right = _variance(part)
             line, line_right = line + own, line_right + own_right
         noise = [frames for p in parts for frames in ((p.e, p.charge, p.one), p.taken)]
-        _add_right_sums(*_powers(noise, 2), steps, right)
+        for piece in _pieces(noise):
+            _add_right_sums(*_powers(piece, 2), steps, right)
         terms = [(p.one, p.charge, p.one) for p in parts]
-        _add_normal_sums(*_powers(terms, 4), steps, normal)
+        for piece in _pieces(terms):
+            _add_normal_sums(*_powers(piece, 4), steps, normal)
         # Not beside the next ones: they are large.
-        del parts, part, noise, terms
+        del parts, part, noise, terms, piece
     if brightest < MIN_CHARGE:
         return None
     covariance = np.linalg.pinv(line, rcond=1e-12, hermitian=True)
@@ -103,7 +108,18 @@ def _gathered(parts: Iterable[Residuals]) -> Iterator[list[Residuals]]:
         yield some
 
 
-def _powers(parts: Sequence[tuple[F32, F32, F32]], highest: int) -> tuple[F32, ...]:
+def _pieces(parts: Sequence[Frames]) -> Iterator[Sequence[Frames]]:
+    """Short sequences together and long ones in pieces: powers of all frames would be large."""
+    if short := [part for part in parts if len(part[0]) <= _LONG]:
+        yield short
+    for e, charge, one in parts:
+        if len(e) > _LONG:
+            for n in range(0, len(e), _LONG):
+                piece = slice(n, n + _LONG)
+                yield [(e[piece], charge[piece], one[piece])]
+
+
+def _powers(parts: Sequence[Frames], highest: int) -> tuple[F32, ...]:
     """Factors over sigma, times the charge to the powers 0, 1, ...; one sequence after the other.
 
     From (factor, charge over sigma, one over sigma), all (t, y, x), to (y, x, t).

@@ -76,15 +76,17 @@ class Measured:
         return replace(self, products=products, hot=hot, links=tuple(self.links[n] for n in at))
 
     @property
-    def _sums(self) -> F64:
+    def _sums(self) -> tuple[F64, F64]:
         if self.products is None:
-            return np.zeros((len(self.links), 0, *self.shape))
-        return np.concatenate([self.products.right, self.products.normal], axis=1)
+            none = np.zeros((len(self.links), 0, *self.shape))
+            return none, none
+        return self.products.right, self.products.normal
 
     def every_period(self) -> Iterator[tuple[Classes, Information]]:
         """All links for each period; single hot pixels are taken with `DOUBT`."""
-        for classes, sums in class_sums(self._sums, self.first):
-            normal, right = self._of_noise(sums)
+        every = (class_sums(sums, self.first) for sums in self._sums)
+        for (classes, products), (_, terms) in zip(*every, strict=True):
+            normal, right = self._of_noise(products, terms)
             if self.hot is not None:
                 shown = self.hot.by_class(classes, self.links, DOUBT)
                 normal["hot pixels"], right["hot pixels"] = shown.sums()
@@ -95,7 +97,7 @@ class Measured:
 
         A hot pixel that is alone in its class counts where the noise says the same.
         """
-        normal, right = self._of_noise(sums_of(self._sums, classes))
+        normal, right = self._of_noise(*(sums_of(sums, classes) for sums in self._sums))
         if self.hot is not None:
             shown = self.hot.by_class(classes, self.links)
             alone = (shown.count == 1) & (shown.value**2 * shown.weight > MARKED**2)
@@ -104,10 +106,10 @@ class Measured:
             normal["hot pixels"], right["hot pixels"] = shown.without(alone).sums()
         return Information(normal, right)
 
-    def _of_noise(self, sums: F64) -> tuple[dict[str, F64], dict[str, F64]]:
+    def _of_noise(self, products: F64, terms: F64) -> tuple[dict[str, F64], dict[str, F64]]:
         if self.products is None:
             return {}, {}
-        normal, right = _shares(sums[:, :TERMS], sums[:, TERMS:], self.products.read)
+        normal, right = _shares(products, terms, self.products.read)
         return {"covariance": normal}, {"covariance": right}
 
 

@@ -62,6 +62,7 @@ VARIATION = {
     "light": "large-scale variation",
 }
 BINS = 6
+IRRELEVANT = {"offset": 1e-6}  # px; standard deviation of harmonics, a fiftieth of what stars need
 FLOOR = 0.3  # least standard deviation of a term over the one that the map's own scatter gives
 
 
@@ -94,7 +95,13 @@ def _fringes(name: str) -> Statistic:
 
     measured.__name__ = f"{name}_fringes"
     title = f"{name}: residual fringes, first and second harmonic"
-    return statistic("space", title, unit=UNITS[name], x="harmonic (cosine, sine)")(measured)
+    return statistic(
+        "space",
+        title,
+        unit=UNITS[name],
+        x="harmonic (cosine, sine)",
+        floor=IRRELEVANT.get(name, 0.0),
+    )(measured)
 
 
 def _low_orders(name: str) -> Statistic:
