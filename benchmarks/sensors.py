@@ -30,7 +30,9 @@ def _processor_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def examine(kind: str, seed: int, folder: Path, options: list[str]) -> dict[str, Any]:
+def examine(
+    kind: str, seed: int, folder: Path, options: list[str], commands: list[str]
+) -> dict[str, Any]:
     """Simulate, run and mark one draw."""
     acquisition, run, truth_file = (folder / name for name in ("acq", "run", "truth.json"))
     quiet = {"capture_output": True, "text": True, "env": os.environ | {"OMP_NUM_THREADS": "1"}}
@@ -41,8 +43,9 @@ def examine(kind: str, seed: int, folder: Path, options: list[str]) -> dict[str,
     truth = json.loads(truth_file.read_text())
     before = _processor_s()
     done = subprocess.run(
-        [*PROGRAM, "pixcal_cli", "run", acquisition, "--out", run, "--quiet"], check=False, **quiet
-    )
+        [*PROGRAM, "pixcal_cli", "run", acquisition, "--out", run, "--quiet", *commands],
+        check=False, **quiet,
+    )  # fmt: skip
     marks = {"kind": kind, "seed": seed, "cpu_s": round(_processor_s() - before, 1)}
     marks |= {key: truth[key] for key in ("ladder", "bits", "drawn")}
     marks["e_per_adu"], marks["noise_e"] = round(truth["gain"], 3), round(truth["read_noise_e"], 3)
@@ -56,8 +59,7 @@ def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
     import pixcal
 
     opened = pixcal.open_run(run)
-    reduced, found = opened.reduction, json.loads((run / "products/diagnosis.json").read_text())
-    figures = reduced["figures_of_merit"]
+    figures = opened.reduction["figures_of_merit"]
 
     def value(name: str) -> float:
         found = figures.get(name, {}).get("value")
@@ -70,19 +72,29 @@ def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
     mask = np.asarray(opened.detector["mask"]) != 0
     true = np.zeros(mask.size, np.bool_)
     true[truth["defects"]] = True
-    named = [cause["effect"] for cause in found["causes"]]
-    if truth["causes"]:
-        right = len(named) == 1 and named[0] in truth["causes"]
-    else:
-        right = not named and found["verdict"] == "no gap"
+    error = figures["conversion_gain"]["error"] or float("nan")
     return {
-        "right": bool(right), "verdict": found["verdict"], "named": named,
-        "p": [cause["p_value"] for cause in found["causes"]],
-        "where": [w["statistic"] for w in found["gap"].get("where", [])][:4],
+        **_diagnosis(run / "products" / "diagnosis.json", truth["causes"]),
+        "gain_error": round(error / truth["gain"], 5),
         "gain_off": round(value("conversion_gain") / truth["gain"] - 1, 5),
         "noise_off": round(noise / truth["read_noise_e"] - 1, 5),
         "missed": round(float((true & ~mask.ravel()).mean()), 6),
         "false": round(float((mask.ravel() & ~true).mean()), 6),
+    }  # fmt: skip
+
+
+def _diagnosis(file: Path, causes: list[list[str]]) -> dict[str, Any]:
+    """Causes named, and whether they are one of each that is to be named."""
+    if not file.exists():
+        return {"right": False}
+    found = json.loads(file.read_text())
+    named = [cause["effect"] for cause in found["causes"]]
+    right = len(named) == len(causes) and all(set(named) & set(one) for one in causes)
+    return {
+        "right": right and (bool(causes) or found["verdict"] == "no gap"),
+        "verdict": found["verdict"], "named": named,
+        "p": [cause["p_value"] for cause in found["causes"]],
+        "where": [w["statistic"] for w in found["gap"].get("where", [])][:4],
     }  # fmt: skip
 
 
@@ -109,23 +121,27 @@ def main() -> None:
     parser.add_argument("kinds", nargs="*")
     parser.add_argument("--draws", type=int, default=8)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--size", default="256")
+    parser.add_argument("--size", nargs=2, default=["257", "383"])
     parser.add_argument("--bias", default="0")
     parser.add_argument("--flats", default="0")
     parser.add_argument("--ladder")
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument(
+        "--no-diagnose", action="store_const", dest="commands", const=["--no-diagnose"], default=[],
+        help="gain, read noise and masks only",
+    )  # fmt: skip
     parser.add_argument("--keep", action="store_true", help="keep frames and runs")
     asked = parser.parse_args()
     from second_bench.sensors import KINDS
 
-    options = ["--size", asked.size, asked.size, "--bias", asked.bias, "--flats", asked.flats]
+    options = ["--size", *asked.size, "--bias", asked.bias, "--flats", asked.flats]
     options += ["--ladder", asked.ladder] if asked.ladder else []
     asked.out.mkdir(parents=True, exist_ok=True)
     lines = []
     for kind in asked.kinds or KINDS:
         for seed in range(asked.seed, asked.seed + asked.draws):
             folder = Path(tempfile.mkdtemp(prefix=f"{kind}-{seed}-", dir=asked.out))
-            lines.append(examine(kind, seed, folder, options))
+            lines.append(examine(kind, seed, folder, options, asked.commands))
             print(json.dumps(lines[-1]), flush=True)
             with (asked.out / "draws.jsonl").open("a") as file:
                 file.write(json.dumps(lines[-1]) + "\n")

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 F64 = NDArray[np.float64]
 LADDERS = ("exposure", "lamp", "both")
-LEVELS = 10
 NIGHT = Time("2026-03-01T20:00:00")
 DARKS_S = (1.0, 4.0)
 
@@ -59,6 +58,8 @@ class Sensor:
         Steps after the light is collected, and on what readout adds; given the frame's number.
     converter : callable
         Codes of real samples (ADU).
+    shift : int
+        Bits that the codes are shifted by in the files.
     """
 
     rng: np.random.Generator
@@ -78,6 +79,7 @@ class Sensor:
     collected: list[Callable[[F64, int], F64]] = field(default_factory=list)
     amplified: list[Callable[[F64, int], F64]] = field(default_factory=list)
     converter: Callable[[F64], F64] = np.rint
+    shift: int = 0
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -107,16 +109,18 @@ class Sensor:
         for step in self.amplified:
             signal = step(signal, number)
         codes = self.converter(self.bias_adu + signal / self.gain)
-        return np.clip(codes, 0, 2**self.bits - 1).astype(np.uint16)
+        whole = np.clip(codes, 0, 2**self.bits - 1).astype(np.uint16)
+        return np.left_shift(whole, self.shift, dtype=np.uint16)
 
 
 def _ladder(rng: np.random.Generator, ladder: str, top_e: float, highest: float) -> list[Series]:
     """Pairs of flats, from the dimmest to the brightest level."""
-    levels = np.linspace(0.04, highest, LEVELS) * top_e
+    count = int(rng.integers(8, 17))
+    levels = np.linspace(rng.uniform(0.01, 0.06), highest, count) * top_e
     times = {
         "exposure": 0.02 * levels / levels[0],
-        "lamp": np.full(LEVELS, 0.05),
-        "both": 0.02 * np.cumsum(rng.uniform(0.3, 1.7, LEVELS)),
+        "lamp": np.full(count, 0.05),
+        "both": 0.02 * np.cumsum(rng.uniform(0.3, 1.7, count)),
     }[ladder]
     return [Series("flat", 2, float(t), float(e)) for t, e in zip(times, levels, strict=True)]
 
@@ -130,11 +134,8 @@ def ordinary(
 ) -> Sensor:
     """A sensor without anything that bias, dark and flat maps do not hold."""
     ny, nx = shape
-    bits = int(rng.integers(10, 17))
-    gain = float(np.exp(rng.uniform(np.log(0.5), np.log(40))))
-    bias = float(rng.uniform(15, 40) if bits < 12 else rng.uniform(60, 400))
-    # Noise of 0.5 to 3 codes: coarser samples have no means.
-    read = gain * float(np.exp(rng.uniform(np.log(0.5), np.log(3))))
+    bits, gain, read = _converter(rng)
+    bias = float(rng.uniform(15, 40) if bits < 12 else rng.uniform(60, 400)) + 4 * read / gain
     range_e = gain * (2**bits - 1 - bias)
     well_e = range_e * float(rng.choice([0.7, 2.0]))
     top_e = 0.93 * min(well_e, range_e)
@@ -144,8 +145,9 @@ def ordinary(
     )
     dark = rng.uniform(0.2, 5) * read * rng.lognormal(0, 0.15, shape) / DARKS_S[-1]
     offsets = rng.uniform(0, 1.5) * rng.standard_normal(shape)
+    pixels = rng.lognormal(0, rng.uniform(0, 0.1), shape)
     sensor = Sensor(
-        rng, gain, gain * float(rng.uniform(0.98, 1.02)), bits, np.full(shape, read),
+        rng, gain, gain * float(rng.uniform(0.98, 1.02)), bits, read * pixels,
         np.maximum(bias + offsets, 8), response, dark, well_e, top_e, 0.001,
         np.zeros(shape, np.bool_),
     )  # fmt: skip
@@ -155,9 +157,24 @@ def ordinary(
     sensor.series += [Series("dark", 10, time, 0.0) for time in DARKS_S]
     sensor.series += _ladder(rng, ladder, top_e, highest)
     if flats:
-        middle = sensor.series[-LEVELS // 2]
+        middle = _middle(sensor)
         sensor.series.append(Series("flat", flats, 1.1 * middle.exptime_s, 1.1 * middle.light_e))
     return sensor
+
+
+def _converter(rng: np.random.Generator) -> tuple[int, float, float]:
+    """Bits, gain (e-/ADU) and read noise (e-) of a camera that somebody could build."""
+    while True:
+        bits = int(rng.integers(8, 17))
+        gain, codes = np.exp(rng.uniform(np.log([0.05, 0.4]), np.log([40, 20])))
+        if gain * codes > 0.7 and codes < 2**bits / 250 and 1e3 < gain * 2**bits < 1e6:
+            return bits, float(gain), float(gain * codes)
+
+
+def _middle(sensor: Sensor) -> Series:
+    """Middle level of the ladder."""
+    flats = [one for one in sensor.series if one.kind == "flat"]
+    return flats[len(flats) // 2]
 
 
 Drawn = dict[str, Any]
@@ -216,7 +233,7 @@ def defects(sensor: Sensor) -> Drawn:
 def stack(sensor: Sensor) -> Drawn:
     """A hundred flats for which the lamp was brighter than for the ladder."""
     off = float(sensor.rng.uniform(0.02, 0.06))
-    of = sensor.series[-LEVELS // 2]
+    of = _middle(sensor)
     sensor.series.append(Series("flat", 100, of.exptime_s, of.light_e * (1 + off)))
     return {"off": off}
 
@@ -344,6 +361,22 @@ def declared_gain(sensor: Sensor) -> Drawn:
     return {"relative": factor}
 
 
+@kind("nonlinearity")
+def curved(sensor: Sensor) -> Drawn:
+    """Response curves of other shapes: bent near the full well only, ever softer, or like an S."""
+    rng, top = sensor.rng, sensor.top_e
+    size = float(np.exp(rng.uniform(np.log(0.01), np.log(0.12))))
+    soft = np.sqrt(3 * size) / top
+    curves: dict[str, Callable[[F64], F64]] = {
+        "top": lambda e: e * (1 - size * (e / top) ** 3),
+        "soft": lambda e: np.tanh(soft * e) / soft,
+        "S": lambda e: e * (1 + size * (e / top) * (1 - 1.5 * e / top)),
+    }
+    shape = str(rng.choice(list(curves)))
+    sensor.response_curve = curves[shape]
+    return {"size": size, "shape": shape}
+
+
 @kind("lag")
 def lag(sensor: Sensor) -> Drawn:
     """A part of the charge of a frame comes with the next."""
@@ -382,6 +415,8 @@ def telegraph(sensor: Sensor) -> Drawn:
 @kind("quantisation")
 def codes(sensor: Sensor) -> Drawn:
     """A tenth of the codes never comes; the next higher one comes instead."""
+    # Noise of many codes hides them.
+    sensor.read_noise_e = sensor.read_noise_e * min(1, 2 * sensor.gain / sensor.read_noise_e.mean())
     there = sensor.rng.random(2**sensor.bits) >= 0.1
     there[-1] = True
     following = np.flatnonzero(there)
@@ -406,6 +441,47 @@ def drift(sensor: Sensor) -> Drawn:
     return {"step_e": step}
 
 
+@kind(highest=1.35)
+def harmless(sensor: Sensor) -> Drawn:
+    """Hot, dead and noisy pixels, a fixed pattern, saturated flats and a steep dark signal."""
+    return defects(sensor) | pattern(sensor)
+
+
+@kind("nonlinearity", highest=1.35)
+def bent_harmless(sensor: Sensor) -> Drawn:
+    """The same with a response that bends."""
+    return nonlinearity(sensor) | harmless(sensor)
+
+
+@kind("row_noise + ipc brighter_fatter")
+def rows_and_coupling(sensor: Sensor) -> Drawn:
+    """Noise of rows that every second row shares, and a coupling that grows with the level."""
+    return row_pairs(sensor) | coupling(sensor)
+
+
+@kind()
+def stretched(sensor: Sensor) -> Drawn:
+    """Codes are written from the highest bits on: each is a multiple of 16, or less."""
+    sensor.shift = min(4, 16 - sensor.bits)
+    return {"factor": 2**sensor.shift}
+
+
+@kind()
+def few(sensor: Sensor) -> Drawn:
+    """Two bias frames, no darks, pairs of flats at three levels."""
+    flats = [one for one in sensor.series if one.kind == "flat"]
+    chosen = [flats[0], flats[len(flats) // 2], flats[-1]]
+    sensor.series = [Series("bias", 2, 0.0, 0.0), *chosen]
+    return {}
+
+
+@kind()
+def without_bias(sensor: Sensor) -> Drawn:
+    """Darks at two exposure times, no bias frames."""
+    sensor.series = [one for one in sensor.series if one.kind != "bias"]
+    return {}
+
+
 def make(
     name: str,
     seed: int,
@@ -420,12 +496,15 @@ def make(
     ladder = ladder or LADDERS[seed % len(LADDERS)]
     sensor = ordinary(rng, shape, ladder, highest, counts)
     drawn = change(sensor)
+    sensor.declared_gain /= 2**sensor.shift
+    good = ~sensor.defects
     truth = {
-        "kind": name, "seed": seed, "causes": cause.split(), "ladder": ladder, "gain": sensor.gain,
-        "bits": sensor.bits, "read_noise_e": float(np.median(sensor.read_noise_e)),
+        "kind": name, "seed": seed, "ladder": ladder, "bits": sensor.bits, "drawn": drawn,
+        "causes": [one.split() for one in cause.split("+")] if cause else [],
+        "gain": sensor.gain / 2**sensor.shift, "declared_gain": sensor.declared_gain,
+        "read_noise_e": float(np.sqrt(np.mean(sensor.read_noise_e[good] ** 2))),
         "bias_adu": float(np.median(sensor.bias_adu)), "well_e": sensor.well_e,
-        "declared_gain": sensor.declared_gain, "top_e": sensor.top_e, "drawn": drawn,
-        "defects": np.flatnonzero(sensor.defects).tolist(),
+        "top_e": sensor.top_e, "defects": np.flatnonzero(sensor.defects).tolist(),
     }  # fmt: skip
     return sensor, truth
 
@@ -449,7 +528,7 @@ def write(sensor: Sensor, out: Path) -> None:
             "gain_e_per_adu": float(f"{sensor.declared_gain:.6g}"),
             "read_noise_e": float(f"{np.median(sensor.read_noise_e):.3g}"),
         },
-        "frames": {one: [f"{one}/*.fits"] for one in ("bias", "dark", "flat")},
+        "frames": {one.kind: [f"{one.kind}/*.fits"] for one in sensor.series},
     }
     (out / "acquisition.yaml").write_text(yaml.safe_dump(described, sort_keys=False))
 
@@ -461,7 +540,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--truth", type=Path)
-    parser.add_argument("--size", type=int, nargs=2, default=(256, 256))
+    parser.add_argument("--size", type=int, nargs=2, default=(257, 383))
     parser.add_argument("--ladder", choices=LADDERS, help="else by the seed")
     parser.add_argument("--bias", type=int, default=0, help="frames; 0: by the seed")
     parser.add_argument("--flats", type=int, default=0, help="of one level beside the ladder")

@@ -15,6 +15,7 @@ MIN_RUNGS = 3  # fewest exposure times that tell a straight line from a bent one
 # Variance over the signal, in units of the least at lower levels, below which pixels are full. A
 # response that bends by a fifth lessens it to 0.64.
 COLLAPSED = 0.25
+SHOT = 0.1  # shot noise over the noise without light, in variance, from which a level tells a slope
 NEARLY = 0.02  # relative distance from a pixel's own full well within which its signal is not used
 
 
@@ -135,7 +136,7 @@ def relative_response(rungs: Sequence[Rung], levels: F64) -> tuple[F64, F64]:
         return charge / light, np.sqrt(variance) / np.abs(light)
 
 
-def unsaturated(rungs: Sequence[Rung]) -> list[Rung]:
+def unsaturated(rungs: Sequence[Rung], dark_variance: float = 0.0) -> list[Rung]:
     """Flats without the signal of full pixels, which becomes NaN.
 
     A full well has no photon noise. It may be full far below the highest code, and read noise then
@@ -146,6 +147,8 @@ def unsaturated(rungs: Sequence[Rung]) -> list[Rung]:
     ----------
     rungs : sequence of Rung
         Of the same pixels, in any order.
+    dark_variance : float
+        Of a usual sample without light (ADU²): the dimmest levels may show little else.
     """
     levels = step_levels(rungs)
     seen = lit(np.fmax.reduce([rung.signal for rung in rungs]))
@@ -154,9 +157,10 @@ def unsaturated(rungs: Sequence[Rung]) -> list[Rung]:
         if not levels[n] > 0:
             continue
         noise = median_and_sigma(rungs[n].variance[seen] * rungs[n].frames)[0]
-        slope = noise / levels[n]
+        slope = (noise - dark_variance) / levels[n]
         full[n] = np.isfinite(least) and slope < COLLAPSED * least
-        least = least if full[n] else min(least, slope)
+        if not full[n] and noise > (1 + SHOT) * dark_variance:
+            least = min(least, slope)
     if not full.any():
         return list(rungs)
     well = np.mean([rung.signal for rung, ended in zip(rungs, full, strict=True) if ended], axis=0)

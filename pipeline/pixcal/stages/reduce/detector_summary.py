@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 
 from pixcal.estimators.detector.calibration import Linearity, linearity
-from pixcal.estimators.detector.emva import full_level, saturation, transfer_points
-from pixcal.kernels.photon_transfer import LADDER, GainFit, add_neighbours, fit_gain
+from pixcal.estimators.detector.emva import Measure, full_level, saturation, transfer_points
+from pixcal.kernels.photon_transfer import BLOCK, LADDER, LAGS, GainFit, add_neighbours, fit_gain
+from pixcal.kernels.robust import median_and_sigma
 from pixcal.kernels.rounding import SHEPPARD, UNTOLD, noise_before_rounding
 from pixcal.model.acquisition import Detector
 from pixcal.model.arrays import F64, Mask
@@ -33,6 +34,8 @@ _NO_LINE = 10.0
 _LINEARITY = 0.02
 _LAMP = 0.3
 """Relative change of light a second between flats that are not of one lamp."""
+_SHARED = 5.0
+"""Errors of the noise that a row shares from which it is there."""
 _LIT = 5.0
 """Least response of the usual pixel over its error: below it the flat would be noise."""
 
@@ -200,13 +203,13 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     times = np.array([group.exptime for group in job.flat])
     if job.flats_timed and job.flat and _one_lamp(times[usable], levels[usable]):
         straight = linearity(times, levels, usable)
-    read_variance = _read_variance(sums[0])
-    read_noise = own = None
-    if read_variance is not None:
-        noise = math.sqrt(read_variance[0])
-        read_noise = (noise, read_variance[1] / (2 * noise) if noise else 0.0)
-        own = _before_rounding(read_variance, folder, job) if job.quantum else read_noise
-    gain = _gain(sums, own, top, job)
+    charge = _dark_charge(folder, job)
+    gain = None
+    # The shot noise of the dark signal is no read noise; how large it is the gain tells.
+    for _ in range(2 if charge else 1):
+        shot = charge / (job.gain if gain is None else gain.gain)
+        read_noise, own = _read_noise(sums[0], shot, folder, job)
+        gain = _gain(sums, own, top, job)
     return Summary(declared, medians, light, read_noise, own, gain, levels, usable, full, straight)
 
 
@@ -231,10 +234,65 @@ def _before_rounding(
     return noise_before_rounding(*variance, means[np.isfinite(means)], frames)
 
 
-def _read_variance(sums: F64) -> tuple[float, float] | None:
+def shared_by_lines(dark: F64) -> dict[str, Measure]:
+    """Variance in time that all pixels of a row, or of a column, share, with its error (ADU²).
+
+    Zero where it is not significant.
+
+    Parameters
+    ----------
+    dark : (N_BINS, COLUMNS) float64
+        Sums over pairs of frames without light, as `bin_pairs` gives them.
+    """
+    total = dark.sum(axis=0)
+    if not total[0]:
+        return {}
+    error = total[2] / total[0] / math.sqrt(total[0])
+    found = {}
+    for name, lags in (("row", ((0, 1), (0, 2))), ("column", ((1, 0), (2, 0)))):
+        at = [3 + LAGS.tolist().index(list(lag)) for lag in lags]
+        # A coupling reaches the next pixel, and a row that repeats the row after it; not both.
+        # The mean of its block was taken off.
+        shared = float(total[at].min() / total[0]) * (BLOCK + 1) / BLOCK
+        found[name] = (shared if shared > _SHARED * error else 0.0, error)
+    return found
+
+
+def _read_variance(dark: F64) -> tuple[float, float] | None:
     """Variance of a sample without light and its error (ADU²)."""
-    dof, _, square = sums[:, :3].sum(axis=0)
-    return (square / dof, square / dof * math.sqrt(2 / dof)) if dof > 0 else None
+    dof, _, square = dark[:, :3].sum(axis=0)
+    if not dof > 0:
+        return None
+    # What lines share was lost in part with the means of blocks.
+    lost = sum(shared for shared, _ in shared_by_lines(dark).values()) / (BLOCK + 1)
+    return square / dof + lost, square / dof * math.sqrt(2 / dof)
+
+
+def _dark_charge(folder: Place, job: Measuring) -> float:
+    """Mean dark signal (ADU) of usual pixels in the frames that tell the read noise."""
+    series = job.read_series
+    if series is None or not series.exptime > 0:
+        return 0.0
+    rate = on_grid(folder, job.shape, ("dark_rate",))[0]
+    median, sigma = median_and_sigma(rate)
+    usual = np.abs(rate - median) <= job.limits.hot * sigma
+    return max(float(rate[usual].mean()), 0.0) * series.exptime if usual.any() else 0.0
+
+
+def _read_noise(
+    dark: F64, shot: float, folder: Place, job: Measuring
+) -> tuple[Measure | None, Measure | None]:
+    """Noise without light (ADU), less shot noise of a variance (ADU²), with and without rounding.
+
+    Both with their errors.
+    """
+    whole = _read_variance(dark)
+    if whole is None:
+        return None, None
+    variance = max(whole[0] - shot, SHEPPARD * job.quantum**2), whole[1]
+    noise = math.sqrt(variance[0])
+    measured = noise, variance[1] / (2 * noise) if noise else 0.0
+    return measured, _before_rounding(variance, folder, job) if job.quantum else measured
 
 
 def _gain(
@@ -247,8 +305,9 @@ def _gain(
     if not (job.dark and job.flat):
         return None
     noise, error = read_noise or (job.read_noise, _GUESS_ERROR * job.read_noise)
-    # With light there is noise enough that rounding adds no more and no less than this.
-    variance = noise**2 + SHEPPARD * job.quantum**2
+    # With light there is noise enough that rounding to ADU adds no more and no less than this; that
+    # to larger steps is part of the noise.
+    variance = noise**2 + SHEPPARD * min(job.quantum, 1.0)
     highest = _LINEAR_SHARE * top
     dark, lit = sums
     lit = np.where(lit[:, 1:2] <= highest * lit[:, :1], lit, 0.0)

@@ -23,9 +23,9 @@ from pixcal.estimators.detector.emva import (
     transfer_points,
     without_trend,
 )
-from pixcal.kernels.photon_transfer import BLOCK, LAGS, add_neighbours
+from pixcal.kernels.photon_transfer import add_neighbours
 from pixcal.model.arrays import F64, Mask
-from pixcal.stages.reduce.detector_summary import Summary, pair_sums
+from pixcal.stages.reduce.detector_summary import Summary, pair_sums, shared_by_lines
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.halves import Window, frames_of, middle_of, read_halves
 from pixcal.stages.reduce.ingested import Ingested
@@ -36,8 +36,6 @@ Json = dict[str, Any]
 
 _TOLD = 1.6
 """Read noise over that of the rounding from which the amplifier's is their difference."""
-_SHARED = 5.0
-"""Errors of the noise that a row shares from which it is shown."""
 _NO_ERROR = 1e-9
 """ADU/s: below it all samples are of one code."""
 _WELL = 0.97
@@ -75,7 +73,7 @@ def characterise(
     note = "" if facts["gain_e_per_adu"]["measured"] is not None else "declared, not measured"
     found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, note)}
     noise = _read_noise(found, facts, gain[0], source.quantum)
-    _row_noise(found, dark.sum(axis=0), gain[0])
+    _row_noise(found, dark, gain[0])
     if top is not None:
         _full_well(found, gain, top, reached, noise)
     if facts["linearity"] is not None:
@@ -142,14 +140,8 @@ def _read_noise(found: Json, facts: Json, gain: float, step: float) -> Measure |
 
 def _row_noise(found: Json, dark: F64, gain: float) -> None:
     """Noise in time that the pixels of a row, or of a column, have in common."""
-    if not dark[0]:
-        return
-    error = dark[2] / dark[0] / math.sqrt(dark[0])
-    for name, lags in (("row", ((0, 1), (0, 2))), ("column", ((1, 0), (2, 0)))):
-        at = [3 + LAGS.tolist().index(list(lag)) for lag in lags]
-        # A coupling reaches the next pixel, and a row that repeats the row after it; not both.
-        shared = float(dark[at].min() / dark[0]) * BLOCK / (BLOCK - 1)
-        if shared > _SHARED * error:
+    for name, (shared, error) in shared_by_lines(dark).items():
+        if shared:
             noise = math.sqrt(shared)
             title, note = f"noise of whole {name}s", "part of the read noise"
             found[f"{name}_noise"] = _figure(

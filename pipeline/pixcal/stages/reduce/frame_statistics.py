@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.detector.bad_pixels import nonlinear
+from pixcal.estimators.detector.bad_pixels import noisy, nonlinear
 from pixcal.estimators.detector.calibration import (
     DarkLine,
     Rung,
@@ -52,6 +52,8 @@ STATISTICS = (
 """Maps of the scratch store."""
 
 _PAIR_LAMP_CHANGE = 0.05
+_COARSE = 3.0
+"""Noise, in steps of the samples, below which the median of few frames' variances jumps."""
 
 
 @dataclass(frozen=True)
@@ -120,17 +122,19 @@ class _Column:
     levels: F64
     noise: F64
     """Variance of a sample that is usual here (ADU²)."""
+    loud: NDArray[np.bool_]
+    """Pixels that are noisy without light: left out of the photon transfer."""
     line: DarkLine | None = None
     rungs: list[Rung] = field(default_factory=list)
 
     @classmethod
     def begin(cls, job: Measuring, index: Index) -> "_Column":
         (y0, y1), (x0, x1) = extent(job.shape, index)
-        maps = {name: np.zeros((y1 - y0, x1 - x0)) for name in STATISTICS}
+        shape = y1 - y0, x1 - x0
+        maps = {name: np.zeros(shape) for name in STATISTICS}
         levels = np.zeros(job.writers["levels"].shape[2:])
-        return cls(
-            index, maps, np.zeros((2, N_BINS, COLUMNS)), levels, np.zeros((y1 - y0, x1 - x0))
-        )
+        pairs = np.zeros((2, N_BINS, COLUMNS))
+        return cls(index, maps, pairs, levels, np.zeros(shape), np.zeros(shape, np.bool_))
 
 
 def measure(job: Measuring, strip: Strip) -> None:
@@ -191,9 +195,8 @@ def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined)
     seen = lit(signal)
     level = median_and_sigma(signal[seen])[0]
     usual = usual_variance(found.variance[seen], frames - 1)
-    if usual < job.quantum**2:
-        # Whole numbers that lie beside one another: their median variance may be nothing.
-        usual = max(usual, float(found.variance[seen].mean()))
+    if usual < (_COARSE * job.quantum) ** 2:
+        usual = float(np.nanmean(found.variance[seen]))
     usual = max(level, 0) / job.gain + job.read_noise**2 if np.isnan(usual) else usual
     brighter = np.fmax(signal / level, 1) if level > 0 else 1.0
     variance = np.fmax(found.variance, usual * brighter) / frames
@@ -204,7 +207,7 @@ def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined)
 
 def _measure_response(job: Measuring, column: _Column) -> None:
     """Response and levels of the tile, and pixels that do not follow the others."""
-    maps, rungs = column.maps, unsaturated(column.rungs)
+    maps, rungs = column.maps, unsaturated(column.rungs, float(np.median(column.noise)))
     column.levels[:, 0] = step_levels(column.rungs)
     levels = step_levels(rungs)
     maps["response"], maps["response_error"] = relative_response(rungs, levels)
@@ -220,7 +223,7 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
         exptime = group.exptime if job.flats_timed else 0.0
         lines = [column.line for column in columns]
         pedestals = [None if x is None else x.signal(exptime).astype(np.float32) for x in lines]
-    for batch in _batches(job, group, tuple(column.index for column in columns)):
+    for number, batch in enumerate(_batches(job, group, tuple(c.index for c in columns))):
         for column, combination, pedestal, samples in zip(
             columns, every, pedestals, batch, strict=True
         ):
@@ -228,9 +231,24 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
             if pedestal is not None:
                 frames -= pedestal
             levels = combination.update(frames)
+            if not lamp and number == 0:
+                column.loud |= _loud(job, frames - levels[:, None, None])
             if lamp or group == job.read_series:
+                frames[:, column.loud] = np.nan
                 column.pairs[int(lamp)] += _pair_sums(job, frames, levels, lamp)
     return [combination.result() for combination in every]
+
+
+def _loud(job: Measuring, frames: F32) -> NDArray[np.bool_]:
+    """Pixels whose noise without light is far above that of the others."""
+    if len(frames) < 2:
+        return np.zeros(frames.shape[1:], np.bool_)
+    variance = frames.var(axis=0, ddof=1, dtype=float)
+    dof = np.full(variance.shape, len(frames) - 1.0)
+    # A sample that lies on a change of code is one of two.
+    usual = max(usual_variance(variance, len(frames) - 1), job.quantum**2 / 4)
+    unknown = np.full(variance.shape, np.nan)
+    return noisy(variance, dof, np.full(variance.shape, usual), unknown, 0 * dof, job.limits.noisy)
 
 
 def _pair_sums(job: Measuring, frames: F32, levels: F32, lamp: bool) -> F64:
