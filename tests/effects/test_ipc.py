@@ -9,6 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from pixcal.effects.ipc import FOUR_ROWS, Ipc
+from pixcal.estimators.crosstalk import covariance
+from pixcal.estimators.crosstalk.links import links
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.maps.corrected import corrected_offsets, phase_change, straight_modes
 from pixcal.kernels.crosstalk import Coupling, couple, noise_shares, outflow, uncouple
@@ -286,6 +288,25 @@ def test_a_kernel_is_found_with_its_period_and_nothing_else(acquired: Acquired, 
     assert np.abs(pulls(found, truth)).max() < 4
     assert max(found.errors.values()) < 1.2e-3
     assert "hot pixels" in found.why
+
+
+@pytest.mark.parametrize("longest", [7, 10_000])
+def test_products_of_neighbours_are_the_same_in_pieces_of_any_length(
+    acquired: Acquired, monkeypatch: pytest.MonkeyPatch, longest: int
+) -> None:
+    frames = acquired({"frames.fringes.0.count": 150, "frames.fringes.1.count": 150})
+    steps = links((frames.good.shape[0], frames.good.shape[1]))[:5]
+    usual = covariance.products(frames, steps)
+    monkeypatch.setattr(covariance, "_LONG", longest)
+    pieces = covariance.products(frames, steps)
+    assert usual is not None
+    assert pieces is not None
+    for name in ("right", "normal"):
+        whole = getattr(usual, name)
+        np.testing.assert_allclose(
+            getattr(pieces, name), whole, rtol=2e-4, atol=2e-4 * np.abs(whole).max()
+        )
+    assert pieces.shot == pytest.approx(usual.shot, rel=1e-6)
 
 
 def test_noise_alone_tells_the_kernel_where_there_are_no_darks(acquired: Acquired) -> None:
