@@ -135,6 +135,8 @@ def write_fit(
     outputs = ["delta_x", "delta_y"] if len(sets) > 1 else ["delta_fringe"]
     facts = {name: set_facts(n) for n, name in enumerate(sets)}
     bad = mask != 0
+    if np.all(bad):
+        facts = {name: own | {"sigma_median_px": None} for name, own in facts.items()}
 
     def holes(values: Any) -> Any:
         return np.where(bad, np.nan, values).astype(np.float32)

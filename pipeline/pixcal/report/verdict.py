@@ -8,7 +8,7 @@ import numpy as np
 
 from pixcal.report.contents import Contents, DiagnosisContents, SetContents
 from pixcal.report.diagnosis_words import level, listed, residual_gap
-from pixcal.report.text import NAMES, duration, number, share, with_error
+from pixcal.report.text import NAMES, NO_OFFSETS, duration, number, share, with_error
 
 TARGET_PX = 5e-5  # target precision of a calibration (paper, section 4.2)
 
@@ -52,7 +52,7 @@ def headline(contents: Contents) -> str:
             nm = sigma * contents.pitch_um * 1e3
             parts.append(f"{NAMES[offset.name]} to {number(sigma, 2)} px ({number(nm, 2)} nm)")
     if not parts:
-        return "The fit left no pixel with an offset: see the masks."
+        return NO_OFFSETS
     return f"The median pixel is calibrated in {' and '.join(parts)}."
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pixcal.effects import known_effects
-from pixcal.report.text import number, with_error
+from pixcal.report.text import NO_OFFSETS, number, with_error
 from pixcal.stages.treatment import SUFFIX, fitted_shapes, treatment_of_kind
 from pixcal.storage.artefact import MANIFEST, read_json
 from pixcal.storage.stage import require
@@ -48,6 +48,8 @@ def advice(run_dir: Path) -> Advice:
     settled = all(_settled(c, correction, bool(sigma)) for c in causes)
     if not fit["outputs"]:
         return Advice((), rows, settled)
+    if not sigma:
+        return Advice((NO_OFFSETS,), rows, settled)
     names = " and ".join(path.name for path in maps_to_use(run_dir).values())
     use = f"Use {names}{_as_what(diagnosis, correction)}."
     return Advice((use, _limit(sigma, diagnosis, correction)), rows, settled)
@@ -88,7 +90,7 @@ def _sigma(fit: Json, correction: Json | None) -> dict[str, float]:
         each = {name: s["sigma_median_px"]["after"] for name, s in correction["sets"].items()}
     else:
         each = {name: s["sigma_median_px"] for name, s in fit["sets"].items()}
-    return {name: sigma for name, sigma in each.items() if sigma}
+    return {name: sigma for name, sigma in each.items() if sigma and math.isfinite(sigma)}
 
 
 def _on_map(cause: Json) -> Json:
