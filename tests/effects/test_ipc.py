@@ -304,7 +304,7 @@ def test_products_of_neighbours_are_the_same_in_pieces_of_any_length(
     for name in ("right", "normal"):
         whole = getattr(usual, name)
         np.testing.assert_allclose(
-            getattr(pieces, name), whole, rtol=2e-4, atol=2e-4 * np.abs(whole).max()
+            getattr(pieces, name), whole, rtol=1e-5, atol=1e-5 * np.abs(whole).max()
         )
     assert pieces.shot == pytest.approx(usual.shot, rel=1e-6)
 

@@ -167,3 +167,17 @@ def test_a_statistic_that_fails_in_a_few_simulations_is_expected_from_the_others
     # Of half of the simulations or more nothing is known.
     usual = known.on_scale(drawn(100, 40))[LINEAR] - known.on_scale(drawn(100))[LINEAR]
     np.testing.assert_allclose(shift, usual if failed < 4 else 0, rtol=1e-9)
+
+
+@pytest.mark.parametrize(("off_px", "differs"), [(2e-6, False), (1e-5, True)])
+def test_harmonics_of_offsets_count_only_where_they_matter(off_px: float, differs: bool) -> None:
+    """However well simulations agree: stars need 5e-5 px."""
+    rng = np.random.default_rng(8)
+    key = ("offset_fringes", "a")
+
+    def curve(size: float) -> dict[Key, Curve]:
+        return {key: Curve(np.arange(4.0), size + 2e-7 * rng.standard_normal(4))}
+
+    reference = Reference.of([curve(0.0) for _ in range(16)])
+    data = reference.on_scale(curve(off_px))
+    assert bool(flagged(compare(data, expect_nominal(reference)))) is differs
