@@ -11,6 +11,7 @@ import sys
 import tempfile
 import time
 import traceback
+from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache, partial
@@ -22,7 +23,7 @@ from faults.bench import STAGES, Bench, make_bench
 
 PAGE = Path(__file__).parents[1] / "docs" / "appendix" / "torture.md"
 BEGIN, END = "<!-- torture: begin -->", "<!-- torture: end -->"
-HEAD = "| what was done | times | how it ended |\n|---|---|---|"
+HEAD = "| fault | times | outcome |\n|---|---|---|"
 SEED = 20261121
 
 ARTEFACTS = ("ingest", "reduce", "sweep", "fit")
@@ -81,8 +82,12 @@ def _on_a_cluster(
         return do(bench, address, stage, times, SEED)
 
 
-def write_table(rows: list[str]) -> None:
-    """Put the rows between the marks of the page."""
+def write_table(outcomes: list[Outcome]) -> None:
+    """Put a row for each fault between the marks of the page: all steps and artefacts together."""
+    ends: dict[str, Counter[str]] = {}
+    for outcome in outcomes:
+        ends.setdefault(outcome.fault, Counter()).update(outcome.ends)
+    rows = [Outcome(fault, ended).row() for fault, ended in ends.items()]
     text = PAGE.read_text(encoding="utf-8")
     table = "\n".join([BEGIN, HEAD, *rows, END])
     text = re.sub(f"{BEGIN}.*{END}", lambda _: table, text, flags=re.DOTALL)
@@ -95,14 +100,14 @@ def _trials(folder: Path, share: float) -> dict[str, Trial]:
     return trials(make_bench(Path(tempfile.mkdtemp(dir=folder))), share)
 
 
-def _tried(folder: Path, share: float, name: str) -> tuple[str, float, str]:
-    """Row of a trial, its seconds, and what went wrong."""
+def _tried(folder: Path, share: float, name: str) -> tuple[Outcome, float, str]:
+    """Outcome of a trial, its seconds, and what went wrong."""
     begun = time.monotonic()
     try:
-        row, wrong = _trials(folder, share)[name]().row(), ""
+        outcome, wrong = _trials(folder, share)[name](), ""
     except Exception as error:
-        row, wrong = "", f"{traceback.format_exc()}{error!r:.2000}"
-    return row, time.monotonic() - begun, wrong
+        outcome, wrong = Outcome(name), f"{traceback.format_exc()}{error!r:.2000}"
+    return outcome, time.monotonic() - begun, wrong
 
 
 def main() -> int:
@@ -113,7 +118,7 @@ def main() -> int:
     jobs = max(1, len(os.sched_getaffinity(0)))
     parser.add_argument("--jobs", type=int, default=jobs, help="at a time [default: all cores]")
     options = parser.parse_args()
-    rows: list[str] = []
+    outcomes: list[Outcome] = []
     failed: list[str] = []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -121,15 +126,15 @@ def main() -> int:
         names = [name for name in every if re.search(options.only, name)]
         try_one = partial(_tried, folder, options.share)
         with ProcessPoolExecutor(options.jobs, mp_context=get_context("spawn")) as pool:
-            for name, (row, took, wrong) in zip(names, pool.map(try_one, names), strict=True):
+            for name, (outcome, took, wrong) in zip(names, pool.map(try_one, names), strict=True):
                 if wrong:
                     failed.append(name)
                     print(f"FAILED {name}\n{wrong}", flush=True)
                 else:
-                    rows.append(row)
-                    print(f"{row} <!-- {name}, {took:.0f} s -->", flush=True)
+                    outcomes.append(outcome)
+                    print(f"{outcome.row()} <!-- {name}, {took:.0f} s -->", flush=True)
     if not failed and not options.only and options.share == 1:
-        write_table(rows)
+        write_table(outcomes)
     print(f"not survived: {', '.join(failed)}" if failed else "all survived")
     return 1 if failed else 0
 

@@ -16,7 +16,7 @@ class Outcome:
     Attributes
     ----------
     fault : str
-        What was done.
+        What was done, without the step or the artefact that it was done to.
     ends : Counter
         How often it ended how.
     """

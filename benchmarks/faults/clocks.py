@@ -62,7 +62,7 @@ JUMPS = {
 
 def jump(bench: Bench, how: Jump) -> Outcome:
     """Alter the stamps of a fringe set: it is said, and the offsets do not change."""
-    outcome = Outcome(f"the camera's clock: {how.__name__.replace('_', ' ')}")
+    outcome = Outcome(f"camera clock: {how.__name__.replace('_', ' ')}")
     acquisition = bench.folder / "clock"
     shutil.rmtree(acquisition, ignore_errors=True)
     shutil.copytree(bench.acquisition, acquisition)
@@ -82,5 +82,5 @@ def jump(bench: Bench, how: Jump) -> Outcome:
         expected, _, same_mask, _ = read_map(bench.reference / "products" / name)
         np.testing.assert_array_equal(mask, same_mask)
         assert np.nanmax(np.abs(delta - expected) / sigma) < 0.05
-    outcome.ends["said, offsets the same" if JUMPS[how] else "a pause, offsets the same"] += 1
+    outcome.ends["warning; same offsets" if JUMPS[how] else "read as a pause; same offsets"] += 1
     return outcome

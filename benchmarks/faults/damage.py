@@ -49,7 +49,7 @@ def zero(file: Path, rng: random.Random) -> None:
     _replace(file, bytes(file.stat().st_size))
 
 
-_DONE = {remove: "removed", cut: "cut short", zero: "turned to zeros"}
+_DONE = {remove: "removed", cut: "cut short", zero: "overwritten with zeros"}
 
 
 def _replace(file: Path, body: bytes) -> None:
@@ -72,7 +72,7 @@ def metadata(bench: Bench, artefact: str, damage: Damage, times: int | None, see
     times : int, optional
         How many of the files; None for each.
     """
-    outcome = Outcome(_fault(damage, f"a file of `{artefact}` that is no chunk"))
+    outcome = Outcome(_fault(damage, "metadata file"))
     rng = random.Random(f"{artefact} {_name(damage)} {seed}")
     for name in _some(stored(bench, artefact, chunks=False), times, rng):
         run = _ready(bench, artefact)
@@ -85,13 +85,13 @@ def metadata(bench: Bench, artefact: str, damage: Damage, times: int | None, see
             reader = bench.command(READERS[artefact], run)
             pixcal(*reader).refused(expected, f"pixcal {OWNERS[artefact]}", *words)
         _mended(bench, run, artefact)
-        outcome.ends["named, its command makes it again, bit-identical"] += 1
+        outcome.ends["refused by name; rebuilt by its command"] += 1
     return outcome
 
 
 def chunks(bench: Bench, artefact: str, damage: Damage, times: int | None, seed: int) -> Outcome:
     """Damage chunks: refused when they are read, never taken for anything else."""
-    outcome = Outcome(_fault(damage, f"a chunk of `{artefact}`"))
+    outcome = Outcome(_fault(damage, "chunk"))
     rng = random.Random(f"{artefact} {_name(damage)} {seed}")
     for name in _some(stored(bench, artefact, chunks=True), times, rng):
         run = _ready(bench, artefact)
@@ -106,26 +106,26 @@ def chunks(bench: Bench, artefact: str, damage: Damage, times: int | None, seed:
         (advised,) = re.findall(r"make it again with '(.*)'", ended.err)
         _type(bench, advised)
         _mended(bench, run, artefact)
-        outcome.ends["named, the command advised makes it again, bit-identical"] += 1
+        outcome.ends["refused by name; rebuilt by its command"] += 1
     return outcome
 
 
 def products(bench: Bench, damage: Damage, times: int, seed: int) -> Outcome:
     """Damage the FITS maps: the fit, up to date as it is, writes them again."""
-    outcome = Outcome(_fault(damage, "a FITS map of the products"))
+    outcome = Outcome(_fault(damage, "FITS map"))
     rng = random.Random(f"products {_name(damage)} {seed}")
     for number in range(times):
         run = bench.copy("damaged", "ingest", "reduce", "sweep", "fit", "products")
         damage(run / "products" / ("delta_x.fits", "delta_y.fits")[number % 2], rng)
         pixcal(*bench.command("fit", run)).succeeded()
         bench.assert_same(run, *STAGES)
-        outcome.ends["written again, bit-identical"] += 1
+        outcome.ends["written again"] += 1
     return outcome
 
 
 def unfinished(bench: Bench, stage: str, damage: Damage, times: int, seed: int) -> Outcome:
     """Kill a command, damage what it has left half-done, and go on."""
-    outcome = Outcome(_fault(damage, f"a file that a killed `{stage}` left half-done"))
+    outcome = Outcome(_fault(damage, "file of an unfinished build"))
     rng = random.Random(f"unfinished {stage} {_name(damage)} {seed}")
     while outcome.tried < times:
         run = bench.copy("unfinished", *STAGES[: STAGES.index(stage)])
@@ -150,7 +150,7 @@ def unfinished(bench: Bench, stage: str, damage: Damage, times: int, seed: int) 
                 if advised := re.findall(r"make it again with '(.*)'", ended.err):
                     _type(bench, advised[0])
         bench.assert_same(run, *STAGES)
-        end = "named, then made again, bit-identical" if refused else "resumed, bit-identical"
+        end = "refused by name; rebuilt" if refused else "resumed"
         outcome.ends[end] += 1
     return outcome
 
@@ -191,8 +191,8 @@ def _some(names: list[str], times: int | None, rng: random.Random) -> list[str]:
 
 def _fault(damage: Damage, what: str) -> str:
     if damage is flip_a_bit:
-        return f"a bit flipped in {what}"
-    return f"{what} {_DONE[damage]}"
+        return f"{what}: one bit flipped"
+    return f"{what}: {_DONE[damage]}"
 
 
 def _name(damage: Damage) -> str:

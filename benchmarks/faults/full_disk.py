@@ -18,7 +18,7 @@ from faults import Outcome
 from faults.bench import STAGES, Bench
 from faults.forks import Ended, pixcal
 
-RESUMED = "one line, exit 1, resumed, bit-identical"
+RESUMED = "one line, exit 1; resumed"
 _LINE = ("disk full; what was complete is kept: make room and run the same command again",)
 
 
@@ -30,7 +30,7 @@ def at_writes(bench: Bench, stage: str, times: int | None, seed: int) -> Outcome
     times : int, optional
         How many of the writes; None for all, one after the other.
     """
-    outcome = Outcome(f"disk full at the n-th write of `{stage}`")
+    outcome = Outcome("disk full at the n-th write")
     earlier = STAGES[: STAGES.index(stage)]
     total = _count(bench, stage, earlier)
     numbers = range(total)
@@ -106,7 +106,7 @@ def _count_writes(run: Path, told: Path) -> None:
 
 def on_small_disks(bench: Bench, stage: str, times: int, seed: int) -> Outcome:
     """Run a command on tmpfs of random sizes that are too small; then with room."""
-    outcome = Outcome(f"a file system that is too small for `{stage}` (tmpfs)")
+    outcome = Outcome("file system too small (tmpfs)")
     earlier = STAGES[: STAGES.index(stage)]
     rng = random.Random(f"{stage} {seed}")
     while outcome.tried < times:

@@ -48,7 +48,7 @@ CHANGES = {
 
 def change(bench: Bench, how: Change, times: int, seed: int, stage: str = "ingest") -> Outcome:
     """Change a file of the acquisition at a random moment of a stage, then put it back."""
-    outcome = Outcome(f"an input file {CHANGES[how]} while `{stage}` runs")
+    outcome = Outcome(f"input file {CHANGES[how]} during a command")
     rng = random.Random(f"{how.__name__} {stage} {seed}")
     while outcome.tried < times:
         acquisition, run = _fresh(bench, stage)
@@ -62,9 +62,9 @@ def change(bench: Bench, how: Change, times: int, seed: int, stage: str = "inges
         if ended.code:
             ended.refused(2, f"{acquisition / name}: ")
             assert not (run / stage).exists()
-            outcome.ends["named, exit 2; with the file restored resumed, bit-identical"] += 1
+            outcome.ends["refused by name; resumed with the file restored"] += 1
         else:
-            outcome.ends["after all was read: bit-identical"] += 1
+            outcome.ends["already read"] += 1
             bench.assert_same(run, stage)
         shutil.copy2(bench.acquisition / name, acquisition / name)
         pixcal(*line(stage, acquisition, run)).succeeded()
@@ -74,9 +74,7 @@ def change(bench: Bench, how: Change, times: int, seed: int, stage: str = "inges
 
 def rot(bench: Bench, times: int, seed: int) -> Outcome:
     """Flip a bit of a frame after it was ingested; its size and time stay."""
-    outcome = Outcome(
-        "a bit of a FITS file flips between `ingest` and `reduce`, its time as it was"
-    )
+    outcome = Outcome("FITS file: one bit flipped between `ingest` and `reduce`")
     rng = random.Random(f"rot {seed}")
     while outcome.tried < times:
         acquisition, run = _fresh(bench, "reduce")
@@ -90,11 +88,11 @@ def rot(bench: Bench, times: int, seed: int) -> Outcome:
         ended = pixcal(*line("reduce", acquisition, run))
         if ended.code:
             ended.refused(2, f"{file}: its bytes are not those that were ingested")
-            outcome.ends["named, exit 2; with the file restored bit-identical"] += 1
+            outcome.ends["refused by name; resumed with the file restored"] += 1
             shutil.copy2(bench.acquisition / name, file)
             pixcal(*line("reduce", acquisition, run)).succeeded()
         else:
-            outcome.ends["in no sample: bit-identical"] += 1
+            outcome.ends["outside the samples"] += 1
         bench.assert_same(run, "reduce")
     return outcome
 

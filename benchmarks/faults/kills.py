@@ -23,20 +23,20 @@ def kill(bench: Bench, stage: str, times: int, seed: int) -> Outcome:
 
     All that is left, and what earlier stages left, must be as without a fault.
     """
-    outcome = Outcome(f"kill -9 of `{stage}` at a random moment")
+    outcome = Outcome("kill -9 at a random moment")
     for again in _disturbed(bench, stage, times, seed, signal.SIGKILL):
         assert again.code == -signal.SIGKILL
         assert again.err == ""
-        outcome.ends["resumed, bit-identical"] += 1
+        outcome.ends["resumed"] += 1
     return outcome
 
 
 def interrupt(bench: Bench, stage: str, times: int, seed: int) -> Outcome:
     """The same with Ctrl-C: one line, exit code 1."""
-    outcome = Outcome(f"Ctrl-C in `{stage}` at a random moment")
+    outcome = Outcome("Ctrl-C at a random moment")
     for again in _disturbed(bench, stage, times, seed, signal.SIGINT):
         again.refused(1, "interrupted; run the same command again to resume")
-        outcome.ends["one line, exit 1, resumed, bit-identical"] += 1
+        outcome.ends["one line, exit 1; resumed"] += 1
     return outcome
 
 
@@ -45,7 +45,7 @@ def loading(bench: Bench, stage: str, times: int, seed: int) -> Outcome:
 
     Before it has come to pixcal, which takes some hundredths of a second, Python answers itself.
     """
-    outcome = Outcome(f"Ctrl-C in the first {LOADING_S} s of `pixcal {stage}`, libraries loading")
+    outcome = Outcome(f"Ctrl-C in the first {LOADING_S} s, while libraries load")
     rng = random.Random(f"loading {stage} {seed}")
     while outcome.tried < times:
         run = bench.copy("loading", *STAGES[: STAGES.index(stage)])
@@ -62,11 +62,11 @@ def loading(bench: Bench, stage: str, times: int, seed: int) -> Outcome:
             continue  # over before: not counted
         if said.startswith("pixcal: "):
             Ended(process.returncode, "", said, 0.0).refused(1, "interrupted; run the same")
-            end = "one line, exit 1, resumed, bit-identical"
+            end = "one line, exit 1; resumed"
         else:
             assert "pixcal_cli" not in said, said
             assert {f.name for f in run.iterdir()} == set(STAGES[: STAGES.index(stage)])
-            end = "Python itself not up yet, nothing begun"
+            end = "Python had not started pixcal"
         pixcal(*bench.command(stage, run)).succeeded()
         bench.assert_same(run, stage)
         outcome.ends[end] += 1

@@ -51,7 +51,7 @@ def _read_only(folder: Path) -> Iterator[None]:
 
 def read_only(bench: Bench) -> Outcome:
     """Every command on a run directory that cannot be written, new or not."""
-    outcome = Outcome("a directory that is read-only")
+    outcome = Outcome("read-only directory")
     before = partial(_as_nobody, bench.folder / "no home")
     for number, stage in enumerate((*STAGES, "allan")):
         run = bench.copy("read only", *(*STAGES, "allan")[:number])
@@ -71,13 +71,13 @@ def read_only(bench: Bench) -> Outcome:
         for stage in STAGES:
             pixcal(*bench.command(stage, run), before=before).succeeded()
     bench.assert_same(run, *STAGES)
-    outcome.ends["frames that are read-only: bit-identical"] += 1
+    outcome.ends["not written to"] += 1
     return outcome
 
 
 def hard_names(bench: Bench, names: Sequence[str]) -> Outcome:
     """The whole chain below directories with odd names."""
-    outcome = Outcome("acquisition and RUN below paths with spaces, quotes, other alphabets")
+    outcome = Outcome("paths with spaces, quotes, other alphabets")
     for name in names:
         folder = bench.folder / "names" / name
         shutil.rmtree(folder, ignore_errors=True)
@@ -88,5 +88,5 @@ def hard_names(bench: Bench, names: Sequence[str]) -> Outcome:
             assert str(run) in ended.out
         bench.assert_same(run, *STAGES)
         pixcal("fit", run / "nowhere").refused(2)
-        outcome.ends["bit-identical"] += 1
+        outcome.ends["same result"] += 1
     return outcome

@@ -11,7 +11,7 @@ from faults.forks import Command, pixcal
 
 def together(bench: Bench, times: int, seed: int) -> Outcome:
     """Begin three commands on one run at almost the same time; each does its work or is refused."""
-    outcome = Outcome("three processes on one RUN at the same time")
+    outcome = Outcome("three commands on one RUN at the same time")
     rng = random.Random(f"together {seed}")
     for number in range(times):
         stage = STAGES[number % len(STAGES)]
@@ -27,11 +27,11 @@ def together(bench: Bench, times: int, seed: int) -> Outcome:
         for command in commands:
             ended = command.end()
             if ended.code == 0:
-                ends["done, or found up to date"] += 1
+                ends["done or up to date"] += 1
                 continue
             ended.refused(2, f"{run}: another pixcal is working there; wait for it")
-            ends["refused with one line, exit 2"] += 1
-        assert ends["done, or found up to date"] > 0
+            ends["one line, exit 2"] += 1
+        assert ends["done or up to date"] > 0
         pixcal(*bench.command(stage, run)).succeeded()
         bench.assert_same(run, *earlier, stage)
         outcome.ends += ends

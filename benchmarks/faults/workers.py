@@ -70,7 +70,7 @@ def _leak(megabytes: int) -> None:
 
 def killed(bench: Bench, address: str, stage: str, times: int, seed: int) -> Outcome:
     """Kill a worker when the first tasks of a command are done."""
-    outcome = Outcome(f"a Dask worker killed in `{stage}`")
+    outcome = Outcome("Dask worker killed")
     rng = random.Random(f"killed {stage} {seed}")
 
     def kill(client: Client, command: Command, run: Path) -> None:
@@ -83,7 +83,7 @@ def killed(bench: Bench, address: str, stage: str, times: int, seed: int) -> Out
 
 def starved(bench: Bench, address: str, stage: str, times: int, seed: int) -> Outcome:
     """Let a worker lose its memory to something else: its nanny kills it."""
-    outcome = Outcome(f"a Dask worker starved of memory in `{stage}`")
+    outcome = Outcome("Dask worker short of memory")
     rng = random.Random(f"starved {stage} {seed}")
 
     def starve(client: Client, command: Command, run: Path) -> None:
@@ -120,8 +120,8 @@ def _disturbed(
             pixcal(*bench.command(stage, run)).succeeded()
         bench.assert_same(run, *earlier, stage)
         if in_time:
-            end = "one line, exit 1, resumed" if ended.code else "its tasks done by others"
-            outcome.ends[f"{end}, bit-identical"] += 1
+            end = "one line, exit 1; resumed" if ended.code else "tasks done by other workers"
+            outcome.ends[end] += 1
     return outcome
 
 

@@ -152,4 +152,4 @@ def _parse_only(command: click.Command, line: list[str]) -> None:
         check_line(f"pixcal: {one_line(explain(error)[1])}\n", (), str(command.name))
 
 
-KINDS = [Kind("options", "bad values of every option and argument of every command", _option, 700)]
+KINDS = [Kind("options", "bad values of all options and arguments", _option, 700)]

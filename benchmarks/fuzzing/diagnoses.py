@@ -271,8 +271,8 @@ def _nominal(case: Case) -> Answer:
 
 
 KINDS = [
-    Kind("diagnose-odd", "odd acquisitions, diagnosed", _odd, 60),
-    Kind("diagnose-run", "damaged, missing, exchanged artefacts, diagnosed", _artefacts, 60),
-    Kind("diagnose-own", "broken effects of the user's own, as candidates", _own, 60),
-    Kind("diagnose-nominal", "bench files for --nominal, bad and good", _nominal, 50),
+    Kind("diagnose-odd", "diagnosis of odd acquisitions", _odd, 60),
+    Kind("diagnose-run", "diagnosis with damaged, missing or swapped artefacts", _artefacts, 60),
+    Kind("diagnose-own", "diagnosis with broken effects of your own", _own, 60),
+    Kind("diagnose-nominal", "bench files for `--nominal`", _nominal, 50),
 ]

@@ -109,4 +109,4 @@ def _exam(case: Case) -> Answer:
     return "truthful"
 
 
-KINDS = [Kind("blind", "examinations and sealed files that are spoilt", _exam, 100)]
+KINDS = [Kind("blind", "damaged blind examinations", _exam, 100)]

@@ -225,10 +225,10 @@ def _kind(name: str, title: str, spoil: Any, cases: int = 400) -> Kind:
 
 
 KINDS = [
-    _kind("cards", "FITS headers: cards missing, doubled, contradictory, rubbish", _cards),
-    _kind("lies", "FITS headers lying about BITPIX, NAXIS, size", _lie),
-    _kind("length", "FITS files cut or extended", _length),
+    _kind("cards", "FITS headers: cards missing, repeated, contradictory, garbage", _cards),
+    _kind("lies", "FITS headers: wrong BITPIX, NAXIS, size", _lie),
+    _kind("length", "FITS files truncated or extended", _length),
     _kind("flipped", "FITS files with changed bytes", _flipped),
-    _kind("rubbish", "files that are no FITS", _rubbish),
-    _kind("bombs", "FITS headers and gzip streams that promise too much", _bomb, 200),
+    _kind("rubbish", "files other than FITS", _rubbish),
+    _kind("bombs", "FITS headers and gzip streams that announce too much data", _bomb, 200),
 ]

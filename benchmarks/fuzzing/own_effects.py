@@ -97,4 +97,4 @@ def _own(case: Case) -> Answer:
     return "truthful"
 
 
-KINDS = [Kind("own-effects", "files with effects of the user's own", _own, 200)]
+KINDS = [Kind("own-effects", "files with your own effects", _own, 200)]

@@ -138,8 +138,6 @@ def _check_page(file: Path, text: str) -> None:
 
 
 KINDS = [
-    Kind(
-        "globs", "globs that leave the acquisition: .., absolute, links in circles", _elsewhere, 500
-    ),
-    Kind("markup", "markup in names, files and headers, on the way to the report", _markup, 30),
+    Kind("globs", "globs: `..`, absolute paths, circular links", _elsewhere, 500),
+    Kind("markup", "markup in names, files and headers", _markup, 30),
 ]

@@ -237,12 +237,12 @@ def bench_cases() -> int:
 
 KINDS = [
     Kind("acquisition", "wrong values at every key of acquisition.yaml", _acquisition_key, 600),
-    Kind("bench-file", "wrong values at every key of a bench file, effects too", _bench_key, 600),
+    Kind("bench-file", "wrong values at every key of a bench file", _bench_key, 600),
     Kind(
         "yaml",
-        "YAML of an acquisition: bombs, tags, huge numbers, keys twice",
+        "acquisition.yaml: YAML bombs, tags, huge numbers, repeated keys",
         _spoilt_acquisition,
         500,
     ),
-    Kind("bench-yaml", "YAML of a bench: the same", _spoilt_bench, 500),
+    Kind("bench-yaml", "bench file: the same", _spoilt_bench, 500),
 ]
