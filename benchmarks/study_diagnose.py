@@ -1,9 +1,9 @@
 """What the diagnosis claims by chance, and from which strength on it finds each effect.
 
 Every acquisition is of another detector, with nothing in it or one effect of some strength, and is
-recorded, reduced and diagnosed as a user's would be. What is played goes to
-``docs/appendix/diagnose/study.jsonl``, where an interrupted study resumes with the same code;
-tables and picture into the page.
+recorded, reduced and diagnosed as a user's would be. Results go to
+``docs/appendix/diagnose/study.jsonl``, where an interrupted study resumes with the same code,
+and tables into the page.
 """
 
 import argparse
@@ -18,7 +18,6 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 import yaml
 from scipy.special import ndtr
@@ -37,9 +36,6 @@ from pixcal.stages import diagnose, ingest, reduce, simulate
 from pixcal.stages.diagnose.inquiry import REFERENCES, Inquiry, inquire
 from pixcal.stages.diagnose.rejection import similar_to
 from pixcal.stages.diagnose.shrinkage import differing, shrinkage
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 
 OUT = Path(__file__).parents[1] / "docs" / "appendix" / "diagnose"
 HERE, PROCESSES = Runtime(cluster="sync"), Runtime(cluster="processes", quiet=False)
@@ -203,25 +199,25 @@ def nominal_table(played: Sequence[dict[str, Any]]) -> str:
     share = [float(np.mean(chances < limit)) for limit in (0.1, 0.01, 0.001)]
     rows = [
         ("nominal acquisitions", count),
-        ("in which a cause was claimed", _share(claims, count)),
-        ("in which a gap was seen", _share(gaps, count)),
-        ("statistics with a chance below 0.1", f"{share[0]:.3f}"),
-        ("below 0.01", f"{share[1]:.4f}"),
-        ("below 0.001", f"{share[2]:.5f}"),
-        ("furthest off a uniform distribution (Kolmogorov-Smirnov)", _ks(chances)),
-        ("statistics whose own chances differ from that with p < 0.05", _unlike(played)),
+        ("with a claimed cause", _share(claims, count)),
+        ("with a significant gap", _share(gaps, count)),
+        ("statistics with p < 0.1", f"{share[0]:.3f}"),
+        ("p < 0.01", f"{share[1]:.4f}"),
+        ("p < 0.001", f"{share[2]:.5f}"),
+        ("largest deviation from a uniform distribution (Kolmogorov-Smirnov)", _ks(chances)),
+        ("statistics that deviate from it with p < 0.05", _unlike(played)),
     ]
     own = [p["estimates"] for p in played if p.get("estimates")]
     if own:
         every = np.array([chance for found in own for chance in found.values()])
         best = np.array([len(found) * min(found.values()) for found in own])
         rows += [
-            ("estimates of effects with a chance below 0.1", f"{np.mean(every < 0.1):.3f}"),
-            ("below 0.01", f"{np.mean(every < 0.01):.4f}"),
-            ("below 0.001", f"{np.mean(every < 0.001):.5f}"),
+            ("estimates of effects with p < 0.1", f"{np.mean(every < 0.1):.3f}"),
+            ("p < 0.01", f"{np.mean(every < 0.01):.4f}"),
+            ("p < 0.001", f"{np.mean(every < 0.001):.5f}"),
             (
-                "acquisitions whose most significant estimate has, times the number of "
-                "candidates, a chance below 0.1",
+                "acquisitions whose most significant estimate has p < 0.1, corrected for the "
+                "number of candidates",
                 _share(int((best < 0.1).sum()), len(best)),
             ),
         ]
@@ -365,41 +361,8 @@ def power_table(played: Sequence[dict[str, Any]]) -> str:
         ]
         off = f"{np.median([abs(a - b) for a, b in pairs]):.3f}" if pairs else "-"
         rows.append((name, *cells, off))
-    header = ("effect", *(f"{s:g} × threshold" for s in STRENGTHS), "share closed, off truth's")
+    header = ("effect", *(f"{s:g} × threshold" for s in STRENGTHS), "error of the gap closed")
     return _table(header, rows)
-
-
-def draw(played: Sequence[dict[str, Any]], file: Path) -> None:
-    """Power curves, a small panel each."""
-    names = sorted({p["effect"] for p in played})
-    columns = 5
-    figure, axes = plt.subplots(
-        -(-len(names) // columns), columns, figsize=(11, 9), sharex=True, sharey=True,
-        squeeze=False, layout="constrained",
-    )  # fmt: skip
-    for axis in axes.flat[len(names) :]:
-        axis.set_visible(False)
-    for name, axis in zip(names, axes.flat, strict=False):
-        own = [p for p in played if p["effect"] == name]
-        share = [
-            np.mean([name in p["taken"] for p in own if p["strength"] == s]) for s in STRENGTHS
-        ]
-        wrong = [
-            np.mean([bool(strangers(p)) for p in own if p["strength"] == s]) for s in STRENGTHS
-        ]
-        axis.semilogx(STRENGTHS, share, "o-", color="#2b6ca3", label="found")
-        axis.semilogx(STRENGTHS, wrong, "x:", color="#b5482f", label="another claimed")
-        axis.set_title(name, fontsize=9)
-        axis.set_ylim(-0.05, 1.05)
-        axis.grid(alpha=0.3)
-    for axis in axes[-1]:
-        axis.set_xticks(STRENGTHS, [f"{s:g}" for s in STRENGTHS])
-        axis.minorticks_off()
-    handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower right", ncols=2, frameon=False)
-    figure.supxlabel("strength, times the threshold")
-    figure.supylabel("share of acquisitions")
-    figure.savefig(file, dpi=110)
 
 
 def main() -> None:
@@ -447,7 +410,7 @@ def main() -> None:
 
 
 def publish(played: Sequence[dict[str, Any]], out: Path) -> None:
-    """Print the tables, draw the picture, and put both into the documentation."""
+    """Print the tables, and put those that the page has marks for into it."""
     nothing = [p for p in played if not p["effect"]]
     something = [p for p in played if p["effect"]]
     tables = {"nominal": nominal_table(nothing)} if nothing else {}
@@ -458,7 +421,6 @@ def publish(played: Sequence[dict[str, Any]], out: Path) -> None:
             "strengths": strengths_table(something),
             "wrong": wrong_table(something),
         }
-        draw(something, out / "power.png")
     page = OUT.parent / "diagnose-study.md"
     text = page.read_text(encoding="utf-8")
     for name, table in tables.items():
