@@ -89,7 +89,7 @@ def measure(lab: Lab, bench: Bench) -> list[Edge]:
 
 
 def draw(edges: list[Edge]) -> Figure:
-    """Frames at both edges, and how far the fringes of both kinds are apart."""
+    """Frames at both edges, and the distance between straight and hyperbolic fringes."""
     figure = new_figure(WIDE, 5.0)
     axes = figure.subplots(1, 5, width_ratios=[1, 1, 1, 1, 2.2])
     panels = [(edge, shape) for edge in edges for shape in SHAPES]
@@ -136,24 +136,22 @@ def make(lab: Lab) -> Outcome:
     return Outcome(
         figure="5",
         title="Straight and hyperbolic fringes",
-        run=f"One frame without noise of {bench.detector.shape[1]} columns at each side of a "
-        f"detector of {number(bench.detector.chip_shape[0])} rows, with straight and with exact "
-        f"fringes; the paper's own size.",
-        caption="Left: the same columns with straight and with hyperbolic fringes. Right: how far "
-        "they are apart in each row, measured on the frames, on the path difference to the order "
-        "after the paraxial one (black).",
+        run=f"One noise-free frame of {bench.detector.shape[1]} columns at each edge of a detector "
+        f"with {number(bench.detector.chip_shape[0])} rows, with straight and with exact fringes.",
+        caption="Left: the same columns with straight and with hyperbolic fringes. Right: their "
+        "distance in each row, measured in the frames, over the next order of the path difference "
+        "(black).",
         rows=(
-            Row("interfringe of 6 mm by equation 4", f"{number(period, 4)} px", "periods"),
-            Row("fringes apart at the edge, middle row", f"{number(middle)} px", "curved"),
-            Row("fringes apart in a corner", f"{number(corner)} px"),
+            Row("fringe period of 6 mm by equation 4", f"{number(period, 4)} px", "periods"),
+            Row("their distance at the edge, middle row", f"{number(middle)} px", "curved"),
+            Row("distance in a corner", f"{number(corner)} px"),
             Row("the same by −qₓ (q² + B²/4) / 2D²", f"{number(leading)} px"),
-            Row("the straight model",
-                f"off by {number(corner / period, 2)} fringes in the corners", "straight"),
+            Row("error of the straight model",
+                f"{number(corner / period, 2)} fringes in the corners", "straight"),
         ),
-        difference="The figure shows a shape, and the shape is the same. In pixels "
-        "it hardly depends on the baseline, so that a longer one does not make it smaller. "
-        f"Where the paper has 7 px, its equation 4 gives {number(period, 2)}: the other end of its "
-        "range agrees.",
+        difference="The shape agrees. The distance in pixels hardly depends on the baseline. "
+        f"The paper gives 7 px for the shortest period, its equation 4 gives {number(period, 2)} "
+        "px.",
         numbers={
             "bend_edge_px": middle,
             "bend_corner_px": corner,

@@ -1,4 +1,4 @@
-"""Figure 9: precision against frames for several interfringes, and what the estimator changes."""
+"""Figure 9: precision against frames for several fringe periods, and what the estimator changes."""
 
 from dataclasses import asdict, dataclass, replace
 
@@ -53,7 +53,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Line:
-    """One interfringe."""
+    """One fringe period."""
 
     interfringe: float
     points: tuple[Point, ...]
@@ -92,7 +92,7 @@ def alternatives(scene: Scene, name: str, frames: tuple[int, ...]) -> dict[str, 
 
 
 def noisy(bench: Bench) -> Bench:
-    """The finest fringes with a laser that is not steady."""
+    """The finest fringes with laser noise."""
     (scan,) = (s for s in bench.frames.fringes if s.name == FINEST)
     return replace(
         bench,
@@ -102,11 +102,11 @@ def noisy(bench: Bench) -> Bench:
 
 
 def draw(lines: dict[str, Line], methods: dict[str, dict[str, list[Point]]]) -> Figure:
-    """All interfringes on the left; the estimators at the finest one on the right."""
+    """All fringe periods on the left; the estimators at the finest one on the right."""
     figure = new_figure(WIDE, 4.8)
     left, right = figure.subplots(1, 2, sharey=True)
     for line, colour in zip(lines.values(), COLOURS, strict=False):
-        label = f"{line.interfringe:.3g} px from fringe to fringe"
+        label = f"{line.interfringe:.3g} px period"
         _points(left, line.points, colour, "o", label)
         _bound(left, line.points, colour)
     left.plot([], [], color=GREY, ls="--", label="Cramér–Rao bound")
@@ -187,37 +187,33 @@ def make(lab: Lab) -> Outcome:
     return Outcome(
         figure="9",
         title="Precision against frames",
-        run=f"{len(lines)} interfringes of {number(frames[-1])} frames of {side} × {side} px, each "
-        "cut to its first frames for the points before; once more with laser noise. The paper "
-        "does not give its window, and simulates sums of frames above 10 000; here all frames are "
-        "made" + ("." if lab.full else f", up to {number(frames[-1])}."),
-        caption="Left: errors against the truth, less the modes that no data tell from the bench, "
-        "on the Cramér–Rao lines (dashed). Right: the paper's iterations (five, without weights) "
-        "beside pixcal on the same frames; hollow with laser noise. Of the paper's maps only "
-        "piston and slopes are taken off.",
+        run=f"{len(lines)} fringe periods, {number(frames[-1])} frames of {side} × {side} px each, "
+        "and the finest fringes again with laser noise. Other points use the first frames. The "
+        "paper does not state its window, and simulates sums of frames above 10 000.",
+        caption="Left: errors against the truth without degenerate modes; dashed: Cramér–Rao "
+        "bounds. Right: pixcal and the paper's iterations (five, without weights) on the same "
+        "frames; hollow: with laser noise. From the paper's maps only piston and slopes are "
+        "removed.",
         rows=(
-            Row("frames for 5 × 10⁻⁵ px at 5 px, pixcal", with_error(own, own * chance), "target"),
+            Row("frames for 5 × 10⁻⁵ px with a period of 5 px, pixcal",
+                with_error(own, own * chance), "target"),
             Row("the same, A and B constant, no weights", with_error(paper, paper * chance),
                 "constant"),
             Row("error over the Cramér–Rao bound, all points",
                 f"{min(ratios):.3f} to {max(ratios):.3f}", "finer"),
-            Row("the same, A and B free and all modes kept: error at the end",
+            Row("error with A and B free and all modes kept, all frames",
                 f"{number(methods['steady']['free'][-1].error)} px", "free"),
             Row(f"A and B constant, {100 * LASER_RMS:g} % laser noise: frames for 5 × 10⁻⁵ px",
                 number(needed["laser"]["constant"]), "laser"),
             Row(f"pixcal, {100 * LASER_RMS:g} % laser noise: frames for 5 × 10⁻⁵ px",
                 number(needed["laser"]["pixcal"])),
         ),
-        difference=f"The paper's number comes out with the paper's estimator: {number(paper)} "
-        f"frames. It gives all samples the same weight, although the dark fringe tells most; "
-        f"with weights from the model the same precision takes {number(own)} frames, "
-        f"{number(paper / own)} times fewer, which is the bound. Free intensities leave four "
-        "fringe patterns open that a map cannot hold apart from them (an ambiguity of the physics, "
-        "not a failure to converge): what they hold of the true offsets, "
-        f"{number(floor)} px in this window, is an error that no more frames lower, and that the "
-        "paper met; taken off both sides they cost nothing. Intensities held constant are no way "
-        f"out once the laser moves by {100 * LASER_RMS:g} %: its noise then stays in the map as "
-        "fringes.",
+        difference=f"The paper's estimator needs {number(paper)} frames, as the paper says. It "
+        f"weights all samples alike. With weights from the model, {number(own)} frames suffice, "
+        f"{number(paper / own)} times fewer, which is the bound. Free intensities are degenerate "
+        f"with four fringe patterns of the map. These patterns hold {number(floor)} px of the true "
+        "offsets here, an error that more frames do not reduce. With constant intensities, laser "
+        f"noise of {100 * LASER_RMS:g} % appears as fringes in the map.",
         numbers={
             "pixcal": {name: asdict(line) for name, line in lines.items()},
             "methods_at_5_px": {

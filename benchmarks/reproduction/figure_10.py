@@ -163,25 +163,24 @@ def make(lab: Lab) -> Outcome:
     return Outcome(
         figure="10",
         title="Parameters and their errors",
-        run=f"{number(frames)} frames of {side} × {side} px, 5 px from fringe to fringe, with bias "
-        "and response maps drawn at random in place of the measured ones. No flats, so that the "
-        "response stays in α and ι as in the paper.",
-        caption="Above: what was fitted. Below: estimate less truth, less the modes that free "
-        "intensities leave open; right, the errors of δx in units of what the fit says of them.",
+        run=f"{number(frames)} frames of {side} × {side} px, fringe period 5 px, with random bias "
+        "and response maps. No flats, so the response stays in α and ι as in the paper.",
+        caption="Above: fitted parameters. Below: errors without degenerate modes; right, the "
+        "errors of δx over their sigma.",
         rows=(
             Row("error of δx over the Cramér–Rao bound", f"{rms / found.bound:.3f}", "systematics"),
             Row("error of δx over its own sigma", f"{pull:.3f}"),
             Row("largest of four tests for patterns (neighbours, rows, columns)",
                 f"{worst:.1f} standard deviations", "map"),
-            Row("chance of the highest peak of its power spectrum", f"{white.peak:.2f}"),
+            Row("p-value of the highest peak of its power spectrum", f"{white.peak:.2f}"),
             Row("correlation of ι with the true response", f"{found.response:.4f}", "response"),
             Row("error of φ(t) over the Cramér–Rao bound",
                 f"{numbers['phi_error_rad'] / found.phi_bound:.3f}"),
             Row("error of B(t)", number(numbers["level_error"])),
         ),
         difference="None in the result. The paper holds A, B and the fringe vector constant from "
-        "the second iteration on; here they are free in every frame, and the errors still carry "
-        "no pattern, because the modes that this opens are known and taken off.",
+        "the second iteration on. Here they are free in every frame, and the degenerate modes are "
+        "removed.",
         numbers=numbers,
         picture=png(draw(found)),
     )  # fmt: skip

@@ -126,9 +126,9 @@ def make(lab: Lab) -> Outcome:
     knees = [one.allan["knee_frames"] for one in found]
     rise = "none" if not any(knees) else ", ".join(f"{number(k)} frames" for k in knees if k)
     rows += [
-        Row("knee, where the deviation leaves the law", rise, "rise"),
+        Row("knee, where the deviation leaves the power law", rise, "rise"),
         Row(f"deviation of {number(MEASURED_FRAMES)} frames", f"{number(at)} px", "allan"),
-        Row("the paper's bench over this simulation", number(excess), "gap"),
+        Row("deviation of the paper's bench over this simulation", number(excess), "gap"),
         Row("error of all frames over the Cramér–Rao bound",
             ", ".join(f"{one.error / one.bound:.3f}" for one in found)),
     ]  # fmt: skip
@@ -139,17 +139,15 @@ def make(lab: Lab) -> Outcome:
         run=f"Two sets of {number(frames)} frames of {bench.detector.shape[0]} × "
         f"{bench.detector.shape[1]} px, batches of {BATCH_FRAMES}: {number(lasts / 60)} minutes "
         "of the bench" + ("." if lab.full else ", where the paper has two hours."),
-        caption="Allan deviation of the maps of batches (black) with its power law (red) over the "
-        "bound (green). The star is what the paper's bench reaches by its own Allan deviations.",
+        caption="Allan deviation of the maps of batches (black), power law (red), bound (green). "
+        "The star is the deviation of the paper's bench.",
         rows=tuple(rows),
-        difference="The law is the same. The level is not: the paper's bench lies "
+        difference="The power law is the same. The paper's bench lies "
         f"{number(excess, 2)} times above a simulation with photon and read noise only, or "
-        f"{number(excess * period_px / FINER_PX, 2)} times if its 10 000 frames are meant for "
-        f"{FINER_PX:g} px from fringe to fringe, as its sentence can be read: the discrepancy that "
-        "it leaves open. What figure 9 shows of the paper's estimator on a steady laser is far "
-        "less than that, so most of it is in the bench, or in constant intensities where the "
-        f"laser is not. The rise after {STABLE_S / 60:.0f} minutes is no part of a stable bench "
-        "and is not simulated here.",
+        f"{number(excess * period_px / FINER_PX, 2)} times if its 10 000 frames refer to a period "
+        f"of {FINER_PX:g} px. The paper's estimator explains far less than that (figure 9). Most "
+        "of it is therefore in the bench, or in intensities that vary but are held constant. The "
+        f"rise after {STABLE_S / 60:.0f} minutes is not simulated.",
         numbers={
             one.name: {
                 "slope": one.allan["slope"], "slope_err": one.allan["slope_err"],

@@ -195,15 +195,14 @@ def make(lab: Lab) -> Outcome:
     sized = "" if lab.full else " (the paper: 10 000 with noise)"
     return Outcome(
         figure="12-13",
-        title="Saw teeth by crosstalk",
-        run=f"40 × 40 px; {number(frames)} frames of each direction with noise at "
-        f"{periods[0]:.2g} px from fringe to fringe, {number(clean_frames)} without at "
-        f"{periods[1]:.2g} px, the latter also without crosstalk{sized}. Figure 12 is a "
-        "measurement in the paper; its kernel is not published, and the one taken has its size and "
-        "kind.",
-        caption="Maps of δy and δx and the means of their rows; red, what the kernel feigns "
-        "by arg(Σ kₙ exp(iKn)) / K. The upper row is fitted by pixcal, the others by the paper's "
-        f"iterations with constant A and B, {CONVERGED} of them.",
+        title="Sawtooth by crosstalk",
+        run=f"40 × 40 px; {number(frames)} frames of each direction with noise and a period of "
+        f"{periods[0]:.2g} px; {number(clean_frames)} without noise and {periods[1]:.2g} px, with "
+        f"and without crosstalk{sized}. The paper does not publish its kernel; this one has its "
+        "size and kind.",
+        caption="Maps of δy and δx and the means of their rows; red, the offsets arg(Σ kₙ "
+        f"exp(iKn)) / K of the kernel. Upper row: pixcal. Others: {CONVERGED} of the paper's "
+        "iterations with constant A and B.",
         rows=(
             Row("teeth of δy, figure 12, peak to peak", _height(real["horizontal"]), "teeth_y"),
             Row("teeth of δx, figure 12, peak to peak", _height(real["vertical"]), "teeth_x"),
@@ -218,14 +217,11 @@ def make(lab: Lab) -> Outcome:
             Row(f"teeth of δy at {periods[1]:.2g} px when A and B are free",
                 _height(free["horizontal"])),
         ),
-        difference="The teeth have the paper's size because the kernel has; that they lie on the "
-        "closed form row by row is the check. Without crosstalk the error is that of rounding to "
-        "16 bits, which falls with the root of the frames; the paper's 10⁻⁷ px need no rounding. "
-        f"At {periods[1]:.2g} px the second harmonic of horizontal fringes has a period of four "
-        "rows, just that of the kernel: a fit with free intensities takes most of the teeth for "
-        "one of the modes it must remove (last line), so the paper's constant intensities, or "
-        "another interfringe, are needed to see them there. For the same reason five iterations do "
-        "not quite get there.",
+        difference="The teeth follow the closed form row by row. Without crosstalk the error is "
+        "that of rounding to 16 bits, which the paper's 10⁻⁷ px do not contain. "
+        f"At {periods[1]:.2g} px the second harmonic of horizontal fringes has the period of the "
+        "kernel, four rows. A fit with free intensities then removes most of the teeth as a "
+        "degenerate mode (last row). Constant intensities or another fringe period show them.",
         numbers={
             title: {
                 OFFSET[name]: {
@@ -247,4 +243,4 @@ def make(lab: Lab) -> Outcome:
 
 def _height(one: Teeth) -> str:
     height, expected = (number(100 * v) for v in (one.height, one.expected_height))
-    return f"{height} % of a pixel, by the kernel {expected} %"
+    return f"{height} % of a pixel, kernel {expected} %"

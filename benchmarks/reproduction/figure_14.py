@@ -220,44 +220,41 @@ def make(lab: Lab) -> Outcome:
     return Outcome(
         figure="14-15",
         title="The paraxial crest",
-        run=f"400 × 400 px, 9 px from fringe to fringe, fibres 18 mm off; {number(counts[0])} "
-        f"frames of each direction with noise, crosstalk and a fringe vector that moves, "
-        f"{number(counts[1])} without any of them{sized}: without noise the number does not "
-        "matter.",
-        caption="Above: the paper's iterations on all effects together. Middle: exact fringes "
-        "without noise, fitted as straight ones (`--model paraxial`). Below: the same frames, the "
-        "shape chosen by evidence (`--model auto`), on the same colours.",
+        run=f"400 × 400 px, period 9 px, fibre pair offset 18 mm; {number(counts[0])} frames of "
+        "each direction with noise, crosstalk and a fringe vector that varies, "
+        f"{number(counts[1])} with none of them{sized}.",
+        caption="Above: the paper's iterations, all effects. Middle: exact fringes without noise, "
+        "fitted as straight ones (`--model paraxial`). Below: the same frames with `--model auto`, "
+        "same colours.",
         rows=(
             Row("crest of δx, straight model, peak to peak",
                 f"{number(dx.crest.reach)} px", "crest"),
             Row("crest of δy, straight model, peak to peak", f"{number(dy.crest.reach)} px"),
-            Row("line of the crest of δx, from the x axis", f"{dx.crest.ridge_deg:.1f}°, "
-                f"of the exact fringes {dx.expected.ridge_deg:.1f}°", "crest"),
-            Row("fibre offset read off the crest of δx", _place(dx.seen), "offset_x"),
-            Row("fibre offset read off the crest of δy", _place(dy.seen), "offset_y"),
-            Row("fibre offset by the hyperbolic fit, δx", _fitted(dx)),
-            Row("crests left with the shape chosen by evidence, δx and δy",
+            Row("direction of the crest of δx, from the x axis", f"{dx.crest.ridge_deg:.1f}°, "
+                f"expected {dx.expected.ridge_deg:.1f}°", "crest"),
+            Row("fibre offset from the crest of δx", _place(dx.seen), "offset_x"),
+            Row("fibre offset from the crest of δy", _place(dy.seen), "offset_y"),
+            Row("fibre offset from the hyperbolic fit, δx", _fitted(dx)),
+            Row("remaining crests with `--model auto`, δx and δy",
                 f"{number(dx.left.reach)} and {number(dy.left.reach)} px "
                 f"({dx.model}, {dy.model})"),
             Row("teeth of δy, figure 14", f"{number(mixed['horizontal'].teeth)} px, kernel "
                 f"{number(mixed['horizontal'].expected_teeth)} px", "same_teeth"),
             Row("fringes in δx, paper's iterations", f"{number(mixed['vertical'].fringes)} px rms",
                 "residuals"),
-            Row("the same with only the laser's noise, only the moving vector, neither",
+            Row("the same with laser noise only, varying fringe vector only, neither",
                 f"{number(alone['laser'])}, {number(alone['vector'])}, "
                 f"{number(alone['nothing'])} px rms"),
             Row("fringes in δx, pixcal", f"{number(mixed['vertical'].auto_fringes)} px rms"),
         ),
-        difference="The crest is the second order of the path difference about a window that the "
-        "fibres do not face; its three numbers give the offset at once, where the paper tried "
-        "until the pictures agreed. Without noise it is of the same size in δx and in δy, since "
-        "both offsets are: that the paper sees little on δy fits its first reason, fibres nearer "
-        "to the window's middle in that direction. The paper's iterations leave fringes because "
-        "A, B and the fringe vector are held while those of the frames move. Taken one by one, "
-        f"laser noise of {100 * real.bench.optics.laser_noise_rms:g} % leaves "
-        f"{number(alone['laser'] / alone['vector'])} times what a vector does that tilts by "
-        f"{real.bench.frames.fringes[0].vector_jitter_rad:g} rad across the window: the paper "
-        "names only the latter.",
+        difference="The crest is the second order of the path difference; its shape gives the "
+        "fibre offset directly, where the paper used trial and error. It has the same size in δx "
+        "and δy because both offsets are the same. The paper sees little in δy, so its fibres may "
+        "be nearer to the axis in that direction. The paper's iterations leave fringes because "
+        "they hold A, B and the fringe vector constant. Laser noise of "
+        f"{100 * real.bench.optics.laser_noise_rms:g} % alone leaves "
+        f"{number(alone['laser'] / alone['vector'])} times as much as a fringe vector that varies "
+        f"by {real.bench.frames.fringes[0].vector_jitter_rad:g} rad across the window.",
         numbers={
             "figure_15": {
                 OFFSET[name]: {

@@ -62,16 +62,15 @@ def make(lab: Lab) -> Outcome:
     return Outcome(
         figure="16-17",
         title="Paths of crests and valleys, and their cost",
-        run=f"One frame of {number(nx)} × {number(ny)} px without noise, the paper's own size; the "
+        run=f"One noise-free frame of {number(nx)} × {number(ny)} px, the size of the paper; the "
         f"fit starts from a distance of {number(bench.optics.nominal_distance_mm, 4)} mm.",
-        caption="Above: the outermost paths, stretched across, and over the detector with the "
-        "fibres. Middle: what the frame looks like there, and the scatter of the points. Below: "
-        "the cost of equation 7 over distance and baseline, over distance and their ratio, and "
-        "along the valley.",
+        caption="Above: the outermost paths, stretched, and all paths with the fibres. Middle: "
+        "details of the frame, and the scatter of the points. Below: the cost of equation 7 over "
+        "distance and baseline, over distance and their ratio, and along the valley.",
         rows=(
-            Row("paths followed", f"{number(facts['paths'])}, by {number(facts['points_used'])} "
+            Row("paths followed", f"{number(facts['paths'])}, with {number(facts['points_used'])} "
                 "points", "paths"),
-            Row("one minimum as far as the maps go", "yes" if facts["unique_minimum"] else "no",
+            Row("single minimum within the maps", "yes" if facts["unique_minimum"] else "no",
                 "minimum"),
             Row("distance D", _apart(*distance), "accurate"),
             Row("baseline B", _apart(*baseline), "accurate"),
@@ -79,8 +78,8 @@ def make(lab: Lab) -> Outcome:
                 f"{number(alone, 2)} and {number(abs(found.ratio_error), 2)}", "correlated"),
             Row("evaluations of the model", number(facts["evaluations"])),
         ),
-        difference="None. The points are fitted together with the bench's nominal values as weak "
-        "priors, and the baseline's tilt is free as well, which the paper does not fit.",
+        difference="None. The fit uses the nominal values of the bench as weak priors and also "
+        "frees the tilt of the baseline.",
         numbers={
             "geometry": facts["geometry"], "paths": facts["paths"], "points": facts["points"],
             "points_used": facts["points_used"], "unique_minimum": facts["unique_minimum"],
@@ -96,4 +95,4 @@ def make(lab: Lab) -> Outcome:
 
 
 def _apart(value: float, sigma: float, true: float) -> str:
-    return f"off by {number(value - true, 2)} mm of {number(true)}, sigma {number(sigma, 2)} mm"
+    return f"error {number(value - true, 2)} mm of {number(true)}, sigma {number(sigma, 2)} mm"

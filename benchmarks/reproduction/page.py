@@ -12,15 +12,12 @@ from reproduction.paper import STATEMENTS, Statement
 
 LEAD = """\
 Figures of Rousset et al., "Pixel-Level Calibration for Space-Based High Precision Astrometry Using
-Young's Fringes", simulated and analysed again from the benches in [`configs/paper`]({configs}).
-This page is written by `{command}` ({version}): every number in the columns "here" is measured in
-that run, and [numbers.json](numbers.json) holds all of them. {size}
+Young's Fringes", simulated and analysed with the benches in [`configs/paper`]({configs}).
+`{command}` ({version}) writes this page. Numbers in the column "here" are measured in that run;
+[numbers.json](numbers.json) holds all of them. {size}
 """
-QUICK = (
-    "Windows and frames are those of some minutes on two cores; `make reproduce-full` takes the "
-    "paper's own."
-)
-FULL = "Windows and frames are the paper's own."
+QUICK = "Windows and frames are smaller than the paper's; `make reproduce-full` takes the paper's."
+FULL = "Windows and frames are the paper's."
 
 
 def write(folder: Path, outcomes: Sequence[Outcome], *, full: bool) -> Path:
@@ -32,7 +29,7 @@ def write(folder: Path, outcomes: Sequence[Outcome], *, full: bool) -> Path:
         version=f"pixcal {__version__}",
         size=FULL if full else QUICK,
     )
-    parts = ["# The paper's figures, made again\n", lead, _contents(outcomes)]
+    parts = ["# The paper's figures\n", lead, _contents(outcomes)]
     for outcome in outcomes:
         name = f"figure-{outcome.figure}.png"
         (folder / name).write_bytes(outcome.picture)
@@ -72,7 +69,7 @@ def _section(outcome: Outcome, picture: str) -> str:
             f"![{_heading(outcome)}]({picture})\n",
             f"{outcome.caption}\n",
             *table,
-            f"\n**The difference.** {outcome.difference}\n",
+            f"\n**Difference.** {outcome.difference}\n",
         ]
     )
 
