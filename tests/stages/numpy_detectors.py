@@ -36,6 +36,7 @@ class Detector:
     scatter: float = 0.0
     shape: tuple[int, int] = (96, 96)
     top: int = 65535
+    step: int = 1
     dark: float = 5.0
     rate: float = 2e4
     prnu: float = 0.01
@@ -51,7 +52,8 @@ class Detector:
         def frame(seconds: float, light: float) -> NDArray[np.uint16]:
             charge = rng.poisson((self.dark + light * self.rate * pixels) * seconds).astype(float)
             noise = self.noise * rng.standard_normal(self.shape)
-            codes = np.rint((self.response(charge) + noise) / self.gain + offset)
+            adu = (self.response(charge) + noise) / self.gain + offset
+            codes = np.rint(adu / self.step) * self.step
             return np.clip(codes, 0, self.top).astype(np.uint16)
 
         plan = {"bias": [(0.0, bias, 0.0)], "dark": [(1.0, dark, 0.0)], "flat": self.flats}

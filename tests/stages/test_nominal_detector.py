@@ -16,6 +16,7 @@ from pixcal.estimators.diagnosis.gap import flagged
         Detector(gain=20.0, noise=10.0, bias=60.0, top=1023, rate=15000.0),
         Detector(gain=5.0, noise=3.0, bias=64.3, scatter=1.5, top=1023, rate=4000.0),
         Detector(gain=0.5, noise=3.0, bias=400.7, rate=8000.0),
+        Detector(gain=0.2, noise=2.0, bias=1000.7, rate=8000.0, step=16),
     ],
     ids=lambda d: f"{d.gain:g} e-/ADU, {d.noise:g} e-, {d.bias:g} ADU",
 )

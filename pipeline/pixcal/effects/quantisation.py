@@ -152,6 +152,7 @@ class Quantisation(Effect):
         if counts is None or not counts.any():
             return None
         step, step_error = step_of(counts)
+        step = max(step, float(evidence.step_adu))
         noise, first = evidence.read_noise / evidence.gain / step, 0.0
         lit = lit or [s.adu for s in evidence.of_kind("flat")]
         if noise < LEAST_NOISE and lit:
@@ -166,12 +167,13 @@ class Quantisation(Effect):
             widths = code_widths(converter_counts(counts, step), noise, first)
         values: dict[str, Any] = {"coarse_adu": step - 1, "dnl_rms": 0.0, "ripple": 0.0}
         errors = {"coarse_adu": step_error}
-        found = [-1.0 if step == 1 else min((step - 1) / step_error, 1e6)]
+        # A camera that shifts its codes by whole bits is an ordinary one.
+        found = [-1.0 if step == evidence.step_adu else min((step - 1) / step_error, 1e6)]
         if widths is not None:
             known, its_errors, chances = _uneven(widths)
             values, errors = values | known, errors | its_errors
             found += chances
-        elif step == 1:
+        elif step == evidence.step_adu:
             return None
         return Estimate(
             cls(**values),

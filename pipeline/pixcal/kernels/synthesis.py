@@ -216,12 +216,14 @@ def amplify(
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def convert(adu: F32, top: int, out: U16) -> None:
-    """Codes of the converter, rounded and clipped to 0 and ``top`` (ADU)."""
-    low, high, half = np.float32(0), np.float32(top), np.float32(0.5)
+def convert(adu: F32, step: int, top: int, out: U16) -> None:
+    """Codes of the converter, rounded to multiples of ``step``, clipped to 0 and ``top`` (ADU)."""
+    low, high, half = np.float32(0), np.float32(top // step), np.float32(0.5)
+    codes = np.float32(1 / step)
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
-            out[i, j] = np.uint16(np.int32(min(max(adu[i, j], low) + half, high)))
+            code = np.int32(min(max(adu[i, j], low) * codes + half, high))
+            out[i, j] = np.uint16(code * step)
 
 
 def block_normals(

@@ -45,6 +45,13 @@ class SimulatedDetector:
         doc="window's first pixel; default: window in the middle",
     )
     bits: int = quantity(16, low=1, high=16, doc="of the analogue-to-digital converter")
+    step_adu: int = quantity(
+        1,
+        unit="ADU",
+        low=1,
+        high=4096,
+        doc="samples are multiples of it: 16 for a camera of 12 bits that writes 16",
+    )
     saturation_adu: float | None = quantity(
         None, unit="ADU", above=0, doc="samples are clipped here; default: the converter's end"
     )
@@ -114,7 +121,8 @@ class SimulatedDetector:
     def top_adu(self) -> int:
         """Largest value that is read, in ADU."""
         top = (1 << self.bits) - 1
-        return top if self.saturation_adu is None else min(top, int(self.saturation_adu))
+        top = top if self.saturation_adu is None else min(top, int(self.saturation_adu))
+        return top // self.step_adu * self.step_adu
 
     @property
     def chip_centre_px(self) -> tuple[float, float]:

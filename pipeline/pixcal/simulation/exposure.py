@@ -232,7 +232,8 @@ class _Chain:
 
     def samples(self, frame: int) -> U16:
         """Codes of a frame."""
-        synthesis.convert(self.adu(frame), self.camera.bench.detector.top_adu, self._samples)
+        d = self.camera.bench.detector
+        synthesis.convert(self.adu(frame), d.step_adu, d.top_adu, self._samples)
         return self._samples
 
     def adu(self, frame: int) -> F32:

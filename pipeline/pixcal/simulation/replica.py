@@ -248,6 +248,7 @@ def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:
             pitch_um=evidence.pitch_um,
             gain_e_per_adu=evidence.gain,
             read_noise_e=evidence.amplifier_noise,
+            step_adu=evidence.step_adu,
             chip=sets[0].window if sets else None,
             origin_px=evidence.origin if sets else None,
             saturation_adu=min(evidence.saturation_adu, TOP_ADU),

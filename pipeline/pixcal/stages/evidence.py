@@ -69,6 +69,7 @@ def evidence_of(run_dir: Local, part: Part | None = None, frames: slice = slice(
         distance_mm=acquisition.fibres.distance_mm,
         origin=(y[0], x[0]),
         photon_transfer=_photon_transfer(used["gain_e_per_adu"]),
+        step_adu=max(int(ingested.quantum), 1),
         neighbours=tuple((y, x) for y, x in used["gain_e_per_adu"]["neighbours"]),
     )
 

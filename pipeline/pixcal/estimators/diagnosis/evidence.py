@@ -199,6 +199,8 @@ class Evidence:
         it gives none.
     neighbours : tuple of (int, int)
         Lags (rows, columns) whose noise that gain counts.
+    step_adu : int
+        Of which all calibration samples are multiples.
     """
 
     fringes: Mapping[str, FringeEvidence]
@@ -218,6 +220,7 @@ class Evidence:
     origin: tuple[int, int] = (0, 0)
     photon_transfer: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     neighbours: tuple[tuple[int, int], ...] = ()
+    step_adu: int = 1
     _found: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def once(self, name: str, *given: Any, make: Callable[[], T]) -> T:
@@ -251,7 +254,7 @@ class Evidence:
     @property
     def dithered(self) -> bool:
         """Whether the read noise spans so much of a code that means of dark samples are right."""
-        return self.amplifier_noise > DITHER * self.gain
+        return self.amplifier_noise > DITHER * self.gain * self.step_adu
 
     @property
     def ladder(self) -> tuple[Stack, ...]:

@@ -44,6 +44,7 @@ def bench_of(
         pitch_um=d.pitch_um,
         gain_e_per_adu=evidence.gain,
         read_noise_e=evidence.amplifier_noise,
+        step_adu=evidence.step_adu,
         name=d.name,
         chip=whole,
         origin_px=evidence.origin,

@@ -138,8 +138,11 @@ def _bias_before_rounding(evidence: Sequence[Evidence], dtypes: Mapping[str, np.
     mean = _mean([e.bias for e in evidence])
     if any(dtype.kind == "f" for dtype in dtypes.values()):
         return mean
-    noise = evidence[0].amplifier_noise / evidence[0].gain
-    return level_before_rounding(mean.astype(float), noise).astype(np.float32)
+    one = evidence[0]
+    level = level_before_rounding(
+        mean.astype(float) / one.step_adu, one.amplifier_noise / one.gain / one.step_adu
+    )
+    return np.asarray(level * one.step_adu, np.float32)
 
 
 def _response_of_fringes(evidence: Sequence[Evidence]) -> F32:

@@ -45,6 +45,7 @@ class Summary:
     """What the calibration frames say of the detector as a whole; None where they do not."""
 
     declared: Detector  # what its owner says
+    step: float  # of the converter (ADU)
     usual: Usual  # medians of the maps
     light: F64  # of each tile in the flats, over that of the detector
     # of a sample, rounding included, from differences of successive frames; its error (ADU)
@@ -80,7 +81,7 @@ class Summary:
         noise = self.declared.read_noise_e
         if self.read_noise is not None:
             noise = gain * self.read_noise[0]
-        return max(noise, gain * ROUNDING_ADU)
+        return max(noise, gain * ROUNDING_ADU * self.step)
 
     def noise_before_rounding_e(self, gain: float) -> float:
         """Read noise (e-) of the amplifier: measured, else declared.
@@ -91,7 +92,7 @@ class Summary:
             return gain * self.before_rounding[0]
         if self.read_noise is None:
             return self.declared.read_noise_e
-        return min(self.declared.read_noise_e, gain * UNTOLD)
+        return min(self.declared.read_noise_e, gain * UNTOLD * self.step)
 
     def warnings(self, gain: float, saturation: float | None) -> list[str]:
         """Sentences on what is not as it should be, or was declared otherwise than measured.
@@ -210,7 +211,10 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
         shot = charge / (job.gain if gain is None else gain.gain)
         read_noise, own = _read_noise(sums[0], shot, folder, job)
         gain = _gain(sums, own, top, job)
-    return Summary(declared, medians, light, read_noise, own, gain, levels, usable, full, straight)
+    return Summary(
+        declared, job.quantum or 1.0, medians, light, read_noise, own, gain, levels, usable, full,
+        straight,
+    )  # fmt: skip
 
 
 def pair_sums(folder: Place, job: Measuring) -> F64:
@@ -230,8 +234,10 @@ def _before_rounding(
     assert job.read_series is not None
     bias, rate = on_grid(folder, job.shape, ("bias", "dark_rate"))
     means = bias + rate * job.read_series.exptime
-    frames = len(job.read_series.frames)
-    return noise_before_rounding(*variance, means[np.isfinite(means)], frames)
+    frames, step = len(job.read_series.frames), job.quantum
+    in_steps = variance[0] / step**2, variance[1] / step**2
+    found = noise_before_rounding(*in_steps, means[np.isfinite(means)] / step, frames)
+    return found and (step * found[0], step * found[1])
 
 
 def shared_by_lines(dark: F64) -> dict[str, Measure]:
@@ -305,9 +311,8 @@ def _gain(
     if not (job.dark and job.flat):
         return None
     noise, error = read_noise or (job.read_noise, _GUESS_ERROR * job.read_noise)
-    # With light there is noise enough that rounding to ADU adds no more and no less than this; that
-    # to larger steps is part of the noise.
-    variance = noise**2 + SHEPPARD * min(job.quantum, 1.0)
+    # With light there is noise enough that rounding adds no more and no less than this.
+    variance = noise**2 + SHEPPARD * job.quantum**2
     highest = _LINEAR_SHARE * top
     dark, lit = sums
     lit = np.where(lit[:, 1:2] <= highest * lit[:, :1], lit, 0.0)

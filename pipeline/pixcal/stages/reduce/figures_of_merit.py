@@ -34,8 +34,6 @@ from pixcal.storage.cube import CHUNK, ArrayReader
 
 Json = dict[str, Any]
 
-_TOLD = 1.6
-"""Read noise over that of the rounding from which the amplifier's is their difference."""
 _NO_ERROR = 1e-9
 """ADU/s: below it all samples are of one code."""
 _WELL = 0.97
@@ -126,8 +124,6 @@ def _read_noise(found: Json, facts: Json, gain: float, step: float) -> Measure |
     steps = "ADU" if step == 1 else f"steps of {step:g} ADU"
     note = f"rounding to {steps} adds {rounding:.3g} e-"
     own = None if entry["measured"] is None else scale * entry["measured"]
-    if step > 1:
-        own = math.sqrt(max(whole**2 - rounding**2, 0.0)) if whole > _TOLD * rounding else None
     if own is None:
         note += "; too coarse to measure the noise before it"
     found["read_noise_with_rounding"] = _figure(
