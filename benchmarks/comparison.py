@@ -26,17 +26,18 @@ from truth import PLANE, Truth
 
 HERE = Path(__file__).parent
 NAME = "vertical"
-MOVING = {"visibility_jitter_rms": 0.03, "vector_jitter_rad": 0.01}
-SCENARIOS: dict[str, tuple[dict[str, float], dict[str, float], dict[str, float]]] = {
+MOVING = {"contrast_noise": {"vibration_rad": 0.0, "polarisation": 0.03, "polarisation_s": 0.0}}
+TILT_RAD = 0.01  # rms, edge to edge, along each axis
+SCENARIOS: dict[str, tuple[dict[str, float], dict[str, float], dict[str, Any]]] = {
     "steady laser, even light, equal pixels": (
         {"prnu_rms": 0.0},
-        {"laser_noise_rms": 0.0, "beam_radius_mm": 1e5},
-        {},
+        {"beam_radius_mm": 1e5},
+        {"intensity_noise": {"rms": 0.0}},
     ),
     "laser noise 2 %, pixels unequal by 1 %": ({}, {}, {}),
     "the same, visibility changing by 3 %, fringes tilting by 1e-2 rad across": ({}, {}, MOVING),
 }
-"""What each changes in the bench: detector, optics, fringe set."""
+"""What each changes in the bench: detector, optics, effects."""
 
 NOTES = """\
 time: from the reduced cube on disk, warm, to the phases of all pixels; the fastest of {repeat} goes
@@ -54,10 +55,13 @@ error: rms over the bound, less the seven modes that such data leave open; good 
 def bench(folder: Path, scenario: str, size: int, frames: int) -> Path:
     """Bench file of a scenario on a square window."""
     config = yaml.safe_load((HERE.parent / "configs" / "precision.yaml").read_text())
-    detector, optics, fringes = SCENARIOS[scenario]
+    detector, optics, effects = SCENARIOS[scenario]
     config["detector"] |= {"shape": [size, size], **detector}
     config["optics"] |= {"visibility": 0.95, **optics}
-    config["frames"]["fringes"][0] |= {"count": frames, **fringes}
+    config["frames"]["fringes"][0]["count"] = frames
+    config["effects"] |= effects
+    if effects is MOVING:
+        config["effects"]["fringe_jitter"] = {"rms": [TILT_RAD / size] * 2}
     path = folder / "bench.yaml"
     path.write_text(yaml.safe_dump(config))
     return path

@@ -66,7 +66,7 @@ def bench(seed: int = 9000) -> dict[str, Any]:
         },
         "optics": {
             "wavelength_nm": 632.8, "distance_mm": 400.0, "beam_radius_mm": 35.0,
-            "visibility": 0.95, "fringes": "straight",
+            "visibility": 0.95,
         },
         "frames": {
             "exptime_s": 0.02, "period_s": 0.14, "per_file": 500, "bias": 60,

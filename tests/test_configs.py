@@ -39,7 +39,8 @@ def test_it_loads_or_is_of_another_kind(file: Path) -> None:
         expected = 5.0 if file.stem == "precision" else 9.588
         assert interfringe(geometry(bench, number)) == pytest.approx(expected, abs=1e-3)
         # The brightest fringe stays in the converter's range and in the well, with its noise.
-        bright = scan.peak_e * (1 + 3 * bench.optics.laser_noise_rms) * (1 + 3 * d.prnu_rms)
+        laser = bench.effects.get("intensity_noise", {}).get("rms", 0.0)
+        bright = scan.peak_e * (1 + 3 * laser) * (1 + 3 * d.prnu_rms)
         assert d.full_well_e is not None
         assert bright < d.full_well_e
         assert bright / d.gain_e_per_adu + d.bias_adu < d.top_adu
@@ -112,6 +113,10 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("frames.fringes.0.phase_law", "sine", "frames.fringes[0].phase_law: 'sine' is not one of"),
     ("frames.fringes.0.phase_law", "ramp", "frames.fringes[0]: phase_step_rad: zero"),
     ("frames.fringes.0.count", True, "frames.fringes[0].count: expected a number"),
+    ("optics.laser_noise_rms", 0.02, "noise_rms: instead, write effects.intensity_noise.rms"),
+    ("optics.fringes", "exact", "optics.fringes: instead, write effects.hyperbolic_fringes"),
+    ("frames.fringes.0.vector_jitter_rad", 0.1, "rad: instead, write effects.fringe_jitter"),
+    ("frames.fringes.0.visibility_jitter_rms", 0.1, "rms: instead, write effects.contrast_noise"),
     ("frames.fringes.0.ghost", 0.005, "frames.fringes[0]: unknown key 'ghost'"),
 ]
 

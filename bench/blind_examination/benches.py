@@ -75,7 +75,6 @@ def draw_bench(layout: Layout, rng: np.random.Generator) -> Bench:
         distance_mm=DISTANCE_MM,
         beam_radius_mm=_round(rng.uniform(25, 45)),
         visibility=_round(rng.uniform(0.85, 0.97)),
-        fringes="straight",
     )
     frames = SimulatedFrames(
         exptime_s=0.02,

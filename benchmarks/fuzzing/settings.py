@@ -102,7 +102,8 @@ def _bench() -> dict[str, Any]:
     plain: dict[str, Any] = to_plain(load_bench(BENCH))
     plain["detector"] |= {"shape": [12, 10], "chip": [40, 30], "origin_px": [3, 4]}
     plain["detector"] |= {"saturation_adu": 60000.0}
-    plain["optics"] |= {"nominal_distance_mm": 400.0, "fringes": "straight"}
+    plain["optics"] |= {"nominal_distance_mm": 400.0}
+    plain["effects"] = {}
     plain["frames"] |= {"bias": 2, "darks": [{"exptime_s": 0.5, "count": 2}]}
     plain["frames"]["flats"] = [{"exptime_s": 0.05, "count": 2}]
     for scan in plain["frames"]["fringes"]:

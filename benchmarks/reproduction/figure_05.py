@@ -77,7 +77,7 @@ def measure(lab: Lab, bench: Bench) -> list[Edge]:
             cut = replace(
                 bench,
                 detector=replace(bench.detector, origin_px=(0, first)),
-                optics=replace(bench.optics, fringes=shape),
+                effects=bench.effects if shape == "exact" else {},
             )
             scene = lab.scene(f"figure-05/{name}-{shape}", cut)
             (file,) = (scene.folder / "acq" / bench.frames.fringes[0].name).glob("*.fits")

@@ -96,7 +96,7 @@ def noisy(bench: Bench) -> Bench:
     (scan,) = (s for s in bench.frames.fringes if s.name == FINEST)
     return replace(
         bench,
-        optics=replace(bench.optics, laser_noise_rms=LASER_RMS),
+        effects=bench.effects | {"intensity_noise": {"rms": LASER_RMS}},
         frames=replace(bench.frames, fringes=(scan,)),
     )
 

@@ -141,16 +141,13 @@ def mixture(scene: Scene, name: str) -> Mixed:
 def causes(lab: Lab, bench: Bench, name: str) -> dict[str, float]:
     """Fringes (px rms) that the paper's iterations leave for one thing that moves at a time."""
     (scan,) = (s for s in bench.frames.fringes if s.name == name)
-    plain = replace(
-        bench,
-        effects={},
-        optics=replace(bench.optics, laser_noise_rms=0.0),
-        frames=replace(bench.frames, fringes=(replace(scan, vector_jitter_rad=0.0),)),
-    )
+    one_set = replace(bench, frames=replace(bench.frames, fringes=(scan,)))
+    kept = {"nothing": (), "laser": ("intensity_noise",), "vector": ("fringe_jitter",)}
     alone = {
-        "nothing": plain,
-        "laser": replace(plain, optics=bench.optics),
-        "vector": replace(plain, frames=replace(bench.frames, fringes=(scan,))),
+        cause: replace(
+            one_set, effects={n: bench.effects[n] for n in ("hyperbolic_fringes", *names)}
+        )
+        for cause, names in kept.items()
     }
     found = {}
     for cause, one in alone.items():
@@ -216,6 +213,7 @@ def make(lab: Lab) -> Outcome:
     alone = causes(lab, real.bench, "vertical")
     dx, dy = found["vertical"], found["horizontal"]
     counts = [s.bench.frames.fringes[0].count for s in (real, scene)]
+    tilt = real.bench.effects["fringe_jitter"]["rms"][0] * real.bench.detector.shape[1]
     sized = "" if lab.full else " (the paper: 500)"
     return Outcome(
         figure="14-15",
@@ -252,9 +250,9 @@ def make(lab: Lab) -> Outcome:
         "and δy because both offsets are the same. The paper sees little in δy, so its fibres may "
         "be nearer to the axis in that direction. The paper's iterations leave fringes because "
         "they hold A, B and the fringe vector constant. Laser noise of "
-        f"{100 * real.bench.optics.laser_noise_rms:g} % alone leaves "
+        f"{100 * real.bench.effects['intensity_noise']['rms']:g} % alone leaves "
         f"{number(alone['laser'] / alone['vector'])} times as much as a fringe vector that varies "
-        f"by {real.bench.frames.fringes[0].vector_jitter_rad:g} rad across the window.",
+        f"by {tilt:g} rad across the window.",
         numbers={
             "figure_15": {
                 OFFSET[name]: {

@@ -33,7 +33,7 @@ def plain_bench(changes: Change | None = None, effects: dict[str, Any] | None = 
         },
         "optics": {
             "wavelength_nm": 632.8, "distance_mm": 400.0, "beam_radius_mm": 35.0,
-            "visibility": 0.95, "fringes": "straight",
+            "visibility": 0.95,
         },
         "frames": {
             "exptime_s": 0.02, "period_s": 0.14, "per_file": 500, "bias": 60,

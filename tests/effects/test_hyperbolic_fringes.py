@@ -10,9 +10,8 @@ from pixcal.effects.hyperbolic_fringes import HyperbolicFringes, bending
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels import optics
 from pixcal.kernels.optics import Geometry
-from pixcal.kernels.scene import detector_maps, electrons_per_unit, light_maps
+from pixcal.kernels.scene import detector_maps, electrons_per_unit, geometry, light_maps
 from pixcal.model.bench import Bench
-from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Estimate
 from pixcal.simulation.recording import recordings
 
@@ -20,20 +19,27 @@ WINDOW = {"detector.shape": [101, 107]}
 PAPER = Geometry(632.8e-6, 4.4e-3, 18.0, 18.0, 400.0, 6.0, 0.0)
 
 
-def test_all_of_the_bending_makes_the_exact_bench(make_effect_bench: Callable[..., Bench]) -> None:
-    chip = {"detector.shape": [31, 37], "detector.chip": [3000, 4000]}
-    straight = make_effect_bench(chip | {"optics.offset_mm": [3.0, -7.0]})
-    exact = replace(straight, optics=replace(straight.optics, fringes="exact"))
+@pytest.mark.parametrize("foot", [(3.0, -7.0), None])
+def test_all_of_it_is_the_path_difference_of_two_fibres(
+    make_effect_bench: Callable[..., Bench], foot: tuple[float, float] | None
+) -> None:
+    bench = make_effect_bench(
+        {"detector.shape": [31, 37], "detector.chip": [3000, 4000], "optics.offset_mm": [3.0, -7.0]}
+    )
     rows = (5, 31)
-    maps = detector_maps(straight.detector, rows)
-    for recording in recordings(straight):
+    maps = detector_maps(bench.detector, rows)
+    x = np.arange(37) + maps.delta_x.astype(float)
+    y = np.arange(*rows)[:, None] + maps.delta_y.astype(float)
+    for recording in recordings(bench):
         if recording.kind == "fringes":
-            e = electrons_per_unit(straight, recording.number)
-            plain = light_maps(straight, recording.number, rows, maps, e)
-            made = HyperbolicFringes((3.0, -7.0)).light(plain, recording, rows, maps)
-            wanted = light_maps(exact, recording.number, rows, maps, e)
-            for name in ("iota", "alpha_sin", "alpha_cos"):
-                np.testing.assert_allclose(getattr(made, name), getattr(wanted, name), atol=0.02)
+            e = electrons_per_unit(bench, recording.number)
+            plain = light_maps(bench, recording.number, rows, maps, e)
+            made = HyperbolicFringes(foot).light(plain, recording, rows, maps)
+            alpha = np.hypot(plain.alpha_sin, plain.alpha_cos)
+            psi = optics.phase(x, y, geometry(bench, recording.number))
+            np.testing.assert_array_equal(made.iota, plain.iota)
+            np.testing.assert_allclose(made.alpha_sin, alpha * np.sin(psi), atol=0.02)
+            np.testing.assert_allclose(made.alpha_cos, alpha * np.cos(psi), atol=0.02)
 
 
 def test_the_bending_has_its_leading_order_and_in_pixels_no_baseline() -> None:
@@ -68,18 +74,12 @@ def test_a_share_of_it_is_that_share(make_effect_bench: Callable[..., Bench]) ->
     assert slope[0] == pytest.approx(0.1 * slope[1], rel=1e-3)
 
 
-def test_a_bench_that_is_exact_already_is_refused(make_effect_bench: Callable[..., Bench]) -> None:
-    exact = make_effect_bench({"optics.fringes": "exact"})
-    with pytest.raises(InputError, match="hyperbolic_fringes: the bench's fringes are exact"):
-        HyperbolicFringes().check(exact)
-    HyperbolicFringes(share=0.0).check(exact)
-
-
 def found_near(foot: tuple[float, float], evidence: Evidence, limit: float) -> Estimate:
     """The estimate, whose foot is within four errors of the true one, which are below a limit."""
     found = HyperbolicFringes.estimate(evidence)
     assert found is not None
     assert isinstance(found.effect, HyperbolicFringes)
+    assert found.effect.foot_mm is not None
     for n in (0, 1):
         error = found.errors[f"foot_mm[{n}]"]
         assert abs(found.effect.foot_mm[n] - foot[n]) < 4 * error < limit

@@ -152,17 +152,17 @@ def test_pixels_that_differ_tell_where_the_contrast_is_noisy(
 ) -> None:
     noisy = {
         "optics.visibility": 0.9,
-        "frames.fringes.0.visibility_jitter_rms": 0.03,
-        "frames.fringes.1.visibility_jitter_rms": 0.03,
     }
-    found = Lag.estimate(acquired(noisy, {"lag": {"share": 0.004, "spread": 0.2}}))
+    white = {"vibration_rad": 0.0, "polarisation": 0.03, "polarisation_s": 0.0}
+    effects = {"contrast_noise": white, "lag": {"share": 0.004, "spread": 0.2}}
+    found = Lag.estimate(acquired(noisy, effects))
     assert found is not None
     assert isinstance(found.effect, Lag)
     assert 1e-3 < found.errors["share"] < 4e-3
     assert abs(found.effect.share - 0.004) < 4 * found.errors["share"]
     assert found.details["by_pixels_sigmas"] > 10
     assert found.significance > 10
-    nothing = Lag.estimate(acquired(noisy))
+    nothing = Lag.estimate(acquired(noisy, {"contrast_noise": white}))
     assert nothing is not None
     assert nothing.significance < 4
 

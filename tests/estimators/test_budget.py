@@ -61,7 +61,7 @@ def test_the_light_is_the_simulators(bench, shape):
 
 
 def test_laws_of_scaling(bench):
-    steady = replace(bench, optics=replace(bench.optics, laser_noise_rms=0.0, beam_radius_mm=1e5))
+    steady = replace(bench, effects={}, optics=replace(bench.optics, beam_radius_mm=1e5))
     quiet = replace(steady, detector=replace(steady.detector, read_noise_e=0.0, dark_e_s=0.0))
     quiet = replace(quiet, detector=replace(quiet.detector, gain_e_per_adu=1e-3))
     one = per_frame(with_sets(quiet, {}))

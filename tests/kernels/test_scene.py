@@ -44,7 +44,6 @@ OPTICS = SimulatedOptics(
     pointing_b_mm=(-2.9, -0.2),
     power_ratio=0.7,
     visibility=0.8,
-    laser_noise_rms=0.02,
 )
 VERTICAL = SimulatedSet(name="vertical", baseline_mm=(6.0, 0.0), count=4000, peak_e=30000.0)
 HORIZONTAL = SimulatedSet(
@@ -160,24 +159,17 @@ def test_frames_are_what_was_asked_for() -> None:
     assert states.phi.min() >= 0
     assert states.phi.max() < 2 * np.pi
     assert abs(np.exp(1j * states.phi).mean()) < 4 / np.sqrt(4000)
-    assert states.level.std() == pytest.approx(0.02, rel=0.05)
-    assert np.array_equal(states.level, states.amplitude)
+    assert (states.level == 1).all()
+    assert (states.amplitude == 1).all()
     assert not states.dkx.any()
     assert not states.dky.any()
     fewer = replace(FRAMES, fringes=(replace(VERTICAL, count=50), HORIZONTAL))
     first = scene.frame_states(replace(BENCH, frames=fewer), 0)
     assert np.array_equal(first.phi, states.phi[:50])
-    assert np.array_equal(first.level, states.level[:50])
 
 
-def test_nuisances_leave_the_phases_as_they_were() -> None:
-    restless = replace(VERTICAL, visibility_jitter_rms=0.2, vector_jitter_rad=0.05)
+def test_a_ramp_has_equal_steps() -> None:
     ramp = replace(VERTICAL, name="ramp", phase_law="ramp", phase_step_rad=0.7)
-    frames = replace(FRAMES, fringes=(restless, ramp))
-    moved = scene.frame_states(replace(BENCH, frames=frames), 0)
-    assert np.array_equal(moved.phi, scene.frame_states(BENCH, 0).phi)
-    assert (moved.amplitude <= moved.level / 0.8 + 1e-12).all()
-    assert moved.dkx.std() * 307 == pytest.approx(0.05, rel=0.05)
-    assert moved.dky.std() * 211 == pytest.approx(0.05, rel=0.05)
+    frames = replace(FRAMES, fringes=(VERTICAL, ramp))
     steps = np.diff(np.unwrap(scene.frame_states(replace(BENCH, frames=frames), 1).phi))
     assert np.allclose(steps, 0.7)

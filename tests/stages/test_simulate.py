@@ -12,6 +12,7 @@ import yaml
 from astropy.io import fits
 from astropy.time import Time
 
+from pixcal.effects import parse_effects
 from pixcal.engine.run import Runtime
 from pixcal.kernels.scene import detector_maps
 from pixcal.model.acquisition import load_acquisition
@@ -59,7 +60,6 @@ BENCH: dict[str, Any] = {
         "offset_mm": [7.31, -4.19],
         "power_ratio": 0.8,
         "visibility": 0.9,
-        "laser_noise_rms": 0.02,
     },
     "frames": {
         "start": "2026-03-02T23:59:50",
@@ -76,6 +76,7 @@ BENCH: dict[str, Any] = {
             {"name": "horizontal", "baseline_mm": [0.5, 5.0], "count": 9, "peak_e": 30000},
         ],
     },
+    "effects": {"hyperbolic_fringes": {"foot_mm": None}, "intensity_noise": {"rms": 0.02}},
 }
 
 
@@ -435,7 +436,8 @@ def test_the_sample_is_what_its_bench_gives(set_number: int) -> None:
     maps = detector_maps(bench.detector, rows)
     recorded = frames(sample, recording.folder)
     assert recorded.shape == (recording.count, *bench.detector.shape)
-    for frame, samples in Camera(bench, rows).expose(recording, range(58, 63)):
+    effects = parse_effects(bench.effects, "bench")
+    for frame, samples in Camera(bench, rows, effects).expose(recording, range(58, 63)):
         assert np.array_equal(samples, recorded[frame, rows[0] : rows[1]])
     with fits.open(ROOT / "data_samples/demo-truth/delta_x.fits") as hdus:
         assert np.array_equal(hdus[0].data[rows[0] : rows[1]], maps.delta_x)

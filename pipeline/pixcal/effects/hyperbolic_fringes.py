@@ -21,7 +21,6 @@ from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
-from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.recording import Recording
 
@@ -72,25 +71,18 @@ class HyperbolicFringes(Effect):
         "Born & Wolf, Principles of Optics, section 7.3: fringes of two point sources",
     )
 
-    foot_mm: tuple[float, float] = quantity(
+    foot_mm: tuple[float, float] | None = quantity(
         (18.0, 18.0),
         unit="mm",
         low=-1e4,
         high=1e4,
-        doc="foot of the fibres' centre from the chip's",
+        doc="foot of the fibres' centre from the chip's; null: where the bench has them",
     )
     distance_mm: float | None = quantity(
         None, unit="mm", above=0, high=1e7, doc="fibres to detector; default: that of the bench"
     )
     share: float = quantity(1.0, low=-100, high=100, doc="of the curvature: 1 exact, 0 straight")
     pairs: tuple[FibrePair, ...] = quantity((), doc="position of each set's fibre pair")
-
-    def check(self, bench: Bench) -> None:
-        if bench.optics.fringes != "straight" and not self.is_null:
-            raise InputError(
-                "effects.hyperbolic_fringes: the bench's fringes are exact already; set "
-                "optics.fringes to straight"
-            )
 
     def light(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
@@ -111,19 +103,25 @@ class HyperbolicFringes(Effect):
     def geometry(self, bench: Bench, number: int) -> Geometry:
         """That of a fringe set, with the foot and the distance given, of the same fringe vector."""
         own, pitch = geometry(bench, number), bench.detector.pitch_um * 1e-3
-        centre = bench.detector.chip_centre_px
         distance = self.distance_mm or own.distance
         wider = distance / own.distance
-        name = bench.frames.fringes[number].name
-        pair = next((p for p in self.pairs if p.set == name), FibrePair(name, self.foot_mm))
+        scan, (x, y) = bench.frames.fringes[number], bench.detector.chip_centre_px
+        pair = next((p for p in self.pairs if p.set == scan.name), None)
+        if pair is None and self.foot_mm is not None:
+            pair = FibrePair(scan.name, self.foot_mm)
+        if pair is not None:
+            foot_x, foot_y = pair.foot_mm
+            own = replace(
+                own,
+                centre_x=x * pitch + foot_x,
+                centre_y=y * pitch + foot_y,
+                baseline_z=pair.height_mm,
+            )
         return replace(
             own,
-            centre_x=centre[0] * pitch + pair.foot_mm[0],
-            centre_y=centre[1] * pitch + pair.foot_mm[1],
             distance=distance,
             baseline_x=own.baseline_x * wider,
             baseline_y=own.baseline_y * wider,
-            baseline_z=pair.height_mm,
         )
 
     @classmethod

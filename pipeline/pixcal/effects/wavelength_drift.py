@@ -69,12 +69,8 @@ class WavelengthDrift(Effect):
         shrunk = -change / (1 + change)
         ny, nx = bench.detector.shape
         where, place = geometry(bench, recording.number), ((nx - 1) / 2, (ny - 1) / 2)
-        if bench.optics.fringes == "exact":
-            kx, ky = optics.fringe_vector(*place, where)
-            phase = optics.phase(*place, where)
-        else:
-            kx, ky = (np.asarray(k) for k in optics.paraxial_vector(where))
-            phase = optics.paraxial_phase(*place, where)
+        kx, ky = optics.paraxial_vector(where)
+        phase = optics.paraxial_phase(*place, where)
         return replace(
             states,
             phi=states.phi + shrunk * phase,

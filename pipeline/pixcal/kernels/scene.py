@@ -193,7 +193,7 @@ class LightMaps:
 def light_maps(
     bench: Bench, number: int, rows: Rows, maps: DetectorMaps, electrons: float
 ) -> LightMaps:
-    """Mean and fringe amplitude of a set, through the pixels' response and at their offsets.
+    """Mean and amplitude of straight fringes, through the pixels' response and at their offsets.
 
     Parameters
     ----------
@@ -209,8 +209,7 @@ def light_maps(
     a, b = fibre_light(bench, number, rows)
     x = np.arange(bench.detector.shape[1]) + maps.delta_x.astype(np.float64)
     y = np.arange(*rows)[:, None] + maps.delta_y.astype(np.float64)
-    shape = optics.phase if bench.optics.fringes == "exact" else optics.paraxial_phase
-    psi = shape(x, y, geometry(bench, number))
+    psi = optics.paraxial_phase(x, y, geometry(bench, number))
     iota = electrons * maps.response * (a + b)
     alpha = electrons * maps.response * 2 * bench.optics.visibility * np.sqrt(a * b)
     return LightMaps(
@@ -238,21 +237,12 @@ class FrameStates:
 
 
 def frame_states(bench: Bench, number: int) -> FrameStates:
-    """Draw the frames of a set; more frames leave the first ones as they are."""
+    """Draw the phases of a set's frames; more frames leave the first ones as they are."""
     scan = bench.frames.fringes[number]
-    ny, nx = bench.detector.shape
-
-    def rng(stream: Stream) -> np.random.Generator:
-        return generator(bench.seed, stream, number)
-
     if scan.phase_law == "ramp":
         phi = np.mod(scan.phase_step_rad * np.arange(scan.count), 2 * np.pi)
     else:
-        phi = 2 * np.pi * rng(Stream.PHASE).random(scan.count)
-    noise = rng(Stream.LASER).standard_normal(scan.count)
-    level = np.maximum(1 + bench.optics.laser_noise_rms * noise, 0)
-    jitter = scan.visibility_jitter_rms * rng(Stream.VISIBILITY).standard_normal(scan.count)
-    # Two fibres cannot interfere by more than all of their light.
-    contrast = np.clip(1 + jitter, 0, 1 / bench.optics.visibility)
-    tilt = scan.vector_jitter_rad * rng(Stream.VECTOR).standard_normal((scan.count, 2))
-    return FrameStates(phi, level, level * contrast, tilt[:, 0] / nx, tilt[:, 1] / ny)
+        rng = generator(bench.seed, Stream.PHASE, number)
+        phi = 2 * np.pi * rng.random(scan.count)
+    steady, still = np.ones(scan.count), np.zeros(scan.count)
+    return FrameStates(phi, steady, steady, still, still)

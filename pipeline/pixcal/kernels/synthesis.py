@@ -41,9 +41,6 @@ class Stream(IntEnum):
     DEFECT = 6
     STITCH = 7
     PHASE = 8
-    LASER = 9
-    VISIBILITY = 10
-    VECTOR = 11
     NOISE = 12
     EFFECT = 13
 

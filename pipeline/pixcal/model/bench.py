@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from pixcal.model.acquisition import check_names, check_set
 from pixcal.model.config import parse, quantity
@@ -156,14 +156,11 @@ class SimulatedOptics:
     visibility: float = quantity(
         1.0, above=0, high=1, doc="contrast where both fibres give the same light"
     )
-    laser_noise_rms: float = quantity(
-        0.0, low=0, high=0.5, doc="relative change of the laser's power from frame to frame"
-    )
-    fringes: str = quantity(
-        "exact",
-        choices=("exact", "straight"),
-        doc="exact: hyperbolic, as two fibres make them; straight: their paraxial limit",
-    )
+
+    moved: ClassVar = {
+        "laser_noise_rms": "effects.intensity_noise.rms",
+        "fringes": "effects.hyperbolic_fringes, {foot_mm: null}, if not straight",
+    }
 
 
 @dataclass(frozen=True)
@@ -191,12 +188,11 @@ class SimulatedSet:
         "random", choices=("random", "ramp"), doc="random: uniform over 2π; ramp: equal steps"
     )
     phase_step_rad: float = quantity(0.0, unit="rad", low=-1e3, high=1e3, doc="step of a ramp")
-    visibility_jitter_rms: float = quantity(
-        0.0, low=0, high=0.5, doc="relative change of the visibility from frame to frame"
-    )
-    vector_jitter_rad: float = quantity(
-        0.0, unit="rad", low=0, high=1e3, doc="rms tilt of the phase, edge to edge, each axis"
-    )
+
+    moved: ClassVar = {
+        "visibility_jitter_rms": "effects.contrast_noise.polarisation, with polarisation_s: 0",
+        "vector_jitter_rad": "effects.fringe_jitter.rms, in rad/px",
+    }
 
     def __post_init__(self) -> None:
         check_set(self.name, self.baseline_mm)

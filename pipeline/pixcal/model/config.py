@@ -1,7 +1,8 @@
 """Strict configuration: plain data into frozen dataclasses, every mistake named by its key.
 
 A configuration class is a frozen dataclass whose fields carry their limits in ``metadata``; make
-them with `quantity`. `to_plain` writes out what `parse` reads.
+them with `quantity`. Its class variable ``moved`` says what to write for keys of old files.
+`to_plain` writes out what `parse` reads.
 """
 
 import dataclasses
@@ -105,6 +106,8 @@ def _section(cls: type[T], data: Any, place: _Place) -> T:
     fields = {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
     for name in data:
         if name not in fields:
+            if name in (moved := getattr(cls, "moved", {})):
+                raise place.inside(name, lines.get(name)).wrong(f"instead, write {moved[name]}")
             near = difflib.get_close_matches(name, fields, n=1)
             meant = f"; did you mean {near[0]!r}? The" if near else "; the"
             text = f"unknown key {name!r:.80}{meant} keys here are {', '.join(fields)}"

@@ -289,7 +289,6 @@ def plain_bench(
             distance_mm=evidence.distance_mm,
             beam_radius_mm=1e4,
             visibility=float(np.clip(visibility, 0.01, 1.0)),
-            fringes="straight",
         ),
         frames=SimulatedFrames(
             exptime_s=exposure,

@@ -12,12 +12,16 @@ from math import ceil
 import numpy as np
 from scipy.optimize import minimize
 
+from pixcal.effects import effects, parse_effects
 from pixcal.estimators.fringe_fit.combine import axes_span_plane
 from pixcal.kernels.optics import fringe_vector
 from pixcal.kernels.scene import fibre_light, geometry
 from pixcal.model.arrays import F64, I64
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
+from pixcal.simulation.effect import Effect
+from pixcal.simulation.exposure import states_of
+from pixcal.simulation.recording import Recording
 from pixcal.stages.budget.bound import (
     FrameSpread,
     WeightErrors,
@@ -31,6 +35,7 @@ Shares = Sequence[float] | F64
 SAMPLES = 96  # pixels along each side of the grid: light changes little from one to the next
 # frames of a ramp that are looked at: it repeats itself, or fills the turn evenly by then
 MAX_PHASES = 2000
+FRAMES_DRAWN = 20_000  # for how light and contrast change from frame to frame
 DARKNESS = 1e-12  # least information of one frame, 1/rad²
 NEGLIGIBLE = 1e-3  # share of the frames that the noise of calibration frames may cost
 # interfringes that a longer baseline is tried for; the paper keeps to 5 px (section 4.2)
@@ -42,6 +47,24 @@ def sample_variance(bench: Bench) -> float:
     d = bench.detector
     dark = d.dark_e_s * bench.frames.exptime_s
     return d.read_noise_e**2 + d.gain_e_per_adu**2 / 12 + dark
+
+
+def own_effects(bench: Bench, where: str) -> tuple[Effect, ...]:
+    """Effects of a bench, those that pixcal knows, as `parse_effects` reads them."""
+    return parse_effects({n: v for n, v in bench.effects.items() if n in effects()}, where)
+
+
+def frame_rms(bench: Bench, number: int) -> tuple[float, float]:
+    """Relative rms of light and of contrast from frame to frame, by the effects of a bench."""
+    scan, f = replace(bench.frames.fringes[number], count=FRAMES_DRAWN), bench.frames
+    sets = (*f.fringes[:number], scan, *f.fringes[number + 1 :])
+    drawn = Recording(
+        replace(bench, frames=replace(f, fringes=sets)), "fringes", number, scan.name, scan.name,
+        scan.count, f.exptime_s, 0.0, f.period_s, 1.0,
+    )  # fmt: skip
+    states = states_of(drawn, own_effects(bench, "bench"))
+    contrast = states.amplitude / np.maximum(states.level, DARKNESS)
+    return float(states.level.std()), float(contrast.std() / contrast.mean())
 
 
 @dataclass(frozen=True)
@@ -81,9 +104,7 @@ class SetBound:
             )
         electrons = scan.peak_e / brightest
         kx, ky = fringe_vector(x[None, :], y[:, None], geometry(bench, number))
-        spread = FrameSpread.normal(
-            optics.laser_noise_rms, scan.visibility_jitter_rms, min(visibility, 1.0)
-        )
+        spread = FrameSpread.normal(*frame_rms(bench, number), min(visibility, 1.0))
         iota, alpha = (electrons * mean).ravel(), (electrons * swing).ravel()
         bare = cls(iota, alpha, kx.ravel(), ky.ravel(), sample_variance(bench), spread, (1.0, 1.0))
         if scan.phase_law == "random":

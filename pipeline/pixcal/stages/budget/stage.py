@@ -34,9 +34,11 @@ from pixcal.stages.budget.expected import (
     brightest_allowed,
     flat_error,
     flats_needed,
+    frame_rms,
     frames_needed,
     joined,
     levers,
+    own_effects,
     planned_split,
     sample_variance,
 )
@@ -67,6 +69,7 @@ def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, 
         If the bench cannot be read, has no fringes, or its phases determine nothing.
     """
     bench = load_bench(bench_file)
+    own_effects(bench, str(bench_file))
     if not bench.frames.fringes:
         raise InputError(f"{bench_file}: frames.fringes: no fringe sets, nothing to budget")
     try:
@@ -237,7 +240,10 @@ def _left_out(bench: Bench) -> list[str]:
         "them"
     )
     if bench.effects:
-        sentences.append(f"the effects of the bench file: {', '.join(sorted(bench.effects))}")
+        sentences.append(
+            "what the effects of the bench file do, but for light and contrast of whole frames: "
+            + ", ".join(sorted(bench.effects))
+        )
     if d.prnu_rms > 0:
         sentences.append(
             f"the response of single pixels: its {100 * d.prnu_rms:.2g} % rms scatters their "
@@ -251,8 +257,8 @@ def _left_out(bench: Bench) -> list[str]:
 def _warnings(bench: Bench, bound: JoinedBound) -> list[str]:
     sentences, limit = [], brightest_allowed(bench)
     ny, nx = bench.detector.shape
-    for scan, s in zip(bench.frames.fringes, bound.sets, strict=True):
-        noise = s.variance + scan.peak_e + (bench.optics.laser_noise_rms * scan.peak_e) ** 2
+    for number, (scan, s) in enumerate(zip(bench.frames.fringes, bound.sets, strict=True)):
+        noise = s.variance + scan.peak_e + (frame_rms(bench, number)[0] * scan.peak_e) ** 2
         top = scan.peak_e + MARGIN * noise**0.5
         if limit is not None and top > limit:
             sentences.append(

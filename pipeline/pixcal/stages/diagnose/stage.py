@@ -21,7 +21,6 @@ from pixcal.stages.diagnose.inquiry import inquire, places
 from pixcal.stages.diagnose.on_map import on_map
 from pixcal.stages.diagnose.result import describe
 from pixcal.stages.diagnose.trial import Effects
-from pixcal.stages.treatment import HYPERBOLIC
 from pixcal.storage.artefact import Build, Manifest, write_json
 from pixcal.storage.formats import STAGES
 from pixcal.storage.stage import copy_products, make, require, working
@@ -100,8 +99,4 @@ def _base(nominal: Path | None, known: Mapping[str, type[Effect]]) -> Effects:
     """Effects that the nominal bench has from the start."""
     if nominal is None:
         return ()
-    bench = load_bench(nominal)
-    found = list(parse_effects(bench.effects, str(nominal), known))
-    if bench.optics.fringes == "exact":
-        found += [kind() for kind in known.values() if kind.fit_model == HYPERBOLIC]
-    return tuple(found)
+    return parse_effects(load_bench(nominal).effects, str(nominal), known)
