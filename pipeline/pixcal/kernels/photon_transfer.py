@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from pixcal.kernels.robust import clipped_variance_factor
+from pixcal.kernels.bilinear import FAST
+from pixcal.kernels.robust import clipped_variance_factor, median_of_columns
 from pixcal.model.arrays import F32, F64
 
 BLOCK = 16  # pixels along each side of a block
@@ -52,71 +53,68 @@ _ALIKE = 1e12
 _SPARE, _RANGE = 3, 3.0
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _block_statistics(
-    first: Any,
-    second: Any,
-    gain: float,
-    read_noise: float,
-    quantum: float,
-    clip: float,
-    size: int,
-    lags: Any,
-) -> Any:
-    ny, nx = first.shape
-    rows, columns = -(-ny // size), -(-nx // size)
-    out = np.zeros((rows * columns, 3 + len(lags)))
-    ratio = np.empty(size * size)
-    used = np.empty((size, size))
-    for block in range(rows * columns):
-        y0, x0 = block // columns * size, block % columns * size
-        y1, x1 = min(y0 + size, ny), min(x0 + size, nx)
-        n = 0
-        for y in range(y0, y1):
-            for x in range(x0, x1):
-                mean = 0.5 * (first[y, x] + second[y, x])
-                sigma = math.sqrt(max(mean, 0.0) / gain + read_noise**2)
-                if not math.isnan(mean):
-                    ratio[n] = (first[y, x] - second[y, x]) / sigma
-                    n += 1
-        if n < _MIN_PIXELS:
-            continue
-        centre = np.median(ratio[:n])
-        spread = _SIGMA_OF_MAD * np.median(np.abs(ratio[:n] - centre))
-        n = 0
-        used[:] = np.nan
-        total, square, level = 0.0, 0.0, 0.0
-        for y in range(y0, y1):
-            for x in range(x0, x1):
-                mean = 0.5 * (first[y, x] + second[y, x])
-                sigma = math.sqrt(max(mean, 0.0) / gain + read_noise**2)
-                d = first[y, x] - second[y, x]
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _fill_ratios(
+    first: F32, second: F32, per_level: float, read_variance: float, ratios: F32
+) -> None:
+    """Differences over their expected noise, by the pixel's place in its block and by block."""
+    slope, floor = np.float32(per_level), np.float32(read_variance)
+    columns = -(-first.shape[1] // BLOCK)
+    for y in range(first.shape[0]):
+        for x in range(first.shape[1]):
+            mean = np.float32(0.5) * (first[y, x] + second[y, x])
+            variance = max(mean, np.float32(0)) * slope + floor
+            place, block = y % BLOCK * BLOCK + x % BLOCK, y // BLOCK * columns + x // BLOCK
+            ratios[place, block] = (first[y, x] - second[y, x]) / np.sqrt(variance)
+
+
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _add_blocks(
+    first: F32, second: F32, per_level: float, read_variance: float, quantum: float,
+    centre: F32, spread: F32, lags: Any, out: F64,
+) -> None:  # fmt: skip
+    slope, floor = np.float32(per_level), np.float32(read_variance)
+    clip, step = np.float32(_CLIP), np.float32(quantum)
+    columns, zero = -(-first.shape[1] // BLOCK), np.float32(0)
+    # Flat, with zeros between the rows and after them: a neighbour is so many places on.
+    width = BLOCK + REACH
+    used = np.zeros(width * (width + 1), np.float32)
+    there = np.zeros_like(used)
+    for block in range(len(out)):
+        # With too few pixels it is NaN, and nothing is within the limits.
+        middle, wide = centre[block], spread[block]
+        y0, x0 = block // columns * BLOCK, block % columns * BLOCK
+        used[:], there[:] = zero, zero
+        n = total = square = level = zero
+        for y in range(min(BLOCK, first.shape[0] - y0)):
+            one, two = first[y0 + y, x0 : x0 + BLOCK], second[y0 + y, x0 : x0 + BLOCK]
+            row, has = used[y * width :], there[y * width :]
+            for x in range(one.size):
+                a, b = one[x], two[x]
+                mean, d = np.float32(0.5) * (a + b), a - b
+                sigma = np.sqrt(max(mean, zero) * slope + floor)
                 # The median deviation of whole numbers may be nothing.
-                limit = clip * math.sqrt((spread * sigma) ** 2 + quantum**2) + quantum
-                if abs(d - centre * sigma) <= limit:
-                    n += 1
-                    used[y - y0, x - x0] = d
-                    total += d
-                    square += d * d
-                    level += mean
-        if n > 1:
-            out[block, 0] = n - 1
-            out[block, 1] = level / n
-            out[block, 2] = 0.5 * (square - total * total / n) / (n - 1)
-            used -= total / n
-            for lag in range(len(lags)):
-                dy, dx = lags[lag]
-                pairs, product = 0, 0.0
-                for y in range(size - dy):
-                    for x in range(max(0, -dx), size - max(0, dx)):
-                        both = used[y, x] * used[y + dy, x + dx]
-                        if not math.isnan(both):
-                            pairs += 1
-                            product += both
-                # The mean that was taken off is of the same pixels: it takes 1 / n of the variance.
-                if pairs:
-                    out[block, 3 + lag] = 0.5 * product / pairs + out[block, 2] / n
-    return out
+                limit = clip * np.sqrt((wide * sigma) ** 2 + step * step) + step
+                inside = abs(d - middle * sigma) <= limit
+                row[x], has[x] = d if inside else zero, inside
+                n, total, square = n + has[x], total + row[x], square + row[x] * row[x]
+                level += mean if inside else zero
+        if n < 2:
+            continue
+        variance = np.float32(0.5) * (square - total * total / n) / (n - 1)
+        out[block, 0], out[block, 1], out[block, 2] = n - 1, level / n, variance
+        for i in range(BLOCK * width):
+            used[i] -= there[i] * (total / n)
+        for lag in range(len(lags)):
+            on = lags[lag, 0] * width + lags[lag, 1]
+            others, are = used[on:], there[on:]
+            pairs = product = zero
+            for i in range(BLOCK * width):
+                pairs += there[i] * are[i]
+                product += used[i] * others[i]
+            # The mean that was taken off is of the same pixels: it takes 1 / n of the variance.
+            if pairs > 0:
+                out[block, 3 + lag] = np.float32(0.5) * product / pairs + variance / n
 
 
 def pair_statistics(
@@ -142,9 +140,18 @@ def pair_statistics(
         for the clipping, and covariance (ADU²) of pixels apart by each of `LAGS`. All zero for the
         rest of a block at the edge that has fewer than 32 pixels.
     """
-    out: F64 = _block_statistics(
-        first.astype(float), second.astype(float), gain, read_noise, quantum, _CLIP, BLOCK, LAGS
-    )
+    blocks = math.prod(-(-n // BLOCK) for n in first.shape)
+    ratios = np.full((BLOCK * BLOCK, blocks), np.nan, np.float32)
+    pair = np.ascontiguousarray(first, np.float32), np.ascontiguousarray(second, np.float32)
+    _fill_ratios(*pair, 1 / gain, read_noise**2, ratios)
+    centre, spread = np.empty((2, blocks), np.float32)
+    few = np.isfinite(ratios).sum(axis=0) < _MIN_PIXELS
+    median_of_columns(ratios.copy(), centre)
+    median_of_columns(np.abs(ratios - centre), spread)
+    centre[few] = np.nan
+    out = np.zeros((blocks, COLUMNS))
+    spread *= np.float32(_SIGMA_OF_MAD)
+    _add_blocks(*pair, 1 / gain, read_noise**2, quantum, centre, spread, LAGS, out)
     out[:, 2:] /= clipped_variance_factor(_CLIP)
     return out
 

@@ -67,8 +67,8 @@ def _sort_columns(rows: Any) -> None:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _median_of_columns(rows: Any, out: Any) -> None:
-    # Sorts the rows; NaN goes to the end and is not counted.
+def median_of_columns(rows: Any, out: Any) -> None:
+    """Median of each column of (row, column) float32, NaN not counted; sorts the rows."""
     for x in range(rows.shape[1]):
         out[x] = 0
     for t in range(rows.shape[0]):
@@ -91,11 +91,11 @@ def _median_and_deviation(frames: Any, median: Any, deviation: Any) -> None:
         for t in range(frames.shape[0]):
             for x in range(frames.shape[2]):
                 rows[t, x] = frames[t, y, x]
-        _median_of_columns(rows, median[y])
+        median_of_columns(rows, median[y])
         for t in range(frames.shape[0]):
             for x in range(frames.shape[2]):
                 rows[t, x] = abs(frames[t, y, x] - median[y, x])
-        _median_of_columns(rows, deviation[y])
+        median_of_columns(rows, deviation[y])
 
 
 def median_and_deviation(frames: F32) -> tuple[F32, F32]:
@@ -217,8 +217,9 @@ class Combination:
         seen, n, s1, s2, s3, s4 = self._sums
         with np.errstate(invalid="ignore", divide="ignore"):
             m1, m2, m3, m4 = (s / n for s in (s1, s2, s3, s4))
-            central2 = m2 - m1**2
-            central4 = m4 - 4 * m1 * m3 + 6 * m1**2 * m2 - 3 * m1**4
+            square = m1**2  # a higher power would take ten times as long
+            central2 = m2 - square
+            central4 = m4 - 4 * m1 * m3 + (6 * m2 - 3 * square) * square
             variance = central2 * n / (n - 1) / clipped_variance_factor(self._clip)
             kurtosis = central4 / central2**2 - 3
         mean = self._reference + m1
@@ -283,7 +284,15 @@ def lit(signal: NDArray[Any]) -> Mask:
 
 def _finite_median(values: F32) -> float:
     finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if finite.size else math.nan
+    return median(finite) if finite.size else math.nan
+
+
+def median(values: NDArray[Any]) -> float:
+    """Median of finite values (n,), which are put in another order; as numpy's, in less time."""
+    low, high = (len(values) - 1) // 2, len(values) // 2
+    values.partition(high)
+    lower = values[high] if low == high else values[:high].max()
+    return float((lower + values[high]) / 2)
 
 
 def median_and_sigma(values: NDArray[Any]) -> tuple[float, float]:
@@ -291,5 +300,5 @@ def median_and_sigma(values: NDArray[Any]) -> tuple[float, float]:
     finite = values[np.isfinite(values)].astype(float)
     if not finite.size:
         return np.nan, np.nan
-    median = float(np.median(finite))
-    return median, _SIGMA_OF_MAD * float(np.median(np.abs(finite - median)))
+    middle = median(finite)
+    return middle, _SIGMA_OF_MAD * median(np.abs(finite - middle))

@@ -35,19 +35,17 @@ class Nonuniformity:
     pixel: Measure
 
 
-def nonuniformity(first: F64, second: F64, good: Mask) -> Nonuniformity:
+def nonuniformity(a: F64, b: F64, lost: int) -> Nonuniformity:
     """Nonuniformity that two averages of independent frames have in common.
 
     Parameters
     ----------
-    first, second : (y, x) float64
-        Averages of as many frames, in any unit.
-    good : (y, x) bool
-        Pixels to use.
+    a, b : (y, x) float64
+        Averages of as many frames, in any unit, as `without_gaps` gives them.
+    lost : int
+        Pixels that are bad.
     """
-    a, b = (_filled(values, good) for values in (first, second))
     ny, nx = a.shape
-    lost = int((~good).sum())
     dofs = np.array([ny - 1, nx - 1, max((ny - 1) * (nx - 1) - lost, 1)], float)
     own = np.array([_squares(a, a), _squares(b, b)]) / dofs
     shared = _squares(a, b) / dofs
@@ -66,8 +64,8 @@ def nonuniformity(first: F64, second: F64, good: Mask) -> Nonuniformity:
     )
 
 
-def _filled(values: F64, good: Mask) -> F64:
-    """The map less its mean; a bad pixel is what its row and its column let expect."""
+def without_gaps(values: F64, good: Mask) -> F64:
+    """The map (y, x) less its mean; a bad pixel is what its row and its column let expect."""
     count = np.maximum(good.sum(axis=1), 1), np.maximum(good.sum(axis=0), 1)
     values = np.where(good, values - values[good].mean(), 0.0)
     rows = values.sum(axis=1) / count[0]
@@ -89,12 +87,12 @@ def _root(variance: float, error: float) -> Measure:
     return (value, error / (2 * value)) if variance > error else (value, math.sqrt(error))
 
 
-def alternation(first: F64, second: F64, good: Mask, *, axis: int) -> Measure:
+def alternation(a: F64, b: F64, *, axis: int) -> Measure:
     """By how much every second row (axis 0) or column (axis 1) is higher than those between.
 
     Parameters
     ----------
-    first, second, good
+    a, b
         As for `nonuniformity`.
 
     Returns
@@ -102,7 +100,7 @@ def alternation(first: F64, second: F64, good: Mask, *, axis: int) -> Measure:
     (float, float)
         Amplitude at the Nyquist frequency, twice; the error is by the scatter of the other lines.
     """
-    means = (_filled(first, good) + _filled(second, good)).mean(axis=1 - axis) / 2
+    means = (a.mean(axis=1 - axis) + b.mean(axis=1 - axis)) / 2
     # Slow structure differs little between neighbours; only pairs of lines are compared.
     steps = np.diff(means)
     signed = steps * (-1.0) ** np.arange(len(steps))
@@ -124,16 +122,16 @@ def without_trend(values: F64, good: Mask) -> F64:
     good : (y, x) bool
         Pixels to use.
     """
-    ny, nx = values.shape
-    y, x = np.linspace(-1, 1, ny)[:, None], np.linspace(-1, 1, nx)[None, :]
-    terms = [np.broadcast_to(t, values.shape) for t in (np.ones(()), x, y, x * x, x * y, y * y)]
+    powers = [np.linspace(-1, 1, n)[:, None] ** np.arange(5) for n in values.shape]
     relative = np.where(good, values / values[good].mean(), 0.0)
-    normal = np.array([[(good * s * t).sum() for t in terms] for s in terms])
-    right = np.array([(relative * t).sum() for t in terms])
-    trend: F64 = sum(
-        (c * t for c, t in zip(np.linalg.lstsq(normal, right)[0], terms, strict=True)),
-        start=np.zeros_like(values),
-    )
+    # Sums of x^m y^n over the good pixels are products with these matrices.
+    of_y, of_x = (p[:, :3] for p in powers)
+    moments, right = powers[0].T @ good @ powers[1], of_y.T @ relative @ of_x
+    y, x = np.nonzero(np.add.outer(np.arange(3), np.arange(3)) < 3)
+    normal = moments[np.add.outer(y, y), np.add.outer(x, x)]
+    terms = np.zeros((3, 3))
+    terms[y, x] = np.linalg.lstsq(normal, right[y, x])[0]
+    trend = of_y @ terms @ of_x.T
     return relative - trend
 
 
@@ -147,19 +145,16 @@ class Spectrogram:
     noise: float  # the same of the noise in the map
 
 
-def spectrogram(first: F64, second: F64, good: Mask, *, axis: int) -> Spectrogram:
+def spectrogram(a: F64, b: F64, *, axis: int) -> Spectrogram:
     """Spectrum of the mean of two averages along an axis (1: along the rows), and its noise.
 
     Parameters
     ----------
-    first, second : (y, x) float64
+    a, b : (y, x) float64
         As for `nonuniformity`.
-    good : (y, x) bool
-        Pixels to use.
     axis : {0, 1}
         Along which the Fourier transform is taken.
     """
-    a, b = (_filled(values, good) for values in (first, second))
     n = a.shape[axis]
     scale = 1 / math.sqrt(n)
     power = np.abs(np.fft.rfft((a + b) / 2, axis=axis) * scale) ** 2

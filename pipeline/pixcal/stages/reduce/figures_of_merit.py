@@ -21,6 +21,7 @@ from pixcal.estimators.detector.emva import (
     saturation,
     spectrogram,
     transfer_points,
+    without_gaps,
     without_trend,
 )
 from pixcal.kernels.photon_transfer import add_neighbours
@@ -203,10 +204,11 @@ _ALTERNATING_SHARE = 0.04
 
 def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: Mask) -> None:
     """Standard deviations, spectra and profiles of a pair of maps."""
-    spread: Nonuniformity = nonuniformity(halves[0], halves[1], good)
+    pair = without_gaps(halves[0], good), without_gaps(halves[1], good)
+    spread: Nonuniformity = nonuniformity(*pair, int((~good).sum()))
     said = ["quadratic trend of the lamp removed"] if name == "prnu" else []
     for axis, lines in ((0, "row"), (1, "column")):
-        size, error = alternation(halves[0], halves[1], good, axis=axis)
+        size, error = alternation(*pair, axis=axis)
         if size > _ALTERNATES * error and size**2 > _ALTERNATING_SHARE * spread.total[0] ** 2:
             said.append(f"every second {lines} is {size:.3g} {unit} higher: a fixed pattern")
     note = "; ".join(said)
@@ -217,7 +219,7 @@ def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: 
     mean = np.where(good, halves.mean(axis=0), np.nan)
     curves[name] = {"unit": unit}
     for axis, along in ((1, "rows"), (0, "columns")):
-        seen = spectrogram(halves[0], halves[1], good, axis=axis)
+        seen = spectrogram(*pair, axis=axis)
         curves[name][along] = _listed((seen.frequency, seen.amplitude), ("frequency", "amplitude"))
         curves[name][along]["noise"] = seen.noise
         count = good.sum(axis=axis)
