@@ -8,6 +8,7 @@ from pathlib import Path
 import second_bench
 from second_bench.cases import CaseError, make_case
 from second_bench.effects import LAWS
+from second_bench.model import MARGIN
 from second_bench.ordinary import VARIATIONS, Layout
 from second_bench.writing import write_acquisition, write_truth
 
@@ -61,7 +62,8 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"--out {asked.out}: exists already; choose another folder")
     if asked.out and asked.truth.resolve().is_relative_to(asked.out.resolve()):
         parser.error(f"--truth {asked.truth}: inside {asked.out}; keep the truth apart")
-    layout = Layout(tuple(asked.size), asked.frames, asked.bias, asked.darks, asked.flats)
+    shape = asked.size[0] + 2 * MARGIN, asked.size[1] + 2 * MARGIN
+    layout = Layout(shape, asked.frames, asked.bias, asked.darks, asked.flats)
     plain = asked.bench == "plain"
     try:
         bench, truth = make_case(asked.case, asked.seed, layout, asked.strength, plain)

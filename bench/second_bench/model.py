@@ -14,6 +14,8 @@ WARM_UP = 3
 EXPTIME_S = 0.02
 """Of fringes and flats."""
 TOP_ADU = 65535
+MARGIN = 4
+"""Pixels that are simulated on every side of those that are written: the sensor goes on there."""
 
 
 def stream(seed: int, *names: str | int) -> np.random.Generator:

@@ -11,16 +11,17 @@ from astropy.io import fits
 from astropy.time import Time, TimeDelta
 from numpy.typing import NDArray
 
-from second_bench.model import TOP_ADU, WARM_UP, Bench, Run
+from second_bench.model import MARGIN, TOP_ADU, WARM_UP, Bench, Run
 
 NIGHT = Time("2026-03-01T20:00:00")
 PER_FILE = 200
+WINDOW = (..., slice(MARGIN, -MARGIN), slice(MARGIN, -MARGIN))
 
 
 def write_acquisition(
     bench: Bench, recorded: Iterable[tuple[Run, NDArray[np.uint16]]], out: Path
 ) -> None:
-    """Write frames and ``acquisition.yaml`` into a new folder."""
+    """Write frames without their margin, and ``acquisition.yaml``, into a new folder."""
     out.mkdir(parents=True)
     for run, frames in recorded:
         (out / run.name).mkdir()
@@ -29,7 +30,7 @@ def write_acquisition(
             header = fits.Header()
             header["DATE-OBS"] = (NIGHT + TimeDelta(seconds, format="sec")).isot
             header["EXPTIME"] = run.exptime_s
-            cube = frames[first : first + PER_FILE]
+            cube = np.ascontiguousarray(frames[first : first + PER_FILE][WINDOW])
             file = out / run.name / f"{run.name}_{first:05d}.fits"
             fits.PrimaryHDU(cube, header).writeto(file)
     (out / "acquisition.yaml").write_text(yaml.safe_dump(_described(bench), sort_keys=False))
@@ -68,9 +69,9 @@ def _described(bench: Bench) -> dict[str, Any]:
 
 
 def write_truth(file: Path, truth: dict[str, Any], bench: Bench) -> None:
-    """Write the truth, the offsets (px) of all pixels included."""
+    """Write the truth, the offsets (px) of all pixels that are written included."""
     maps = {
-        name: [[round(float(v), 7) for v in row] for row in values]
+        name: [[round(float(v), 7) for v in row] for row in values[WINDOW]]
         for name, values in (("delta_x", bench.delta_x), ("delta_y", bench.delta_y))
     }
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -70,7 +70,10 @@ class BrighterFatter(Effect):
         return self.shift_px_per_e * boundary_shifts(self.falloff_px)
 
     def charge(self, charge: F32, shot: Shot) -> F32:
-        return charge + moved_charge(charge, self._shifts, self.along_y)
+        wide = shot.surrounded(charge, REACH)
+        inside = slice(REACH, -REACH)
+        moved = moved_charge(wide, self._shifts, self.along_y)
+        return charge + moved[inside, inside]
 
     def restored(self, charge: F32) -> F32:
         """Charge as it would be with boundaries that stay.

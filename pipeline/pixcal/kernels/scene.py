@@ -190,6 +190,24 @@ class LightMaps:
     alpha_cos: F32
 
 
+def with_margin(light: LightMaps, margin: int) -> LightMaps:
+    """The light with a margin of pixels like those at the edge, in which the fringes go on."""
+    z = light.alpha_cos + 1j * light.alpha_sin
+    y, x = (np.arange(-margin, n + margin) for n in z.shape)
+    ky = np.angle(np.sum(z[1:] * z[:-1].conj()))
+    kx = np.angle(np.sum(z[:, 1:] * z[:, :-1].conj()))
+    further = [
+        np.where(i < 0, i, np.maximum(i - n + 1, 0)) for i, n in zip((y, x), z.shape, strict=True)
+    ]
+    turn = ky * further[0][:, None] + kx * further[1]
+    wide = np.pad(z, margin, "edge") * np.exp(1j * turn)
+    return LightMaps(
+        np.pad(light.iota, margin, "edge"),
+        wide.imag.astype(np.float32),
+        wide.real.astype(np.float32),
+    )
+
+
 def light_maps(
     bench: Bench, number: int, rows: Rows, maps: DetectorMaps, electrons: float
 ) -> LightMaps:
@@ -229,10 +247,15 @@ class FrameStates:
     dkx: F64  # change of the fringe vector along x, rad/px, about the window's centre
     dky: F64  # change of the fringe vector along y, rad/px
 
-    def turns(self, frame: int, shape: tuple[int, int], rows: Rows) -> tuple[F32, F32]:
-        """Phase of a frame along columns and rows, as `synthesis.illuminate` takes it."""
-        x = np.arange(shape[1]) - (shape[1] - 1) / 2
-        y = np.arange(*rows) - (shape[0] - 1) / 2
+    def turns(
+        self, frame: int, shape: tuple[int, int], rows: Rows, margin: int = 0
+    ) -> tuple[F32, F32]:
+        """Phase of a frame along columns and rows, as `synthesis.illuminate` takes it.
+
+        With as many more pixels at either end as the ``margin`` has.
+        """
+        x = np.arange(-margin, shape[1] + margin) - (shape[1] - 1) / 2
+        y = np.arange(rows[0] - margin, rows[1] + margin) - (shape[0] - 1) / 2
         return turns(self.dkx[frame] * x), turns(self.phi[frame] + self.dky[frame] * y)
 
 

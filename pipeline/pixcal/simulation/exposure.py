@@ -21,6 +21,7 @@ from pixcal.kernels.scene import (
     detector_maps,
     frame_states,
     light_maps,
+    with_margin,
 )
 from pixcal.kernels.synthesis import BLOCK_ROWS
 from pixcal.model.arrays import F32, U16
@@ -121,6 +122,13 @@ class _Shot:
             return None
         return self._chain.charge(frame, self._at)
 
+    def surrounded(self, charge: F32, reach: int) -> F32:
+        """Charge of this frame with a margin, in which its light goes on."""
+        wide = self._chain.beyond(self.frame, reach)
+        inside = slice(reach, -reach)
+        wide[inside, inside] = charge
+        return wide
+
     def rng(self, effect: str, *key: int) -> np.random.Generator:
         """Random numbers of an effect in this frame."""
         return self.recording.rng(effect, self.frame, *key)
@@ -163,6 +171,7 @@ class _Chain:
         # Of a frame and of those before it, each before and after the effect that looks back.
         self._charges = _Latest[tuple[int, int]](2 * max(back, default=1))
         self._kept_normals = _Latest[tuple[int, str]](sum(back))
+        self._margins: dict[int, tuple[LightMaps, F32]] = {}
         self._samples = np.empty(self.dark.shape, np.uint16)
 
     @cached_property
@@ -193,6 +202,20 @@ class _Chain:
         for at, effect in enumerate(self.effects[:upto]):
             mean = effect.photons(mean, _Shot(self, frame, at))
         return mean
+
+    def beyond(self, frame: int, reach: int) -> F32:
+        """Mean charge of a frame around the rows at hand; in their middle it is undefined."""
+        if reach not in self._margins:
+            self._margins[reach] = with_margin(self.light, reach), np.pad(self.dark, reach, "edge")
+        light, dark = self._margins[reach]
+        states, shape = self.states, self.camera.bench.detector.shape
+        columns, lines = states.turns(frame, shape, self.camera.rows, reach)
+        wide = np.empty_like(dark)
+        synthesis.illuminate(
+            light.iota, light.alpha_sin, light.alpha_cos,
+            states.level[frame], states.amplitude[frame], columns, lines, wide,
+        )  # fmt: skip
+        return np.minimum(wide + dark, np.float32(self.well))
 
     def charge(self, frame: int, upto: int) -> F32:
         """Charge, by all that acts on the light and the first ``upto`` effects on charge."""

@@ -50,6 +50,13 @@ class Shot(Protocol):
     def charge(self, frame: int) -> F32 | None:
         """Charge of another frame, without this effect; None outside the recording."""
 
+    def surrounded(self, charge: F32, reach: int) -> F32:
+        """Charge (y, x) of this frame with ``reach`` more pixels on every side, e-.
+
+        Beyond the rows at hand and the window's columns lies what the light of the frame collects
+        there: fringes go on, pixels are like those at the edge, without noise.
+        """
+
     def rng(self, effect: str, *key: int) -> np.random.Generator:
         """Random numbers of an effect in this frame, the same for all rows.
 
