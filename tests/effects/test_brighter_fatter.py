@@ -114,6 +114,32 @@ def test_what_moved_is_brought_back() -> None:
     np.testing.assert_allclose(effect.restored(changed), charge, atol=0.1)
 
 
+def test_charge_moves_over_the_edges_of_a_window(make_effect_bench: Callable[..., Bench]) -> None:
+    """A window of a larger sensor comes out as it is within a larger window, edges included."""
+    quiet = {
+        "detector.chip": [60, 64], "detector.hot_fraction": 0.0, "detector.delta_rms_px": 0.0,
+        "detector.prnu_rms": 0.0, "detector.bias_pixel_rms_adu": 0.0, "frames.fringes.0.count": 7,
+        "detector.read_noise_e": 0.0,
+    }  # fmt: skip
+    effect = BrighterFatter(STRONG)
+
+    def moved(shape: list[int]) -> np.ndarray:
+        bench = make_effect_bench({**quiet, "detector.shape": shape})
+        bench = replace(bench, shot_noise=False)
+        fringes = next(r for r in recordings(bench) if r.kind == "fringes")
+        plain, made = frames_of(bench, fringes), frames_of(bench, fringes, [effect])
+        return made.astype(float) - plain
+
+    inner, outer = moved([19, 23])[:, :, :], moved([29, 33])[:, 5:-5, 5:-5]
+    # The peak of the window sets the power of the light.
+    scale = np.vdot(outer, inner) / np.vdot(outer, outer)
+    assert scale == pytest.approx(1, abs=0.02)
+    assert np.abs(inner).max() > 100
+    for edge in (np.s_[:, 0], np.s_[:, -1], np.s_[:, :, 0], np.s_[:, :, -1]):
+        assert np.abs(inner[edge]).max() > 30
+        np.testing.assert_allclose(inner[edge], scale * outer[edge], atol=6)
+
+
 def test_frames_lose_contrast_with_their_level(make_effect_bench: Callable[..., Bench]) -> None:
     losses = []
     for peak in (10_000, 40_000):

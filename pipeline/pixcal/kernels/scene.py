@@ -191,20 +191,27 @@ class LightMaps:
 
 
 def with_margin(light: LightMaps, margin: int) -> LightMaps:
-    """The light with a margin of pixels like those at the edge, in which the fringes go on."""
+    """The light with a margin of pixels like those at the edge, in which the fringes go on.
+
+    By the step of the phase along each row, and from row to row at the edge: a piece of the window
+    has the same margin as the whole where both end.
+    """
     z = light.alpha_cos + 1j * light.alpha_sin
-    y, x = (np.arange(-margin, n + margin) for n in z.shape)
-    ky = np.angle(np.sum(z[1:] * z[:-1].conj()))
-    kx = np.angle(np.sum(z[:, 1:] * z[:, :-1].conj()))
-    further = [
-        np.where(i < 0, i, np.maximum(i - n + 1, 0)) for i, n in zip((y, x), z.shape, strict=True)
-    ]
-    turn = ky * further[0][:, None] + kx * further[1]
-    wide = np.pad(z, margin, "edge") * np.exp(1j * turn)
+    beyond = np.arange(1, margin + 1)
+    step = np.angle(np.sum(z[:, 1:] * z[:, :-1].conj(), axis=1))[:, None]
+    z = np.hstack(
+        [z[:, :1] * np.exp(-1j * step * beyond[::-1]), z, z[:, -1:] * np.exp(1j * step * beyond)]
+    )
+    up, down = (np.angle(np.sum(b * a.conj())) for a, b in ((z[:2][-1], z[0]), (z[-2:][0], z[-1])))
+    z = np.vstack(
+        [
+            z[:1] * np.exp(1j * up * beyond[::-1, None]),
+            z,
+            z[-1:] * np.exp(1j * down * beyond[:, None]),
+        ]
+    )
     return LightMaps(
-        np.pad(light.iota, margin, "edge"),
-        wide.imag.astype(np.float32),
-        wide.real.astype(np.float32),
+        np.pad(light.iota, margin, "edge"), z.imag.astype(np.float32), z.real.astype(np.float32)
     )
 
 

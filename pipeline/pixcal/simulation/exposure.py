@@ -215,7 +215,7 @@ class _Chain:
             light.iota, light.alpha_sin, light.alpha_cos,
             states.level[frame], states.amplitude[frame], columns, lines, wide,
         )  # fmt: skip
-        return np.minimum(wide + dark, np.float32(self.well))
+        return np.asarray(np.minimum(wide + dark, np.float32(self.well)))
 
     def charge(self, frame: int, upto: int) -> F32:
         """Charge, by all that acts on the light and the first ``upto`` effects on charge."""

@@ -171,8 +171,13 @@ def _fitted(
     k = float(np.hypot(*one.k))
     # The scan starts anywhere: turn the others to the first before the mean is taken.
     phasors = [f.theta[2] + 1j * f.theta[1] for f in found]
-    turned = [z * np.exp(-1j * np.angle(np.vdot(phasors[0][good], z[good]))) for z in phasors]
-    z = np.mean(turned, axis=0)
+    turns = [np.angle(np.vdot(phasors[0][good], z[good])) for z in phasors]
+    z = np.mean([z * np.exp(-1j * a) for z, a in zip(phasors, turns, strict=True)], axis=0)
+    waves = [
+        (f.g[:, 1] + 1j * f.g[:, 2]) * np.exp(1j * a) for f, a in zip(found, turns, strict=True)
+    ]
+    wave = np.concatenate(waves)
+    g = np.stack([np.concatenate([f.g[:, 0] for f in found]), wave.real, wave.imag], axis=1)
     theta = np.stack([np.mean([f.theta[0] for f in found], axis=0), z.imag, z.real])
     delta = np.mean([f.delta for f in found], axis=0)
     sigma = np.sqrt(np.sum([f.sigma**2 for f in found], axis=0)) / len(found) / k
@@ -186,6 +191,7 @@ def _fitted(
         origin,
         flat,
         one.name,
+        g=g,
     )
 
 

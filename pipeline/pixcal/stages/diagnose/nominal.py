@@ -33,7 +33,11 @@ from pixcal.stages import reduce
 from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
-from pixcal.stages.diagnose.undone import IntensityBeforeEffects, undone_on_samples
+from pixcal.stages.diagnose.undone import (
+    FitOfFrames,
+    IntensityBeforeEffects,
+    undone_on_samples,
+)
 
 TWO_BEAMS = 2
 """Degree, over a window, of the logarithm of the contrast of two Gaussian beams (their intensities'
@@ -166,6 +170,8 @@ class FittedSet:
         Of the set.
     light, contrast : (y, x) float32 or float
         What mean and contrast of the fringes are times those that were measured.
+    g : (t, 3) float64, optional
+        Intensity, and amplitude times cosine and sine of the phase, of the frames that were fitted.
     """
 
     theta: F64
@@ -177,6 +183,7 @@ class FittedSet:
     name: str = ""
     light: F32 | float = 1.0
     contrast: F32 | float = 1.0
+    g: F64 | None = None
 
     def without(self, effects: Sequence[Effect]) -> "FittedSet":
         """The same with effects undone that act on maps: offsets as fitted with them known."""
@@ -186,7 +193,7 @@ class FittedSet:
         for effect in sorted(effects, key=lambda e: e.turn, reverse=True):
             # Their levels are those of `IntensityBeforeEffects`, without the noise of maps.
             by_maps = effect.undo(by_maps) or by_maps
-            maps = effect.undo(maps) or undone_on_samples(effect, maps) or maps
+            maps = effect.undo(maps) or undone_on_samples(effect, maps, self._fit) or maps
         if maps is before:
             return replace(self, flat=None)
         size = float(np.hypot(*self.k))
@@ -207,6 +214,13 @@ class FittedSet:
             light=light.astype(np.float32),
             contrast=contrast.astype(np.float32),
         )
+
+    @cached_property
+    def _fit(self) -> FitOfFrames | None:
+        if self.g is None:
+            return None
+        maps = FringeMaps(filled(self.theta, self.k), self.k, self.origin, self.flat, self.name)
+        return FitOfFrames.of(maps, self.g)
 
     @cached_property
     def offsets(self) -> OffsetModel:

@@ -6,17 +6,22 @@ effects, it must start from the light as it was before they acted.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 
-from pixcal.model.arrays import F64
+from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import SimulatedDetector
 from pixcal.simulation.effect import Effect, FringeMaps
 
 PHASES = 16
 """Of a fringe that is undone sample by sample."""
 MAP_PHASES = 12
-"""Frames, spread over a fringe, of which an effect on samples is undone."""
+"""Spread over a fringe, at which an effect on samples is undone."""
+_PHASES = 2 * np.pi * np.arange(MAP_PHASES) / MAP_PHASES
+_EVEN = np.stack([np.ones(MAP_PHASES), np.cos(_PHASES), np.sin(_PHASES)], axis=1)
+TURNS = 5
+"""Of the fits of pixels and frames: each gains a factor of three or more."""
 LEAST_SIGNAL = 1.0
 """Of a sample (e-), below which its shot noise is not taken."""
 ACROSS = 9
@@ -57,20 +62,102 @@ class IntensityBeforeEffects:
         return np.asarray(found[:, ACROSS // 2, ACROSS // 2], float)
 
 
-def undone_on_samples(effect: Effect, maps: FringeMaps) -> FringeMaps | None:
+def undone_on_samples(
+    effect: Effect, maps: FringeMaps, fit: "FitOfFrames | None" = None
+) -> FringeMaps | None:
     """Maps that a fit finds in frames without noise that an effect was undone on.
 
     None where the effect is not one of samples.
+
+    Parameters
+    ----------
+    fit : FitOfFrames, optional
+        Of the frames that the maps were fitted to; by default their phases are spread evenly.
     """
-    phi = 2 * np.pi * np.arange(MAP_PHASES) / MAP_PHASES
-    frames = np.stack([np.ones(MAP_PHASES), np.cos(phi), np.sin(phi)])
     flat = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat
-    charge = np.einsum("mt,myx->tyx", frames, maps.theta * flat)
+    charge = np.einsum("tm,myx->tyx", _EVEN, maps.theta * flat)
     undone = effect.undo_samples(charge.astype(np.float32))
     if undone is None:
         return None
-    weight = 1 / np.maximum(charge, LEAST_SIGNAL)
-    normal = np.einsum("mt,nt,tyx->yxmn", frames, frames, weight)
-    right = np.einsum("mt,tyx->yxm", frames, weight * undone)
-    theta = np.moveaxis(np.linalg.solve(normal, right[..., None])[..., 0], -1, 0)
-    return replace(maps, theta=theta)
+    fit = FitOfFrames.of(maps, _EVEN) if fit is None else fit
+    return replace(maps, theta=maps.theta + fit.taken_up(undone - charge) / flat)
+
+
+@dataclass(frozen=True)
+class FitOfFrames:
+    """What a joint fit of pixels and frames takes up of a change that depends on the phase.
+
+    Where phases are few or not spread evenly, harmonics of a change have a part in the maps: by the
+    pixels' fit directly, and by the frames' parameters that the fit finds beside.
+
+    Attributes
+    ----------
+    psi : (y, x) float64
+        Phase of the pixels, rad.
+    by_pixel, by_frames : (3, MAP_PHASES, y, x) float32
+        Weights by which a change at each of the phases is summed into the maps: that of the pixel
+        itself, and that of all pixels against the phase of their own fringe.
+    """
+
+    psi: F64
+    by_pixel: F32
+    by_frames: F32
+
+    @classmethod
+    def of(cls, maps: FringeMaps, g: F64) -> Self:
+        """From the maps, and (B, A cos phi, A sin phi) of the frames, (t, 3)."""
+        light = (maps.theta * (1.0 if maps.flat is None else maps.flat)).reshape(3, -1)
+        weight = 1 / np.maximum(g @ light, LEAST_SIGNAL)
+        frames = _taken_by_frames(g, light)
+        normal = np.einsum("ti,tj,tp->pij", g, g, weight, optimize=True)
+        own = np.einsum("ti,tk,tp->pik", g, _between(_phase(g)), weight, optimize=True)
+        other = np.einsum("ti,tjk,tp,jp->pik", g, frames, weight, light, optimize=True)
+        shape = 3, MAP_PHASES, *maps.theta.shape[1:]
+        by_pixel, by_frames = (
+            np.moveaxis(np.linalg.solve(normal, right), 0, -1).reshape(shape).astype(np.float32)
+            for right in (own, -other)
+        )
+        return cls(np.arctan2(*maps.theta[1:]), by_pixel, by_frames)
+
+    def taken_up(self, change: F64) -> F64:
+        """Part (3, y, x) of the maps in a change (phase, y, x) of samples, in its unit."""
+        orders = np.arange(MAP_PHASES // 2 + 1)[:, None, None]
+        turned = np.fft.rfft(change, axis=0) * np.exp(-1j * orders * self.psi)
+        of_all = np.fft.irfft(turned.mean(axis=(1, 2)), MAP_PHASES)
+        return np.asarray(
+            np.einsum("mtyx,tyx->myx", self.by_pixel, change)
+            + np.einsum("mtyx,t->myx", self.by_frames, of_all)
+        )
+
+
+def _phase(g: F64) -> F64:
+    return np.arctan2(g[:, 2], g[:, 1])
+
+
+def _between(phase: F64) -> F64:
+    """Weights (..., MAP_PHASES) that interpolate to some phases by all harmonics."""
+    apart = phase[..., None] - _PHASES
+    orders = np.arange(1, MAP_PHASES // 2).reshape(-1, *[1] * apart.ndim)
+    last = np.cos(MAP_PHASES // 2 * apart)
+    return np.asarray((1 + 2 * np.cos(orders * apart).sum(axis=0) + last) / MAP_PHASES)
+
+
+def _taken_by_frames(g: F64, light: F64) -> F64:
+    """What each frame's parameters (t, 3) take of a change at each phase (MAP_PHASES) of a fringe.
+
+    By fitting pixels and frames in turn, on pixels of the usual light spread over a fringe.
+    """
+    mean, amplitude = np.median(light[0]), np.median(np.hypot(light[1], light[2]))
+    psi = np.linspace(0, 2 * np.pi, 2 * MAP_PHASES, endpoint=False)
+    usual = np.stack([np.full_like(psi, mean), amplitude * np.sin(psi), amplitude * np.cos(psi)])
+    weight = 1 / np.maximum(g @ usual, LEAST_SIGNAL)
+    of_pixels = np.einsum("tp,ti,tj->pij", weight, g, g)
+    of_frames = np.einsum("tp,ip,jp->tij", weight, usual, usual)
+    change = _between(psi + _phase(g)[:, None])
+    taken = np.zeros((len(g), 3, MAP_PHASES))
+    for _ in range(TURNS):
+        rest = change - np.einsum("ip,tik->tpk", usual, taken)
+        theta = np.linalg.solve(of_pixels, np.einsum("tp,ti,tpk->pik", weight, g, rest))
+        rest = change - np.einsum("ti,pik->tpk", g, theta)
+        taken = np.linalg.solve(of_frames, np.einsum("tp,ip,tpk->tik", weight, usual, rest))
+    return taken

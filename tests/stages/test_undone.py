@@ -1,0 +1,74 @@
+"""Effects on samples, undone on maps: what the fit of some frames took up of them."""
+
+import numpy as np
+import pytest
+
+from pixcal.effects.nonlinearity import Nonlinearity
+from pixcal.estimators.maps.corrected import phase_change
+from pixcal.simulation.effect import FringeMaps
+from pixcal.stages.diagnose.undone import FitOfFrames, undone_on_samples
+
+SHAPE = (23, 31)
+BENT = Nonlinearity(-0.05, 0.02)
+
+
+def fitted(samples, theta, g, turns=60):
+    """Maps and frames (B, A cos phi, A sin phi), fitted in turn, weighted by photon noise."""
+    maps, pixels = theta.reshape(3, -1).copy(), samples.reshape(len(samples), -1)
+    weight = 1 / np.maximum(g @ maps, 1)
+    for _ in range(turns):
+        normal = np.einsum("tp,ti,tj->pij", weight, g, g)
+        maps = np.linalg.solve(normal, np.einsum("tp,ti,tp->pi", weight, g, pixels)[..., None])
+        maps = maps[..., 0].T
+        normal = np.einsum("tp,ip,jp->tij", weight, maps, maps)
+        g = np.linalg.solve(normal, np.einsum("tp,ip,tp->ti", weight, maps, pixels)[..., None])
+        g = g[..., 0]
+    return maps.reshape(theta.shape), g
+
+
+def acquisition(phi):
+    y, x = np.indices(SHAPE, float)
+    psi = 0.03 * y + 2 * np.pi / 9.3 * x
+    theta = np.stack([np.full(SHAPE, 2e4), 1.8e4 * np.sin(psi), 1.8e4 * np.cos(psi)])
+    g = np.stack([np.ones_like(phi), np.cos(phi), np.sin(phi)], axis=1)
+    samples = BENT.response(np.einsum("ti,iyx->tyx", g, theta).astype(np.float32))
+    return theta, fitted(samples.astype(float), theta, g), psi
+
+
+def third_harmonic(before, after, psi):
+    """Of the phase's change against the fringe: no freedom of pixels and frames makes one."""
+    change = phase_change(before, after)
+    return np.mean((change - change.mean()) * np.exp(-3j * psi))
+
+
+@pytest.mark.parametrize("law", ["random", "walk"])
+def test_harmonics_that_few_phases_bring_into_the_maps_are_undone(law):
+    rng = np.random.default_rng(6)
+    phi = rng.uniform(0, 2 * np.pi, 20) if law == "random" else rng.normal(0, 0.4, 60).cumsum()
+    truth, (theta, g), psi = acquisition(phi)
+    maps = FringeMaps(theta, (2 * np.pi / 9.3, 0.03))
+    moved = third_harmonic(truth, theta, psi)
+    assert abs(moved) > 3e-4
+    undone = undone_on_samples(BENT, maps, FitOfFrames.of(maps, g))
+    assert abs(third_harmonic(truth, undone.theta, psi)) < 0.1 * abs(moved)
+
+
+def test_of_phases_spread_evenly_harmonics_take_no_part():
+    truth, (theta, g), psi = acquisition(2 * np.pi * np.arange(60) / 60)
+    maps = FringeMaps(theta, (2 * np.pi / 9.3, 0.03))
+    fit, even = FitOfFrames.of(maps, g), undone_on_samples(BENT, maps)
+    np.testing.assert_allclose(undone_on_samples(BENT, maps, fit).theta, even.theta, atol=2.0)
+    assert abs(third_harmonic(truth, even.theta, psi)) < 1e-5
+
+
+def test_of_a_change_of_the_light_the_maps_take_all():
+    """A change that is itself a fringe: by the pixels where it is their own alone."""
+    _, (theta, g), _ = acquisition(np.linspace(0, 5, 40))
+    fit = FitOfFrames.of(FringeMaps(theta, (0.6, 0.0)), g)
+    assert not fit.taken_up(np.zeros((12, *SHAPE))).any()
+    even = 2 * np.pi * np.arange(12)[:, None, None] / 12
+    one = np.zeros((12, *SHAPE))
+    one[:, 5:6, 7:8] = 3 + 0.5 * np.cos(even) - 0.2 * np.sin(even)
+    taken = fit.taken_up(one)
+    np.testing.assert_allclose(taken[:, 5, 7], [3, 0.5, -0.2], atol=0.03)
+    assert np.abs(np.delete(taken[:, 5], 7, axis=1)).max() < 0.03
