@@ -48,7 +48,8 @@ def a_curve(
 
     return {
         "statistic": statistic, "set": of, "title": f"title of {statistic}", "domain": domain,
-        "unit": "", "x_label": "bin", "kind": "power", "x": [float(n) for n in range(values)],
+        "quantity": "values", "unit": "", "x_label": "bin", "kind": "power",
+        "x": [float(n) for n in range(values)],
         "measured": list(1 + 0.01 * sigma * last), "nominal": band(0.0),
         "with_effects": band(sigma - after), "z": list(sigma * last),
         "z_after": list(after * last), "in_gap": sigma > NOTICED, "weight": sigma**2,

@@ -197,7 +197,8 @@ def write_diagnose(run: Path, verdict: str = "explained", effects: tuple[str, ..
     band = {"value": [0.0, 1.0], "low": [-0.1, 0.9], "high": [0.1, 1.1]}
     curve = {
         "statistic": "contrast_by_step", "set": "one", "title": "contrast by step",
-        "kind": "linear", "domain": "time", "unit": "", "x_label": "frames before", "x": [1.0, 2.0],
+        "kind": "linear", "domain": "time", "quantity": "slope", "unit": "",
+        "x_label": "frames before", "x": [1.0, 2.0],
         "measured": [2.0, 1.0], "nominal": band, "with_effects": band, "z": [9.0, 0.0],
         "z_after": [0.5, 0.0], "in_gap": True, "left": 0.0, "weight": 81.0, "significance": 9.0,
         "significance_after": -37.0,

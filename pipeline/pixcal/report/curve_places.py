@@ -52,47 +52,6 @@ _AXES = {
 }
 
 
-# What the values of statistics are, by the ends of their names; powers are shown as rms.
-_QUANTITIES = {
-    "hot_neighbours": "dark current / that of hot pixel",
-    "neighbours|neighbours_by_row|neighbours_by_level|line_repeats|alike": "correlation",
-    "harmonics": "amplitude / α",
-    "residual_by_level": "mean residual",
-    "residual_noise": "residual, rms",
-    "variance_by_level|variance_by_place|variance_by_time|pixel_noise|read_noise|photon_transfer"
-    "|bias_change": "noise / expected noise",
-    "lines|lines_of_bias|lines_of_dark": "noise / white noise",
-    "flat_ladder": "departure, relative",
-    "bits": "frequency − ½",
-    "code_classes": "scatter, relative",
-    "outliers": "outliers",
-    "pixel_peakedness": "kurtosis",
-    "bending": "coefficient",
-    "frames_before": "share of the signal",
-    "contrast_by_step": "slope of contrast",
-    "frames_by_phase": "amplitude, relative",
-    "allan_of_batches": "Allan deviation",
-    "turn_along_of_frames|turn_across_of_frames": "change of phase, rms",
-    "bias_of_frames|dark_of_frames": "level, rms",
-    "first_flats|intensity_of_frames|flat_of_frames": "intensity, relative",
-    "bias_trend": "change of level",
-}
-
-
-def quantity(curve: Mapping[str, Any]) -> str:
-    """What the values of a curve are, for its axis."""
-    name = str(curve["statistic"])
-    for ends, words in _QUANTITIES.items():
-        if name.endswith(tuple(ends.split("|"))):
-            return words
-    kind, _, _ = name.partition("_")
-    rms = ", rms" if curve["kind"] == "power" else ""
-    relative = {"contrast": "contrast, relative", "light": "level, relative"}
-    return {"offset": "offset", "apart": "difference", "estimate": "significance"}.get(
-        kind, relative.get(kind, str(curve["title"]))
-    ) + rms
-
-
 def axis_label(curve: Mapping[str, Any]) -> str:
     """What the places of a curve are."""
     label = str(curve["x_label"])

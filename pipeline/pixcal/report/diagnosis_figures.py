@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from pixcal.model.arrays import F64
 from pixcal.report.colours import BAND, BLUE, GREY, INK, RED
 from pixcal.report.contents import DiagnosisContents
-from pixcal.report.curve_places import axis_label, places, quantity
+from pixcal.report.curve_places import axis_label, places
 from pixcal.report.diagnosis_words import DETECTOR, effect_title, percent, unit
 from pixcal.report.drawing import TITLE, WIDE, Unit, axes_grid, finish, plain_ticks, unit_for
 
@@ -249,7 +249,8 @@ def _value_axis(axes: Axes, curve: Mapping[str, Any], values: F64, scale: Unit) 
             plain_ticks(axes.yaxis, good.min() / 2, good.max() * 2)
     else:
         axes.axhline(0, color=GREY, linewidth=0.8)
-    label = f"{quantity(curve)} ({scale.label})" if scale.label else quantity(curve)
+    quantity = str(curve["quantity"])
+    label = f"{quantity} ({scale.label})" if scale.label else quantity
     axes.set_ylabel(_plain(label, 40))
     axes.margins(x=0.06)
     finish(axes)

@@ -9,14 +9,15 @@ from pixcal.report.text import number
 # what `curves.json` has for the name of a set where a curve is of no single set
 DETECTOR = "detector"
 
-_UNITS = {"sigma": "σ", "2 √count": "2 √number", "": "", "h^-0.5": "1/√h"}
-
 
 def unit(name: str) -> str:
     """A unit in its usual notation."""
-    if name in _UNITS:
-        return _UNITS[name]
-    return name.replace("h^0.5", "√h").replace("e-", "e⁻").replace("um", "µm")
+    return (
+        name.replace("h^-0.5", "1/√h")
+        .replace("h^0.5", "√h")
+        .replace("e-", "e⁻")
+        .replace("um", "µm")
+    )
 
 
 def percent(value: float) -> str:

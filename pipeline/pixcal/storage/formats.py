@@ -31,7 +31,7 @@ STAGES = {
         Stage("fit", 1, "fit RUN"),
         Stage("allan", 1, "allan RUN"),
         Stage("crests", 1, "crests RUN"),
-        Stage("diagnose", 5, "diagnose RUN", of_fringes=False),
+        Stage("diagnose", 6, "diagnose RUN", of_fringes=False),
         Stage("corrected", 2, "fit RUN --with-diagnosis"),
         Stage("astrometry", 1, "astrometry RUN"),
         Stage("report", 2, "report RUN", of_fringes=False),

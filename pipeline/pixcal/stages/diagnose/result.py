@@ -225,6 +225,7 @@ def _curves(
                 "set": key[1],
                 "title": one.title,
                 "domain": one.domain,
+                "quantity": one.quantity,
                 "unit": one.unit,
                 "x_label": one.x_label,
                 "kind": one.kind,

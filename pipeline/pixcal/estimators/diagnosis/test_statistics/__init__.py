@@ -40,7 +40,8 @@ class Statistic:
     name: str
     title: str
     domain: str  # `space`, `time`, `intensity` or `noise`
-    unit: str
+    quantity: str  # what the values are: of a power, what their roots are
+    unit: str  # of the quantity; empty where it is a ratio
     x_label: str
     kind: str  # `linear`, or `power`: mean squares, which are compared by their logarithms
     of_set: bool  # looks at one fringe set; else at all of the evidence,
@@ -54,6 +55,7 @@ class Statistic:
 def statistic(
     domain: str,
     title: str,
+    quantity: str,
     *,
     unit: str = "",
     x: str = "",
@@ -68,8 +70,9 @@ def statistic(
         kind = "power" if power else "linear"
         of_set = sets and not together
         return Statistic(
-            measure.__name__, title, domain, unit, x, kind, of_set, together, floor, measure
-        )
+            measure.__name__, title, domain, quantity, unit, x, kind, of_set, together, floor,
+            measure,
+        )  # fmt: skip
 
     return mark
 

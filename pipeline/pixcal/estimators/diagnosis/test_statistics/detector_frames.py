@@ -64,7 +64,7 @@ def _neighbours_of(kind: str) -> Statistic:
 
     measured.__name__ = f"{kind}_neighbours"
     title = f"correlation of neighbours in {kind} frames"
-    return statistic("noise", title, x="neighbour", sets=False)(measured)
+    return statistic("noise", title, "correlation", x="neighbour", sets=False)(measured)
 
 
 def _lines_of(kind: str) -> Statistic:
@@ -78,7 +78,8 @@ def _lines_of(kind: str) -> Statistic:
 
     measured.__name__ = f"{kind}_line_repeats"
     title = f"correlated row and column noise in {kind} frames"
-    return statistic("noise", title, x="distance: rows, then columns", sets=False)(measured)
+    x = "distance: rows, then columns"
+    return statistic("noise", title, "correlation", x=x, sets=False)(measured)
 
 
 def _repeats(rest: F32, good: Mask, axis: int) -> F64:
@@ -89,7 +90,11 @@ def _repeats(rest: F32, good: Mask, axis: int) -> F64:
 
 
 @statistic(
-    "noise", "correlation of neighbours in flats, bright minus dim", x="neighbour", sets=False
+    "noise",
+    "correlation of neighbours in flats, bright minus dim",
+    "correlation",
+    x="neighbour",
+    sets=False,
 )
 def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
     """Of the brighter half of the levels less that of the others."""
@@ -107,7 +112,8 @@ def flat_neighbours_by_level(evidence: Evidence) -> Curve | None:
 
 
 @statistic(
-    "time", "change of the bias: spatial spectrum", x="band, then two rows, two columns",
+    "time", "change of the bias: spatial spectrum", "noise / expected noise",
+    x="band, then two rows, two columns",
     power=True, sets=False,
 )  # fmt: skip
 def bias_change(evidence: Evidence) -> Curve | None:

@@ -10,7 +10,7 @@ from pixcal.estimators.diagnosis.test_statistics.look import CODES, LEVELS, Look
 CLASSES = (4, 16, 64)
 
 
-@statistic("intensity", "harmonics of the fringes", x="harmonic (cosine, sine)")
+@statistic("intensity", "harmonics of the fringes", "amplitude / α", x="harmonic (cosine, sine)")
 def harmonics(look: Look) -> Curve:
     """Two to four times the phase in the residuals, over the fringe amplitude."""
     found, good = look.found, look.good
@@ -29,7 +29,9 @@ def harmonics(look: Look) -> Curve:
     return Curve(np.array(places), np.array(values))
 
 
-@statistic("intensity", "mean residual against signal", unit="e-", x="bin of level")
+@statistic(
+    "intensity", "mean residual against signal", "mean residual", unit="e-", x="bin of level"
+)
 def residual_by_level(look: Look) -> Curve:
     """Mean residual in bins of the level."""
     return Curve(np.arange(LEVELS, dtype=float), look.by_level[0])
@@ -38,6 +40,7 @@ def residual_by_level(look: Look) -> Curve:
 @statistic(
     "intensity",
     "photon transfer: variance of flats against signal",
+    "noise / expected noise",
     x="flat",
     power=True,
     sets=False,
@@ -58,7 +61,13 @@ def photon_transfer(evidence: Evidence) -> Curve | None:
     return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None
 
 
-@statistic("intensity", "linearity: flats off a line over exposure time", x="flat", sets=False)
+@statistic(
+    "intensity",
+    "linearity: flats off a line over exposure time",
+    "relative deviation",
+    x="flat",
+    sets=False,
+)
 def flat_ladder(evidence: Evidence) -> Curve | None:
     """Departure of each level of one lamp from the line over exposure time."""
     found = ladder(evidence)
@@ -68,7 +77,7 @@ def flat_ladder(evidence: Evidence) -> Curve | None:
     return Curve(found.times, found.levels / line - 1)
 
 
-@statistic("intensity", "frequency of each bit in the samples", x="bit")
+@statistic("intensity", "frequency of each bit in the samples", "frequency − ½", x="bit")
 def bits(look: Look) -> Curve | None:
     """How much more often than every second time each of the lowest bits is set."""
     count = look.remainders
@@ -79,7 +88,9 @@ def bits(look: Look) -> Curve | None:
     return Curve(bit.astype(float), is_set @ count / count.sum() - 0.5)
 
 
-@statistic("intensity", "uniformity of ADC codes", x="codes a class", power=True)
+@statistic(
+    "intensity", "uniformity of ADC codes", "relative scatter", x="codes a class", power=True
+)
 def code_classes(look: Look) -> Curve | None:
     """Scatter of how often codes come up, by their remainders on division by powers of two."""
     count = look.remainders

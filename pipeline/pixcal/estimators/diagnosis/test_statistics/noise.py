@@ -23,27 +23,45 @@ LEAST_DARKS = 5
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
 
 
-@statistic("noise", "residual variance against signal", x="bin of level", power=True)
+@statistic(
+    "noise",
+    "residual variance against signal",
+    "noise / expected noise",
+    x="bin of level",
+    power=True,
+)
 def variance_by_level(look: Look) -> Curve:
     """Mean square of residuals over their noise, in bins of the level."""
     return Curve(np.arange(LEVELS, dtype=float), look.by_level[1])
 
 
-@statistic("noise", "residual noise", unit="e-", x="", power=True)
+@statistic("noise", "residual noise", "rms residual", unit="e-", power=True)
 def residual_noise(look: Look) -> Curve:
     """Mean square of the residuals."""
     squares = np.einsum("tp,tp->p", look.electrons, look.electrons) / len(look.electrons)
     return Curve(np.zeros(1), np.array([float(squares[look.good.ravel()].mean())]))
 
 
-@statistic("noise", "residual variance by position", x="cell of 4 × 4", power=True)
+@statistic(
+    "noise",
+    "residual variance by position",
+    "noise / expected noise",
+    x="cell of 4 × 4",
+    power=True,
+)
 def variance_by_place(look: Look) -> Curve | None:
     """Mean square of residuals over their noise, in cells of the window, row by row."""
     cells = by_cell(look.moments[0], look.good)
     return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
 
 
-@statistic("noise", "residual variance against time", x="eighth of the frames", power=True)
+@statistic(
+    "noise",
+    "residual variance against time",
+    "noise / expected noise",
+    x="eighth of the frames",
+    power=True,
+)
 def variance_by_time(look: Look) -> Curve:
     """Mean square of residuals over their noise, in eighths of the frames."""
     squares = np.einsum("tyx,tyx->t", look.residual, look.residual) / look.good.sum()
@@ -51,14 +69,19 @@ def variance_by_time(look: Look) -> Curve:
     return Curve(np.arange(1.0, 9.0), np.array(value))
 
 
-@statistic("noise", "correlation of neighbours", x="neighbour")
+@statistic("noise", "correlation of neighbours", "correlation", x="neighbour")
 def neighbours(look: Look) -> Curve:
     """Correlation of the residuals of pixels some rows and columns apart."""
     sums, count = look.neighbours
     return Curve(np.arange(len(STEPS), dtype=float), _mean_product(sums, count))
 
 
-@statistic("noise", "correlation of neighbours by row, modulo 4", x="row of four, down then right")
+@statistic(
+    "noise",
+    "correlation of neighbours by row, modulo 4",
+    "correlation",
+    x="row of four, down then right",
+)
 def neighbours_by_row(look: Look) -> Curve:
     """Correlation with the pixel below and to the right, for each row of four."""
     sums, count = (of[[STEPS.index((1, 0)), STEPS.index((0, 1))]] for of in look.neighbours)
@@ -69,7 +92,7 @@ def neighbours_by_row(look: Look) -> Curve:
     return Curve(np.arange(8.0), (value - value.mean(axis=1, keepdims=True)).ravel())
 
 
-@statistic("noise", "correlation of neighbours, bright minus dark", x="neighbour")
+@statistic("noise", "correlation of neighbours, bright minus dark", "correlation", x="neighbour")
 def neighbours_by_level(look: Look) -> Curve:
     """Covariance over shot noise in bright samples less that in dark ones."""
     keep = slice(None, None, look.thinned)
@@ -102,7 +125,7 @@ def _line_power(rest: F32, good: Mask) -> F64:
     return np.array(out)
 
 
-@statistic("noise", "row and column noise", x="rows, columns", power=True)
+@statistic("noise", "row and column noise", "noise / white noise", x="rows, columns", power=True)
 def lines(look: Look) -> Curve:
     """Of the fringe frames' residuals."""
     return Curve(np.arange(2.0), _line_power(look.residual, look.good))
@@ -122,7 +145,8 @@ def _lines_of(kind: str) -> Statistic:
 
     measured.__name__ = f"lines_of_{kind}"
     title = f"row and column noise in {kind} frames"
-    return statistic("noise", title, x="rows, columns", power=True, sets=False)(measured)
+    quantity = "noise / white noise"
+    return statistic("noise", title, quantity, x="rows, columns", power=True, sets=False)(measured)
 
 
 def _calm(frames: F32, good: Mask) -> F32:
@@ -135,7 +159,7 @@ def _calm(frames: F32, good: Mask) -> F32:
     return np.asarray(rest * good, np.float32)
 
 
-@statistic("noise", "outliers", x="sigma, low then high", unit="2 √count", floor=1.0)
+@statistic("noise", "outliers", "outliers", x="sigma, low then high", unit="2 √number", floor=1.0)
 def outliers(look: Look) -> Curve:
     """Residuals of good pixels beyond 5, 7 and 10 sigma: twice the root of their number."""
     limits = np.array(OUTLIERS)
@@ -146,8 +170,9 @@ def outliers(look: Look) -> Curve:
 @statistic(
     "noise",
     "outliers in dark frames",
+    "outliers",
     x="sigma, low then high",
-    unit="2 √count",
+    unit="2 √number",
     sets=False,
     floor=1.0,
 )
@@ -165,13 +190,15 @@ def dark_outliers(evidence: Evidence) -> Curve | None:
     return Curve(np.concatenate([-limits, limits]), value) if stacks else None
 
 
-@statistic("noise", "noise distribution of the pixels", x="quantile", power=True)
+@statistic(
+    "noise", "noise distribution of the pixels", "noise / expected noise", x="quantile", power=True
+)
 def pixel_noise(look: Look) -> Curve:
     """Quantiles over the pixels of the mean square of their residuals."""
     return Curve(np.array(QUANTILES), np.quantile(look.moments[0][look.good], QUANTILES))
 
 
-@statistic("noise", "kurtosis of the pixels' residuals", x="quantile")
+@statistic("noise", "kurtosis of the pixels' residuals", "kurtosis", x="quantile")
 def pixel_peakedness(look: Look) -> Curve:
     """Quantiles over the pixels of the kurtosis of their residuals."""
     second, fourth = (moment[look.good] for moment in look.moments)
@@ -181,6 +208,7 @@ def pixel_peakedness(look: Look) -> Curve:
 @statistic(
     "noise",
     "read noise distribution of the pixels (bias frames)",
+    "noise / expected noise",
     x="quantile",
     power=True,
     sets=False,
@@ -224,7 +252,13 @@ def ranges_about(values: F64, quantiles: Sequence[float]) -> F64:
     return np.array(found)
 
 
-@statistic("noise", "neighbours of hot pixels", x="left, right, above, below", sets=False)
+@statistic(
+    "noise",
+    "neighbours of hot pixels",
+    "dark current / that of hot pixel",
+    x="left, right, above, below",
+    sets=False,
+)
 def hot_neighbours(evidence: Evidence) -> Curve | None:
     """Dark current beside hot pixels over theirs."""
     dark = evidence.dark_rate - np.median(evidence.dark_rate)

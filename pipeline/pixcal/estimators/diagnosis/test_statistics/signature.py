@@ -42,7 +42,9 @@ def statistic_named(name: str) -> Statistic:
     def nothing(_: object) -> None:
         return None
 
-    return Statistic(name, title, domain, "σ", "", "linear", False, False, FLOOR, nothing)
+    return Statistic(
+        name, title, domain, "significance", "σ", "", "linear", False, False, FLOOR, nothing
+    )
 
 
 FLOOR = 0.7  # of a significance, by chance, at least

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -22,7 +23,11 @@ SAME = 0.98  # cosine of the angle below which two sets measure along the same a
 
 
 @statistic(
-    "space", "correlation of maps between sets", x="contrast, light of each pair", together=True
+    "space",
+    "correlation of maps between sets",
+    "correlation",
+    x="contrast, light of each pair",
+    together=True,
 )
 def alike(looks: Sequence[Look]) -> Curve | None:
     """Correlation of the maps of each pair of sets."""
@@ -40,7 +45,13 @@ def _correlation(one: F64, other: F64) -> float:
 
 
 @statistic(
-    "space", "difference of offsets between sets", unit="px", x="pair", power=True, together=True
+    "space",
+    "difference of offsets between sets",
+    "rms difference",
+    unit="px",
+    x="pair",
+    power=True,
+    together=True,
 )
 def apart(looks: Sequence[Look]) -> Curve | None:
     """Mean square of the difference of the offsets along one axis, by two baselines."""
@@ -55,6 +66,7 @@ def apart(looks: Sequence[Look]) -> Curve | None:
 
 
 UNITS = {"offset": "px", "contrast": "", "light": ""}
+QUANTITIES = {"offset": "offset", "contrast": "relative contrast", "light": "relative level"}
 LINES = {0: "rows", 1: "columns"}
 VARIATION = {
     "offset": "curvature",
@@ -66,6 +78,12 @@ IRRELEVANT = {"offset": 1e-6}  # px; standard deviation of harmonics, a fiftieth
 FLOOR = 0.3  # least standard deviation of a term over the one that the map's own scatter gives
 
 
+def _power(name: str, title: str, x: str) -> Callable[[Callable[[Any], Curve | None]], Statistic]:
+    """Mark a function of mean squares of a map."""
+    quantity = f"{QUANTITIES[name]}, rms"
+    return statistic("space", title, quantity, unit=UNITS[name], x=x, power=True)
+
+
 def _repeats(name: str, axis: int) -> Statistic:
     def measured(look: Look) -> Curve:
         size = np.abs(repeats(look.flat_maps[name], axis))
@@ -73,7 +91,8 @@ def _repeats(name: str, axis: int) -> Statistic:
 
     measured.__name__ = f"{name}_{LINES[axis]}_repeat"
     title = f"{name}: periodic pattern of {LINES[axis]}"
-    return statistic("space", title, unit=UNITS[name], x=f"period, {LINES[axis]}")(measured)
+    x = f"period, {LINES[axis]}"
+    return statistic("space", title, QUANTITIES[name], unit=UNITS[name], x=x)(measured)
 
 
 def _profile(name: str, axis: int) -> Statistic:
@@ -84,7 +103,7 @@ def _profile(name: str, axis: int) -> Statistic:
 
     measured.__name__ = f"{name}_{LINES[axis]}"
     title = f"{name}: profile of {LINES[axis]}"
-    return statistic("space", title, unit=UNITS[name], x="cycles a pixel", power=True)(measured)
+    return _power(name, title, "cycles a pixel")(measured)
 
 
 def _fringes(name: str) -> Statistic:
@@ -98,6 +117,7 @@ def _fringes(name: str) -> Statistic:
     return statistic(
         "space",
         title,
+        QUANTITIES[name],
         unit=UNITS[name],
         x="harmonic (cosine, sine)",
         floor=IRRELEVANT.get(name, 0.0),
@@ -121,7 +141,9 @@ def _low_orders(name: str) -> Statistic:
     measured.__name__ = f"{name}_bending"
     title = f"{name}: {VARIATION[name]}"
     # Of light, whose surface is taken off, nothing is left but what outliers do to it.
-    return statistic("space", title, unit="sigma", x="Legendre term", floor=FLOOR)(measured)
+    return statistic("space", title, "coefficient", unit="σ", x="Legendre term", floor=FLOOR)(
+        measured
+    )
 
 
 def _scales(name: str) -> Statistic:
@@ -137,7 +159,7 @@ def _scales(name: str) -> Statistic:
 
     measured.__name__ = f"{name}_scales"
     title = f"{name}: power by spatial frequency"
-    return statistic("space", title, unit=UNITS[name], x="cycles a pixel", power=True)(measured)
+    return _power(name, title, "cycles a pixel")(measured)
 
 
 def _peak(name: str) -> Statistic:
@@ -153,7 +175,7 @@ def _peak(name: str) -> Statistic:
 
     measured.__name__ = f"{name}_peak"
     title = f"{name}: strongest isolated spatial frequency"
-    return statistic("space", title, unit=UNITS[name], x="cycles a pixel", power=True)(measured)
+    return _power(name, title, "cycles a pixel")(measured)
 
 
 def _by_place(name: str) -> Statistic:
@@ -164,7 +186,7 @@ def _by_place(name: str) -> Statistic:
 
     measured.__name__ = f"{name}_by_place"
     title = f"{name}: power by position"
-    return statistic("space", title, unit=UNITS[name], x="cell of 4 × 4", power=True)(measured)
+    return _power(name, title, "cell of 4 × 4")(measured)
 
 
 def _binned(frequency: F64, power: F64, highest: float = 0.5) -> Curve:

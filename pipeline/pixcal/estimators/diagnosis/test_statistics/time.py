@@ -13,10 +13,10 @@ from pixcal.kernels.sample_sums import frame_means
 from pixcal.model.arrays import F64
 
 SERIES = {
-    "intensity": ("intensity", ""),
-    "contrast": ("contrast", ""),
-    "turn_along": ("fringe vector, along", "rad"),
-    "turn_across": ("fringe vector, across", "rad"),
+    "intensity": ("intensity", "relative intensity, rms", ""),
+    "contrast": ("contrast", "relative contrast, rms", ""),
+    "turn_along": ("fringe vector, along", "change of phase, rms", "rad"),
+    "turn_across": ("fringe vector, across", "change of phase, rms", "rad"),
 }
 LAGS = (1, 2, 3, -1, -2)
 BATCHES = 8
@@ -26,15 +26,16 @@ DISTINCT = 0.05
 
 
 def _spectrum(name: str) -> Statistic:
-    title, unit = SERIES[name]
+    title, quantity, unit = SERIES[name]
 
     def measured(look: Look) -> Curve:
         return power_of(look.frames[name])
 
     measured.__name__ = f"{name}_of_frames"
     return statistic(
-        "time", f"{title}: spectrum over the frames", unit=unit, x="cycles a frame", power=True
-    )(measured)
+        "time", f"{title}: spectrum over the frames", quantity, unit=unit, x="cycles a frame",
+        power=True,
+    )(measured)  # fmt: skip
 
 
 def power_of(series: F64) -> Curve:
@@ -50,7 +51,9 @@ def power_of(series: F64) -> Curve:
     return Curve(np.array(middle), np.array(value))
 
 
-@statistic("time", "signal carried over from other frames", x="frames before")
+@statistic(
+    "time", "signal carried over from other frames", "share of the signal", x="frames before"
+)
 def frames_before(look: Look) -> Curve:
     """Share of another frame's fringes in the residuals.
 
@@ -70,7 +73,10 @@ def frames_before(look: Look) -> Curve:
     return Curve(np.array(LAGS, float), np.array(values))
 
 
-@statistic("time", "contrast against the phase step from earlier frames", x="frames before")
+@statistic(
+    "time", "contrast against the phase step from earlier frames", "slope of the contrast",
+    x="frames before",
+)  # fmt: skip
 def contrast_by_step(look: Look) -> Curve:
     """Slope of the contrast against the cosine of the step."""
     contrast, phi = look.frames["contrast"], look.found.phi
@@ -83,7 +89,7 @@ def contrast_by_step(look: Look) -> Curve:
     return Curve(np.array(LAGS[:3], float), np.array(values))
 
 
-@statistic("time", "contrast and intensity against phase", x="term")
+@statistic("time", "contrast and intensity against phase", "relative amplitude", x="term")
 def frames_by_phase(look: Look) -> Curve:
     """Amplitudes of contrast and intensity at one, two and three times the frame's phase."""
     phi = look.found.phi
@@ -100,6 +106,7 @@ def frames_by_phase(look: Look) -> Curve:
 @statistic(
     "time",
     "Allan deviation of the offsets over batches",
+    "Allan deviation",
     unit="px",
     x="batches averaged",
     power=True,
@@ -146,12 +153,15 @@ def _of_stacks(kind: str) -> Statistic:
 
     measured.__name__ = f"{kind}_of_frames"
     return statistic(
-        "time", f"mean of {kind} frames: spectrum", unit="" if kind == "flat" else "e-",
-        x="bin of frequency", power=True, sets=False,
+        "time", f"mean of {kind} frames: spectrum",
+        "relative intensity, rms" if kind == "flat" else "level, rms",
+        unit="" if kind == "flat" else "e-", x="bin of frequency", power=True, sets=False,
     )(measured)  # fmt: skip
 
 
-@statistic("time", "first flat of each level against the next ones", sets=False)
+@statistic(
+    "time", "first flat of each level against the next ones", "relative intensity", sets=False
+)
 def first_flats(evidence: Evidence) -> Curve | None:
     """Mean over the levels of the relative change; a lamp that flickers changes each by itself."""
     every = [light_of(evidence, s) for s in evidence.ladder if len(s.adu) > 1]
@@ -167,7 +177,7 @@ SPECTRA = tuple(_spectrum(name) for name in SERIES)
 STACKS = tuple(_of_stacks(kind) for kind in ("bias", "dark", "flat"))
 
 
-@statistic("time", "trend of the bias level", unit="e-", x="", sets=False)
+@statistic("time", "trend of the bias level", "change of level", unit="e-", sets=False)
 def bias_trend(evidence: Evidence) -> Curve | None:
     """Slope of the mean of bias and dark frames over their run, last less first."""
     values = []
