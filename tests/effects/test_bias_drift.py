@@ -283,7 +283,7 @@ def test_a_ramp_that_begins_anew_with_each_run_is_found(
     found = BiasDrift.estimate(acquired(None, {"bias_drift": RUN | {"run_ramp_e_h": -4000.0}}))
     assert found is not None
     assert isinstance(found.effect, BiasDrift)
-    assert found.law == "ramp of each run of fringes"
+    assert found.law == "ramp in each fringe set"
     assert found.significance > 8
     error = found.errors["run_ramp_e_h"]
     assert error < 800

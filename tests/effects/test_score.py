@@ -119,7 +119,7 @@ def test_strengths_that_are_no_numbers_need_an_estimate_of_their_own(
     )
     file.write_text(text.replace("self.rate *", "self.rate[0] *"))
     reason = estimate(acquired(), effect_of_file(file))
-    assert reason == "none of its strengths is one number: give it an estimate"
+    assert reason == "none of its strengths is a single number: define estimate"
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ from pixcal.estimators.diagnosis.test_statistics.noise import OUTLIERS
 from pixcal.report import curve_places, diagnosis_words
 from pixcal.report import diagnosis_maps as maps
 from pixcal.report import page as page_module
-from pixcal.report.contents import Contents, DiagnosisContents, EffectWords, StageRecord
+from pixcal.report.contents import Contents, DiagnosisContents, StageRecord
 from pixcal.report.curve_places import place, places
 from pixcal.report.diagnosis_figures import Bar, Closed, curves_figure, gap_figure
 from pixcal.report.diagnosis_words import percent, with_interval
@@ -61,7 +61,9 @@ def a_curve(
 def a_cause(effect: str = "lag", **changes: Any) -> dict[str, Any]:
     return {
         "effect": effect, "title": f"what {effect} is", "parameters": {"share": 0.002},
-        "uncertainty": {"share": 2e-5}, "gap_closed": 0.8, "gap_closed_interval": [0.75, 0.83],
+        "uncertainty": {"share": 2e-5}, "units": {"share": "e-/um"}, "strengths": ["share"],
+        "meanings": {"share": "left behind"}, "about": "Charge stays.",
+        "gap_closed": 0.8, "gap_closed_interval": [0.75, 0.83],
         "gain_over_rest": 0.61, "p_value": 2e-40, "sigmas": 80.0, "why": "frames follow others",
         "given_away_by": [{"statistic": "lines", "set": "one"}], "not_told_apart_from": [],
         "would_decide": [],
@@ -101,11 +103,8 @@ def a_diagnosis(
                          "frames": {"fringes/one": [100, 199, 100]}},
         },
     }  # fmt: skip
-    words = {
-        "lag": EffectWords("words", "Charge stays.", {"share": ("e-/um", "left behind")}),
-        "ipc": EffectWords("crosstalk"),
-    }
-    return DiagnosisContents(facts, list(curves), words, NOTICED)
+    titles = {"lag": "words", "ipc": "crosstalk"}
+    return DiagnosisContents(facts, list(curves), titles, NOTICED)
 
 
 def contents(found: DiagnosisContents | None, **changes: Any) -> Contents:

@@ -64,6 +64,7 @@ def test_exact_numbers_end_without_zeros(value: float, text: str) -> None:
         (3.2e-8, 1.1e-9, "(3.20 ± 0.11) × 10⁻⁸"),
         (3.0, None, "3.000"),
         (3.0, 0.0, "3.000"),
+        (131.816610, 4e-15, "131.817"),
         (None, 1.0, "–"),
     ],
 )

@@ -56,11 +56,18 @@ def test_what_acts_on_samples_moves_offsets_in_proportion(effect, tmp_path):
     assert double == pytest.approx(2 * one, rel=0.15)
 
 
+def size(*strengths):
+    return {"units": dict.fromkeys(strengths, ""), "strengths": list(strengths)}
+
+
 def test_the_size_of_an_effect_is_told_in_its_units():
     couplings = [{"share": 0.03}, {"share": -0.001}]
-    cause = {"effect": "ipc", "parameters": {"couplings": couplings}}
+    cause = {"parameters": {"couplings": couplings}, **size("couplings")}
     assert size_of(cause) == "2 couplings, largest 3 %"
     wave = {"beat_rad_px": [0.7, 0.1], "static": [0.003, -0.004], "forward": [0.0, 0.001]}
-    ghost = {"effect": "ghost_fringes", "parameters": {"share": 0.0, "waves": [wave]}}
+    ghost = {"parameters": {"share": 0.0, "waves": [wave]}, **size("share", "waves")}
     assert size_of(ghost) == "1 wave, largest 0.5 %"
-    assert size_of({"effect": "one of your own", "parameters": {}}) == "-"
+    glow = {"parameters": {"rate": 118.0, "reach_px": 15.0}, "uncertainty": {"rate": 2.0}}
+    own = glow | {"units": {"rate": "e-/s", "reach_px": "px"}, "strengths": ["rate"]}
+    assert size_of(own) == "rate 118.0 ± 2.0 e⁻/s"
+    assert size_of({"parameters": {"share": 0.0}, **size("share")}) == "-"

@@ -205,7 +205,9 @@ def write_diagnose(run: Path, verdict: str = "explained", effects: tuple[str, ..
     }  # fmt: skip
     cause = {
         "effect": "lag", "title": "left behind", "parameters": {"share": 0.002},
-        "uncertainty": {"share": 1e-5}, "gap_closed": 0.97, "gap_closed_interval": [0.95, 0.98],
+        "uncertainty": {"share": 1e-5}, "units": {"share": ""}, "strengths": ["share"],
+        "meanings": {"share": "share of the charge"}, "about": "Charge stays.",
+        "gap_closed": 0.97, "gap_closed_interval": [0.95, 0.98],
         "gain_over_rest": 0.97, "p_value": 1e-30, "sigmas": 30.0, "why": NASTY,
         "given_away_by": [{"statistic": "contrast_by_step", "set": "one"}],
         "not_told_apart_from": [], "would_decide": [],
@@ -355,9 +357,8 @@ def test_another_diagnosis_makes_another_page(tmp_path: Path) -> None:
     write_diagnose(run)
     found = words(section(page_of(run), "diagnosis"))
     assert "left behind (lag) accounts for" in found
-    # What an effect is and its parameters' meaning come from the effect itself.
-    assert "each electron stays behind" in found
-    assert "of a frame's charge, left behind for later frames" in found
+    assert "Charge stays." in found
+    assert "share of the charge" in found
     assert NASTY in found
     shutil.rmtree(run / "diagnose")
     write_diagnose(run, "partly explained", ("lag", "own_effect"))

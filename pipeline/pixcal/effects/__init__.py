@@ -49,7 +49,7 @@ def effect_of_file(path: Path) -> type[Effect]:
         spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise InputError(f"{path}: cannot be imported ({reason:.200}); mend it") from error
+        raise InputError(f"{path}: cannot be imported ({reason:.200}); fix it") from error
     try:
         return checked(_only_effect(module), path)
     except TypeError as error:
@@ -89,7 +89,7 @@ def parse_effects(
         if name not in known:
             raise InputError(
                 f"{where}: effects: unknown effect {name!r:.80}; known are {', '.join(known)}; "
-                "one of your own is known with --own and its file"
+                "give the file of your own effect with --own"
             )
         parameters = {} if values is None else values
         found.append(parse(known[name], parameters, where, key=f"effects.{name}"))

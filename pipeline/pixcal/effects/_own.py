@@ -52,7 +52,7 @@ def _check(effect: type[Effect]) -> None:
     fields = {field.name for field in dataclasses.fields(effect)}
     for what in ("strengths", "optional_parameters"):
         if unknown := set(getattr(effect, what)) - fields:
-            raise InputError(f"{what} names {', '.join(sorted(unknown))}, which is no field")
+            raise InputError(f"{what} names {', '.join(sorted(unknown))}, which is not a field")
     domains = getattr(effect, "domains", None)
     if not isinstance(domains, tuple) or not domains or not set(domains) <= set(DOMAINS):
         raise InputError(f"domains is missing or not a tuple out of {', '.join(DOMAINS)}")
@@ -73,7 +73,7 @@ def _told(step: Callable[..., Any], file: Path, gives_back: bool) -> Callable[..
         except InputError as error:
             raise InputError(f"{file}: {error}" if gives_back else str(error)) from error
         except (Exception, SystemExit) as error:
-            raise InputError(f"{file}: {step.__name__}: {_reason(error)}; mend the file") from error
+            raise InputError(f"{file}: {step.__name__}: {_reason(error)}; fix the file") from error
         return result
 
     return told
@@ -85,7 +85,7 @@ def _estimate(method: Any, file: Path) -> Any:
     That ends a diagnosis (no InputError): of frames that cannot tell, it gives None instead.
     """
     if not isinstance(method, classmethod):
-        raise InputError("estimate is no class method: put @classmethod above it")
+        raise InputError("estimate is not a class method: put @classmethod above it")
 
     def told(cls: type[Effect], evidence: Any) -> Estimate | None:
         try:
@@ -95,7 +95,7 @@ def _estimate(method: Any, file: Path) -> Any:
         except (InputError, NotImplementedError):
             raise
         except (Exception, SystemExit) as error:
-            raise PixcalError(f"{file}: estimate: {_reason(error)}; mend the file") from error
+            raise PixcalError(f"{file}: estimate: {_reason(error)}; fix the file") from error
         return found
 
     return classmethod(told)
@@ -112,25 +112,27 @@ def _check_estimate(found: Any, effect: type[Effect]) -> None:
     names = {field.name for field in dataclasses.fields(effect)}
     for name, sigma in dict(found.errors).items():
         if name.partition("[")[0] not in names or not (np.isfinite(sigma) and sigma >= 0):
-            raise ValueError(f"errors: {name!r} is no parameter, or {sigma!r} no error of one")
+            raise ValueError(
+                f"errors: {name!r} is not a parameter, or {sigma!r} is not a valid error"
+            )
     if not np.isfinite(found.significance):
         raise ValueError(f"significance is {found.significance!r}")
     if not isinstance(found.why, str):
-        raise TypeError("why is not a sentence")
+        raise TypeError("why is not a text")
 
 
 def _compare(result: Any, given: Any) -> None:
     """Raise TypeError unless a result is of the kind, the shape, and finite."""
     if dataclasses.is_dataclass(given):
         if type(result) is not type(given):
-            raise TypeError(f"gives {type(result).__name__}, not {type(given).__name__}")
+            raise TypeError(f"returns {type(result).__name__}, not {type(given).__name__}")
         for field in dataclasses.fields(given):
             _compare(getattr(result, field.name), getattr(given, field.name))
     elif isinstance(given, np.ndarray):
         if not isinstance(result, np.ndarray) or result.shape != given.shape:
-            raise TypeError(f"gives no array of shape {given.shape}")
+            raise TypeError(f"does not return an array of shape {given.shape}")
         if result.dtype.kind not in "fiub" or not np.isfinite(result).all():
-            raise TypeError("gives values that are not finite real numbers")
+            raise TypeError("returns values that are not finite real numbers")
 
 
 def _reason(error: BaseException) -> str:

@@ -47,7 +47,7 @@ _KEY, _RUN = 1000, 2000  # first keys of the walks' random numbers: no recording
 
 @dataclass(frozen=True)
 class BiasDrift(Effect):
-    """A constant added to all pixels of a frame; time runs from the acquisition's first frame.
+    """A bias common to all pixels of a frame, which varies; time starts at the first frame.
 
     Slow changes are those of the temperature: a ramp, a settling after power-on, a random walk that
     goes on through all frames. A ramp or walk may also begin anew with each run of fringes, when
@@ -59,7 +59,7 @@ class BiasDrift(Effect):
     """
 
     name = "bias_drift"
-    title = "offset of the whole frame, changing"
+    title = "bias that varies from frame to frame"
     acts_at = Stage.READOUT
     order = 3
     domains = ("time", "noise")
@@ -74,20 +74,30 @@ class BiasDrift(Effect):
         "Nordic Optical Telescope, CCD7 pre-commissioning report: 1 ADU in two hours",
     )
 
-    jitter_rms: float = quantity(2.0, unit="e-", low=0, high=1e5, doc="white from frame to frame")
-    ramp_e_h: float = quantity(1.5, unit="e-/h", low=-1e6, high=1e6, doc="steady change")
-    walk_e_h: float = quantity(1.0, unit="e-/h^0.5", low=0, high=1e6, doc="random walk")
+    jitter_rms: float = quantity(
+        2.0, unit="e-", low=0, high=1e5, doc="white noise from frame to frame, rms"
+    )
+    ramp_e_h: float = quantity(1.5, unit="e-/h", low=-1e6, high=1e6, doc="linear drift")
+    walk_e_h: float = quantity(
+        1.0, unit="e-/h^0.5", low=0, high=1e6, doc="random walk, rms after an hour"
+    )
     settle_e: float = quantity(
-        5.0, unit="e-", low=-1e5, high=1e5, doc="what decays from the first frame on"
+        5.0,
+        unit="e-",
+        low=-1e5,
+        high=1e5,
+        doc="amplitude of an exponential decay from the first frame on",
     )
     settle_s: float = quantity(600.0, unit="s", above=0, high=1e7, doc="time constant of the decay")
     run_walk_e_h: float = quantity(
-        0.0, unit="e-/h^0.5", low=0, high=1e6, doc="random walk that begins with each fringe run"
+        0.0, unit="e-/h^0.5", low=0, high=1e6, doc="random walk that restarts with each fringe set"
     )
     run_ramp_e_h: float = quantity(
-        0.0, unit="e-/h", low=-1e6, high=1e6, doc="steady change that begins with each fringe run"
+        0.0, unit="e-/h", low=-1e6, high=1e6, doc="linear drift that restarts with each fringe set"
     )
-    tracks: tuple[Track, ...] = quantity((), unit="e-", doc="offsets of fringe runs as measured")
+    tracks: tuple[Track, ...] = quantity(
+        (), unit="e-", doc="measured bias of each frame, by fringe set"
+    )
 
     def trend(self, time_s: F64) -> F64:
         """Offset (t,), e-, that is not random; of an acquisition's times."""
@@ -162,7 +172,7 @@ class BiasDrift(Effect):
 
     @classmethod
     def _in_runs(cls, evidence: Evidence) -> Estimate | None:
-        """A walk or ramp of each run of fringes by itself, from B and A of its frames."""
+        """A walk or ramp in each fringe set by itself, from B and A of its frames."""
         light = light_of(evidence)
         if light is None:
             return None
@@ -177,7 +187,7 @@ class BiasDrift(Effect):
         chance = joint_log_chance(there, none, there.size[-2:])
         # What both explain is given to the walk, which allows for more.
         rise = max(sloped.profile - there.profile, 0.0)
-        law, ramp, errors = "random walk", 0.0, {}
+        law, ramp, errors = "random walk, rms after an hour", 0.0, {}
         if np.sqrt(2 * rise) > STEADY:
             law, there = "ramp", sloped
             ramp = float(there.beta[0]) * HOUR_S
@@ -190,7 +200,7 @@ class BiasDrift(Effect):
             {"run_walk_e_h": error * per_hour} | errors,
             sigmas(log_chance_of_any([chance, log_chance(rise)])),
             "the mean level changes from frame to frame while the fringe amplitude does not",
-            law=f"{law} of each run of fringes",
+            law=f"{law} in each fringe set",
         )
 
     @classmethod

@@ -25,14 +25,14 @@ _TURNS = 4  # of the inverse: each gains the size of the effect, a few per cent
 
 @dataclass(frozen=True)
 class BrighterFatter(Effect):
-    """Boundaries of pixels that move with the charge around them (`pixcal.kernels.boundaries`).
+    """Pixel boundaries shift with the charge around them (`pixcal.kernels.boundaries`).
 
     It is not linear in the intensity, so maps alone tell neither what it does nor what would be
     without it; `restored` undoes it on frames.
     """
 
     name = "brighter_fatter"
-    title = "pixels that shrink as they fill"
+    title = "brighter-fatter effect"
     acts_at = Stage.CHARGE
     order = 1
     domains = ("intensity", "noise", "space")
@@ -52,14 +52,12 @@ class BrighterFatter(Effect):
         unit="px/e-",
         low=0,
         high=1e-5,
-        doc="shift of a pixel's own boundaries by an electron in it",
+        doc="shift of a pixel's boundaries by each electron in it",
     )
     falloff_px: float = quantity(
         0.5, unit="px", above=0, high=10, doc="distance over which the shift falls by a factor e"
     )
-    along_y: float = quantity(
-        1.0, low=0, high=10, doc="shift of boundaries between rows over that between columns"
-    )
+    along_y: float = quantity(1.0, low=0, high=10, doc="ratio of the shift along y to that along x")
 
     @property
     def halo(self) -> int:
@@ -139,7 +137,7 @@ class BrighterFatter(Effect):
         if alone is not None:
             falloff, size, along_y = alone.falloff_px, alone.shift, alone.along_y
             errors, together = _errors(alone)
-            why += "; no bent response is needed beside it"
+            why += "; no nonlinearity is needed in addition"
         details["a_00"] = size * float(area_changes(falloff)[REACH, REACH])
         effect = cls(float(np.clip(size, 0, 1e-5)), falloff, along_y)
         return Estimate(effect, errors, significance, why, details, together)

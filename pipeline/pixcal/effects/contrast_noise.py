@@ -17,7 +17,7 @@ from pixcal.simulation.track import Track, at
 
 @dataclass(frozen=True)
 class ContrastNoise(Effect):
-    """Fringe amplitude A of every frame, multiplied by a factor of its own; B stays.
+    """The fringe amplitude A varies from frame to frame; the intensity B does not.
 
     Within an exposure, a vibration of rms phase s smears the fringes by exp(-s²/2). That of a
     resonance comes and goes: its energy in a frame is exponentially distributed, so the factor is
@@ -29,7 +29,7 @@ class ContrastNoise(Effect):
     """
 
     name = "contrast_noise"
-    title = "visibility changing from frame to frame"
+    title = "visibility that varies from frame to frame"
     acts_at = Stage.LIGHT
     order = 5
     domains = ("time",)
@@ -46,13 +46,17 @@ class ContrastNoise(Effect):
     )
 
     vibration_rad: float = quantity(
-        0.2, unit="rad", low=0, high=2, doc="rms phase within an exposure, over all frames"
+        0.2, unit="rad", low=0, high=2, doc="rms phase of a vibration within an exposure"
     )
-    polarisation: float = quantity(0.005, low=0, high=0.5, doc="relative rms of a slow change")
+    polarisation: float = quantity(
+        0.005, low=0, high=0.5, doc="relative rms of a slow variation, such as of the polarisation"
+    )
     polarisation_s: float = quantity(
-        600.0, unit="s", low=0, high=1e6, doc="time over which it changes; 0: white"
+        600.0, unit="s", low=0, high=1e6, doc="correlation time of the slow variation; 0: white"
     )
-    tracks: tuple[Track, ...] = quantity((), doc="relative changes as measured, set by set")
+    tracks: tuple[Track, ...] = quantity(
+        (), doc="measured relative change of each frame, by fringe set"
+    )
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         energy = recording.rng(self.name).standard_exponential(recording.count)

@@ -35,7 +35,7 @@ _SKEW = 5.0
 
 @dataclass(frozen=True)
 class CosmicHits(Effect):
-    """Straight tracks through the sensitive layer, as many as the exposure is long.
+    """Straight tracks of particles through the sensitive layer, in proportion to the exposure time.
 
     A track leaves charge in proportion to its length, with the fluctuations of thin layers, and the
     charge spreads before it is collected. Nothing of it is constant in time, so maps of the fit
@@ -43,7 +43,7 @@ class CosmicHits(Effect):
     """
 
     name = "cosmic_hits"
-    title = "particles that hit the detector"
+    title = "hits by cosmic-ray particles"
     acts_at = Stage.CHARGE
     order = 2
     domains = ("noise",)
@@ -60,14 +60,16 @@ class CosmicHits(Effect):
     )
 
     rate_cm2_s: float = quantity(
-        0.03, unit="/(cm² s)", low=0, high=1e7, doc="particles through the detector's plane"
+        0.03, unit="/(cm² s)", low=0, high=1e7, doc="flux of particles through the detector"
     )
     electrons_per_um: float = quantity(
-        70.0, unit="e-/um", above=0, high=1e4, doc="most probable charge for a length of track"
+        70.0, unit="e-/um", above=0, high=1e4, doc="most probable charge per length of track"
     )
-    thickness_um: float = quantity(8.0, unit="um", above=0, high=1e3, doc="of the sensitive layer")
+    thickness_um: float = quantity(
+        8.0, unit="um", above=0, high=1e3, doc="thickness of the sensitive layer"
+    )
     diffusion_um: float = quantity(
-        1.5, unit="um", above=0, high=100, doc="rms by which charge spreads until it is collected"
+        1.5, unit="um", above=0, high=100, doc="rms width of the charge cloud at collection"
     )
 
     def charge(self, charge: F32, shot: Shot) -> F32:

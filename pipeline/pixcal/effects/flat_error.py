@@ -30,7 +30,7 @@ _MIN_FRAMES = 8
 
 @dataclass(frozen=True)
 class FlatError(Effect):
-    """Response in the fringe frames over that in the flats: from pixel to pixel, and smooth.
+    """The response in the fringe frames differs from that in the flats.
 
     Flats by a lamp of another colour, another angle or another polarisation. Mean and fringe of a
     pixel change by the same factor: iota and alpha show it, divided by the flat, in the same pixels
@@ -39,7 +39,7 @@ class FlatError(Effect):
     """
 
     name = "flat_error"
-    title = "flat that is not the response to the fringes' light"
+    title = "flat that differs from the response in the fringe frames"
     acts_at = Stage.PIXEL
     order = 2
     domains = ("space",)
@@ -47,16 +47,16 @@ class FlatError(Effect):
     absorbed_because = "it scales level and fringes of a pixel equally and leaves the phase"
     frames_needed = ("flat", "axis")
     sources = (
-        "EMVA Standard 1288, release 4.0 (2021): nonuniformity is told with the wavelength and the "
-        "f-number of the light that it was measured with",
+        "EMVA Standard 1288, release 4.0 (2021): nonuniformity is stated with the wavelength and "
+        "f-number of its light",
         "Stubbs & Tonry 2006, ApJ 646, 1436: flats of a broad band are not those of a narrow one; "
         "a per cent is common",
     )
 
-    pixel_rms: float = quantity(0.002, low=0, high=0.5, doc="relative, from pixel to pixel")
-    smooth_rms: float = quantity(0.005, low=0, high=0.5, doc="relative, of the smooth part")
+    pixel_rms: float = quantity(0.002, low=0, high=0.5, doc="relative rms from pixel to pixel")
+    smooth_rms: float = quantity(0.005, low=0, high=0.5, doc="relative rms of the smooth part")
     scale_px: float = quantity(
-        8.0, unit="px", above=1, high=1e5, doc="wavelength of the smooth part over 2 pi"
+        8.0, unit="px", above=1, high=1e5, doc="scale of the smooth part: its wavelength over 2 pi"
     )
 
     def ratio(self, detector: SimulatedDetector, rows: Rows) -> F32:

@@ -20,7 +20,7 @@ TRACKS = ("along_x", "along_y")
 
 @dataclass(frozen=True)
 class FringeDrift(Effect):
-    """Slow change of the fringe vector: a ramp, a settling, a random walk.
+    """Slow drift of the fringe vector: a ramp, a decay, a random walk.
 
     The time of each fringe set runs from its first frame: fibres are moved between sets, and the
     mean vector of a set is fitted anyway. A slow change of the phase has no parameter: every frame
@@ -30,7 +30,7 @@ class FringeDrift(Effect):
     """
 
     name = "fringe_drift"
-    title = "fringe vector changing slowly"
+    title = "fringe vector that drifts"
     acts_at = Stage.LIGHT
     order = 3
     domains = ("time", "space")
@@ -46,17 +46,25 @@ class FringeDrift(Effect):
     )
 
     ramp: tuple[float, float] = quantity(
-        (2.5e-5, 2.5e-5), unit="rad/px/h", low=-10, high=10, doc="of the vector along x and y"
+        (2.5e-5, 2.5e-5), unit="rad/px/h", low=-10, high=10, doc="linear drift along x and y"
     )
     settle: tuple[float, float] = quantity(
-        (2.5e-5, 2.5e-5), unit="rad/px", low=-1, high=1, doc="what decays from the first frame on"
+        (2.5e-5, 2.5e-5),
+        unit="rad/px",
+        low=-1,
+        high=1,
+        doc="amplitude of an exponential decay from the first frame on",
     )
     settle_s: float = quantity(600.0, unit="s", above=0, high=1e6, doc="time constant of the decay")
     walk: tuple[float, float] = quantity(
-        (1e-5, 1e-5), unit="rad/px/h^0.5", low=0, high=10, doc="random walk along x and y"
+        (1e-5, 1e-5),
+        unit="rad/px/h^0.5",
+        low=0,
+        high=10,
+        doc="random walk along x and y, rms after an hour",
     )
-    along_x: tuple[Track, ...] = quantity((), unit="rad/px", doc="slow change of kx as measured")
-    along_y: tuple[Track, ...] = quantity((), unit="rad/px", doc="slow change of ky as measured")
+    along_x: tuple[Track, ...] = quantity((), unit="rad/px", doc="measured slow change of kx")
+    along_y: tuple[Track, ...] = quantity((), unit="rad/px", doc="measured slow change of ky")
 
     def vector_change(self, time_s: F64) -> F64:
         """Change of the fringe vector (t, 2), rad/px, that is not random; from its first frame.

@@ -17,7 +17,7 @@ from pixcal.simulation.track import Track, at
 
 @dataclass(frozen=True)
 class FringeJitter(Effect):
-    """A random change of the fringe vector in every frame, white, along x and y; and a vibration.
+    """White noise of the fringe vector from frame to frame along x and y, and a vibration.
 
     Two fibre tips that move against each other by d change the vector by ``2 pi pitch d /
     (wavelength distance)``, whatever the baseline and the window: 1.1e-4 rad/px a micrometre on the
@@ -27,7 +27,7 @@ class FringeJitter(Effect):
     """
 
     name = "fringe_jitter"
-    title = "fringe vector changing from frame to frame"
+    title = "fringe vector that varies from frame to frame"
     acts_at = Stage.LIGHT
     order = 4
     domains = ("time", "space")
@@ -35,24 +35,24 @@ class FringeJitter(Effect):
     absorbed_because = "the fit has a free fringe vector in each frame where it moves"
     frames_needed = ()
     sources = (
-        "Rousset et al., sections 4.2 and 5.2: fringe residuals are laid to changing Kx, Ky, and "
-        "these to low-frequency vibrations",
+        "Rousset et al., sections 4.2 and 5.2: fringe residuals come from changing Kx, Ky, and "
+        "these from low-frequency vibrations",
         "C. G. Gordon 1992, Proc. SPIE 1619, 71: laboratory floors of 12 to 50 um/s rms (curves "
         "VC-C to VC-A), which at 30 Hz is 0.07 to 0.27 um",
     )
 
     rms: tuple[float, float] = quantity(
-        (2.5e-5, 2.5e-5), unit="rad/px", low=0, high=0.1, doc="of the vector along x and y"
+        (2.5e-5, 2.5e-5), unit="rad/px", low=0, high=0.1, doc="white noise along x and y, rms"
     )
     vibration: tuple[float, float] = quantity(
-        (0.0, 0.0), unit="rad/px", low=0, high=0.1, doc="amplitude along x and y"
+        (0.0, 0.0), unit="rad/px", low=0, high=0.1, doc="amplitude of the vibration along x and y"
     )
     vibration_hz: float = quantity(
-        20.3, unit="Hz", low=0, high=1e4, doc="its frequency; frames see it folded below half "
-        "their rate"
+        20.3, unit="Hz", low=0, high=1e4, doc="frequency of the vibration; aliased below half "
+        "the frame rate"
     )  # fmt: skip
-    along_x: tuple[Track, ...] = quantity((), unit="rad/px", doc="fast change of kx as measured")
-    along_y: tuple[Track, ...] = quantity((), unit="rad/px", doc="fast change of ky as measured")
+    along_x: tuple[Track, ...] = quantity((), unit="rad/px", doc="measured fast change of kx")
+    along_y: tuple[Track, ...] = quantity((), unit="rad/px", doc="measured fast change of ky")
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         drawn = recording.rng(self.name).standard_normal((recording.count, 2))

@@ -29,7 +29,7 @@ _CURVED = 3.0
 
 @dataclass(frozen=True)
 class GainError(Effect):
-    """True gain (electrons per ADU) over the one used, less one; samples in ADU stay as they are.
+    """The true gain (e-/ADU) differs from the one used; the samples in ADU do not change.
 
     Light and dark signal are as many ADU as before, which are other numbers of electrons: their
     shot noise in ADU changes by ``1 / sqrt(1 + relative)``, and nothing else does. Read noise is
@@ -38,7 +38,7 @@ class GainError(Effect):
     """
 
     name = "gain_error"
-    title = "gain that is not the one declared"
+    title = "gain that differs from the declared value"
     acts_at = Stage.CONVERTER
     order = 1
     domains = ("noise", "intensity")
@@ -51,15 +51,15 @@ class GainError(Effect):
     sources = (
         "Janesick 2007, Photon Transfer (SPIE PM170): gain by photon transfer, to about 1 % with "
         "some ten thousand pixels",
-        "Moore, Ninkov & Forrest 2006, Opt. Eng. 45, 076402: crosstalk that the noise of single "
-        "pixels does not tell makes the gain wrong by per cents",
+        "Moore, Ninkov & Forrest 2006, Opt. Eng. 45, 076402: crosstalk between pixels biases "
+        "the gain by several per cent",
         "EMVA Standard 1288, release 4.0 (2021): system gain from variance against mean, "
         "of the camera's operating point and temperature",
     )
 
     relative: float = quantity(
-        0.03, low=-0.9, high=9.0, doc="true gain over the one used, less one; shot noise in ADU "
-        "has a variance smaller by as much"
+        0.03, low=-0.9, high=9.0, doc="true gain over the gain used, minus 1; the variance of "
+        "shot noise in ADU is smaller by as much"
     )  # fmt: skip
 
     def detector(self, maps: DetectorMaps, bench: Bench, rows: Rows) -> DetectorMaps:
@@ -100,7 +100,7 @@ class GainError(Effect):
             {"relative": float(error)},
             float(abs(relative) / error),
             f"noise that grows with the level in the {' and the '.join(found)} is "
-            f"{share:.3f} times that of the gain used",
+            f"{share:.3f} times that expected with the gain used",
             details,
         )
 

@@ -26,17 +26,17 @@ class GhostWave:
     """One ghost as it is measured in the maps of a fringe set, with no assumption on its origin."""
 
     beat_rad_px: tuple[float, float] = quantity(
-        unit="rad/px", low=-np.pi, high=np.pi, doc="vector of the beat along x and y"
+        unit="rad/px", low=-np.pi, high=np.pi, doc="beat vector along x and y"
     )
     set: str = quantity("", doc="name of the fringe set; default: all")
     static: tuple[float, float] = quantity(
         (0.0, 0.0), low=-0.9, high=0.9, doc="cosine and sine of the pattern of the mean light"
     )
     forward: tuple[float, float] = quantity(
-        (0.0, 0.0), low=-0.9, high=0.9, doc="of the fringes at the fringe vector plus the beat"
+        (0.0, 0.0), low=-0.9, high=0.9, doc="the same of the fringes at fringe vector plus beat"
     )
     backward: tuple[float, float] = quantity(
-        (0.0, 0.0), low=-0.9, high=0.9, doc="of the fringes at the fringe vector less the beat"
+        (0.0, 0.0), low=-0.9, high=0.9, doc="the same of the fringes at fringe vector minus beat"
     )
 
     def scaled(self, factor: float) -> Self:
@@ -52,7 +52,7 @@ class GhostWave:
 
 @dataclass(frozen=True)
 class GhostFringes(Effect):
-    """A weak beam, the reflection of a fibre in a plate, adds its field to the two direct ones.
+    """A weak reflection of one fibre interferes with the two direct beams.
 
     Of amplitude ``share`` and at the angle of ``beat_rad_px`` to its parent's beam, it interferes
     with both fibres. With its parent it makes a pattern that stands still: the mean light gains
@@ -64,7 +64,7 @@ class GhostFringes(Effect):
     """
 
     name = "ghost_fringes"
-    title = "ghost fringes of a parasitic reflection"
+    title = "ghost fringes from a parasitic reflection"
     acts_at = Stage.LIGHT
     order = 7
     domains = ("space",)
@@ -77,16 +77,22 @@ class GhostFringes(Effect):
         "wedge of angle w makes fringes of lambda / (2 n w)",
     )
 
-    share: float = quantity(0.005, low=0, high=0.9, doc="amplitude of the ghost over its parent's")
+    share: float = quantity(
+        0.005, low=0, high=0.9, doc="amplitude of the ghost over that of its parent beam"
+    )
     beat_rad_px: tuple[float, float] = quantity(
-        (0.35, 0.2), unit="rad/px", low=-np.pi, high=np.pi, doc="vector of the beat along x and y"
+        (0.35, 0.2), unit="rad/px", low=-np.pi, high=np.pi, doc="beat vector along x and y"
     )  # fmt: skip
     phase_rad: float = quantity(
-        0.0, unit="rad", low=-1e3, high=1e3, doc="of the beat in the window's first pixel"
+        0.0,
+        unit="rad",
+        low=-1e3,
+        high=1e3,
+        doc="phase of the beat in the first pixel of the window",
     )
-    parent: str = quantity("modulated", choices=PARENTS, doc="fibre that is reflected")
-    in_flats: bool = quantity(False, doc="whether flats have the static pattern too")
-    waves: tuple[GhostWave, ...] = quantity((), doc="ghosts as measured, beside the one above")
+    parent: str = quantity("modulated", choices=PARENTS, doc="reflected fibre")
+    in_flats: bool = quantity(False, doc="whether the flats contain the static pattern too")
+    waves: tuple[GhostWave, ...] = quantity((), doc="measured ghosts, in addition to the one above")
 
     def _waves(self, of: str) -> list[GhostWave]:
         """All waves of a set."""
@@ -204,9 +210,9 @@ def _law(
 ) -> tuple[str, tuple[GhostWave, ...], float]:
     """Law of the amplitudes, the waves that follow it, and the share of chi-square it leaves."""
     laws = {
-        "static pattern alone: a ghost crossed in polarisation with the other fibre": (1, 0, 0),
-        "ghost of the modulated fibre: static pattern and fringes that follow": (1, 1, 0),
-        "ghost of the fixed fibre: static pattern and fringes that follow": (1, 0, 1),
+        "static fringes alone: a ghost crossed in polarisation with the other fibre": (1, 0, 0),
+        "ghost of the modulated fibre: static and moving fringes": (1, 1, 0),
+        "ghost of the fixed fibre: static and moving fringes": (1, 0, 1),
         BOTH: (2, 1, 1),
     }
     best = None

@@ -36,7 +36,7 @@ class FibrePair:
 
     set: str = quantity(doc="name of the fringe set")
     foot_mm: tuple[float, float] = quantity(
-        unit="mm", low=-1e4, high=1e4, doc="foot of the fibres' centre from the chip's"
+        unit="mm", low=-1e4, high=1e4, doc="position of the fibre pair relative to the chip centre"
     )
     height_mm: float = quantity(
         0.0, unit="mm", low=-100, high=100, doc="fibre B further from the detector than A"
@@ -45,7 +45,7 @@ class FibrePair:
 
 @dataclass(frozen=True)
 class HyperbolicFringes(Effect):
-    """Exact phase of two fibre tips less its paraxial limit, added to the straight fringes.
+    """Difference between the exact phase of two fibre tips and its paraxial limit.
 
     To leading order the curvature is ``-K·q q² / (2 D²)``, q from the foot of the fibres' centre:
     in proportion to the fringe vector, so in pixels it does not depend on the baseline, and sets
@@ -76,13 +76,19 @@ class HyperbolicFringes(Effect):
         unit="mm",
         low=-1e4,
         high=1e4,
-        doc="foot of the fibres' centre from the chip's; null: where the bench has them",
+        doc="position of the fibre pair relative to the chip centre; null: that of the bench",
     )
     distance_mm: float | None = quantity(
-        None, unit="mm", above=0, high=1e7, doc="fibres to detector; default: that of the bench"
+        None,
+        unit="mm",
+        above=0,
+        high=1e7,
+        doc="distance from the fibres to the detector; default: that of the bench",
     )
-    share: float = quantity(1.0, low=-100, high=100, doc="of the curvature: 1 exact, 0 straight")
-    pairs: tuple[FibrePair, ...] = quantity((), doc="position of each set's fibre pair")
+    share: float = quantity(
+        1.0, low=-100, high=100, doc="share of the exact curvature: 1 exact, 0 straight"
+    )
+    pairs: tuple[FibrePair, ...] = quantity((), doc="position of the fibre pair of each set")
 
     def light(
         self, light: LightMaps, recording: Recording, rows: Rows, maps: DetectorMaps
@@ -141,7 +147,7 @@ class HyperbolicFringes(Effect):
         by_common = _gain(evidence, sets, [common] * len(sets))
         by_own = _gain(evidence, sets, [values for values, _ in own])
         details = {f"foot_of_{f.name}_mm": v.tolist() for f, (v, _) in zip(sets, own, strict=True)}
-        why = "curvature of the phase maps of the shape that two fibres give"
+        why = "the phase maps are curved as two fibres make them"
         foot = _foot(common)
         if by_own - by_common < max(_APART, _MODEL * by_own):
             errors = np.sqrt(np.diag(fit.covariance))

@@ -21,7 +21,7 @@ MOST_AMBIENT = 0.3
 
 @dataclass(frozen=True)
 class IntensityNoise(Effect):
-    """Intensity B and amplitude A of every frame, multiplied by the same factor.
+    """Intensity B and amplitude A of each frame vary by the same factor.
 
     White from frame to frame, or correlated over ``correlation_s`` (a first-order autoregression,
     which is what a damped random walk is at equal steps), and a line of one frequency. Where each
@@ -30,7 +30,7 @@ class IntensityNoise(Effect):
     """
 
     name = "intensity_noise"
-    title = "intensity changing from frame to frame"
+    title = "intensity that varies from frame to frame"
     acts_at = Stage.LIGHT
     order = 2
     domains = ("time",)
@@ -44,23 +44,27 @@ class IntensityNoise(Effect):
         "change the power at below 1 Hz to some kHz, the mains at 50 and 100 Hz",
     )
 
-    rms: float = quantity(0.02, low=0, high=0.5, doc="relative, of the mean intensity")
-    correlation_s: float = quantity(0.0, unit="s", low=0, high=1e6, doc="0: white")
-    line: float = quantity(0.0, low=0, high=0.5, doc="relative amplitude of a line")
+    rms: float = quantity(0.02, low=0, high=0.5, doc="relative rms of the intensity")
+    correlation_s: float = quantity(
+        0.0, unit="s", low=0, high=1e6, doc="correlation time; 0: white"
+    )
+    line: float = quantity(0.0, low=0, high=0.5, doc="relative amplitude of a periodic variation")
     line_hz: float = quantity(
-        100.0, unit="Hz", low=0, high=1e4, doc="its frequency; an exposure of whole periods does "
-        "not see it"
+        100.0, unit="Hz", low=0, high=1e4, doc="frequency of the periodic variation; it cancels "
+        "in exposures of whole periods"
     )  # fmt: skip
     ambient: tuple[float, ...] = quantity(
-        (), low=0, high=0.9, doc="share of each set's mean light that does not follow the laser"
+        (), low=0, high=0.9, doc="share of the light of each set that does not follow the laser"
     )
     separate: float = quantity(
-        0.0, low=0, high=0.1, doc="relative rms of the contrast, white, where each fibre's power "
-        "changes by itself"
+        0.0, low=0, high=0.1, doc="relative rms of the contrast, white, if the powers of the two "
+        "fibres vary separately"
     )  # fmt: skip
-    tracks: tuple[Track, ...] = quantity((), doc="relative changes as measured, set by set")
+    tracks: tuple[Track, ...] = quantity(
+        (), doc="measured relative change of each frame, by fringe set"
+    )
     contrast_tracks: tuple[Track, ...] = quantity(
-        (), doc="relative changes of the contrast as measured, where the fibres change separately"
+        (), doc="measured relative change of the contrast, if the fibres vary separately"
     )
 
     def scaled(self, factor: float) -> Self:
@@ -121,5 +125,5 @@ class IntensityNoise(Effect):
             effect = replace(effect, ambient=ambient)
         elif found.significance > SIGNIFICANT:
             effect = replace(effect, separate=separate_powers(evidence))
-        law = "the power of each fibre changes by itself" if effect.separate else found.law
+        law = "the powers of the two fibres vary separately" if effect.separate else found.law
         return replace(found, effect=effect, law=law)

@@ -24,7 +24,7 @@ _TURNS = 60
 
 @dataclass(frozen=True)
 class IntraPixelResponse(Effect):
-    """A response of uniform height and a width along x and y, of its own in every pixel.
+    """Each pixel responds uniformly over a width along x and y, which differs from pixel to pixel.
 
     The fringe's amplitude is multiplied by ``sin(u) / u`` with ``u = K width / 2`` along each axis:
     the visibility falls, the more the closer the fringes; the mean light stays, and so do the
@@ -33,7 +33,7 @@ class IntraPixelResponse(Effect):
     """
 
     name = "intra_pixel_response"
-    title = "pixels of a width"
+    title = "intra-pixel response"
     acts_at = Stage.PIXEL
     order = 1
     domains = ("space",)
@@ -47,10 +47,10 @@ class IntraPixelResponse(Effect):
     )
 
     width_px: tuple[float, float] = quantity(
-        (0.95, 0.95), unit="px", low=0, high=3, doc="of the response along x and y"
+        (0.95, 0.95), unit="px", low=0, high=3, doc="mean width of the response along x and y"
     )
     width_rms_px: float = quantity(
-        0.005, unit="px", low=0, high=0.5, doc="of the width from pixel to pixel, each axis"
+        0.005, unit="px", low=0, high=0.5, doc="rms of the width from pixel to pixel, each axis"
     )
 
     def light(

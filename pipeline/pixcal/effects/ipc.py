@@ -76,8 +76,8 @@ class Ipc(Effect):
 
     couplings: tuple[Coupling, ...] = quantity(
         FOUR_ROWS,
-        doc="list of dy, dx (px, from source to receiver), share, every_rows, row, every_columns, "
-        "column (which pixels are sources), per_ke (change of the share with the signal, 1/ke-)",
+        doc="list of couplings: dy, dx (px, from source to receiver), share, per_ke (change of "
+        "the share with the signal, 1/ke-); every_rows, row, every_columns, column (sources)",
     )
 
     def __post_init__(self) -> None:
@@ -228,7 +228,7 @@ class Ipc(Effect):
 def _couplings_of(kernel: F64) -> list[Coupling]:
     rows, columns = kernel.shape
     if rows % 2 == 0 or columns % 2 == 0:
-        raise InputError(f"a kernel has a pixel in its middle, not {rows} x {columns} pixels")
+        raise InputError(f"a kernel needs odd numbers of rows and columns, not {rows} x {columns}")
     return [
         Coupling(int(y) - rows // 2, int(x) - columns // 2, float(kernel[y, x]))
         for y, x in np.argwhere(kernel)
@@ -257,7 +257,9 @@ def _on_charge(
 
 def _why(kernel: Kernel) -> str:
     if not kernel.couplings:
-        return "neither neighbours of hot pixels, nor noise that neighbours share, stand out"
+        return (
+            "no significant signal beside hot pixels, and no significant noise common to neighbours"
+        )
     rows = max(c.every_rows for c in kernel.couplings)
     columns = max(c.every_columns for c in kernel.couplings)
     ways = " and ".join(kernel.by)

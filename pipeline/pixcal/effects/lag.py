@@ -46,7 +46,7 @@ _STEPS = 12  # of all parameters of such traps
 
 @dataclass(frozen=True)
 class Lag(Effect):
-    """Incomplete transfer: each electron stays behind with a chance of ``share``.
+    """Part of the charge of a frame appears in later frames.
 
     It comes out with the next frame, or over several. No charge is lost, and before the first frame
     of a recording the pixels were dark and empty. A barrier may hold back another share of each
@@ -78,34 +78,36 @@ class Lag(Effect):
     )
 
     share: float = quantity(
-        0.002, low=0, high=0.5, doc="of a frame's charge, left behind for later frames"
+        0.002, low=0, high=0.5, doc="share of the charge of a frame that appears in later frames"
     )
     decay_frames: float = quantity(
         0.0,
         unit="frames",
         low=0,
         high=_MAX_DECAY,
-        doc="in which what comes out falls by a factor e; 0: all with the next frame",
+        doc="frames in which the release falls by a factor e; 0: all in the next frame",
     )
     spread: float = quantity(
-        0.1, low=0, high=1, doc="of the share from pixel to pixel, relative (rms)"
+        0.1, low=0, high=1, doc="relative rms of the share from pixel to pixel"
     )
 
     bands: tuple[float, ...] = quantity(
-        (), low=0, high=100, doc="share of the charge in bands of its level that begin at 0, 1/8, "
-        "1/4 and 1/2 of level_e, over `share`; empty: the same in all"
+        (), low=0, high=100, doc="factors of the share at signals from 0, 1/8, 1/4 and 1/2 of "
+        "level_e on; empty: the same share at all signals"
     )  # fmt: skip
-    level_e: float = quantity(50_000.0, unit="e-", above=0, high=1e7, doc="full scale of the bands")
+    level_e: float = quantity(
+        50_000.0, unit="e-", above=0, high=1e7, doc="signal that bands refers to"
+    )
     later: tuple[float, ...] = quantity(
-        (), low=0, high=1, doc="parts of what stayed behind that come out 1, 2, ... frames later; "
-        "empty: as decay_frames says"
+        (), low=0, high=1, doc="parts of the lagging charge that appear 1, 2, ... frames later; "
+        "empty: an exponential decay over decay_frames"
     )  # fmt: skip
     quiet: float = quantity(
-        0.0, low=0, high=1, doc="part of what comes out that has no shot noise of its own"
+        0.0, low=0, high=1, doc="part of the released charge without shot noise of its own"
     )
     capacity_e: float = quantity(
-        0.0, unit="e-", low=0, high=1e7, doc="that a pixel holds back at most, of all frames; it "
-        "comes out as decay_frames says; 0: no limit"
+        0.0, unit="e-", low=0, high=1e7, doc="largest charge that a pixel holds back, released "
+        "over decay_frames; 0: no limit"
     )  # fmt: skip
 
     @property
@@ -295,8 +297,8 @@ class Lag(Effect):
             }
             | of_level,
             sigmas_of_best(sigmas, uneven / uneven_error),
-            "the contrast falls with the step of the phase since the frame before"
-            + (", and pixels keep it unevenly" if uneven > _CLEAR * uneven_error else ""),
+            "the contrast falls with the phase step from the previous frame"
+            + (", unevenly from pixel to pixel" if uneven > _CLEAR * uneven_error else ""),
             {"by_contrast_sigmas": sigmas, "by_pixels_sigmas": uneven / uneven_error},
         )
 
@@ -575,8 +577,8 @@ def _of_flats(evidence: Evidence) -> Estimate | None:
         Lag(float(np.clip(share, 0, 0.5)), 0.0, 0.0),
         {"share": share_error},
         share / share_error,
-        "the first flat of a level is fainter; after another flat, rather than darkness, the share "
-        "is a lower limit",
+        "the first flat of a level is fainter; if another flat came before it, the share is a "
+        "lower limit",
         {"share": share},
     )
 

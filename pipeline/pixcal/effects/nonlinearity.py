@@ -39,7 +39,7 @@ class Bend:
     """A point of a measured response."""
 
     level_e: float = quantity(unit="e-", low=0, high=1e8, doc="charge")
-    change_e: float = quantity(unit="e-", low=-1e7, high=1e7, doc="signal beyond the polynomial")
+    change_e: float = quantity(unit="e-", low=-1e7, high=1e7, doc="deviation from the polynomial")
 
     def scaled(self, factor: float) -> Self:
         """The same point of a response ``factor`` times as far from the polynomial."""
@@ -57,7 +57,7 @@ class Nonlinearity(Effect):
     """
 
     name = "nonlinearity"
-    title = "response that is not a straight line"
+    title = "nonlinear response"
     acts_at = Stage.SIGNAL
     order = 2
     domains = ("intensity",)
@@ -71,15 +71,27 @@ class Nonlinearity(Effect):
     )
 
     quadratic: float = quantity(
-        -0.015, low=-0.3, high=0.3, doc="relative deviation at level_e from the first power of u"
+        -0.015,
+        low=-0.3,
+        high=0.3,
+        doc="relative deviation at level_e that is proportional to the signal",
     )
     cubic: float = quantity(
-        -0.005, low=-0.3, high=0.3, doc="relative deviation at level_e from the second power of u"
+        -0.005,
+        low=-0.3,
+        high=0.3,
+        doc="relative deviation at level_e that is proportional to the square of the signal",
     )
     level_e: float = quantity(
-        50_000.0, unit="e-", above=0, high=1e7, doc="where the deviations are given: the full well"
+        50_000.0,
+        unit="e-",
+        above=0,
+        high=1e7,
+        doc="signal at which the deviations are given: the full well",
     )
-    bends: tuple[Bend, ...] = quantity((), doc="points of the response as measured, rising")
+    bends: tuple[Bend, ...] = quantity(
+        (), doc="measured points of the response curve, in rising order"
+    )
 
     @property
     def turns_at(self) -> float:

@@ -31,7 +31,7 @@ _KEY = 997
 
 @dataclass(frozen=True)
 class Quantisation(Effect):
-    """A converter of step ``1 + coarse_adu``, whose steps between codes are displaced.
+    """A converter with coarse steps, or with codes of uneven width.
 
     One converter, or one ramp, for all columns. Displacements that are independent leave the
     response straight: codes differ in width, by chance and by a ripple, and one of no width is
@@ -41,7 +41,7 @@ class Quantisation(Effect):
     """
 
     name = "quantisation"
-    title = "steps and uneven codes of the converter"
+    title = "coarse or uneven steps of the converter"
     acts_at = Stage.CONVERTER
     order = 2
     domains = ("noise", "intensity")
@@ -57,23 +57,31 @@ class Quantisation(Effect):
     )
 
     coarse_adu: float = quantity(
-        3.0, unit="ADU", low=0, high=4095, doc="step of the converter beyond 1 ADU"
+        3.0, unit="ADU", low=0, high=4095, doc="step of the converter minus 1 ADU"
     )
     dnl_rms: float = quantity(
         0.3, unit="codes", low=0, high=1, doc="scatter of the code widths (differential "
         "nonlinearity)"
     )  # fmt: skip
     ripple: float = quantity(
-        0.1, unit="codes", low=0, high=0.9, doc="amplitude of widths that rise and fall"
+        0.1,
+        unit="codes",
+        low=0,
+        high=0.9,
+        doc="amplitude of a periodic variation of the code widths",
     )
     ripple_codes: float = quantity(
-        2.0, unit="codes", low=2, high=16, doc="period of the ripple; 2: even and odd codes"
+        2.0, unit="codes", low=2, high=16, doc="period of that variation; 2: even and odd codes"
     )
     ripple_phase_rad: float = quantity(
-        0.0, unit="rad", low=-7, high=7, doc="phase of the ripple at code zero"
+        0.0, unit="rad", low=-7, high=7, doc="phase of that variation at code zero"
     )
     bits: tuple[float, ...] = quantity(
-        (), unit="codes", low=-1000, high=1000, doc="error of each bit's weight, the least first"
+        (),
+        unit="codes",
+        low=-1000,
+        high=1000,
+        doc="error of the weight of each bit, lowest bit first",
     )
 
     @property

@@ -22,7 +22,7 @@ _MODEL = 0.01
 
 @dataclass(frozen=True)
 class RollingShutter(Effect):
-    """Row y is exposed ``line_time_us * y`` later than the window's first row.
+    """Each row is exposed later than the one before.
 
     The modulator goes to the next phase ``delay_us`` after the first row's exposure ends: rows that
     are still exposed hold a share of the next frame's light, which grows with the row. A delay of
@@ -34,7 +34,7 @@ class RollingShutter(Effect):
     """
 
     name = "rolling_shutter"
-    title = "rows exposed while the phase steps"
+    title = "rows exposed one after the other"
     acts_at = Stage.LIGHT
     order = 9
     domains = ("time", "space")
@@ -49,20 +49,28 @@ class RollingShutter(Effect):
     )
 
     line_time_us: float = quantity(
-        1.2, unit="us", low=0, high=1e5, doc="from the start of a row to that of the next"
+        1.2, unit="us", low=0, high=1e5, doc="delay from one row to the next"
     )
     delay_us: float = quantity(
-        0.0, unit="us", low=0, high=1e10, doc="from the end of the first row's exposure to the step"
+        0.0,
+        unit="us",
+        low=0,
+        high=1e10,
+        doc="time from the end of the exposure of the first row to the phase step",
     )
 
     settling: tuple[float, ...] = quantity(
-        (), low=-1, high=1, doc="share of the step by which the phase is off, at rows at equal "
-        "distances from the window's first to its last (none, or four and more)"
+        (), low=-1, high=1, doc="phase error as a share of the phase step, at equally spaced "
+        "rows from the first to the last of the window (none, or four and more)"
     )  # fmt: skip
-    of_step: str = quantity("last", choices=("last", "next"), doc="step that ``settling`` is of")
+    of_step: str = quantity(
+        "last",
+        choices=("last", "next"),
+        doc="phase step that settling refers to: the last or the next one",
+    )
     origin_rad: float | None = quantity(
-        None, unit="rad", low=-10, high=10, doc="where the modulator's range of one turn begins; "
-        "default: it goes the shorter way around"
+        None, unit="rad", low=-10, high=10, doc="start of the modulator's range of 2 pi; default: "
+        "the phase takes the shorter way"
     )  # fmt: skip
 
     def check(self, bench: Bench) -> None:
@@ -139,7 +147,7 @@ class RollingShutter(Effect):
             return None
         settled = find_settling(many)
         which = "from the last" if settled.way < 0 else "to the next"
-        law = "phase of the rows off by a share of the step, of any profile"
+        law = "phase error of the rows in proportion to the phase step, with any profile"
         settling = Estimate(
             cls(
                 0.0, settling=tuple(float(v) for v in np.clip(settled.share, -1, 1)),
@@ -147,7 +155,7 @@ class RollingShutter(Effect):
             ),
             {f"settling[{n}]": float(e) for n, e in enumerate(settled.error)},
             settled.significance,
-            f"the phase of the rows follows the step {which} frame",
+            f"the phase of the rows depends on the step {which} frame",
             law=law,
         )  # fmt: skip
         mixed = cls._mixed(sets) if sets else settling
@@ -171,11 +179,11 @@ class RollingShutter(Effect):
                 "delay_us": max(line, error) * ramp.knee_error + error * ramp.knee,
             },
             float(ramp.slope / ramp.error),
-            f"the {'next' if ramp.way > 0 else 'last'} frame's light in the residuals, by row",
+            f"the {'next' if ramp.way > 0 else 'last'} frame's light in the residuals, row by row",
             {
                 "share_per_row_of_next": sums[0].slope,
                 "share_per_row_of_last": sums[1].slope,
                 "errors": [float(s.error) for s in sums],
             },
-            law="rows exposed while the phase steps",
+            law="rows exposed one after the other",
         )

@@ -26,7 +26,7 @@ FIRST_MODE = 3
 
 @dataclass(frozen=True)
 class RowNoise(Effect):
-    """Rows are sampled one after the other, each at once: what the reference does then, all get.
+    """Noise of the reference or of the readout that all pixels of a row or a column share.
 
     White and flicker noise from row to row; rows that two amplifiers read in turn, whose levels
     part and meet from frame to frame; and columns, white from column to column and frame to frame.
@@ -37,7 +37,7 @@ class RowNoise(Effect):
     """
 
     name = "row_noise"
-    title = "noise common to a row or a column"
+    title = "noise common to the pixels of a row or a column"
     acts_at = Stage.READOUT
     order = 2
     domains = ("noise", "time")
@@ -51,15 +51,29 @@ class RowNoise(Effect):
         "taken here as a tenth of a read noise of 16 e-",
     )
 
-    row_rms: float = quantity(1.6, unit="e-", low=0, high=1e5, doc="white from row to row")
+    row_rms: float = quantity(
+        1.6, unit="e-", low=0, high=1e5, doc="white noise from row to row, rms"
+    )
     flicker_rms: float = quantity(
-        0.5, unit="e-", low=0, high=1e5, doc="1/f from row to row: in every octave of frequency"
+        0.5,
+        unit="e-",
+        low=0,
+        high=1e5,
+        doc="1/f noise from row to row, rms per octave of frequency",
     )
     interlace_rms: float = quantity(
-        0.5, unit="e-", low=0, high=1e5, doc="of even rows from the mean; odd rows the other way"
+        0.5,
+        unit="e-",
+        low=0,
+        high=1e5,
+        doc="rms difference of even rows from the mean; odd rows have the opposite sign",
     )
     column_rms: float = quantity(
-        0.8, unit="e-", low=0, high=1e5, doc="white from column to column, anew in every frame"
+        0.8,
+        unit="e-",
+        low=0,
+        high=1e5,
+        doc="white noise from column to column, new in each frame, rms",
     )
 
     def readout(self, adu: F32, shot: Shot) -> F32:

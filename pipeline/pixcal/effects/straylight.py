@@ -28,7 +28,7 @@ class StrayPattern:
     rows: tuple[int, int] = quantity(doc="first row of the part, and the one after the last")
     columns: tuple[int, int] = quantity(doc="first column, and the one after the last")
     coefficients: tuple[float, ...] = quantity(
-        low=-20, high=20, doc="of Legendre products in log(1 + share), by total degree"
+        low=-20, high=20, doc="coefficients of Legendre products in log(1 + share), by total degree"
     )
 
     def scaled(self, factor: float) -> Self:
@@ -50,7 +50,7 @@ class StrayPattern:
 
 @dataclass(frozen=True)
 class Straylight(Effect):
-    """Incoherent light in the fringe frames, in units of the fibres' own at the same place.
+    """Incoherent light in the fringe frames, relative to the light of the fibres.
 
     It follows the laser's power. The mean light becomes ``1 + share + slope·r`` times what it was,
     and more where a bump or a measured pattern says so; the fringe stays: the visibility falls, the
@@ -73,19 +73,26 @@ class Straylight(Effect):
     )
 
     share: float = quantity(
-        0.02, low=0, high=10, doc="of the fibres' light, in the window's first pixel"
+        0.02,
+        low=0,
+        high=10,
+        doc="ratio to the light of the fibres in the first pixel of the window",
     )
     slope_per_px: tuple[float, float] = quantity(
-        (4e-5, -2e-5), unit="1/px", low=-1, high=1, doc="how the share grows along x and y"
+        (4e-5, -2e-5), unit="1/px", low=-1, high=1, doc="gradient of the share along x and y"
     )
-    bump: float = quantity(0.0, low=0, high=10, doc="share on top of a round bump")
+    bump: float = quantity(0.0, low=0, high=10, doc="peak share of a round spot")
     bump_centre_px: tuple[float, float] = quantity(
-        (0.0, 0.0), unit="px", low=-1e5, high=1e5, doc="column and row of the window"
+        (0.0, 0.0),
+        unit="px",
+        low=-1e5,
+        high=1e5,
+        doc="centre of the spot, column and row of the window",
     )
     bump_radius_px: float = quantity(
-        30.0, unit="px", above=0, high=1e5, doc="standard deviation of the bump"
+        30.0, unit="px", above=0, high=1e5, doc="standard deviation of the spot"
     )
-    patterns: tuple[StrayPattern, ...] = quantity((), doc="as measured, set by set")
+    patterns: tuple[StrayPattern, ...] = quantity((), doc="measured pattern of each set")
 
     def pattern(self, rows: Rows, columns: Rows, of: str = "") -> F64:
         """Share (y, x) in a set on rows and columns of the window (first, one after the last)."""

@@ -29,7 +29,7 @@ _FRAMES_AT_ONCE = 256
 
 @dataclass(frozen=True)
 class TelegraphNoise(Effect):
-    """A trap near the source follower of some pixels that is full or empty.
+    """Some pixels jump between two levels, as a trap fills and empties.
 
     Both states are equally likely; the level lies half an amplitude above or below its mean.
     Amplitudes have a gamma distribution, by default an exponential one. Nothing of it is constant
@@ -55,16 +55,16 @@ class TelegraphNoise(Effect):
         "pixels; the distribution of amplitudes has an exponential tail",
     )
 
-    share: float = quantity(0.02, low=0, high=1, doc="of the pixels that have it")
+    share: float = quantity(0.02, low=0, high=1, doc="share of the pixels with telegraph noise")
     amplitude_e: float = quantity(
-        30.0, unit="e-", low=0, high=1e6, doc="mean distance of the two levels"
+        30.0, unit="e-", low=0, high=1e6, doc="mean difference of the two levels"
     )
     switching_s: float = quantity(
-        0.5, unit="s", low=0, high=1e6, doc="mean stay in a level; 0: another draw in every frame"
+        0.5, unit="s", low=0, high=1e6, doc="mean time in a level; 0: independent in each frame"
     )
     amplitude_shape: float = quantity(
-        1.0, low=0.01, high=100, doc="of the gamma distribution of amplitudes: 1 is exponential, "
-        "large: all are alike"
+        1.0, low=0.01, high=100, doc="shape of the gamma distribution of amplitudes; 1: "
+        "exponential, large: equal amplitudes"
     )  # fmt: skip
 
     def readout(self, adu: F32, shot: Shot) -> F32:

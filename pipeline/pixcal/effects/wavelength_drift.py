@@ -23,7 +23,7 @@ CALM = 2.0  # errors of a walk up to which the levels hold still
 
 @dataclass(frozen=True)
 class WavelengthDrift(Effect):
-    """Relative change of the wavelength: a ramp, a random walk, and hops to another mode and back.
+    """The wavelength changes by a ramp, a random walk, or hops to another laser mode and back.
 
     A change by epsilon takes ``epsilon K / (1 + epsilon)`` off the fringe vector of every set, K
     being its own: along the fringe axis, the more the closer the fringes. That of the refractive
@@ -33,7 +33,7 @@ class WavelengthDrift(Effect):
     """
 
     name = "wavelength_drift"
-    title = "wavelength drifting, or hopping between modes"
+    title = "wavelength that drifts or hops between laser modes"
     acts_at = Stage.LIGHT
     order = 1
     domains = ("time",)
@@ -49,11 +49,13 @@ class WavelengthDrift(Effect):
         "air of 1 K more has an index lower by 1e-6 (Edlen's equation)",
     )
 
-    ramp: float = quantity(1e-6, unit="1/h", low=-1, high=1, doc="relative change in an hour")
+    ramp: float = quantity(1e-6, unit="1/h", low=-1, high=1, doc="relative change per hour")
     walk: float = quantity(
         5e-7, unit="h^-0.5", low=0, high=1, doc="relative random walk, rms after an hour"
     )
-    hop: float = quantity(1.1e-6, low=-0.1, high=0.1, doc="relative difference of the two modes")
+    hop: float = quantity(
+        1.1e-6, low=-0.1, high=0.1, doc="relative difference between the two modes"
+    )
     hops_per_h: float = quantity(
         12.0, unit="1/h", low=0, high=1e6, doc="hops to the other mode or back, at random times"
     )

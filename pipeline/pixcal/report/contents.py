@@ -107,24 +107,13 @@ class DetectorContents:
 
 
 @dataclass(frozen=True)
-class EffectWords:
-    """Title, description and parameters of an effect."""
-
-    title: str  # title, about: in a few words, and in a sentence
-    about: str = ""
-    # unit and meaning of each parameter
-    parameters: Mapping[str, tuple[str, str]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class DiagnosisContents:
     """What ``pixcal diagnose`` found."""
 
     facts: dict[str, Any]  # `diagnosis.json`
     # of `curves.json`: each statistic as measured, as simulated, and with the effects
     curves: Sequence[dict[str, Any]]
-    # words for effects, by name; of those that are not known there are none
-    effects: Mapping[str, EffectWords]
+    titles: Mapping[str, str]  # of the effects of pixcal, by name
     # significance (sigma) from which a statistic counts as different; that of the curves allows
     # for how many were tested
     noticed: float

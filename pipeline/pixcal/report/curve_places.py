@@ -43,7 +43,7 @@ _AXES = {
         "beyond so many σ", "beyond {} σ", ("−5", "−7", "−10", "+5", "+7", "+10")
     ),
     "quantile": _Axis("quantile of the pixels", "{} quantile"),
-    "bin of level": _Axis("level, dark to bright", "level bin {}, 0 the darkest"),
+    "bin of level": _Axis("level, dark to bright", "level bin {} (0: darkest)"),
     "period, rows": _Axis("period, rows", "every {} rows"),
     "period, columns": _Axis("period, columns", "every {} columns"),
     "frames before": _Axis("other frame", "frame {}"),

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from pixcal.report.contents import DiagnosisContents, EffectWords
+from pixcal.report.contents import DiagnosisContents
 from pixcal.report.curve_places import place
 from pixcal.report.diagnosis_words import (
     DETECTOR,
@@ -49,13 +49,12 @@ def causes(result: DiagnosisContents) -> Table:
     return Table("Causes", header, rows)
 
 
-def about_cause(cause: Facts, result: DiagnosisContents) -> str:
+def about_cause(cause: Facts) -> str:
     """What an effect is, its evidence, and its law with the share that this closes by itself."""
-    words = result.effects.get(cause["effect"], EffectWords(""))
     evidence, size, law = cause.get("why"), cause.get("sigmas"), cause.get("law")
     by_law = cause.get("gap_closed_by_law", cause["gap_closed"])
     sentences = [
-        words.about,
+        cause["about"],
         f"Evidence: {evidence.rstrip('.')}." if evidence else "",
         f"Detection significance in the fitted frames: {number(size, 2)}σ." if size else "",
         f"Law: {law}." if law else "",
@@ -78,22 +77,22 @@ def evidence(result: DiagnosisContents, cause: Facts) -> list[Facts]:
     return [curves[key] for key in keys if key in curves]
 
 
-def parameters(cause: Facts, result: DiagnosisContents) -> Iterator[tuple[str, Table]]:
+def parameters(cause: Facts) -> Iterator[tuple[str, Table]]:
     """Parameters with their errors; lists of like mappings have tables of their own."""
-    words = result.effects.get(cause["effect"], EffectWords(""))
     errors, values = cause["uncertainty"], cause["parameters"]
     rows = []
     for name, value in values.items():
         if not is_table(value):
-            its_unit, meaning = words.parameters.get(name, ("", ""))
-            rows.append([name, _fitted(name, value, errors), unit(its_unit) or "–", meaning])
+            its_unit = unit(cause["units"].get(name, "")) or "–"
+            meaning = cause["meanings"].get(name, "")
+            rows.append([name, _fitted(name, value, errors), its_unit, meaning])
     if rows:
         header = ["parameter", "value", "unit", "meaning"]
         yield "", Table(f"Parameters of {cause['effect']}", header, rows)
     for name, value in values.items():
         if is_table(value):
             table, same = _list_of(name, value, errors)
-            meaning = words.parameters.get(name, ("", ""))[1]
+            meaning = cause["meanings"].get(name, "")
             about = [f"{name}: {meaning}." if meaning else "", f"Common to all: {same}."]
             yield " ".join(filter(None, about if same else about[:1])), table
 

@@ -50,9 +50,8 @@ def listed(names: Iterable[str], last: str = "and") -> str:
 
 def effect_title(diagnosis: DiagnosisContents, name: str) -> str:
     """An effect in a few words and its name: own effects are known by the causes alone."""
-    words = diagnosis.effects.get(name)
-    given = [c["title"] for c in diagnosis.facts["causes"] if c["effect"] == name and "title" in c]
-    title = given[0] if given else words.title if words else ""
+    given = {c["effect"]: c["title"] for c in diagnosis.facts["causes"]}
+    title = given.get(name) or diagnosis.titles.get(name)
     return f"{title} ({name})" if title else name
 
 

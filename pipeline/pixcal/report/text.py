@@ -81,12 +81,18 @@ def _grouped(text: str) -> str:
     return text.replace(",", "\u202f").replace("-", "−")
 
 
+# share of a value below which an error says nothing of a measurement
+SMALLEST = 1e-9
+
+
 def with_error(value: float | None, error: float | None) -> str:
     """A value with two digits of its error."""
     if value is None or not math.isfinite(value):
         return "–"
     if error is None or not math.isfinite(error) or error <= 0:
         return number(value, 4)
+    if error < SMALLEST * abs(value):
+        return exact(value)
     exponent = math.floor(math.log10(error))
     if -6 <= exponent < 4:
         decimals = max(0, 1 - exponent)

@@ -42,8 +42,8 @@ CONVERGED = 0.05
 MOST = 3.0  # factor by which a step changes a parameter at most
 TELLING = 0.02  # share of the information from which a deviation is looked at again
 SINGULAR = 1e-6  # share of the largest eigenvalue below which parameters are not told apart
-RANDOM = "what it adds, at random, to the second moments of frames, by its forward model"
-STEADY = "what it changes in frames and maps, beyond what the fit absorbs, by its forward model"
+RANDOM = "changes in the second moments of frames, as its forward model predicts"
+STEADY = "changes in frames and maps that the fit does not absorb, as its forward model predicts"
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
     start = kind()
     names = tuple(n for n in kind.strengths if isinstance(getattr(start, n), float))
     if not names:
-        raise NotImplementedError("none of its strengths is one number: give it an estimate")
+        raise NotImplementedError("none of its strengths is a single number: define estimate")
     changes = _changes(evidence)
     way = changes.way(start)
     fit = _Fit(changes, way, names)

@@ -15,8 +15,10 @@ class Track:
     """A quantity of the frames of a fringe set, straight between points, constant beyond them."""
 
     set: str = quantity(doc="name of the fringe set")
-    time_s: tuple[float, ...] = quantity(unit="s", doc="after the set's first frame, rising")
-    value: tuple[float, ...] = quantity(low=-1e6, high=1e6, doc="at these times")
+    time_s: tuple[float, ...] = quantity(
+        unit="s", doc="seconds after the first frame of the set, ascending"
+    )
+    value: tuple[float, ...] = quantity(low=-1e6, high=1e6, doc="values at these times")
 
     @classmethod
     def of(cls, name: str, time_s: F64, value: F64) -> Self:

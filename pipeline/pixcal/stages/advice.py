@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -50,8 +50,9 @@ def advice(run_dir: Path) -> Advice:
         return Advice((), rows, settled)
     if not sigma:
         return Advice((NO_OFFSETS,), rows, settled)
-    names = " and ".join(path.name for path in maps_to_use(run_dir).values())
-    use = f"Use {names}{_as_what(diagnosis, correction)}."
+    names = [path.name for path in maps_to_use(run_dir).values()]
+    it_needs = "They need" if len(names) > 1 else "It needs"
+    use = f"Use {' and '.join(names)}{_as_what(diagnosis, correction, it_needs)}."
     return Advice((use, _limit(sigma, diagnosis, correction)), rows, settled)
 
 
@@ -98,7 +99,7 @@ def _on_map(cause: Json) -> Json:
     return measured
 
 
-def _as_what(diagnosis: Json | None, correction: Json | None) -> str:
+def _as_what(diagnosis: Json | None, correction: Json | None, it_needs: str) -> str:
     if diagnosis is None:
         return " as fitted. No diagnosis was made, so biases are unknown"
     if correction is not None and correction["outputs"]:
@@ -106,7 +107,7 @@ def _as_what(diagnosis: Json | None, correction: Json | None) -> str:
         return f", corrected for {' and '.join(freed)}"
     if any(_on_map(c)["action"] == "corrected" for c in diagnosis["causes"]):
         return " as fitted, NOT corrected for the effects below"
-    return " as fitted. They need no correction"
+    return f" as fitted. {it_needs} no correction"
 
 
 def _corrects(how: str) -> bool:
@@ -198,11 +199,7 @@ def _reason(effect: str, model: str, models: Mapping[str, str]) -> str:
 
 def size_of(cause: Json) -> str:
     """The strengths of an effect with errors and units."""
-    kind = known_effects().get(cause["effect"])
-    if kind is None:
-        return "-"
-    units = {f.name: f.metadata.get("unit", "") for f in fields(kind)}
-    sizes = (_strength(cause, name, units[name]) for name in kind.strengths)
+    sizes = (_strength(cause, name, cause["units"][name]) for name in cause["strengths"])
     return "; ".join(filter(None, sizes)) or "-"
 
 

@@ -1,9 +1,8 @@
 """Report: one HTML page on the whole run."""
 
 import gc
-import inspect
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from pixcal.report.contents import (
     Detail,
     DetectorContents,
     DiagnosisContents,
-    EffectWords,
     FrameSeries,
     MapContents,
     SetContents,
@@ -46,7 +44,6 @@ from pixcal.report.summary import (
     summarise,
     summarise_flags,
 )
-from pixcal.simulation.effect import Effect
 from pixcal.stages.advice import HEADER, advice
 from pixcal.storage.artefact import MANIFEST, Build, Manifest, read_json
 from pixcal.storage.cube import ArrayReader
@@ -232,16 +229,8 @@ def _diagnosis(folder: Path, *, settled: bool) -> DiagnosisContents:
         # In the file the significance is that of the statistic by itself.
         for key in ("significance", "significance_after"):
             curve[key] = sigmas_among(float(log_ndtr(-curve[key])), facts["statistics"])
-    words = {name: _effect_words(kind) for name, kind in effects().items()}
-    return DiagnosisContents(facts, curves, words, sigmas_of(np.log(CHANCE)), settled)
-
-
-def _effect_words(kind: type[Effect]) -> EffectWords:
-    about, _, _ = (inspect.getdoc(kind) or "").partition("\n")
-    parameters = {
-        f.name: (f.metadata.get("unit", ""), f.metadata.get("doc", "")) for f in fields(kind)
-    }
-    return EffectWords(kind.title, about.replace("`", ""), parameters)
+    titles = {name: kind.title for name, kind in effects().items()}
+    return DiagnosisContents(facts, curves, titles, sigmas_of(np.log(CHANCE)), settled)
 
 
 # Words and tables

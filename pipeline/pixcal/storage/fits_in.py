@@ -209,8 +209,8 @@ def _check_rest(stream: _Stream, end: int) -> None:
     # Fill of any one value is no data: zeros by the standard, blanks of some writers.
     if len(set(fill)) > 1 or (len(set(following)) > 1 and not extension):
         raise ValueError(
-            f"its header calls for {end} bytes, and there are more data; mend NAXISn and BITPIX, "
-            "or remove it"
+            f"its header calls for {end} bytes, but there are more data; correct NAXISn and "
+            "BITPIX, or remove it"
         )
 
 
@@ -309,7 +309,7 @@ def _coding(header: fits.Header, prefix: str) -> Coding:
     scale, zero = number(header, "BSCALE", 1.0), number(header, "BZERO", 0.0)
     if not scale or zero is None:
         raise ValueError(
-            "header key BSCALE is zero, or BSCALE or BZERO is not a number; mend the header"
+            "header key BSCALE is zero, or BSCALE or BZERO is not a number; correct the header"
         )
     # Only integers have a BLANK; ZBLANK is the name that compressors give it.
     key = "BLANK" if "BLANK" in header else "ZBLANK"

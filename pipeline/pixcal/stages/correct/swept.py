@@ -167,7 +167,7 @@ def undone(maps: FringeMaps, effects: Sequence[Effect]) -> tuple[FringeMaps, lis
         ):
             raise InputError(
                 f"effect {effect.name!r}: undo gives no finite maps of the shape it is given; "
-                "mend its file"
+                "fix its file"
             )
         steps.append(phase_change(maps.theta, after.theta))
         maps = after

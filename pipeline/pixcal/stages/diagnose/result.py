@@ -1,6 +1,8 @@
 """``diagnosis.json`` and the curves behind it, from what a search found."""
 
+import inspect
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -160,8 +162,12 @@ def _cause(
     return {
         "effect": name,
         "title": effect.title,
+        "about": (inspect.getdoc(effect) or "").partition("\n")[0].replace("`", ""),
         "parameters": to_plain(effect),
         "uncertainty": {k: float(v) for k, v in estimate.errors.items()},
+        "units": {f.name: f.metadata.get("unit", "") for f in fields(effect)},
+        "meanings": {f.name: f.metadata.get("doc", "") for f in fields(effect)},
+        "strengths": list(effect.strengths),
         "law": estimate.law,
         "gap_closed": _closed(alone.gap.total),
         "gap_closed_interval": [_closed(v) for v in reversed(alone.interval)],
