@@ -5,14 +5,13 @@ import pytest
 import scipy.ndimage
 from numpy.typing import NDArray
 
+from pixcal.kernels.gain_fit import GainFit, fit_gain
 from pixcal.kernels.photon_transfer import (
     BLOCK,
     LAGS,
     N_BINS,
-    GainFit,
     add_neighbours,
     bin_pairs,
-    fit_gain,
     pair_statistics,
 )
 
@@ -35,7 +34,7 @@ def measure(rng: np.random.Generator, scenes: list[F64]) -> GainFit:
     dof, _, square, *_ = bin_pairs(pair(rng, np.zeros_like(scenes[0]))).sum(axis=0)
     sums = sum(bin_pairs(pair(rng, scene)) for scene in scenes)
     variance = square / dof
-    fitted = fit_gain(np.asarray(sums), variance, variance * np.sqrt(2 / dof), np.inf)
+    fitted = fit_gain(np.asarray(sums), (variance, variance * np.sqrt(2 / dof)), np.inf)
     assert fitted is not None
     return fitted
 
@@ -60,7 +59,7 @@ def measure_shared(
     lit = np.asarray(sum(pairs(scene) for scene in scenes))
     sums, added = add_neighbours(lit, dark) if neighbours else (lit[:, :3], [])
     error = variance * np.sqrt(2 / dark[:, 0].sum())
-    fitted = fit_gain(sums, variance, error, np.inf)
+    fitted = fit_gain(sums, (variance, error), np.inf)
     assert fitted is not None
     return fitted, added
 
@@ -142,7 +141,7 @@ def test_outliers_do_not_bias_the_gain() -> None:
     second.reshape(-1)[rng.choice(first.size, 1000)] = 0
     first[100], second[:, 50] = np.nan, np.nan
     sums = bin_pairs(pair_statistics(first, second, gain=1.5, read_noise=3.0, quantum=1.0))
-    fitted = fit_gain(sums, READ_ADU**2, 0.1, np.inf)
+    fitted = fit_gain(sums, (READ_ADU**2, 0.1), np.inf)
     assert fitted is not None
     assert fitted.gain == pytest.approx(GAIN, abs=3 * fitted.error)
 
@@ -161,7 +160,7 @@ def test_levels_above_the_highest_are_not_used() -> None:
     rng = np.random.default_rng(5)
     low, high = (bin_pairs(pair(rng, np.full((256, 256), n))) for n in (1e4, 8e4))
     high[:, 2] *= 0.3  # saturation takes the noise away
-    fitted = fit_gain(low + high, READ_ADU**2, 0.1, 2e4 / GAIN)
+    fitted = fit_gain(low + high, (READ_ADU**2, 0.1), 2e4 / GAIN)
     assert fitted is not None
     assert fitted.gain == pytest.approx(GAIN, abs=3 * fitted.error)
     assert fitted.levels[1] < 2e4 / GAIN
@@ -170,40 +169,58 @@ def test_levels_above_the_highest_are_not_used() -> None:
 def test_points_off_the_line_widen_the_error() -> None:
     rng = np.random.default_rng(6)
     low, high = (bin_pairs(pair(rng, np.full((256, 256), n))) for n in (1e4, 4e4))
-    straight = fit_gain(low + high, READ_ADU**2, 0.1, np.inf)
+    straight = fit_gain(low + high, (READ_ADU**2, 0.1), np.inf)
     high[:, 2] *= 1.2
-    bent = fit_gain(low + high, READ_ADU**2, 0.1, np.inf)
+    bent = fit_gain(low + high, (READ_ADU**2, 0.1), np.inf)
     assert straight is not None
     assert bent is not None
     assert bent.chi2_reduced > 10 > straight.chi2_reduced
     assert bent.error > 3 * straight.error
 
 
+@pytest.mark.parametrize("power", [1, 2, 3])
 @pytest.mark.parametrize("size", [0.01, 0.04, 0.12])
-def test_a_response_that_bends_leaves_the_gain_at_level_zero(size: float) -> None:
+def test_a_response_that_bends_leaves_the_gain_at_level_zero(size: float, power: int) -> None:
     rng = np.random.default_rng(9)
     electrons = np.linspace(1e3, 4e4, 10)
-    bent = electrons * (1 - size * electrons / 4e4) / GAIN
-    slope = 1 - 2 * size * electrons / 4e4
+    share = size * (electrons / 4e4) ** power
+    bent, slope = electrons * (1 - share) / GAIN, 1 - (power + 1) * share
     variance = electrons * slope**2 / GAIN**2 + READ_ADU**2
     dof = np.full(10, 65_000.0)
-    gains, curved = [], []
+    gains, curved, pulls = [], [], []
     for _ in range(20):
         seen = variance * (1 + rng.standard_normal(10) * np.sqrt(2 / dof))
-        fitted = fit_gain(np.stack([dof, dof * bent, dof * seen], 1), READ_ADU**2, 0.02, np.inf)
+        fitted = fit_gain(np.stack([dof, dof * bent, dof * seen], 1), (READ_ADU**2, 0.02), np.inf)
         assert fitted is not None
         assert fitted.gain == pytest.approx(GAIN, abs=5 * fitted.error)
         curved.append(fitted.curved)
         gains.append(fitted.gain)
+        pulls.append((fitted.gain - GAIN) / fitted.error)
     assert np.mean(curved) < -size
     assert np.mean(gains) == pytest.approx(GAIN, rel=0.005)
+    assert np.sqrt(np.mean(np.square(pulls))) < 1.5
+
+
+def test_a_bias_that_wanders_does_not_bias_the_gain() -> None:
+    rng = np.random.default_rng(14)
+    level, dof = np.linspace(100, 8000, 10), np.full(10, 65_000.0)
+    off = {0.0: [], 3.0: []}  # type: dict[float, list[float]]
+    for _ in range(20):
+        seen = (level / GAIN + READ_ADU**2) * (1 + rng.standard_normal(10) * np.sqrt(2 / dof))
+        sums = np.stack([dof, dof * (level + 4.0), dof * seen], 1)
+        for error, gains in off.items():
+            fitted = fit_gain(sums, (READ_ADU**2, 0.02), np.inf, level_error=error)
+            assert fitted is not None
+            gains.append(fitted.gain / GAIN - 1)
+    assert np.mean(off[0.0]) > 0.005
+    assert np.sqrt(np.mean(np.square(off[3.0]))) < 0.004
 
 
 def test_without_light_there_is_no_gain() -> None:
     rng = np.random.default_rng(7)
-    assert fit_gain(np.zeros((N_BINS, 3)), 25.0, 0.1, np.inf) is None
+    assert fit_gain(np.zeros((N_BINS, 3)), (25.0, 0.1), np.inf) is None
     dark = bin_pairs(pair(rng, np.zeros((64, 64))))
-    fitted = fit_gain(dark, READ_ADU**2 + 1 / 12, 0.1, np.inf)
+    fitted = fit_gain(dark, (READ_ADU**2 + 1 / 12, 0.1), np.inf)
     assert fitted is None or fitted.error > 0.2 * fitted.gain
 
 

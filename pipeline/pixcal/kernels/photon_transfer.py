@@ -14,7 +14,6 @@ measured as far as `REACH` and added where they are significant.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,6 @@ from pixcal.kernels.robust import clipped_variance_factor, median_of_columns
 from pixcal.model.arrays import F32, F64
 
 BLOCK = 16  # pixels along each side of a block
-LADDER = 4  # groups of flats from which the curve may bend
 N_BINS = 512  # bins of level: bin n holds `n² / 4` to `(n + 1)² / 4` ADU, the last one all above
 REACH = 2  # pixels between neighbours whose covariance is measured, along each axis
 
@@ -44,13 +42,6 @@ _PAIRED = 1 - REACH / BLOCK
 _CLIP = 5.0
 _MIN_PIXELS = 32  # fewer do not tell outliers from noise
 _SIGMA_OF_MAD = 1.482602218505602
-_ITERATIONS = 4
-_TERMS = 3  # of the polynomial of the slope, at most: a response that bends by 12 % needs three
-# errors that its last term has at least: one left out biases the gain by hardly more than that
-_CURVED = 2.0
-_ALIKE = 1e12
-# points more than terms, and range of levels, that tell a curve from points off a line
-_SPARE, _RANGE = 3, 3.0
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -221,116 +212,3 @@ def add_neighbours(lit: F64, dark: F64) -> tuple[F64, list[tuple[int, int]]]:
     sums[used, 2] += dof * 2 * beyond[:, significant].sum(axis=1)
     sums[used] /= 1 + 2 * significant.sum() / _PAIRED**2
     return sums, [(int(y), int(x)) for y, x in LAGS[significant]]
-
-
-@dataclass(frozen=True)
-class GainFit:
-    """Gain by photon transfer."""
-
-    gain: float  # e-/ADU
-    # 1 sigma, e-/ADU; widened where the points leave the line by more than their noise, and by
-    # what a curvature would change that is neither significant nor absent
-    error: float
-    chi2_reduced: float  # of the points about the line
-    levels: tuple[float, float]  # lowest and highest level used, ADU
-    # slope at the highest level (variance over level) relative to that at zero, less one; zero
-    # where a straight line fits
-    curved: float = 0.0
-    # lags whose covariances were added to the variance: see `add_neighbours`
-    neighbours: tuple[tuple[int, int], ...] = ()
-
-
-def fit_gain(
-    sums: F64,
-    read_variance: float,
-    read_variance_error: float,
-    highest: float,
-    *,
-    straight: bool = False,
-) -> GainFit | None:
-    """Fit the curve from the read noise through the points of variance against level.
-
-    It is a straight line, unless curvature is significant: a nonlinear response and charge that
-    neighbours share in proportion to the level bend it, and the gain is its slope at level zero.
-    The weights come from the curve itself, never from the measured variances: those that are low
-    by chance would weigh more.
-
-    Parameters
-    ----------
-    sums : (N_BINS, 3) float64
-        As `add_neighbours` gives them.
-    read_variance, read_variance_error : float
-        Variance at level zero and its error (ADU²).
-    highest : float
-        Highest level to use (ADU).
-    straight : bool
-        Fit a line only: within few flats the level changes from place to place, as the amplifiers
-        do.
-
-    Returns
-    -------
-    GainFit or None
-        None when nothing is above the read noise.
-    """
-    dof = sums[:, 0]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        level, variance = sums[:, 1] / dof, sums[:, 2] / dof
-    used = (dof > 0) & (level > 0) & (level <= highest)
-    dof, level, shot = dof[used], level[used], variance[used] - read_variance
-    if not used.any() or not (dof * shot).sum() > 0:
-        return None
-    top = float(level.max())
-    curve, left_out = None, 0.0
-    for terms in range(1, 2 if straight else _TERMS + 1):
-        more = _curve(dof, level, shot, read_variance, terms)
-        if more is None:
-            break
-        found, covariance, chi2, _ = more
-        last = math.sqrt(max(1.0, chi2) * covariance[-1, -1])
-        if curve is not None and abs(found[-1]) < _CURVED * last:
-            if abs(found[-1]) > last:
-                left_out = float(found[0] - curve[0][0])
-            break
-        curve = more
-    if curve is None:
-        return None
-    found, covariance, chi2, of_read = curve
-    slope = float(found[0])
-    scatter = max(1.0, chi2) * covariance[0, 0]
-    error = math.sqrt(scatter + (of_read * read_variance_error) ** 2 + left_out**2)
-    return GainFit(
-        1 / slope, error / slope**2, chi2, (float(level.min()), top), float(found.sum() / slope - 1)
-    )
-
-
-def _curve(
-    dof: F64, level: F64, shot: F64, read_variance: float, terms: int
-) -> tuple[F64, F64, float, float] | None:
-    """Polynomial of the slope over the level, as a share of the highest.
-
-    Returns
-    -------
-    found, covariance : (terms,), (terms, terms) float64
-        Coefficients, and their covariance for points that scatter as their noise lets expect.
-    chi2 : float
-        Reduced.
-    of_read : float
-        Change of the first coefficient with the read variance.
-    """
-    if terms > 1 and (len(level) < terms + _SPARE or level.max() < _RANGE * level.min()):
-        return None
-    design = level * (level / level.max()) ** np.arange(terms)[:, None]
-    expected = (dof * shot).sum() / (dof * level).sum() * level
-    for _ in range(_ITERATIONS):
-        weight = dof / (2 * (np.maximum(expected, 0) + read_variance) ** 2)
-        normal = (weight * design) @ design.T
-        if not np.linalg.cond(normal) < _ALIKE:
-            return None
-        covariance = np.linalg.inv(normal)
-        found = covariance @ (design @ (weight * shot))
-        if found[0] <= 0 or found.sum() <= 0:
-            return None
-        expected = found @ design
-    chi2 = float((weight * (shot - expected) ** 2).sum() / max(len(level) - terms, 1))
-    of_read = float((covariance @ (design @ weight))[0])
-    return found, covariance, chi2, of_read

@@ -25,9 +25,10 @@ class PixelNoise:
     # mean, scatter: (y, x) of the logarithm of the variance over its mean in the detector
     mean: F64
     scatter: F64
+    rounding: float = 0.0  # share of the variance that the converter's rounding adds
 
     @classmethod
-    def of(cls, stacks: Sequence[F32], good: Mask) -> "PixelNoise | None":
+    def of(cls, stacks: Sequence[F32], good: Mask, rounding: float = 0.0) -> "PixelNoise | None":
         """From frames (t, y, x) without light, ADU; None of fewer than `FEWEST` frames."""
         stacks = [s for s in stacks if len(s) >= 2]
         freedom = sum(len(s) - 1 for s in stacks)
@@ -55,9 +56,10 @@ class PixelNoise:
         ordinary = good & ~far
         if ordinary.any():
             mean = mean - np.log(np.mean(np.exp(mean + scatter**2 / 2)[ordinary]))
-        return cls(mean, np.where(good, scatter, 0.0))
+        return cls(mean, np.where(good, scatter, 0.0), rounding)
 
     def drawn(self, rng: np.random.Generator) -> F32:
-        """Read noise (y, x) of every pixel over the detector's."""
+        """Read noise (y, x) before rounding of every pixel over the detector's."""
         log = self.mean + self.scatter * rng.standard_normal(self.mean.shape)
-        return np.exp(log / 2).astype(np.float32)
+        before = (np.exp(log) - self.rounding) / (1 - self.rounding)
+        return np.sqrt(np.maximum(before, 0)).astype(np.float32)

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.kernels.photon_transfer import LADDER, neighbour_noise
+from pixcal.kernels.gain_fit import LADDER
+from pixcal.kernels.photon_transfer import neighbour_noise
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, Stage

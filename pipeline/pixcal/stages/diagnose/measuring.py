@@ -112,7 +112,11 @@ def nominal_bench(
         dtypes,
         bench,
         Measured(maps, sets, FlatLight.of(evidence, light)),
-        PixelNoise.of([s.adu for e in parts for s in e.of_kind("bias")], good)
+        PixelNoise.of(
+            [s.adu for e in parts for s in e.of_kind("bias")],
+            good,
+            1 - (one.amplifier_noise / one.read_noise) ** 2,
+        )
         if one.dithered
         else None,
         _gain(evidence, flat.astype(float), good, with_flats),

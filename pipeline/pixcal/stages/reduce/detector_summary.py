@@ -8,15 +8,16 @@ import numpy as np
 
 from pixcal.estimators.detector.calibration import Linearity, linearity
 from pixcal.estimators.detector.emva import Measure, full_level, saturation, transfer_points
-from pixcal.kernels.photon_transfer import BLOCK, LADDER, LAGS, GainFit, add_neighbours, fit_gain
-from pixcal.kernels.robust import median_and_sigma
-from pixcal.kernels.rounding import SHEPPARD, UNTOLD, noise_before_rounding
+from pixcal.kernels.gain_fit import LADDER, GainFit, fit_gain
+from pixcal.kernels.photon_transfer import add_neighbours
+from pixcal.kernels.rounding import SHEPPARD, UNTOLD
 from pixcal.model.acquisition import Detector
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
-from pixcal.stages.reduce.calibration import Usual, on_grid, usual
+from pixcal.stages.reduce.calibration import Usual, usual
 from pixcal.stages.reduce.columns import grid
 from pixcal.stages.reduce.frame_statistics import Measuring
+from pixcal.stages.reduce.read_noise import bias_wander, dark_charge, read_noise
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.place import Place
 
@@ -29,13 +30,8 @@ _GAIN_ERROR = 0.2
 _GUESS_ERROR = 0.1
 _SMOOTH = 0.25 + SHEPPARD
 """Variance of a sample, in square codes, from which rounding adds the same at every level."""
-_NO_LINE = 10.0
-"""Reduced chi-square of a photon-transfer curve that is no line."""
-_LINEARITY = 0.02
 _LAMP = 0.3
 """Relative change of light a second between flats that are not of one lamp."""
-_SHARED = 5.0
-"""Errors of the noise that a row shares from which it is there."""
 _LIT = 5.0
 """Least response of the usual pixel over its error: below it the flat would be noise."""
 
@@ -94,72 +90,6 @@ class Summary:
             return self.declared.read_noise_e
         return min(self.declared.read_noise_e, gain * UNTOLD * self.step)
 
-    def warnings(self, gain: float, saturation: float | None) -> list[str]:
-        """Sentences on what is not as it should be, or was declared otherwise than measured.
-
-        Parameters
-        ----------
-        gain : float
-            That is used (e-/ADU).
-        saturation : float or None
-            Where flats were found to saturate (ADU), if it was not declared.
-        """
-        found = []
-        if saturation is not None:
-            found.append(
-                f"flats saturate at {saturation:.0f} ADU, where their samples pile up: "
-                f"{(~self.usable).sum()} of {len(self.usable)} levels are left out of gain and "
-                "linearity; declare detector.saturation_adu if it is another level"
-            )
-        if self.gain is not None and self.gain.chi2_reduced > _NO_LINE:
-            found.append(
-                "the photon-transfer curve is no straight line (reduced chi-square "
-                f"{self.gain.chi2_reduced:.3g}): do not rely on the gain measured; causes are a "
-                "nonlinear response, amplifiers of different gain, a lamp that flickers, or charge "
-                "shared by neighbours"
-            )
-        if self.gain is not None and self.gain.neighbours:
-            lags = ", ".join(f"({y}, {x})" for y, x in self.gain.neighbours)
-            found.append(
-                "neighbours share charge: their noise is correlated in the flats at (rows, "
-                f"columns) {lags}; the gain counts what they share"
-            )
-        if self.gain is not None and self.gain.curved:
-            found.append(
-                "the photon-transfer curve bends: variance over level changes by "
-                f"{100 * self.gain.curved:+.2g} % up to {self.gain.levels[1]:.0f} ADU; the gain is "
-                "that at level zero; causes are a nonlinear response, or charge that neighbours "
-                "share the more the brighter they are"
-            )
-        if self.linearity is not None and self.linearity.max_deviation > _LINEARITY:
-            found.append(
-                f"the levels of the flats are up to {100 * self.linearity.max_deviation:.2g} % off "
-                "a straight line over exposure time: the response of all pixels, or the lamp, is "
-                "not linear; no pixel is flagged for it"
-            )
-        declared = self.declared.gain_e_per_adu
-        if self.gain is not None:
-            value, error = self.gain.gain, self.gain.error
-            if abs(value - declared) > max(3 * error, 0.02 * declared):
-                found.append(
-                    f"photon transfer gives a gain of {value:.4g} ± {error:.2g} e-/ADU, not the "
-                    f"{declared:g} of detector.gain_e_per_adu: "
-                    + (
-                        "correct it, or use '--gain measured'; all electrons are counted with it"
-                        if gain == declared
-                        else "electrons are counted with the measured one"
-                    )
-                )
-        noise = self.declared.read_noise_e
-        if self.before_rounding is not None:
-            value, error = (gain * v for v in self.before_rounding)
-            if abs(value - noise) > max(3 * error, 0.1 * noise):
-                found.append(
-                    f"the read noise is {value:.4g} ± {error:.2g} e-, not the {noise:g} of "
-                    "detector.read_noise_e: the measured one is used"
-                )
-        return found
-
 
 def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     """Put the statistics of all columns together.
@@ -204,15 +134,15 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     times = np.array([group.exptime for group in job.flat])
     if job.flats_timed and job.flat and _one_lamp(times[usable], levels[usable]):
         straight = linearity(times, levels, usable)
-    charge = _dark_charge(folder, job)
-    gain = None
+    charge = dark_charge(folder, job)
+    gain, wander = None, bias_wander(job)
     # The shot noise of the dark signal is no read noise; how large it is the gain tells.
     for _ in range(2 if charge else 1):
         shot = charge / (job.gain if gain is None else gain.gain)
-        read_noise, own = _read_noise(sums[0], shot, folder, job)
-        gain = _gain(sums, own, top, job)
+        noise, own = read_noise(sums[0], shot, folder, job)
+        gain = _gain(sums, own, wander, top, job)
     return Summary(
-        declared, job.quantum or 1.0, medians, light, read_noise, own, gain, levels, usable, full,
+        declared, job.quantum or 1.0, medians, light, noise, own, gain, levels, usable, full,
         straight,
     )  # fmt: skip
 
@@ -227,86 +157,13 @@ def pair_sums(folder: Place, job: Measuring) -> F64:
     return sums
 
 
-def _before_rounding(
-    variance: tuple[float, float], folder: Place, job: Measuring
-) -> tuple[float, float] | None:
-    """Noise of the amplifier and its error (ADU), by where the levels lie between codes."""
-    assert job.read_series is not None
-    bias, rate = on_grid(folder, job.shape, ("bias", "dark_rate"))
-    means = bias + rate * job.read_series.exptime
-    frames, step = len(job.read_series.frames), job.quantum
-    in_steps = variance[0] / step**2, variance[1] / step**2
-    found = noise_before_rounding(*in_steps, means[np.isfinite(means)] / step, frames)
-    return found and (step * found[0], step * found[1])
-
-
-def shared_by_lines(dark: F64) -> dict[str, Measure]:
-    """Variance in time that all pixels of a row, or of a column, share, with its error (ADU²).
-
-    Zero where it is not significant.
-
-    Parameters
-    ----------
-    dark : (N_BINS, COLUMNS) float64
-        Sums over pairs of frames without light, as `bin_pairs` gives them.
-    """
-    total = dark.sum(axis=0)
-    if not total[0]:
-        return {}
-    error = total[2] / total[0] / math.sqrt(total[0])
-    found = {}
-    for name, lags in (("row", ((0, 1), (0, 2))), ("column", ((1, 0), (2, 0)))):
-        at = [3 + LAGS.tolist().index(list(lag)) for lag in lags]
-        # A coupling reaches the next pixel, and a row that repeats the row after it; not both.
-        # The mean of its block was taken off.
-        shared = float(total[at].min() / total[0]) * (BLOCK + 1) / BLOCK
-        found[name] = (shared if shared > _SHARED * error else 0.0, error)
-    return found
-
-
-def _read_variance(dark: F64) -> tuple[float, float] | None:
-    """Variance of a sample without light and its error (ADU²)."""
-    dof, _, square = dark[:, :3].sum(axis=0)
-    if not dof > 0:
-        return None
-    # What lines share was lost in part with the means of blocks.
-    lost = sum(shared for shared, _ in shared_by_lines(dark).values()) / (BLOCK + 1)
-    return square / dof + lost, square / dof * math.sqrt(2 / dof)
-
-
-def _dark_charge(folder: Place, job: Measuring) -> float:
-    """Mean dark signal (ADU) of usual pixels in the frames that tell the read noise."""
-    series = job.read_series
-    if series is None or not series.exptime > 0:
-        return 0.0
-    rate = on_grid(folder, job.shape, ("dark_rate",))[0]
-    median, sigma = median_and_sigma(rate)
-    usual = np.abs(rate - median) <= job.limits.hot * sigma
-    return max(float(rate[usual].mean()), 0.0) * series.exptime if usual.any() else 0.0
-
-
-def _read_noise(
-    dark: F64, shot: float, folder: Place, job: Measuring
-) -> tuple[Measure | None, Measure | None]:
-    """Noise without light (ADU), less shot noise of a variance (ADU²), with and without rounding.
-
-    Both with their errors.
-    """
-    whole = _read_variance(dark)
-    if whole is None:
-        return None, None
-    variance = max(whole[0] - shot, SHEPPARD * job.quantum**2), whole[1]
-    noise = math.sqrt(variance[0])
-    measured = noise, variance[1] / (2 * noise) if noise else 0.0
-    return measured, _before_rounding(variance, folder, job) if job.quantum else measured
-
-
 def _gain(
-    sums: F64, read_noise: tuple[float, float] | None, top: float, job: Measuring
+    sums: F64, read_noise: Measure | None, wander: float, top: float, job: Measuring
 ) -> GainFit | None:
     """Photon transfer below the level ``top`` (ADU above bias) of saturation, neighbours added.
 
-    None where the level above bias is unknown, or the error is too large.
+    The bias wanders by so much (ADU). None where the level above bias is unknown, or the error is
+    too large.
     """
     if not (job.dark and job.flat):
         return None
@@ -320,7 +177,13 @@ def _gain(
     smooth = lit[:, 2:3] > _SMOOTH * job.quantum**2 * lit[:, :1]
     lit = np.where(smooth, lit, 0.0) if smooth.any() else lit
     shared, added = add_neighbours(lit, dark)
-    fitted = fit_gain(shared, variance, 2 * noise * error, highest, straight=len(job.flat) < LADDER)
+    fitted = fit_gain(
+        shared,
+        (variance, 2 * noise * error),
+        highest,
+        level_error=wander,
+        straight=len(job.flat) < LADDER,
+    )
     if fitted is None or not fitted.error < _GAIN_ERROR * fitted.gain:
         return None
     return replace(fitted, neighbours=tuple(added))

@@ -42,13 +42,13 @@ class FlatSurvey:
     def of(cls, arrays: Mapping[str, Reader]) -> "FlatSurvey":
         """Look at the middle rows of all flats, and of a frame without light."""
         dark = next((arrays[name] for name in ("bias", "dark") if name in arrays), None)
-        pedestal = 0.0 if dark is None else float(np.nanmean(_rows(dark, 0, 1)))
+        pedestal = 0.0 if dark is None else float(np.nanmean(middle_rows(dark, 0, 1)))
         flats = arrays["flat"]
         whole = flats.dtype.kind in "iu"
         levels, tops = [], []
         for number in range(flats.shape[0]):
             if number % TOGETHER == 0:
-                several = _rows(flats, number, number + TOGETHER)
+                several = middle_rows(flats, number, number + TOGETHER)
             samples = several[number % TOGETHER]
             levels.append(float(np.nanmean(samples)) - pedestal)
             if whole:
@@ -72,18 +72,19 @@ class FlatSurvey:
 
 def share_at_zero(frames: Reader) -> float:
     """Share of the samples of the first frame that are zero, where no sample is below."""
-    samples = _rows(frames, 0, 1)
+    samples = middle_rows(frames, 0, 1)
     return 0.0 if samples.min() < 0 else float((samples == 0).mean())
 
 
 def code_step(arrays: Sequence[Reader]) -> int:
     """Largest step of which all samples of some frames are multiples; 1 if they are few."""
     ends = ((array, n) for array in arrays for n in {0, array.shape[0] - 1})
-    codes = {int(code) for array, n in ends for code in np.unique(_rows(array, n, n + 1))}
+    codes = {int(code) for array, n in ends for code in np.unique(middle_rows(array, n, n + 1))}
     return math.gcd(*codes) if len(codes) >= NEIGHBOURS else 1
 
 
-def _rows(frames: Reader, begin: int, end: int) -> NDArray[Any]:
+def middle_rows(frames: Reader, begin: int, end: int) -> NDArray[Any]:
+    """Samples (t, y, x) of the middle `ROWS` rows of some frames."""
     count, ny, nx = frames.shape
     first = max((ny - ROWS) // 2, 0)
     read: NDArray[Any] = frames.read(

@@ -22,6 +22,7 @@ from pixcal.model.options import Reduce
 from pixcal.stages.reduce.calibration import Finishing, calibration_writers, finish
 from pixcal.stages.reduce.columns import extent, indices, run_noted, strip_width
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
+from pixcal.stages.reduce.detector_warnings import detector_warnings
 from pixcal.stages.reduce.electrons import convert_bytes
 from pixcal.stages.reduce.figures_of_merit import characterise
 from pixcal.stages.reduce.flat_survey import share_at_zero
@@ -225,7 +226,8 @@ def _report(
 ) -> None:
     job, summary, sets = found.job, found.summary, found.sets
     piled = source.saturation_found if source.detector.saturation_adu is None else None
-    warnings = [*source.exposures.warnings, *_cut_off(source), *summary.warnings(found.gain, piled)]
+    warnings = [*source.exposures.warnings, *_cut_off(source)]
+    warnings += detector_warnings(summary, found.gain, piled)
     declared = source.detector.saturation_adu is not None
     warnings += _dark_lines(ArrayReader(made.folder / "calibration.zarr" / "mask"), source.shape)
     for name, facts in sets.items():

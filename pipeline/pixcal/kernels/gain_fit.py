@@ -1,0 +1,130 @@
+"""Gain from a photon-transfer curve that bends as far as its points show.
+
+Variance is ``offset + level (c_0 + c_1 u + c_2 u² + c_3 u³ + c_4 u⁴)``, with u the level over the
+highest one; the gain is ``1 / c_0``. A nonlinear response, or charge that neighbours share in
+proportion to the level, bends the curve. How far is not known beforehand: c_1 to c_4, relative to
+c_0, are normal numbers of a common size, and the size is zero or any below one. The average over
+the sizes, each with the weight of its evidence (MacKay 1992, *Neural Computation* 4, 415), is the
+gain; what remains unknown of the curve is in its error.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from pixcal.model.arrays import F64
+
+LADDER = 4  # groups of flats from which the curve may bend
+
+_TERMS = 4  # that bend the curve
+_STRAIGHT = 1e-6  # size of terms that are as good as zero
+_SIZES = np.concatenate([[_STRAIGHT], np.geomspace(1e-3, 1.0, 13)])
+_CHANCES = np.concatenate([[0.5], np.full(13, 0.5 / 13)])
+_CURVED = 0.05  # chance of a straight line below which the curve bends
+# points more than terms, and range of levels, that tell a curve from points off a line
+_SPARE, _RANGE = 3, 3.0
+_ITERATIONS = 5
+
+
+@dataclass(frozen=True)
+class GainFit:
+    """Gain by photon transfer."""
+
+    gain: float  # e-/ADU
+    # 1 sigma, e-/ADU; widened where the points leave the curve by more than their noise
+    error: float
+    chi2_reduced: float  # of the points about the curve
+    levels: tuple[float, float]  # lowest and highest level used, ADU
+    # slope at the highest level (variance over level) relative to that at zero, less one; zero
+    # where a straight line fits
+    curved: float = 0.0
+    # lags whose covariances were added to the variance: see `photon_transfer.add_neighbours`
+    neighbours: tuple[tuple[int, int], ...] = ()
+
+
+def fit_gain(
+    sums: F64,
+    read_variance: tuple[float, float],
+    highest: float,
+    *,
+    level_error: float = 0.0,
+    straight: bool = False,
+) -> GainFit | None:
+    """Fit the curve through the points of variance against level, from the read noise on.
+
+    The weights come from the curve itself, never from the measured variances: those that are low
+    by chance would weigh more.
+
+    Parameters
+    ----------
+    sums : (N_BINS, 3) float64
+        As `photon_transfer.add_neighbours` gives them.
+    read_variance : (float, float)
+        Variance at level zero and its error (ADU²).
+    highest : float
+        Highest level to use (ADU).
+    level_error : float
+        By which all levels may be too high or too low (ADU): the bias wanders.
+    straight : bool
+        Fit a line only: within few flats the level changes from place to place, as the amplifiers
+        do.
+
+    Returns
+    -------
+    GainFit or None
+        None when nothing is above the read noise.
+    """
+    dof = sums[:, 0]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        level, variance = sums[:, 1] / dof, sums[:, 2] / dof
+    used = (dof > 0) & (level > 0) & (level <= highest)
+    dof, level, shot = dof[used], level[used], variance[used] - read_variance[0]
+    if not used.any() or not (dof * shot).sum() > 0:
+        return None
+    top = float(level.max())
+    bends = not straight and len(level) > _TERMS + _SPARE and top >= _RANGE * level.min()
+    terms, sizes = (_TERMS, _SIZES) if bends else (0, _SIZES[:1])
+    design = np.stack(
+        [np.ones_like(level), *(level * (level / top) ** n for n in range(terms + 1))]
+    )
+    slope, chi2 = float((dof * shot).sum() / (dof * level).sum()), 1.0
+    expected = slope * level
+    for _ in range(_ITERATIONS):
+        weight = dof / (2 * (np.maximum(expected, 0) + read_variance[0]) ** 2)
+        normal, right = (design * weight) @ design.T / chi2, design @ (weight * shot) / chi2
+        of_offset = read_variance[1] ** 2 + (level_error * slope) ** 2
+        found = [
+            _posterior(normal, right, np.array([1 / of_offset, 0.0, *[(s * slope) ** -2] * terms]))
+            for s in sizes
+        ]
+        evidence = np.array([one[2] for one in found])
+        share = _CHANCES[: len(sizes)] * np.exp(evidence - evidence.max())
+        share /= share.sum()
+        mean = share @ np.array([one[0] for one in found])
+        slope, expected = float(mean[1]), mean @ design
+        if not slope > 0 or not mean[1:].sum() > 0:
+            return None
+        # About the loosest curve: that they bend is no scatter.
+        freedom = len(level) - np.array([np.trace(one[1] @ normal) for one in found])
+        rest = weight @ (shot - found[-1][0] @ design) ** 2
+        chi2 = max(1.0, float(rest / max(freedom[-1], 1)))
+    scatter = share @ [one[1][1, 1] + (one[0][1] - slope) ** 2 for one in found]
+    return GainFit(
+        1 / slope,
+        math.sqrt(scatter) / slope**2,
+        float(weight @ (shot - expected) ** 2 / max(share @ freedom, 1)),
+        (float(level.min()), top),
+        float(mean[2:].sum() / slope) if share[0] < _CURVED else 0.0,
+    )
+
+
+def _posterior(normal: F64, right: F64, information: F64) -> tuple[F64, F64, float]:
+    """Mean, covariance and log evidence of coefficients about zero, of some prior information."""
+    total = normal + np.diag(information)
+    scale = 1 / np.sqrt(np.diag(total))
+    covariance = np.linalg.inv(total * np.outer(scale, scale)) * np.outer(scale, scale)
+    mean = covariance @ right
+    known = np.log(information[information > 0]).sum()
+    evidence = right @ mean + known + np.linalg.slogdet(covariance)[1]
+    return mean, covariance, float(evidence) / 2

@@ -1,0 +1,81 @@
+"""Sentences on a detector that is not as it should be, or was declared otherwise than measured."""
+
+from pixcal.kernels.gain_fit import GainFit
+from pixcal.stages.reduce.detector_summary import Summary
+
+_NO_LINE = 10.0
+"""Reduced chi-square of a photon-transfer curve that is no line."""
+_LINEARITY = 0.02
+
+
+def detector_warnings(summary: Summary, gain: float, saturation: float | None) -> list[str]:
+    """What to say of the detector as a whole.
+
+    Parameters
+    ----------
+    summary : Summary
+    gain : float
+        That is used (e-/ADU).
+    saturation : float or None
+        Where flats were found to saturate (ADU), if it was not declared.
+    """
+    found = []
+    if saturation is not None:
+        found.append(
+            f"flats saturate at {saturation:.0f} ADU, where their samples pile up: "
+            f"{(~summary.usable).sum()} of {len(summary.usable)} levels are left out of gain and "
+            "linearity; declare detector.saturation_adu if it is another level"
+        )
+    if summary.gain is not None:
+        found += _of_gain(summary.gain, summary.declared.gain_e_per_adu, gain)
+    if summary.linearity is not None and summary.linearity.max_deviation > _LINEARITY:
+        found.append(
+            f"the levels of the flats are up to {100 * summary.linearity.max_deviation:.2g} % off "
+            "a straight line over exposure time: the response of all pixels, or the lamp, is "
+            "not linear; no pixel is flagged for it"
+        )
+    noise = summary.declared.read_noise_e
+    if summary.before_rounding is not None:
+        value, error = (gain * v for v in summary.before_rounding)
+        if abs(value - noise) > max(3 * error, 0.1 * noise):
+            found.append(
+                f"the read noise is {value:.4g} ± {error:.2g} e-, not the {noise:g} of "
+                "detector.read_noise_e: the measured one is used"
+            )
+    return found
+
+
+def _of_gain(fit: GainFit, declared: float, used: float) -> list[str]:
+    found = []
+    if fit.chi2_reduced > _NO_LINE:
+        found.append(
+            "the photon-transfer curve is no straight line (reduced chi-square "
+            f"{fit.chi2_reduced:.3g}): do not rely on the gain measured; causes are a "
+            "nonlinear response, amplifiers of different gain, a lamp that flickers, or charge "
+            "shared by neighbours"
+        )
+    if fit.neighbours:
+        lags = ", ".join(f"({y}, {x})" for y, x in fit.neighbours)
+        found.append(
+            "neighbours share charge: their noise is correlated in the flats at (rows, "
+            f"columns) {lags}; the gain counts what they share"
+        )
+    if fit.curved:
+        found.append(
+            "the photon-transfer curve bends: variance over level changes by "
+            f"{100 * fit.curved:+.2g} % up to {fit.levels[1]:.0f} ADU; the gain is "
+            "that at level zero; causes are a nonlinear response, or charge that neighbours "
+            "share the more the brighter they are"
+        )
+    value, error = fit.gain, fit.error
+    if abs(value - declared) > max(3 * error, 0.02 * declared):
+        found.append(
+            f"photon transfer gives a gain of {value:.4g} ± {error:.2g} e-/ADU, not the "
+            f"{declared:g} of detector.gain_e_per_adu: "
+            + (
+                "correct it, or use '--gain measured'; all electrons are counted with it"
+                if used == declared
+                else "electrons are counted with the measured one"
+            )
+        )
+    return found

@@ -1,0 +1,102 @@
+"""Noise of frames without light: of samples, of what lines share, of their mean level."""
+
+import math
+
+import numpy as np
+
+from pixcal.estimators.detector.emva import Measure
+from pixcal.kernels.photon_transfer import BLOCK, LAGS
+from pixcal.kernels.robust import median_and_sigma
+from pixcal.kernels.rounding import SHEPPARD, noise_before_rounding
+from pixcal.model.arrays import F64
+from pixcal.stages.reduce.calibration import on_grid
+from pixcal.stages.reduce.flat_survey import middle_rows
+from pixcal.stages.reduce.frame_statistics import Measuring
+from pixcal.storage.place import Place
+
+_SHARED = 5.0
+"""Errors of the noise that a row shares from which it is there."""
+
+
+def shared_by_lines(dark: F64) -> dict[str, Measure]:
+    """Variance in time that all pixels of a row, or of a column, share, with its error (ADU²).
+
+    Zero where it is not significant.
+
+    Parameters
+    ----------
+    dark : (N_BINS, COLUMNS) float64
+        Sums over pairs of frames without light, as `bin_pairs` gives them.
+    """
+    total = dark.sum(axis=0)
+    if not total[0]:
+        return {}
+    error = total[2] / total[0] / math.sqrt(total[0])
+    found = {}
+    for name, lags in (("row", ((0, 1), (0, 2))), ("column", ((1, 0), (2, 0)))):
+        at = [3 + LAGS.tolist().index(list(lag)) for lag in lags]
+        # A coupling reaches the next pixel, and a row that repeats the row after it; not both.
+        # The mean of its block was taken off.
+        shared = float(total[at].min() / total[0]) * (BLOCK + 1) / BLOCK
+        found[name] = (shared if shared > _SHARED * error else 0.0, error)
+    return found
+
+
+def _read_variance(dark: F64) -> tuple[float, float] | None:
+    """Variance of a sample without light and its error (ADU²)."""
+    dof, _, square = dark[:, :3].sum(axis=0)
+    if not dof > 0:
+        return None
+    # What lines share was lost in part with the means of blocks.
+    lost = sum(shared for shared, _ in shared_by_lines(dark).values()) / (BLOCK + 1)
+    return square / dof + lost, square / dof * math.sqrt(2 / dof)
+
+
+def dark_charge(folder: Place, job: Measuring) -> float:
+    """Mean dark signal (ADU) of usual pixels in the frames that tell the read noise."""
+    series = job.read_series
+    if series is None or not series.exptime > 0:
+        return 0.0
+    rate = on_grid(folder, job.shape, ("dark_rate",))[0]
+    median, sigma = median_and_sigma(rate)
+    usual = np.abs(rate - median) <= job.limits.hot * sigma
+    return max(float(rate[usual].mean()), 0.0) * series.exptime if usual.any() else 0.0
+
+
+def read_noise(
+    dark: F64, shot: float, folder: Place, job: Measuring
+) -> tuple[Measure | None, Measure | None]:
+    """Noise without light (ADU), less shot noise of a variance (ADU²), with and without rounding.
+
+    Both with their errors.
+    """
+    whole = _read_variance(dark)
+    if whole is None:
+        return None, None
+    variance = max(whole[0] - shot, SHEPPARD * job.quantum**2), whole[1]
+    noise = math.sqrt(variance[0])
+    measured = noise, variance[1] / (2 * noise) if noise else 0.0
+    return measured, _before_rounding(variance, folder, job) if job.quantum else measured
+
+
+def _before_rounding(
+    variance: tuple[float, float], folder: Place, job: Measuring
+) -> tuple[float, float] | None:
+    """Noise of the amplifier and its error (ADU), by where the levels lie between codes."""
+    assert job.read_series is not None
+    bias, rate = on_grid(folder, job.shape, ("bias", "dark_rate"))
+    means = bias + rate * job.read_series.exptime
+    frames, step = len(job.read_series.frames), job.quantum
+    in_steps = variance[0] / step**2, variance[1] / step**2
+    found = noise_before_rounding(*in_steps, means[np.isfinite(means)] / step, frames)
+    return found and (step * found[0], step * found[1])
+
+
+def bias_wander(job: Measuring) -> float:
+    """By how much the level without light changes from frame to frame, rms (ADU)."""
+    series = job.read_series
+    if series is None or len(series.frames) < 2:
+        return 0.0
+    reader = job.frames[series.array]
+    means = [np.nanmean(middle_rows(reader, n, n + 1)) for n in series.frames]
+    return float(np.std(means, ddof=1))
