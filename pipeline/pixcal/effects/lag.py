@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from pixcal.estimators.detector.flat_ladder import flicker
+from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker
 from pixcal.estimators.detector.noiseless_charge import missing_noise
 from pixcal.estimators.detector.traps import BANDS, LossFit, in_bands
 from pixcal.estimators.diagnosis.distortions import Freedom
@@ -586,15 +586,13 @@ def _of_flats(evidence: Evidence) -> Estimate | None:
 def _first_frame(stack: Stack, evidence: Evidence) -> tuple[float, float, float] | None:
     """Level of a stack, how much its first frame differs from the others, and the error; e-."""
     count = len(stack.adu)
-    if count < (2 if stack.kind == "flat" else _SERIES):
+    lamp, known = flicker(evidence)
+    if count < (2 if stack.kind == "flat" and known > FLICKER_KNOWN else _SERIES):
         return None
     light = (stack.adu - evidence.bias)[:, evidence.good] * evidence.gain
     means = light.mean(axis=1)
     rest = means[1:]
     level = float(rest.mean())
     # What the lamp did from frame to frame is measured by the frames themselves.
-    if count < _SERIES:
-        scatter = level * max(flicker(evidence), _STEADIEST)
-    else:
-        scatter = float(rest.std(ddof=2))
+    scatter = level * max(lamp, _STEADIEST) if count < _SERIES else float(rest.std(ddof=2))
     return level, float(means[0] - level), scatter * float(np.sqrt(1 + 1 / len(rest)))

@@ -157,7 +157,7 @@ def _states(seed: int, frames: int, pixels: int, keep: float) -> U8:
 
 def _series(evidence: Evidence) -> Iterator[Series]:
     dark = [s for s in evidence.stacks if s.kind != "flat" and len(s.adu) >= _MIN_FRAMES]
-    if sum(len(s.adu) for s in dark) >= _ENOUGH:
+    if sum(len(s.adu) for s in dark) >= _ENOUGH or not evidence.fringes:
         for stack in dark:
             if (series := _of_stack(stack, evidence)) is not None:
                 yield series

@@ -19,6 +19,11 @@ STEADY = 0.1  # rms of the levels about a curve beyond which the lamp was change
 RATES = 1.3  # largest over least light a second of few levels of one lamp
 DISAGREE = 4.0  # errors between the curve of the levels and that of their noise
 
+# least degrees of freedom of the flicker with which first frames tell more than it: six pairs
+FLICKER_KNOWN = 2.0
+
+# information of a median of absolute deviations, over that of a standard deviation
+_OF_MEDIAN = 0.37
 _WITH_OFFSET, _WITH_CUBIC = 5, 6  # fewest levels for these terms
 _TURNS = 30
 _SMALL = 1e-4
@@ -50,8 +55,8 @@ def light_of(evidence: Evidence, stack: Stack) -> F64:
     return np.asarray(stack.adu[:, good].mean(axis=1, dtype=float) * evidence.gain - dark)
 
 
-def flicker(evidence: Evidence) -> float:
-    """Relative change of the lamp from frame to frame, rms.
+def flicker(evidence: Evidence) -> tuple[float, float]:
+    """Relative change of the lamp from frame to frame, rms, and the degrees of freedom it has.
 
     The first frame of a series may lack what stayed behind of the frame before: of pairs, what
     their steps have in common is left out.
@@ -67,8 +72,11 @@ def flicker(evidence: Evidence) -> float:
     pairs = np.array(firsts) - (np.median(firsts) if firsts else 0.0)
     every = np.concatenate([steps, pairs if len(pairs) > 2 else []])
     if not len(every):
-        return 0.0
-    return 1.4826 * float(np.median(np.abs(every))) / float(np.sqrt(2))
+        return 0.0, 1.0
+    # Of few values the median of what is off the median is too low (Croux and Rousseeuw 1992).
+    few = len(every) / max(len(every) - 0.8, 0.7)
+    spread = 1.4826 * few * float(np.median(np.abs(every))) / float(np.sqrt(2))
+    return spread, max(_OF_MEDIAN * len(every), 1.0)
 
 
 def straight_line(times: F64, levels: F64, at: F64) -> F64:
@@ -97,7 +105,7 @@ def _ladder(evidence: Evidence) -> Ladder | None:
         return None
     counts = np.array([len(one) for one in light])
     # Photons hardly matter in the mean of a frame; the lamp does.
-    error = np.hypot(LAMP, flicker(evidence) / np.sqrt(counts))
+    error = np.hypot(LAMP, flicker(evidence)[0] / np.sqrt(counts))
     # Where the flat varies, bright pixels bend more than the mean does.
     flat = evidence.flat[evidence.good] / evidence.flat[evidence.good].mean()
     moments = float((flat**2).mean()), float((flat**3).mean())

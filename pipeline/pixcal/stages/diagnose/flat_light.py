@@ -1,5 +1,6 @@
 """The light of the flats as it was: a lamp is no part of the detector, and none is quite steady."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -14,6 +15,9 @@ from pixcal.stages.diagnose.undone import IntensityBeforeEffects
 SERIES = 8
 """Frames of a series whose light is taken as it was in each; of fewer it is drawn."""
 
+_FLICKER = 103
+"""Key of random numbers."""
+
 
 @dataclass(frozen=True)
 class FlatLight:
@@ -25,6 +29,8 @@ class FlatLight:
         Relative rms from frame to frame, and of levels about the line over exposure time.
     one_lamp : bool
         Whether the levels are those of one lamp; else they are taken as measured.
+    freedom : float
+        Degrees of freedom that ``flicker`` is known by.
     frames : mapping
         By the number of a recording, the light (t,) of each frame over the mean; NaN for frames
         that are drawn: the first, which may lack what stayed behind, and those not looked at.
@@ -33,6 +39,7 @@ class FlatLight:
     flicker: float = 0.0
     wander: float = 0.0
     one_lamp: bool = False
+    freedom: float = math.inf
     frames: Mapping[int, F64] = field(default_factory=dict)
 
     @classmethod
@@ -44,10 +51,12 @@ class FlatLight:
             if np.isfinite(own).sum() >= SERIES:
                 frames[number] = own / np.nanmean(own)
                 frames[number][0] = np.nan
+        flickers, freedoms = zip(*map(flicker, evidence), strict=True)
         return cls(
-            float(np.mean([flicker(one) for one in evidence])),
+            float(np.mean(flickers)),
             float(np.mean([LAMP if one is None else one.wander for one in found])),
             all(one is not None for one in found),
+            min(freedoms),
             frames,
         )
 
@@ -56,10 +65,19 @@ class FlatLight:
         known = self.frames.get(recording.number)
         if known is not None and np.isfinite(known[frame]):
             return float(known[frame])
-        of_frame = 1 + self.flicker * recording.rng("lamp", frame).standard_normal()
+        of_frame = (
+            1 + self._flicker(recording.bench.seed) * recording.rng("lamp", frame).standard_normal()
+        )
         if known is not None or not self.one_lamp:
             return float(of_frame)
         return float(of_frame * (1 + self.wander * recording.rng("lamp").standard_normal()))
+
+    def _flicker(self, seed: int) -> float:
+        """Flicker in a simulation, as it may be within its error."""
+        if math.isinf(self.freedom):
+            return self.flicker
+        square = np.random.default_rng([seed, _FLICKER]).chisquare(self.freedom) / self.freedom
+        return self.flicker / math.sqrt(square)
 
     def levels(
         self, recordings: Sequence[Recording], before: IntensityBeforeEffects

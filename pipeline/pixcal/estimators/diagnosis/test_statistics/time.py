@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.fft import dct
 
-from pixcal.estimators.detector.flat_ladder import light_of
+from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker, light_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
 from pixcal.estimators.diagnosis.test_statistics.look import Look
@@ -165,14 +165,13 @@ def _of_stacks(kind: str) -> Statistic:
 def first_flats(evidence: Evidence) -> Curve | None:
     """Mean over the levels of the relative change; a lamp that flickers changes each by itself."""
     every = [light_of(evidence, s) for s in evidence.ladder if len(s.adu) > 1]
-    if len(every) < LEVELS_OF_FLATS or min(light.mean() for light in every) <= 0:
+    if flicker(evidence)[1] < FLICKER_KNOWN or min(light.mean() for light in every) <= 0:
         return None
     steps = [float(light[0] / light[1:].mean()) - 1 for light in every]
     return Curve(np.zeros(1), np.array([np.mean(steps)]))
 
 
 MIN_FRAMES = 8
-LEVELS_OF_FLATS = 3
 SPECTRA = tuple(_spectrum(name) for name in SERIES)
 STACKS = tuple(_of_stacks(kind) for kind in ("bias", "dark", "flat"))
 
