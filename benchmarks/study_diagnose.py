@@ -44,7 +44,7 @@ STRENGTHS = (0.3, 1.0, 3.0, 10.0)
 FIRST_SEED, SEEDS_APART = 5000, 10
 CODE = (
     "effects", "estimators", "kernels", "model", "simulation", "stages/diagnose", "stages/fit",
-    "stages/reduce", "stages/evidence.py", "stages/simulate.py",
+    "stages/reduce", "stages/evidence.py", "stages/simulate",
 )  # fmt: skip
 """Of pixcal, what a play depends on."""
 MOST_WRONG = 3

@@ -21,8 +21,9 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError, PlanError
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import recordings
-from pixcal.stages import simulate
 from pixcal.stages.simulate import Config, run
+from pixcal.stages.simulate import stage as simulate
+from pixcal.stages.simulate import truth as simulated_truth
 from pixcal.storage.artefact import artefact_key, read_manifest
 
 ROOT = Path(__file__).parents[2]
@@ -200,7 +201,8 @@ def test_the_bits_do_not_depend_on_how_the_work_is_cut(
         return [(0, 5), (5, 70), (70, 131)]
 
     monkeypatch.setattr(simulate, "FRAMES_PER_TASK", 5)
-    monkeypatch.setattr(simulate, "_blocks", odd_rows)
+    monkeypatch.setattr(simulate, "row_blocks", odd_rows)
+    monkeypatch.setattr(simulated_truth, "row_blocks", odd_rows)
     assert contents(simulated(tmp_path)) == contents(acq)
 
 

@@ -11,20 +11,18 @@ and its frames (``B``, ``A``, ``phi``, ``dkx``, ``dky``); and the bench file.
 
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import fields, replace
+from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-
 from pixcal.effects import known_effects, parse_effects
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.kernels import optics, synthesis
-from pixcal.kernels.scene import DetectorMaps, Rows, geometry
+from pixcal.kernels import synthesis
+from pixcal.kernels.scene import Rows
 from pixcal.model import acquisition as described
 from pixcal.model.arrays import U16
 from pixcal.model.bench import Bench, load_bench
@@ -32,26 +30,17 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.model.options import Simulate
 from pixcal.model.yaml_file import to_yaml
-from pixcal.simulation.effect import Effect
-from pixcal.simulation.exposure import Camera, states_of
+from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import Recording, recordings
-from pixcal.storage.artefact import (
-    MANIFEST,
-    Manifest,
-    artefact_key,
-    read_manifest,
-    write_json,
-    write_manifest,
-)
+from pixcal.stages.simulate.folders import put_in_place, resolved, up_to_date
+from pixcal.stages.simulate.truth import Effects, row_blocks, write_truth
+from pixcal.storage.artefact import Manifest, artefact_key
 from pixcal.storage.fits_out import COMPRESSED, FrameWriter
-from pixcal.storage.formats import STAGES, Stage
+from pixcal.storage.formats import STAGES
 from pixcal.storage.lock import lock
 from pixcal.storage.manifest import file_digest
 
-# maps that are told; read noise and gain of a simulated detector are the same in all pixels
-TRUTH_MAPS = tuple(f for f in fields(DetectorMaps) if f.name not in ("read_noise", "adu_per_e"))
-TRUTH_SCHEMA = "pixcal/truth/1"
-
+STAGE, TRUTH = STAGES["simulate"], STAGES["simulate-truth"]
 FRAMES_PER_TASK = 128  # the maps of some rows are made once for so many frames
 
 # peak of a task for each pixel of its rows: maps, phases in float64, one frame (measured)
@@ -66,8 +55,6 @@ _BYTES_PER_COMPRESSED_SAMPLE = 10
 _MJD_EPOCH = datetime(1858, 11, 17)
 
 Config = Simulate
-
-Effects = tuple[Effect, ...]
 
 
 class Exposes(Protocol):
@@ -95,16 +82,16 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
         If the bench file is wrong, or a directory holds what simulate did not put there.
     """
     plan = load_bench(bench)
-    out = _resolved(out, "--out")
-    truth = _resolved(config.truth or out.with_name(f"{out.name}-truth"), "--truth")
+    out = resolved(out, "--out")
+    truth = resolved(config.truth or out.with_name(f"{out.name}-truth"), "--truth")
     if truth.is_relative_to(out) or out.is_relative_to(truth):
         raise InputError(f"--truth {truth}: one inside the other with {out}; keep the truth apart")
     effects = _checked_effects(plan, bench, config.own)
     own = {f"effect {file.name}": file_digest(file) for file in config.own}
-    stage, told = STAGES["simulate"], STAGES["simulate-truth"]
-    key = artefact_key(stage.name, stage.format, to_plain(plan), own)
-    before, truth_before = _standing(out, stage, "--out"), _standing(truth, told, "--truth")
-    if before and truth_before and _whole(out, before, key) and _whole(truth, truth_before, key):
+    key = artefact_key(STAGE.name, STAGE.format, to_plain(plan), own)
+    before = up_to_date(out, STAGE, key, "--out")
+    # Both are looked at, so that nothing else is in the way of either.
+    if up_to_date(truth, TRUTH, key, "--truth") and before:
         return before
     aside, truth_aside = (p.with_name(f".{p.name}.partial") for p in (out, truth))
     with lock(aside):
@@ -114,16 +101,6 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
         finally:
             for folder in (aside, truth_aside):
                 shutil.rmtree(folder, ignore_errors=True)
-
-
-def _resolved(folder: Path, option: str) -> Path:
-    """Where a directory is, or will be made."""
-    try:
-        folder = folder.resolve()
-        folder.parent.mkdir(parents=True, exist_ok=True)
-    except (OSError, RuntimeError) as error:  # the latter for links in a circle
-        raise InputError(f"{option} {folder}: cannot be made ({error}); choose another") from error
-    return folder
 
 
 def acquire(
@@ -156,61 +133,15 @@ def _build(
         folder.mkdir(parents=True)
     recorded = recordings(plan)
     runtime = _fitting(plan, recorded, effects, runtime)
-    _write_truth(plan, effects, recorded, truth_made, runtime)
+    write_truth(plan, effects, recorded, truth_made, runtime)
     bench, *own = sources
     shutil.copyfile(bench, truth_made / "bench.yaml")
     for file in own:
         shutil.copyfile(file, truth_made / file.name)
     _write_frames(plan, effects, recorded, made, runtime)
     _write_description(plan, made)
-    _put(truth_made, truth_out, _manifest("simulate-truth", key, to_plain(plan)))
-    return _put(made, out, _manifest("simulate", key, {}))
-
-
-def _manifest(name: str, key: str, plain: dict[str, Any]) -> Manifest:
-    return Manifest(name, STAGES[name].format, key, plain, {})
-
-
-def _standing(folder: Path, stage: Stage, option: str) -> Manifest | None:
-    """Manifest of what stands where we want to write; refused when it is not simulate's."""
-    if not folder.exists():
-        return None
-    if not folder.is_dir():
-        raise InputError(f"{option} {folder}: a file is in the way; choose another directory")
-    there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if not p.is_dir()}
-    if not there:
-        return None
-    manifest = read_manifest(folder)
-    if manifest is None or manifest.stage != stage.name:
-        raise InputError(
-            f"{option} {folder}: not empty, and not made by 'pixcal simulate'; choose another"
-        )
-    foreign = sorted(there - set(manifest.summary.get("files", {})) - {MANIFEST})
-    if foreign:
-        raise InputError(f"{folder / foreign[0]}: not made by 'pixcal simulate'; move it away")
-    return manifest
-
-
-def _whole(folder: Path, manifest: Manifest, key: str) -> bool:
-    """Whether a directory was made from this bench and all of it is still there."""
-    return manifest.key == key and _sizes(folder) == manifest.summary.get("files")
-
-
-def _sizes(folder: Path) -> dict[str, int]:
-    files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p != folder / MANIFEST)
-    return {p.relative_to(folder).as_posix(): p.stat().st_size for p in files}
-
-
-def _put(made: Path, final: Path, manifest: Manifest) -> Manifest:
-    """Write the manifest and put a complete directory in place of what stood there."""
-    manifest.summary["files"] = _sizes(made)
-    write_manifest(made, manifest)
-    if final.exists():
-        old = made.with_name("replaced")
-        shutil.rmtree(old, ignore_errors=True)
-        final.rename(old)
-    made.rename(final)
-    return manifest
+    put_in_place(truth_made, truth_out, TRUTH, key, to_plain(plan))
+    return put_in_place(made, out, STAGE, key, {})
 
 
 def _checked_effects(bench: Bench, where: Path, own: tuple[Path, ...]) -> Effects:
@@ -222,12 +153,6 @@ def _checked_effects(bench: Bench, where: Path, own: tuple[Path, ...]) -> Effect
         except InputError as error:
             raise InputError(f"{where}: effects.{effect.name}: {error}") from error
     return found
-
-
-def _blocks(bench: Bench) -> list[Rows]:
-    """The window's rows, in the blocks that share their noise generator."""
-    ny, step = bench.detector.shape[0], synthesis.BLOCK_ROWS
-    return [(row, min(row + step, ny)) for row in range(0, ny, step)]
 
 
 def _fitting(
@@ -259,7 +184,7 @@ def _write_frames(
         files = _create_files(bench, recording, folder)
         ready += [(file, recording.folder in bench.frames.compress) for file in files]
         spans += _spans(recording, files, bench.frames.per_file)
-    pieces = list(product(_blocks(bench), _batches(spans)))
+    pieces = list(product(row_blocks(bench), _batches(spans)))
     run_tasks(partial(_write_piece, bench, effects, camera), pieces, runtime, label="frames")
     run_tasks(_finish, ready, runtime, label="files")
 
@@ -368,53 +293,3 @@ def _write_description(bench: Bench, folder: Path) -> None:
         ),
     )
     (folder / "acquisition.yaml").write_text(to_yaml(contents), encoding="utf-8")
-
-
-def _write_truth(
-    bench: Bench, effects: Effects, recorded: list[Recording], folder: Path, runtime: Runtime
-) -> None:
-    """Maps as FITS; geometry and frames as JSON."""
-    units = {"delta_x": "pix", "delta_y": "pix", "bias": "adu", "dark_rate": "electron/s"}
-    maps = [
-        FrameWriter.create(
-            folder / f"{field.name}.fits",
-            bench.detector.shape,
-            "uint8" if field.name == "mask" else "float32",
-            {"BUNIT": units[field.name]} if field.name in units else None,
-        )
-        for field in TRUTH_MAPS
-    ]
-    run_tasks(partial(_write_maps, bench, effects, maps), _blocks(bench), runtime, label="truth")
-    for writer in maps:
-        writer.finish()
-    sets = {s.folder: _set_truth(bench, effects, s) for s in recorded if s.kind == "fringes"}
-    write_json(folder / "truth.json", {"schema": TRUTH_SCHEMA, "sets": sets})
-
-
-def _write_maps(bench: Bench, effects: Effects, writers: list[FrameWriter], rows: Rows) -> None:
-    camera = Camera(bench, rows, effects)
-    skip = rows[0] - camera.rows[0]
-    keep = slice(skip, skip + rows[1] - rows[0])
-    for field, writer in zip(TRUTH_MAPS, writers, strict=True):
-        writer.write_rows(rows[0], getattr(camera.maps, field.name)[keep])
-
-
-def _set_truth(bench: Bench, effects: Effects, recording: Recording) -> dict[str, Any]:
-    g, states = geometry(bench, recording.number), states_of(recording, effects)
-    ny, nx = bench.detector.shape
-    kx, ky = optics.fringe_vector((nx - 1) / 2, (ny - 1) / 2, g)
-    return {
-        "centre_px": [g.centre_x / g.pitch, g.centre_y / g.pitch],
-        "baseline_mm": [g.baseline_x, g.baseline_y, g.baseline_z],
-        "distance_mm": g.distance,
-        "wavelength_nm": bench.optics.wavelength_nm,
-        "interfringe_px": float(2 * np.pi / np.hypot(kx, ky)),
-        "kx": float(kx),
-        "ky": float(ky),
-        "electrons": recording.electrons,
-        "B": states.level.tolist(),
-        "A": states.amplitude.tolist(),
-        "phi": states.phi.tolist(),
-        "dkx": states.dkx.tolist(),
-        "dky": states.dky.tolist(),
-    }

@@ -1,0 +1,80 @@
+"""The truth of a simulated acquisition: maps as FITS, geometry and frames of each set as JSON."""
+
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.kernels import optics, synthesis
+from pixcal.kernels.scene import DetectorMaps, Rows, geometry
+from pixcal.model.bench import Bench
+from pixcal.simulation.effect import Effect
+from pixcal.simulation.exposure import Camera, states_of
+from pixcal.simulation.recording import Recording
+from pixcal.storage.artefact import write_json
+from pixcal.storage.fits_out import FrameWriter
+
+Effects = tuple[Effect, ...]
+
+# maps that are told; read noise and gain of a simulated detector are the same in all pixels
+TRUTH_MAPS = tuple(f for f in fields(DetectorMaps) if f.name not in ("read_noise", "adu_per_e"))
+TRUTH_SCHEMA = "pixcal/truth/1"
+
+
+def row_blocks(bench: Bench) -> list[Rows]:
+    """The window's rows, in the blocks that share their noise generator."""
+    ny, step = bench.detector.shape[0], synthesis.BLOCK_ROWS
+    return [(row, min(row + step, ny)) for row in range(0, ny, step)]
+
+
+def write_truth(
+    bench: Bench, effects: Effects, recorded: list[Recording], folder: Path, runtime: Runtime
+) -> None:
+    """Maps as FITS; geometry and frames as JSON."""
+    units = {"delta_x": "pix", "delta_y": "pix", "bias": "adu", "dark_rate": "electron/s"}
+    maps = [
+        FrameWriter.create(
+            folder / f"{field.name}.fits",
+            bench.detector.shape,
+            "uint8" if field.name == "mask" else "float32",
+            {"BUNIT": units[field.name]} if field.name in units else None,
+        )
+        for field in TRUTH_MAPS
+    ]
+    run_tasks(partial(_write_maps, bench, effects, maps), row_blocks(bench), runtime, label="truth")
+    for writer in maps:
+        writer.finish()
+    sets = {s.folder: _set_truth(bench, effects, s) for s in recorded if s.kind == "fringes"}
+    write_json(folder / "truth.json", {"schema": TRUTH_SCHEMA, "sets": sets})
+
+
+def _write_maps(bench: Bench, effects: Effects, writers: list[FrameWriter], rows: Rows) -> None:
+    camera = Camera(bench, rows, effects)
+    skip = rows[0] - camera.rows[0]
+    keep = slice(skip, skip + rows[1] - rows[0])
+    for field, writer in zip(TRUTH_MAPS, writers, strict=True):
+        writer.write_rows(rows[0], getattr(camera.maps, field.name)[keep])
+
+
+def _set_truth(bench: Bench, effects: Effects, recording: Recording) -> dict[str, Any]:
+    g, states = geometry(bench, recording.number), states_of(recording, effects)
+    ny, nx = bench.detector.shape
+    kx, ky = optics.fringe_vector((nx - 1) / 2, (ny - 1) / 2, g)
+    return {
+        "centre_px": [g.centre_x / g.pitch, g.centre_y / g.pitch],
+        "baseline_mm": [g.baseline_x, g.baseline_y, g.baseline_z],
+        "distance_mm": g.distance,
+        "wavelength_nm": bench.optics.wavelength_nm,
+        "interfringe_px": float(2 * np.pi / np.hypot(kx, ky)),
+        "kx": float(kx),
+        "ky": float(ky),
+        "electrons": recording.electrons,
+        "B": states.level.tolist(),
+        "A": states.amplitude.tolist(),
+        "phi": states.phi.tolist(),
+        "dkx": states.dkx.tolist(),
+        "dky": states.dky.tolist(),
+    }
