@@ -8,12 +8,14 @@ import pytest
 
 from pixcal.effects.rolling_shutter import RollingShutter
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.row_settling import profile
 from pixcal.kernels.scene import frame_states
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.exposure import Camera, frames_of
 from pixcal.simulation.recording import recordings
 
+RINGING = tuple(0.015 * np.exp(-r / 0.9) * np.cos(12 * r) for r in np.linspace(0, 1, 25))
 LATE = 120_000.0
 """us: the frame's period less its exposure."""
 
@@ -109,7 +111,7 @@ def test_rows_are_turned_by_a_share_of_the_last_step(
 
 
 @pytest.mark.quick(1)
-@pytest.mark.parametrize("share", [SETTLING, tuple(np.linspace(0.01, -0.01, 9))])
+@pytest.mark.parametrize("share", [SETTLING, tuple(np.linspace(0.01, -0.01, 9)), RINGING])
 @pytest.mark.parametrize("origin", [None, 0.0])
 def test_a_modulator_that_settles_is_found(
     acquired: Callable[..., Evidence], share: tuple[float, ...], origin: float | None
@@ -121,7 +123,8 @@ def test_a_modulator_that_settles_is_found(
     assert isinstance(found.effect, RollingShutter)
     assert found.effect.of_step == "last"
     assert found.significance > 10
-    apart = np.array(found.effect.settling) - (np.array(share) - np.mean(share))
+    at = np.linspace(0, 1, len(share))
+    apart = profile(found.effect.settling, at) - (np.array(share) - np.mean(share))
     # But for the mean, which is the frames' own phase.
     assert np.ptp(apart) < 0.1 * np.ptp(share)
 

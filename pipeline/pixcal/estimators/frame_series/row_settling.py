@@ -15,7 +15,7 @@ from pixcal.estimators.frame_series.row_ramp import INSIDE, rows_of
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F64
 
-KNOTS = 9  # rows at equal distances at which the profile is given
+KNOTS = 13  # rows at equal distances at which the profile is given
 ORIGINS = 8  # phases tried as the one where the modulator's range begins
 # standard deviations from which that phase is sought more finely, and how finely, rad
 CLEAR, FINEST = 4.0, 0.01
@@ -106,8 +106,9 @@ def _fit(
         value, weight = np.array(slopes).T
         mean = float(np.average(value, weights=weight))
         line = np.linspace(-0.5, 0.5, KNOTS)
-        # Of a straight profile the fit's free fringe vectors have left nothing.
-        share = share - line * (line @ share) / (line @ line) + mean * line
+        # Of a profile's slope over the rows the fit's free fringe vectors have left nothing.
+        rows = terms @ line
+        share = share + line * (mean - rows @ terms @ share / (rows @ rows))
         variance = variance + line**2 / weight.sum()
         gain += mean**2 * float(weight.sum())
     return gain, share, np.sqrt(variance)
