@@ -45,8 +45,8 @@ from pixcal.storage.stage import copy_products, make, working
 STAGE = STAGES["allan"]
 SCHEMA = "pixcal/allan/1"
 MIN_BATCHES = 3
-# a task takes a square of as many of the fit's chunks a side: one file of each length
-TILES_A_SIDE = 4
+# a task takes so many of the fit's chunks, one above the other: one file of each length
+TILES_HIGH = 4
 COUNT_BYTES = 64 << 20  # of the digits of all values of a map (`quantiles_of_parts`)
 DIFFERENCES = 32  # differences in time whose products show what pixels share
 # levels of the quantiles that describe the noise over a region
@@ -81,10 +81,9 @@ class Batches:
         return cls(folder, len(time), (ny, nx), (cy, cx), facts["batch_frames"], step, note)
 
     def tiles(self, area: Region, times: int = 1) -> list[Tile]:
-        """Squares of ``times`` chunks a side, cut to an area."""
-        y0, y1, x0, x1 = area
-        sides = [c * times for c in self.chunks]
-        return list(product(_spans(y0, y1, sides[0]), _spans(x0, x1, sides[1])))
+        """So many chunks one above the other, cut to an area."""
+        (y0, y1, x0, x1), (cy, cx) = area, self.chunks
+        return list(product(_spans(y0, y1, times * cy), _spans(x0, x1, cx)))
 
     def read(self, name: str, tile: Tile) -> F32:
         """``batch_delta`` or ``batch_sigma`` (batch, y, x) of a tile, px."""
@@ -153,9 +152,9 @@ def _measure_set(
     folder = made.folder / "allan.zarr" / name
     lengths = averaging_lengths(batches.n)
     cy, cx = batches.chunks
-    tile_bytes = 4 * cy * cx * (2 * batches.n + len(lengths) * (TILES_A_SIDE**2 + 2))
+    tile_bytes = 4 * cy * cx * (2 * batches.n + len(lengths) * (TILES_HIGH + 2))
     # Some rows of a map in copies; counts of its values; draws of the curve.
-    rows = 16 * TILES_A_SIDE * cy * batches.window[1]
+    rows = 16 * TILES_HIGH * cy * batches.window[1]
     held = rows + COUNT_BYTES + 40 * MAX_DRAWS * len(lengths)
     plan = make_plan(f"the Allan deviation of {name}", tile_bytes, held, runtime)
     runtime = runtime.with_workers(plan.workers)
@@ -187,7 +186,8 @@ def _write_maps(
 ) -> None:
     """Deviation of every pixel, and what its error of the fit lets expect for one batch."""
     create_group(folder)
-    shape, chunks = batches.window, tuple(TILES_A_SIDE * c for c in batches.chunks)
+    (cy, cx), shape = batches.chunks, batches.window
+    chunks = (TILES_HIGH * cy, cx)
     options: dict[str, Any] = {"fill_value": np.nan, "attrs": {"units": "pixel"}}
     adev = create_array(
         folder / "adev", (len(lengths), *shape), "<f4", dims=("length", "y", "x"),
@@ -197,7 +197,7 @@ def _write_maps(
         folder / "expected", shape, "<f4", dims=("y", "x"), chunks=chunks, **options
     )
     done = made.journal()
-    squares = batches.tiles((0, shape[0], 0, shape[1]), TILES_A_SIDE)
+    squares = batches.tiles((0, shape[0], 0, shape[1]), TILES_HIGH)
     steps = {square: f"{name}:{square[0][0]},{square[1][0]}" for square in squares}
     squares = [square for square in squares if steps[square] not in done]
     run_tasks(
@@ -283,7 +283,7 @@ def _sums(
         return ArrayReader(batches.folder / "batch_count").read().astype(np.int64), []
     sums = run_tasks(
         partial(_sums_task, batches, lengths, folder / "expected"),
-        batches.tiles(region, TILES_A_SIDE),
+        batches.tiles(region, TILES_HIGH),
         runtime,
         label=f"region {_name(region)}",
     )

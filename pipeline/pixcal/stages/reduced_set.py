@@ -12,6 +12,8 @@ from pixcal.storage.cube import ArrayReader, CachedReader
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.place import Local, Place
 
+STRIP = 4  # tiles side by side whose maps are in one chunk: a file costs more than what is in it
+
 
 @dataclass
 class ReducedSet:
@@ -71,6 +73,18 @@ class ReducedSet:
         """Row and column of every tile, row by row."""
         rows, columns = self.grid
         return [(i, j) for i in range(rows) for j in range(columns)]
+
+    def strips(self) -> list[list[tuple[int, int]]]:
+        """The same in groups: neighbours in a row whose maps share a chunk."""
+        rows, columns = self.grid
+        starts = [(i, j) for i in range(rows) for j in range(0, columns, STRIP)]
+        return [[(i, n) for n in range(j, min(j + STRIP, columns))] for i, j in starts]
+
+    @property
+    def map_chunks(self) -> tuple[int, int]:
+        """Rows and columns of a chunk of maps (y, x)."""
+        _, cy, cx = self.signal.chunks
+        return cy, cx * min(STRIP, self.grid[1])
 
     @property
     def coding(self) -> Coding:

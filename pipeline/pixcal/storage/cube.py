@@ -436,8 +436,7 @@ class ArrayReader:
             block[...] = self._memory.values[tuple(slice(*ends) for ends in full)]
             return block
         scratch = np.empty(self.chunks, self.dtype)
-        spans = [range(a // c, -(-b // c)) for (a, b), c in zip(full, self.chunks, strict=True)]
-        for index in product(*spans):
+        for index in self._within(full):
             chunk = self.read_chunk(index, scratch)
             source, target = [], []
             for i, c, (a, b) in zip(index, self.chunks, full, strict=True):
@@ -446,6 +445,12 @@ class ArrayReader:
                 target.append(slice(lo - a, hi - a))
             block[tuple(target)] = chunk[tuple(source)]
         return block
+
+    def _within(self, ranges: Sequence[tuple[int, int]]) -> Iterator[tuple[int, ...]]:
+        """Chunks that hold a block."""
+        return product(
+            *(range(a // c, -(-b // c)) for (a, b), c in zip(ranges, self.chunks, strict=True))
+        )
 
     def tiles(self) -> Iterator[tuple[tuple[int, int], tuple[int, int]]]:
         """Ranges ((y0, y1), (x0, x1)) of the columns of chunks, for arrays (time, y, x)."""
@@ -482,6 +487,12 @@ class CachedReader(ArrayReader):
         if key not in self._kept:
             self._kept[key] = super().read_chunk(key)
         return self._kept[key]
+
+    def keep_block(self, *ranges: tuple[int, int]) -> None:
+        """Keep the chunks of a block, given one (start, stop) for each of the last axes."""
+        whole = [(0, n) for n in self.shape[: len(self.shape) - len(ranges)]]
+        for index in self._within([*whole, *ranges]):
+            self.keep(index)
 
     def holds(self, index: Sequence[int]) -> bool:
         """Whether a chunk is in memory."""

@@ -16,7 +16,7 @@ INDEX = "chunks.npy"
 DISK_FULL = (errno.ENOSPC, errno.EDQUOT)  # errors of the system that are no fault of the file
 # bytes that one task sends to a URL at the same time, and more than it reads ahead
 BATCH_BYTES = 16 << 20
-MANY_FILES = 1000  # that are not flushed one by one
+MANY_FILES = 250  # that are not flushed one by one
 
 
 # name of a file below a folder, such as `c/0/1/2`, and its content in parts

@@ -27,7 +27,7 @@ STAGES = {
     for stage in (
         Stage("ingest", 2, "ingest ACQ --out RUN", earlier=(1,), of_fringes=False),
         Stage("reduce", 1, "reduce RUN", of_fringes=False),
-        Stage("sweep", 3, "fit RUN"),
+        Stage("sweep", 4, "fit RUN"),
         Stage("fit", 1, "fit RUN"),
         Stage("allan", 1, "allan RUN"),
         Stage("crests", 1, "crests RUN"),

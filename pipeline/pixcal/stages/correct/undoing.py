@@ -52,7 +52,7 @@ def undo_on_maps(swept: Swept, target: Path, runtime: Runtime, name: str) -> Non
     tiles = swept.source.tiles()
     if swept.has_halves:
         halves = _create(target, swept, ("half_phase", "half_sigma"), HALVES)
-        plan = make_plan(f"halves of {name}", cy * cx * (28 * swept.n_batches + 100), 0, runtime)
+        plan = make_plan(f"halves of {name}", cy * cx * (44 * swept.n_batches + 100), 0, runtime)
         run_tasks(
             partial(_halve, swept, halves, middle), tiles, runtime.with_workers(plan.workers),
             label=f"halves {name}",

@@ -1,12 +1,14 @@
 """The maps of all sets and what they give together: one pass over the sweep's maps."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
@@ -17,15 +19,23 @@ from pixcal.estimators.fringe_fit.tile_sums import local_modes
 from pixcal.model.arrays import F32, F64, U8
 from pixcal.stages.fit.fringe_set import FittedSet
 from pixcal.stages.fit.scouting import read_frames
-from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
+from pixcal.stages.fit.sweep import BATCH_MAPS, rounded
+from pixcal.stages.reduced_set import STRIP
+from pixcal.storage.cube import (
+    ArrayReader,
+    ArrayWriter,
+    CachedReader,
+    create_array,
+    create_group,
+    write_array,
+)
 from pixcal.storage.links import link_files
 from pixcal.storage.place import Local
 
 SAME_AS_SWEPT = ("iota", "alpha", "chi2", "mask")
 """Maps of a set that are those of its sweep."""
-MANTISSA = 12
-"""Binary digits kept of the batches' maps: the others, far below their noise, would take as much
-disk again."""
+Writers = dict[tuple[str, str], ArrayWriter]
+"""By name of the set, "" for maps of all of them, and of the array."""
 TOLD, TOLD_IN_ALL = 4000, 4_000_000
 """Errors that a tile tells at most for the median of all, and about how many all of them tell."""
 
@@ -73,26 +83,28 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
     both = axes_span_plane([axis(f.shape, ny / 2, nx / 2) for f in fitted])
     outputs = outputs_of(both)
     create_group(group)
-    writers = {f.name: _create_set(group / f.name, f) for f in fitted}
-    joint = _create_joint(group, fitted[0], outputs)
+    writers = _create_joint(group, fitted[0], outputs)
+    for f in fitted:
+        writers |= _create_set(group / f.name, f)
     pixels = int(np.prod(source.signal.chunks[1:]))
     most = max(f.n_batches for f in fitted)
-    plan = make_plan(
-        "the maps of the fit", pixels * (500 + 60 * len(fitted) + 40 * most), 0, runtime
-    )
+    # Of a tile; of all maps of a strip, read, made and written.
+    per_pixel = 500 + 60 * len(fitted) + 40 * most + STRIP * len(fitted) * (60 + 20 * most)
+    plan = make_plan("the maps of the fit", pixels * per_pixel, 0, runtime)
     removed = {f.name: f.fit.basis.removed(f.planes, f.fit.coefficients) for f in fitted}
     # Each tile gets its own part of them: on a cluster they travel with it.
-    jobs = [
-        (at, {name: local[n] for name, local in removed.items()})
+    jobs = {
+        at: (at, {name: local[n] for name, local in removed.items()})
         for n, at in enumerate(source.tiles())
-    ]
-    told = run_tasks(
-        partial(_tile_task, fitted, writers, joint, both),
-        jobs,
+    }
+    every = run_tasks(
+        partial(_write_strip, fitted, writers, both),
+        [[jobs[at] for at in strip] for strip in source.strips()],
         runtime.with_workers(plan.workers),
         label="maps",
     )
-    for writer in [*(w for own in writers.values() for w in own.values()), *joint.values()]:
+    told = [of_tile for of_strip in every for of_tile in of_strip]
+    for writer in writers.values():
         writer.finish()
     sets = {}
     for n, f in enumerate(fitted):
@@ -107,23 +119,24 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
 def write_offsets(group: Local, fitted: list[FittedSet]) -> None:
     """Write the offsets of each set alone, as `write_maps` has them."""
     for f in fitted:
-        writer = _map_writers(group / f.name, f, ("delta",))["delta"]
+        swept = {name: ArrayReader(f.swept / name) for name in ("mask", "phase", "sigma")}
+        writer = _map_writer(group / f.name / "delta", f)
         removed = f.fit.basis.removed(f.planes, f.fit.coefficients)
-        for n, at in enumerate(f.source.tiles()):
-            y, x = f.source.ranges(at)
-            writer.write((y[0], x[0]), offsets(f, at, removed[n]).delta)
+        tiles = enumerate(f.source.tiles())
+        parts = {at: offsets(f, swept, at, removed[n]).delta for n, at in tiles}
+        for strip in f.source.strips():
+            (y, _), (x, _) = f.source.ranges(strip[0])
+            writer.write((y, x), np.concatenate([parts[at] for at in strip], axis=1))
         writer.finish()
 
 
-def _map_writers(group: Local, fitted: FittedSet, names: Sequence[str]) -> dict[str, ArrayWriter]:
-    """Maps (y, x) in pixels."""
-    return {
-        name: create_array(
-            group / name, fitted.source.shape, "<f4", dims=("y", "x"),
-            chunks=fitted.source.signal.chunks[1:], fill_value=np.nan, attrs={"units": "pixel"},
-        )
-        for name in names
-    }  # fmt: skip
+def _map_writer(place: Local, fitted: FittedSet, batches: int = 0) -> ArrayWriter:
+    """A map (y, x) in pixels, or one for each batch."""
+    many = (batches,) * (batches > 0)
+    return create_array(
+        place, (*many, *fitted.source.shape), "<f4", dims=("batch", "y", "x")[-2 - len(many) :],
+        chunks=(*many, *fitted.source.map_chunks), fill_value=np.nan, attrs={"units": "pixel"},
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -136,19 +149,45 @@ class _Told:
     freedom: int
 
 
-def _tile_task(
-    fitted: list[FittedSet],
-    writers: dict[str, dict[str, ArrayWriter]],
-    joint: dict[str, ArrayWriter],
-    both: bool,
-    job: tuple[tuple[int, int], dict[str, F64]],
-) -> _Told:
+Job = tuple[tuple[int, int], dict[str, F64]]
+"""A tile, and the modes removed from each set there."""
+Swept = Mapping[str, ArrayReader]
+"""Readers of the maps of a set's sweep."""
+
+
+def _write_strip(
+    fitted: list[FittedSet], writers: Writers, both: bool, strip: Sequence[Job]
+) -> list[_Told]:
+    """Write the maps of tiles side by side."""
+    (y0, y1), (x0, _) = fitted[0].source.ranges(strip[0][0])
+    _, (_, x1) = fitted[0].source.ranges(strip[-1][0])
+    swept: list[Swept] = []
+    for f in fitted:
+        names = ("phase", "sigma", *SAME_AS_SWEPT, *(BATCH_MAPS if f.n_batches else ()))
+        held = {name: CachedReader(f.swept / name) for name in names}
+        for reader in held.values():
+            # Those that are linked too: damage would be there for good.
+            reader.keep_block((y0, y1), (x0, x1))
+        swept.append(held)
+    found = [_maps_of_tile(fitted, swept, both, job) for job in strip]
+    for name, writer in writers.items():
+        data = np.concatenate([maps.pop(name) for maps, _ in found], axis=-1)
+        writer.write((*(0,) * (data.ndim - 2), y0, x0), data)
+    return [told for _, told in found]
+
+
+def _maps_of_tile(
+    fitted: list[FittedSet], readers: list[Swept], both: bool, job: Job
+) -> tuple[dict[tuple[str, str], NDArray[Any]], _Told]:
+    """Maps of a tile by the keys of their writers, and what there is to tell of it."""
     at, removed = job
     y, x = fitted[0].source.ranges(at)
-    for f in fitted:
-        for name in SAME_AS_SWEPT:
-            ArrayReader(f.swept / name).read_chunk(at)  # linked: damage would be there for good
-    found = [_write_set(f, at, removed[f.name], writers[f.name]) for f in fitted]
+    made: dict[tuple[str, str], NDArray[Any]] = {}
+    found = []
+    for f, swept in zip(fitted, readers, strict=True):
+        offset, maps = _maps_of_set(f, swept, at, removed[f.name])
+        found.append(offset)
+        made |= {(f.name, name): values for name, values in maps.items()}
     delta, sigma = (
         np.stack([getattr(m, name) for m in found]).astype(float) for name in ("delta", "sigma")
     )
@@ -160,16 +199,14 @@ def _tile_task(
     missing = ~np.isfinite(values).all(axis=0)
     # A flag counts where it costs the pixel its value; a set that others replace does not.
     flags = np.where(missing, np.bitwise_or.reduce(masks, axis=0), 0).astype(np.uint8)
-    start = (y[0], x[0])
     for name, own_value, own_error in zip(outputs_of(both), values, errors, strict=True):
-        joint[name].write(start, own_value)
-        joint[f"{name}_sigma"].write(start, own_error)
-    joint["mask"].write(start, flags)
+        made |= {("", name): own_value, ("", f"{name}_sigma"): own_error}
+    made["", "mask"] = flags
     freedom = np.isfinite(delta).sum(axis=0) - len(values)
     goods = [np.isfinite(s) for s in sigma]
     number = max(1, min(TOLD, TOLD_IN_ALL // len(fitted[0].planes)))
     some = [_some(s[good].astype(np.float32), number) for s, good in zip(sigma, goods, strict=True)]
-    return _Told(
+    return made, _Told(
         [int(good.sum()) for good in goods],
         some,
         float(chi2[~missing].sum()),
@@ -202,36 +239,35 @@ class SetOffsets:
     scale: np.float32
 
 
-def offsets(fitted: FittedSet, at: tuple[int, int], removed: F64) -> SetOffsets:
+def offsets(fitted: FittedSet, swept: Swept, at: tuple[int, int], removed: F64) -> SetOffsets:
     """Offsets of a set in a tile, the modes that were removed from its phases."""
     source = fitted.source
     y, x = source.ranges(at)
     plane = fitted.planes[at[0] * source.grid[1] + at[1]]
-    flags: U8 = ArrayReader(fitted.swept / "mask").read(y, x)
-    phase = ArrayReader(fitted.swept / "phase").read(y, x)
+    flags: U8 = swept["mask"].read(y, x)
+    phase = swept["phase"].read(y, x)
     shape = (phase.shape[0], phase.shape[1])
     modes = local_modes(fitted.carrier, plane, shape)
     surface = (removed[:, 0] @ modes).reshape(shape)
     k = float(np.hypot(*fitted.shape.vector(*plane.centre)))
     scale = np.float32(np.sqrt(fitted.noise) / k)
     delta = ((wrapped(phase - plane.on(shape)) - surface) / k).astype(np.float32)
-    sigma = np.asarray(ArrayReader(fitted.swept / "sigma").read(y, x) * scale)
+    sigma = np.asarray(swept["sigma"].read(y, x) * scale)
     delta[flags != 0] = sigma[flags != 0] = np.nan
     return SetOffsets(delta, sigma, flags, modes, k, scale)
 
 
-def _write_set(
-    fitted: FittedSet, at: tuple[int, int], removed: F64, writers: dict[str, ArrayWriter]
-) -> SetOffsets:
-    """Write a set's own maps of a tile."""
+def _maps_of_set(
+    fitted: FittedSet, swept: Swept, at: tuple[int, int], removed: F64
+) -> tuple[SetOffsets, dict[str, F32]]:
+    """A set's own maps of a tile."""
     y, x = fitted.source.ranges(at)
-    start, found = (y[0], x[0]), offsets(fitted, at, removed)
-    writers["delta"].write(start, found.delta)
-    writers["sigma"].write(start, found.sigma)
+    found = offsets(fitted, swept, at, removed)
+    made = {"delta": found.delta, "sigma": found.sigma}
     if fitted.n_batches:
         everything = (0, fitted.n_batches)
         for name, array in (("batch_delta", "batch_phase"), ("batch_sigma", "batch_sigma")):
-            maps = ArrayReader(fitted.swept / array).read(everything, y, x).astype(np.float32)
+            maps = swept[array].read(everything, y, x)
             if name == "batch_delta":
                 surfaces = removed[:, 1:].T.astype(np.float32) @ found.modes.astype(np.float32)
                 maps -= surfaces.reshape(maps.shape)
@@ -240,11 +276,11 @@ def _write_set(
             else:
                 maps *= found.scale
             maps[:, found.flags != 0] = np.nan
-            writers[name].write((0, *start), _rounded(maps))
-    return found
+            made[name] = rounded(maps)
+    return found, made
 
 
-def _create_set(folder: Path, fitted: FittedSet) -> dict[str, ArrayWriter]:
+def _create_set(folder: Path, fitted: FittedSet) -> Writers:
     """The set's folder: what is the sweep's is linked; writers of the rest."""
     create_group(folder)
     for name in SAME_AS_SWEPT:
@@ -254,24 +290,18 @@ def _create_set(folder: Path, fitted: FittedSet) -> dict[str, ArrayWriter]:
         assert isinstance(swept, Path)
         link_files(swept, folder / name)
     _write_frames(folder, fitted.swept)
-    writers = _map_writers(folder, fitted, ("delta", "sigma"))
-    (cy, cx), shape = fitted.source.signal.chunks[1:], fitted.source.shape
     n = fitted.n_batches
+    writers = {name: _map_writer(folder / name, fitted) for name in ("delta", "sigma")}
     for name in ("batch_delta", "batch_sigma") if n else ():
-        writers[name] = create_array(
-            folder / name, (n, *shape), "<f4", dims=("batch", "y", "x"), chunks=(n, cy, cx),
-            fill_value=np.nan, attrs={"units": "pixel"},
-        )  # fmt: skip
-    return writers
+        writers[name] = _map_writer(folder / name, fitted, n)
+    return {(fitted.name, name): writer for name, writer in writers.items()}
 
 
-def _create_joint(
-    group: Path, fitted: FittedSet, outputs: tuple[str, ...]
-) -> dict[str, ArrayWriter]:
-    (cy, cx), shape = fitted.source.signal.chunks[1:], fitted.source.shape
+def _create_joint(group: Path, fitted: FittedSet, outputs: tuple[str, ...]) -> Writers:
     names = [array for name in outputs for array in (name, f"{name}_sigma")]
-    writers = _map_writers(group, fitted, names)
-    writers["mask"] = create_array(group / "mask", shape, "u1", dims=("y", "x"), chunks=(cy, cx))
+    writers = {("", name): _map_writer(group / name, fitted) for name in names}
+    shape, chunks = fitted.source.shape, fitted.source.map_chunks
+    writers["", "mask"] = create_array(group / "mask", shape, "u1", dims=("y", "x"), chunks=chunks)
     return writers
 
 
@@ -290,14 +320,6 @@ def _write_frames(folder: Path, maps: Local) -> None:
 def outputs_of(both: bool) -> tuple[str, ...]:
     """Maps that sets give together, whose axes differ or not."""
     return ("delta_x", "delta_y") if both else ("delta_fringe",)
-
-
-def _rounded(values: F32) -> F32:
-    """Rounded to `MANTISSA` digits, in place; what is no number stays none."""
-    bits, dropped = values.view(np.uint32), 23 - MANTISSA
-    bits += np.uint32(1 << (dropped - 1))
-    bits &= np.uint32(0xFFFFFFFF ^ ((1 << dropped) - 1))
-    return values
 
 
 def _some(values: F32, number: int) -> F32:

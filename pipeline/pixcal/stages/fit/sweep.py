@@ -4,12 +4,14 @@ What it leaves, ``RUN/sweep``, holds for every model of the fringes' geometry, w
 the phases afterwards: trying another model does not read the cube again.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
@@ -21,13 +23,13 @@ from pixcal.estimators.fringe_fit.sweep import BOUND_PIXELS, TileMaps, frames_to
 from pixcal.estimators.fringe_fit.tile_fit import Tile
 from pixcal.estimators.fringe_fit.tile_sums import Carrier, TileSums, sum_row
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.arrays import F64, Mask
+from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Sweep
 from pixcal.stages.fit.scouting import CACHE_BYTES, read_frames, scout_set
 from pixcal.stages.fitted_shape import nominal_vector
-from pixcal.stages.reduced_set import ReducedSet
+from pixcal.stages.reduced_set import STRIP, ReducedSet
 from pixcal.storage.artefact import (
     Build,
     Manifest,
@@ -46,8 +48,10 @@ CHI2_SAMPLES = 4096
 MIN_SAMPLES = 16
 MAPS = ("iota", "alpha", "phase", "sigma", "chi2")
 BATCH_MAPS = ("batch_phase", "batch_sigma")
-BATCH_DTYPE = "<f2"
-"""Half precision rounds them by a few thousandths of their noise, and halves the time they take."""
+MANTISSA = 12
+"""Binary digits kept of the batches' maps: the others, far below their noise, would take as much
+disk again."""
+TABLES = ("tiles", "sums")  # of a row of numbers for each tile
 
 
 Config = Sweep
@@ -159,17 +163,19 @@ def sweep_set(
     # Codes held until the start model stands and those of the chunk at hand; sums, maps and modes;
     # what is kept of each batch.
     held = 2 * min(prime, source.n_frames) + 4 * source.block
-    per_task = cy * cx * (held + 900 + 24 * n_batches + source.more_bytes)
+    kept = STRIP * (40 + 16 * n_batches)
+    per_task = cy * cx * (held + 900 + 24 * n_batches + kept + source.more_bytes)
     plan = make_plan(f"the fit of {name}", per_task, CACHE_BYTES, runtime)
-    tiles = [t for t in source.tiles() if f"{name}:{t[0]},{t[1]}" not in done]
+    strips = {f"{name}:{strip[0]}": strip for strip in source.strips()}
+    steps = [step for step in strips if step not in done]
     carrier = Carrier((float(facts["k"][0]), float(facts["k"][1])), frames.reference)
     job = _Job(source, writers, frames, carrier, batches, prime, facts["noise"], config.chi2_limit)
     run_tasks(
-        partial(_sweep_task, job),
-        tiles,
+        partial(_sweep_strip, job),
+        [strips[step] for step in steps],
         runtime.with_workers(plan.workers),
         label=f"fit {name}",
-        done=lambda n, _: made.note(f"{name}:{tiles[n][0]},{tiles[n][1]}"),
+        done=lambda n, _: made.note(steps[n]),
     )
     for writer in writers.values():
         writer.finish()
@@ -190,9 +196,8 @@ def sweep_set(
 
 
 def _create_maps(folder: Local, source: ReducedSet, n_batches: int) -> dict[str, ArrayWriter]:
-    """Arrays that the tasks write, one chunk a tile."""
-    ny, nx = source.shape
-    cy, cx = source.signal.chunks[1:]
+    """Arrays that the tasks write, one chunk a strip."""
+    (ny, nx), (cy, cx) = source.shape, source.map_chunks
     units = {"iota": "electron", "alpha": "electron", "phase": "radian", "sigma": "radian"}
     writers = {
         name: create_array(
@@ -206,14 +211,14 @@ def _create_maps(folder: Local, source: ReducedSet, n_batches: int) -> dict[str,
     )
     for name in BATCH_MAPS if n_batches else ():
         writers[name] = create_array(
-            folder / name, (n_batches, ny, nx), BATCH_DTYPE, dims=("batch", "y", "x"),
+            folder / name, (n_batches, ny, nx), "<f4", dims=("batch", "y", "x"),
             chunks=(n_batches, cy, cx), fill_value=np.nan,
         )  # fmt: skip
     width = 1 + _bound_pixels(source) + _chi2_pixels(source)
-    for name, numbers in (("tiles", width), ("sums", TileSums.width(n_batches))):
+    for name, numbers in zip(TABLES, (width, TileSums.width(n_batches)), strict=True):
         writers[name] = create_array(
             folder / name, (*source.grid, numbers), "<f8", dims=("row", "column", "fact"),
-            chunks=(1, 1, numbers), fill_value=np.nan,
+            chunks=(1, min(STRIP, source.grid[1]), numbers), fill_value=np.nan,
         )  # fmt: skip
     return writers
 
@@ -229,8 +234,19 @@ def _chi2_pixels(source: ReducedSet) -> int:
     return max(MIN_SAMPLES, CHI2_SAMPLES // (rows * columns))
 
 
-def _sweep_task(job: _Job, at: tuple[int, int]) -> None:
-    source, writers = job.source, job.writers
+def _sweep_strip(job: _Job, strip: Sequence[tuple[int, int]]) -> None:
+    """Sweep tiles side by side and write their maps."""
+    parts = [_sweep_tile(job, at) for at in strip]
+    (y, _), (x, _) = job.source.ranges(strip[0])
+    for name, writer in job.writers.items():
+        of_tiles = name in TABLES
+        data = np.concatenate([part.pop(name) for part in parts], axis=1 if of_tiles else -1)
+        writer.write((*strip[0], 0) if of_tiles else (*(0,) * (data.ndim - 2), y, x), data)
+
+
+def _sweep_tile(job: _Job, at: tuple[int, int]) -> dict[str, NDArray[Any]]:
+    """A tile's maps, and its rows of the tables, by the names of their arrays."""
+    source = job.source
     tile, mask = source.tile(at), source.mask(at)
     fresh = sum(not source.signal.holds((n, *at)) for n in range(source.n_blocks))
     number = _bound_pixels(source)
@@ -238,26 +254,29 @@ def _sweep_task(job: _Job, at: tuple[int, int]) -> None:
         tile, source.blocks(at), source.coding, job.frames, job.carrier.k, job.batches, job.prime,
         number,
     )  # fmt: skip
-    start = (tile.y[0], tile.x[0])
-    for name in MAPS:
-        writers[name].write(start, getattr(maps, name))
-    for name in BATCH_MAPS if "batch_phase" in writers else ():
-        # Of values that half precision does not hold (errors above 65504 rad) nothing is known.
-        with np.errstate(over="ignore"):
-            writers[name].write((0, *start), getattr(maps, name).astype(BATCH_DTYPE))
     flags = fit_flags(
         mask, maps.iota, maps.alpha, maps.sigma, maps.chi2, maps.count, job.noise, job.chi2_limit
     )
-    writers["mask"].write(start, flags)
     usable = (mask == 0) & np.isfinite(maps.chi2)
     chi2 = maps.chi2[usable]
     chi2 = chi2[:: -(-len(chi2) // _chi2_pixels(source)) or 1]
-    facts = np.full((1, 1, writers["tiles"].shape[2]), np.nan)
+    facts = np.full((1, 1, job.writers["tiles"].shape[2]), np.nan)
     facts[0, 0, 0] = fresh
     facts[0, 0, 1 : 1 + len(maps.bound)] = maps.bound
     facts[0, 0, 1 + number : 1 + number + len(chi2)] = chi2
-    writers["tiles"].write((*at, 0), facts)
-    writers["sums"].write((*at, 0), _sums(job, tile, maps, flags == 0)[None, None])
+    sums = _sums(job, tile, maps, flags == 0)[None, None]
+    found = {name: getattr(maps, name) for name in MAPS}
+    # In place, once the sums have been taken.
+    found |= {name: rounded(getattr(maps, name)) for name in BATCH_MAPS}
+    return found | {"mask": flags, "tiles": facts, "sums": sums}
+
+
+def rounded(values: F32) -> F32:
+    """Rounded to `MANTISSA` digits, in place; what is no number stays none."""
+    bits, dropped = values.view(np.uint32), 23 - MANTISSA
+    bits += np.uint32(1 << (dropped - 1))
+    bits &= np.uint32(0xFFFFFFFF ^ ((1 << dropped) - 1))
+    return values
 
 
 def _sums(job: _Job, tile: Tile, maps: TileMaps, good: Mask) -> F64:
