@@ -19,11 +19,11 @@ from pixcal.stages.budget.expected import (
     frames_needed,
     grid,
     joined,
-    levers,
     pixel_contrast,
     planned_split,
     sample_variance,
 )
+from pixcal.stages.budget.levers import levers
 
 ROOT = Path(__file__).parents[2]
 

@@ -20,15 +20,8 @@ from pixcal.stages.crests.crest_fit import (
     relative_phase,
     valley,
 )
-from pixcal.stages.crests.crests import (
-    SEED_PIXELS,
-    CrestCarrier,
-    CrestPaths,
-    Windows,
-    find_crests,
-    seed_vector,
-    tile_sums,
-)
+from pixcal.stages.crests.crests import SEED_PIXELS, CrestPaths, find_crests, seed_vector, tile_sums
+from pixcal.stages.crests.windows import CrestCarrier, Windows
 
 F64 = NDArray[np.float64]
 WIDE_PITCH = 40e-3

@@ -9,7 +9,7 @@ from pixcal.effects.lag import Lag
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.simulation.effect import FringeMaps
 from pixcal.stages.advice import size_of
-from pixcal.stages.diagnose.nominal import FittedSet
+from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.on_map import on_map
 
 K = (0.03, 2 * np.pi / 9)

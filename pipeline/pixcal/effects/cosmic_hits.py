@@ -135,33 +135,16 @@ class CosmicHits(Effect):
 
 @dataclass(frozen=True)
 class _Search:
-    """Outliers of a sequence of frames.
+    """Outliers of a sequence of frames."""
 
-    Attributes
-    ----------
-    exposure : float
-        Area times time, cm² s.
-    samples : int
-    limit : float
-        From how many sigmas on a sample is an outlier.
-    peaks, noise : (hit,) float64
-        Brightest sample of each hit upwards, and sigma there; e-.
-    downwards : int
-        Hits downwards.
-    sigmas : (q,) float64
-        Quantiles of sigma, e-.
-    even : bool
-        Whether sigma is about the same in all pixels.
-    """
-
-    exposure: float
+    exposure: float  # area times time, cm² s
     samples: int
-    limit: float
-    peaks: F64
+    limit: float  # from how many sigmas on a sample is an outlier
+    peaks: F64  # peaks, noise: (hit,) brightest sample of each hit upwards, and sigma there; e-
     noise: F64
-    downwards: int
-    sigmas: F64
-    even: bool
+    downwards: int  # hits downwards
+    sigmas: F64  # (q,) quantiles of sigma, e-
+    even: bool  # whether sigma is about the same in all pixels
 
 
 def _searches(evidence: Evidence) -> Iterator[_Search]:

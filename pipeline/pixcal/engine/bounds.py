@@ -20,18 +20,11 @@ class Exceeded(BaseException):
 
 @dataclass(frozen=True)
 class Bound:
-    """What work may use.
+    """What work may use."""
 
-    Attributes
-    ----------
-    seconds : float
-        Processor time of its own thread: what others do on the machine makes no difference.
-    memory : int
-        Bytes of this process.
-    """
-
+    # processor time of its own thread: what others do on the machine makes no difference
     seconds: float
-    memory: int = sys.maxsize
+    memory: int = sys.maxsize  # bytes of this process
 
     @contextmanager
     def kept(self) -> Iterator[None]:

@@ -21,21 +21,13 @@ class Detail:
 
 @dataclass(frozen=True)
 class MapContents:
-    """One product of the fit; all maps in px.
+    """One product of the fit; all maps in px."""
 
-    Attributes
-    ----------
-    name : str
-        ``delta_x``, ``delta_y`` or ``delta_fringe``.
-    detail : Detail, optional
-        Where the whole map is shown in means of blocks.
-    """
-
-    name: str
+    name: str  # ``delta_x``, ``delta_y`` or ``delta_fringe``
     delta: MapSummary
     sigma: MapSummary
     spectrum: Spectrum | None
-    detail: Detail | None = None
+    detail: Detail | None = None  # where the whole map is shown in means of blocks
 
 
 @dataclass(frozen=True)
@@ -57,26 +49,16 @@ class FrameSeries:
 
 @dataclass(frozen=True)
 class SetContents:
-    """One fringe set.
-
-    Attributes
-    ----------
-    facts : dict
-        Its entry in ``fit.json``.
-    iota, visibility, chi2 : MapSummary
-        Mean level (e-), alpha / iota, reduced chi-square.
-    allan : dict, optional
-        Its entry in ``allan.json``.
-    """
+    """One fringe set."""
 
     name: str
-    facts: dict[str, Any]
-    iota: MapSummary
+    facts: dict[str, Any]  # its entry in ``fit.json``
+    iota: MapSummary  # iota, visibility, chi2: mean level (e-), alpha / iota, reduced chi-square
     visibility: MapSummary
     chi2: MapSummary
     flags: FlagSummary
     series: FrameSeries
-    allan: dict[str, Any] | None = None
+    allan: dict[str, Any] | None = None  # its entry in ``allan.json``
 
 
 # title and unit of each map of the reduction

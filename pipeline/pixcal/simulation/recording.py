@@ -16,39 +16,22 @@ SEEDS_APART = 1_000_003
 
 @dataclass(frozen=True)
 class Recording:
-    """Frames taken one after the other under the same conditions.
-
-    Attributes
-    ----------
-    bench : Bench
-    kind : str
-        ``bias``, ``dark``, ``flat`` or ``fringes``.
-    number : int
-        Among those of its kind.
-    folder, stem : str
-        Of its files.
-    count : int
-        Frames.
-    exptime_s : float
-    start_s, period_s : float
-        First frame after the start of the acquisition, and from frame to frame.
-    electrons : float
-        Electrons for unit light: of a flat its mean, of fringes as in `electrons_per_unit`.
-    window : int
-        Which, where several windows of a detector are simulated by themselves: they share what
-        happens to a frame, and not the noise of their pixels.
-    """
+    """Frames taken one after the other under the same conditions."""
 
     bench: Bench
-    kind: str
-    number: int
-    folder: str
+    kind: str  # ``bias``, ``dark``, ``flat`` or ``fringes``
+    number: int  # among those of its kind
+    folder: str  # folder, stem: of its files
     stem: str
-    count: int
+    count: int  # frames
     exptime_s: float
+    # start_s, period_s: first frame after the start of the acquisition, and from frame to frame
     start_s: float
     period_s: float
+    # electrons for unit light: of a flat its mean, of fringes as in `electrons_per_unit`
     electrons: float
+    # which, where several windows of a detector are simulated by themselves: they share what
+    # happens to a frame, and not the noise of their pixels
     window: int = 0
 
     @property

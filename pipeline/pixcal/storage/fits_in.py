@@ -49,22 +49,12 @@ _STORED = {8: "u1", 16: "i2", 32: "i4", -32: "f4"}
 
 @dataclass(frozen=True)
 class Coding:
-    """How samples are coded: value = bscale × stored + bzero.
+    """How samples are coded: value = bscale × stored + bzero."""
 
-    Attributes
-    ----------
-    bitpix : int
-        FITS code of the stored type.
-    bscale, bzero : float
-        Slope and offset (ADU).
-    blank : int or None
-        Stored integer that stands for a missing sample.
-    """
-
-    bitpix: int
-    bscale: float = 1.0
+    bitpix: int  # FITS code of the stored type
+    bscale: float = 1.0  # bscale, bzero: slope and offset (ADU)
     bzero: float = 0.0
-    blank: int | None = None
+    blank: int | None = None  # stored integer that stands for a missing sample
 
     @cached_property
     def exact(self) -> bool:
@@ -85,38 +75,19 @@ class Coding:
 
 @dataclass(frozen=True)
 class FrameFile:
-    """A file with one frame or a cube of frames.
+    """A file with one frame or a cube of frames."""
 
-    Attributes
-    ----------
-    source : SourceFile
-        The file.
-    container : {"plain", "gzip", "tiles", "picture"}
-        ``tiles``: an image compressed by tiles, in a binary table. ``picture``: TIFF or PNG.
-    hdu : int
-        Number of the header and data unit that holds the image.
-    offset : int
-        Byte where its data begin (once decompressed, for ``gzip``).
-    shape : tuple of int
-        (planes, y, x).
-    coding : Coding
-        How the samples are stored.
-    tile : tuple of int
-        (planes, rows) of a compressed tile; (1, 1) for other containers.
-    mjd : float or None
-        Time stamp of the first plane (modified Julian date, days).
-    exptime_s, temperature_c : float or None
-        Exposure time (s) and detector temperature (degrees Celsius).
-    """
-
-    source: SourceFile
+    source: SourceFile  # the file
+    # ``tiles``: an image compressed by tiles, in a binary table. ``picture``: TIFF or PNG.
     container: Container
-    hdu: int
-    offset: int
-    shape: tuple[int, int, int]
-    coding: Coding
+    hdu: int  # number of the header and data unit that holds the image
+    offset: int  # byte where its data begin (once decompressed, for ``gzip``)
+    shape: tuple[int, int, int]  # (planes, y, x)
+    coding: Coding  # how the samples are stored
+    # (planes, rows) of a compressed tile; (1, 1) for other containers
     tile: tuple[int, int] = (1, 1)
-    mjd: float | None = None
+    mjd: float | None = None  # time stamp of the first plane (modified Julian date, days)
+    # exptime_s, temperature_c: exposure time (s) and detector temperature (degrees Celsius)
     exptime_s: float | None = None
     temperature_c: float | None = None
 

@@ -28,66 +28,33 @@ NO_SAMPLE = -(1 << 30)
 
 @dataclass(frozen=True)
 class FringeEvidence:
-    """One fringe set on a part of the window, and what the fit found there.
-
-    Attributes
-    ----------
-    name : str
-    baseline_mm : (float, float)
-        Nominal.
-    k : (float, float)
-        Fringe vector (kx, ky) at the window's centre, rad/px.
-    origin : (int, int)
-        Row and column of the part's first pixel in the window.
-    window : (int, int)
-        Rows and columns of the whole window.
-    time_s, exptime_s : (t,), float
-        Time of each frame, s; exposure time (nan when unknown).
-    electrons : (t, y, x) float32
-        Reduced samples (bias and dark taken off, divided by the flat); NaN without weight.
-    adu : (t, y, x) uint16 or other
-        The same samples as the camera wrote them.
-    g : (t, 3) float64
-        (B, A cos phi, A sin phi) at the middle of the part.
-    dk : (t, 2) float64
-        Change of the fringe vector (x, y), rad/px; zeros when the fit held it.
-    free : (t, 5) float64
-        (B, A cos phi, A sin phi, dkx, dky) of each frame by itself, from this part's pixels, with
-        the fringe vector free whether the fit held it or not.
-    free_covariance : (t, 5, 5) float64
-        Of ``free``, from the noise of the samples.
-    theta : (3, y, x) float64
-        (iota, alpha sin psi, alpha cos psi), e-.
-    sigma : (y, x) float64
-        1-sigma error of the phase psi, rad, of the noise.
-    delta : (y, x) float64
-        Offset along the fringe axis, px, modes removed; NaN where masked.
-    good : (y, x) bool
-    read_variance, shot_factor : (y, x) float64
-        Variance of a sample: ``shot_factor * model + read_variance`` (e-²).
-    start_s : float
-        Time of the set's first frame after that of the acquisition; nan when unknown.
-    """
+    """One fringe set on a part of the window, and what the fit found there."""
 
     name: str
-    baseline_mm: tuple[float, float]
-    k: tuple[float, float]
-    origin: tuple[int, int]
-    window: tuple[int, int]
-    time_s: F64
+    baseline_mm: tuple[float, float]  # nominal
+    k: tuple[float, float]  # fringe vector (kx, ky) at the window's centre, rad/px
+    origin: tuple[int, int]  # row and column of the part's first pixel in the window
+    window: tuple[int, int]  # rows and columns of the whole window
+    time_s: F64  # time_s, exptime_s: time of each frame, s; exposure time (nan when unknown)
     exptime_s: float
+    # (t, y, x) reduced samples (bias and dark taken off, divided by the flat); NaN without weight
     electrons: F32
-    adu: NDArray[np.generic]
-    g: F64
-    dk: F64
+    adu: NDArray[np.generic]  # (t, y, x) the same samples as the camera wrote them
+    g: F64  # (t, 3) (B, A cos phi, A sin phi) at the middle of the part
+    dk: F64  # (t, 2) change of the fringe vector (x, y), rad/px; zeros when the fit held it
+    # (t, 5) (B, A cos phi, A sin phi, dkx, dky) of each frame by itself, from this part's pixels,
+    # with the fringe vector free whether the fit held it or not
     free: F64
-    free_covariance: F64
-    theta: F64
-    sigma: F64
-    delta: F64
-    good: Mask
+    free_covariance: F64  # (t, 5, 5) of ``free``, from the noise of the samples
+    theta: F64  # (3, y, x) (iota, alpha sin psi, alpha cos psi), e-
+    sigma: F64  # (y, x) 1-sigma error of the phase psi, rad, of the noise
+    delta: F64  # (y, x) offset along the fringe axis, px, modes removed; NaN where masked
+    good: Mask  # (y, x)
+    # read_variance, shot_factor: (y, x) variance of a sample: ``shot_factor * model +
+    # read_variance`` (e-²)
     read_variance: F64
     shot_factor: F64
+    # time of the set's first frame after that of the acquisition; nan when unknown
     start_s: float = np.nan
 
     @cached_property
@@ -143,84 +110,42 @@ class FringeEvidence:
 
 @dataclass(frozen=True)
 class Stack:
-    """Calibration frames of one kind and exposure time, as the camera wrote them.
+    """Calibration frames of one kind and exposure time, as the camera wrote them."""
 
-    Attributes
-    ----------
-    kind : str
-        ``bias``, ``dark`` or ``flat``.
-    exptime_s : float
-        nan when unknown.
-    time_s : (t,) float64
-        Time of each frame, from the first of its kind.
-    adu : (t, y, x) float32
-    start_s : float
-        Time of the first of its kind after the first frame of the acquisition; nan when unknown.
-    step : int
-        Of the lamp, among flats of one exposure time; 0 is the dimmest.
-    """
-
-    kind: str
-    exptime_s: float
-    time_s: F64
-    adu: F32
+    kind: str  # ``bias``, ``dark`` or ``flat``
+    exptime_s: float  # nan when unknown
+    time_s: F64  # (t,) time of each frame, from the first of its kind
+    adu: F32  # (t, y, x)
+    # time of the first of its kind after the first frame of the acquisition; nan when unknown
     start_s: float = np.nan
-    step: int = 0
+    step: int = 0  # of the lamp, among flats of one exposure time; 0 is the dimmest
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """A part of the window of an acquisition that was reduced and fitted.
+    """A part of the window of an acquisition that was reduced and fitted."""
 
-    Attributes
-    ----------
-    fringes : mapping
-        Fringe sets by name.
-    stacks : tuple of Stack
-        Bias, darks and flats.
-    gain : float
-        e-/ADU.
-    read_noise : float
-        Of a sample, the rounding of the converter included; e- rms.
-    amplifier_noise : float
-        The same before rounding.
-    bias, dark_rate, flat : (y, x) float64
-        Calibration maps: ADU, e-/s, relative.
-    good : (y, x) bool
-        Pixels without flags.
-    saturation_adu : float
-        Declared, or the end of the samples' type.
-    pitch_um, wavelength_nm, distance_mm : float
-        Nominal bench.
-    origin : (int, int)
-        Row and column of the part's first pixel in the window.
-    photon_transfer : (float, float, float)
-        Gain that photon transfer gives (e-/ADU), its error, and the reduced chi-square; nan where
-        it gives none.
-    neighbours : tuple of (int, int)
-        Lags (rows, columns) whose noise that gain counts.
-    step_adu : int
-        Of which all calibration samples are multiples.
-    """
-
-    fringes: Mapping[str, FringeEvidence]
-    stacks: tuple[Stack, ...]
-    gain: float
-    read_noise: float
-    amplifier_noise: float
-    bias: F64
+    fringes: Mapping[str, FringeEvidence]  # fringe sets by name
+    stacks: tuple[Stack, ...]  # bias, darks and flats
+    gain: float  # e-/ADU
+    read_noise: float  # of a sample, the rounding of the converter included; e- rms
+    amplifier_noise: float  # the same before rounding
+    bias: F64  # bias, dark_rate, flat: (y, x) calibration maps: ADU, e-/s, relative
     dark_rate: F64
     flat: F64
-    good: Mask
-    saturation_adu: float
-    pitch_um: float
+    good: Mask  # (y, x) pixels without flags
+    saturation_adu: float  # declared, or the end of the samples' type
+    pitch_um: float  # pitch_um, wavelength_nm, distance_mm: nominal bench
     wavelength_nm: float
     distance_mm: float
     notes: tuple[str, ...] = field(default=())
-    origin: tuple[int, int] = (0, 0)
+    origin: tuple[int, int] = (0, 0)  # row and column of the part's first pixel in the window
+    # gain that photon transfer gives (e-/ADU), its error, and the reduced chi-square; nan where it
+    # gives none
     photon_transfer: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+    # lags (rows, columns) whose noise that gain counts
     neighbours: tuple[tuple[int, int], ...] = ()
-    step_adu: int = 1
+    step_adu: int = 1  # of which all calibration samples are multiples
     _found: dict[Any, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def once(self, name: str, *given: Any, make: Callable[[], T]) -> T:

@@ -28,7 +28,6 @@ from pixcal.report.budget_figures import budget_figure
 from pixcal.report.drawing import png
 from pixcal.stages.budget.expected import (
     JoinedBound,
-    Lever,
     SetBound,
     bias_frames_needed,
     brightest_allowed,
@@ -37,11 +36,11 @@ from pixcal.stages.budget.expected import (
     frame_rms,
     frames_needed,
     joined,
-    levers,
     own_effects,
     planned_split,
     sample_variance,
 )
+from pixcal.stages.budget.levers import Lever, levers
 from pixcal.storage.artefact import digest, write_json
 
 SCHEMA = "pixcal/budget/1"

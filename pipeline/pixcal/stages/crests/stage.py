@@ -23,7 +23,7 @@ from pixcal import __version__
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels.demodulation import N_SUMS
-from pixcal.kernels.optics import PARAMETERS, Geometry, paraxial_vector, phase, phase_jacobian
+from pixcal.kernels.optics import paraxial_vector
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, I64, Mask
 from pixcal.model.config import result_options
@@ -39,15 +39,9 @@ from pixcal.stages.crests.crest_fit import (
     fit_crests,
     valley,
 )
-from pixcal.stages.crests.crests import (
-    SEED_PIXELS,
-    CrestCarrier,
-    CrestPaths,
-    Windows,
-    find_crests,
-    seed_vector,
-    tile_sums,
-)
+from pixcal.stages.crests.crests import SEED_PIXELS, CrestPaths, find_crests, seed_vector, tile_sums
+from pixcal.stages.crests.facts import agreement, fitted_geometry, geometry_facts, warnings
+from pixcal.stages.crests.windows import CrestCarrier, Windows
 from pixcal.stages.fit.sweep import load_run
 from pixcal.stages.fitted_shape import nominal_geometry
 from pixcal.stages.reduced_set import ReducedSet
@@ -60,7 +54,6 @@ STAGE = STAGES["crests"]
 SCHEMA = "pixcal/crests/1"
 MAP_SIDE = 21  # places along each side of a cost map; odd, so that the minimum is one of them
 MAP_REACH = 0.04  # how far the maps go from the minimum, as a share of distance and baseline
-NOTABLE_CHI2 = 3.0  # from here on the reduced chi-square of the points is pointed out
 FIGURE_BYTES = 128 << 20  # Matplotlib and one figure
 
 Range = tuple[int, int]
@@ -134,7 +127,7 @@ def _measure(
     picture = crest_figure(_view(name, source, frames[0], paths, fit, maps))
     (made.folder / f"crests-{name}.png").write_bytes(png(picture))
     costs = (maps["cost_baseline"], maps["cost_ratio"], maps["valley_cost"])
-    other, note = _fitted_geometry(facts.get(name), nominal)
+    other, note = fitted_geometry(facts.get(name), nominal)
     return {
         "frames": [n for n, phi in zip(frames, paths.phi, strict=True) if np.isfinite(phi)],
         "points": len(paths),
@@ -143,13 +136,13 @@ def _measure(
         "interfringe_px": paths.interfringe,
         "segment_px": paths.segment,
         "point_sigma_median_px": float(np.median(paths.sigma_px)),
-        "geometry": _geometry_facts(fit),
+        "geometry": geometry_facts(fit),
         "cost_rad2": fit.cost,
         "chi2_reduced": fit.chi2_reduced,
         "evaluations": fit.evaluations,
         "unique_minimum": all(falls_then_rises(cost) for cost in costs),
-        "warnings": _warnings(fit),
-        "agreement": None if other is None else _agreement(paths, fit, *other),
+        "warnings": warnings(fit),
+        "agreement": None if other is None else agreement(paths, fit, *other),
         "agreement_note": note,
     }
 
@@ -262,71 +255,6 @@ def _arrays(
         "valley_ratio": (best, ("distance",), {}),
         "valley_cost": (cost, ("distance",), {}),
     }  # fmt: skip
-
-
-def _warnings(fit: CrestFit) -> list[str]:
-    sentences = []
-    if fit.chi2_reduced > NOTABLE_CHI2:
-        sentences.append(
-            f"points scatter {np.sqrt(fit.chi2_reduced):.1f} times more than their noise; errors "
-            "allow for it as if points were independent, which offsets of whole blocks are not"
-        )
-    lost = int((~fit.used).sum())
-    if lost > 0.05 * len(fit.used):
-        sentences.append(f"{lost} of {len(fit.used)} points are outliers and were left out")
-    return sentences
-
-
-def _geometry_facts(fit: CrestFit) -> dict[str, float]:
-    columns = {
-        "_mm": fit.geometry.vector(), "_sigma_mm": fit.sigma,
-        "_nominal_mm": fit.prior.nominal.vector(), "_prior_sigma_mm": fit.prior.sigma,
-    }  # fmt: skip
-    return {
-        name + suffix: float(values[n])
-        for n, name in enumerate(PARAMETERS)
-        for suffix, values in columns.items()
-    }
-
-
-def _fitted_geometry(
-    facts: Mapping[str, Any] | None, nominal: Geometry
-) -> tuple[tuple[Geometry, F64] | None, str]:
-    """Geometry of the hyperbolic fit and its errors (mm), or why there is none."""
-    if facts is None:
-        return None, "RUN/fit is not there yet"
-    if facts["model"] != "hyperbolic":
-        return None, f"the fit took {facts['model']} fringes, which have no positions of the fibres"
-    fitted = facts["geometry"]
-    geometry = nominal.with_vector([fitted[f"{name}_mm"] for name in PARAMETERS])
-    return (geometry, np.array([fitted[f"{name}_sigma_mm"] for name in PARAMETERS])), ""
-
-
-def _agreement(paths: CrestPaths, fit: CrestFit, other: Geometry, sigma: F64) -> dict[str, Any]:
-    """Differences to another fit's geometry, parameter by parameter and in what they predict."""
-    difference = fit.geometry.vector() - other.vector()
-    both = np.hypot(fit.sigma, sigma)
-    ny, nx = paths.frame
-    y, x = (a.ravel() for a in np.mgrid[0 : ny - 1 : 33j, 0 : nx - 1 : 33j])
-    difference_rad = phase(x, y, fit.geometry) - phase(x, y, other)
-    modes = phase_jacobian(x, y, fit.geometry)
-    modes -= modes.mean(axis=0)
-    expected = np.einsum("ni,ij,nj->n", modes, fit.covariance, modes)
-    px = paths.interfringe / (2 * np.pi)
-    return {
-        "parameters": {
-            name: {
-                "difference_mm": float(d),
-                "sigma_mm": float(s),
-                "difference_sigma": float(d / s),
-                "from_prior": bool(prior),
-            }
-            for name, d, s, prior in zip(PARAMETERS, difference, both, fit.from_prior, strict=True)
-        },
-        "phase_rms_px": float(np.std(difference_rad) * px),
-        "phase_max_px": float(np.max(np.abs(difference_rad - difference_rad.mean())) * px),
-        "phase_sigma_px": float(np.sqrt(expected.mean()) * px),
-    }
 
 
 def _view(

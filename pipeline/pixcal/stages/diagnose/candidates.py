@@ -13,32 +13,16 @@ NEARLY_ALL = 0.9
 
 @dataclass
 class Candidate:
-    """An effect that may be a cause.
-
-    Attributes
-    ----------
-    name : str
-    estimate : Estimate, optional
-        From the fitted frames.
-    reason : str
-        Why it was rejected; empty when it was accepted.
-    alone : Trial, optional
-        The bench with this effect only.
-    ways : int
-        Number of variants that were simulated; the likeliest one counts.
-    share : float
-        Fraction of its significance that the causes accepted before it do not produce.
-    replay : Effect, optional
-        The effect as measured, whatever its law.
-    """
+    """An effect that may be a cause."""
 
     name: str
-    estimate: Estimate | None
-    reason: str = ""
-    alone: Trial | None = None
-    ways: int = 1
+    estimate: Estimate | None  # from the fitted frames
+    reason: str = ""  # why it was rejected; empty when it was accepted
+    alone: Trial | None = None  # the bench with this effect only
+    ways: int = 1  # number of variants that were simulated; the likeliest one counts
+    # fraction of its significance that the causes accepted before it do not produce
     share: float = 1.0
-    replay: Effect | None = None
+    replay: Effect | None = None  # the effect as measured, whatever its law
 
     @property
     def significance(self) -> float:
@@ -73,22 +57,12 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class Addition:
-    """A variant of a candidate, added to the causes.
-
-    Attributes
-    ----------
-    name : str
-    effect : Effect
-        As simulated.
-    trial : Trial
-    gain : float
-        In log-likelihood, over the causes without it in as many simulations.
-    """
+    """A variant of a candidate, added to the causes."""
 
     name: str
-    effect: Effect
+    effect: Effect  # as simulated
     trial: Trial
-    gain: float
+    gain: float  # in log-likelihood, over the causes without it in as many simulations
 
 
 Additions = dict[str, Addition]
@@ -97,23 +71,13 @@ Additions = dict[str, Addition]
 
 @dataclass
 class Accepted:
-    """Causes accepted so far.
+    """Causes accepted so far."""
 
-    Attributes
-    ----------
-    current : Trial
-        The bench with all of them.
-    shares : dict
-        Fraction of the significance of each remaining candidate that they do not produce.
-    effects : dict
-        By name, in the order of acceptance.
-    alike : dict
-        By the name of a cause, the candidates that fit about as well.
-    """
-
-    current: Trial
+    current: Trial  # the bench with all of them
+    # fraction of the significance of each remaining candidate that they do not produce
     shares: dict[str, float]
-    effects: dict[str, Effect] = field(default_factory=dict)
+    effects: dict[str, Effect] = field(default_factory=dict)  # by name, in the order of acceptance
+    # by the name of a cause, the candidates that fit about as well
     alike: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     @property
@@ -124,30 +88,17 @@ class Accepted:
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Causes that were accepted, and the simulations that decided.
+    """Causes that were accepted, and the simulations that decided."""
 
-    Attributes
-    ----------
-    nominal, final : Trial
-        The bench without effects, and with all causes.
-    accepted : tuple of str
-        Names of the causes, in the order of acceptance.
-    without : mapping
-        The bench with all causes but one, by its name.
-    candidates : mapping
-    alike : mapping
-        By the name of a cause, the candidates that fit about as well.
-    by_law : mapping
-        The bench with one cause as the best of its laws describes it, by its name. A cause that is
-        its own law is left out.
-    """
-
-    nominal: Trial
+    nominal: Trial  # nominal, final: the bench without effects, and with all causes
     final: Trial
-    accepted: tuple[str, ...]
-    without: Mapping[str, Trial]
+    accepted: tuple[str, ...]  # names of the causes, in the order of acceptance
+    without: Mapping[str, Trial]  # the bench with all causes but one, by its name
     candidates: Mapping[str, Candidate]
+    # by the name of a cause, the candidates that fit about as well
     alike: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    # the bench with one cause as the best of its laws describes it, by its name. A cause that is
+    # its own law is left out.
     by_law: Mapping[str, Trial] = field(default_factory=dict)
 
 

@@ -21,25 +21,17 @@ _FLICKER = 103
 
 @dataclass(frozen=True)
 class FlatLight:
-    """Light of the flats.
+    """Light of the flats."""
 
-    Attributes
-    ----------
-    flicker, wander : float
-        Relative rms from frame to frame, and of levels about the line over exposure time.
-    one_lamp : bool
-        Whether the levels are those of one lamp; else they are taken as measured.
-    freedom : float
-        Degrees of freedom that ``flicker`` is known by.
-    frames : mapping
-        By the number of a recording, the light (t,) of each frame over the mean; NaN for frames
-        that are drawn: the first, which may lack what stayed behind, and those not looked at.
-    """
-
+    # flicker, wander: relative rms from frame to frame, and of levels about the line over exposure
+    # time
     flicker: float = 0.0
     wander: float = 0.0
+    # whether the levels are those of one lamp; else they are taken as measured
     one_lamp: bool = False
-    freedom: float = math.inf
+    freedom: float = math.inf  # degrees of freedom that ``flicker`` is known by
+    # by the number of a recording, the light (t,) of each frame over the mean; NaN for frames that
+    # are drawn: the first, which may lack what stayed behind, and those not looked at
     frames: Mapping[int, F64] = field(default_factory=dict)
 
     @classmethod

@@ -41,26 +41,13 @@ CLEAR = 20.0
 
 @dataclass(frozen=True)
 class Inquiry:
-    """A search, and all that it was made of.
+    """A search, and all that it was made of."""
 
-    Attributes
-    ----------
-    base : tuple of Effect
-        That the nominal bench has from the start.
-    look : DiagnosisInput
-    trials : Trials
-    reference : Reference
-    data : mapping
-        Curves of the data on the reference's scales.
-    search : Search
-    found : SearchResult
-    """
-
-    base: Effects
+    base: Effects  # that the nominal bench has from the start
     look: DiagnosisInput
     trials: Trials
     reference: Reference
-    data: Mapping[Key, F64]
+    data: Mapping[Key, F64]  # curves of the data on the reference's scales
     search: Search
     found: SearchResult
 

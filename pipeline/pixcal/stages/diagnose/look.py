@@ -39,33 +39,17 @@ FEWEST_FRAMES = 24
 
 @dataclass(frozen=True)
 class DiagnosisInput:
-    """What is looked at.
+    """What is looked at."""
 
-    Attributes
-    ----------
-    first : Window
-        That effects are fitted on.
-    windows : tuple of Window
-        That they are tried on.
-    each : tuple of mapping
-        Curves of the test frames of each window.
-    measured : mapping
-        Their mean.
-    facts : dict
-        What is told of it.
-    runtime, few : Runtime
-        With as many workers as fit the memory: of simulations, and of estimates.
-    room : bool
-        Whether estimates on frames that are taken again fit in beside simulations, here.
-    """
-
-    first: Window
-    windows: tuple[Window, ...]
-    each: tuple[Curves, ...]
-    measured: Curves
-    facts: dict[str, Any]
+    first: Window  # that effects are fitted on
+    windows: tuple[Window, ...]  # that they are tried on
+    each: tuple[Curves, ...]  # curves of the test frames of each window
+    measured: Curves  # their mean
+    facts: dict[str, Any]  # what is told of it
+    # runtime, few: with as many workers as fit the memory: of simulations, and of estimates
     runtime: Runtime
     few: Runtime
+    # whether estimates on frames that are taken again fit in beside simulations, here
     room: bool = False
 
 

@@ -27,20 +27,12 @@ OF_NOISE = (Stage.CHARGE, Stage.SIGNAL)
 
 @dataclass(frozen=True)
 class MeasuredGain:
-    """Gain of the amplifiers over the one that electrons were counted with.
+    """Gain of the amplifiers over the one that electrons were counted with."""
 
-    Attributes
-    ----------
-    amplifiers : (y, x) float64
-        Of each pixel's amplifier over the detector's mean.
-    transfer : tuple of (float, float)
-        Gain by photon transfer, and its 1-sigma error, of each part of the flats.
-    neighbours : tuple of (int, int)
-        Lags (rows, columns) whose covariances the photon transfer counts.
-    """
-
-    amplifiers: F64
+    amplifiers: F64  # (y, x) of each pixel's amplifier over the detector's mean
+    # gain by photon transfer, and its 1-sigma error, of each part of the flats
     transfer: tuple[tuple[float, float], ...] = ()
+    # lags (rows, columns) whose covariances the photon transfer counts
     neighbours: tuple[tuple[int, int], ...] = ()
 
     def drawn(self, rng: np.random.Generator, change: float = 1.0) -> F32:

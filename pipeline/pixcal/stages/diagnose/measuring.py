@@ -20,15 +20,13 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, Indices, Mask
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.description import bench_of, recordings_of
+from pixcal.stages.diagnose.fitted_set import FittedSet, contrast_surface, light_surface
 from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain
 from pixcal.stages.diagnose.nominal import (
-    FittedSet,
     Measured,
     NominalBench,
     SetTruth,
-    contrast_surface,
-    light_surface,
 )
 from pixcal.stages.diagnose.parts import Half, Table
 

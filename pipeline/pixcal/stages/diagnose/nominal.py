@@ -11,67 +11,41 @@ are what a simulation must bring about by some effect.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.fringe_fit.fringes import grid
-from pixcal.estimators.maps.corrected import corrected_offsets, phase_change, straight_modes
-from pixcal.estimators.maps.structure import OffsetModel, smooth_surface, true_offsets
-from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.arrays import F32, F64, Indices, Mask
+from pixcal.model.arrays import F32, F64, Indices
 from pixcal.model.bench import Bench
-from pixcal.simulation.effect import Effect, FringeMaps, Stage
+from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import SEEDS_APART, Recording
 from pixcal.simulation.shot import Shot
 from pixcal.stages import reduce
+from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_change
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
-from pixcal.stages.diagnose.undone import (
-    FitOfFrames,
-    IntensityBeforeEffects,
-    undone_on_samples,
-)
+from pixcal.stages.diagnose.undone import IntensityBeforeEffects
 
-TWO_BEAMS = 2
-"""Degree, over a window, of the logarithm of the contrast of two Gaussian beams (their intensities'
-ratio is the exponential of a quadratic form)."""
 _GAIN, _NOISE = 101, 102
 """Keys of random numbers."""
 
 
 @dataclass(frozen=True)
 class SetTruth:
-    """One fringe set of the nominal bench.
+    """One fringe set of the nominal bench."""
 
-    Attributes
-    ----------
-    light : (y, x) float32
-        Mean, for unit response, e-.
-    contrast : (y, x) float32
-        Fringe amplitude over the mean, a smooth surface.
-    psi : (y, x) float64
-        Phase of the pixels if they had no offsets, rad.
-    k : (float, float)
-        Fringe vector, rad/px.
-    step : float
-        Of a ramp of the phase, rad; zero: no ramp.
-    phi : (t,) float64
-        Phase of every frame as measured, rad; NaN for frames that were not looked at.
-    """
-
-    light: F32
-    contrast: F32
-    psi: F64
-    k: tuple[float, float]
-    step: float
-    phi: F64
+    light: F32  # (y, x) mean, for unit response, e-
+    contrast: F32  # (y, x) fringe amplitude over the mean, a smooth surface
+    psi: F64  # (y, x) phase of the pixels if they had no offsets, rad
+    k: tuple[float, float]  # fringe vector, rad/px
+    step: float  # of a ramp of the phase, rad; zero: no ramp
+    phi: F64  # (t,) phase of every frame as measured, rad; NaN for frames that were not looked at
 
     def phase(self, delta_x: F32, delta_y: F32) -> F64:
         """Phase (y, x) of the pixels at their offsets (px), rad."""
@@ -139,132 +113,22 @@ class Measured(Effect):
         return FrameStates(phi, np.ones(count), np.ones(count), still, still)
 
 
-def light_surface(theta: F64, good: Mask) -> F64:
-    """Mean light (y, x) of a fit's maps, smooth over the window."""
-    return smooth_surface(np.where(good, theta[0], np.nan), good)
-
-
-def contrast_surface(theta: F64, good: Mask) -> F64:
-    """Contrast (y, x) of a fit's maps as two Gaussian beams can make it over a window."""
-    alpha = np.hypot(*theta[1:])
-    used = good & (alpha > 0) & (theta[0] > 0)
-    log = np.where(used, np.log(np.where(used, alpha / theta[0], 1.0)), np.nan)
-    return np.asarray(np.exp(smooth_surface(log, used, TWO_BEAMS)))
-
-
-@dataclass(frozen=True)
-class FittedSet:
-    """What was fitted of a fringe set.
-
-    Attributes
-    ----------
-    theta : (3, y, x) float64
-        NaN in bad pixels.
-    delta, sigma : (y, x) float64
-        Offset and its error, px; NaN in bad pixels.
-    k : (float, float)
-        rad/px.
-    origin : (int, int)
-    flat : (y, x) float64, optional
-    name : str
-        Of the set.
-    light, contrast : (y, x) float32 or float
-        What mean and contrast of the fringes are times those that were measured.
-    g : (t, 3) float64, optional
-        Intensity, and amplitude times cosine and sine of the phase, of the frames that were fitted.
-    """
-
-    theta: F64
-    delta: F64
-    sigma: F64
-    k: tuple[float, float]
-    origin: tuple[int, int]
-    flat: F64 | None = None
-    name: str = ""
-    light: F32 | float = 1.0
-    contrast: F32 | float = 1.0
-    g: F64 | None = None
-
-    def without(self, effects: Sequence[Effect]) -> "FittedSet":
-        """The same with effects undone that act on maps: offsets as fitted with them known."""
-        maps = by_maps = before = FringeMaps(
-            filled(self.theta, self.k), self.k, self.origin, self.flat, self.name
-        )
-        for effect in sorted(effects, key=lambda e: e.turn, reverse=True):
-            # Their levels are those of `IntensityBeforeEffects`, without the noise of maps.
-            by_maps = effect.undo(by_maps) or by_maps
-            maps = effect.undo(maps) or undone_on_samples(effect, maps, self._fit) or maps
-        if maps is before:
-            return replace(self, flat=None)
-        size = float(np.hypot(*self.k))
-        delta = corrected_offsets(
-            self.delta,
-            self.sigma,
-            phase_change(before.theta, maps.theta),
-            straight_modes(before.theta, self.k),
-            size,
-        )
-        good = np.asarray(np.isfinite(self.theta).all(axis=0))
-        light = light_surface(by_maps.theta, good) / light_surface(before.theta, good)
-        contrast = contrast_surface(by_maps.theta, good) / contrast_surface(before.theta, good)
-        return replace(
-            self,
-            delta=delta,
-            flat=maps.flat,
-            light=light.astype(np.float32),
-            contrast=contrast.astype(np.float32),
-        )
-
-    @cached_property
-    def _fit(self) -> FitOfFrames | None:
-        if self.g is None:
-            return None
-        maps = FringeMaps(filled(self.theta, self.k), self.k, self.origin, self.flat, self.name)
-        return FitOfFrames.of(maps, self.g)
-
-    @cached_property
-    def offsets(self) -> OffsetModel:
-        """Offsets that can be true."""
-        return true_offsets(self.delta, self.sigma, np.arctan2(*filled(self.theta, self.k)[1:]))
-
-
 @dataclass(frozen=True)
 class NominalBench:
-    """An acquisition's nominal bench, ready to take the same frames again.
-
-    Attributes
-    ----------
-    acquisition : Acquisition
-    tables : mapping
-        Of all frames, as in ``frames.json``.
-    reduction : reduce.Config
-    dtypes : mapping
-        Of the samples of each array.
-    bench : Bench
-        Geometry and what effects ask for.
-    measured : Measured
-        Without offsets.
-    noise : PixelNoise, optional
-        Read noise of the pixels.
-    gain : MeasuredGain
-    fits : tuple of FittedSet
-        What was fitted of each fringe set.
-    recordings : tuple of Recording
-        In the order of their arrays; one for each exposure time of calibration frames.
-    places : tuple of (str, int array)
-        Array of each recording and the numbers of its frames there.
-    """
+    """An acquisition's nominal bench, ready to take the same frames again."""
 
     acquisition: Acquisition
-    tables: Mapping[str, Table]
+    tables: Mapping[str, Table]  # of all frames, as in ``frames.json``
     reduction: reduce.Config
-    dtypes: Mapping[str, np.dtype[Any]]
-    bench: Bench
-    measured: Measured
-    noise: PixelNoise | None
+    dtypes: Mapping[str, np.dtype[Any]]  # of the samples of each array
+    bench: Bench  # geometry and what effects ask for
+    measured: Measured  # without offsets
+    noise: PixelNoise | None  # read noise of the pixels
     gain: MeasuredGain
-    fits: tuple[FittedSet, ...]
+    fits: tuple[FittedSet, ...]  # what was fitted of each fringe set
+    # in the order of their arrays; one for each exposure time of calibration frames
     recordings: tuple[Recording, ...]
+    # array of each recording and the numbers of its frames there
     places: tuple[tuple[str, Indices], ...]
 
     def simulate(

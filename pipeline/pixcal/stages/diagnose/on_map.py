@@ -11,7 +11,7 @@ from pixcal.estimators.maps.corrected import phase_change, straight_modes
 from pixcal.kernels.crosstalk import filled
 from pixcal.model.arrays import F64
 from pixcal.simulation.effect import Effect, FringeMaps
-from pixcal.stages.diagnose.nominal import FittedSet
+from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.undone import undone_on_samples
 from pixcal.stages.treatment import fitted_shapes, treatment_of
 

@@ -26,36 +26,20 @@ Table = Mapping[str, list[Any]]
 
 @dataclass(frozen=True)
 class Half:
-    """Some frames of every array of an acquisition.
+    """Some frames of every array of an acquisition."""
 
-    Attributes
-    ----------
-    frames : mapping
-        Numbers of the frames (ascending) by name of the array, e.g. ``bias``, ``fringes/vertical``.
-    """
-
+    # numbers of the frames (ascending) by name of the array, e.g. ``bias``, ``fringes/vertical``.
     frames: Mapping[str, Indices]
 
 
 @dataclass(frozen=True)
 class Raw:
-    """Frames of a part of the window, in ADU.
-
-    Attributes
-    ----------
-    acquisition : Acquisition
-    arrays : mapping
-        (t, y, x) by name of the array.
-    tables : mapping
-        What is known of each frame, in columns, as in ``frames.json``.
-    reduction : reduce.Config
-        How to reduce them.
-    """
+    """Frames of a part of the window, in ADU."""
 
     acquisition: Acquisition
-    arrays: Mapping[str, Frames]
-    tables: Mapping[str, Table]
-    reduction: reduce.Config
+    arrays: Mapping[str, Frames]  # (t, y, x) by name of the array
+    tables: Mapping[str, Table]  # what is known of each frame, in columns, as in ``frames.json``
+    reduction: reduce.Config  # how to reduce them
 
     @property
     def checksum(self) -> int:

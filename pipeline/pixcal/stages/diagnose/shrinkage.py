@@ -25,14 +25,7 @@ DRAWS = 200
 
 @dataclass(frozen=True)
 class Trial:
-    """A bench held against the data.
-
-    Attributes
-    ----------
-    effects : tuple of Effect
-    expected : Expectation
-    log_likelihood : float
-    """
+    """A bench held against the data."""
 
     effects: Effects
     expected: Expectation
@@ -41,21 +34,11 @@ class Trial:
 
 @dataclass(frozen=True)
 class Shrinkage:
-    """How far the gap shrinks, with its interval (5 to 95 %).
+    """How far the gap shrinks, with its interval (5 to 95 %)."""
 
-    Attributes
-    ----------
-    before, after : mapping
-        Differences of the curves.
-    where : set
-        Curves that make up the gap.
-    gap : Gap
-    interval : (float, float)
-    """
-
-    before: Mapping[Key, Difference]
+    before: Mapping[Key, Difference]  # before, after: differences of the curves
     after: Mapping[Key, Difference]
-    where: set[Key]
+    where: set[Key]  # curves that make up the gap
     gap: Gap
     interval: tuple[float, float]
 

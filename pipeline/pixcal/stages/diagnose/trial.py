@@ -33,28 +33,15 @@ Effects = tuple[Effect, ...]
 
 @dataclass(frozen=True)
 class Window:
-    """A part of the detector that is looked at.
+    """A part of the detector that is looked at."""
 
-    Attributes
-    ----------
-    part : ((int, int), (int, int))
-        Rows and columns.
-    bench : NominalBench
-        As measured there.
-    learn, test : Half
-        Frames that effects are fitted on, and frames that they are tried on.
-    whole : (int, int)
-        Rows and columns of the detector's window.
-    seed : int
-        To which those of simulations are added: every acquisition is held against other random
-        numbers, so that what chance does to one is not done to all of them.
-    """
-
-    part: Part
-    bench: NominalBench
-    learn: Half
+    part: Part  # rows and columns
+    bench: NominalBench  # as measured there
+    learn: Half  # learn, test: frames that effects are fitted on, and frames that they are tried on
     test: Half
-    whole: tuple[int, int]
+    whole: tuple[int, int]  # rows and columns of the detector's window
+    # to which those of simulations are added: every acquisition is held against other random
+    # numbers, so that what chance does to one is not done to all of them
     seed: int = 0
 
     def evidence(
@@ -74,26 +61,15 @@ class Window:
 
 @dataclass(frozen=True)
 class Trials:
-    """Simulations of the test frames of some windows; none is made twice.
-
-    Attributes
-    ----------
-    windows : tuple of Window
-    scratch : Path
-        Folder for what is written in between; a run that goes on finds its simulations there.
-    runtime : Runtime
-    signatures : tuple of Signature
-        Effects whose estimates are statistics too.
-    estimates : mapping
-        By name, of effects whose parameters are known within errors: from the seed ``exact`` on
-        they are moved by these, so that the scatter of the simulations holds what they leave open.
-    exact : int
-    """
+    """Simulations of the test frames of some windows; none is made twice."""
 
     windows: tuple[Window, ...]
+    # folder for what is written in between; a run that goes on finds its simulations there
     scratch: Path
     runtime: Runtime
-    signatures: tuple[Signature, ...] = ()
+    signatures: tuple[Signature, ...] = ()  # effects whose estimates are statistics too
+    # by name, of effects whose parameters are known within errors: from the seed ``exact`` on they
+    # are moved by these, so that the scatter of the simulations holds what they leave open
     estimates: Mapping[str, Estimate] = field(default_factory=dict)
     exact: int = 0
     _made: dict[tuple[frozenset[Effect], int], list[Curves] | str] = field(default_factory=dict)

@@ -89,17 +89,12 @@ class FitOfFrames:
 
     Where phases are few or not spread evenly, harmonics of a change have a part in the maps: by the
     pixels' fit directly, and by the frames' parameters that the fit finds beside.
-
-    Attributes
-    ----------
-    psi : (y, x) float64
-        Phase of the pixels, rad.
-    by_pixel, by_frames : (3, MAP_PHASES, y, x) float32
-        Weights by which a change at each of the phases is summed into the maps: that of the pixel
-        itself, and that of all pixels against the phase of their own fringe.
     """
 
-    psi: F64
+    psi: F64  # (y, x) phase of the pixels, rad
+    # by_pixel, by_frames: (3, MAP_PHASES, y, x) weights by which a change at each of the phases is
+    # summed into the maps: that of the pixel itself, and that of all pixels against the phase of
+    # their own fringe
     by_pixel: F32
     by_frames: F32
 

@@ -39,64 +39,31 @@ FAR_PERIOD = 0.15
 
 @dataclass(frozen=True)
 class SetFit:
-    """A shape fitted to a set.
+    """A shape fitted to a set."""
 
-    Attributes
-    ----------
-    basis : ModeBasis
-        The shape and the modes about it.
-    coefficients : (mode, 1 + batch) float64
-        What is left to take off the phases of the run and of each batch.
-    covariance : (mode, mode) float64
-        Of the shape's coefficients and the gauge's.
-    square : float
-        Weighted square of what remains of the map.
-    spread : float
-        The same for each pixel: variance of the map over that of its noise.
-    steps : int
-        Gauss-Newton steps taken.
-    """
-
-    basis: ModeBasis
+    basis: ModeBasis  # the shape and the modes about it
+    # (mode, 1 + batch) what is left to take off the phases of the run and of each batch
     coefficients: F64
-    covariance: F64
-    square: float
-    spread: float
-    steps: int
+    covariance: F64  # (mode, mode) of the shape's coefficients and the gauge's
+    square: float  # weighted square of what remains of the map
+    spread: float  # the same for each pixel: variance of the map over that of its noise
+    steps: int  # gauss-Newton steps taken
 
 
 @dataclass(frozen=True)
 class FittedSet:
-    """A set with its shape, ready for its maps to be written.
-
-    Attributes
-    ----------
-    name : str
-    source : ReducedSet
-    swept : Path or MemoryPath
-        ``sweep.zarr/<set name>``.
-    facts : dict
-        Summary of the set's sweep.
-    planes : list of TilePlane
-        Unwrapped, one a tile.
-    fit : SetFit
-    shape : FringeShape
-        With the fitted parameters.
-    model, evidence : str
-        Name of the shape, and why it was chosen.
-    noise : float
-        Usual reduced chi-square: the variance of the samples over that of the noise model.
-    """
+    """A set with its shape, ready for its maps to be written."""
 
     name: str
     source: ReducedSet
-    swept: Local
-    facts: dict[str, Any]
-    planes: list[TilePlane]
+    swept: Local  # ``sweep.zarr/<set name>``
+    facts: dict[str, Any]  # summary of the set's sweep
+    planes: list[TilePlane]  # unwrapped, one a tile
     fit: SetFit
-    shape: FringeShape
-    model: str
+    shape: FringeShape  # with the fitted parameters
+    model: str  # model, evidence: name of the shape, and why it was chosen
     evidence: str
+    # usual reduced chi-square: the variance of the samples over that of the noise model
     noise: float
 
     @property

@@ -50,20 +50,11 @@ class SetTotals:
 
 @dataclass(frozen=True)
 class Totals:
-    """What is known once all maps are written.
+    """What is known once all maps are written."""
 
-    Attributes
-    ----------
-    sets : dict
-        By name.
-    outputs : tuple of str
-        Maps that the sets give together.
-    consistency : float or None
-        Reduced chi-square of the sets' disagreement; None where they determine no more than that.
-    """
-
-    sets: dict[str, SetTotals]
-    outputs: tuple[str, ...]
+    sets: dict[str, SetTotals]  # by name
+    outputs: tuple[str, ...]  # maps that the sets give together
+    # reduced chi-square of the sets' disagreement; None where they determine no more than that
     consistency: float | None
 
 
@@ -216,27 +207,14 @@ def _maps_of_tile(
 
 @dataclass(frozen=True)
 class SetOffsets:
-    """Of one set in one tile.
+    """Of one set in one tile."""
 
-    Attributes
-    ----------
-    delta, sigma : (y, x) float32
-        Offset and its error, px; NaN where masked.
-    flags : (y, x) uint8
-    modes : (mode, y * x) float64
-        Of the shape and the gauge.
-    k : float
-        Length of the fringe vector, rad/px.
-    scale : float32
-        Errors (px) over those of the sweep (rad).
-    """
-
-    delta: F32
+    delta: F32  # delta, sigma: (y, x) offset and its error, px; NaN where masked
     sigma: F32
-    flags: U8
-    modes: F64
-    k: float
-    scale: np.float32
+    flags: U8  # (y, x)
+    modes: F64  # (mode, y * x) of the shape and the gauge
+    k: float  # length of the fringe vector, rad/px
+    scale: np.float32  # errors (px) over those of the sweep (rad)
 
 
 def offsets(fitted: FittedSet, swept: Swept, at: tuple[int, int], removed: F64) -> SetOffsets:

@@ -62,21 +62,11 @@ def finish(writer: ArrayWriter) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Writers:
-    """What an array of frames is written to.
+    """What an array of frames is written to."""
 
-    Attributes
-    ----------
-    catalogue : ArrayWriter
-        (time, band, 2): what `pixcal.storage.fits_rows.read_rows` returns.
-    samples : ArrayWriter or None
-        (time, y, x) in ADU, where they are copied.
-    shape, dtype
-        Of the frames.
-    """
-
-    catalogue: ArrayWriter
-    samples: ArrayWriter | None
-    shape: tuple[int, ...]
+    catalogue: ArrayWriter  # (time, band, 2): what `pixcal.storage.fits_rows.read_rows` returns
+    samples: ArrayWriter | None  # (time, y, x) in ADU, where they are copied
+    shape: tuple[int, ...]  # shape, dtype: of the frames
     dtype: str
 
     @classmethod
@@ -108,27 +98,14 @@ class Writers:
 
 @dataclass(frozen=True)
 class Kept:
-    """An array of an earlier ingest whose files are still the same.
+    """An array of an earlier ingest whose files are still the same."""
 
-    Attributes
-    ----------
-    array : str
-        Its name now.
-    name : str
-        Its name then.
-    folder : Path
-        The earlier artefact.
-    facts : mapping
-        What `Writers.finish` returned then.
-    files : list of FrameFile
-        The files as their headers described them then; where the samples of those that were copied
-        are is not known.
-    """
-
-    array: str
-    name: str
-    folder: Path
-    facts: Mapping[str, Any]
+    array: str  # its name now
+    name: str  # its name then
+    folder: Path  # the earlier artefact
+    facts: Mapping[str, Any]  # what `Writers.finish` returned then
+    # the files as their headers described them then; where the samples of those that were copied
+    # are is not known
     files: list[FrameFile]
 
 

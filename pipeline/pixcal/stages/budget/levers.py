@@ -1,0 +1,124 @@
+"""Changes of a bench that save frames, the most helpful first."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pixcal.model.arrays import F64
+from pixcal.model.bench import Bench
+from pixcal.stages.budget.bound import phase_information, unweighted_variance
+from pixcal.stages.budget.expected import (
+    JoinedBound,
+    SetBound,
+    brightest_allowed,
+    joined,
+    pixel_contrast,
+    planned_split,
+)
+
+# interfringes that a longer baseline is tried for; the paper keeps to 5 px (section 4.2)
+FINER_PX = (5.0, 4.0, 3.0)
+
+
+@dataclass(frozen=True)
+class Lever:
+    """A change of the bench, and what it does to the variance of one frame of all sets joined."""
+
+    name: str
+    # of the worse component at the median pixel, px², for one frame shared by the sets
+    variance: float
+    period_s: float  # from frame to frame
+    note: str = ""  # what it assumes, or ""
+
+
+def levers(bench: Bench, now: JoinedBound) -> list[Lever]:
+    """Possible changes of the bench, the most helpful first, and the loss of equal weights."""
+    split, period = planned_split(bench), bench.frames.period_s
+    best = now.best_split()
+    candidates = [
+        Lever("as planned", _worse(now, split), period),
+        *(
+            Lever(name, _worse(joined(changed, contrast), split), changed.frames.period_s, note)
+            for name, changed, contrast, note in _changes(bench, now)
+        ),
+    ]
+    if len(now.components) == 2 and np.abs(best - split).max() > 0.02:
+        shares = " : ".join(f"{100 * s:.0f}" for s in best)
+        candidates.append(Lever(f"frames shared {shares} %", _worse(now, best), period))
+    plain = tuple(
+        replace(s, loss=(s.loss[0] * ratio, s.loss[1] * ratio))
+        for s, ratio in ((s, _unweighted_ratio(s)) for s in now.sets)
+    )
+    candidates.append(
+        Lever("equal weights", _worse(JoinedBound(plain), split), period, "a loss: do not")
+    )
+    return sorted(candidates, key=lambda lever: lever.variance * lever.period_s)
+
+
+def _worse(bound: JoinedBound, split: F64) -> float:
+    return float(bound.median(split).max())
+
+
+def _unweighted_ratio(s: SetBound) -> float:
+    plain = unweighted_variance(s.iota, s.alpha, s.variance, s.frames)
+    return float(np.median(plain * phase_information(s.iota, s.alpha, s.variance, s.frames)))
+
+
+Change = tuple[str, Bench, list[float] | None, str]
+
+
+def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
+    """(name, bench, contrast of each set, note) of every change that is one."""
+    d, o, f = bench.detector, bench.optics, bench.frames
+    changes = _finer_fringes(bench, now)
+    limit = brightest_allowed(bench)
+    if limit is not None and min(s.peak_e for s in f.fringes) < 0.95 * limit:
+        fuller = tuple(replace(s, peak_e=max(s.peak_e, limit)) for s in f.fringes)
+        name = f"brightest fringe at {limit / 1e3:.3g} ke-"
+        changes.append((name, replace(bench, frames=replace(f, fringes=fuller)), None, "no margin"))
+    doubled = tuple(replace(s, peak_e=2 * s.peak_e) for s in f.fringes)
+    changes.append(
+        ("twice the light a frame", replace(bench, frames=replace(f, fringes=doubled)), None,
+         "and the well for it")
+    )  # fmt: skip
+    if d.read_noise_e > 0:
+        quiet = replace(d, read_noise_e=d.read_noise_e / 2)
+        changes.append(
+            (f"read noise {quiet.read_noise_e:.3g} e-", replace(bench, detector=quiet), None, "")
+        )
+    if o.visibility < 0.995:
+        clear = replace(o, visibility=1.0)
+        changes.append(("visibility 1", replace(bench, optics=clear), None, ""))
+    if abs(np.log(o.power_ratio)) > 0.02:
+        equal = replace(o, power_ratio=1.0)
+        changes.append(("fibres of equal power", replace(bench, optics=equal), None, ""))
+    if any(s.loss[0] > 1.01 for s in now.sets):
+        random = tuple(replace(s, phase_law="random") for s in f.fringes)
+        changes.append(
+            ("phases over the whole cycle", replace(bench, frames=replace(f, fringes=random)),
+             None, "")
+        )  # fmt: skip
+    if f.period_s > 1.05 * f.exptime_s:
+        fast = replace(bench, frames=replace(f, period_s=f.exptime_s))
+        changes.append((f"a frame every {f.exptime_s:.3g} s", fast, None, "no dead time"))
+    return changes
+
+
+def _finer_fringes(bench: Bench, now: JoinedBound) -> list[Change]:
+    """Longer baselines, down to the next interfringe of `FINER_PX`."""
+    widest = max(s.interfringe for s in now.sets)
+    wanted = next((w for w in FINER_PX if w < 0.9 * widest), None)
+    if wanted is None:
+        return []
+    longer, contrast = [], []
+    for scan, s in zip(bench.frames.fringes, now.sets, strict=True):
+        stretch = max(1.0, s.interfringe / wanted)
+        bx, by = scan.baseline_mm
+        longer.append(replace(scan, baseline_mm=(bx * stretch, by * stretch)))
+        kx, ky = np.array(s.axis) * float(s.k[s.typical])
+        contrast.append(pixel_contrast(kx * stretch, ky * stretch) / pixel_contrast(kx, ky))
+    length = max(float(np.hypot(*scan.baseline_mm)) for scan in longer)
+    changed = replace(bench, frames=replace(bench.frames, fringes=tuple(longer)))
+    loss = 100 * (1 - min(contrast))
+    note = f"contrast {loss:.2g} % less: a pixel averages over itself"
+    return [(f"interfringe {wanted:g} px (baseline {length:.3g} mm)", changed, contrast, note)]
