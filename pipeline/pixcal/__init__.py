@@ -10,6 +10,8 @@ from typing import Any
 
 __version__ = version("pixcal")
 
+# the public names by the module that holds them, which is loaded with their first use.
+# ``__init__.pyi`` is written from it, for type checkers and editors, by ``make doc-pages``.
 _HOMES = {
     "api.arrays": ("calibrate",),
     "api.centroids": ("correct_centroids", "distortion_wcs"),
@@ -24,10 +26,6 @@ _HOMES = {
     "model.errors": ("InputError", "PixcalError"),
     "model.flags": ("PixelFlag",),
 }
-"""The public names by the module that holds them, which is loaded with their first use.
-
-``__init__.pyi`` is written from it, for type checkers and editors, by ``make doc-pages``.
-"""
 
 __all__ = sorted(["__version__", *(name for names in _HOMES.values() for name in names)])
 

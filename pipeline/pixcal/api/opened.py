@@ -42,8 +42,8 @@ class Run:
     """
 
     path: Path
+    # the temporary directory of the run; it is removed with the last reference to it
     _kept: TemporaryDirectory[str] | None = field(default=None, repr=False, compare=False)
-    """The temporary directory of the run; it is removed with the last reference to it."""
 
     def __fspath__(self) -> str:
         return str(self.path)

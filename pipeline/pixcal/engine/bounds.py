@@ -10,8 +10,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-LOOK_S = 0.2
-"""From one look at what is used to the next."""
+LOOK_S = 0.2  # from one look at what is used to the next
 
 
 class Exceeded(BaseException):

@@ -26,8 +26,7 @@ from pixcal.simulation.score import score, score_again
 
 __all__ = ["DOMAINS", "Effect", "Estimate", "FringeMaps", "Stage"]
 
-NONZERO = 3.0
-"""Errors from which a strength of an effect counts as different from zero."""
+NONZERO = 3.0  # errors from which a strength of an effect counts as different from zero
 
 
 @dataclass(frozen=True)

@@ -17,25 +17,18 @@ from pixcal.model.bench import Bench
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.shot import Shot
 
-DOMAINS = ("space", "time", "intensity", "noise")
-"""Where an effect may show."""
+DOMAINS = ("space", "time", "intensity", "noise")  # where an effect may show
 
 
 class Stage(IntEnum):
     """Where in the chain from fibre to file an effect acts; effects are applied in this order."""
 
-    LIGHT = 1
-    """Laser, fibres, modulator, glass: before the photon is absorbed."""
-    PIXEL = 2
-    """Where and how well a pixel responds."""
-    CHARGE = 3
-    """Collected electrons, shot noise included."""
-    SIGNAL = 4
-    """Voltages: coupling between pixels, response of the amplifier."""
-    READOUT = 5
-    """Noise and drift of the electronics."""
-    CONVERTER = 6
-    """Analogue to digital: the last of all."""
+    LIGHT = 1  # laser, fibres, modulator, glass: before the photon is absorbed
+    PIXEL = 2  # where and how well a pixel responds
+    CHARGE = 3  # collected electrons, shot noise included
+    SIGNAL = 4  # voltages: coupling between pixels, response of the amplifier
+    READOUT = 5  # noise and drift of the electronics
+    CONVERTER = 6  # analogue to digital: the last of all
 
 
 @dataclass(frozen=True)

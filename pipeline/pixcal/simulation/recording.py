@@ -10,8 +10,7 @@ from pixcal.kernels.synthesis import Stream, generator
 from pixcal.model.bench import Bench
 
 KINDS = ("bias", "dark", "flat", "fringes")
-SEEDS_APART = 1_000_003
-"""From the seed of one window's pixels to that of the next."""
+SEEDS_APART = 1_000_003  # from the seed of one window's pixels to that of the next
 
 
 @dataclass(frozen=True)

@@ -34,12 +34,11 @@ class Manifest:
     format: int
     key: str
     config: dict[str, Any]
-    inputs: dict[str, str]
-    """Key of each artefact (or file set) that this one was made from."""
+    inputs: dict[str, str]  # key of each artefact (or file set) that this one was made from
     pixcal: str = __version__
     summary: dict[str, Any] = field(default_factory=dict)
+    # digest of each file of the artefact, but for chunks of arrays
     files: dict[str, str] = field(default_factory=dict)
-    """Digest of each file of the artefact, but for chunks of arrays."""
 
 
 def digest(*parts: Any) -> str:

@@ -27,8 +27,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F32, F64
 
-Frames = tuple[F32, F32, F32]
-"""Factor, charge over sigma, and one over sigma, all (t, y, x)."""
+Frames = tuple[F32, F32, F32]  # factor, charge over sigma, and one over sigma, all (t, y, x)
 
 MIN_CHARGE = 0.1  # charge (10⁴ e-) of the least light whose noise can tell
 TINY = np.float32(1e-20)

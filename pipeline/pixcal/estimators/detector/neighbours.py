@@ -37,15 +37,12 @@ _MIN_FRAMES = 2
 class _Noise:
     """Some frames less what they should be; all (t, y, x) or (y, x), e- before the flat."""
 
-    residual: F32
-    """Zero where a sample is not to be used."""
+    residual: F32  # zero where a sample is not to be used
     variance: F32
-    charge: F32
-    """Mean charge."""
+    charge: F32  # mean charge
+    # covariance (t, pair) that was taken off the residuals of pairs of pixels with the frames
     taken: Callable[[Mask, Mask], F32]
-    """Covariance (t, pair) that was taken off the residuals of pairs of pixels with the frames."""
-    kept: float
-    """Share of the covariance that is left where each pixel was fitted."""
+    kept: float  # share of the covariance that is left where each pixel was fitted
     good: Mask
 
 

@@ -14,19 +14,17 @@ from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.kernels.noise_sums import product_sums
 from pixcal.model.arrays import F32, F64, Mask
 
+# rows and columns from a pixel to itself and to those that it may share its noise with
 STEPS = np.array([(0, 0), (0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)])
-"""Rows and columns from a pixel to itself and to those that it may share its noise with."""
+# error of a share of the variance that is left however many samples there are: no owner knows the
+# gain of a detector better than this, and amplifiers differ by as much
 FLOOR = 5e-3
-"""Error of a share of the variance that is left however many samples there are: no owner knows the
-gain of a detector better than this, and amplifiers differ by as much."""
-MIN_PIXELS = 200
-"""Fewest pixels that tell a noise."""
+MIN_PIXELS = 200  # fewest pixels that tell a noise
 
 _CLIP = 6.0
 _MIN_LEVELS = 3
 _ALIKE = 1e4
-_READ_KNOWN = 0.3
-"""Relative error of the read noise's variance as it was used."""
+_READ_KNOWN = 0.3  # relative error of the read noise's variance as it was used
 
 
 @dataclass(frozen=True)

@@ -16,14 +16,10 @@ from pixcal.model.arrays import F32, F64, Mask
 
 T = TypeVar("T")
 
-STRIPE = 4
-"""Rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves."""
-SATURATED = 1e-3
-"""Share of saturated samples from which flats tell nothing of levels and noise."""
-DITHER = 0.38
-"""Noise over a code from which means of rounded samples are right to 2 % of a code."""
-NO_SAMPLE = -(1 << 30)
-"""Electrons that stand for a sample without weight."""
+STRIPE = 4  # rows of a stripe of `FringeEvidence.halves`: few neighbours lie in different halves
+SATURATED = 1e-3  # share of saturated samples from which flats tell nothing of levels and noise
+DITHER = 0.38  # noise over a code from which means of rounded samples are right to 2 % of a code
+NO_SAMPLE = -(1 << 30)  # electrons that stand for a sample without weight
 
 
 @dataclass(frozen=True)

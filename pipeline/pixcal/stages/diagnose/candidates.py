@@ -7,8 +7,7 @@ from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.shrinkage import Trial
 from pixcal.stages.diagnose.trial import Effects
 
-NEARLY_ALL = 0.9
-"""Share of its significance from which a candidate is not scaled down."""
+NEARLY_ALL = 0.9  # share of its significance from which a candidate is not scaled down
 
 
 @dataclass
@@ -65,8 +64,7 @@ class Addition:
     gain: float  # in log-likelihood, over the causes without it in as many simulations
 
 
-Additions = dict[str, Addition]
-"""Of every candidate the likeliest, by its name."""
+Additions = dict[str, Addition]  # of every candidate the likeliest, by its name
 
 
 @dataclass

@@ -20,9 +20,9 @@ from pixcal.model.arrays import F64
 from pixcal.stages.diagnose.shrinkage import Trial, differing
 from pixcal.stages.diagnose.trial import Curves, Effects
 
+# relative error of an effect's law: a second cause needs evidence that another law of the first
+# would not produce
 LAW_ERROR = 0.25
-"""Relative error of an effect's law: a second cause needs evidence that another law of the first
-would not produce."""
 
 
 class Comparison:

@@ -7,12 +7,10 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.parts import Table
 
-SAME_AXIS = 0.98
-"""Cosine of the angle below which two sets measure along one axis."""
-LADDER = 3
-"""Exposure times of flats that make a ladder."""
+SAME_AXIS = 0.98  # cosine of the angle below which two sets measure along one axis
+LADDER = 3  # exposure times of flats that make a ladder
+# a ramp of equal steps shows nothing of light that a frame has of its neighbours
 RANDOM = "fringes with random phases"
-"""A ramp of equal steps shows nothing of light that a frame has of its neighbours."""
 MORE = "more frames of the same kind"
 
 

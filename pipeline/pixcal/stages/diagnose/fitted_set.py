@@ -13,9 +13,9 @@ from pixcal.model.arrays import F32, F64, Mask
 from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages.diagnose.undone import FitOfFrames, undone_on_samples
 
+# degree, over a window, of the logarithm of the contrast of two Gaussian beams (their intensities'
+# ratio is the exponential of a quadratic form)
 TWO_BEAMS = 2
-"""Degree, over a window, of the logarithm of the contrast of two Gaussian beams (their intensities'
-ratio is the exponential of a quadratic form)."""
 
 
 @dataclass(frozen=True)

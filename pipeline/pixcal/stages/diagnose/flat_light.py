@@ -12,11 +12,9 @@ from pixcal.model.arrays import F64
 from pixcal.simulation.recording import Recording
 from pixcal.stages.diagnose.undone import IntensityBeforeEffects
 
-SERIES = 8
-"""Frames of a series whose light is taken as it was in each; of fewer it is drawn."""
+SERIES = 8  # frames of a series whose light is taken as it was in each; of fewer it is drawn
 
-_FLICKER = 103
-"""Key of random numbers."""
+_FLICKER = 103  # key of random numbers
 
 
 @dataclass(frozen=True)

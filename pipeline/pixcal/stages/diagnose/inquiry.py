@@ -32,11 +32,9 @@ from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Search
 from pixcal.stages.diagnose.trial import OF_ESTIMATE, Curves, Effects, Signature, Trials, estimate
 from pixcal.stages.diagnose.windows import whole_of
 
-REFERENCES = 16
-"""Simulations of the nominal bench."""
+REFERENCES = 16  # simulations of the nominal bench
 LEARN_SEED = 900_000
-CLEAR = 20.0
-"""Significance above which a slow estimate is no test statistic."""
+CLEAR = 20.0  # significance above which a slow estimate is no test statistic
 
 
 @dataclass(frozen=True)

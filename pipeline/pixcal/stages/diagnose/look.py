@@ -24,17 +24,14 @@ from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.artefact import read_json
 from pixcal.storage.stage import read_acquisition, require
 
+# evidence in memory and the run that it is made of, for each sample of all fringe sets (measured,
+# as the next two)
 EVIDENCE_BYTES = 34
-"""Evidence in memory and the run that it is made of, for each sample of all fringe sets (measured,
-as the next two)."""
+# a sample of bias, dark or flat: as it was read, in the run made of it, and as a real number
 CALIBRATION_BYTES = 12
-"""A sample of bias, dark or flat: as it was read, in the run made of it, and as a real number."""
-LOOK_BYTES = 50
-"""What the statistics of one set need beside it, for each sample of the largest set."""
-ESTIMATE_BYTES = 130
-"""What the hungriest estimate, that of crosstalk, needs beside it."""
-FEWEST_FRAMES = 24
-"""Fringe frames in each half."""
+LOOK_BYTES = 50  # what the statistics of one set need beside it, for each sample of the largest set
+ESTIMATE_BYTES = 130  # what the hungriest estimate, that of crosstalk, needs beside it
+FEWEST_FRAMES = 24  # fringe frames in each half
 
 
 @dataclass(frozen=True)

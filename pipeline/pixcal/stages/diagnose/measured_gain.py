@@ -13,16 +13,14 @@ from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import Recording
 
-DECLARED_ERROR = 0.01
-"""Relative error that a declared gain may well have."""
+DECLARED_ERROR = 0.01  # relative error that a declared gain may well have
+# errors between a declared gain and that of the flats beyond which only the latter counts
 DISAGREE = 3.0
-"""Errors between a declared gain and that of the flats beyond which only the latter counts."""
-FRAMES = 8
-"""Flats that are simulated with and without effects, from the same random numbers."""
+FRAMES = 8  # flats that are simulated with and without effects, from the same random numbers
+# shot noise over read noise, as variances, of a flat that tells what effects do to the former
 LIT = 4.0
-"""Shot noise over read noise, as variances, of a flat that tells what effects do to the former."""
+# steps whose effects change the noise of flats otherwise than a gain does
 OF_NOISE = (Stage.CHARGE, Stage.SIGNAL)
-"""Steps whose effects change the noise of flats otherwise than a gain does."""
 
 
 @dataclass(frozen=True)

@@ -30,17 +30,13 @@ from pixcal.stages.diagnose.nominal import (
 )
 from pixcal.stages.diagnose.parts import Half, Table
 
-HOT = 40.0
-"""Robust standard deviations of the dark current beyond which a pixel is hot."""
+HOT = 40.0  # robust standard deviations of the dark current beyond which a pixel is hot
+# pixels around a hot one that may have got some of its charge: at most a share of `SHARED`
 HOT_REACH = 2
-"""Pixels around a hot one that may have got some of its charge: at most a share of `SHARED`."""
 SHARED = 0.1
-WILD = 8.0
-"""Standard deviations beyond which a residual is left out."""
-NO_TEST = 10.0
-"""Reduced chi-square of the photon transfer beyond which its gain is not believed."""
-CORE = 5.0
-"""Robust standard deviations within which the scatter of the dark signal may be noise."""
+WILD = 8.0  # standard deviations beyond which a residual is left out
+NO_TEST = 10.0  # reduced chi-square of the photon transfer beyond which its gain is not believed
+CORE = 5.0  # robust standard deviations within which the scatter of the dark signal may be noise
 
 
 def nominal_bench(

@@ -32,8 +32,7 @@ from pixcal.stages.diagnose.measured_gain import MeasuredGain, photon_transfer_c
 from pixcal.stages.diagnose.parts import Half, Raw, Table, select
 from pixcal.stages.diagnose.undone import IntensityBeforeEffects
 
-_GAIN, _NOISE = 101, 102
-"""Keys of random numbers."""
+_GAIN, _NOISE = 101, 102  # keys of random numbers
 
 
 @dataclass(frozen=True)

@@ -7,18 +7,13 @@ from pixcal.stages.diagnose.candidates import Candidate
 from pixcal.stages.diagnose.comparison import LAW_ERROR, Comparison
 from pixcal.stages.diagnose.shrinkage import LEAST, Trial
 
+# by which a weak candidate must raise the log-likelihood of the held-out frames; others by `LEAST`
 MIN_LOGLIK_GAIN_WEAK = 12.0
-"""By which a weak candidate must raise the log-likelihood of the held-out frames; others by
-`LEAST`."""
-OPEN = 0.15
-"""Residual gap above which an unknown cause is assumed."""
-LITTLE = 0.1
-"""Fraction of the gap that a doubtful cause must close,"""
-BESIDE_OPEN = 0.25
-"""and every cause, as a fraction of the residual gap."""
+OPEN = 0.15  # residual gap above which an unknown cause is assumed
+LITTLE = 0.1  # fraction of the gap that a doubtful cause must close,
+BESIDE_OPEN = 0.25  # and every cause, as a fraction of the residual gap
 
-Rejection = tuple[str, str]
-"""Name of a cause, and why it is rejected."""
+Rejection = tuple[str, str]  # name of a cause, and why it is rejected
 
 
 def similar_to(name: str) -> str:

@@ -29,18 +29,13 @@ from pixcal.stages.diagnose.deciding import recommend_frames
 from pixcal.stages.diagnose.shrinkage import Shrinkage, Trial, differing, shrinkage
 
 SCHEMA = "pixcal/diagnosis/1"
-EXPLAINED = 0.15
-"""Share of the gap that may be left where it is called explained,"""
-LEFT = 0.25
-"""and share of any one statistic's that is off by more than"""
-STILL = 6.0
-"""standard deviations: less can be the simulation of the effects themselves."""
+EXPLAINED = 0.15  # share of the gap that may be left where it is called explained,
+LEFT = 0.25  # and share of any one statistic's that is off by more than
+STILL = 6.0  # standard deviations: less can be the simulation of the effects themselves
+# statistics told in units of the bench even where nothing differs
 ALWAYS = ("allan_of_batches", "offset_by_place", "residual_noise")
-"""Statistics told in units of the bench even where nothing differs."""
-LEAST_CHANCE = 1e-12
-"""Smallest that is told: of tails further out nobody knows the shape."""
-SHOWN = 3
-"""Statistics named that gave a cause away."""
+LEAST_CHANCE = 1e-12  # smallest that is told: of tails further out nobody knows the shape
+SHOWN = 3  # statistics named that gave a cause away
 
 
 def describe(

@@ -35,22 +35,15 @@ from pixcal.stages.diagnose.rejection import (
 from pixcal.stages.diagnose.shrinkage import LEAST, Trial
 from pixcal.stages.diagnose.trial import Curves, Effects
 
+# significance that an estimate needs where there is a gap, instead of `SIGNIFICANT`,
 MIN_SIGMA_IN_GAP = 1.5
-"""Significance that an estimate needs where there is a gap, instead of `SIGNIFICANT`,"""
-MIN_SIGMA_WEAK = 1.0
-"""and where no candidate is significant: the weakest may be the true one."""
-SCREEN = 3
-"""Simulations of a candidate,"""
-CONFIRM = 8
-"""and of the accepted causes."""
-PROMISING = 0.25
-"""Share of the best gain from which a candidate is simulated more than once,"""
-SURE_OF_ONE = 3.0
-"""with its effect known to one part in this: what one simulation leaves open."""
-MOST = 5
-"""Causes that are accepted at most."""
-SIMILAR = 0.7
-"""Fraction of a candidate's significance that another effect may produce."""
+MIN_SIGMA_WEAK = 1.0  # and where no candidate is significant: the weakest may be the true one
+SCREEN = 3  # simulations of a candidate,
+CONFIRM = 8  # and of the accepted causes
+PROMISING = 0.25  # share of the best gain from which a candidate is simulated more than once,
+SURE_OF_ONE = 3.0  # with its effect known to one part in this: what one simulation leaves open
+MOST = 5  # causes that are accepted at most
+SIMILAR = 0.7  # fraction of a candidate's significance that another effect may produce
 
 Simulate = Callable[[Sequence[Effects], int, str, Sequence[str]], Sequence[list[Curves] | str]]
 Estimates = Callable[[Effects, Sequence[str]], Mapping[str, float]]

@@ -18,8 +18,7 @@ from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.model.arrays import F64
 from pixcal.stages.diagnose.trial import Effects
 
-LEAST = 5.0
-"""By which an effect must raise the log-likelihood of unseen data."""
+LEAST = 5.0  # by which an effect must raise the log-likelihood of unseen data
 DRAWS = 200
 
 

@@ -22,12 +22,12 @@ from pixcal.stages.evidence import Part
 from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.manifest import digest
 
+# of which the slowest takes 6 s for as many samples as there are at most (`windows.SAMPLES`)
 OF_ESTIMATE = Bound(seconds=45.0)
-"""Of which the slowest takes 6 s for as many samples as there are at most (`windows.SAMPLES`)."""
 
 Curves = dict[Key, Curve]
+# an effect whose estimate is a statistic; or, by its forward model, the score test of just it
 Signature = type[Effect] | Again
-"""An effect whose estimate is a statistic; or, by its forward model, the score test of just it."""
 Effects = tuple[Effect, ...]
 
 

@@ -14,18 +14,13 @@ from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import SimulatedDetector
 from pixcal.simulation.effect import Effect, FringeMaps
 
-PHASES = 16
-"""Of a fringe that is undone sample by sample."""
-MAP_PHASES = 12
-"""Spread over a fringe, at which an effect on samples is undone."""
+PHASES = 16  # of a fringe that is undone sample by sample
+MAP_PHASES = 12  # spread over a fringe, at which an effect on samples is undone
 _PHASES = 2 * np.pi * np.arange(MAP_PHASES) / MAP_PHASES
 _EVEN = np.stack([np.ones(MAP_PHASES), np.cos(_PHASES), np.sin(_PHASES)], axis=1)
-TURNS = 5
-"""Of the fits of pixels and frames: each gains a factor of three or more."""
-LEAST_SIGNAL = 1.0
-"""Of a sample (e-), below which its shot noise is not taken."""
-ACROSS = 9
-"""Pixels along the side of a frame whose level is undone."""
+TURNS = 5  # of the fits of pixels and frames: each gains a factor of three or more
+LEAST_SIGNAL = 1.0  # of a sample (e-), below which its shot noise is not taken
+ACROSS = 9  # pixels along the side of a frame whose level is undone
 
 
 @dataclass(frozen=True)

@@ -9,16 +9,12 @@ from pixcal.model.arrays import Indices
 from pixcal.stages.diagnose.parts import Half, Table, groups
 from pixcal.stages.evidence import Part
 
-SIDE = 128
-"""Pixels along the side of a window on a large detector: those of a chunk of the cube."""
-LARGEST = 288
-"""Rows or columns of a detector that are taken whole; of more, windows do not overlap."""
-APART = 4
-"""Sides of a window that a detector has at least where windows lie on chunks."""
+SIDE = 128  # pixels along the side of a window on a large detector: those of a chunk of the cube
+LARGEST = 288  # rows or columns of a detector that are taken whole; of more, windows do not overlap
+APART = 4  # sides of a window that a detector has at least where windows lie on chunks
+# samples of a fringe set that are looked at in each half of the frames and each window
 SAMPLES = 6_000_000
-"""Samples of a fringe set that are looked at in each half of the frames and each window."""
-FEWEST = 4
-"""Calibration frames of an exposure time that can be halved; fewer serve both halves."""
+FEWEST = 4  # calibration frames of an exposure time that can be halved; fewer serve both halves
 
 
 def chosen_windows(shape: tuple[int, int]) -> tuple[Part, tuple[Part, ...]]:

@@ -19,22 +19,19 @@ from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.place import Local
 
-MAX_STEPS = 8
-"""Gauss-Newton steps of a shape; it is nearly linear (physics note, section 4)."""
-STEP_RAD = 1e-7
-"""A step that moves phases by less, rms, is the last."""
+MAX_STEPS = 8  # gauss-Newton steps of a shape; it is nearly linear (physics note, section 4)
+STEP_RAD = 1e-7  # a step that moves phases by less, rms, is the last
+# fall in chi-square for which ``auto`` takes hyperbolic fringes: one chance in a hundred for three
+# terms. Taken in vain they cost three modes of the map; curvature missed stays in it whole.
 EVIDENCE = 12.0
-"""Fall in chi-square for which ``auto`` takes hyperbolic fringes: one chance in a hundred for three
-terms. Taken in vain they cost three modes of the map; curvature missed stays in it whole."""
-QUADRATIC = 3
-"""Terms of second order, which is what hyperbolic fringes show first."""
+QUADRATIC = 3  # terms of second order, which is what hyperbolic fringes show first
+# power at large scales over that at small ones beyond which the map has structure of its own
 RED = 2.5
-"""Power at large scales over that at small ones beyond which the map has structure of its own."""
+# fall then asked of each term over that of terms of no cause: the power of steps falls with the
+# order of the term, and two stitches reach 15
 EXCESS = 50.0
-"""Fall then asked of each term over that of terms of no cause: the power of steps falls with the
-order of the term, and two stitches reach 15."""
+# relative departure of the fringe period from the nominal one that is worth a note
 FAR_PERIOD = 0.15
-"""Relative departure of the fringe period from the nominal one that is worth a note."""
 
 
 @dataclass(frozen=True)

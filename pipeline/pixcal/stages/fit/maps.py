@@ -32,12 +32,11 @@ from pixcal.storage.cube import (
 from pixcal.storage.links import link_files
 from pixcal.storage.place import Local
 
-SAME_AS_SWEPT = ("iota", "alpha", "chi2", "mask")
-"""Maps of a set that are those of its sweep."""
+SAME_AS_SWEPT = ("iota", "alpha", "chi2", "mask")  # maps of a set that are those of its sweep
+# by name of the set, "" for maps of all of them, and of the array
 Writers = dict[tuple[str, str], ArrayWriter]
-"""By name of the set, "" for maps of all of them, and of the array."""
+# errors that a tile tells at most for the median of all, and about how many all of them tell
 TOLD, TOLD_IN_ALL = 4000, 4_000_000
-"""Errors that a tile tells at most for the median of all, and about how many all of them tell."""
 
 
 @dataclass(frozen=True)
@@ -140,10 +139,8 @@ class _Told:
     freedom: int
 
 
-Job = tuple[tuple[int, int], dict[str, F64]]
-"""A tile, and the modes removed from each set there."""
-Swept = Mapping[str, ArrayReader]
-"""Readers of the maps of a set's sweep."""
+Job = tuple[tuple[int, int], dict[str, F64]]  # a tile, and the modes removed from each set there
+Swept = Mapping[str, ArrayReader]  # readers of the maps of a set's sweep
 
 
 def _write_strip(

@@ -17,16 +17,13 @@ from pixcal.storage.artefact import read_json, write_json
 from pixcal.storage.cube import ArrayReader, write_array
 from pixcal.storage.place import Local
 
-SCOUT_SHARE = 0.01
-"""Share of the tiles that the scout reads (of large windows)."""
-SCOUT_TILES = 5
-"""Tiles that the scout reads where they can be kept in memory."""
+SCOUT_SHARE = 0.01  # share of the tiles that the scout reads (of large windows)
+SCOUT_TILES = 5  # tiles that the scout reads where they can be kept in memory
+# memory for the scout's tiles; fixed, so that results do not depend on ``--memory``
 CACHE_BYTES = 384 << 20
-"""Memory for the scout's tiles; fixed, so that results do not depend on ``--memory``."""
-PRIME_BYTES = 48 << 20
-"""Memory for the codes of the scout's first look."""
+PRIME_BYTES = 48 << 20  # memory for the codes of the scout's first look
+# chunks along time that the first look takes frames from: one may hold little of a slow scan
 LOOKS = 16
-"""Chunks along time that the first look takes frames from: one may hold little of a slow scan."""
 
 
 @dataclass(frozen=True)

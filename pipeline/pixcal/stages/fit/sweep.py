@@ -43,14 +43,14 @@ from pixcal.storage.formats import STAGES
 from pixcal.storage.place import Local
 from pixcal.storage.stage import make, read_acquisition, require
 
+# chi-squares kept in all to tell the usual one from (at least `MIN_SAMPLES` of a tile)
 CHI2_SAMPLES = 4096
-"""Chi-squares kept in all to tell the usual one from (at least `MIN_SAMPLES` of a tile)."""
 MIN_SAMPLES = 16
 MAPS = ("iota", "alpha", "phase", "sigma", "chi2")
 BATCH_MAPS = ("batch_phase", "batch_sigma")
+# binary digits kept of the batches' maps: the others, far below their noise, would take as much
+# disk again
 MANTISSA = 12
-"""Binary digits kept of the batches' maps: the others, far below their noise, would take as much
-disk again."""
 TABLES = ("tiles", "sums")  # of a row of numbers for each tile
 
 

@@ -26,8 +26,7 @@ from pixcal.storage.frames import tabulate
 from pixcal.storage.place import Place
 from pixcal.storage.sources import SourceFile
 
-FRAMES_A_PIECE = 16
-"""Frames that one task catalogues: a chunk of the catalogue."""
+FRAMES_A_PIECE = 16  # frames that one task catalogues: a chunk of the catalogue
 
 
 def create(cubes: Place, array: str, shape: Sequence[int], dtype: Any) -> ArrayWriter:

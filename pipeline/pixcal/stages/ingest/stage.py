@@ -44,8 +44,8 @@ from pixcal.storage.stage import make
 
 STAGE = STAGES["ingest"]
 
+# heights of a band, the first that fits the memory: whole chunks, and long reads
 _BAND_ROWS = (512, 384, 256, 128)
-"""Heights of a band, the first that fits the memory: whole chunks, and long reads."""
 
 _DTYPES = tuple(map(np.dtype, ("u1", "i1", "u2", "i2", "u4", "i4", "f4")))
 _FILES_A_TASK = 32

@@ -22,17 +22,17 @@ from pixcal.storage.place import Place
 
 _SAMPLES = 1 << 20
 _FLAT_FLOOR = 0.05
+# weight of the detector's read variance beside a pixel's own, in degrees of freedom: that of pixels
+# whose read noise differs by 13 % rms. Few frames alone would give good pixels false weights, and
+# at low light a chi-square that flags them.
 _PRIOR_DOF = 30
-"""Weight of the detector's read variance beside a pixel's own, in degrees of freedom: that of
-pixels whose read noise differs by 13 % rms. Few frames alone would give good pixels false weights,
-and at low light a chi-square that flags them."""
 
+# attributes of a mask, as CF has them
 FLAG_ATTRS = {
     "long_name": "why a pixel is not to be used",
     "flag_masks": [int(flag) for flag in PixelFlag],
     "flag_meanings": " ".join(str(flag.name).lower() for flag in PixelFlag),
 }
-"""Attributes of a mask, as CF has them."""
 
 _MAPS: dict[str, tuple[Any, dict[str, Any]]] = {
     "bias": (np.float32, {"units": "adu", "long_name": "signal at exposure zero"}),

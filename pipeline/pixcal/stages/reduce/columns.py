@@ -19,10 +19,8 @@ from pixcal.storage.place import UrlPath
 Index = tuple[int, int]
 Strip = tuple[Index, ...]
 
-SHARE = 0.8
-"""Of the memory allowed, that strips may be made wide for."""
-CAUTIOUS = 4
-"""Tasks that share as much memory as this process may use, on a cluster."""
+SHARE = 0.8  # of the memory allowed, that strips may be made wide for
+CAUTIOUS = 4  # tasks that share as much memory as this process may use, on a cluster
 
 
 def grid(shape: tuple[int, int]) -> tuple[int, int]:

@@ -21,19 +21,16 @@ from pixcal.stages.reduce.read_noise import bias_wander, dark_charge, read_noise
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.place import Place
 
-ROUNDING_ADU = math.sqrt(SHEPPARD)
-"""Noise of a converter that rounds to whole ADU."""
+ROUNDING_ADU = math.sqrt(SHEPPARD)  # noise of a converter that rounds to whole ADU
 
 _LINEAR_SHARE = 0.7
 _SATURATED_RUNG = 1e-2
 _GAIN_ERROR = 0.2
 _GUESS_ERROR = 0.1
+# variance of a sample, in square codes, from which rounding adds the same at every level
 _SMOOTH = 0.25 + SHEPPARD
-"""Variance of a sample, in square codes, from which rounding adds the same at every level."""
-_LAMP = 0.3
-"""Relative change of light a second between flats that are not of one lamp."""
-_LIT = 5.0
-"""Least response of the usual pixel over its error: below it the flat would be noise."""
+_LAMP = 0.3  # relative change of light a second between flats that are not of one lamp
+_LIT = 5.0  # least response of the usual pixel over its error: below it the flat would be noise
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,7 @@
 from pixcal.kernels.gain_fit import GainFit
 from pixcal.stages.reduce.detector_summary import Summary
 
-_NO_LINE = 10.0
-"""Reduced chi-square of a photon-transfer curve that is no line."""
+_NO_LINE = 10.0  # reduced chi-square of a photon-transfer curve that is no line
 _LINEARITY = 0.02
 
 

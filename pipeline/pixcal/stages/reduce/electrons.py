@@ -136,12 +136,11 @@ def write_coordinates(folder: Place, time_s: Any, shape: tuple[int, int]) -> Non
         write_array(folder / name, values, dims=(name,), attrs=attrs)
 
 
+# share of saturated samples up to which a pixel is good: particles hit it now and then, and those
+# samples have no weight. Light that saturates does so in every bright fringe, and biases the rest.
 STRAY_SHARE = 1e-3
-"""Share of saturated samples up to which a pixel is good: particles hit it now and then, and those
-samples have no weight. Light that saturates does so in every bright fringe, and biases the rest."""
 
-STRAY_SAMPLES = 2
-"""Saturated samples that a pixel may have in a short run."""
+STRAY_SAMPLES = 2  # saturated samples that a pixel may have in a short run
 
 
 class _Column:

@@ -8,8 +8,8 @@ import numpy as np
 
 from pixcal.model.arrays import F32
 
+# exposure times are the same within this relative distance: cameras write what they measured
 _SAME = 1e-3
-"""Exposure times are the same within this relative distance: cameras write what they measured."""
 
 
 @dataclass(frozen=True)

@@ -36,10 +36,8 @@ from pixcal.storage.cube import CHUNK, ArrayReader
 
 Json = dict[str, Any]
 
-_NO_ERROR = 1e-9
-"""ADU/s: below it all samples are of one code."""
-_WELL = 0.97
-"""Share of the converter's range below which it is the wells that are full."""
+_NO_ERROR = 1e-9  # ADU/s: below it all samples are of one code
+_WELL = 0.97  # share of the converter's range below which it is the wells that are full
 
 
 def characterise(
@@ -197,10 +195,8 @@ def _full_well(
 
 
 _TITLES = {"dsnu": "DSNU", "prnu": "PRNU"}
-_ALTERNATES = 6.0
-"""Errors of a difference between every second line that is worth a word."""
-_ALTERNATING_SHARE = 0.04
-"""Of the variance of the map that its square is at least."""
+_ALTERNATES = 6.0  # errors of a difference between every second line that is worth a word
+_ALTERNATING_SHARE = 0.04  # of the variance of the map that its square is at least
 
 
 def _spread(found: Json, curves: Json, name: str, unit: str, halves: F64, good: Mask) -> None:

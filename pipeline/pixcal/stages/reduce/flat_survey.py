@@ -15,19 +15,13 @@ from numpy.typing import NDArray
 from pixcal.model.arrays import F64, I64
 from pixcal.storage.frame_reader import Reader
 
-ROWS = 64
-"""Rows that are looked at, in the middle of the frames."""
-TOGETHER = 64
-"""Frames that are read at once: those of a chunk of a cube."""
-APART = 0.05
-"""Relative distance of two levels that are not one lamp's flicker."""
-LEAST_SHARE = 1e-3
-"""Of the samples of a frame that lie at the highest code at least."""
+ROWS = 64  # rows that are looked at, in the middle of the frames
+TOGETHER = 64  # frames that are read at once: those of a chunk of a cube
+APART = 0.05  # relative distance of two levels that are not one lamp's flicker
+LEAST_SHARE = 1e-3  # of the samples of a frame that lie at the highest code at least
 LEAST_SAMPLES = 50
-NEIGHBOURS = 16
-"""Codes below the highest that are held against it."""
-PILED = 4
-"""How many times as many samples as at any of these are a pile."""
+NEIGHBOURS = 16  # codes below the highest that are held against it
+PILED = 4  # how many times as many samples as at any of these are a pile
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ from pixcal.storage.cube import CHUNK, ArrayWriter, create_array, create_group
 from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import Place
 
+# maps of the scratch store
 STATISTICS = (
     "bias",  # ADU
     "dark_rate",  # ADU/s
@@ -49,11 +50,10 @@ STATISTICS = (
     "outliers",
     "flags",
 )
-"""Maps of the scratch store."""
 
 _PAIR_LAMP_CHANGE = 0.05
+# noise, in steps of the samples, below which the median of few frames' variances jumps
 _COARSE = 3.0
-"""Noise, in steps of the samples, below which the median of few frames' variances jumps."""
 
 
 @dataclass(frozen=True)
@@ -120,10 +120,8 @@ class _Column:
     maps: dict[str, F64]
     pairs: F64
     levels: F64
-    noise: F64
-    """Variance of a sample that is usual here (ADU²)."""
-    loud: NDArray[np.bool_]
-    """Pixels that are noisy without light: left out of the photon transfer."""
+    noise: F64  # variance of a sample that is usual here (ADU²)
+    loud: NDArray[np.bool_]  # pixels that are noisy without light: left out of the photon transfer
     line: DarkLine | None = None
     rungs: list[Rung] = field(default_factory=list)
 

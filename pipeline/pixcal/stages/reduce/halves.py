@@ -19,14 +19,12 @@ from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.artefact import Build
 from pixcal.storage.cube import CHUNK, ArrayReader
 
+# first row and the one after the last; the same of columns
 Window = tuple[tuple[int, int], tuple[int, int]]
-"""First row and the one after the last; the same of columns."""
 
-SIDE = 1024
-"""Longest side of the middle of the detector whose nonuniformity is measured."""
+SIDE = 1024  # longest side of the middle of the detector whose nonuniformity is measured
 _LEAST_PIXELS = 16
-_FRAMES = 64
-"""Most frames of a series that are read for it."""
+_FRAMES = 64  # most frames of a series that are read for it
 
 
 @dataclass(frozen=True)

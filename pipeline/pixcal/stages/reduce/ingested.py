@@ -20,8 +20,7 @@ from pixcal.storage.frame_reader import FrameReader, Reader
 from pixcal.storage.place import Local, Place
 from pixcal.storage.stage import read_acquisition
 
-MOST_ADU = 2.0**32
-"""No converter gives more: real numbers beyond are no samples."""
+MOST_ADU = 2.0**32  # no converter gives more: real numbers beyond are no samples
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ from pixcal.stages.reduce.flat_survey import middle_rows
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.storage.place import Place
 
-_SHARED = 5.0
-"""Errors of the noise that a row shares from which it is there."""
+_SHARED = 5.0  # errors of the noise that a row shares from which it is there
 
 
 def shared_by_lines(dark: F64) -> dict[str, Measure]:

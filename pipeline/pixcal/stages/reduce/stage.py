@@ -48,8 +48,7 @@ SCHEMA = "pixcal/reduce/1"
 _MIN_READ_FRAMES = 8  # fewer do not tell the noise of each pixel
 _SHARED_BYTES = 64 << 20
 _LINES = 4  # rows or columns beside one another without light that are worth a word
-_CUT_OFF = 1e-3
-"""Share of samples at code zero from which noise is cut off."""
+_CUT_OFF = 1e-3  # share of samples at code zero from which noise is cut off
 
 
 Config = Reduce

@@ -33,19 +33,15 @@ class Moments:
     """Of the noise of each pixel of a series, in units of the common noise."""
 
     pixel: Indices
-    count: F64
-    """Samples."""
+    count: F64  # samples
     variance: F64
-    kurtosis: F64
-    """Excess, unbiased."""
+    kurtosis: F64  # excess, unbiased
+    # sum of products of neighbouring frames, over the degrees of freedom of the variance
     neighbours: F64
-    """Sum of products of neighbouring frames, over the degrees of freedom of the variance."""
-    dof: float
-    """Of the variance: fewer than the samples have where pixels differ anyway."""
+    dof: float  # of the variance: fewer than the samples have where pixels differ anyway
     sigma: float
     period_s: float
-    frames: int
-    """That most pixels have."""
+    frames: int  # that most pixels have
 
     def of(self, pixels: Indices) -> "Moments":
         """Of some pixels (ascending) alone."""
