@@ -79,7 +79,7 @@ MISTAKES: list[tuple[str, Any, str]] = [
     ("detector.origin_px", [10, 8300], "detector: origin_px: 96 columns from 8300"),
     ("detector.bits", 24, "detector.bits: 24 is above 16"),
     ("detector.bits", 8, "detector: bias_adu: 500 ADU leaves no room below saturation"),
-    ("detector.saturation_adu", 70000, "detector: saturation_adu: 70000 ADU is above the end"),
+    ("detector.saturation_adu", 70000, "detector: saturation_adu: 70000 ADU is above the largest"),
     ("detector.hot_fraction", 1.2, "detector.hot_fraction: 1.2 is above 0.5"),
     ("detector.prnu_rms", float("nan"), "detector.prnu_rms: expected a finite number"),
     ("detector.delta_rms_px", 2.0, "detector.delta_rms_px: 2.0 is above 0.5 px"),

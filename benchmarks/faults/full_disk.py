@@ -19,7 +19,7 @@ from faults.bench import STAGES, Bench
 from faults.forks import Ended, pixcal
 
 RESUMED = "one line, exit 1; resumed"
-_LINE = ("disk full; what was complete is kept: make room and run the same command again",)
+_LINE = ("disk full; complete results are kept: free some space and run the same command again",)
 
 
 def at_writes(bench: Bench, stage: str, times: int | None, seed: int) -> Outcome:

@@ -112,7 +112,7 @@ def _show_given(plan: Mapping[str, Any]) -> None:
 
 
 def _show_shares(plan: Mapping[str, Any]) -> None:
-    click.echo("\nwhat the frames are for: photons alone, and the factors that raise them")
+    click.echo("\nframes for photon noise alone, and the factors that increase them")
     rows = [
         (
             name,
@@ -129,7 +129,9 @@ def _show_shares(plan: Mapping[str, Any]) -> None:
 
 
 def _show_calibration(plan: Mapping[str, Any]) -> None:
-    click.echo("\ncalibration frames, so that their noise costs less than 0.1 % of the frames")
+    click.echo(
+        "\ncalibration frames for which their noise costs less than 0.1 % more fringe frames"
+    )
     rows = []
     for name, s in plan["sets"].items():
         c = s["calibration"]
@@ -147,7 +149,7 @@ def _show_calibration(plan: Mapping[str, Any]) -> None:
 
 
 def _show_levers(plan: Mapping[str, Any]) -> None:
-    click.echo("\nwhat if (all sets, the worse axis)")
+    click.echo("\nalternatives (all sets, the worse axis)")
     planned = next(v for v in plan["levers"] if v["name"] == "as planned")
     rows = []
     for lever in plan["levers"]:

@@ -74,7 +74,7 @@ def _show(result: Mapping[str, Any]) -> None:
             printing.show_table(("scale", *SIZES), [(side, *row) for side, row in sizes])
         printing.show_notes(_sentences(components))
     if result["summary"] is not None:
-        click.echo("\neach map's own errors beyond noise, from the differences of all pairs, px")
+        click.echo("\nerrors of each map beyond noise, from the differences of all pairs, px")
         columns = [map(_amount, facts["own"]) for facts in result["summary"].values()]
         rows = list(zip(labels, *columns, strict=True))
         printing.show_table(("", *result["summary"]), rows)

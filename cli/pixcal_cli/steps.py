@@ -134,8 +134,8 @@ def effect_list(text: str) -> tuple[str, ...]:
     names = tuple(name.strip() for name in text.split(",") if name.strip())
     if not names:
         raise InputError(
-            f"--effects {text!r:.80}: no name of an effect; write names with commas between them, "
-            "or leave the option out for all effects"
+            f"--effects {text!r:.80}: names no effect; give names separated by commas, or "
+            "omit the option for all effects"
         )
     return names
 

@@ -257,7 +257,7 @@ def diagnose(
     without : Sequence[str]
         Effects to leave out.
     own : Sequence[str | os.PathLike[str]]
-        Python file with an own effect; repeatable.
+        Python file with your own effect; repeatable.
     nominal : str or path, optional
         Bench file whose effects belong to the nominal simulation.
     runtime : Runtime, optional
@@ -299,7 +299,7 @@ def fit(
     with_diagnosis : bool
         Also write maps corrected for the effects that 'pixcal diagnose' found.
     own : Sequence[str | os.PathLike[str]]
-        Python file of an own effect that the diagnosis found; repeatable.
+        Python file of your own effect that the diagnosis found; repeatable.
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 
@@ -369,13 +369,13 @@ def reduce(
     hot_sigma : float
         Dark signal of ``HOT`` pixels, robust sigmas above the median.
     dead_below : float
-        Response over the neighbours' below which a pixel is ``DEAD``.
+        Response relative to the neighbours below which a pixel is ``DEAD``.
     dead_above : float
-        Response over the neighbours' above which a pixel is ``DEAD``.
+        Response relative to the neighbours above which a pixel is ``DEAD``.
     noisy_factor : float
-        Noise over the usual noise above which a pixel is ``NOISY``.
+        Noise relative to the typical noise above which a pixel is ``NOISY``.
     nonlinear_share : float
-        Departure from a line above which it is ``NONLINEAR``.
+        Deviation from a straight line above which a pixel is ``NONLINEAR``.
     rounding_share : float
         Share of the variance that rounding may add.
     cubes : str or path, optional
@@ -455,7 +455,7 @@ def simulate(
     truth : str or path, optional
         Directory of the truth.
     own : Sequence[str | os.PathLike[str]]
-        Python file with an own effect that BENCH.yaml names; repeatable.
+        Python file with your own effect that BENCH.yaml names; repeatable.
     runtime : Runtime, optional
         Where and with how much memory tasks run.
 

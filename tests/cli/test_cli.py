@@ -463,7 +463,7 @@ def test_candidates_without_a_name_are_refused(
 ) -> None:
     assert invoke(["diagnose", "RUN", "--effects", names]) == 2
     assert not calls
-    assert f"--effects {names!r}: no name of an effect; write names" in capsys.readouterr().err
+    assert f"--effects {names!r}: names no effect; give names" in capsys.readouterr().err
     assert invoke(["diagnose", "RUN"]) == 0
     assert invoke(["diagnose", "RUN", "--effects", "lag, ipc,-row_noise,"]) == 0
     every, some = (args[1] for _, args in calls)

@@ -53,7 +53,7 @@ def test_three_runs(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     text = capsys.readouterr().out
     for pair in ("one | two", "one | three", "two | three"):
         assert f"\n{pair}\n" in text
-    assert "each map's own errors beyond noise" in text
+    assert "errors of each map beyond noise" in text
     assert "delta_x: the maps differ less than their noise" in text
 
 

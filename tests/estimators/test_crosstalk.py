@@ -93,7 +93,7 @@ def test_noise_that_far_pixels_share_is_refused_at_once():
     found = choose(noise_shared(steps, near), lambda classes: 0.0)
     assert [steps[n] for n in found.links] == near
     assert found.classes.count == 1
-    with pytest.raises(InputError, match=r"^not decided: .* 48 of them more than 2 pixels apart"):
+    with pytest.raises(InputError, match=r"^not decided: .* 48 of them beyond 2 pixels"):
         choose(noise_shared(steps, steps), lambda classes: 0.0)
 
 

@@ -50,7 +50,7 @@ def a_view(perfect: float | None = 3e-3, **changes: Any) -> AstrometryView:
                 "uas_per_px": SCALE, "px_per_lambda_over_d": 2.53,
             },
             "stars": {"number": 100, "positions": 5, "electrons": 1e8, "window_px": 23},
-            "detector": {"pixels": "maps and a draw of their errors", "shape": [50, 70]},
+            "detector": {"pixels": "the maps plus random errors of size SIGMA", "shape": [50, 70]},
         },
         "target_px": 5e-5,
         "table": (("no photon noise", "x", "3e-3 px, 21 µas", "2e-4 px, 1.4 µas", "15 ± 1"),) * 8,

@@ -235,7 +235,7 @@ def test_maps_of_noise_are_told_from_maps_that_help(tmp_path: Path) -> None:
     found = result_of(nothing)
     assert found["axes"]["x"]["floor"]["perfect"]["px"] is None
     assert found["axes"]["x"]["floor"]["gain"]["value"] is None
-    assert any("below the maps' errors" in w for w in found["warnings"])
+    assert any("below the errors of the maps" in w for w in found["warnings"])
     assert "not significant" in table(found)[0].perfect
     worse = make_run(tmp_path / "worse", added(offsets(4, 1e-3), offsets(5, 2e-3)), 2e-3)
     truth = write_truth(tmp_path / "truth", offsets(4, 1e-3))

@@ -307,7 +307,7 @@ def test_without_a_diagnosis_it_says_what_to_run(make_bench, write_reduced, tmp_
     of = {"own": [], "nominal": {}}
     with build(run, "diagnose", DIAGNOSIS_FORMAT, of, {"reduce": "earlier"}) as made:
         write_json(made.folder / "diagnosis.json", {"verdict": "no gap", "causes": []})
-    with pytest.raises(InputError, match="reduced otherwise; run 'pixcal diagnose"):
+    with pytest.raises(InputError, match="reduced differently; run 'pixcal diagnose"):
         correct.run(run, correct.Config(), SYNC)
 
 

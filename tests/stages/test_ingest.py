@@ -229,7 +229,7 @@ def test_up_to_date_is_skipped(
     first = ingest.run(acquisition, tmp_path / "run", ingest.Config(), SYNC)
     monkeypatch.setattr(ingest, "run_tasks", None)
     moved = acquisition.rename(tmp_path / "moved")
-    with pytest.raises(InputError, match=r"the frames of .* are not there any more; run 'pixcal"):
+    with pytest.raises(InputError, match=r"the frames of .* are gone; run 'pixcal"):
         read(tmp_path / "run")
     second = ingest.run(moved, tmp_path / "run", ingest.Config(overwrite=True), SYNC)
     assert second.key == first.key

@@ -539,7 +539,7 @@ def test_darks_of_one_time_are_bias_and_dark_together(tmp_path: Path) -> None:
         "fringes/a": (camera.fringes(3), [10.0] * 3),
     }
     found = small(tmp_path, kinds)
-    assert any("stands for bias and dark" in w for w in found["warnings"])
+    assert any("is subtracted as bias and dark signal" in w for w in found["warnings"])
     both = (camera.bias + camera.dark * 10 / GAIN).mean()
     assert read(tmp_path, "calibration.zarr/bias").mean() == pytest.approx(both, rel=1e-3)
     assert not read(tmp_path, "calibration.zarr/dark_rate").any()

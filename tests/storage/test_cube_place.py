@@ -143,7 +143,7 @@ def test_a_copy_of_a_run_reads_its_cubes_and_leaves_them(
     assert not steps, "nor does it write there"
     assert make(copy, 2, base) == made.cubes
     for left, plus in ((first, 1), (unfinished.cubes, 2)):
-        assert f"{left}: left there" in caplog.text
+        assert f"{left}: not removed" in caplog.text
         np.testing.assert_array_equal(ArrayReader(left / "reduced.zarr" / "a").read(), DATA + plus)
     np.testing.assert_array_equal(content(run), DATA + 1)
 

@@ -98,7 +98,7 @@ def test_stamped_cube_of_unknown_rhythm_is_numbered() -> None:
     assert found["file"] == ["b", "b", "a", "a"]
     assert found["time_s"] == [0, 1, 2, 3]
     assert found["mjd"] == [60000.0, None, 60001.0, None]
-    assert "frames are numbered" in " ".join(warnings)
+    assert "frames have numbers in place of times" in " ".join(warnings)
     # The pace of bias frames is nothing that their owner need give.
     _, warnings = table([frame_file("a", 60000.0, 2), frame_file("b", 60001.0, 2)], array="bias")
     assert warnings == []
@@ -107,4 +107,4 @@ def test_stamped_cube_of_unknown_rhythm_is_numbered() -> None:
 def test_cube_that_lasts_too_long_is_told() -> None:
     files = [frame_file("a", 60000.0, 3), frame_file("b", 60000 + SECOND, 3)]
     _, warnings = table(files, 0.9)
-    assert "a cube lasts beyond the next file's time stamp by its frame_period_s" in warnings[0]
+    assert "by its frame_period_s, a cube ends after the time stamp of the next file" in warnings[0]

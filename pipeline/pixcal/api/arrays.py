@@ -152,7 +152,7 @@ def _checked(name: str, stack: ArrayLike) -> Frames:
     """Frames in a type that a FITS file of frames can hold."""
     array = np.asarray(stack)
     if array.ndim != 3 or 0 in array.shape:
-        raise InputError(f"{name}: shape {array.shape}; frames are (t, y, x), none of them zero")
+        raise InputError(f"{name}: shape {array.shape}; frames are (t, y, x), no axis may be zero")
     if array.dtype.kind not in "uif":
         raise InputError(f"{name}: {array.dtype} samples; give whole numbers or floating point")
     if array.dtype in (np.uint8, np.uint16) or array.dtype.kind == "f":

@@ -67,7 +67,7 @@ class HyperbolicFringes(Effect):
     frames_needed = ("axis",)
     sources = (
         "Rousset et al., section 5.2 and figures 5, 14 and 15: fibres at 40 cm, (18 mm, 18 mm) "
-        "from the middle of the window (design/paper.txt)",
+        "from the middle of the window",
         "Born & Wolf, Principles of Optics, section 7.3: fringes of two point sources",
     )
 

@@ -39,7 +39,7 @@ class IntensityNoise(Effect):
     frames_needed = ()
     quick = False
     sources = (
-        "Rousset et al., section on simulations: 2 % fluctuations of the laser (design/paper.txt)",
+        "Rousset et al., section on simulations: 2 % fluctuations of the laser",
         "Thorlabs manual 12112-S01 (HRP350 He-Ne laser): modes that sweep through the gain curve "
         "change the power at below 1 Hz to some kHz, the mains at 50 and 100 Hz",
     )

@@ -107,7 +107,7 @@ class IntraPixelResponse(Effect):
             },
             # Pairs of fibres of other powers have another visibility, which is nominal.
             float(scatter / its_error),
-            "visibility that scatters from pixel to pixel, the more the closer the fringes",
+            "visibility that varies from pixel to pixel, more strongly at shorter fringe periods",
             {"of_width": float(square / error), "of_scatter": float(scatter / its_error)},
         )
 

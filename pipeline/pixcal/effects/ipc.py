@@ -68,7 +68,7 @@ class Ipc(Effect):
     quick = False
     sources = (
         "Rousset et al., section 5.1: period of four rows, 2-3 % vertical, 0.6 % horizontal, "
-        "sparse (design/paper.txt)",
+        "sparse",
         "Moore, Ninkov & Forrest, Proc. SPIE 5167, 204 (2004): deterministic, conserves the signal",
         "Donlon, Ninkov & Baum, PASP 130, 074503 (2018): 0.68 to 1.45 % over the well of an H2RG",
         "Le Graët et al., Proc. SPIE 12191 (2022): the kernel changes over the array",

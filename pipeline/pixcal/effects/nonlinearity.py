@@ -65,7 +65,7 @@ class Nonlinearity(Effect):
     frames_needed = ("ladder",)
     quick = False
     sources = (
-        "Rousset et al., table 1: 2 % linearity error of the GIGAPYX-4600 (design/paper.txt)",
+        "Rousset et al., table 1: 2 % linearity error of the GIGAPYX-4600",
         "Janesick, Photon Transfer (SPIE 2007), chapter 7: below 1 % of the source follower (V/V), "
         "more of the sense node, whose capacitance grows with the charge (V/e-)",
     )

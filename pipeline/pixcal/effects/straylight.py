@@ -67,7 +67,7 @@ class Straylight(Effect):
     strengths = ("share", "slope_per_px", "bump", "patterns")
     frames_needed = ("axis",)
     sources = (
-        "Rousset et al., eq. 3: straylight is a part of the mean term B iota (design/paper.txt)",
+        "Rousset et al., eq. 3: straylight is a part of the mean term B iota",
         "Harvey et al. 2012, Opt. Eng. 51, 013402: a clean surface of 2 nm rms scatters "
         "(4 pi 2 / 633)^2 = 0.16 %; black walls reflect some per cent of what misses the detector",
     )

@@ -274,7 +274,7 @@ class _Tasks:
         if isinstance(error, KilledWorker):
             return ClusterError(
                 f"{where}: {error.allowed_failures + 1} workers died at the same task, the last "
-                f"was {error.last_worker.address} (out of memory? their logs tell); give them a "
+                f"was {error.last_worker.address} (out of memory? see their logs); give them a "
                 "larger --memory-limit, or pixcal fewer --workers"
             )
         if isinstance(error, ModuleNotFoundError) and str(error.name).startswith("pixcal"):

@@ -38,10 +38,12 @@ class Coupling:
 
     dy: int = quantity(unit="px", low=-1024, high=1024, doc="rows from source to receiver")
     dx: int = quantity(unit="px", low=-1024, high=1024, doc="columns from source to receiver")
-    share: float = quantity(low=-0.2, high=0.2, doc="of the source's signal, at small signals")
+    share: float = quantity(
+        low=-0.2, high=0.2, doc="share of the signal of the source, at small signals"
+    )
     every_rows: int = quantity(1, low=1, high=1024, doc="sources lie in every n-th row")
     row: int = quantity(0, low=0, high=1023, doc="the first of these rows")
-    every_columns: int = quantity(1, low=1, high=1024, doc="and in every n-th column")
+    every_columns: int = quantity(1, low=1, high=1024, doc="sources lie in every n-th column")
     column: int = quantity(0, low=0, high=1023, doc="the first of these columns")
     per_ke: float = quantity(
         0.0, unit="1/ke-", low=-0.02, high=0.02,

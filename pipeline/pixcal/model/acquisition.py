@@ -79,7 +79,7 @@ class FringeSet:
     def __post_init__(self) -> None:
         check_set(self.name, self.baseline_mm)
         if re.fullmatch("mask|delta_(x|y|fringe)(_sigma)?", self.name):
-            raise InputError(f"name: {self.name!r} is the name of a result; choose another")
+            raise InputError(f"name: {self.name!r} is reserved for a result; choose another")
         if not self.files:
             raise InputError("files: the list is empty")
         _check_globs("files", self.files)

@@ -27,13 +27,15 @@ class SimulatedDetector:
     """
 
     shape: tuple[int, int] = quantity(
-        unit="px", low=1, high=65536, doc="window that is read: [rows, columns]"
+        unit="px", low=1, high=65536, doc="window that is read out: [rows, columns]"
     )
     pitch_um: float = quantity(unit="um", low=0.01, high=1000, doc="pixel pitch")
     gain_e_per_adu: float = quantity(unit="e-/ADU", low=1e-6, high=1e6, doc="conversion gain")
     read_noise_e: float = quantity(unit="e-", low=0, high=1e6, doc="read noise, rms")
     name: str = quantity("", doc="free text")
-    seed: int = quantity(0, low=0, high=10**18, doc="which specimen of the chip this is")
+    seed: int = quantity(
+        0, low=0, high=10**18, doc="random seed of the detector: its fixed patterns"
+    )
     chip: tuple[int, int] | None = quantity(
         None, unit="px", low=1, high=65536, doc="whole chip: [rows, columns]; default: the window"
     )
@@ -50,35 +52,44 @@ class SimulatedDetector:
         unit="ADU",
         low=1,
         high=4096,
-        doc="samples are multiples of it: 16 for a camera of 12 bits that writes 16",
+        doc="step of the samples: 16 for a 12-bit camera that writes 16 bits",
     )
     saturation_adu: float | None = quantity(
-        None, unit="ADU", above=0, doc="samples are clipped here; default: the converter's end"
+        None,
+        unit="ADU",
+        above=0,
+        doc="samples are clipped here; default: largest code of the converter",
     )
     full_well_e: float | None = quantity(
         None, unit="e-", low=1, high=1e7, doc="charge is clipped here; default: never"
     )
     bias_adu: float = quantity(500.0, unit="ADU", low=0, high=65535, doc="mean bias")
     bias_pixel_rms_adu: float = quantity(
-        0.0, unit="ADU", low=0, high=65535, doc="bias structure from pixel to pixel"
+        0.0, unit="ADU", low=0, high=65535, doc="rms of the bias pattern from pixel to pixel"
     )
     bias_column_rms_adu: float = quantity(
-        0.0, unit="ADU", low=0, high=65535, doc="bias structure from column to column"
+        0.0, unit="ADU", low=0, high=65535, doc="rms of the bias pattern from column to column"
     )
     dark_e_s: float = quantity(0.0, unit="e-/s", low=0, high=1e7, doc="dark current")
     hot_fraction: float = quantity(0.0, low=0, high=0.5, doc="share of the pixels that are hot")
     hot_rate_e_s: float = quantity(
-        0.0, unit="e-/s", low=0, high=1e7, doc="mean dark current of hot pixels (at least half)"
+        0.0,
+        unit="e-/s",
+        low=0,
+        high=1e7,
+        doc="mean dark current of hot pixels; each has at least half of it",
     )
     dead_fraction: float = quantity(
         0.0, low=0, high=0.5, doc="share of the pixels without response"
     )
-    prnu_rms: float = quantity(0.0, low=0, high=0.5, doc="response from pixel to pixel, relative")
+    prnu_rms: float = quantity(
+        0.0, low=0, high=0.5, doc="relative rms of the response from pixel to pixel"
+    )
     delta_rms_px: float = quantity(
-        0.0, unit="px", low=0, high=0.5, doc="offsets from pixel to pixel, each axis"
+        0.0, unit="px", low=0, high=0.5, doc="rms offset from pixel to pixel, each axis"
     )
     stitch_rms_px: float = quantity(
-        0.0, unit="px", low=0, high=0.5, doc="offsets from stitching block to block, each axis"
+        0.0, unit="px", low=0, high=0.5, doc="rms offset from stitching block to block, each axis"
     )
     stitch_px: tuple[int, int] = quantity(
         (64, 64), unit="px", low=1, high=65536, doc="stitching block: [rows, columns]"
@@ -92,17 +103,20 @@ class SimulatedDetector:
             first, size, whole = self.origin[axis], self.shape[axis], self.chip_shape[axis]
             if first < 0 or first + size > whole:
                 raise InputError(
-                    f"origin_px: {size} {name} from {first} do not fit on {whole}; see shape, chip"
+                    f"origin_px: {size} {name} from {first} on exceed the chip of {whole}; see "
+                    "shape, chip"
                 )
         if self.saturation_adu is not None and self.saturation_adu > (1 << self.bits) - 1:
             raise InputError(
-                f"saturation_adu: {self.saturation_adu:g} ADU is above the end of a converter of "
-                f"{self.bits} bits ({(1 << self.bits) - 1})"
+                f"saturation_adu: {self.saturation_adu:g} ADU is above the largest code of "
+                f"{self.bits} bits, {(1 << self.bits) - 1}; give less, or more bits"
             )
         if self.bias_adu >= self.top_adu:
             raise InputError(f"bias_adu: {self.bias_adu:g} ADU leaves no room below saturation")
         if self.hot_fraction + self.dead_fraction > 0.5:
-            raise InputError("hot_fraction: with dead_fraction more than half of the pixels")
+            raise InputError(
+                "hot_fraction: more than half of the pixels together with dead_fraction; give less"
+            )
 
     @property
     def chip_shape(self) -> tuple[int, int]:
@@ -141,7 +155,11 @@ class SimulatedOptics:
         unit="mm", low=1e-3, high=1e7, doc="1/e² radius of each fibre's light on the detector"
     )
     nominal_distance_mm: float | None = quantity(
-        None, unit="mm", low=0.1, high=1e7, doc="what the acquisition declares; default: the truth"
+        None,
+        unit="mm",
+        low=0.1,
+        high=1e7,
+        doc="distance that acquisition.yaml declares; default: the true one",
     )
     offset_mm: tuple[float, float] = quantity(
         (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="projected centre of the fibres: [x, y]"
@@ -154,7 +172,7 @@ class SimulatedOptics:
     )
     power_ratio: float = quantity(1.0, low=1e-3, high=1e3, doc="power of B over that of A")
     visibility: float = quantity(
-        1.0, above=0, high=1, doc="contrast where both fibres give the same light"
+        1.0, above=0, high=1, doc="contrast where both fibres give the same intensity"
     )
 
     moved: ClassVar = {
@@ -176,13 +194,17 @@ class SimulatedSet:
         unit="e-",
         low=1e-3,
         high=1e7,
-        doc="brightest fringe in the window, unit response, mean power",
+        doc="signal of the brightest fringe in the window, for unit response and mean power",
     )
     baseline_z_mm: float = quantity(
-        0.0, unit="mm", low=-1e4, high=1e4, doc="tilt: fibre B minus fibre A away from the detector"
+        0.0,
+        unit="mm",
+        low=-1e4,
+        high=1e4,
+        doc="fibre B minus fibre A along the optical axis (tilt)",
     )
     offset_mm: tuple[float, float] | None = quantity(
-        None, unit="mm", low=-1e5, high=1e5, doc="of this pair, instead of the one in optics"
+        None, unit="mm", low=-1e5, high=1e5, doc="centre of this pair; default: that in optics"
     )
     phase_law: str = quantity(
         "random", choices=("random", "ramp"), doc="random: uniform over 2π; ramp: equal steps"
@@ -201,7 +223,9 @@ class SimulatedSet:
                 f"name: {self.name!r} is the folder of calibration frames; choose another"
             )
         if self.phase_law == "ramp" and self.phase_step_rad == 0:
-            raise InputError("phase_step_rad: zero, so the ramp never moves; give its step")
+            raise InputError(
+                "phase_step_rad: zero, so the phase does not change; give the step of the ramp"
+            )
 
 
 @dataclass(frozen=True)
@@ -218,9 +242,9 @@ class SimulatedFrames:
 
     exptime_s: float = quantity(unit="s", low=1e-9, high=1e6, doc="of the fringe frames")
     period_s: float = quantity(
-        unit="s", low=1e-9, high=1e6, doc="frame to frame; longer exposures take their own time"
+        unit="s", low=1e-9, high=1e6, doc="time from frame to frame; longer exposures take longer"
     )
-    start: str = quantity("2026-01-01T00:00:00", doc="of the first frame, ISO 8601, UTC")
+    start: str = quantity("2026-01-01T00:00:00", doc="time of the first frame, ISO 8601, UTC")
     per_file: int = quantity(1, low=1, high=100_000, doc="1: 2-D frames; more: 3-D cubes")
     compress: tuple[str, ...] = quantity((), doc="bias, dark, flat or sets to tile-compress (RICE)")
     bias: int = quantity(0, low=0, high=MAX_FRAMES, doc="number of bias frames")
@@ -229,10 +253,10 @@ class SimulatedFrames:
         (), doc="dark frames, one entry for each exposure time"
     )
     flats: tuple[ExposureStep, ...] = quantity(
-        (), doc="flats under a steady lamp: a ladder of levels"
+        (), doc="flats under a steady lamp, one entry for each exposure time"
     )
     flat_rate_e_s: float | None = quantity(
-        None, unit="e-/s", low=1e-3, high=1e12, doc="the lamp, for unit response"
+        None, unit="e-/s", low=1e-3, high=1e12, doc="signal rate under the lamp, for unit response"
     )
     fringes: tuple[SimulatedSet, ...] = quantity((), doc="the fringe sets")
 
@@ -247,7 +271,7 @@ class SimulatedFrames:
             if len(set(times)) < len(times):
                 raise InputError(f"{key}: two entries have the same exptime_s; join them")
         if self.flats and self.flat_rate_e_s is None:
-            raise InputError("flat_rate_e_s: missing (in e-/s), and there are flats")
+            raise InputError("flat_rate_e_s: missing (in e-/s); flats need it")
         if not (self.bias or self.darks or self.flats or self.fringes):
             raise InputError("bias, darks, flats, fringes: no frames at all; give some")
         if self.period_s < self.exptime_s:
@@ -280,8 +304,10 @@ class Bench:
     detector: SimulatedDetector = quantity()
     optics: SimulatedOptics = quantity()
     frames: SimulatedFrames = quantity()
-    seed: int = quantity(0, low=0, high=10**18, doc="of everything that changes between frames")
-    shot_noise: bool = quantity(True, doc="false: the charge is its mean")
+    seed: int = quantity(
+        0, low=0, high=10**18, doc="random seed of all that changes from frame to frame"
+    )
+    shot_noise: bool = quantity(True, doc="false: no shot noise")
     effects: dict[str, Any] = field(
         default_factory=dict,
         hash=False,

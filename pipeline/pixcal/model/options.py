@@ -92,16 +92,28 @@ class Reduce:
         10.0, low=5, high=1e6, doc="Dark signal of ``HOT`` pixels, robust sigmas above the median."
     )
     dead_below: float = _python(
-        0.5, low=0, high=1, doc="Response over the neighbours' below which a pixel is ``DEAD``."
+        0.5,
+        low=0,
+        high=1,
+        doc="Response relative to the neighbours below which a pixel is ``DEAD``.",
     )
     dead_above: float = _python(
-        2.0, low=1, high=1e6, doc="Response over the neighbours' above which a pixel is ``DEAD``."
+        2.0,
+        low=1,
+        high=1e6,
+        doc="Response relative to the neighbours above which a pixel is ``DEAD``.",
     )
     noisy_factor: float = _python(
-        1.5, low=1, high=1e6, doc="Noise over the usual noise above which a pixel is ``NOISY``."
+        1.5,
+        low=1,
+        high=1e6,
+        doc="Noise relative to the typical noise above which a pixel is ``NOISY``.",
     )
     nonlinear_share: float = _python(
-        0.03, above=0, high=1e6, doc="Departure from a line above which it is ``NONLINEAR``."
+        0.03,
+        above=0,
+        high=1e6,
+        doc="Deviation from a straight line above which a pixel is ``NONLINEAR``.",
     )
     rounding_share: float = _python(
         1e-3, above=0, high=1, doc="Share of the variance that rounding may add."
@@ -136,7 +148,7 @@ class Fit(Sweep):
         doc="Also write maps corrected for the effects that 'pixcal diagnose' found.",
     )
     own: tuple[Path, ...] = _own(
-        "Python file of an own effect that the diagnosis found", in_key=False
+        "Python file of your own effect that the diagnosis found", in_key=False
     )
 
 
@@ -182,7 +194,7 @@ class Diagnose:
 
     only: tuple[str, ...] = _python((), doc="The only candidates.")
     without: tuple[str, ...] = _python((), doc="Effects to leave out.")
-    own: tuple[Path, ...] = _own("Python file with an own effect")
+    own: tuple[Path, ...] = _own("Python file with your own effect")
     nominal: Path | None = quantity(
         None, metavar="BENCH.yaml", doc="Bench file whose effects belong to the nominal simulation."
     )
@@ -289,7 +301,7 @@ class Simulate:
     truth: Path | None = quantity(
         None, metavar="DIR", shown="ACQ-truth", doc="Directory of the truth."
     )
-    own: tuple[Path, ...] = _own("Python file with an own effect that BENCH.yaml names")
+    own: tuple[Path, ...] = _own("Python file with your own effect that BENCH.yaml names")
 
 
 @dataclass(frozen=True)

@@ -140,8 +140,8 @@ def _check_region(region: Region | None, window: tuple[int, int]) -> None:
     y0, y1, x0, x1 = region
     if not (0 <= y0 < y1 <= window[0] and 0 <= x0 < x1 <= window[1]):
         raise InputError(
-            f"--region {_name(region)}: not inside the window; as y0:y1,x0:x1 with the ends "
-            f"excluded all of it is 0:{window[0]},0:{window[1]}"
+            f"--region {_name(region)}: not inside the window, which is "
+            f"0:{window[0]},0:{window[1]} (y0:y1,x0:x1, ends excluded)"
         )
 
 
@@ -267,8 +267,8 @@ def _measure_region(
     curve = fit_curve(chosen, median, np.log(high / low) / 2, pixels, shared, white)
     warnings = []
     if curve.knee is not None and curve.knee > batches.n / 2:
-        warnings = [f"not quite white: a knee at {curve.knee * batches.frames:.2g} frames, "
-                    "beyond what the run can show, is not given"]  # fmt: skip
+        warnings = [f"not quite white: the fitted knee at {curve.knee * batches.frames:.2g} "
+                    "frames is longer than the run can show"]  # fmt: skip
         curve = replace(curve, knee=None)
     expected = float(np.median(noise)) / np.sqrt(chosen)
     facts = _as_json(batches, chosen, curve, expected.tolist(), warnings)

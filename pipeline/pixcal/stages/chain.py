@@ -65,7 +65,7 @@ def run(
         with step("corrected", out / "corrected"):
             refused = correct.attempt(out, of_fit, runtime)
         if refused is not None:
-            note(f"corrected: not possible, the fitted maps stand: {refused}")
+            note(f"corrected: not possible, use the maps as fitted: {refused}")
     with step("report", out / "report"):
         report.run(out, report.Config(), runtime)
     return Done(fringes, diagnosed)

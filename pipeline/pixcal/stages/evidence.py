@@ -96,7 +96,7 @@ def _fringes(
     times = source.time_s()[frames]
     first, last, step = frames.indices(source.n_frames)
     if step != 1:
-        raise ValueError("frames that follow one another are needed")
+        raise ValueError("consecutive frames are needed")
     if (last - first) * (y[1] - y[0]) * (x[1] - x[0]) > MAX_SAMPLES:
         raise InputError(f"fringe set {name!r}: more than {MAX_SAMPLES} samples; take a part")
     codes = source.signal.read((first, last), y, x).astype(np.uint16, copy=False)

@@ -168,9 +168,13 @@ def fitted_shapes(run_dir: Path) -> tuple[str, Mapping[str, str]]:
 def treatment_of_kind(kind: type[Effect], model: str, models: Mapping[str, str]) -> tuple[str, str]:
     """How a kind of effect is treated, and why; parameters as in `treatments`."""
     if kind.undo is not Effect.undo:
-        return "undone on maps", "it acts on the three maps of a fit alike"
+        return "undone on maps", "it acts linearly on the maps of the fit"
     if kind.undo_samples is not Effect.undo_samples:
-        return "undone on samples", "it depends on the light of each frame: swept again without it"
+        return (
+            "undone on samples",
+            "it depends on the light of each frame: removed from the samples, which are fitted "
+            "again",
+        )
     if kind.fit_model == HYPERBOLIC:
         return _of_bent_fringes(model, models)
     if kind.absorbed_because:
@@ -181,10 +185,11 @@ def treatment_of_kind(kind: type[Effect], model: str, models: Mapping[str, str])
 def _of_bent_fringes(requested: str, models: Mapping[str, str]) -> tuple[str, str]:
     straight = [name for name, model in models.items() if model != HYPERBOLIC]
     if not straight:
-        return "in the fit", "the shape that was fitted to the fringes is hyperbolic"
+        return "in the fit", "hyperbolic fringes were fitted"
     if requested == "auto":
         return (
             IN_CORRECTED,
-            f"the fit took straight fringes ({', '.join(straight)}); the corrected maps do not",
+            f"straight fringes were fitted ({', '.join(straight)}); the corrected maps use "
+            "hyperbolic ones",
         )
-    return "not undone", "straight fringes were asked for: give --model hyperbolic"
+    return "not undone", "--model paraxial was given: use --model hyperbolic"

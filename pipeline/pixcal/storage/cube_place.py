@@ -103,7 +103,7 @@ def remove_cubes(artefact: Path, run: Path) -> None:
             return
         place = parse_place(pointer["place"])
         if not _owns(run, pointer):
-            log.warning("%s: left there, a copy of %s may need it", place, run)
+            log.warning("%s: not removed, because a copy of %s may need it", place, run)
             return
         remove_arrays(place)
         open_folder(place).remove([NOTE])
@@ -131,7 +131,7 @@ def _read(artefact: Local) -> Mapping[str, Any] | None:
 
 def _damaged(file: Local, reason: str) -> DamagedError:
     error = DamagedError(f"{file}: damaged{reason}", file)
-    error.advice = "say where cubes go with --cubes (--cubes RUN: in RUN), and they are made again"
+    error.advice = "give --cubes again (--cubes RUN: inside RUN) to write them anew"
     return error
 
 

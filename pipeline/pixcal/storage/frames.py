@@ -91,15 +91,15 @@ def tabulate(
         stamped = False
         if array.startswith("fringes"):
             warnings.append(
-                "a cube's EXPTIME is missing or zero, and optics.frame_period_s is not given, so "
-                "its frames are numbered"
+                "a cube has no EXPTIME, or zero, and optics.frame_period_s is not given: its "
+                "frames have numbers in place of times"
             )
     if stamped:
         frames = _stamped_frames(ordered, steps, frame_period_s)
         late = next((a for a, b in pairwise(frames) if b.time_s < a.time_s), None)
         if late is not None:
             warnings.append(
-                f"a cube lasts beyond the next file's time stamp by its {late.time_source}"
+                f"by its {late.time_source}, a cube ends after the time stamp of the next file"
             )
     else:
         frames = _counted_frames(ordered, frame_period_s)

@@ -88,7 +88,7 @@ def _cards(place: str, row: dict[str, str | None]) -> Iterable[tuple[str, str | 
         except ValueError:
             value = math.nan
         if not math.isfinite(value) or (key == "EXPTIME" and value < 0):
-            raise InputError(f"{place}: {key} {text!r:.40} is not a number that it can have")
+            raise InputError(f"{place}: {key} {text!r:.40} is not a valid number")
         yield key, value
 
 

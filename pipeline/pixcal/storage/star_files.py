@@ -68,7 +68,7 @@ def write_table(table: Table, path: Path, *, overwrite: bool) -> None:
         If the file is there and not to be replaced, or its name says no format.
     """
     if path.exists() and not overwrite:
-        raise InputError(f"{path}: is there already; choose another --out, or add --overwrite")
+        raise InputError(f"{path}: exists; choose another --out, or add --overwrite")
     kinds = {".csv": "ascii.csv", ".ecsv": "ascii.ecsv", ".fits": "fits", ".vot": "votable"}
     if path.suffix.lower() not in kinds:
         raise InputError(f"{path}: write a name that ends in {', '.join(kinds)}")

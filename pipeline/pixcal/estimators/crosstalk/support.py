@@ -77,8 +77,8 @@ def choose(measured: Measured, pattern: Callable[[Classes], float]) -> Choice:
     far = sum(max(map(abs, measured.links[n])) > NEAR for n in there)
     if far > MOST_FAR:
         raise InputError(
-            f"not decided: noise is shared by {len(there)} kinds of pairs of pixels, {far} of them "
-            f"more than {NEAR} pixels apart (at most {MOST_FAR} are measured): it is not that of a "
+            f"not decided: noise is correlated at {len(there)} distances between pixels, {far} of "
+            f"them beyond {NEAR} pixels (at most {MOST_FAR} are measured), unlike a crosstalk "
             "kernel"
         )
     none = Classes(1, 1, measured.first)

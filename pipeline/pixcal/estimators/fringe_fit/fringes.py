@@ -95,8 +95,8 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
     """
     if max(map(abs, nominal)) * SHORTEST_PX > 2 * np.pi:
         raise InputError(
-            f"baseline_mm and optics give fringes of {2 * np.pi / np.hypot(*nominal):.2g} px: "
-            f"pixels show them from {SHORTEST_PX:g} px on along x and y; correct the numbers, or "
+            f"baseline_mm and optics give a fringe period of {2 * np.pi / np.hypot(*nominal):.2g} "
+            f"px, below {SHORTEST_PX:g} px along x or y; correct the numbers, or "
             "use a shorter baseline"
         )
     shape = maps.shape[1:]
@@ -154,8 +154,8 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
     cosine = found @ np.array(nominal) / max(np.hypot(*found) * np.hypot(*nominal), 1e-300)
     if abs(cosine) < MOST_TURNED:
         raise InputError(
-            f"the fringes lie {np.degrees(np.arccos(abs(cosine))):.0f} degrees from where "
-            "baseline_mm says; correct it, or list the files of the right set"
+            f"the fringes are {np.degrees(np.arccos(abs(cosine))):.0f} degrees from the "
+            "direction of baseline_mm; correct it, or list the files of the right set"
         )
     sign = np.sign(cosine)
     return float(sign * found[0]), float(sign * found[1])

@@ -160,7 +160,7 @@ class Scout:
     def _require_pixels(self) -> None:
         if sum(int(t.good.sum()) for t in self.tiles) < 30:
             raise InputError(
-                "fewer than 30 good pixels are left to find the fringes with: the others are "
+                "fewer than 30 good pixels are left: the others are "
                 "masked, saturated too often, or do not fit the fringes; look at the mask, the "
                 "bias frames and the level of the light"
             )
@@ -216,8 +216,8 @@ class Scout:
         values, vectors = eigh(gram, subset_by_index=(last - 3, last), overwrite_a=True)
         if values[1] <= 1e-12 * values[3] or values[1] < ABOVE_NOISE * values[0]:
             raise InputError(
-                "no fringes found, or their phase was scanned too little: what differs from frame "
-                "to frame is noise; look at the frames, and scan evenly over a turn or more"
+                "no fringes found, or their phase was scanned too little: the frames "
+                "differ by noise only; check the frames, and scan the phase evenly over 2π or more"
             )
         g = vectors[:, :0:-1]
         first, block = self.tiles[0], codes[0]
@@ -254,7 +254,7 @@ class Scout:
         turned = np.hypot((kx - self.k[0]) * nx, (ky - self.k[1]) * ny)
         if not np.median(away) < FOLLOWS_RAD or turned > np.pi:
             raise InputError(
-                "no fringes found that the pixels follow; look at the frames, at the bias frames, "
+                "no fringes found in the pixels; check the frames, at the bias frames, "
                 "and at which files the set lists"
             )
         across = float(np.hypot(kx * nx, ky * ny)) / (2 * np.pi)

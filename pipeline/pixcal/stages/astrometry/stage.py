@@ -184,7 +184,7 @@ def _facts(
     """What was simulated."""
     return {
         "detector": {
-            "pixels": "maps and a draw of their errors" if detector.drawn else "truth",
+            "pixels": "the maps plus random errors of size SIGMA" if detector.drawn else "truth",
             "truth": None if config.truth is None else str(config.truth),
             "shape": list(detector.shape),
             "places": int(maps.places.sum()),
@@ -249,17 +249,18 @@ def _warnings(result: Mapping[str, Any]) -> list[str]:
         gain = axis["floor"]["gain"]["value"]
         if axis["floor"]["perfect"]["px"] is None:
             sentences.append(
-                f"{name}: the pixels' own offsets are below the maps' errors; these maps "
-                "do not improve centroids; more frames are needed"
+                f"{name}: the offsets of the pixels are below the errors of the maps, so these "
+                "maps do not improve centroids; take more frames"
             )
         elif gain is not None and gain < 1:
             sentences.append(
-                f"{name}: the maps' errors exceed the offsets; these maps make centroids worse"
+                f"{name}: the errors of the maps exceed the offsets, so these maps make centroids "
+                "worse"
             )
     if "fringe" in result["axes"]:
         sentences.append(
-            "offsets are known along one axis only: those across it, taken as zero here, move "
-            "stars along it too"
+            "offsets are known along one axis only; those along the other axis, taken as zero "
+            "here, also move stars"
         )
     if result["detector"]["modes_removed_px"] is None:
         sentences.append(

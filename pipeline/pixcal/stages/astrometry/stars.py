@@ -40,8 +40,8 @@ class Telescope:
         low, high = SAMPLINGS
         if not low <= self.sampling <= high:
             raise InputError(
-                f"--focal-length, --wavelength, --diameter: {self.sampling:.3g} px in lambda/D, "
-                f"from {low:g} to {high:g} can be done; change one of them"
+                f"--focal-length, --wavelength, --diameter: {self.sampling:.3g} px per "
+                f"lambda/D, not from {low:g} to {high:g}; change one of them"
             )
 
     @property

@@ -106,7 +106,7 @@ def axis_facts(
     bound : float
         Cramér-Rao bound of one position, px.
     drawn : bool
-        Whether the detector is the maps and a draw of their errors.
+        Whether the detector is the the maps plus random errors of size SIGMA.
     """
     kinds = dict(zip(KINDS, np.moveaxis(errors, -1, 0), strict=True))
 

@@ -78,8 +78,8 @@ def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
         changes.append((name, replace(bench, frames=replace(f, fringes=fuller)), None, "no margin"))
     doubled = tuple(replace(s, peak_e=2 * s.peak_e) for s in f.fringes)
     changes.append(
-        ("twice the light a frame", replace(bench, frames=replace(f, fringes=doubled)), None,
-         "and the well for it")
+        ("twice the light in each frame", replace(bench, frames=replace(f, fringes=doubled)), None,
+         "needs twice the full well")
     )  # fmt: skip
     if d.read_noise_e > 0:
         quiet = replace(d, read_noise_e=d.read_noise_e / 2)
@@ -95,7 +95,7 @@ def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
     if any(s.loss[0] > 1.01 for s in now.sets):
         random = tuple(replace(s, phase_law="random") for s in f.fringes)
         changes.append(
-            ("phases over the whole cycle", replace(bench, frames=replace(f, fringes=random)),
+            ("phases over the whole period", replace(bench, frames=replace(f, fringes=random)),
              None, "")
         )  # fmt: skip
     if f.period_s > 1.05 * f.exptime_s:
@@ -120,5 +120,5 @@ def _finer_fringes(bench: Bench, now: JoinedBound) -> list[Change]:
     length = max(float(np.hypot(*scan.baseline_mm)) for scan in longer)
     changed = replace(bench, frames=replace(bench.frames, fringes=tuple(longer)))
     loss = 100 * (1 - min(contrast))
-    note = f"contrast {loss:.2g} % less: a pixel averages over itself"
+    note = f"contrast {loss:.2g} % lower: a pixel averages over its area"
     return [(f"interfringe {wanted:g} px (baseline {length:.3g} mm)", changed, contrast, note)]

@@ -99,7 +99,7 @@ def _write(out: Path, result: dict[str, Any]) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
-        raise InputError(f"--out {out}: a file is in the way; choose another directory") from error
+        raise InputError(f"--out {out}: is a file; choose another directory") from error
     aside = out / ".budget.png.aside"
     aside.write_bytes(png(budget_figure(result)))
     aside.replace(out / "budget.png")
@@ -240,13 +240,13 @@ def _left_out(bench: Bench) -> list[str]:
     )
     if bench.effects:
         sentences.append(
-            "what the effects of the bench file do, but for light and contrast of whole frames: "
+            "effects of the bench file, except variations of light and contrast of whole frames: "
             + ", ".join(sorted(bench.effects))
         )
     if d.prnu_rms > 0:
         sentences.append(
-            f"the response of single pixels: its {100 * d.prnu_rms:.2g} % rms scatters their "
-            f"errors by {50 * d.prnu_rms:.2g} %"
+            f"the response of single pixels, {100 * d.prnu_rms:.2g} % rms, which changes their "
+            f"errors by {50 * d.prnu_rms:.2g} % rms"
         )
     if not bench.shot_noise:
         sentences.append("shot_noise: false in the bench file: a budget always counts it")
@@ -273,7 +273,7 @@ def _warnings(bench: Bench, bound: JoinedBound) -> list[str]:
         across = float(np.hypot(np.median(s.kx) * nx, np.median(s.ky) * ny) / (2 * np.pi))
         if across < HONEST_FRINGES:
             sentences.append(
-                f"{scan.name}: {across:.2g} fringes across the window; fewer than "
-                f"{HONEST_FRINGES:g} leave true offsets and fringes mixed up"
+                f"{scan.name}: {across:.2g} fringes across the window; with fewer "
+                f"than {HONEST_FRINGES:g}, offsets and fringes cannot be separated"
             )
     return sentences

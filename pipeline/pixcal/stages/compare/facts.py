@@ -81,11 +81,11 @@ def _evidence(facts: dict[str, Any]) -> list[str]:
             evidence.append(f"{name}: a wave of {size}")
         elif profile["significance"] > -ndtri(SHARE):
             times = f"{profile['ratio']:.2g} times"
-            evidence.append(f"{name}: their means differ {times} more than noise")
+            evidence.append(f"{name}: means differ by {times} the noise")
     blocks, outliers = facts["blocks"], facts["outliers"]
     for kind, number in blocks["beyond"].items():
         if number:
-            evidence.append(f"the {kind} of {number} of {blocks['number']} blocks")
+            evidence.append(f"{kind} of {number} of {blocks['number']} blocks")
     # The chance of so many or more, by the Poisson law.
     if gammainc(outliers["beyond_5_sigma"], outliers["expected"]) < SHARE:
         evidence.append(f"{outliers['beyond_5_sigma']} single pixels")

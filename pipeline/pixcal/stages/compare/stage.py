@@ -99,10 +99,10 @@ def _check_out(out: Path) -> None:
     if not out.exists():
         return
     if not out.is_dir():
-        raise InputError(f"--out {out}: a file is in the way; choose another directory")
+        raise InputError(f"--out {out}: is a file; choose another directory")
     made = read_manifest(out)
     if (made is not None and made.stage != STAGE.name) or (out / "ingest").exists():
-        raise InputError(f"--out {out}: holds something else of pixcal; choose another directory")
+        raise InputError(f"--out {out}: holds other results of pixcal; choose another directory")
 
 
 def _sides(runs: Sequence[Path], config: Config) -> list[Side]:
@@ -131,8 +131,8 @@ def _components(sides: Sequence[Side]) -> dict[str, Vector]:
     for side in sides:
         if not side.both and _angle(side.axes[0], direction) > PARALLEL_DEG:
             raise InputError(
-                f"{side.run}: its fringes are turned by {_angle(side.axes[0], direction):.0f} "
-                f"degrees against those of {single.run}; they measure different components"
+                f"{side.run}: its fringes are rotated by {_angle(side.axes[0], direction):.0f} "
+                f"degrees from those of {single.run}; they measure different components"
             )
     return {"delta_fringe": direction}
 
@@ -208,7 +208,7 @@ def _warnings(sides: Sequence[Side], components: dict[str, Vector]) -> list[str]
             if turned > NOTED_DEG:
                 share = np.sin(np.radians(turned))
                 sentences.append(
-                    f"{side.label}: fringes turned by {turned:.1f} degrees: {100 * share:.1g} % of "
-                    "the offsets along the fringes count as a difference"
+                    f"{side.label}: fringes rotated by {turned:.1f} degrees: {100 * share:.1g} % "
+                    "of the offsets along the fringes count as a difference"
                 )
     return sentences

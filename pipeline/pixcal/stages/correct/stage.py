@@ -65,7 +65,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     diagnosed = require(run_dir, "diagnose")
     if diagnosed.inputs["reduce"] != require(run_dir, "reduce").key:
         raise InputError(
-            f"{run_dir / 'diagnose'}: of frames that were reduced otherwise; run "
+            f"{run_dir / 'diagnose'}: made from frames that were reduced differently; run "
             f"'pixcal diagnose {run_dir}' again"
         )
     fitted = fit.run(run_dir, config, runtime)

@@ -166,7 +166,7 @@ def undone(maps: FringeMaps, effects: Sequence[Effect]) -> tuple[FringeMaps, lis
             or not np.isfinite(after.theta).all()
         ):
             raise InputError(
-                f"effect {effect.name!r}: undo gives no finite maps of the shape it is given; "
+                f"effect {effect.name!r}: undo does not return finite maps of the same shape; "
                 "fix its file"
             )
         steps.append(phase_change(maps.theta, after.theta))

@@ -89,7 +89,7 @@ class CrestPaths:
 def seed_vector(patch: NDArray[Any], good: Mask, nominal: Vector) -> Vector:
     """Fringe vector (kx, ky), rad/px, of a patch (y, x) of a frame; its sign is the nominal's."""
     if good.sum() < MIN_POINTS**2:
-        raise InputError("no fringes found: too few good samples at the middle of the frame")
+        raise InputError("no fringes found: too few good samples in the centre of the frame")
     level = float(patch[good].mean())
     if not level > 0:
         raise InputError("no fringes found: the frame is dark")
@@ -185,8 +185,8 @@ def find_crests(
 def _check(use: Mask) -> None:
     if use.sum() < MIN_POINTS:
         raise InputError(
-            f"no fringes found in enough windows: {use.sum()} of {use.size} show them, at least "
-            f"{MIN_POINTS} are needed; give a shorter --segment, or more --frames"
+            f"fringes found in only {use.sum()} of {use.size} windows, at least {MIN_POINTS} are "
+            f"needed; give a shorter --segment, or more --frames"
         )
 
 

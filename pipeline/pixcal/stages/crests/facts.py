@@ -18,8 +18,8 @@ def warnings(fit: CrestFit) -> list[str]:
     sentences = []
     if fit.chi2_reduced > NOTABLE_CHI2:
         sentences.append(
-            f"points scatter {np.sqrt(fit.chi2_reduced):.1f} times more than their noise; errors "
-            "allow for it as if points were independent, which offsets of whole blocks are not"
+            f"points scatter {np.sqrt(fit.chi2_reduced):.1f} times more than their noise. The "
+            "errors include this, but are too small if whole blocks of pixels are offset"
         )
     lost = int((~fit.used).sum())
     if lost > 0.05 * len(fit.used):

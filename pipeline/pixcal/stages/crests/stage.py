@@ -75,7 +75,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     acquisition = load_run(run_dir)
     if not acquisition.frames.fringes:
         raise InputError(
-            f"{run_dir}: the acquisition lists no fringes; crests need some, in frames.fringes"
+            f"{run_dir}: the acquisition lists no fringes; crests needs frames.fringes"
         )
     with working(run_dir, "reduce") as inputs:
         facts: dict[str, Any] = {}

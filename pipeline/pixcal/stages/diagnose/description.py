@@ -150,6 +150,6 @@ def _top(
         if peak + float(np.median(evidence.bias)) > 65535:
             raise InputError(
                 f"fringes reach {peak:.0f} ADU above the bias: samples above 65535 ADU cannot be "
-                "simulated; diagnose frames of a converter of 16 bits"
+                "simulated; give frames of a 16-bit converter"
             )
     return min(top, acquisition.detector.saturation_adu or top)

@@ -78,8 +78,8 @@ def _kinds(config: Config, known: Mapping[str, type[Effect]]) -> dict[str, type[
     for name in (*config.only, *config.without):
         if name not in known:
             raise InputError(
-                f"--effects {name!r:.80}: unknown effect; known are {', '.join(known)}; one of "
-                "your own is known with --own and its file"
+                f"--effects {name!r:.80}: unknown effect; known are {', '.join(known)}; give "
+                "the file of your own effect with --own"
             )
         if name in config.only and name in config.without:
             raise InputError(

@@ -192,8 +192,8 @@ def _choose(model: str, tiles: TileSums, start: Start) -> tuple[SetFit, str]:
     background = max(1.0, beyond)
     needed = QUADRATIC * EXCESS * background if background > RED else EVIDENCE
     reason = (
-        f"hyperbolic fringes lower chi-square by {gain:.0f}, {needed:.0f} are asked for where "
-        f"large scales hold {background:.1f} times the power of small ones"
+        f"hyperbolic fringes lower chi-square by {gain:.0f}; {needed:.0f} is required, because "
+        f"large scales have {background:.1f} times the power of small ones"
     )
     if gain <= needed:
         return straight, reason

@@ -50,7 +50,7 @@ def header_of(run_dir: Path, result: dict[str, Any], key: str) -> tuple[list[Car
         ("PIXCALID", key, "key of the fit"),
         ("INDIGEST", result["input"], "digest of the acquisition"),
         ("MODEL", "+".join(sorted(models)), "shape of the fringes, as fitted"),
-        ("MODELOPT", result["model"], "shape of the fringes that was asked for"),
+        ("MODELOPT", result["model"], "requested shape of the fringes"),
         ("NSETS", len(result["sets"]), "fringe sets used"),
     ]
     history = []

@@ -73,9 +73,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """
     acquisition = load_run(run_dir)
     if not acquisition.frames.fringes:
-        raise InputError(
-            f"{run_dir}: the acquisition lists no fringes; a fit needs some, in frames.fringes"
-        )
+        raise InputError(f"{run_dir}: the acquisition lists no fringes; fit needs frames.fringes")
 
     def body(made: Build) -> None:
         try:

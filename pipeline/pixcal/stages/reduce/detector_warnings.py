@@ -48,8 +48,8 @@ def _of_gain(fit: GainFit, declared: float, used: float) -> list[str]:
     found = []
     if fit.chi2_reduced > _NO_LINE:
         found.append(
-            "the photon-transfer curve is no straight line (reduced chi-square "
-            f"{fit.chi2_reduced:.3g}): do not rely on the gain measured; causes are a "
+            "the photon-transfer curve is not a straight line (reduced chi-square "
+            f"{fit.chi2_reduced:.3g}): do not rely on the measured gain; possible causes: a "
             "nonlinear response, amplifiers of different gain, a lamp that flickers, or charge "
             "shared by neighbours"
         )
@@ -61,7 +61,7 @@ def _of_gain(fit: GainFit, declared: float, used: float) -> list[str]:
         )
     if fit.curved:
         found.append(
-            "the photon-transfer curve bends: variance over level changes by "
+            "the photon-transfer curve is not straight: variance over level changes by "
             f"{100 * fit.curved:+.2g} % up to {fit.levels[1]:.0f} ADU; the gain is "
             "that at level zero; causes are a nonlinear response, or charge that neighbours "
             "share the more the brighter they are"

@@ -68,7 +68,8 @@ def group_exposures(tables: Mapping[str, Mapping[str, Sequence[Any]]]) -> Exposu
         times |= {name: [1.0] * len(times[name]) for name in ["dark", *lit]}
         unit = ", and dark_rate is in electrons an exposure" if "bias" in times else ""
         found.warnings.append(
-            f"no frame has EXPTIME: darks are taken to be exposed as long as the others{unit}"
+            "no frame has EXPTIME: darks are assumed to have the same exposure time as the "
+            f"others{unit}"
         )
     _group_darks(found, times)
     _group_flats(found, times.get("flat", []), tables.get("flat", {}).get("step"))
@@ -108,12 +109,12 @@ def _group_darks(found: Exposures, times: Mapping[str, list[float | None]]) -> N
     if not found.dark:
         found.warnings.append(
             "no bias and no dark frames: bias and dark signal are taken as zero, the gain is not "
-            "measured, and signals hold the bias"
+            "measured, and signals include the bias"
         )
     elif not bias and not found.has_rate:
         found.warnings.append(
-            "no bias frames, and darks of one exposure time only: their mean stands for bias and "
-            "dark signal together, which is right for frames exposed as long as the darks"
+            "no bias frames, and darks of one exposure time only: their mean is subtracted as "
+            "bias and dark signal, which is right only for frames of the same exposure time"
         )
     elif not found.has_rate and dark:
         found.warnings.append(
@@ -157,6 +158,6 @@ def _time_fringes(found: Exposures, name: str, times: list[float | None]) -> Non
         other = sum(t is not None and abs(t - expected) > _SAME * expected for t in times)
         if other:
             found.warnings.append(
-                f"{name}: {other} of {len(times)} frames are not exposed {expected:g} s as the "
-                "darks that stand for their bias and dark signal"
+                f"{name}: {other} of {len(times)} frames do not have the exposure time of "
+                f"the darks, {expected:g} s, whose mean is subtracted as bias and dark signal"
             )

@@ -125,7 +125,7 @@ def _read_noise(found: Json, facts: Json, gain: float, step: float) -> Measure |
     note = f"rounding to {steps} adds {rounding:.3g} e-"
     own = None if entry["measured"] is None else scale * entry["measured"]
     if own is None:
-        note += "; too coarse to measure the noise before it"
+        note += "; too coarse to measure the noise without it"
     found["read_noise_with_rounding"] = _figure(
         "read noise with rounding", "e-", (whole, error), note
     )

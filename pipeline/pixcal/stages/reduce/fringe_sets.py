@@ -184,8 +184,8 @@ def set_warnings(name: str, found: dict[str, Any], declared: bool, share: float)
     largest = found["largest_adu"]
     if not declared and any(largest == 2**bits - 1 for bits in _CONVERTERS):
         warnings.append(
-            f"{name}: the largest sample is {largest}, the end of a converter; if it saturates "
-            "there, declare detector.saturation_adu"
+            f"{name}: the largest sample is {largest}, the largest code of a converter; if it "
+            "saturates there, declare detector.saturation_adu"
         )
     if found["mean_e"] is None:
         warnings.append(f"{name}: no sample has weight: all are saturated or missing")

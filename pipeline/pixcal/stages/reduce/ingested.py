@@ -96,8 +96,8 @@ class Ingested:
             if (found / file).exists():
                 return found
         raise InputError(
-            f"{folder}: the frames of {self.folder} are not there any more; run 'pixcal ingest ACQ "
-            f"--out {run}' with ACQ where they are (and --copy, to remove them then)"
+            f"{folder}: the frames of {self.folder} are gone; run 'pixcal ingest ACQ --out {run}' "
+            "with their new place as ACQ (--copy keeps a copy in RUN)"
         )
 
     @cached_property

@@ -30,7 +30,7 @@ def up_to_date(folder: Path, stage: Stage, key: str, option: str) -> Manifest | 
     if not folder.exists():
         return None
     if not folder.is_dir():
-        raise InputError(f"{option} {folder}: a file is in the way; choose another directory")
+        raise InputError(f"{option} {folder}: is a file; choose another directory")
     there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if not p.is_dir()}
     if not there:
         return None

@@ -85,7 +85,7 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
     out = resolved(out, "--out")
     truth = resolved(config.truth or out.with_name(f"{out.name}-truth"), "--truth")
     if truth.is_relative_to(out) or out.is_relative_to(truth):
-        raise InputError(f"--truth {truth}: one inside the other with {out}; keep the truth apart")
+        raise InputError(f"--truth {truth}: lies inside {out}, or around it; choose another")
     effects = _checked_effects(plan, bench, config.own)
     own = {f"effect {file.name}": file_digest(file) for file in config.own}
     key = artefact_key(STAGE.name, STAGE.format, to_plain(plan), own)

@@ -63,7 +63,7 @@ def photon_transfer(evidence: Evidence) -> Curve | None:
 
 @statistic(
     "intensity",
-    "linearity: flats off a line over exposure time",
+    "linearity: deviation of the flats from a line over exposure time",
     "relative deviation",
     x="flat",
     sets=False,
