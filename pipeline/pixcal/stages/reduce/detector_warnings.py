@@ -56,15 +56,15 @@ def _of_gain(fit: GainFit, declared: float, used: float) -> list[str]:
     if fit.neighbours:
         lags = ", ".join(f"({y}, {x})" for y, x in fit.neighbours)
         found.append(
-            "neighbours share charge: their noise is correlated in the flats at (rows, "
-            f"columns) {lags}; the gain counts what they share"
+            "crosstalk: the noise of neighbours in the flats is correlated at (rows, columns) "
+            f"{lags}; the gain includes it"
         )
     if fit.curved:
         found.append(
             "the photon-transfer curve is not straight: variance over level changes by "
             f"{100 * fit.curved:+.2g} % up to {fit.levels[1]:.0f} ADU; the gain is "
-            "that at level zero; causes are a nonlinear response, or charge that neighbours "
-            "share the more the brighter they are"
+            "that at level zero; possible causes: a nonlinear response, or the brighter-fatter "
+            "effect"
         )
     value, error = fit.gain, fit.error
     if abs(value - declared) > max(3 * error, 0.02 * declared):
