@@ -1,19 +1,25 @@
 """Charge that stays behind in the pixel and comes out with later frames."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
-from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker
+from pixcal.estimators.detector.frame_lag import (
+    CLEAR,
+    LAGS,
+    MAX_DECAY,
+    contrast_steps,
+    decay_of,
+    released_freely,
+    share_of_flats,
+    weighted_mean,
+)
 from pixcal.estimators.detector.noiseless_charge import missing_noise
+from pixcal.estimators.detector.pixel_lag import uneven_pixels
 from pixcal.estimators.detector.traps import BANDS, LossFit, in_bands
-from pixcal.estimators.diagnosis.distortions import Freedom
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.diagnosis.middle import MOST, middle
-from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
 from pixcal.kernels.transfer import fill_traps, left_behind
@@ -24,24 +30,8 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 TAIL = 1e-3  # share of the charge left behind whose release is brought forward to the last frame
-LAGS = 6  # frames back that are looked at
-# of the phase that pixels are free to have, so that a bent response is not taken for lag
-HARMONICS = 5
-CONTROLS = 8  # frames after a frame that are compared with the one before it
-_MAX_DECAY = 3.0
-_CLIP = 5.0
-_MIN_FRAMES = 20
-_SERIES = 8
-_STEADIEST = 1e-4
 _ROUNDS = 2
-_CLEAR = 4.0
-# chi-squares from which releases, or the level, are taken as they come
-_NOT_EXPONENTIAL, _NOT_EVEN = 40.0, 25.0
 _TURNS = 3  # of the inverse: each gains a factor of the share
-# trials for traps that fill up: what they keep from frame to frame, and hold at most, over what
-# they would take of full scale
-_KEEPS, _ROOMS = (0.3, 0.6), (0.1, 0.2, 0.4, 0.7)
-_STEPS = 12  # of all parameters of such traps
 
 
 @dataclass(frozen=True)
@@ -84,7 +74,7 @@ class Lag(Effect):
         0.0,
         unit="frames",
         low=0,
-        high=_MAX_DECAY,
+        high=MAX_DECAY,
         doc="frames in which the release falls by a factor e; 0: all in the next frame",
     )
     spread: float = quantity(
@@ -248,24 +238,38 @@ class Lag(Effect):
         frame of each flat tells, which lacks what the dark before it could not give.
         """
         if not evidence.fringes:
-            return _of_flats(evidence)
+            of_flats = share_of_flats(evidence)
+            if of_flats is None:
+                return None
+            share, error = of_flats
+            why = (
+                "the first flat of a level is fainter; after another flat, rather than darkness, "
+                "the share is a lower limit"
+            )
+            effect = cls(float(np.clip(share, 0, 0.5)), 0.0, 0.0)
+            return Estimate(effect, {"share": error}, share / error, why, {"share": share})
         fringes = tuple(evidence.fringes.values())
         found = cls(0.0)
         for _ in range(_ROUNDS):
-            steps = [s for f in fringes if (s := _contrast_steps(f, found)) is not None]
-            if not steps:
+            known = np.zeros(LAGS)
+            known[: len(found.releases)] = (found.share * found.releases)[:LAGS]
+            # Linear about a lag that is known in part, which is taken out of the frames first.
+            frames = [found.restored(f.free[:, :3].astype(np.float32)) for f in fringes]
+            told = [s for f in frames if (s := contrast_steps(f.astype(float))) is not None]
+            if not told:
                 return None
-            share, keep, share_error, keep_error, sigmas = _decay(steps)
+            steps = [(known + shares, information) for shares, information in told]
+            share, keep, share_error, keep_error, sigmas = decay_of(steps)
             found = cls(float(np.clip(share, 0, 0.5)), -1 / np.log(keep) if keep else 0.0)
-        share, share_error, later = _freely(steps, keep, share, share_error)
+        share, share_error, later = released_freely(steps, keep, share, share_error)
         part = middle(evidence)
         level_e = max(float(np.nanquantile(f.electrons[::7], 0.99)) for f in fringes)
-        uneven, uneven_error = _mean(
+        uneven, uneven_error = weighted_mean(
             [p for f in part.fringes.values() if (p := uneven_pixels(f)) is not None]
         )
         # What the pixels have in common is no less than how much they differ by.
         rms = float(np.sqrt(max(uneven, 0.0))) / (1 - keep)
-        least = rms if uneven > _CLEAR * uneven_error else 0.0
+        least = rms if uneven > CLEAR * uneven_error else 0.0
         share = float(np.clip(share, least, 0.5))
         spread, spread_error = 0.0, 1.0
         if share > 0:
@@ -275,9 +279,9 @@ class Lag(Effect):
             spread_error = float(np.hypot(spread_error, spread * share_error) / share)
         whole = cls(share, found.decay_frames, 0.0, (), level_e, later)
         of_level: dict[str, float] = {}
-        if sigmas > _CLEAR:
+        if sigmas > CLEAR:
             whole, of_level = _by_level(part, whole)
-        quiet, quiet_error = _quiet(part, whole) if sigmas > _CLEAR else (0.0, 1.0)
+        quiet, quiet_error = _quiet(part, whole) if sigmas > CLEAR else (0.0, 1.0)
         decay = -1 / np.log(keep) if keep else 0.0
         decay_error = keep_error * decay**2 / keep if keep else -1 / np.log(min(keep_error, 0.9))
         return Estimate(
@@ -285,7 +289,7 @@ class Lag(Effect):
                 whole,
                 decay_frames=whole.decay_frames
                 if whole.capacity_e
-                else min(float(decay), _MAX_DECAY),
+                else min(float(decay), MAX_DECAY),
                 spread=min(spread, 1.0),
                 quiet=quiet,
             ),
@@ -298,7 +302,7 @@ class Lag(Effect):
             | of_level,
             sigmas_of_best(sigmas, uneven / uneven_error),
             "the contrast falls with the phase step from the previous frame"
-            + (", unevenly from pixel to pixel" if uneven > _CLEAR * uneven_error else ""),
+            + (", unevenly from pixel to pixel" if uneven > CLEAR * uneven_error else ""),
             {"by_contrast_sigmas": sigmas, "by_pixels_sigmas": uneven / uneven_error},
         )
 
@@ -327,132 +331,31 @@ def _shares(lag: Lag, detector: SimulatedDetector, rows: Rows) -> F32:
     return share
 
 
-def _contrast_steps(fringes: FringeEvidence, lag: Lag) -> tuple[F64, F64] | None:
-    """Shares (lag,) that come out 1, 2, ... frames later, and their information (lag, lag).
-
-    Linear about a lag that is known in part: its share is taken out of the frames first.
-    """
-    b, a_cos, a_sin = lag.restored(fringes.free[:, :3].astype(np.float32)).astype(float).T
-    count = len(b)
-    if count < _MIN_FRAMES + LAGS:
-        return None
-    phase = np.arctan2(a_sin, a_cos)
-    contrast = np.hypot(a_cos, a_sin) / b
-    contrast = contrast / np.median(contrast)
-    terms = np.zeros((LAGS, count))
-    for back in range(1, LAGS + 1):
-        light = b[:-back] / b[back:]
-        terms[back - 1, back:] = light * (np.cos(phase[:-back] - phase[back:]) - 1)
-    time = np.linspace(-1, 1, count)
-    # What a wrong gauge of the fit and slow changes do to the contrast.
-    other = [np.ones(count), time, time**2]
-    for n in (1, 2):
-        other += [np.cos(n * phase), np.sin(n * phase)]
-    basis, size, _ = np.linalg.svd(np.stack(other).T, full_matrices=False)
-    basis = basis[:, size > 1e-6 * size[0]]
-    used = np.ones(count, bool)
-    for _ in range(2):
-        inside = np.linalg.qr(basis[used])[0]
-        rest = terms[:, used] - (terms[:, used] @ inside) @ inside.T
-        y = contrast[used] - inside @ (inside.T @ contrast[used])
-        normal = rest @ rest.T
-        if np.any(np.diag(normal) < 1e-3 * used.sum()):
-            return None
-        shares = np.linalg.solve(normal, rest @ y)
-        left = y - shares @ rest
-        scatter = np.sqrt(left @ left / (used.sum() - LAGS - basis.shape[1]))
-        spread = 1.4826 * np.median(np.abs(left))
-        used[used] = np.abs(left) <= _CLIP * max(spread, 1e-12)
-    known = np.zeros(LAGS)
-    known[: len(lag.releases)] = (lag.share * lag.releases)[:LAGS]
-    return known + shares, normal / scatter**2
-
-
-def _decay(steps: list[tuple[F64, F64]]) -> tuple[float, float, float, float, float]:
-    """Share, what is kept from frame to frame, their errors, and how significant the share is."""
-    information = np.sum([n for _, n in steps], axis=0)
-    right = np.sum([n @ w for w, n in steps], axis=0)
-    power = np.arange(LAGS)
-
-    def release(keep: float) -> F64:
-        return np.asarray((1 - keep) * keep**power)
-
-    def gain(keep: float) -> float:
-        """Significance of the share, with its sign."""
-        u = release(keep)
-        return float(u @ right / np.sqrt(u @ information @ u))
-
-    highest = float(np.exp(-1 / _MAX_DECAY))
-    best = float(minimize_scalar(lambda k: -gain(k), bounds=(0, highest), method="bounded").x)
-    # Without lag the decay has no meaning; it must show.
-    if gain(best) ** 2 < gain(0.0) ** 2 + _CLEAR**2:
-        best = 0.0
-    u = release(best)
-    share = float(u @ right / (u @ information @ u))
-    slope = power * (1 - best) * best ** np.maximum(power - 1, 0) - best**power
-    jacobian = np.stack([u, max(share, 1e-9) * slope])
-    covariance = np.linalg.inv(jacobian @ information @ jacobian.T)
-    errors = np.sqrt(np.diag(covariance))
-    if not best:
-        errors[0] = 1 / np.sqrt(u @ information @ u)
-    return share, best, float(errors[0]), float(errors[1]), gain(best)
-
-
-def _freely(
-    steps: list[tuple[F64, F64]], keep: float, share: float, error: float
-) -> tuple[float, float, tuple[float, ...]]:
-    """Share, its error and what comes out in each frame, where an exponential does not describe it.
-
-    Else share and error as given, and nothing.
-    """
-    information = np.sum([n for _, n in steps], axis=0)
-    free = np.linalg.solve(information, np.sum([n @ w for w, n in steps], axis=0))
-    away = free - share * (1 - keep) * keep ** np.arange(LAGS)
-    if float(away @ information @ away) < _NOT_EXPONENTIAL or share < _CLEAR * error:
-        return share, error, ()
-    covariance = np.linalg.inv(information)
-    kept = np.maximum(free, 0)
-    total = float(kept.sum())
-    return total, float(np.sqrt(covariance.sum())), tuple(map(float, kept / total))
-
-
 def _by_level(evidence: Evidence, lag: Lag) -> tuple[Lag, dict[str, float]]:
     """The lag with what it does at each level, and errors of that, where it is not the same at all.
 
     Either a share of each band of the level stays, whatever stayed before, or traps fill up.
     """
-    fit = LossFit(middle(evidence, MOST // 2), lag.level_e)
 
     def banded(shares: F64, charge: F32) -> F32:
         return _banded(lag, shares).lost(charge)[0]
 
-    even = np.full(len(BANDS), lag.share)
-    fit.weigh(banded, even)
-    found = fit.fit(banded, even, 2)
-    errors = np.sqrt(np.diag(found.covariance))
-    precision = inverse_normal(found.covariance)
-    # The contrast tells the common share to its square, which steps about a model leave out.
-    away = found.value - (precision @ found.value).sum() / precision.sum()
-    if float(away @ precision @ away) < _NOT_EVEN:
-        return lag, {}
-
     def trapped(values: F64, charge: F32) -> F32:
         return _trapped(lag, values).lost(charge)[0]
 
-    full = lag.share * lag.level_e
-    starts = [(*even, keep, room * full) for keep in _KEEPS for room in _ROOMS]
-    best = min(starts, key=lambda start: fit.chi2(trapped, start))
-    traps = fit.fit(trapped, best, _STEPS // 2)
-    fit.weigh(trapped, traps.value)
-    traps = fit.fit(trapped, traps.value, _STEPS)
-    if traps.chi2 > fit.chi2(banded, found.value) - _NOT_EVEN:
-        relative = {f"bands[{n}]": float(e / lag.share) for n, e in enumerate(errors)}
-        return _banded(lag, found.value), relative
-    errors = np.sqrt(np.diag(traps.covariance))
-    of_traps = _trapped(lag, traps.value)
-    scale = (*(1 / of_traps.share for _ in BANDS), of_traps.decay_frames**2 / of_traps._keep, 1)
-    names = (*(f"bands[{n}]" for n in range(len(BANDS))), "decay_frames", "capacity_e")
-    return of_traps, {n: float(e * s) for n, e, s in zip(names, errors, scale, strict=True)}
+    fit = LossFit(middle(evidence, MOST // 2), lag.level_e)
+    bands, traps = fit.by_level(banded, trapped, lag.share, lag.share * lag.level_e)
+    names = [f"bands[{n}]" for n in range(len(BANDS))]
+    if traps is not None:
+        found = _trapped(lag, traps.value)
+        names += ["decay_frames", "capacity_e"]
+        scale = [*(1 / found.share for _ in BANDS), found.decay_frames**2 / found._keep, 1.0]
+        errors = np.sqrt(np.diag(traps.covariance)) * scale
+    elif bands is not None:
+        found, errors = _banded(lag, bands.value), np.sqrt(np.diag(bands.covariance)) / lag.share
+    else:
+        return lag, {}
+    return found, dict(zip(names, map(float, errors), strict=True))
 
 
 def _banded(lag: Lag, shares: F64) -> Lag:
@@ -463,7 +366,7 @@ def _banded(lag: Lag, shares: F64) -> Lag:
 def _trapped(lag: Lag, values: F64) -> Lag:
     """Traps that take shares of the bands of the level, keep a part, and hold so much at most."""
     *shares, keep, most = values
-    decay = -1 / np.log(np.clip(keep, 1e-3, np.exp(-1 / _MAX_DECAY)))
+    decay = -1 / np.log(np.clip(keep, 1e-3, np.exp(-1 / MAX_DECAY)))
     share = float(np.mean(np.maximum(shares, 0)))
     traps = replace(
         lag, share=min(share, 0.5), decay_frames=float(decay), capacity_e=float(most), later=()
@@ -478,121 +381,4 @@ def _quiet(evidence: Evidence, lag: Lag) -> tuple[float, float]:
         return lag.lost(signal)[1]
 
     part, error = missing_noise(evidence, comes_out)
-    return float(np.clip(part, 0, 1)) if part > _CLEAR * error else 0.0, min(error, 1.0)
-
-
-def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
-    """Mean square deviation of the pixels' shares from their mean, and its error.
-
-    From the frame before, less what the frames after give: they have no part in the frame, but as
-    much of everything else.
-    """
-    if len(fringes.g) < _MIN_FRAMES + CONTROLS:
-        return None
-    freedom = Freedom(fringes, HARMONICS)
-    residual = freedom.left_over(freedom.of_good(fringes.residual))
-    weighted = freedom.weight * residual
-    steps = (1, *range(-1, -CONTROLS - 1, -1))
-    before, *after = _squares_of_shares(fringes, freedom, weighted, steps)
-    value, error = np.array(after).T
-    noise = np.hypot(before[1], np.sqrt((error**2).mean() / CONTROLS))
-    scatter = value.std(ddof=1) * np.sqrt(1 + 1 / CONTROLS)
-    return before[0] - float(value.mean()), float(max(noise, scatter))
-
-
-def _squares_of_shares(
-    fringes: FringeEvidence, freedom: Freedom, weighted: F32, steps: Sequence[int]
-) -> list[tuple[float, float]]:
-    """Mean square, above noise, of the pixels' shares of an earlier frame, and its error.
-
-    One for each number of steps back, from the residuals (t, n) times their weights.
-    """
-    others = np.zeros((len(steps), *fringes.g.T.shape), np.float32)
-    for other, step in zip(others, steps, strict=True):
-        other[:] = np.roll(fringes.g, step, axis=0).T
-        other[:, slice(0, step) if step > 0 else slice(step, None)] = 0
-    own, weight, theta = freedom.of_time, freedom.weight, fringes.theta[:, freedom.good]
-    count = weight.shape[1]
-    upper = np.triu_indices(3)
-
-    def summed(products: F32, samples: F32) -> F32:
-        """Sums over time (..., n) of products (..., t) with samples (t, n); all in one product."""
-        found = products.reshape(-1, products.shape[-1]) @ samples
-        return found.reshape(*products.shape[:-1], count)
-
-    mixed = summed(own[:, None] * others[:, None], weight)
-    rights = summed(others, weighted)
-    found = []
-    for own_squares, own_mixed, own_right in zip(
-        summed(others[:, upper[0]] * others[:, upper[1]], weight), mixed, rights, strict=True
-    ):
-        squares = np.empty((3, 3, count))
-        squares[upper] = squares[upper[::-1]] = own_squares
-        # The other frame is a sum of the pixel's maps, less what the pixel can have of its own; of
-        # that nothing is left in the residuals.
-        along = np.einsum("kin,in->kn", own_mixed, theta)
-        taken = np.einsum("nij,jn->in", freedom.pixel_inverse, along)
-        information = np.einsum("in,ijn,jn->n", theta, squares, theta)
-        information -= np.einsum("kn,kn->n", along, taken)
-        found.append(_mean_square(np.einsum("in,in->n", theta, own_right), information))
-    return found
-
-
-def _mean_square(right: F64, information: F64) -> tuple[float, float]:
-    """Mean square of shares less that of their noise, and its error, from normal equations (n,)."""
-    told = information > 1e-3 * np.median(information)
-    share, variance = right[told] / information[told], 1 / information[told]
-    square = share**2 - variance
-    trust = 1 / (variance**2 + np.median(variance) ** 2)
-    # Particles leave wild values in a few pixels.
-    trust *= np.abs(square) < _CLIP**2 * np.median(np.abs(square))
-    total = trust.sum()
-    mean = float(trust @ square / total)
-    return mean, float(np.sqrt(trust**2 @ (square - mean) ** 2) / total)
-
-
-def _mean(values: list[tuple[float, float]]) -> tuple[float, float]:
-    """Weighted mean and its error; of an empty list one that says nothing."""
-    if not values:
-        return 0.0, 1.0
-    value, error = np.array(values).T
-    weight = error**-2
-    return float(weight @ value / weight.sum()), float(weight.sum() ** -0.5)
-
-
-def _of_flats(evidence: Evidence) -> Estimate | None:
-    """The first frame of each flat against the rest, over the level.
-
-    Any offset of first frames is taken from stacks without light.
-    """
-    found = np.array([f for s in evidence.stacks if (f := _first_frame(s, evidence)) is not None])
-    if len(found) < 2 or np.ptp(found[:, 0]) < 10 * found[:, 2].min():
-        return None
-    level, step, error = found.T
-    design = np.stack([-level, np.ones_like(level)]) / error
-    covariance = np.linalg.inv(design @ design.T)
-    share = float((covariance @ (design @ (step / error)))[0])
-    share_error = float(np.sqrt(covariance[0, 0]))
-    return Estimate(
-        Lag(float(np.clip(share, 0, 0.5)), 0.0, 0.0),
-        {"share": share_error},
-        share / share_error,
-        "the first flat of a level is fainter; if another flat came before it, the share is a "
-        "lower limit",
-        {"share": share},
-    )
-
-
-def _first_frame(stack: Stack, evidence: Evidence) -> tuple[float, float, float] | None:
-    """Level of a stack, how much its first frame differs from the others, and the error; e-."""
-    count = len(stack.adu)
-    lamp, known = flicker(evidence)
-    if count < (2 if stack.kind == "flat" and known > FLICKER_KNOWN else _SERIES):
-        return None
-    light = (stack.adu - evidence.bias)[:, evidence.good] * evidence.gain
-    means = light.mean(axis=1)
-    rest = means[1:]
-    level = float(rest.mean())
-    # What the lamp did from frame to frame is measured by the frames themselves.
-    scatter = level * max(lamp, _STEADIEST) if count < _SERIES else float(rest.std(ddof=2))
-    return level, float(means[0] - level), scatter * float(np.sqrt(1 + 1 / len(rest)))
+    return float(np.clip(part, 0, 1)) if part > CLEAR * error else 0.0, min(error, 1.0)

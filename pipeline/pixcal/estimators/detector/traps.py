@@ -24,6 +24,13 @@ UNKNOWN = 6  # first frames, whose past is not known
 CONVERGED = 1.0  # fall in chi-square that a step must bring
 # lengths of a step that are tried: where room is short, samples that fill it change with the step
 LENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25)
+NOT_EVEN = 25.0  # chi-square from which what stays is taken to depend on the level
+# trials for traps that fill up: what they keep from frame to frame, and hold at most, over what
+# they would take of full scale
+KEEPS, ROOMS = (0.3, 0.6), (0.1, 0.2, 0.4, 0.7)
+STEPS = 12  # of all parameters of such traps
+
+Loss = Callable[[F64, F32], F32]
 
 
 def in_bands(level: F32, level_e: float) -> list[F32]:
@@ -56,9 +63,7 @@ class LossFit:
     def __init__(self, evidence: Evidence, level_e: float) -> None:
         self._sets = [_Set(evidence, fringes, level_e) for fringes in evidence.fringes.values()]
 
-    def fit(
-        self, lost: Callable[[F64, F32], F32], start: Sequence[float] | F64, rounds: int
-    ) -> FittedLoss:
+    def fit(self, lost: Loss, start: Sequence[float] | F64, rounds: int) -> FittedLoss:
         """Gauss-Newton steps of the parameters of a loss.
 
         Parameters
@@ -95,21 +100,52 @@ class LossFit:
                 break
         return FittedLoss(value, covariance, chi2)
 
-    def chi2(self, lost: Callable[[F64, F32], F32], value: Sequence[float] | F64) -> float:
+    def by_level(
+        self, banded: Loss, trapped: Loss, share: float, full: float
+    ) -> tuple[FittedLoss | None, FittedLoss | None]:
+        """Shares of bands of the level, and traps that fill up, if they explain more.
+
+        Parameters
+        ----------
+        banded, trapped : callable
+            As of `fit`: from a share of each band; from these, what traps keep and what they hold.
+        share, full : float
+            That stays on the mean, and of full scale, e-.
+
+        Returns
+        -------
+        bands, traps : FittedLoss or None
+            None where the share is the same in all bands; where traps explain no more.
+        """
+        even = np.full(len(BANDS), share)
+        self.weigh(banded, even)
+        bands = self.fit(banded, even, 2)
+        precision = inverse_normal(bands.covariance)
+        # The contrast tells the common share to its square, which steps about a model leave out.
+        away = bands.value - (precision @ bands.value).sum() / precision.sum()
+        if float(away @ precision @ away) < NOT_EVEN:
+            return None, None
+        starts = [(*even, keep, room * full) for keep in KEEPS for room in ROOMS]
+        best = min(starts, key=lambda start: self.chi2(trapped, start))
+        traps = self.fit(trapped, best, STEPS // 2)
+        self.weigh(trapped, traps.value)
+        traps = self.fit(trapped, traps.value, STEPS)
+        better = traps.chi2 <= self.chi2(banded, bands.value) - NOT_EVEN
+        return bands, traps if better else None
+
+    def chi2(self, lost: Loss, value: Sequence[float] | F64) -> float:
         """Of a loss as it is."""
         return sum(rest.chi2 for rest in self._rests(lost, np.array(value)))
 
-    def weigh(self, lost: Callable[[F64, F32], F32], value: Sequence[float] | F64) -> None:
+    def weigh(self, lost: Loss, value: Sequence[float] | F64) -> None:
         """Take what a loss leaves of the contrast for its noise."""
         for one, rest in zip(self._sets, self._rests(lost, np.array(value)), strict=True):
             one.contrast_error *= 1.4826 * float(np.median(np.abs(rest.contrast[UNKNOWN:])))
 
-    def _rests(self, lost: Callable[[F64, F32], F32], value: F64) -> list["_Rest"]:
+    def _rests(self, lost: Loss, value: F64) -> list["_Rest"]:
         return [one.rest(lost(value, one.level)) for one in self._sets]
 
-    def _sums(
-        self, lost: Callable[[F64, F32], F32], value: F64, rests: Sequence["_Rest"]
-    ) -> tuple[F64, F64]:
+    def _sums(self, lost: Loss, value: F64, rests: Sequence["_Rest"]) -> tuple[F64, F64]:
         """Least-squares sums of a step of the parameters, then of a bent response."""
         slopes: list[list[_Rest]] = []
         for n, size in enumerate(value):

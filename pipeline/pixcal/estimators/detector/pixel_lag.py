@@ -1,0 +1,85 @@
+"""Lag that differs from pixel to pixel, in the residuals of the fringe frames."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pixcal.estimators.diagnosis.distortions import Freedom
+from pixcal.estimators.diagnosis.evidence import FringeEvidence
+from pixcal.model.arrays import F32, F64
+
+# of the phase that pixels are free to have, so that a bent response is not taken for lag
+HARMONICS = 5
+CONTROLS = 8  # frames after a frame that are compared with the one before it
+CLIP = 5.0
+MIN_FRAMES = 20
+
+
+def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
+    """Mean square deviation of the pixels' shares from their mean, and its error.
+
+    From the frame before, less what the frames after give: they have no part in the frame, but as
+    much of everything else.
+    """
+    if len(fringes.g) < MIN_FRAMES + CONTROLS:
+        return None
+    freedom = Freedom(fringes, HARMONICS)
+    residual = freedom.left_over(freedom.of_good(fringes.residual))
+    weighted = freedom.weight * residual
+    steps = (1, *range(-1, -CONTROLS - 1, -1))
+    before, *after = _squares_of_shares(fringes, freedom, weighted, steps)
+    value, error = np.array(after).T
+    noise = np.hypot(before[1], np.sqrt((error**2).mean() / CONTROLS))
+    scatter = value.std(ddof=1) * np.sqrt(1 + 1 / CONTROLS)
+    return before[0] - float(value.mean()), float(max(noise, scatter))
+
+
+def _squares_of_shares(
+    fringes: FringeEvidence, freedom: Freedom, weighted: F32, steps: Sequence[int]
+) -> list[tuple[float, float]]:
+    """Mean square, above noise, of the pixels' shares of an earlier frame, and its error.
+
+    One for each number of steps back, from the residuals (t, n) times their weights.
+    """
+    others = np.zeros((len(steps), *fringes.g.T.shape), np.float32)
+    for other, step in zip(others, steps, strict=True):
+        other[:] = np.roll(fringes.g, step, axis=0).T
+        other[:, slice(0, step) if step > 0 else slice(step, None)] = 0
+    own, weight, theta = freedom.of_time, freedom.weight, fringes.theta[:, freedom.good]
+    count = weight.shape[1]
+    upper = np.triu_indices(3)
+
+    def summed(products: F32, samples: F32) -> F32:
+        """Sums over time (..., n) of products (..., t) with samples (t, n); all in one product."""
+        found = products.reshape(-1, products.shape[-1]) @ samples
+        return found.reshape(*products.shape[:-1], count)
+
+    mixed = summed(own[:, None] * others[:, None], weight)
+    rights = summed(others, weighted)
+    found = []
+    for own_squares, own_mixed, own_right in zip(
+        summed(others[:, upper[0]] * others[:, upper[1]], weight), mixed, rights, strict=True
+    ):
+        squares = np.empty((3, 3, count))
+        squares[upper] = squares[upper[::-1]] = own_squares
+        # The other frame is a sum of the pixel's maps, less what the pixel can have of its own; of
+        # that nothing is left in the residuals.
+        along = np.einsum("kin,in->kn", own_mixed, theta)
+        taken = np.einsum("nij,jn->in", freedom.pixel_inverse, along)
+        information = np.einsum("in,ijn,jn->n", theta, squares, theta)
+        information -= np.einsum("kn,kn->n", along, taken)
+        found.append(_mean_square(np.einsum("in,in->n", theta, own_right), information))
+    return found
+
+
+def _mean_square(right: F64, information: F64) -> tuple[float, float]:
+    """Mean square of shares less that of their noise, and its error, from normal equations (n,)."""
+    told = information > 1e-3 * np.median(information)
+    share, variance = right[told] / information[told], 1 / information[told]
+    square = share**2 - variance
+    trust = 1 / (variance**2 + np.median(variance) ** 2)
+    # Particles leave wild values in a few pixels.
+    trust *= np.abs(square) < CLIP**2 * np.median(np.abs(square))
+    total = trust.sum()
+    mean = float(trust @ square / total)
+    return mean, float(np.sqrt(trust**2 @ (square - mean) ** 2) / total)
