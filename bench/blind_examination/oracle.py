@@ -14,7 +14,8 @@ from blind_examination.cases import effects_of
 from blind_examination.draw import Truth
 from pixcal.effects import effects
 from pixcal.engine.run import Runtime
-from pixcal.estimators.diagnosis.gap import Reference, expect_nominal, expect_with, log_likelihood
+from pixcal.estimators.diagnosis.expectation import Reference, expect_nominal, expect_with
+from pixcal.estimators.diagnosis.gap import log_likelihood
 from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError

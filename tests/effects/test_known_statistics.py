@@ -10,7 +10,7 @@ import pytest
 
 from pixcal.effects import effects
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.gap import Reference
+from pixcal.estimators.diagnosis.expectation import Reference
 from pixcal.estimators.diagnosis.test_statistics import DETECTOR, known_statistics, measure
 
 

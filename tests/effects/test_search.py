@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from pixcal.estimators.diagnosis.gap import Reference, compare, flagged
+from pixcal.estimators.diagnosis.expectation import Reference
+from pixcal.estimators.diagnosis.gap import compare, flagged
 from pixcal.estimators.diagnosis.test_statistics import Curve, Key
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage

@@ -5,7 +5,8 @@ import pytest
 
 from pixcal.effects.ipc import Ipc
 from pixcal.effects.row_noise import RowNoise
-from pixcal.estimators.diagnosis.gap import Reference, compare, expect_nominal
+from pixcal.estimators.diagnosis.expectation import Reference, expect_nominal
+from pixcal.estimators.diagnosis.gap import compare
 from pixcal.estimators.diagnosis.test_statistics import Curve, Key
 from pixcal.simulation.effect import Effect, Estimate
 from pixcal.stages.diagnose.candidates import Candidate

@@ -4,17 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm
 
-from pixcal.estimators.diagnosis.gap import (
-    CHANCE,
-    Reference,
-    compare,
-    expect_nominal,
-    expect_with,
-    flagged,
-    log_likelihood,
-    remaining,
-    scaled,
-)
+from pixcal.estimators.diagnosis.expectation import Reference, expect_nominal, expect_with, scaled
+from pixcal.estimators.diagnosis.gap import CHANCE, compare, flagged, log_likelihood, remaining
 from pixcal.estimators.diagnosis.test_statistics import Curve, Key, known_statistics
 from pixcal.stages.diagnose.shrinkage import LEAST
 

@@ -12,14 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.diagnosis.deviations import (
-    Change,
-    Deviation,
-    SetDeviations,
-    StackDeviations,
-    is_smooth,
-)
+from pixcal.estimators.diagnosis.deviations import Change, SetDeviations, StackDeviations
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.map_deviations import Deviation, is_smooth
 from pixcal.model.arrays import F32
 from pixcal.simulation.forward import ForwardModel, Stage
 from pixcal.simulation.replica import Replica

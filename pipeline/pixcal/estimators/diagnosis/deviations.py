@@ -8,14 +8,12 @@ it, with all that the fit absorbs taken off.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import dct
-from scipy.ndimage import median_filter
 
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import (
@@ -25,30 +23,16 @@ from pixcal.estimators.diagnosis.evidence import (
     Stack,
     free_frames,
 )
+from pixcal.estimators.diagnosis.map_deviations import MAPS, Deviation, change_of_maps, weighed
 from pixcal.estimators.diagnosis.pair_sums import pair_sums, pair_variance, taken_by_fit
 from pixcal.estimators.diagnosis.test_statistics.look import Look
 from pixcal.estimators.fringe_fit.tile_fit import Coding
-from pixcal.estimators.maps.structure import flattened, without_outliers
+from pixcal.estimators.maps.structure import without_outliers
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 WILD = 8.0  # standard deviations beyond which a residual is an outlier
 HARMONICS = 2  # of the phase, with which parameters of the frames may go for reasons of the fit
-# of the smooth surface that maps of the nominal bench may have
-DEGREES = {"offset": 3, "contrast": 2, "light": 3}
-MAPS = tuple(DEGREES)
-AROUND = 5  # pixels along the side of a pixel's surroundings
-# share of the changes of pixels by which they may differ from those of their surroundings
-ALONE = 0.5
 KNOWN = 0.02  # relative error of the variance that the noise model gives to parameters of a frame
-
-
-@dataclass(frozen=True)
-class Deviation:
-    """Values that differ from what is nominal, and one over their variance."""
-
-    value: NDArray[Any]
-    weight: NDArray[Any]
-
 
 Change = dict[str, NDArray[Any]]
 
@@ -139,7 +123,7 @@ class SetDeviations(_Deviations):
     def maps(self) -> Deviation:
         """Maps (3, y, x) of the pixels, of `MAPS`."""
         maps = Look(self.found, self._evidence).maps
-        return _weighed(np.stack([maps[name] for name in MAPS]))
+        return weighed(np.stack([maps[name] for name in MAPS]))
 
     @cached_property
     def pairs(self) -> Deviation:
@@ -229,7 +213,7 @@ class SetDeviations(_Deviations):
         of_map = {"offset": turn, "contrast": amplitude - light, "light": light}
         out = np.full((len(MAPS), *good.shape), np.nan)
         out[:, good] = [of_map[name] for name in MAPS]
-        return _changed(out, self.maps)
+        return change_of_maps(out, self.maps)
 
     def second_moments(self, name: str, change: NDArray[Any]) -> F64:
         """What a random change of residuals adds to ``pairs``, of frames to ``power``."""
@@ -263,7 +247,7 @@ class StackDeviations(_Deviations):
         mean = self._stack.adu.mean(axis=0)
         if self._stack.kind != "bias":
             mean = mean - self._evidence.bias
-        return _weighed(without_outliers(np.where(self.good, mean, np.nan))[None])
+        return weighed(without_outliers(np.where(self.good, mean, np.nan))[None])
 
     @cached_property
     def pairs(self) -> Deviation:
@@ -286,7 +270,7 @@ class StackDeviations(_Deviations):
         if "maps" in names:
             mean = np.full((1, *self.good.shape), np.nan)
             mean[0, self.good] = changed.mean(axis=0) - bias[self.good]
-            change["maps"] = _changed(mean, self.maps)
+            change["maps"] = change_of_maps(mean, self.maps)
         return change
 
 
@@ -299,39 +283,6 @@ def band_power(series: F64, *, squares: bool = True) -> F64:
 def _octaves(modes: int) -> Indices:
     starts = 2 ** np.arange(2, max(int(np.log2(max(modes, 8))), 3)) - 4
     return np.asarray(starts[starts < modes])
-
-
-def _weighed(maps: F64) -> Deviation:
-    """Maps less their smooth surfaces, weighed by what neighbours differ by; NaN by nothing."""
-    flat, weight = _flattened(maps), np.zeros(maps.shape)
-    for own, out in zip(maps, weight, strict=True):
-        steps = np.diff(own, axis=1)
-        if np.isfinite(steps).any():
-            spread = 1.4826 * float(np.nanmedian(np.abs(steps))) / np.sqrt(2)
-            out[np.isfinite(own)] = 1 / max(spread**2, 1e-30)
-    return Deviation(flat, weight)
-
-
-def is_smooth(maps: F64, weight: F64) -> bool:
-    """Whether maps (m, y, x) change from pixel to pixel by less than they do at large.
-
-    Of others, the noise of the maps that were measured may decide.
-    """
-    around = np.stack([median_filter(own, AROUND, mode="reflect") for own in maps])
-    rough, whole = (float((weight * v**2).sum()) for v in (maps - around, maps))
-    return rough <= ALONE**2 * whole
-
-
-def _changed(maps: F64, measured: Deviation) -> F64:
-    """Change of maps less smooth surfaces, on the pixels that were measured."""
-    return _flattened(np.where(measured.weight > 0, maps, np.nan))
-
-
-def _flattened(maps: F64) -> F64:
-    degrees = [DEGREES[name] for name in MAPS] if len(maps) == len(MAPS) else [DEGREES["light"]]
-    return np.nan_to_num(
-        np.stack([flattened(own, degree) for own, degree in zip(maps, degrees, strict=True)])
-    )
 
 
 def _inverse(variance: F64) -> F64:

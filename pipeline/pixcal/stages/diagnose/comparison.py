@@ -5,16 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.gap import (
+from pixcal.estimators.diagnosis.expectation import (
     Expectation,
     Reference,
-    compare,
     expect_nominal,
     expect_with,
-    flagged,
-    log_likelihood,
-    remaining,
 )
+from pixcal.estimators.diagnosis.gap import compare, flagged, log_likelihood, remaining
 from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.model.arrays import F64
 from pixcal.stages.diagnose.shrinkage import Trial, differing

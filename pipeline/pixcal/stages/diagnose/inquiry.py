@@ -10,14 +10,8 @@ import numpy as np
 
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.gap import (
-    Difference,
-    Reference,
-    compare,
-    expect_nominal,
-    expect_with,
-    flagged,
-)
+from pixcal.estimators.diagnosis.expectation import Reference, expect_nominal, expect_with
+from pixcal.estimators.diagnosis.gap import Difference, compare, flagged
 from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
 from pixcal.kernels.significance import SIGNIFICANT

@@ -9,15 +9,8 @@ import numpy as np
 from scipy.special import log_ndtr, ndtr
 
 from pixcal import __version__
-from pixcal.estimators.diagnosis.gap import (
-    Difference,
-    Expectation,
-    Reference,
-    flagged,
-    likelier,
-    sigmas_among,
-    sigmas_of,
-)
+from pixcal.estimators.diagnosis.expectation import Expectation, Reference
+from pixcal.estimators.diagnosis.gap import Difference, flagged, likelier, sigmas_among, sigmas_of
 from pixcal.estimators.diagnosis.test_statistics import DETECTOR, Curve, Key
 from pixcal.estimators.diagnosis.test_statistics.signature import statistic_named
 from pixcal.model.arrays import F64

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.gap import Reference
+from pixcal.estimators.diagnosis.expectation import Reference
 from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64

@@ -5,15 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.gap import (
-    Difference,
-    Expectation,
-    Gap,
-    compare,
-    flagged,
-    likelier,
-    remaining,
-)
+from pixcal.estimators.diagnosis.expectation import Expectation
+from pixcal.estimators.diagnosis.gap import Difference, Gap, compare, flagged, likelier, remaining
 from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.model.arrays import F64
 from pixcal.stages.diagnose.trial import Effects

@@ -10,10 +10,9 @@ errors of the fit let expect of white noise); ``slope`` with ``slope_err`` of th
 name ``y0:y1,x0:x1``.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -25,74 +24,36 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.frame_series.stability import (
     MAX_DRAWS,
     NO_CURVE,
-    ONE_SIGMA,
     Curve,
     fit_curve,
     shared_noise,
     white_population,
 )
-from pixcal.kernels.allan import allan_deviation, averaging_lengths, disjoint_differences
-from pixcal.kernels.quantiles import quantiles_of_parts
-from pixcal.model.arrays import F32, F64, I64, Mask
+from pixcal.kernels.allan import allan_deviation, averaging_lengths
+from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.config import result_options
-from pixcal.model.errors import DamagedError, InputError
+from pixcal.model.errors import InputError
 from pixcal.model.options import Allan, Region
+from pixcal.stages.allan.batches import (
+    TILES_HIGH,
+    Batches,
+    Tile,
+    noise_levels,
+    quantiles_of_region,
+    region_name,
+    sums_of_region,
+)
 from pixcal.storage.artefact import Build, Manifest, read_json, write_json
-from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
+from pixcal.storage.cube import ArrayWriter, create_array, create_group, write_array
 from pixcal.storage.formats import STAGES
 from pixcal.storage.stage import copy_products, make, working
 
 STAGE = STAGES["allan"]
 SCHEMA = "pixcal/allan/1"
 MIN_BATCHES = 3
-# a task takes so many of the fit's chunks, one above the other: one file of each length
-TILES_HIGH = 4
 COUNT_BYTES = 64 << 20  # of the digits of all values of a map (`quantiles_of_parts`)
-DIFFERENCES = 32  # differences in time whose products show what pixels share
-# levels of the quantiles that describe the noise over a region
-NOISE_LEVELS = (np.arange(64) + 0.5) / 64
-
-Range = tuple[int, int]
-Tile = tuple[Range, Range]
 
 Config = Allan
-
-
-@dataclass(frozen=True)
-class Batches:
-    """The batch maps of one fringe set, as the fit left them."""
-
-    folder: Path
-    n: int  # batches, gaps included
-    window: tuple[int, int]
-    chunks: tuple[int, int]  # of the fit's maps, (rows, columns)
-    frames: int  # frames of a batch
-    step_s: float  # from one batch to the next, seconds
-    note: str  # what the fit says of them, or ""
-
-    @classmethod
-    def open(cls, folder: Path, facts: dict[str, Any]) -> "Batches":
-        """Look at ``fit.zarr/<set name>``; ``facts`` are the set's part of ``fit.json``."""
-        delta, time = ArrayReader(folder / "delta"), ArrayReader(folder / "batch_time").read()
-        ny, nx = delta.shape
-        cy, cx = delta.chunks
-        step = round(float(time[1] - time[0]), 9) if len(time) > 1 else 0.0
-        note = facts.get("batch_note", "")
-        return cls(folder, len(time), (ny, nx), (cy, cx), facts["batch_frames"], step, note)
-
-    def tiles(self, area: Region, times: int = 1) -> list[Tile]:
-        """So many chunks one above the other, cut to an area."""
-        (y0, y1, x0, x1), (cy, cx) = area, self.chunks
-        return list(product(_spans(y0, y1, times * cy), _spans(x0, x1, cx)))
-
-    def read(self, name: str, tile: Tile) -> F32:
-        """``batch_delta`` or ``batch_sigma`` (batch, y, x) of a tile, px."""
-        return ArrayReader(self.folder / name).read((0, self.n), *tile)
-
-
-def _spans(start: int, stop: int, size: int) -> Iterator[Range]:
-    for edge in range(start // size * size, stop, size):
-        yield max(edge, start), min(edge + size, stop)
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -129,18 +90,13 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         return make(run_dir, STAGE, options, inputs, body, publish=publish)
 
 
-def _name(region: Region) -> str:
-    y0, y1, x0, x1 = region
-    return f"{y0}:{y1},{x0}:{x1}"
-
-
 def _check_region(region: Region | None, window: tuple[int, int]) -> None:
     if region is None:
         return
     y0, y1, x0, x1 = region
     if not (0 <= y0 < y1 <= window[0] and 0 <= x0 < x1 <= window[1]):
         raise InputError(
-            f"--region {_name(region)}: not inside the window, which is "
+            f"--region {region_name(region)}: not inside the window, which is "
             f"0:{window[0]},0:{window[1]} (y0:y1,x0:x1, ends excluded)"
         )
 
@@ -163,7 +119,7 @@ def _measure_set(
     whole = (0, batches.window[0], 0, batches.window[1])
     main = _measure_region(folder, batches, lengths, config.region or whole, runtime)
     regions = {
-        _name(region): _measure_region(folder, batches, lengths, region, runtime)
+        region_name(region): _measure_region(folder, batches, lengths, region, runtime)
         for region in config.regions
     }
     notes = [batches.note] if batches.note else []
@@ -249,19 +205,19 @@ def _measure_region(
     folder: Path, batches: Batches, lengths: tuple[int, ...], region: Region, runtime: Runtime
 ) -> dict[str, Any]:
     """Curve of the median pixel of a region, as it goes into ``allan.json``."""
-    counts, grams = _sums(folder, batches, lengths, region, runtime)
+    counts, grams = sums_of_region(folder, batches, lengths, region, runtime)
     # A batch is there when most pixels have it: a few may lack one for reasons of their own.
     present = counts > counts.max(initial=0) / 2
     filled = int(present.sum())
     common = {"n_batches": batches.n, "gaps": batches.n - filled}
     usable = [n for n, m in enumerate(lengths) if _has_difference(present, m)]
-    quantiles, pixels = _quantiles(folder / "adev", region, usable)
+    quantiles, pixels = quantiles_of_region(folder / "adev", region, usable)
     if filled < MIN_BATCHES or not quantiles:
         reason = f"{filled} of {batches.n} batches have data: too few for an Allan deviation"
         return _as_json(batches, [], NO_CURVE, [], [reason]) | common | {"pixels": 0}
     chosen = [lengths[n] for n in quantiles]
     low, median, high = np.array(list(quantiles.values())).T
-    noise = _noise_levels(folder / "expected", region)
+    noise = noise_levels(folder / "expected", region)
     white = white_population(present, chosen, noise if pixels > 1 else None)
     shared = shared_noise([grams[n] for n in quantiles], pixels)
     curve = fit_curve(chosen, median, np.log(high / low) / 2, pixels, shared, white)
@@ -275,75 +231,8 @@ def _measure_region(
     return facts | common | {"pixels": pixels}
 
 
-def _sums(
-    folder: Path, batches: Batches, lengths: tuple[int, ...], region: Region, runtime: Runtime
-) -> tuple[I64, list[F64]]:
-    """Pixels of a region that have each batch, and for each length their products."""
-    if not lengths:
-        return ArrayReader(batches.folder / "batch_count").read().astype(np.int64), []
-    sums = run_tasks(
-        partial(_sums_task, batches, lengths, folder / "expected"),
-        batches.tiles(region, TILES_HIGH),
-        runtime,
-        label=f"region {_name(region)}",
-    )
-    grams = [np.sum(parts, axis=0) for parts in zip(*(s[1] for s in sums), strict=True)]
-    return np.sum([s[0] for s in sums], axis=0), grams
-
-
-def _sums_task(
-    batches: Batches, lengths: tuple[int, ...], expected: Path, square: Tile
-) -> tuple[I64, list[F64]]:
-    """Pixels that have each batch, and the products of differences that pixels may share."""
-    counts = np.zeros(batches.n, np.int64)
-    grams: list[Any] = [0.0] * len(lengths)
-    for tile in batches.tiles((*square[0], *square[1])):
-        series = batches.read("batch_delta", tile).reshape(batches.n, -1)
-        noise = ArrayReader(expected).read(*tile).ravel()
-        noise[noise <= 0] = np.nan
-        counts += np.isfinite(series).sum(axis=1)
-        for number, m in enumerate(lengths):
-            # Missing batches and pixels without errors are NaN both, and add nothing.
-            steps = np.nan_to_num(disjoint_differences(series, m, DIFFERENCES) / noise)
-            grams[number] = grams[number] + steps @ steps.T
-    return counts, grams
-
-
 def _has_difference(present: Mask, m: int) -> bool:
     return bool(np.isin(2 * m, np.convolve(present, np.ones(2 * m, int), "valid")))
-
-
-def _quantiles(
-    path: Path, region: Region, usable: Sequence[int]
-) -> tuple[dict[int, tuple[float, float, float]], int]:
-    """Central 68 % and median over a region for each length's number, and how many pixels."""
-    quantiles, pixels = {}, 0
-    for n in usable:
-        parts = partial(_positive, path, (n, n + 1), region)
-        found, count = quantiles_of_parts(parts, (ONE_SIGMA[0], 0.5, ONE_SIGMA[1]))
-        pixels = max(pixels, count)
-        if count:
-            low, median, high = found.tolist()
-            quantiles[n] = (low, median, high)
-    return quantiles, pixels
-
-
-def _positive(path: Path, lengths: Range | None, region: Region) -> Iterator[F32]:
-    """Finite values of a map over a region that are above zero, some rows at a time."""
-    reader = ArrayReader(path)
-    y0, y1, x0, x1 = region
-    for rows in _spans(y0, y1, reader.chunks[-2]):
-        values = reader.read(*([lengths] if lengths else []), rows, (x0, x1))
-        # No noise gives zero.
-        yield values[(values > 0) & (values < np.inf)]
-
-
-def _noise_levels(path: Path, region: Region) -> F64:
-    """Quantiles of the expected deviation of one batch over a region, px."""
-    levels, count = quantiles_of_parts(partial(_positive, path, None, region), NOISE_LEVELS)
-    if not count:
-        raise DamagedError(f"{path}: no errors of batches", path)
-    return levels
 
 
 def _as_json(

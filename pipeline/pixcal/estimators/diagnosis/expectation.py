@@ -1,0 +1,179 @@
+"""What a bench lets expect of every curve, from simulations with different random numbers."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from scipy.special import stdtr
+
+from pixcal.estimators.diagnosis.test_statistics import Curve, Key
+from pixcal.estimators.diagnosis.test_statistics.signature import statistic_named
+from pixcal.model.arrays import F64
+
+Curves = Mapping[Key, Curve]
+
+TOLERANCE = 0.05  # share of what an effect does that its simulation may be wrong by
+# standard deviations from which one value of a curve is changed, whatever the others are
+STANDS_OUT = 2.5
+
+
+def scaled(values: F64, usual: F64) -> F64:
+    """Mean squares over their usual size, on a scale where chance is nearly normal."""
+    ratio = values / np.maximum(usual, 1e-300)
+    low = 3 * (np.cbrt(np.minimum(ratio, 1.0)) - 1)
+    return np.asarray(np.where(ratio > 1, np.log(np.maximum(ratio, 1.0)), low))
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What the nominal bench lets expect: simulations with different seeds, on their scales."""
+
+    # median (n,) of each curve that is a power; None for the others
+    usual: Mapping[Key, F64 | None]
+    values: Mapping[Key, F64]  # (simulation, n) of each curve, in the order of the seeds
+    # as how many independent values each curve's are, `independent_values`
+    independent: Mapping[Key, float]
+
+    @classmethod
+    def of(cls, simulated: Sequence[Curves]) -> "Reference":
+        """From simulations; curves that not all of them have are left out."""
+        keys = [k for k in simulated[0] if all(k in s for s in simulated)]
+        keys = [k for k in keys if len({len(s[k].value) for s in simulated}) == 1]
+        usual: dict[Key, F64 | None] = {}
+        values = {}
+        for key in keys:
+            stack = np.stack([s[key].value for s in simulated])
+            power = statistic_named(key[0]).kind == "power"
+            usual[key] = np.median(stack, axis=0) if power else None
+            own = usual[key]
+            values[key] = stack if own is None else scaled(stack, own)
+        floors = {key: statistic_named(key[0]).floor for key in values}
+        independent = {key: independent_values(v, floors[key]) for key, v in values.items()}
+        return cls(usual, values, independent)
+
+    def on_scale(self, curves: Curves) -> dict[Key, F64]:
+        """Curves on the scales of the reference, where it has them."""
+        found = {}
+        for key, usual in self.usual.items():
+            curve = curves.get(key)
+            if curve is not None and len(curve.value) == self.values[key].shape[1]:
+                found[key] = curve.value if usual is None else scaled(curve.value, usual)
+        return found
+
+    def without(self, keys: Collection[Key]) -> Self:
+        """The reference of all other curves."""
+        kept = self.values.keys() - set(keys)
+        return type(self)(
+            {key: self.usual[key] for key in self.values if key in kept},
+            {key: v for key, v in self.values.items() if key in kept},
+            {key: self.independent[key] for key in self.values if key in kept},
+        )
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """What a bench, nominal or with effects, lets expect of every curve."""
+
+    # mean, variance: (n,) on the reference's scales; the variance of a value of the data about the
+    # mean
+    mean: Mapping[Key, F64]
+    variance: Mapping[Key, F64]
+    noise: Mapping[Key, F64]  # variance (n,) of the nominal bench alone
+    independent: Mapping[Key, float]  # as of the reference
+    dof: int
+
+
+def expect_nominal(reference: Reference) -> Expectation:
+    """What the nominal bench lets expect."""
+    mean, variance, noise, count = {}, {}, {}, 2
+    for key, values in reference.values.items():
+        count = len(values)
+        noise[key] = _variance(values, statistic_named(key[0]).floor)
+        mean[key] = values.mean(axis=0)
+        variance[key] = noise[key] * (1 + 1 / count)
+    return Expectation(mean, variance, noise, reference.independent, count - 1)
+
+
+def expect_with(
+    reference: Reference, simulated: Sequence[Curves], error: float = 0.0
+) -> Expectation:
+    """What a bench with effects, of this relative ``error`` of their strength, lets expect.
+
+    The simulations have the first seeds of the reference, in the same order: what differs is due to
+    effects.
+    """
+    nominal = expect_nominal(reference)
+    scaled_ones = [reference.on_scale(s) for s in simulated]
+    pairs: dict[Key, tuple[F64, F64]] = {}
+    for key, values in reference.values.items():
+        # An estimate may fail in a few simulations: the others tell what it is.
+        having = [n for n, s in enumerate(scaled_ones) if key in s]
+        if 2 * len(having) > len(simulated):
+            pairs[key] = np.stack([scaled_ones[n][key] for n in having]), values[having]
+    mean, variance = dict(nominal.mean), dict(nominal.variance)
+    usual = _usual_scatter(pairs, nominal)
+    for key, (own, same_seeds) in pairs.items():
+        change, count, noise = own - same_seeds, len(own), nominal.noise[key]
+        paired = change.var(axis=0, ddof=1) if count > 1 else usual * noise
+        # What the same seeds do not have in common, in units of the noise: 2 is all of it.
+        apart = min(float(np.mean(paired / noise)), 2.0)
+        shift = change.mean(axis=0)
+        certain = _certain(shift, apart * noise / count)
+        mean[key] = nominal.mean[key] + certain * shift
+        more = (TOLERANCE**2 + error**2) * (certain * shift) ** 2 + certain * paired / count
+        if count > 1:
+            # What the effects add to the scatter, beyond what few seeds have by chance.
+            chance = noise * np.sqrt(4 * apart * (1 - apart / 4) / (count - 1))
+            excess = own.var(axis=0, ddof=1) - same_seeds.var(axis=0, ddof=1) - chance
+            more += np.maximum(excess, 0)
+        variance[key] = nominal.variance[key] + more
+    return replace(nominal, mean=mean, variance=variance)
+
+
+def _usual_scatter(pairs: Mapping[Key, tuple[F64, F64]], nominal: Expectation) -> float:
+    """Variance of changes that are chance alone, over the noise: that of most curves.
+
+    Effects that move the light change the noise of every sample a little, and so all curves.
+    """
+    sizes = [
+        float(np.mean((own - same) ** 2 / nominal.noise[key])) for key, (own, same) in pairs.items()
+    ]
+    return min(float(np.median(sizes)), 2.0) if sizes else 0.0
+
+
+def _certain(shift: F64, chance: F64) -> F64:
+    """Share (n,) of a curve's change that is the effects' (positive part of James and Stein).
+
+    Of the whole curve; and of values by themselves, where one stands out.
+    """
+    squares = shift**2 / np.maximum(chance, 1e-300)
+    whole = max(1 - 1 / max(float(np.mean(squares)), 1e-300), 0.0)
+    return np.maximum(whole, 1 - STANDS_OUT**2 / np.maximum(squares, STANDS_OUT**2))
+
+
+def _variance(values: F64, floor: float) -> F64:
+    """Variance (n,), leaning on the other values of the curve so that none is tiny by chance."""
+    own = values.var(axis=0, ddof=1)
+    rounding = (1e-9 * np.abs(values).max(axis=0)) ** 2
+    leaning = 0.9 * own + 0.1 * np.median(own) + rounding + 1e-300
+    return np.asarray(np.maximum(leaning, floor**2))
+
+
+def independent_values(values: F64, floor: float = 0.0) -> float:
+    """As how many independent values those of a curve are, when the least likely one is looked at.
+
+    Each of the simulations (simulation, n) is held against the others. Of n independent values the
+    least chance u has -log(1 - u) distributed as an exponential with the mean 1 / n, whose
+    likelihood gives n. The standard deviation is at least ``floor``.
+    """
+    count, n = values.shape
+    if n == 1 or count < 3:
+        return float(n)
+    total = 0.0
+    for number in range(count):
+        others = np.delete(values, number, axis=0)
+        error = np.sqrt(_variance(others, floor) * (1 + 1 / len(others)))
+        chance = 2 * stdtr(count - 2, -np.abs(values[number] - others.mean(axis=0)) / error)
+        total -= float(np.log1p(-min(float(chance.min()), 1 - 1e-9)))
+    return float(np.clip(count / total, 1, n))
