@@ -39,13 +39,11 @@ class FittedSet:
 
     def without(self, effects: Sequence[Effect]) -> "FittedSet":
         """The same with effects undone that act on maps: offsets as fitted with them known."""
-        maps = by_maps = before = FringeMaps(
-            filled(self.theta, self.k), self.k, self.origin, self.flat, self.name
-        )
+        maps = by_maps = before = self.maps
         for effect in sorted(effects, key=lambda e: e.turn, reverse=True):
             # Their levels are those of `IntensityBeforeEffects`, without the noise of maps.
             by_maps = effect.undo(by_maps) or by_maps
-            maps = effect.undo(maps) or undone_on_samples(effect, maps, self._fit) or maps
+            maps = self.undone(effect, maps) or maps
         if maps is before:
             return replace(self, flat=None)
         size = float(np.hypot(*self.k))
@@ -68,11 +66,18 @@ class FittedSet:
         )
 
     @cached_property
+    def maps(self) -> FringeMaps:
+        """As fitted; bad pixels are like those around them."""
+        theta = filled(self.theta, self.k)
+        return FringeMaps(theta, self.k, self.origin, self.flat, self.name)
+
+    def undone(self, effect: Effect, maps: FringeMaps) -> FringeMaps | None:
+        """Maps without an effect, as a fit of the same frames gives them; None where none tell."""
+        return effect.undo(maps) or undone_on_samples(effect, maps, self._fit)
+
+    @cached_property
     def _fit(self) -> FitOfFrames | None:
-        if self.g is None:
-            return None
-        maps = FringeMaps(filled(self.theta, self.k), self.k, self.origin, self.flat, self.name)
-        return FitOfFrames.of(maps, self.g)
+        return None if self.g is None else FitOfFrames.of(self.maps, self.g)
 
     @cached_property
     def offsets(self) -> OffsetModel:

@@ -8,11 +8,9 @@ import numpy as np
 
 from pixcal.estimators.fringe_fit.modes import solve_modes
 from pixcal.estimators.maps.corrected import phase_change, straight_modes
-from pixcal.kernels.crosstalk import filled
 from pixcal.model.arrays import F64
-from pixcal.simulation.effect import Effect, FringeMaps
+from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.fitted_set import FittedSet
-from pixcal.stages.diagnose.undone import undone_on_samples
 from pixcal.stages.treatment import fitted_shapes, treatment_of
 
 
@@ -44,8 +42,8 @@ def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str
 def _change(effect: Effect, fit: FittedSet) -> F64:
     """Change (pixel,) of the offsets of good pixels by an effect, px; modes taken off."""
     good = np.isfinite(fit.theta).all(axis=0) & np.isfinite(fit.delta)
-    maps = FringeMaps(filled(fit.theta, fit.k), fit.k, fit.origin, fit.flat, fit.name)
-    after = effect.undo(maps) or undone_on_samples(effect, maps) or effect.predict(maps)
+    maps = fit.maps
+    after = fit.undone(effect, maps) or effect.predict(maps)
     if after is None or not good.any():
         return np.zeros(0)
     change = -phase_change(maps.theta, after.theta)[good]
