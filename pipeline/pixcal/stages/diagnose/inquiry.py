@@ -1,7 +1,7 @@
 """A reduced run is looked at, its nominal bench simulated, and causes of the gap are searched."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -99,41 +99,51 @@ def inquire(
         kept = tuple(s for s in signatures if _key_of(s) not in outdone)
         trials = replace(trials, signatures=kept)
 
-    def asked_again(on: Effects, names: Sequence[str], few: Runtime) -> dict[str, float]:
-        window = look.first
-        laws = {c.replay: c.estimate.effect for c in candidates.values() if c.replay and c.estimate}
-        try:
-            by_law = tuple(laws.get(effect, effect) for effect in on)
-            evidence = window.evidence(window.learn, (*base, *by_law), LEARN_SEED)
-        except InputError:
-            return {}  # These frames do not tell what the effects look like.
-        asked = {n: _again(candidates[n]) or kinds[n] for n in names}
-        found = _estimates(evidence, asked, few, "estimate again")
-        return {n: e.significance for n, e in found.items() if isinstance(e, Estimate)}
+    asking = _Asking(look, base, kinds, candidates, trials)
+    search = Search(reference, data, asking.simulate, asking.again)
+    return Inquiry(base, look, trials, reference, data, search, search.run(candidates))
 
-    answers: dict[tuple[Effects, tuple[str, ...]], dict[str, float]] = {}
+
+@dataclass(frozen=True)
+class _Asking:
+    """What a search asks for: simulations, and estimates on the first frames taken again."""
+
+    look: DiagnosisInput
+    base: Effects
+    kinds: Mapping[str, type[Effect]]
+    candidates: Mapping[str, Candidate]
+    trials: Trials
+    # significances that were found beside simulations
+    answers: dict[tuple[Effects, tuple[str, ...]], dict[str, float]] = field(default_factory=dict)
 
     def simulate(
-        benches: Sequence[Effects], seeds: int, label: str, asked: Sequence[str]
+        self, benches: Sequence[Effects], seeds: int, label: str, asked: Sequence[str]
     ) -> list[list[Curves] | str]:
         """Curves of benches; what is asked of the first is answered meanwhile, if there is room."""
 
         def answer() -> None:
             one = Runtime(cluster="sync")
-            answers[benches[0], tuple(asked)] = asked_again(benches[0], asked, one)
+            self.answers[benches[0], tuple(asked)] = self._estimated(benches[0], asked, one)
 
-        return trials.curves(
-            [(*base, *bench) for bench in benches], seeds, label,
-            answer if asked and look.room else None,
-        )  # fmt: skip
+        beside = answer if asked and self.look.room else None
+        return self.trials.curves([(*self.base, *b) for b in benches], seeds, label, beside)
 
-    def again(on: Effects, names: Sequence[str]) -> dict[str, float]:
+    def again(self, on: Effects, names: Sequence[str]) -> dict[str, float]:
         """Significance of candidates on the first frames taken again with some effects."""
-        answer = answers.pop((on, tuple(names)), None)
-        return asked_again(on, names, look.few) if answer is None else answer
+        answer = self.answers.pop((on, tuple(names)), None)
+        return self._estimated(on, names, self.look.few) if answer is None else answer
 
-    search = Search(reference, data, simulate, again)
-    return Inquiry(base, look, trials, reference, data, search, search.run(candidates))
+    def _estimated(self, on: Effects, names: Sequence[str], few: Runtime) -> dict[str, float]:
+        window, every = self.look.first, self.candidates.values()
+        laws = {c.replay: c.estimate.effect for c in every if c.replay and c.estimate}
+        try:
+            by_law = tuple(laws.get(effect, effect) for effect in on)
+            evidence = window.evidence(window.learn, (*self.base, *by_law), LEARN_SEED)
+        except InputError:
+            return {}  # These frames do not tell what the effects look like.
+        asked = {n: _again(self.candidates[n]) or self.kinds[n] for n in names}
+        found = _estimates(evidence, asked, few, "estimate again")
+        return {n: e.significance for n, e in found.items() if isinstance(e, Estimate)}
 
 
 def places(made: Inquiry) -> list[dict[str, Any]]:

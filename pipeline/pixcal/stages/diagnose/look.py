@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from pixcal.engine.plan import Plan, make_plan
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages import reduce
@@ -71,37 +71,14 @@ def look_at(
         If there are too few frames, or a part cannot be fitted.
     """
     ingested = Ingested(run_dir / "ingest")
-    acquisition = read_acquisition(run_dir)
-    # Every window is to be looked at with the saturation of the whole detector.
-    saturation = acquisition.detector.saturation_adu or ingested.saturation_found
-    acquisition = replace(
-        acquisition, detector=replace(acquisition.detector, saturation_adu=saturation)
-    )
-    reduction = _reduction(run_dir)
+    acquisition, reduction = _acquisition(run_dir, ingested), _reduction(run_dir)
     shape = ingested.shape
     first, parts = chosen_windows(shape)
     pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
     saturated = read_json(run_dir / "reduce" / "reduce.json")["saturation_adu"]
     own = split(ingested.tables, pixels, saturated.get("full_frames", ()))
     _enough(own.test)
-    largest, evidence = _samples(own.test, pixels)
-    calibration = (
-        CALIBRATION_BYTES
-        * pixels
-        * sum(len(frames) for name, frames in own.test.frames.items() if "/" not in name)
-    )
-    need = EVIDENCE_BYTES * evidence + LOOK_BYTES * largest + calibration
-    estimates = ESTIMATE_BYTES * largest
-    held = EVIDENCE_BYTES * evidence + calibration
-    for_estimates = make_plan("diagnose", estimates, held, runtime)
-    plan = make_plan("diagnose", need, 0, runtime)
-    few = runtime.with_workers(for_estimates.workers)
-    room = (
-        runtime.cluster == "threads"
-        and plan.workers > 1
-        and Plan(need, held + estimates, plan.workers - 1).total <= runtime.memory
-    )
-    runtime = runtime.with_workers(plan.workers)
+    runtime, few, room = _memory(own.test, pixels, runtime)
     dtypes = {name: array.dtype for name, array in ingested.arrays.items()}
     windows: list[Window] = []
     left_out: list[dict[str, Any]] = []
@@ -112,12 +89,8 @@ def look_at(
         raws = [take(ingested, acquisition, h, part, reduction) for h in (own.learn, own.test)]
         seed = raws[0].checksum if seed is None else seed
         try:
-            halves = run_tasks(
-                partial(_evidence, run_dir, part, shape),
-                list(enumerate(raws)),
-                runtime.here,
-                label=f"window {len(windows) + len(left_out) + 1}",
-            )
+            number = len(windows) + len(left_out) + 1
+            halves = _evidence(run_dir, part, shape, raws, runtime, number)
         except InputError as error:
             # In a corner there may be no light; effects are fitted in the middle.
             if part == first or len(left_out) == len(parts) - 1:
@@ -135,39 +108,73 @@ def look_at(
         windows.append(Window(part, bench, own.learn, own.test, shape, seed))
         if part in parts:
             measured.append(looked_at(halves[1], signatures))
-    return DiagnosisInput(
-        windows[0],
-        tuple(w for w in windows if w.part in parts),
-        tuple(measured),
-        averaged(measured),
-        {
-            "shape": list(shape),
-            "fitted_on": {"window": plain_part(first), "frames": _plain_half(own.learn)},
-            "tried_on": {
-                "windows": [plain_part(w.part) for w in windows if w.part in parts],
-                "frames": _plain_half(own.test),
-            },
-            "left_out": left_out,
-            "shared": shared(own),
-            "kinds": [kind for kind in ("bias", "dark", "flat") if kind in ingested.tables],
-            "sets": {s.name: list(s.baseline_mm) for s in acquisition.frames.fringes},
-            "missing_frames": missing_frames(
-                acquisition, ingested.tables, [s.step for s in windows[0].bench.measured.sets]
-            ),
+    tried = tuple(w for w in windows if w.part in parts)
+    facts = {
+        "shape": list(shape),
+        "fitted_on": {"window": plain_part(first), "frames": _plain_half(own.learn)},
+        "tried_on": {
+            "windows": [plain_part(w.part) for w in tried],
+            "frames": _plain_half(own.test),
         },
-        runtime,
-        few,
-        room,
+        "left_out": left_out,
+        "shared": shared(own),
+        "kinds": [kind for kind in ("bias", "dark", "flat") if kind in ingested.tables],
+        "sets": {s.name: list(s.baseline_mm) for s in acquisition.frames.fringes},
+        "missing_frames": missing_frames(
+            acquisition, ingested.tables, [s.step for s in windows[0].bench.measured.sets]
+        ),
+    }
+    return DiagnosisInput(
+        windows[0], tried, tuple(measured), averaged(measured), facts, runtime, few, room
     )
 
 
-def _evidence(run_dir: Path, part: Part, shape: tuple[int, int], item: tuple[int, Raw]) -> Evidence:
-    number, raw = item
-    try:
-        return evidence_of(raw, part, shape)
-    except InputError as error:
-        which = ("first", "second")[number]
-        raise InputError(f"{run_dir}: in the {which} half of the frames, {error}") from error
+def _acquisition(run_dir: Path, ingested: Ingested) -> Acquisition:
+    """The acquisition; every window is looked at with the saturation of the whole detector."""
+    acquisition = read_acquisition(run_dir)
+    saturation = acquisition.detector.saturation_adu or ingested.saturation_found
+    return replace(acquisition, detector=replace(acquisition.detector, saturation_adu=saturation))
+
+
+def _memory(half: Half, pixels: int, runtime: Runtime) -> tuple[Runtime, Runtime, bool]:
+    """As many workers as fit the memory: of simulations, and of estimates; whether one fits beside.
+
+    That is an estimate beside simulations, here.
+    """
+    largest, evidence = _samples(half, pixels)
+    frames = sum(len(frames) for name, frames in half.frames.items() if "/" not in name)
+    held = EVIDENCE_BYTES * evidence + CALIBRATION_BYTES * pixels * frames
+    need, estimates = held + LOOK_BYTES * largest, ESTIMATE_BYTES * largest
+    for_estimates = make_plan("diagnose", estimates, held, runtime)
+    plan = make_plan("diagnose", need, 0, runtime)
+    room = (
+        runtime.cluster == "threads"
+        and plan.workers > 1
+        and Plan(need, held + estimates, plan.workers - 1).total <= runtime.memory
+    )
+    few = runtime.with_workers(for_estimates.workers)
+    return runtime.with_workers(plan.workers), few, room
+
+
+def _evidence(
+    run_dir: Path,
+    part: Part,
+    shape: tuple[int, int],
+    raws: Sequence[Raw],
+    runtime: Runtime,
+    number: int,
+) -> list[Evidence]:
+    """Both halves of the frames of a window, reduced and fitted."""
+
+    def of_half(item: tuple[str, Raw]) -> Evidence:
+        which, raw = item
+        try:
+            return evidence_of(raw, part, shape)
+        except InputError as error:
+            raise InputError(f"{run_dir}: in the {which} half of the frames, {error}") from error
+
+    halves = list(zip(("first", "second"), raws, strict=True))
+    return run_tasks(of_half, halves, runtime.here, label=f"window {number}")
 
 
 def _samples(half: Half, pixels: int) -> tuple[int, int]:

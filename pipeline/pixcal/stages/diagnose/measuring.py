@@ -95,8 +95,6 @@ def nominal_bench(
         adu_per_e=np.full(good.shape, 1 / one.gain, np.float32),
         mask=np.where(good, 0, 1).astype(np.uint8),
     )
-    # Where frames are too few to part, every part holds the same ones.
-    parts = evidence if parted("bias", halves) else evidence[:1]
     bench = bench_of(acquisition, tables, one, whole, sets, dtypes)
     recordings, places, light = recordings_of(bench, acquisition, tables, evidence, halves)
     return NominalBench(
@@ -106,18 +104,25 @@ def nominal_bench(
         dtypes,
         bench,
         Measured(maps, sets, FlatLight.of(evidence, light)),
-        PixelNoise.of(
-            [s.adu for e in parts for s in e.of_kind("bias")],
-            good,
-            1 - (one.amplifier_noise / one.read_noise) ** 2,
-        )
-        if one.dithered
-        else None,
+        _pixel_noise(evidence, halves, good),
         _gain(evidence, flat.astype(float), good, with_flats),
         fits,
         tuple(recordings),
         tuple(places),
     )
+
+
+def _pixel_noise(
+    evidence: Sequence[Evidence], halves: Sequence[Half], good: Mask
+) -> PixelNoise | None:
+    """Read noise of each pixel; None where rounding hides it."""
+    one = evidence[0]
+    if not one.dithered:
+        return None
+    # Where frames are too few to part, every part holds the same ones.
+    parts = evidence if parted("bias", halves) else evidence[:1]
+    bias = [s.adu for e in parts for s in e.of_kind("bias")]
+    return PixelNoise.of(bias, good, 1 - (one.amplifier_noise / one.read_noise) ** 2)
 
 
 def parted(name: str, halves: Sequence[Half]) -> bool:
