@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pixcal.effects.quantisation import Quantisation
+from pixcal.effects.quantisation import Quantisation, _uneven
 from pixcal.estimators.detector.code_density import code_widths, histogram, step_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 
@@ -90,6 +90,16 @@ def test_steps_are_found_from_gaps(step: float) -> None:
     assert counts is not None
     found, error = step_of(counts)
     assert abs(found - step) < 2 * error < 2e-3 * step
+
+
+def test_codes_beside_saturation_are_not_wide() -> None:
+    rng = np.random.default_rng(9)
+    samples = np.minimum(np.rint(rng.normal(3900, 150, (40, 100, 100))), 4000).astype(np.uint16)
+    counts = histogram([samples], np.ones((100, 100), bool))
+    assert counts is not None
+    seen = [code_widths(counts, 3.0, last=last) for last in (np.inf, 4000.0)]
+    clipped, whole = (max(_uneven(widths)[2]) for widths in seen if widths is not None)
+    assert whole < 4 < clipped
 
 
 @pytest.mark.quick(1)

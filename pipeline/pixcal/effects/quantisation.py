@@ -170,9 +170,10 @@ class Quantisation(Effect):
             noise = LEAST_NOISE
         widths = None
         if counts is not None:
-            if 1 < step < FEW_MISSING and _has_wrong_bits(code_widths(counts, noise, first)):
+            top = evidence.saturation_adu
+            if 1 < step < FEW_MISSING and _has_wrong_bits(code_widths(counts, noise, first, top)):
                 step = 1.0
-            widths = code_widths(converter_counts(counts, step), noise, first)
+            widths = code_widths(converter_counts(counts, step), noise, first, top / step)
         values: dict[str, Any] = {"coarse_adu": step - 1, "dnl_rms": 0.0, "ripple": 0.0}
         errors = {"coarse_adu": step_error}
         # A camera that shifts its codes by whole bits is an ordinary one.

@@ -266,7 +266,9 @@ class CodeWidths:
         return Ripple(1 / best, abs(found), float(error), float(np.angle(found)), chance)
 
 
-def code_widths(counts: F64, noise: float, first: float = 0.0) -> CodeWidths | None:
+def code_widths(
+    counts: F64, noise: float, first: float = 0.0, last: float = np.inf
+) -> CodeWidths | None:
     """Widths from the counts of a converter's codes; None where too few came up.
 
     Parameters
@@ -276,6 +278,8 @@ def code_widths(counts: F64, noise: float, first: float = 0.0) -> CodeWidths | N
         Least noise of a sample, in codes.
     first : float
         Code from which the noise is at least that.
+    last : float
+        Code at which samples saturate.
     """
     half = int(np.clip(noise / 2, _LEAST_HALF, _MOST_HALF))
     if noise < LEAST_NOISE or len(counts) < 2 * _CALM:
@@ -291,7 +295,7 @@ def code_widths(counts: F64, noise: float, first: float = 0.0) -> CodeWidths | N
     # Weights that hardly depend on the code's own count.
     calm = uniform_filter1d(expected, length)
     used = (uniform_filter1d(filled, length) > FEWEST_COUNTS) & (calm > FEWEST_COUNTS)
-    used &= (expected > 0) & (np.arange(len(counts)) >= first + half)
+    used &= (expected > 0) & (code >= first + half) & (code < last - length)
     if np.count_nonzero(used) < FEWEST_CODES:
         return None
     kernel = -savgol_coeffs(length, _ORDER)
