@@ -276,14 +276,14 @@ def show_report(run: Path) -> None:
 
 def show_advice(run: Path) -> None:
     """Print which map to use, what limits it, and what each cause does to it."""
-    from pixcal.stages.advice import HEADER, advice  # here: for a fast `pixcal --help`
+    from pixcal.stages.advice import advice  # here: for a fast `pixcal --help`
 
     summary = advice(run)
     click.echo()
     for sentence in summary.sentences:
         click.echo(sentence)
     if summary.rows:
-        show_table(HEADER, summary.rows)
+        show_table(summary.rows[0], summary.rows[1:])
 
 
 def show_run(run: Path, *, fitted: bool, diagnosed: bool) -> None:

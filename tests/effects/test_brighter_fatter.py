@@ -101,7 +101,7 @@ def test_shared_noise_is_the_jacobian_of_the_moved_charge() -> None:
 
         here, there = (y, x), (y + dy, x + dx)
         expected = slope(here, there) * SCENE[there] + slope(there, here) * SCENE[here]
-        found = shared_noise(SCENE[None], pushes, shifts, dy, dx)[0]
+        found = shared_noise(SCENE[None], pushes, shifts, (dy, dx))[0]
         assert found[here] == pytest.approx(expected, rel=0.01, abs=1)
         assert found[1].max() == found[:, -2].max() == 0
 

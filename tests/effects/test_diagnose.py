@@ -419,6 +419,21 @@ def test_windows_that_are_tried_do_not_overlap(shape: tuple[int, int]) -> None:
     assert len(tried) == (4 if min(shape) > 288 else 2)
 
 
+@pytest.mark.parametrize("shape", [(512, 640), (1024, 1280), (257, 1000), (3000, 3000)])
+def test_few_frames_without_fringes_are_looked_at_in_more_pixels(shape: tuple[int, int]) -> None:
+    plain, tried = chosen_windows(shape)
+    wide, same = chosen_windows(shape, 60)
+    assert same == tried
+    sides = [np.diff(window).ravel() for window in (plain, wide)]
+    assert np.prod(sides[1]) > 1.5 * np.prod(sides[0])
+    assert (sides[1] >= sides[0]).all()
+    assert np.prod(sides[1]) * 60 <= 6e6
+    for rows, columns in tried:
+        apart = [b[0] >= a[1] or b[1] <= a[0] for a, b in zip(wide, (rows, columns), strict=True)]
+        assert any(apart)
+    assert chosen_windows(shape, 5000) == (plain, tried)
+
+
 @pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "effect",

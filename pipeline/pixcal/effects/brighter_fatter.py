@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixcal.estimators.detector.neighbours import shared_charge
+from pixcal.estimators.detector.neighbours import SharedCharge, shared_charge
 from pixcal.estimators.detector.response import Boundaries, boundaries_alone, boundaries_beside
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.middle import middle
 from pixcal.kernels.boundaries import REACH, area_changes, boundary_shifts, moved_charge
+from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F32, F64
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
@@ -20,6 +21,8 @@ _DISAGREE = 4.0
 # standard deviations, with a response that is free beside, from which it may explain all
 _HINTED = 1.5
 _NEEDED = 12.0  # chi-square of `POWERS` terms beyond which they are needed: one in 130 by chance
+_APART = 9.0  # chi-square from which shifts along x and y are not the same
+_MOST_ALONG_Y = 10.0  # of the shift along y over that along x
 _TURNS = 4  # of the inverse: each gains the size of the effect, a few per cent
 
 
@@ -57,7 +60,9 @@ class BrighterFatter(Effect):
     falloff_px: float = quantity(
         0.5, unit="px", above=0, high=10, doc="distance over which the shift falls by a factor e"
     )
-    along_y: float = quantity(1.0, low=0, high=10, doc="ratio of the shift along y to that along x")
+    along_y: float = quantity(
+        1.0, low=0, high=_MOST_ALONG_Y, doc="ratio of the shift along y to that along x"
+    )
 
     @property
     def halo(self) -> int:
@@ -129,10 +134,12 @@ class BrighterFatter(Effect):
                 beyond = max(both.gain - both.axes + 1, 0.0)
                 significance = float(np.copysign(np.sqrt(beyond), size))
                 why += ", and a second harmonic of the fringes that depends on their direction"
+        along_y = 1.0
+        if not evidence.fringes:
+            size, variance, along_y, significance = _by_axis(noise)
         error = float(np.sqrt(variance))
         errors: dict[str, float] = {"shift_px_per_e": error}
         together: tuple[dict[str, float], ...] = ()
-        along_y = 1.0
         alone = _alone(evidence, falloff) if significance > _HINTED and evidence.fringes else None
         if alone is not None:
             falloff, size, along_y = alone.falloff_px, alone.shift, alone.along_y
@@ -141,6 +148,19 @@ class BrighterFatter(Effect):
         details["a_00"] = size * float(area_changes(falloff)[REACH, REACH])
         effect = cls(float(np.clip(size, 0, 1e-5)), falloff, along_y)
         return Estimate(effect, errors, significance, why, details, together)
+
+
+def _by_axis(noise: SharedCharge) -> tuple[float, float, float, float]:
+    """Shift between columns, its variance, that between rows over it, and their significance."""
+    together = noise.size**2 / noise.variance
+    chi2 = float(noise.axes @ np.linalg.solve(noise.covariance, noise.axes))
+    if chi2 - together < _APART:
+        return noise.size, noise.variance, 1.0, float(noise.size / np.sqrt(noise.variance))
+    along_x, along_y = noise.axes
+    size = max(along_x, along_y / _MOST_ALONG_Y, 0.0)
+    ratio = float(np.clip(along_y / size, 0, _MOST_ALONG_Y)) if size > 0 else 1.0
+    sigmas = sigmas_of_chi2(chi2, 2) if size > 0 else -1.0
+    return size, float(noise.covariance[0, 0]), ratio, sigmas
 
 
 def _alone(evidence: Evidence, falloff: float) -> Boundaries | None:

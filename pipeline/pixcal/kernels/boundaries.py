@@ -149,8 +149,14 @@ def boundary_pushes(charge: F32, shifts: F64) -> tuple[F32, F32]:
     return np.stack(x), np.stack(y)
 
 
-def shared_noise(charge: F32, pushes: tuple[F32, F32], shifts: F64, dy: int, dx: int) -> F32:
-    """Covariance of the shot noise of each pixel and the one at (dy, dx) from it.
+def shared_noise(
+    charge: F32,
+    pushes: tuple[F32, F32],
+    shifts: F64,
+    step: tuple[int, int],
+    axes: tuple[float, float] = (1.0, 1.0),
+) -> F32:
+    """Covariance of the shot noise of each pixel and the one at a step from it.
 
     To first order in the shift, for any scene.
 
@@ -162,6 +168,10 @@ def shared_noise(charge: F32, pushes: tuple[F32, F32], shifts: F64, dy: int, dx:
         From `boundary_pushes`.
     shifts
         As in `moved_charge`.
+    step : (int, int)
+        Rows and columns.
+    axes : (float, float)
+        Factors of the shifts of boundaries between columns and between rows.
 
     Returns
     -------
@@ -169,13 +179,13 @@ def shared_noise(charge: F32, pushes: tuple[F32, F32], shifts: F64, dy: int, dx:
         e-²; zero for pixels within `REACH` of the edges, or with the other one there.
     """
     out = np.zeros_like(charge)
-    _, ny, nx = charge.shape
+    (dy, dx), (_, ny, nx) = step, charge.shape
     rows = _between(ny, dy)
     columns = _between(nx, dx)
     if rows.start < rows.stop and columns.start < columns.stop:
         v, u = _moved(rows, dy), _moved(columns, dx)
-        gain = _gain(charge, pushes, shifts, (rows, columns), dy, dx)
-        back = _gain(charge, pushes, shifts, (v, u), -dy, -dx)
+        gain = _gain(charge, pushes, shifts, (rows, columns), (dy, dx), axes)
+        back = _gain(charge, pushes, shifts, (v, u), (-dy, -dx), axes)
         out[:, rows, columns] = gain * charge[:, v, u] + back * charge[:, rows, columns]
     return out
 
@@ -189,30 +199,35 @@ def _moved(part: slice, by: int) -> slice:
 
 
 def _gain(
-    q: F32, pushes: tuple[F32, F32], shifts: F64, part: tuple[slice, slice], dy: int, dx: int
+    q: F32,
+    pushes: tuple[F32, F32],
+    shifts: F64,
+    part: tuple[slice, slice],
+    step: tuple[int, int],
+    axes: tuple[float, float],
 ) -> F32:
-    """Derivative of what pixels gain by the charge of the one at (dy, dx) from each."""
+    """Derivative of what pixels gain by the charge of the one at a step from each."""
 
-    def slope(y: int, x: int) -> np.float32:
+    def slope(y: int, x: int, axis: int) -> np.float32:
         i, j = y + REACH, x + REACH - 1
         inside = 0 <= i < shifts.shape[0] and 0 <= j < shifts.shape[1]
-        return np.float32(0.25 * shifts[i, j] if inside else 0)
+        return np.float32(0.25 * axes[axis] * shifts[i, j] if inside else 0)
 
-    rows, columns = part
+    (dy, dx), (rows, columns) = step, part
     above, left = _moved(rows, -1), _moved(columns, -1)
     here = q[:, rows, columns]
-    total: F32 = slope(dy, dx) * (here + q[:, rows, _moved(columns, 1)])
-    total -= slope(dy, dx + 1) * (here + q[:, rows, left])
-    total += slope(dx, dy) * (here + q[:, _moved(rows, 1), columns])
-    total -= slope(dx, dy + 1) * (here + q[:, above, columns])
-    half = np.float32(0.5)
+    total: F32 = slope(dy, dx, 0) * (here + q[:, rows, _moved(columns, 1)])
+    total -= slope(dy, dx + 1, 0) * (here + q[:, rows, left])
+    total += slope(dx, dy, 1) * (here + q[:, _moved(rows, 1), columns])
+    total -= slope(dx, dy + 1, 1) * (here + q[:, above, columns])
+    across, along = (np.float32(0.5 * factor) for factor in axes)
     # The neighbour across a boundary also widens what the shift of the boundary takes.
     if (dy, dx) == (0, 1):
-        total += half * pushes[0][:, rows, columns]
+        total += across * pushes[0][:, rows, columns]
     elif (dy, dx) == (0, -1):
-        total -= half * pushes[0][:, rows, left]
+        total -= across * pushes[0][:, rows, left]
     elif (dy, dx) == (1, 0):
-        total += half * pushes[1][:, rows, columns]
+        total += along * pushes[1][:, rows, columns]
     elif (dy, dx) == (-1, 0):
-        total -= half * pushes[1][:, above, columns]
+        total -= along * pushes[1][:, above, columns]
     return total

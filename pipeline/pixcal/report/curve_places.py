@@ -28,6 +28,19 @@ _AXES = {
     ),
     "left, right, above, below": _Axis("neighbour", "neighbour {}", ("x−1", "x+1", "y−1", "y+1")),
     "rows, columns": _Axis("", "{}", ("rows", "columns")),
+    "distance: rows, then columns": _Axis(
+        "lines apart",
+        "{} apart",
+        tuple(f"{n} {of}{'s' * (n > 1)}" for of in ("row", "column") for n in range(1, 5)),
+    ),
+    "band, then two rows, two columns": _Axis(
+        "period",
+        "periods of {}",
+        ("8 px and more", "4 to 8 px", "2.7 to 4 px", "2 to 2.7 px", "2 rows", "2 columns"),
+    ),
+    "bin of frequency": _Axis(
+        "half-waves over the frames", "{} half-waves over the frames", ("1 to 3", "4 to 9", "10 on")
+    ),
     "cell of 4 × 4": _Axis(
         "cell of the window",
         "cell {}",

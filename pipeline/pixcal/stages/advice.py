@@ -15,7 +15,7 @@ from pixcal.storage.stage import require
 
 Json = Mapping[str, Any]
 
-HEADER = ("effect", "size", "effect on the offsets", "action")
+_HEADER = ("effect", "size", "effect on the offsets", "action")
 # in the place of `on_map` where a diagnosis has none
 NOT_MEASURED = {"rms_px": 0.0, "max_px": 0.0, "action": "not measured"}
 MATTERS = 0.3  # share of SIGMA from which an error that SIGMA does not hold limits a map
@@ -26,7 +26,7 @@ class Advice:
     """What to know before using the maps."""
 
     sentences: tuple[str, ...]  # which maps to use, and what limits them; none without maps
-    rows: tuple[tuple[str, str, str, str], ...]  # a row for each cause, under `HEADER`
+    rows: tuple[tuple[str, ...], ...]  # a header, and a row for each cause; empty without any
     settled: bool = True  # whether no cause asks for anything to be done
 
 
@@ -41,10 +41,13 @@ def advice(run_dir: Path) -> Advice:
     sigma = _sigma(fit, correction)
     causes = diagnosis["causes"] if diagnosis else ()
     shapes = fitted_shapes(run_dir)
-    rows = tuple(
+    rows: tuple[tuple[str, ...], ...] = tuple(
         (c["effect"], size_of(c), _moved(c, sigma), _action(c, correction, shapes, bool(sigma)))
         for c in causes
     )
+    rows = (_HEADER, *rows) if rows else ()
+    if not sigma:
+        rows = tuple((*row[:2], *row[3:]) for row in rows)
     settled = all(_settled(c, correction, bool(sigma)) for c in causes)
     if not fit["outputs"]:
         return Advice((), rows, settled)
@@ -144,10 +147,8 @@ def _limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json 
 
 def _moved(cause: Json, sigma: Mapping[str, float]) -> str:
     """Change of the offsets, against the error of the best set's median pixel."""
-    if not sigma:
-        return "no maps"
     rms, most = _on_map(cause)["rms_px"], _on_map(cause)["max_px"]
-    if not rms:
+    if not rms or not sigma:
         return "none"
     in_sigma = number(rms / min(sigma.values()), 2)
     return f"{number(rms, 2)} px rms ({in_sigma} σ), {number(most, 2)} px maximum"
@@ -175,14 +176,13 @@ def _action(
     because = f": {why}" if why else ""
     if action == "corrected":
         if not with_maps:
-            text = "maps of offsets measured with this detector would be corrected for it"
+            text = "maps of pixel offsets can be corrected for it"
         elif _settled(cause, correction, with_maps):
             text = "maps corrected"
         else:
             text = "NOT corrected: run 'pixcal fit RUN --with-diagnosis'"
     elif action == "unaffected":
-        maps = "maps" if with_maps else "maps of offsets measured with this detector would be"
-        text = f"{maps} unaffected{because}"
+        text = f"{'maps unaffected' if with_maps else 'no bias of pixel offsets'}{because}"
     else:
         text = action.replace("fix the", "fix on the") + because
     if cause.get("would_decide"):

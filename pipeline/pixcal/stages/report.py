@@ -44,7 +44,7 @@ from pixcal.report.summary import (
     summarise,
     summarise_flags,
 )
-from pixcal.stages.advice import HEADER, advice
+from pixcal.stages.advice import advice
 from pixcal.storage.artefact import MANIFEST, Build, Manifest, read_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.folder import INDEX
@@ -127,7 +127,7 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
         ),
         warnings=_warnings(manifests, facts),
         advice=summary.sentences,
-        causes=(HEADER, *summary.rows) if summary.rows else (),
+        causes=summary.rows,
     )
 
 

@@ -52,6 +52,9 @@ class SharedCharge:
 
     size: float  # size, variance: of the shift by an electron, px
     variance: float
+    # (2,), (2, 2) the same of boundaries between columns and of those between rows
+    axes: F64
+    covariance: F64
 
 
 def shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
@@ -72,31 +75,43 @@ def shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
 
 
 def _shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
-    n = 2 * len(DIRECTIONS) + 1
+    n = 2 * len(DIRECTIONS) + 2
     normal, right = np.zeros((n, n)), np.zeros(n)
     for noise in _noises(evidence):
         pushes = boundary_pushes(noise.charge, shifts)
         for d, step in enumerate(DIRECTIONS):
-            at = [2 * d, 2 * d + 1, n - 1]
-            shared = shared_noise(noise.charge, pushes, shifts, *step)
-            more, more_right = _sums(noise, shared, *step)
+            at = [2 * d, 2 * d + 1, n - 2, n - 1]
+            shared = [
+                shared_noise(noise.charge, pushes, shifts, step, axes) for axes in ((1, 0), (0, 1))
+            ]
+            more, more_right = _sums(noise, np.stack(shared), *step)
             normal[np.ix_(at, at)] += more
             right[at] += more_right
     if not normal[-1, -1]:
         return None
-    covariance = inverse_normal(normal)
-    return SharedCharge(float(covariance[-1] @ right), float(covariance[-1, -1]))
+    alike = np.eye(n)[:, :-1]
+    alike[-1, -1] = 1
+    one, covariance = inverse_normal(alike.T @ normal @ alike), inverse_normal(normal)
+    return SharedCharge(
+        float(one[-1] @ (right @ alike)),
+        float(one[-1, -1]),
+        covariance[-2:] @ right,
+        covariance[-2:, -2:],
+    )
 
 
 def _sums(noise: _Noise, shared: F32, dy: int, dx: int) -> tuple[F64, F64]:
-    """Normal matrix and right-hand side for (constant, in proportion, boundaries) of a pair."""
+    """Normal matrix and right-hand side for (constant, in proportion, boundaries) of a pair.
+
+    The boundaries are two terms, ``shared`` (2, t, y, x).
+    """
     one = np.zeros_like(noise.good)
     ny, nx = one.shape
     m = REACH
     one[m + max(0, -dy) : ny - m - max(0, dy), m + max(0, -dx) : nx - m - max(0, dx)] = True
     one &= noise.good & np.roll(noise.good, (-dy, -dx), axis=(0, 1))
     other = np.roll(one, (dy, dx), axis=(0, 1))
-    normal, right = np.zeros((3, 3)), np.zeros(3)
+    normal, right = np.zeros((4, 4)), np.zeros(4)
     _add_products(
         noise.residual, noise.variance, noise.charge, shared, noise.taken(one, other),
         *np.nonzero(one), dy, dx, normal, right,
@@ -109,27 +124,24 @@ def _add_products(
     residual: Any, variance: Any, charge: Any, shared: Any, taken: Any,
     rows: Any, columns: Any, dy: int, dx: int, normal: Any, right: Any,
 ) -> None:  # fmt: skip
+    terms = np.ones(4)
     for t in range(len(residual)):
-        s0 = s1 = s2 = s11 = s12 = s22 = p0 = p1 = p2 = 0.0
         for n in range(len(rows)):
             y, x = rows[n], columns[n]
             v, u = y + dy, x + dx
             product = residual[t, y, x] * residual[t, v, u]
             if product != 0:
                 w = 1 / (variance[t, y, x] * variance[t, v, u])
-                one, two = charge[t, y, x] + charge[t, v, u], shared[t, y, x]
+                terms[1] = charge[t, y, x] + charge[t, v, u]
+                terms[2], terms[3] = shared[0, t, y, x], shared[1, t, y, x]
                 product = w * (product + taken[t, n])
-                s0 += w
-                s1 += w * one
-                s2 += w * two
-                s11 += w * one * one
-                s12 += w * one * two
-                s22 += w * two * two
-                p0 += product
-                p1 += product * one
-                p2 += product * two
-        normal += np.array([[s0, s1, s2], [s1, s11, s12], [s2, s12, s22]])
-        right += np.array([p0, p1, p2])
+                for i in range(4):
+                    right[i] += product * terms[i]
+                    for j in range(i + 1):
+                        normal[i, j] += w * terms[i] * terms[j]
+    for i in range(4):
+        for j in range(i):
+            normal[j, i] = normal[i, j]
 
 
 def _noises(evidence: Evidence) -> Iterator[_Noise]:

@@ -73,7 +73,8 @@ def look_at(
     ingested = Ingested(run_dir / "ingest")
     acquisition, reduction = _acquisition(run_dir, ingested), _reduction(run_dir)
     shape = ingested.shape
-    first, parts = chosen_windows(shape)
+    calibrations = sum(len(table["file"]) for table in ingested.tables.values())
+    first, parts = chosen_windows(shape, 0 if acquisition.frames.fringes else calibrations)
     pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
     saturated = read_json(run_dir / "reduce" / "reduce.json")["saturation_adu"]
     own = split(ingested.tables, pixels, saturated.get("full_frames", ()))

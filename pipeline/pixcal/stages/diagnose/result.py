@@ -118,6 +118,15 @@ def _verdict(found: SearchResult, final: Shrinkage) -> str:
     return "explained" if final.gap.total <= EXPLAINED and not still else "partly explained"
 
 
+def _on_the_same_pixels(facts: Mapping[str, Any]) -> bool:
+    """Whether effects are tried on pixels that they were fitted on."""
+    fitted = facts["fitted_on"]["window"]
+    return any(
+        all(a[0] < b[1] and b[0] < a[1] for a, b in zip(fitted, window, strict=True))
+        for window in facts["tried_on"]["windows"]
+    )
+
+
 def _cause(
     name: str,
     found: SearchResult,
@@ -143,8 +152,8 @@ def _cause(
     own = estimate.significance * candidate.share
     log_both = max(float(log_ndtr(-own)) - max(gain, 0.0), -600.0)
     chance = np.exp(log_both) * (1 - log_both)
-    if facts["shared"] and not facts["sets"]:
-        # Both parts hold the same frames: the second says nothing new.
+    if facts["shared"] and not facts["sets"] and _on_the_same_pixels(facts):
+        # Both parts hold the same samples: the second says nothing new.
         chance = float(ndtr(-own))
     chance *= len(found.candidates) * candidate.ways
     return {

@@ -1,5 +1,6 @@
 """Which pixels and frames are looked at: all of a small window, some windows of a large one."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -17,11 +18,12 @@ SAMPLES = 6_000_000
 FEWEST = 4  # calibration frames of an exposure time that can be halved; fewer serve both halves
 
 
-def chosen_windows(shape: tuple[int, int]) -> tuple[Part, tuple[Part, ...]]:
+def chosen_windows(shape: tuple[int, int], frames: int = 0) -> tuple[Part, tuple[Part, ...]]:
     """The window that effects are fitted on, and those that they are tried on.
 
     A small detector is one window, and only the frames are parted. On a large one, effects are
-    fitted in the middle and tried in four other places (two, where one side is short).
+    fitted in the middle and tried in four other places (two, where one side is short). Where there
+    are no fringes but few ``frames``, more pixels in the middle make up for them.
     """
     if max(shape) <= LARGEST:
         return whole_of(shape), (whole_of(shape),)
@@ -40,7 +42,24 @@ def chosen_windows(shape: tuple[int, int]) -> tuple[Part, tuple[Part, ...]]:
 
     middle = place(0.5, 0.5)
     others = {place(y, x) for y, x in ((0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9))}
-    return middle, tuple(sorted(others))
+    tried = tuple(sorted(others))
+    if not frames:
+        return middle, tried
+    side = math.isqrt(SAMPLES // frames)
+    rows, columns = (
+        _widened(own, side, (a[1], b[0]) if a != b else (0, size))
+        for own, size, a, b in zip(middle, shape, tried[0], tried[-1], strict=True)
+    )
+    return (rows, columns), tried
+
+
+def _widened(span: tuple[int, int], side: int, room: tuple[int, int]) -> tuple[int, int]:
+    """Rows or columns in the middle of some room, of a side, if they are more than these."""
+    side = min(side, room[1] - room[0])
+    if side <= span[1] - span[0]:
+        return span
+    first = (room[0] + room[1] - side) // 2
+    return first, first + side
 
 
 def whole_of(shape: tuple[int, int]) -> Part:
