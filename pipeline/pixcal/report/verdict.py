@@ -218,8 +218,8 @@ def _of_set(facts: dict[str, Any], allan: dict[str, Any] | None) -> Said:
     if scale is not None and abs(scale - 1) > 0.02:
         yield (
             _level(abs(scale - 1), 0.02, 0.3),
-            "variance of the residuals over that of the declared noise: {}; all errors were "
-            "multiplied by its root, {}. The gain or the read noise may be wrong, or the model "
+            "variance of the residuals over that of the declared noise: {}. All errors were "
+            "multiplied by its root, {}. Gain or read noise may be wrong, or the model "
             "incomplete",
             number(scale**2, 4),
             number(scale, 4),
@@ -251,9 +251,8 @@ def _of_geometry(facts: dict[str, Any]) -> Said:
         yield (
             CHECK,
             f"the fit places the fibres {{}} from their nominal position along {axis}. If the "
-            "bench is better aligned than that, smooth structure of the detector (steps between "
-            "stitched blocks) was fitted as curvature of the fringes: fit with --model paraxial "
-            "and compare",
+            "bench is better aligned, the fit took smooth structure of the detector (such as "
+            "stitching) for curvature of the fringes. Compare with --model paraxial",
             f"{number(abs(centre - nominal))} mm",
         )
 
