@@ -5,18 +5,9 @@ from functools import lru_cache
 
 import numpy as np
 
-from pixcal.estimators.detector.frame_lag import (
-    CLEAR,
-    LAGS,
-    MAX_DECAY,
-    contrast_steps,
-    decay_of,
-    released_freely,
-    share_of_flats,
-    weighted_mean,
-)
+from pixcal.estimators.detector.frame_lag import CLEAR, MAX_DECAY, common_lag, share_of_flats
 from pixcal.estimators.detector.noiseless_charge import missing_noise
-from pixcal.estimators.detector.pixel_lag import uneven_pixels
+from pixcal.estimators.detector.pixel_lag import Uneven
 from pixcal.estimators.detector.traps import BANDS, LossFit, in_bands
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.diagnosis.middle import MOST, middle
@@ -30,7 +21,6 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 TAIL = 1e-3  # share of the charge left behind whose release is brought forward to the last frame
-_ROUNDS = 2
 _TURNS = 3  # of the inverse: each gains a factor of the share
 
 
@@ -249,62 +239,40 @@ class Lag(Effect):
             effect = cls(float(np.clip(share, 0, 0.5)), 0.0, 0.0)
             return Estimate(effect, {"share": error}, share / error, why, {"share": share})
         fringes = tuple(evidence.fringes.values())
-        found = cls(0.0)
-        for _ in range(_ROUNDS):
-            known = np.zeros(LAGS)
-            known[: len(found.releases)] = (found.share * found.releases)[:LAGS]
-            # Linear about a lag that is known in part, which is taken out of the frames first.
-            frames = [found.restored(f.free[:, :3].astype(np.float32)) for f in fringes]
-            told = [s for f in frames if (s := contrast_steps(f.astype(float))) is not None]
-            if not told:
-                return None
-            steps = [(known + shares, information) for shares, information in told]
-            share, keep, share_error, keep_error, sigmas = decay_of(steps)
-            found = cls(float(np.clip(share, 0, 0.5)), -1 / np.log(keep) if keep else 0.0)
-        share, share_error, later = released_freely(steps, keep, share, share_error)
+        common = common_lag([f.free[:, :3] for f in fringes], cls._undone)
+        if common is None:
+            return None
         part = middle(evidence)
-        level_e = max(float(np.nanquantile(f.electrons[::7], 0.99)) for f in fringes)
-        uneven, uneven_error = weighted_mean(
-            [p for f in part.fringes.values() if (p := uneven_pixels(f)) is not None]
-        )
+        uneven = Uneven.of(part.fringes.values())
+        sure, unalike = common.sigmas > CLEAR, uneven.sigmas > CLEAR
         # What the pixels have in common is no less than how much they differ by.
-        rms = float(np.sqrt(max(uneven, 0.0))) / (1 - keep)
-        least = rms if uneven > CLEAR * uneven_error else 0.0
-        share = float(np.clip(share, least, 0.5))
-        spread, spread_error = 0.0, 1.0
-        if share > 0:
-            spread = rms / share
-            size = max(rms, np.sqrt(uneven_error) / (1 - keep))
-            spread_error = uneven_error / (1 - keep) ** 2 / (2 * size)
-            spread_error = float(np.hypot(spread_error, spread * share_error) / share)
-        whole = cls(share, found.decay_frames, 0.0, (), level_e, later)
-        of_level: dict[str, float] = {}
-        if sigmas > CLEAR:
-            whole, of_level = _by_level(part, whole)
-        quiet, quiet_error = _quiet(part, whole) if sigmas > CLEAR else (0.0, 1.0)
-        decay = -1 / np.log(keep) if keep else 0.0
-        decay_error = keep_error * decay**2 / keep if keep else -1 / np.log(min(keep_error, 0.9))
+        share = float(np.clip(common.share, uneven.rms(common.keep) if unalike else 0.0, 0.5))
+        spread, spread_error = uneven.spread(common.keep, share, common.share_error)
+        level_e = max(float(np.nanquantile(f.electrons[::7], 0.99)) for f in fringes)
+        whole = cls(share, common.decay_frames, 0.0, (), level_e, common.later)
+        whole, of_level = _by_level(part, whole) if sure else (whole, {})
+        quiet, quiet_error = _quiet(part, whole) if sure else (0.0, 1.0)
+        decay = whole.decay_frames if whole.capacity_e else min(common.decay_frames, MAX_DECAY)
         return Estimate(
-            replace(
-                whole,
-                decay_frames=whole.decay_frames
-                if whole.capacity_e
-                else min(float(decay), MAX_DECAY),
-                spread=min(spread, 1.0),
-                quiet=quiet,
-            ),
+            replace(whole, decay_frames=decay, spread=min(spread, 1.0), quiet=quiet),
             {
-                "share": share_error,
-                "decay_frames": float(decay_error),
+                "share": common.share_error,
+                "decay_frames": common.decay_error,
                 "spread": min(spread_error, 1.0),
                 "quiet": quiet_error,
             }
             | of_level,
-            sigmas_of_best(sigmas, uneven / uneven_error),
+            sigmas_of_best(common.sigmas, uneven.sigmas),
             "the contrast falls with the phase step from the previous frame"
-            + (", unevenly from pixel to pixel" if uneven > CLEAR * uneven_error else ""),
-            {"by_contrast_sigmas": sigmas, "by_pixels_sigmas": uneven / uneven_error},
+            + (", unevenly from pixel to pixel" if unalike else ""),
+            {"by_contrast_sigmas": common.sigmas, "by_pixels_sigmas": uneven.sigmas},
         )
+
+    @classmethod
+    def _undone(cls, share: float, decay_frames: float, frames: F32) -> tuple[F32, F64]:
+        """Frames without a lag, and the shares that come out 1, 2, ... frames later."""
+        lag = cls(share, decay_frames)
+        return lag.restored(frames), share * lag.releases
 
 
 @lru_cache(maxsize=4)

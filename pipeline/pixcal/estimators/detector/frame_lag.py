@@ -1,14 +1,18 @@
 """Lag that all pixels have in common: contrast of fringe frames, and the first frames of flats."""
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
 import numpy as np
 from scipy.optimize import minimize_scalar
 
 from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker
 from pixcal.estimators.detector.pixel_lag import CLIP, MIN_FRAMES
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
-from pixcal.model.arrays import F64
+from pixcal.model.arrays import F32, F64
 
 LAGS = 6  # frames back that are looked at
+ROUNDS = 2  # of the fit, each about the lag of the one before
 MAX_DECAY = 3.0
 _SERIES = 8
 _STEADIEST = 1e-4
@@ -16,7 +20,7 @@ CLEAR = 4.0
 _NOT_EXPONENTIAL = 40.0  # chi-square from which releases are taken as they come
 
 
-def contrast_steps(frames: F64) -> tuple[F64, F64] | None:
+def _contrast_steps(frames: F64) -> tuple[F64, F64] | None:
     """Shares (lag,) that come out 1, 2, ... frames later, and their information (lag, lag).
 
     From (B, A cos phi, A sin phi) of the frames (t, 3); None where they do not tell.
@@ -55,10 +59,68 @@ def contrast_steps(frames: F64) -> tuple[F64, F64] | None:
     return shares, normal / scatter**2
 
 
-def decay_of(steps: list[tuple[F64, F64]]) -> tuple[float, float, float, float, float]:
-    """Share, what is kept from frame to frame, their errors, and how significant the share is."""
-    information = np.sum([n for _, n in steps], axis=0)
-    right = np.sum([n @ w for w, n in steps], axis=0)
+@dataclass(frozen=True)
+class CommonLag:
+    """Lag of all pixels alike, as the contrast of the frames shows it."""
+
+    share: float  # that stays behind
+    share_error: float
+    keep: float  # part of what is held that stays for another frame
+    keep_error: float
+    sigmas: float  # significance of the share
+    later: tuple[float, ...] = ()  # parts that come out later, where they are not exponential
+
+    @property
+    def decay_frames(self) -> float:
+        """Frames in which what comes out falls by a factor e."""
+        return float(-1 / np.log(self.keep)) if self.keep else 0.0
+
+    @property
+    def decay_error(self) -> float:
+        """Of `decay_frames`."""
+        if not self.keep:
+            return float(-1 / np.log(min(self.keep_error, 0.9)))
+        return self.keep_error * self.decay_frames**2 / self.keep
+
+
+def common_lag(
+    frames: Sequence[F64], undone: Callable[[float, float, F32], tuple[F32, F64]]
+) -> CommonLag | None:
+    """Lag by the contrast of frames against the step of the phase since those before.
+
+    Parameters
+    ----------
+    frames : sequence of (t, 3) float64
+        (B, A cos phi, A sin phi) of the frames of each fringe set.
+    undone : callable
+        Frames without a lag of a share and a decay, and the shares that come out later.
+
+    Returns
+    -------
+    CommonLag or None
+        None where the frames do not tell.
+    """
+    found = CommonLag(0.0, 0.0, 0.0, 0.0, 0.0)
+    for _ in range(ROUNDS):
+        steps = []
+        for own in frames:
+            # Linear about a lag that is known in part, which is taken out of the frames first.
+            share = float(np.clip(found.share, 0, 0.5))
+            rest, known = undone(share, found.decay_frames, own.astype(np.float32))
+            told = _contrast_steps(rest.astype(float))
+            if told is not None:
+                more = np.pad(known[:LAGS], (0, LAGS - len(known[:LAGS])))
+                steps.append((more + told[0], told[1]))
+        if not steps:
+            return None
+        information = np.sum([n for _, n in steps], axis=0)
+        right = np.sum([n @ w for w, n in steps], axis=0)
+        found = _exponential(information, right)
+    return _freely(found, information, right)
+
+
+def _exponential(information: F64, right: F64) -> CommonLag:
+    """Shares that fall by the same factor from frame to frame."""
     power = np.arange(LAGS)
 
     def release(keep: float) -> F64:
@@ -82,34 +144,20 @@ def decay_of(steps: list[tuple[F64, F64]]) -> tuple[float, float, float, float, 
     errors = np.sqrt(np.diag(covariance))
     if not best:
         errors[0] = 1 / np.sqrt(u @ information @ u)
-    return share, best, float(errors[0]), float(errors[1]), gain(best)
+    return CommonLag(share, float(errors[0]), best, float(errors[1]), gain(best))
 
 
-def released_freely(
-    steps: list[tuple[F64, F64]], keep: float, share: float, error: float
-) -> tuple[float, float, tuple[float, ...]]:
-    """Share, its error and what comes out in each frame, where an exponential does not describe it.
-
-    Else share and error as given, and nothing.
-    """
-    information = np.sum([n for _, n in steps], axis=0)
-    free = np.linalg.solve(information, np.sum([n @ w for w, n in steps], axis=0))
-    away = free - share * (1 - keep) * keep ** np.arange(LAGS)
-    if float(away @ information @ away) < _NOT_EXPONENTIAL or share < CLEAR * error:
-        return share, error, ()
-    covariance = np.linalg.inv(information)
+def _freely(found: CommonLag, information: F64, right: F64) -> CommonLag:
+    """The same with what comes out in each frame, where an exponential does not describe it."""
+    free = np.linalg.solve(information, right)
+    away = free - found.share * (1 - found.keep) * found.keep ** np.arange(LAGS)
+    unlike = float(away @ information @ away) >= _NOT_EXPONENTIAL
+    if not unlike or found.share < CLEAR * found.share_error:
+        return found
     kept = np.maximum(free, 0)
     total = float(kept.sum())
-    return total, float(np.sqrt(covariance.sum())), tuple(map(float, kept / total))
-
-
-def weighted_mean(values: list[tuple[float, float]]) -> tuple[float, float]:
-    """Weighted mean and its error; of an empty list one that says nothing."""
-    if not values:
-        return 0.0, 1.0
-    value, error = np.array(values).T
-    weight = error**-2
-    return float(weight @ value / weight.sum()), float(weight.sum() ** -0.5)
+    error = float(np.sqrt(np.linalg.inv(information).sum()))
+    return replace(found, share=total, share_error=error, later=tuple(map(float, kept / total)))
 
 
 def share_of_flats(evidence: Evidence) -> tuple[float, float] | None:

@@ -1,6 +1,7 @@
 """Lag that differs from pixel to pixel, in the residuals of the fringe frames."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,6 +14,42 @@ HARMONICS = 5
 CONTROLS = 8  # frames after a frame that are compared with the one before it
 CLIP = 5.0
 MIN_FRAMES = 20
+
+
+@dataclass(frozen=True)
+class Uneven:
+    """How much the pixels' shares of the frame before differ: mean square, and its error."""
+
+    square: float
+    error: float
+
+    @classmethod
+    def of(cls, sets: Iterable[FringeEvidence]) -> "Uneven":
+        """Of all sets together; without any it says nothing."""
+        found = [one for f in sets if (one := uneven_pixels(f)) is not None]
+        if not found:
+            return cls(0.0, 1.0)
+        value, error = np.array(found).T
+        weight = error**-2
+        return cls(float(weight @ value / weight.sum()), float(weight.sum() ** -0.5))
+
+    @property
+    def sigmas(self) -> float:
+        """Significance."""
+        return self.square / self.error
+
+    def rms(self, keep: float) -> float:
+        """Of the shares, where a part of what is held stays for another frame."""
+        return float(np.sqrt(max(self.square, 0.0))) / (1 - keep)
+
+    def spread(self, keep: float, share: float, share_error: float) -> tuple[float, float]:
+        """Relative spread of the shares about the mean one, and its error."""
+        if share <= 0:
+            return 0.0, 1.0
+        spread = self.rms(keep) / share
+        size = max(self.rms(keep), np.sqrt(self.error) / (1 - keep))
+        error = self.error / (1 - keep) ** 2 / (2 * size)
+        return spread, float(np.hypot(error, spread * share_error) / share)
 
 
 def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
