@@ -112,7 +112,7 @@ def test_frame_sums_give_each_frame_its_parameters(far):
     f = np.float32
     start_g, start_dk = (g + 1e-5).astype(f), (dk + 1e-7 / far).astype(f)
     normal, right = np.zeros((t, 15)), np.zeros((t, 5))
-    codes = np.rint((model + 20_000) * 0.5).astype(np.uint16)
+    codes = np.rint((model + 20_000) * 0.5).astype(f)
     frame_sums(
         codes, 2.0, -20_000.0, 65535, start_g, start_dk, y.astype(f), x.astype(f), theta.astype(f),
         np.full(n, 256, f), np.ones(n, f), normal, right,

@@ -133,7 +133,7 @@ GROUP = 1024  # pixels summed at a time: what is kept of them stays in the first
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def frame_sums(
-    codes: Any,
+    codes: F32,
     scale: float,
     offset: float,
     fill: int,
@@ -151,8 +151,8 @@ def frame_sums(
 
     Parameters
     ----------
-    codes : (t, p) array of unsigned integers
-        Stored samples of p pixels.
+    codes : (t, p) float32
+        Stored samples of p pixels; of other types it would be compiled again.
     g, dk : (t, 3), (t, 2) float32
         Current frame parameters; the sums are of the residual to them.
     y, x : (p,) float32

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
+from numba import njit
 
 from pixcal.model.arrays import F64
 
@@ -54,12 +55,18 @@ def damped_walk(normals: F64, keep: float) -> F64:
     """
     if not keep or not len(normals):
         return normals
-    # Here: scipy.signal takes most of a second to import, and few runs need it.
-    from scipy.signal import lfilter
+    walk = np.empty(len(normals))
+    _walk(np.ascontiguousarray(normals, float), keep, np.sqrt(1 - keep**2), walk)
+    return walk
 
-    step = np.sqrt(1 - keep**2)
-    walk, _ = lfilter([step], [1.0, -keep], normals, zi=[(1 - step) * normals[0]])
-    return np.asarray(walk)
+
+# Not scipy.signal's filter: it takes most of a second to import, and longer for such short lines.
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _walk(normals: F64, keep: float, step: float, walk: F64) -> None:
+    at = (1 - step) * normals[0]
+    for n in range(len(normals)):
+        walk[n] = step * normals[n] + at
+        at = keep * walk[n]
 
 
 def swing(time_s: F64, hz: float, phase: float, exptime_s: float = 0.0) -> F64:

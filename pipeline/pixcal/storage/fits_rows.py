@@ -185,7 +185,9 @@ def _tiles_at_once(file: FrameFile) -> tuple[int, int]:
     """(planes, rows) decoded at once: whole tiles, some MiB of them."""
     planes, rows = file.tile
     tile_bytes = planes * rows * file.shape[2] * file.coding.stored.itemsize
-    return planes, rows * max(1, _TILE_PIECE // tile_bytes)
+    rows *= max(1, _TILE_PIECE // tile_bytes)
+    # Of small frames several: astropy looks at the header again for each piece.
+    return planes * max(1, rows // file.shape[1]), rows
 
 
 def _unpack_tiles(file: FrameFile, out: BinaryIO) -> None:

@@ -236,8 +236,9 @@ def free_frames(
     y, x = np.broadcast_arrays(*grid((good.shape[0], good.shape[1])))
     packed, right = np.zeros((n, 15)), np.zeros((n, 5))
     start, turned = g.astype(np.float32), dk.astype(np.float32)
+    samples = np.take(codes.reshape(n, -1), used, axis=1).astype(np.float32, copy=False)
     frame_sums(
-        np.take(codes.reshape(n, -1), used, axis=1), coding.scale, coding.offset, coding.fill,
+        samples, coding.scale, coding.offset, coding.fill,
         start, turned, y[good].astype(np.float32), x[good].astype(np.float32),
         np.ascontiguousarray(theta[:, good], np.float32), read_variance[good].astype(np.float32),
         shot_factor[good].astype(np.float32), packed, right,

@@ -320,7 +320,7 @@ class Scout:
             packed, right = np.zeros((n, 15)), np.zeros((n, 5))
             yy, xx = np.divmod(picked, tile.shape[1])
             frame_sums(
-                codes,
+                codes.astype(np.float32),
                 self.coding.scale,
                 self.coding.offset,
                 self.coding.fill,
