@@ -143,7 +143,7 @@ def test_a_four_step_ramp_costs_a_sixth_more_frames(bench):
     assert 1.1 < s.loss[0] < s.loss[1]
     assert s.worst == pytest.approx(free.per_frame.max() * s.loss[1])
     names = {lever.name for lever in levers(ramp, joined(ramp))}
-    assert "phases over the whole cycle" in names
+    assert "phases over the whole period" in names
 
 
 def test_levers_are_what_the_changed_bench_gives(bench):

@@ -46,7 +46,7 @@ class WavelengthDrift(Effect):
         "neighbouring modes of a 30 cm tube are c / (2 x 0.3 m) = 500 MHz apart, 1.1e-6",
         "Wieman & Hollberg 1991, Rev. Sci. Instrum. 62, 1: free diode lasers follow temperature by "
         "some 0.25 nm/K, in hops: 1e-4 and more",
-        "air of 1 K more has an index lower by 1e-6 (Edlen's equation)",
+        "air that is 1 K warmer has an index lower by 1e-6 (Edlen's equation)",
     )
 
     ramp: float = quantity(1e-6, unit="1/h", low=-1, high=1, doc="relative change per hour")

@@ -283,7 +283,7 @@ class SimulatedFrames:
                 f"start: {self.start!r:.80} is not like 2026-01-01T00:00:00"
             ) from error
         if moment.tzinfo is not None and moment.utcoffset() != timedelta(0):
-            raise InputError(f"start: {self.start!r:.80} is not in UTC; leave the zone out")
+            raise InputError(f"start: {self.start!r:.80} is not in UTC; omit the time zone")
         counts = [(self.bias, self.bias_exptime_s), *((s.count, 0.0) for s in self.fringes)]
         counts += [(rung.count, rung.exptime_s) for rung in (*self.darks, *self.flats)]
         seconds = sum(count * max(self.period_s, exptime) for count, exptime in counts)
