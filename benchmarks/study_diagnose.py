@@ -47,7 +47,7 @@ CODE = (
     "stages/reduce", "stages/evidence.py", "stages/simulate",
 )  # fmt: skip
 """Of pixcal, what a play depends on."""
-MOST_WRONG = 3
+MAX_WRONG = 3
 """That are named in a table."""
 ALIKE = 0.05
 """By which shares of the gap may differ."""
@@ -234,7 +234,7 @@ def shares_table(played: Sequence[dict[str, Any]]) -> str:
         ("with the fitted parameters as they are", [p["closed"] for p in own]),
     ):
         off = np.array(shares) - [p["closed_by_truth"] for p in own]
-        far = np.argsort(-abs(off))[:MOST_WRONG]
+        far = np.argsort(-abs(off))[:MAX_WRONG]
         named = ", ".join(f"{own[n]['effect']} {off[n]:+.2f}" for n in far)
         rows += [
             (f"share closed, {what}: within {ALIKE:g} of the true effect's",
@@ -262,7 +262,7 @@ def wrong_table(played: Sequence[dict[str, Any]]) -> str:
         if not closed:
             continue
         shares = np.array([share for share, *_ in closed])
-        most = sorted(closed, reverse=True)[:MOST_WRONG]
+        most = sorted(closed, reverse=True)[:MAX_WRONG]
         told = ", ".join(f"{other} of {name}'s {share:.2f}" for share, _, other, name in most)
         rows += [
             ("share closed: median", f"{np.median(shares):.3f}"),

@@ -39,7 +39,7 @@ LAYOUTS = {
     "standard": Layout((128, 128), 600, 100, 24, 24, 0.3),
 }
 
-MOST_SETS = 3  # fringe sets of a case at most
+MAX_SETS = 3  # fringe sets of a case at most
 FLATS_S = (0.006, 0.014, 0.022, 0.03)
 
 

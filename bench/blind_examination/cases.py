@@ -32,7 +32,7 @@ from pixcal.storage.artefact import digest
 from pixcal.storage.lock import lock
 
 MOMENT = datetime(2026, 1, 1, tzinfo=UTC).timestamp()  # time of every file
-MOST_SEED = 10**17
+MAX_SEED = 10**17
 
 
 def make(out: Path, sealed: Path, config: MakeConfig, runtime: Runtime) -> Examination:
@@ -51,7 +51,7 @@ def make(out: Path, sealed: Path, config: MakeConfig, runtime: Runtime) -> Exami
         If something stands in the way, or the truth would lie beside the cases.
     """
     _check(out, sealed, config)
-    seed = EXAMINATION + secrets.randbelow(MOST_SEED) if config.seed is None else config.seed
+    seed = EXAMINATION + secrets.randbelow(MAX_SEED) if config.seed is None else config.seed
     examination = draw_examination(config.cases, seed, config.size, config.bench)
     write_examination(out, sealed, examination, runtime)
     return examination

@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from blind_examination.benches import LAYOUTS, MOST_SETS
+from blind_examination.benches import LAYOUTS, MAX_SETS
 from blind_examination.manifest import RUNS, read_manifest
 from blind_examination.options import RunConfig
 from pixcal.engine.plan import BASE_BYTES, make_plan
@@ -30,7 +30,7 @@ FAILED = "failed.json"
 # of a case that is done: by which code, in how many seconds, and why there are no maps
 DONE = "sat.json"
 BEGUN = "begun.json"  # of a case: by which code
-LEAST_BYTES = 1 << 30  # of a case on a cluster, whose workers have limits of their own
+MIN_BYTES = 1 << 30  # of a case on a cluster, whose workers have limits of their own
 # artefacts that are removed once a case is diagnosed
 LARGE = ("ingest", "reduce", "sweep", "fit", "corrected")
 
@@ -84,11 +84,11 @@ def share(what: str, size: str, cases: int, runtime: Runtime) -> tuple[Runtime, 
     """
     layout = LAYOUTS[size]
     half = math.prod(layout.shape) * -(-layout.frames // 2)
-    need = half * (ESTIMATE_BYTES + MOST_SETS * EVIDENCE_BYTES)
+    need = half * (ESTIMATE_BYTES + MAX_SETS * EVIDENCE_BYTES)
     plan = make_plan(what, need, 0, runtime)
     over = runtime.with_workers(plan.workers)
     if runtime.remote:
-        return over, Runtime("sync", memory=BASE_BYTES + max(need, LEAST_BYTES))
+        return over, Runtime("sync", memory=BASE_BYTES + max(need, MIN_BYTES))
     if min(cases, plan.workers) <= 1:
         return over, replace(runtime, quiet=True)
     memory = (runtime.memory - BASE_BYTES) // min(cases, plan.workers)

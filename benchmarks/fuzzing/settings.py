@@ -22,7 +22,7 @@ WRONG: tuple[Any, ...] = (
 )  # fmt: skip
 GONE = object()
 BENCH = Path(__file__).parents[2] / "tests" / "bench.yaml"
-MOST_SAMPLES = 400_000
+MAX_SAMPLES = 400_000
 """A bench that is right and asks for more is not simulated here: it would only take long."""
 
 Path_ = tuple[Any, ...]
@@ -130,7 +130,7 @@ def _bench_key(case: Case) -> Answer:
     names = [*_names(at), "effects"]
     if pixcal("budget", file, "--precision", "1e-3", names=names) == 2:
         return "refused"
-    if _samples(made) > MOST_SAMPLES:
+    if _samples(made) > MAX_SAMPLES:
         return "truthful"
     acq = case.folder / "acq"
     if pixcal("simulate", file, "--out", acq, *RUNTIME, names=names) == 2:

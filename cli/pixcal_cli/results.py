@@ -233,13 +233,13 @@ def show_diagnosis(run: Path) -> None:
             number(entry["after"], 3),
             f"{entry['significance']:.1f}",
         )
-        for entry in gap["where"][:MOST_ROWS]
+        for entry in gap["where"][:MAX_ROWS]
     ]
     if rows:
         columns = ("statistic", "where", "measured", "nominal", "with causes", "significance σ")
         show_table(columns, rows)
-        if len(gap["where"]) > MOST_ROWS:
-            click.echo(f"  and {len(gap['where']) - MOST_ROWS} more in diagnosis.json")
+        if len(gap["where"]) > MAX_ROWS:
+            click.echo(f"  and {len(gap['where']) - MAX_ROWS} more in diagnosis.json")
     if diagnosis["more_would_tell"]:
         click.echo(f"  recommended frames: {'; '.join(diagnosis['more_would_tell'])}")
 
@@ -259,14 +259,14 @@ def _show_cause(cause: Mapping[str, Any]) -> None:
 
 LAW_DIFFERS = 0.02
 """Difference of the shares closed by a cause and by its law alone that is printed."""
-MOST_ROWS = 8
+MAX_ROWS = 8
 """Largest number of differences that are printed."""
-LEAST_CHANCE = 1e-12
+MIN_P_VALUE = 1e-12
 """Smallest p-value that is printed as a number."""
 
 
 def _chance(p: float) -> str:
-    return f"< {LEAST_CHANCE:.0e}" if p <= LEAST_CHANCE else f"{p:.1e}"
+    return f"< {MIN_P_VALUE:.0e}" if p <= MIN_P_VALUE else f"{p:.1e}"
 
 
 def show_report(run: Path) -> None:

@@ -14,8 +14,8 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
 from pixcal.stages.diagnose.comparison import Comparison
 from pixcal.stages.diagnose.rejection import MIN_LOGLIK_GAIN_WEAK, doubtful
-from pixcal.stages.diagnose.search import CONFIRM, MOST, SCREEN, Search
-from pixcal.stages.diagnose.shrinkage import LEAST, differing, shrinkage
+from pixcal.stages.diagnose.search import CONFIRM, MAX_CAUSES, SCREEN, Search
+from pixcal.stages.diagnose.shrinkage import MIN_LOGLIK_GAIN, differing, shrinkage
 
 KEYS: tuple[Key, ...] = (
     ("harmonics", "a"),
@@ -354,7 +354,7 @@ def test_a_cause_beyond_the_most_is_told_that_no_more_were_sought() -> None:
     truth = dict.fromkeys(SINGLE, 0.03)
     found, _ = search(truth, [candidate(label, 0.03) for label in SINGLE])
     (left_out,) = set(SINGLE) - set(found.accepted)
-    assert len(found.accepted) == MOST
+    assert len(found.accepted) == MAX_CAUSES
     assert "the search stops after" in found.candidates[left_out].reason
 
 
@@ -370,7 +370,7 @@ def test_an_effect_that_was_hinted_at_and_not_taken_is_told_so() -> None:
     assert told
     for reason in told:
         gain = float(reason.split("by only ")[1].split(";")[0])
-        assert LEAST <= gain < MIN_LOGLIK_GAIN_WEAK
+        assert MIN_LOGLIK_GAIN <= gain < MIN_LOGLIK_GAIN_WEAK
 
 
 def test_each_cause_is_weighed_alone_by_as_many_simulations_as_all_together() -> None:

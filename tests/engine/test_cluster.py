@@ -20,7 +20,7 @@ import pytest
 from distributed import Client, LocalCluster, Security
 
 from pixcal.engine import cluster as engine_cluster
-from pixcal.engine.cluster import AHEAD, LEAST_AHEAD, workers_of
+from pixcal.engine.cluster import AHEAD, MIN_AHEAD, workers_of
 from pixcal.engine.parcel import versions
 from pixcal.engine.plan import DASK_WORKER_BYTES, USABLE, make_plan
 from pixcal.engine.run import Runtime, run_tasks
@@ -113,10 +113,10 @@ def test_every_task_once_and_none_left_behind(cluster: Any) -> None:
         if number % 29 == 0:
             most = max(most, known_tasks(cluster.address))
 
-    count = 10 * LEAST_AHEAD
+    count = 10 * MIN_AHEAD
     run_tasks(partial(pow, 3), range(count), cluster.runtime, label="powers", done=done)
     assert Counter(noted) == Counter(range(count))
-    assert 0 < most <= max(LEAST_AHEAD, AHEAD * 4), "the scheduler gets them bit by bit"
+    assert 0 < most <= max(MIN_AHEAD, AHEAD * 4), "the scheduler gets them bit by bit"
     assert eventually(lambda: known_tasks(cluster.address) == 0)
 
 

@@ -7,7 +7,7 @@ from scipy.stats import kstest, norm
 from pixcal.estimators.diagnosis.expectation import Reference, expect_nominal, expect_with, scaled
 from pixcal.estimators.diagnosis.gap import CHANCE, compare, flagged, log_likelihood, remaining
 from pixcal.estimators.diagnosis.test_statistics import Curve, Key, known_statistics
-from pixcal.stages.diagnose.shrinkage import LEAST
+from pixcal.stages.diagnose.shrinkage import MIN_LOGLIK_GAIN
 
 LINEAR: Key = ("harmonics", "a")
 POWER: Key = ("contrast_of_frames", "a")
@@ -96,7 +96,7 @@ def test_a_shift_is_a_gap_that_its_cause_closes_and_another_does_not() -> None:
     wrong = expect_with(known, [drawn(s, shift=-40) for s in range(100, 108)])
     assert log_likelihood(data, right) > log_likelihood(data, nominal) + 50
     # A wrong effect widens what is expected, which is worth less than one that is taken.
-    assert log_likelihood(data, wrong) < log_likelihood(data, nominal) + LEAST
+    assert log_likelihood(data, wrong) < log_likelihood(data, nominal) + MIN_LOGLIK_GAIN
 
 
 def test_half_of_a_gap_is_half_closed() -> None:

@@ -15,7 +15,7 @@ from pixcal.simulation.effect import DOMAINS, Effect, Estimate, Stage
 # steps of the exposure: each gives back what it is given first, changed
 STEPS = ("states", "detector", "light", "photons", "charge", "signal", "readout")
 OTHERS = ("__post_init__", "check", "predict", "undo", "undo_samples", "noise_factor")
-MOST_AROUND = 4096  # rows around a piece, or frames before one, that an effect may ask for
+MAX_AROUND = 4096  # rows around a piece, or frames before one, that an effect may ask for
 
 
 def checked(effect: type[Effect], file: Path) -> type[Effect]:
@@ -57,8 +57,8 @@ def _check(effect: type[Effect]) -> None:
     if not isinstance(domains, tuple) or not domains or not set(domains) <= set(DOMAINS):
         raise InputError(f"domains is missing or not a tuple out of {', '.join(DOMAINS)}")
     for name in ("halo", "frames_back"):
-        if not 0 <= getattr(default, name) <= MOST_AROUND:
-            raise InputError(f"{name} is not from 0 to {MOST_AROUND}")
+        if not 0 <= getattr(default, name) <= MAX_AROUND:
+            raise InputError(f"{name} is not from 0 to {MAX_AROUND}")
 
 
 def _told(step: Callable[..., Any], file: Path, gives_back: bool) -> Callable[..., Any]:

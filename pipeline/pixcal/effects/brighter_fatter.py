@@ -6,8 +6,8 @@ import numpy as np
 
 from pixcal.estimators.detector.neighbours import SharedCharge, shared_charge
 from pixcal.estimators.detector.response import Boundaries, boundaries_alone, boundaries_beside
+from pixcal.estimators.diagnosis.central_crop import central_crop
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.middle import middle
 from pixcal.kernels.boundaries import REACH, area_changes, boundary_shifts, moved_charge
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F32, F64
@@ -22,7 +22,7 @@ _DISAGREE = 4.0
 _HINTED = 1.5
 _NEEDED = 12.0  # chi-square of `POWERS` terms beyond which they are needed: one in 130 by chance
 _APART = 9.0  # chi-square from which shifts along x and y are not the same
-_MOST_ALONG_Y = 10.0  # of the shift along y over that along x
+_MAX_ALONG_Y = 10.0  # of the shift along y over that along x
 _TURNS = 4  # of the inverse: each gains the size of the effect, a few per cent
 
 
@@ -61,7 +61,7 @@ class BrighterFatter(Effect):
         0.5, unit="px", above=0, high=10, doc="distance over which the shift falls by a factor e"
     )
     along_y: float = quantity(
-        1.0, low=0, high=_MOST_ALONG_Y, doc="ratio of the shift along y to that along x"
+        1.0, low=0, high=_MAX_ALONG_Y, doc="ratio of the shift along y to that along x"
     )
 
     @property
@@ -114,7 +114,7 @@ class BrighterFatter(Effect):
         noise. Where it explains all harmonics with some falloff, and as much along y as along x or
         another part of it, no response is taken to be beside it.
         """
-        evidence = middle(evidence)
+        evidence = central_crop(evidence)
         falloff = cls().falloff_px
         shifts = boundary_shifts(falloff)
         noise = shared_charge(evidence, shifts)
@@ -157,8 +157,8 @@ def _by_axis(noise: SharedCharge) -> tuple[float, float, float, float]:
     if chi2 - together < _APART:
         return noise.size, noise.variance, 1.0, float(noise.size / np.sqrt(noise.variance))
     along_x, along_y = noise.axes
-    size = max(along_x, along_y / _MOST_ALONG_Y, 0.0)
-    ratio = float(np.clip(along_y / size, 0, _MOST_ALONG_Y)) if size > 0 else 1.0
+    size = max(along_x, along_y / _MAX_ALONG_Y, 0.0)
+    ratio = float(np.clip(along_y / size, 0, _MAX_ALONG_Y)) if size > 0 else 1.0
     sigmas = sigmas_of_chi2(chi2, 2) if size > 0 else -1.0
     return size, float(noise.covariance[0, 0]), ratio, sigmas
 

@@ -16,7 +16,7 @@ from pixcal.simulation.recording import Recording
 from pixcal.simulation.track import Track, at
 
 # share of light that does not follow the laser beyond which contrast noise is likelier
-MOST_AMBIENT = 0.3
+MAX_AMBIENT = 0.3
 
 
 @dataclass(frozen=True)
@@ -120,8 +120,8 @@ class IntensityNoise(Effect):
         assert isinstance(found.effect, cls)
         effect = found.effect
         shares = ambient_shares(evidence)
-        if any(SIGNIFICANT * error < share < MOST_AMBIENT for share, error in shares):
-            ambient = tuple(float(np.clip(share, 0, MOST_AMBIENT)) for share, _ in shares)
+        if any(SIGNIFICANT * error < share < MAX_AMBIENT for share, error in shares):
+            ambient = tuple(float(np.clip(share, 0, MAX_AMBIENT)) for share, _ in shares)
             effect = replace(effect, ambient=ambient)
         elif found.significance > SIGNIFICANT:
             effect = replace(effect, separate=separate_powers(evidence))

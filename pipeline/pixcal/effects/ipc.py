@@ -30,7 +30,7 @@ from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.shot import Shot
 
-LEAST_SHARE = 2e-5  # couplings below do not move offsets by what matters, and take time
+MIN_SHARE = 2e-5  # couplings below do not move offsets by what matters, and take time
 MIN_FLAT = 0.01  # least response that maps are divided by
 
 # A kernel of the size and kind that the paper finds on its GIGAPYX-4600
@@ -241,7 +241,7 @@ def _worth_it(couplings: Sequence[Coupling]) -> tuple[Coupling, ...]:
 
     They stay in the list, for their errors hang together with the others'.
     """
-    return tuple(c if abs(c.share) > LEAST_SHARE else c.scaled(0.0) for c in couplings)
+    return tuple(c if abs(c.share) > MIN_SHARE else c.scaled(0.0) for c in couplings)
 
 
 def _on_charge(

@@ -9,8 +9,8 @@ from pixcal.estimators.detector.frame_lag import CLEAR, MAX_DECAY, common_lag, s
 from pixcal.estimators.detector.noiseless_charge import missing_noise
 from pixcal.estimators.detector.pixel_lag import Uneven
 from pixcal.estimators.detector.traps import BANDS, LossFit, in_bands
+from pixcal.estimators.diagnosis.central_crop import MAX_SAMPLES, central_crop
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
-from pixcal.estimators.diagnosis.middle import MOST, middle
 from pixcal.kernels.scene import TILE, Rows, chip_map
 from pixcal.kernels.significance import sigmas_of_best
 from pixcal.kernels.transfer import fill_traps, left_behind
@@ -242,7 +242,7 @@ class Lag(Effect):
         common = common_lag([f.free[:, :3] for f in fringes], cls._undone)
         if common is None:
             return None
-        part = middle(evidence)
+        part = central_crop(evidence)
         uneven = Uneven.of(part.fringes.values())
         sure, unalike = common.sigmas > CLEAR, uneven.sigmas > CLEAR
         # What the pixels have in common is no less than how much they differ by.
@@ -311,7 +311,7 @@ def _by_level(evidence: Evidence, lag: Lag) -> tuple[Lag, dict[str, float]]:
     def trapped(values: F64, charge: F32) -> F32:
         return _trapped(lag, values).lost(charge)[0]
 
-    fit = LossFit(middle(evidence, MOST // 2), lag.level_e)
+    fit = LossFit(central_crop(evidence, MAX_SAMPLES // 2), lag.level_e)
     bands, traps = fit.by_level(banded, trapped, lag.share, lag.share * lag.level_e)
     names = [f"bands[{n}]" for n in range(len(BANDS))]
     if traps is not None:

@@ -10,8 +10,8 @@ from pixcal.estimators.detector.flat_ladder import ladder_response
 from pixcal.estimators.detector.neighbours import shared_charge
 from pixcal.estimators.detector.response import departure, fit_curve, fit_response
 from pixcal.estimators.detector.transfer_curve import transfer_curve
+from pixcal.estimators.diagnosis.central_crop import central_crop
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.middle import middle
 from pixcal.kernels.boundaries import boundary_shifts
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
 from pixcal.model.arrays import F32, F64
@@ -154,7 +154,7 @@ class Nonlinearity(Effect):
         by_levels = told[0] > told[1]
         if evidence.fringes:
             shifts = boundary_shifts(FALLOFF_PX)
-            part = middle(evidence)
+            part = central_crop(evidence)
             noise = shared_charge(part, shifts)
             known = None if noise is None else (noise.size, noise.variance)
             sizes, covariance = fit_response(part, level, 2, shifts, known)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pixcal.estimators.detector.code_density import (
-    LEAST_NOISE,
+    MIN_NOISE,
     CodeWidths,
     code_widths,
     converter_counts,
@@ -163,11 +163,11 @@ class Quantisation(Effect):
         step = max(step, float(evidence.step_adu))
         noise, first = evidence.read_noise / evidence.gain / step, 0.0
         lit = lit or [s.adu for s in evidence.of_kind("flat")]
-        if noise < LEAST_NOISE and lit:
+        if noise < MIN_NOISE and lit:
             counts = histogram(lit, evidence.good)
-            shot = LEAST_NOISE**2 - noise**2
+            shot = MIN_NOISE**2 - noise**2
             first = float(np.median(evidence.bias)) / step + shot * step * evidence.gain
-            noise = LEAST_NOISE
+            noise = MIN_NOISE
         widths = None
         if counts is not None:
             top = evidence.saturation_adu

@@ -21,7 +21,7 @@ from pixcal.simulation.shot import Shot
 HARMONICS = 5  # of the phase that are taken out of fringe residuals before they count as noise
 _MIN_FRAMES = 10
 _ENOUGH = 20
-_LEAST_NOISE_ADU = 0.8
+_MIN_NOISE_ADU = 0.8
 _HOT = 4.0
 _WIDE = 16
 _FRAMES_AT_ONCE = 256
@@ -179,7 +179,7 @@ def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
     if rest.shape[1] < _ENOUGH:
         return None
     spread = 1.4826 * float(np.median(np.abs(rest)))
-    if spread < _LEAST_NOISE_ADU * evidence.gain:
+    if spread < _MIN_NOISE_ADU * evidence.gain:
         # Of noise below a step of the converter the shape is that of the steps.
         return None
     return Series(

@@ -30,7 +30,7 @@ from pixcal.model.errors import ClusterError, InputError
 CONNECT = "10s"
 AHEAD = 4  # tasks handed to the scheduler for each thread: it takes a while to hear that one ended
 # tasks handed over however few threads there are: a cluster that grows does so by demand
-LEAST_AHEAD = 32
+MIN_AHEAD = 32
 LOOK_S = 5.0  # time between two looks at how many threads there are
 # by these a run directory that is worked on is known (`pixcal.storage.lock`)
 HELD = (".lock", ".partial")
@@ -264,7 +264,7 @@ class _Tasks:
             at_once = self._job.at_once
             threads = self._client.nthreads().values()
             slots = sum(min(n, at_once) if at_once else n for n in threads)
-            self._room = max(AHEAD * slots, LEAST_AHEAD)
+            self._room = max(AHEAD * slots, MIN_AHEAD)
             self._look_again = time.monotonic() + LOOK_S
         return self._room
 

@@ -19,9 +19,9 @@ SMOOTH = 1.0  # noise from which mean and variance no longer depend on the level
 _FRACTIONS = 256
 _REACH = 9.0
 _HARMONICS = 8
-_LEAST = 1e-3
+_MIN_SIGMA = 1e-3
 _EVERYWHERE = 0.5  # scatter of the levels from which they lie evenly between codes
-_LEAST_KNOWN = 0.05
+_MIN_KNOWN = 0.05
 _SLOPE_STEP = 1e-3
 
 
@@ -33,7 +33,7 @@ def rounded_moments(level: F64, sigma: float) -> tuple[F64, F64]:
     reach = int(np.ceil(_REACH * sigma)) + 1
     codes = np.arange(-reach, reach + 1.0)
     edges = np.arange(-reach - 0.5, reach + 1)
-    below = ndtr((edges - (level - whole)[..., None]) / max(sigma, _LEAST))
+    below = ndtr((edges - (level - whole)[..., None]) / max(sigma, _MIN_SIGMA))
     chance = np.diff(below, axis=-1)
     mean = chance @ codes
     return whole + mean, np.asarray(chance @ codes**2 - mean**2)
@@ -74,7 +74,7 @@ def noise_before_rounding(
         return sigma, error / (2 * sigma)
     spread = _clipped_variance(means) - variance / frames - SHEPPARD
     everywhere = spread > _EVERYWHERE**2
-    least = _LEAST if everywhere else UNTOLD
+    least = _MIN_SIGMA if everywhere else UNTOLD
     places = np.zeros(_HARMONICS) if everywhere else _harmonics(means, variance / frames)
     level = np.arange(_FRACTIONS) / _FRACTIONS
 
@@ -104,4 +104,4 @@ def _harmonics(means: F64, noise: float) -> F64:
     order = np.arange(1, _HARMONICS + 1)
     turns = np.cos(2 * np.pi * order[:, None] * means).mean(axis=1)
     kept = np.exp(-2 * np.pi**2 * order**2 * noise)
-    return np.where(kept > _LEAST_KNOWN, np.clip(turns / kept, -1, 1), 0.0)
+    return np.where(kept > _MIN_KNOWN, np.clip(turns / kept, -1, 1), 0.0)

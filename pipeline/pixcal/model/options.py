@@ -19,7 +19,7 @@ from pixcal.model.errors import InputError
 # limits (y0, y1, x0, x1) of a rectangle of pixels, ends excluded
 Region = tuple[int, int, int, int]
 
-MOST_ELECTRONS = 1e15  # the Poisson generator counts so far
+MAX_ELECTRONS = 1e15  # the Poisson generator counts so far
 
 
 def _as_in(kind: type, name: str) -> Any:
@@ -255,9 +255,9 @@ class Astrometry:
     def __post_init__(self) -> None:
         if self.window is not None and self.window % 2 == 0:
             raise InputError(f"--window {self.window}: even; give an odd number")
-        if self.electrons + self.background_e > MOST_ELECTRONS:
+        if self.electrons + self.background_e > MAX_ELECTRONS:
             raise InputError(
-                f"--electrons, --background: more than {MOST_ELECTRONS:g} e- cannot be counted; "
+                f"--electrons, --background: more than {MAX_ELECTRONS:g} e- cannot be counted; "
                 "give less"
             )
 

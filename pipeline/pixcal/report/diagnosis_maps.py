@@ -15,7 +15,7 @@ from pixcal.report.drawing import TITLE, WIDE, axes_grid
 
 CELLS = "cell of 4 × 4"  # `x_label` of curves whose values are cells of the window
 ASIDE = 3.0  # standard deviations below which a map is not worth looking at
-MOST = 3  # maps side by side
+MAX_MAPS = 3  # maps side by side
 LARGEST = 12.0  # standard deviations at which colours end
 # least side of a window in the picture, share of the detector's: real ones would be dots
 SMALLEST = 0.17
@@ -59,7 +59,7 @@ def panels(
     """
     maps = _of_windows(places) if places else _of_cells(shape, curves)
     maps = [panel for panel in maps if panel.largest > ASIDE]
-    return sorted(maps, key=lambda panel: -panel.largest)[:MOST]
+    return sorted(maps, key=lambda panel: -panel.largest)[:MAX_MAPS]
 
 
 def _of_windows(places: Sequence[Mapping[str, Any]]) -> list[Panel]:

@@ -27,7 +27,7 @@ from pixcal.simulation.exposure import Camera
 from pixcal.simulation.forward import ForwardModel, Stage
 from pixcal.simulation.recording import Recording
 
-LEAST_S = 1e-6  # exposure time and period where none is known
+MIN_S = 1e-6  # exposure time and period where none is known
 TOP_ADU = 65535.0
 
 
@@ -181,7 +181,7 @@ def _states(found: FringeEvidence) -> FrameStates:
 
 
 def _period(time_s: F64) -> float:
-    return max(float(np.median(np.diff(time_s))), LEAST_S) if len(time_s) > 1 else LEAST_S
+    return max(float(np.median(np.diff(time_s))), MIN_S) if len(time_s) > 1 else MIN_S
 
 
 def _first(found: FringeEvidence) -> int:
@@ -254,7 +254,7 @@ def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:
             saturation_adu=min(evidence.saturation_adu, TOP_ADU),
         ),
         float(np.mean(contrast)) if contrast else 1.0,
-        (max([*exposures[:1], LEAST_S]), _period(sets[0].time_s) if sets else 0.0),
+        (max([*exposures[:1], MIN_S]), _period(sets[0].time_s) if sets else 0.0),
         [(s.name, s.baseline_mm, len(s.g), 2 * float(np.median(s.theta[0][s.good]))) for s in sets],
     )
 

@@ -39,7 +39,7 @@ HINT = 2.0  # standard deviations from which parameters are fitted
 ROUNDS = 4  # steps, each halved up to
 HALVINGS = 4  # times, until the misfit falls by less than
 CONVERGED = 0.05
-MOST = 3.0  # factor by which a step changes a parameter at most
+MAX_FACTOR = 3.0  # factor by which a step changes a parameter at most
 TELLING = 0.02  # share of the information from which a deviation is looked at again
 SINGULAR = 1e-6  # share of the largest eigenvalue below which parameters are not told apart
 RANDOM = "changes in the second moments of frames, as its forward model predicts"
@@ -274,11 +274,11 @@ def _shapes(model: ForwardModel) -> list[str]:
 
 
 def _moved(model: ForwardModel, step: Mapping[str, float]) -> ForwardModel:
-    """The model with parameters moved, none by more than a factor of `MOST`."""
+    """The model with parameters moved, none by more than a factor of `MAX_FACTOR`."""
     new = {}
     for name, size in step.items():
         value = getattr(model, name)
-        low, high = sorted((value / MOST, value * MOST))
+        low, high = sorted((value / MAX_FACTOR, value * MAX_FACTOR))
         new[name] = float(np.clip(value + size, low, high))
     return _replaced(model, new)
 

@@ -27,7 +27,7 @@ Sums = tuple[F64, F64]
 
 WITHIN = 2  # rows and columns of the kernel about its middle
 ROUNDS = 3  # of the shares, each with the second order of those before
-MOST_SHARES = 480  # that are measured together: time goes with the third power of their number
+MAX_SHARES = 480  # that are measured together: time goes with the third power of their number
 NEGLIGIBLE = 1e-4  # share whose products with others do not count
 
 
@@ -81,7 +81,7 @@ class Frames:
     def kernel(
         self, classes: Classes, known: Sequence[Coupling], per_ke: float = 0.0
     ) -> "Dense | None":
-        """All couplings of the steps for the classes of a period; None for more than `MOST_SHARES`.
+        """All couplings of the steps for the classes of a period; None for more than `MAX_SHARES`.
 
         Known couplings are started from. With ``per_ke``, a relative change of the shares with the
         signal (1/ke-), maps do not count, which are those of one level.
@@ -90,7 +90,7 @@ class Frames:
             coupling_of(classes, *divmod(u, 2), step)
             for step in self.steps for u in range(2 * classes.count)
         )  # fmt: skip
-        if len(every) > MOST_SHARES:
+        if len(every) > MAX_SHARES:
             return None
         shrinkage = Shrinkage.of(self.steps, classes.count)
         shares = _shares_of(every, known)
@@ -147,7 +147,7 @@ def frames_of(
 
 
 def dense_kernel(parts: Iterable[Evidence], start: Sequence[Coupling]) -> Dense | None:
-    """Measure all couplings of the period of a kernel; None for more than `MOST_SHARES`.
+    """Measure all couplings of the period of a kernel; None for more than `MAX_SHARES`.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ CLIP = 5.0
 RISE = 1e-4  # how much brighter-fatter may well make a share rise with the charge, 1/ke-
 ENOUGH = 4  # values beyond the first that tell a rise with the charge from disagreement
 MIN_LEVELS = 3  # hot pixels of a coupling that tell whether its share changes with the signal
-MOST = 4000  # hot pixels used, the brightest
+MAX_PIXELS = 4000  # hot pixels used, the brightest
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ def hot_pixels(
         return None
     highest = rest > OWN_RING * maximum_filter(rest, 2 * REACH + 1, mode="constant")
     y, x = np.nonzero((rest > MIN_SIGMAS * noise) & highest & _unsaturated(evidence))
-    order = np.argsort(-rest[y, x], kind="stable")[:MOST]
+    order = np.argsort(-rest[y, x], kind="stable")[:MAX_PIXELS]
     y, x = y[order], x[order]
     if not len(y):
         return None

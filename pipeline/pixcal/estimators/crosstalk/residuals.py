@@ -20,12 +20,12 @@ from pixcal.model.arrays import F32, F64, Indices
 UNIT = 1e4  # electrons that charge is counted in; variances are in 10⁴ e-²
 CLIP = 6.0  # residuals beyond so many sigmas (particles, telegraph noise) do not count
 # samples of one sequence that are used at most; of longer ones frames spread over it
-MOST = 6_000_000
+MAX_SAMPLES = 6_000_000
 MIN_FRAMES = 16  # fewest frames of a fringe set that leave residuals
 # every so many frames the modes are kept; they change little, and only their products count
 STRIDE = 16
 STEPS = 3  # times that what is common to pixels and to frames is taken off in turn, till it is both
-LEAST = 0.1  # least share of a sample's noise that is left, of those that count
+MIN_NOISE_SHARE = 0.1  # least share of a sample's noise that is left, of those that count
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def all_residuals(evidence: Evidence, known: Sequence[Coupling]) -> Iterator[Res
 
 
 def _spread(frames: int, pixels: int) -> Indices:
-    few = max(MIN_FRAMES, MOST // pixels)
+    few = max(MIN_FRAMES, MAX_SAMPLES // pixels)
     return np.unique(np.linspace(0, frames - 1, min(frames, few)).astype(int))
 
 
@@ -157,7 +157,9 @@ def _noise(
     for _ in range(STEPS):
         modes.take_off(flat)
         flat -= pixels.part_of(flat)
-    e /= np.sqrt(np.maximum(1 - pixels.taken(), LEAST)).astype(np.float32).reshape(e.shape)
+    e /= (
+        np.sqrt(np.maximum(1 - pixels.taken(), MIN_NOISE_SHARE)).astype(np.float32).reshape(e.shape)
+    )
     # Noise beyond what is known makes every product count for less.
     squares = float(np.einsum("tyx,tyx->t", e, e).sum(dtype=float))
     excess = max(1.0, squares / max(int(np.count_nonzero(one)), 1))

@@ -23,7 +23,7 @@ FALSE_ALARM = 0.01  # chance that noise alone gives any coupling
 # makes the median significance of acquisitions without couplings about zero.
 INDEPENDENT = 0.35
 WORTH = 16.0  # fall in chi-square for which another share is taken, once a link is known to couple
-NEAR, MOST_FAR = 2, 12  # of a kernel few couplings reach over more pixels than that
+NEAR, MAX_FAR = 2, 12  # of a kernel few couplings reach over more pixels than that
 NOTHING = 1e-6  # weight of a share below which it is not measured at all
 
 
@@ -75,10 +75,10 @@ def choose(measured: Measured, pattern: Callable[[Classes], float]) -> Choice:
     gains = np.stack([_best_gains(*i.total) for _, i in measured.every_period()])
     there = tuple(int(n) for n in np.nonzero(gains.max(axis=0) > critical)[0])
     far = sum(max(map(abs, measured.links[n])) > NEAR for n in there)
-    if far > MOST_FAR:
+    if far > MAX_FAR:
         raise InputError(
             f"not decided: noise is correlated at {len(there)} distances between pixels, {far} of "
-            f"them beyond {NEAR} pixels (at most {MOST_FAR} are measured), unlike a crosstalk "
+            f"them beyond {NEAR} pixels (at most {MAX_FAR} are measured), unlike a crosstalk "
             "kernel"
         )
     none = Classes(1, 1, measured.first)

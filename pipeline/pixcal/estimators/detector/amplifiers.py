@@ -11,7 +11,7 @@ from numpy.polynomial.legendre import legvander
 
 from pixcal.model.arrays import F64, Mask
 
-MOST = 7  # boundaries that are looked for along each axis
+MAX_BOUNDARIES = 7  # boundaries that are looked for along each axis
 NARROWEST = 8  # rows or columns of an amplifier at least
 SIGNIFICANT = 6.0  # standard deviations of a step of the flat
 SMOOTH = 2  # degree of what the lamp does beside the steps
@@ -67,7 +67,7 @@ def _boundaries(along: F64) -> list[int]:
     steps: list[int] = []
     noise = 1.4826 * float(np.median(np.abs(np.diff(along)))) / np.sqrt(2)
     places = range(NARROWEST, len(along) - NARROWEST + 1)
-    while noise > 0 and len(steps) < MOST:
+    while noise > 0 and len(steps) < MAX_BOUNDARIES:
         free = [p for p in places if all(abs(p - s) >= NARROWEST for s in steps)]
         basis = np.linalg.qr(_terms(len(along), steps))[0]
         rest = along - basis @ (basis.T @ along)

@@ -22,10 +22,10 @@ FEWEST_CODES = 24
 CARRY = 32  # codes whose multiples turn over so many bits that their sum may be off by several
 POPULATED = 20.0  # counts of codes around from which an empty one is a gap
 NEAR = 0.1  # how far the share of codes that come up may be from one over the step
-LEAST_AGREEMENT = 0.5
+MIN_AGREEMENT = 0.5
 TIE = 0.01  # of a code: multiples of the step this near half-way may be rounded up or down
 _ORDER = 3
-_LEAST_HALF, _MOST_HALF = 4, 12
+_MIN_HALF, _MAX_HALF = 4, 12
 _CALM = 101
 _NO_CHANGE = 1e-6
 _MISSED = 3.0
@@ -34,7 +34,7 @@ _UNEVEN = 2e-3
 # fits of the weights of bits, until the misfit falls by less than
 _BIT_FITS, _SETTLED = 12, 0.1
 # codes of noise below which the peak of dark frames is too narrow for a local fit
-LEAST_NOISE = 1.4
+MIN_NOISE = 1.4
 LOWEST_RIPPLE = 1 / 16  # turns a code
 
 
@@ -84,7 +84,7 @@ def step_of(counts: F64) -> tuple[float, float]:
     simple = [float(Fraction(found).limit_denominator(n)) for n in (1, 2, 4, 16, 128, 1024)]
     trials = [t for t in (*simple, found) if t >= 1]
     agreed = [_agreement(codes, taken, trial) for trial in trials]
-    if max(agreed) < LEAST_AGREEMENT:
+    if max(agreed) < MIN_AGREEMENT:
         return none
     step = trials[int(np.argmax(agreed))]
     return step, 0.5 * step / float(codes[-1])
@@ -281,8 +281,8 @@ def code_widths(
     last : float
         Code at which samples saturate.
     """
-    half = int(np.clip(noise / 2, _LEAST_HALF, _MOST_HALF))
-    if noise < LEAST_NOISE or len(counts) < 2 * _CALM:
+    half = int(np.clip(noise / 2, _MIN_HALF, _MAX_HALF))
+    if noise < MIN_NOISE or len(counts) < 2 * _CALM:
         return None
     # Here: scipy.signal takes most of a second to import, and few runs need it.
     from scipy.signal import savgol_coeffs, savgol_filter
@@ -318,7 +318,7 @@ def _carried_over(counts: F64) -> Mask:
     One or more, just below a multiple of `CARRY`, among codes that do come.
     """
     gap = np.zeros(len(counts), bool)
-    around = uniform_filter1d(counts, 2 * _MOST_HALF + 1)
+    around = uniform_filter1d(counts, 2 * _MAX_HALF + 1)
     for first in range(CARRY, len(counts), CARRY):
         below = counts[first - CARRY // 2 : first][::-1]
         empty = int(np.argmax(below > 0)) if below.any() else 0

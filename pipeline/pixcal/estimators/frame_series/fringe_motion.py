@@ -24,9 +24,9 @@ from pixcal.model.arrays import F64
 
 CROSSED = 0.5  # sine of the angle between fringes from which they count as different
 HOP_WINDOWS = (2, 4, 8, 16, 32)  # frames before and after, of which the means are compared
-SURE_HOP = 6.5
-SURE_STEP = 2.5  # standard deviations of a hop beside a slope, which tells half as well
-MOST_HOPS = 64
+SIGNIFICANT_HOP = 6.5
+SIGNIFICANT_STEP = 2.5  # standard deviations of a hop beside a slope, which tells half as well
+MAX_HOPS = 64
 OCTAVE = 1.4  # ratio of frequencies over which the power of a slow change hardly differs
 BESIDE = 3  # modes on either side, of which the power is that of a line
 # excess of the power over that of white noise, in errors, that is a slow change's
@@ -157,11 +157,11 @@ def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
             break
         aside, aside_scatter = _differences(across, width)
         smooth = np.zeros(len(aside), bool)
-        for _ in range(MOST_HOPS):
+        for _ in range(MAX_HOPS):
             change, scatter = _differences(rest, width)
             at = int(np.argmax(np.where(smooth, 0.0, np.abs(change))))
             sharpness = abs(change[at]) / scatter
-            if smooth[at] or sharpness < max(SURE_HOP, 2 * abs(aside[at]) / aside_scatter):
+            if smooth[at] or sharpness < max(SIGNIFICANT_HOP, 2 * abs(aside[at]) / aside_scatter):
                 break
             if not _is_step(rest, at, width, float(change[at])):
                 smooth[max(0, at - width) : at + width] = True
@@ -178,7 +178,7 @@ def _is_step(values: F64, at: int, width: int, size: float) -> bool:
     steps = np.convolve(values, np.linalg.pinv(design)[2, ::-1], "valid")
     scatter = 1.4826 * float(np.median(np.abs(steps - np.median(steps))))
     same = abs(steps[at] - size) < 3 * scatter
-    return bool(same and abs(steps[at]) > SURE_STEP * scatter)
+    return bool(same and abs(steps[at]) > SIGNIFICANT_STEP * scatter)
 
 
 def _measured(along: F64, found: dict[int, float]) -> tuple[Hop, ...]:

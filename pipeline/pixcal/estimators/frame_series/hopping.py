@@ -18,7 +18,7 @@ ROUNDS = 200
 SETTLED = 1e-4  # growth of the log-likelihood at which they end
 BASES = 33  # levels tried for the base of each series, to begin with
 # of the size, and in all of the time: what is smaller counts as this
-LEAST_NOISE, FEWEST_HOPS = 1e-3, 0.01
+MIN_NOISE, FEWEST_HOPS = 1e-3, 0.01
 # of the rate's logarithm, and of the size over the noise, over which the likelihood bends
 STEP = 0.2
 
@@ -119,7 +119,7 @@ def _change(rate: float, step_s: float) -> float:
 def _begun(values: F64, step_s: float, slope: float, size: float, rate: float) -> _Series:
     """With the likeliest base on a grid."""
     ramp = slope * (np.arange(len(values)) - (len(values) - 1) / 2)
-    noise = max(scatter_of(values), LEAST_NOISE * abs(size))
+    noise = max(scatter_of(values), MIN_NOISE * abs(size))
     flat = values - ramp
     bases = np.linspace(flat.min() - size / 2, flat.max() - size / 2, BASES)
     nothing = np.zeros(len(values))
@@ -150,5 +150,5 @@ def _settled(s: _Series, size: float) -> _Series:
     base = _ramp_of(s.values - size * s.second)
     off = s.values - base
     square = off**2 - 2 * size * s.second * off + size**2 * s.second
-    noise = max(float(np.sqrt(max(square.mean(), 0.0))), LEAST_NOISE * abs(size))
+    noise = max(float(np.sqrt(max(square.mean(), 0.0))), MIN_NOISE * abs(size))
     return replace(s, base=base, noise=noise)

@@ -13,7 +13,7 @@ import numpy as np
 
 from pixcal.model.arrays import F32, F64, I64, Mask
 
-BLOCKS, LEAST_BLOCK = 16, 4  # blocks of a row at most, and pixels of a block at least
+BLOCKS, MIN_BLOCK = 16, 4  # blocks of a row at most, and pixels of a block at least
 FEWEST_BLOCKS = 4
 FEWEST_FRAMES = 8
 FEWEST_LINES = 8
@@ -49,7 +49,7 @@ def line_spectrum(residual: F32, good: Mask, fitted: int = 1) -> LineSpectrum | 
     """
     frames, lines, width = residual.shape
     lines -= lines % 2
-    size = max(LEAST_BLOCK, -(-width // BLOCKS))
+    size = max(MIN_BLOCK, -(-width // BLOCKS))
     blocks = width // size
     if frames < FEWEST_FRAMES or lines < FEWEST_LINES or blocks < FEWEST_BLOCKS:
         return None

@@ -25,7 +25,7 @@ CONTRASTS = np.array([[1, 1, -1, -1], [1, -1, 1, -1], [1, -1, -1, 1]]) / 4
 NOISES = np.array([[1, 1, 1, 1], [1, 1, 0, 0], [1, 0, 1, 0]])
 # lowest size of the noise of pixels, of what is predicted; other parts may go as far below zero as
 # `BELOW` of it
-LEAST_NOISE = 0.05
+MIN_NOISE = 0.05
 BELOW = 0.3
 
 
@@ -110,7 +110,7 @@ def offset_modes(every: Sequence[OffsetSeries], shapes: Sequence[F64]) -> Modes:
         designs.append(design)
         parts.append(part)
         least = np.maximum(least, -BELOW * s.noise[0] / np.array([1.0, walk.max()]))
-    own = [LEAST_NOISE, -BELOW * LEAST_NOISE, -BELOW * LEAST_NOISE]
+    own = [MIN_NOISE, -BELOW * MIN_NOISE, -BELOW * MIN_NOISE]
     return Modes(
         values=np.concatenate(values),
         known=np.concatenate(designs),

@@ -20,9 +20,9 @@ ORIGINS = 8  # phases tried as the one where the modulator's range begins
 # standard deviations from which that phase is sought more finely, and how finely, rad
 CLEAR, FINEST = 4.0, 0.01
 # columns of the window that are enough to tell the steps' way and origin; of wide ones one in
-# `MOST_APART` at most
+# `MAX_APART` at most
 COLUMNS = 24
-MOST_APART = 4
+MAX_APART = 4
 OWN_ORDERS = 4  # harmonics of a frame's own phase that a step must not be taken for
 
 
@@ -63,7 +63,7 @@ def find_settling(sets: Sequence[FringeEvidence]) -> Settling:
     """The likeliest profile, of the last step or the next, along either way around the turn."""
     origins = [None, *(2 * np.pi * n / ORIGINS for n in range(ORIGINS))]
     ways = [(way, origin) for way in (-1, 1) for origin in origins]
-    every = int(np.clip(min(f.good.shape[1] for f in sets) // COLUMNS, 1, MOST_APART))
+    every = int(np.clip(min(f.good.shape[1] for f in sets) // COLUMNS, 1, MAX_APART))
     found = {one: _fit(sets, *one, every)[0] for one in ways}
     way, origin = max(found, key=lambda one: found[one])
     gain = found[way, origin]

@@ -28,7 +28,7 @@ SLOW = 12  # cosine modes that are drift
 AROUND, MEDIAN = 15, 0.455
 OUTLIER = 9.0  # power over the level from which a mode counts less
 DARK = 0.05  # share of the mean light below which a frame tells nothing
-LEAST_NOISE = 0.05  # lowest size of the noise, of what is predicted
+MIN_NOISE = 0.05  # lowest size of the noise, of what is predicted
 BELOW = 0.15  # how far below zero a size may come out, of the noise
 
 
@@ -219,7 +219,7 @@ def assemble(
         share = np.einsum("ab,inba->in", np.linalg.inv(s.noise), shared[i]).max(axis=1)
         least = np.maximum(least, -BELOW / np.maximum(share, 1e-300))
     stacked = np.concatenate(covariances, axis=1)
-    of_noise = np.tile([LEAST_NOISE, -np.inf, LEAST_NOISE], len(every))
+    of_noise = np.tile([MIN_NOISE, -np.inf, MIN_NOISE], len(every))
     return Modes(
         values=np.concatenate(values),
         known=np.concatenate(designs),

@@ -16,7 +16,7 @@ from pixcal.model.arrays import F64, Indices, Mask
 
 BLOCK = 8  # pixels along the side of a block
 _CLIP = 5.0
-_LEAST = 1e-30  # variance of a map that its signals fit exactly
+_MIN_VARIANCE = 1e-30  # variance of a map that its signals fit exactly
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def fit_maps(parts: Sequence[MapPart]) -> MapFit:
     """Weighted least squares of the same parameters in several maps."""
     n = parts[0].signals.shape[1]
     values = np.zeros(n)
-    variances = np.array([max(p.data @ p.data / max(p.dof, 1), _LEAST) for p in parts])
+    variances = np.array([max(p.data @ p.data / max(p.dof, 1), _MIN_VARIANCE) for p in parts])
     for _ in range(3):
         normal, right = np.zeros((n, n)), np.zeros(n)
         for part, variance in zip(parts, variances, strict=True):
@@ -74,7 +74,10 @@ def fit_maps(parts: Sequence[MapPart]) -> MapFit:
         values = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) @ right
         left = [p.data - p.signals @ values for p in parts]
         variances = np.array(
-            [max(r @ r / max(p.dof - n, 1), _LEAST) for p, r in zip(parts, left, strict=True)]
+            [
+                max(r @ r / max(p.dof - n, 1), _MIN_VARIANCE)
+                for p, r in zip(parts, left, strict=True)
+            ]
         )
     covariance = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     meat = np.zeros((n, n))

@@ -19,7 +19,7 @@ from pixcal.kernels.psf import MARGIN, Psf
 from pixcal.model.arrays import F32, F64
 
 # share of a star's weights on pixels without an offset beyond which it is not corrected
-MOST_UNKNOWN = 0.1
+MAX_UNKNOWN = 0.1
 _SIGMA_OF_FWHM = 1 / math.sqrt(8 * math.log(2))
 _KNOTS = 24
 _FAINT = 1e12  # variance of a pixel beside which that of the star's own light does not count, e-²
@@ -87,7 +87,7 @@ def correct_centroids(
         window[1][:, *target] = sigma[:, *source]
         known = np.isfinite(window).all(axis=(0, 1))
         lost = np.abs(weights * ~known).sum() / np.abs(weights).sum()
-        if lost > MOST_UNKNOWN:
+        if lost > MAX_UNKNOWN:
             continue
         delta, spread = np.where(known, window, 0.0)
         corrected[n] = place[n] - np.einsum("acyx,cyx->a", weights, delta)

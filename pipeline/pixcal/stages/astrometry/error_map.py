@@ -17,13 +17,13 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.star_centroids.centroids import Star
 from pixcal.model.arrays import C128, F64
 from pixcal.stages.astrometry.detector import PixelPositions
-from pixcal.stages.astrometry.stars import MOST_LOST
+from pixcal.stages.astrometry.stars import MAX_LOST
 from pixcal.storage.cube import ArrayWriter, create_array, create_group
 
 TILE = 512  # side of a task's part of the map, about, px
 SHOWN = 96  # most blocks along the longer side of the pictures of the whole detector
 # least side of such a block, px: a few independent places, for its rms to mean something
-LEAST_BLOCK = 8
+MIN_BLOCK = 8
 GRIDS = ("perfect", "measured")
 
 
@@ -50,7 +50,7 @@ class ErrorMaps:
 
 def tile_side(shape: tuple[int, int]) -> tuple[int, int]:
     """Side of a task's tile, and of the blocks it is divided into, px."""
-    block = max(LEAST_BLOCK, -(-max(shape) // SHOWN))
+    block = max(MIN_BLOCK, -(-max(shape) // SHOWN))
     return block * max(1, TILE // block), block
 
 
@@ -127,6 +127,6 @@ def place_errors(
     if not patch.good.all():
         diagonal = np.stack([[kernels[k, k]] for k in range(len(axes))])
         kept = -sums(diagonal, patch.good.astype(float)[None])
-        counts = counts & (kept >= 1 - MOST_LOST).all(axis=0)
-        errors /= np.maximum(kept, 1 - MOST_LOST)
+        counts = counts & (kept >= 1 - MAX_LOST).all(axis=0)
+        errors /= np.maximum(kept, 1 - MAX_LOST)
     return np.where(counts, errors, np.nan)

@@ -20,7 +20,7 @@ SAMPLINGS = (0.4, 40.0)  # pixels in lambda / D that the table of the pattern is
 MICROARCSECONDS = 180 / np.pi * 3600e6
 BATCH = 16  # stars of a task
 # a place is not used where masked pixels would tell more than so much of the position
-MOST_LOST = 0.1
+MAX_LOST = 0.1
 # errors of a star at a place: pixels taken for a perfect grid, or where the maps say; without and
 # with photon noise; and the first two as `centroids.Star.weights` predicts them
 KINDS = ("perfect", "measured", "perfect_photons", "measured_photons", "linear", "linear_measured")
@@ -141,5 +141,5 @@ def observe_star(detector: PixelPositions, plan: Observation, core: F64, number:
     weights = np.stack([star.weights(p, g) for p, g in zip(place, good, strict=True)])
     errors += [np.einsum("nabyx,nbyx->na", weights, moved) for moved in (true, true - known)]
     along = np.einsum("jna,ka->njk", np.stack(errors), axes)
-    along[(np.einsum("kyx,nyx->nk", core, ~good) > MOST_LOST).any(axis=1)] = np.nan
+    along[(np.einsum("kyx,nyx->nk", core, ~good) > MAX_LOST).any(axis=1)] = np.nan
     return np.asarray(along)

@@ -17,7 +17,7 @@ from pixcal.stages.compare.sides import Side, Tile, Vector
 
 COARSE = 256  # most blocks along the longer side that are kept in memory
 SHOWN_BLOCKS = 16  # blocks along the longer side of the map of differences, or up to twice as many
-LEAST_BLOCK = 4  # least side of its blocks, px
+MIN_BLOCK = 4  # least side of its blocks, px
 DISAGREE = 5.0  # sigma beyond which a pixel is listed
 LISTED = 1000  # most pixels of a tile that are listed
 PULLS = np.linspace(-50, 50, 2001)  # edges of the histogram of differences over their errors
@@ -54,7 +54,7 @@ class Pair:
     def shown(self) -> int:
         """Side of the blocks of the map of differences, px: a power of two."""
         side = _power_of_two(max(self.window) / SHOWN_BLOCKS)
-        return max(side, LEAST_BLOCK, 1 << self.coarse)
+        return max(side, MIN_BLOCK, 1 << self.coarse)
 
     @property
     def tile_side(self) -> tuple[int, int]:

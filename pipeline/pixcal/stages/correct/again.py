@@ -19,7 +19,7 @@ from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.treatment import Treatment, Treatments
 
 SAMPLES = 5_000_000  # of each fringe set that are in memory at a time
-MOST_PARTS = 4  # times that many at most
+MAX_PARTS = 4  # times that many at most
 
 
 def measured_again(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatments:
@@ -64,7 +64,7 @@ def _parts(run_dir: Path, runtime: Runtime) -> Iterator[Evidence]:
     if not counts:
         return
     frames = max(1, SAMPLES // pixels)
-    number = min(MOST_PARTS, -(-min(counts) // frames))
+    number = min(MAX_PARTS, -(-min(counts) // frames))
     samples = min(frames, min(counts)) * pixels
     held = EVIDENCE_BYTES * samples * len(counts)
     make_plan("measuring effects again", ESTIMATE_BYTES * samples, held, runtime)

@@ -14,9 +14,9 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages import reduce
-from pixcal.stages.diagnose.deciding import missing_frames
 from pixcal.stages.diagnose.measuring import nominal_bench
 from pixcal.stages.diagnose.parts import Half, Raw, evidence_of, take
+from pixcal.stages.diagnose.recommended_frames import missing_frames
 from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, looked_at
 from pixcal.stages.diagnose.windows import Split, chosen_windows, split
 from pixcal.stages.evidence import Part

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.stages.diagnose.candidates import Candidate
 from pixcal.stages.diagnose.comparison import LAW_ERROR, Comparison
-from pixcal.stages.diagnose.shrinkage import LEAST, Trial
+from pixcal.stages.diagnose.shrinkage import MIN_LOGLIK_GAIN, Trial
 
-# by which a weak candidate must raise the log-likelihood of the held-out frames; others by `LEAST`
+# least rise of the log-likelihood of the held-out frames by a candidate of weak significance
 MIN_LOGLIK_GAIN_WEAK = 12.0
 OPEN = 0.15  # residual gap above which an unknown cause is assumed
 LITTLE = 0.1  # fraction of the gap that a doubtful cause must close,
@@ -23,12 +23,12 @@ def similar_to(name: str) -> str:
 
 def needed_gain(candidate: Candidate) -> float:
     """Gain in log-likelihood of the held-out frames that a candidate needs."""
-    return LEAST if candidate.significance >= SIGNIFICANT else MIN_LOGLIK_GAIN_WEAK
+    return MIN_LOGLIK_GAIN if candidate.significance >= SIGNIFICANT else MIN_LOGLIK_GAIN_WEAK
 
 
 def too_little(gain: float) -> str:
     """Why a candidate that was tried is rejected."""
-    if gain < LEAST:
+    if gain < MIN_LOGLIK_GAIN:
         return "the held-out frames are not fitted better"
     return (
         f"the log-likelihood of the held-out frames rises by only {gain:.1f}; an effect of weak "
@@ -55,7 +55,7 @@ def redundant(
         for name, trial in without.items()
     }
     least = min(gains, key=lambda name: gains[name], default=None)
-    if least is None or gains[least] >= LEAST:
+    if least is None or gains[least] >= MIN_LOGLIK_GAIN:
         return None
     return least, "the other causes explain the data as well without it"
 

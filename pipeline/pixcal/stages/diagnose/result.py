@@ -18,7 +18,7 @@ from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place
 from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
-from pixcal.stages.diagnose.deciding import recommend_frames
+from pixcal.stages.diagnose.recommended_frames import recommend_frames
 from pixcal.stages.diagnose.shrinkage import Shrinkage, Trial, differing, shrinkage
 
 SCHEMA = "pixcal/diagnosis/1"
@@ -27,7 +27,7 @@ LEFT = 0.25  # and share of any one statistic's that is off by more than
 STILL = 6.0  # standard deviations: less can be the simulation of the effects themselves
 # statistics told in units of the bench even where nothing differs
 ALWAYS = ("allan_of_batches", "offset_by_place", "residual_noise")
-LEAST_CHANCE = 1e-12  # smallest that is told: of tails further out nobody knows the shape
+MIN_P_VALUE = 1e-12  # smallest that is told: of tails further out nobody knows the shape
 SHOWN = 3  # statistics named that gave a cause away
 
 
@@ -170,7 +170,7 @@ def _cause(
         "gap_closed_interval": [_closed(v) for v in reversed(alone.interval)],
         "gap_closed_by_law": _closed(by_law.gap.total),
         "gain_over_rest": _rounded(without.gap.total - final.gap.total),
-        "p_value": float(np.clip(chance, LEAST_CHANCE, 1.0)),
+        "p_value": float(np.clip(chance, MIN_P_VALUE, 1.0)),
         "sigmas": _rounded(estimate.significance),
         "why": estimate.why,
         "given_away_by": _telling(found.without[name], found.final, data),

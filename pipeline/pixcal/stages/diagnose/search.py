@@ -32,7 +32,7 @@ from pixcal.stages.diagnose.rejection import (
     similar_to,
     too_little,
 )
-from pixcal.stages.diagnose.shrinkage import LEAST, Trial
+from pixcal.stages.diagnose.shrinkage import MIN_LOGLIK_GAIN, Trial
 from pixcal.stages.diagnose.trial import Curves, Effects
 
 # significance that an estimate needs where there is a gap, instead of `SIGNIFICANT`,
@@ -41,8 +41,8 @@ MIN_SIGMA_WEAK = 1.0  # and where no candidate is significant: the weakest may b
 SCREEN = 3  # simulations of a candidate,
 CONFIRM = 8  # and of the accepted causes
 PROMISING = 0.25  # share of the best gain from which a candidate is simulated more than once,
-SURE_OF_ONE = 3.0  # with its effect known to one part in this: what one simulation leaves open
-MOST = 5  # causes that are accepted at most
+KNOWN_TO = 3.0  # with its effect known to one part in this: what one simulation leaves open
+MAX_CAUSES = 5  # causes that are accepted at most
 SIMILAR = 0.7  # fraction of a candidate's significance that another effect may produce
 
 Simulate = Callable[[Sequence[Effects], int, str, Sequence[str]], Sequence[list[Curves] | str]]
@@ -79,11 +79,11 @@ class Search:
         """Search; ``reason`` of the rejected candidates is filled in."""
         remaining = {n: c for n, c in candidates.items() if c.estimate and not c.reason}
         causes = Accepted(self.comparison.nominal, dict.fromkeys(remaining, 1.0))
-        while len(causes.effects) < MOST and self._accept_one(causes, remaining, candidates):
+        while len(causes.effects) < MAX_CAUSES and self._accept_one(causes, remaining, candidates):
             pass
-        if len(causes.effects) == MOST:
+        if len(causes.effects) == MAX_CAUSES:
             for candidate in remaining.values():
-                candidate.reason = f"not tested: the search stops after {MOST} causes"
+                candidate.reason = f"not tested: the search stops after {MAX_CAUSES} causes"
         return self._each_weighed(causes, candidates)
 
     def _accept_one(
@@ -109,7 +109,7 @@ class Search:
         causes.effects[best] = effect
         candidates[best].share = causes.shares[best]
         candidates[best].reason = ""
-        enough = max(gains[best] - LEAST, LEAST)
+        enough = max(gains[best] - MIN_LOGLIK_GAIN, MIN_LOGLIK_GAIN)
         causes.alike[best] = tuple(n for n, g in gains.items() if n != best and g > enough)
         causes.shares = self._unexplained(causes.bench, remaining)
         for name in [n for n, share in causes.shares.items() if share < 1 - SIMILAR]:
@@ -226,7 +226,7 @@ class Search:
                 continue
             sure = remaining[name].significance
             if simulations == 1:
-                sure = min(sure, SURE_OF_ONE)
+                sure = min(sure, KNOWN_TO)
             trial = self.comparison.trial(bench, curves, sure)
             trial = self.comparison.allowing_for_laws(trial, causes.current)
             made.append(Addition(name, effect, trial, trial.log_likelihood - start.log_likelihood))

@@ -11,7 +11,7 @@ from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.model.arrays import F64
 from pixcal.stages.diagnose.trial import Effects
 
-LEAST = 5.0  # by which an effect must raise the log-likelihood of unseen data
+MIN_LOGLIK_GAIN = 5.0  # by which an effect must raise the log-likelihood of unseen data
 DRAWS = 200
 
 
@@ -67,6 +67,6 @@ def differing(nominal: Trial, final: Trial, data: Mapping[Key, F64]) -> set[Key]
     if not final.effects:
         return where
     gains = likelier(data, nominal.expected, final.expected)
-    where |= {key for key, gain in gains.items() if gain > LEAST / 2}
+    where |= {key for key, gain in gains.items() if gain > MIN_LOGLIK_GAIN / 2}
     # A cause that many curves tell a little each is still told by the one that does it best.
     return where or {max(gains, key=lambda key: gains[key])}

@@ -19,7 +19,7 @@ MAP_PHASES = 12  # spread over a fringe, at which an effect on samples is undone
 _PHASES = 2 * np.pi * np.arange(MAP_PHASES) / MAP_PHASES
 _EVEN = np.stack([np.ones(MAP_PHASES), np.cos(_PHASES), np.sin(_PHASES)], axis=1)
 TURNS = 5  # of the fits of pixels and frames: each gains a factor of three or more
-LEAST_SIGNAL = 1.0  # of a sample (e-), below which its shot noise is not taken
+MIN_SIGNAL = 1.0  # of a sample (e-), below which its shot noise is not taken
 ACROSS = 9  # pixels along the side of a frame whose level is undone
 
 
@@ -97,7 +97,7 @@ class FitOfFrames:
     def of(cls, maps: FringeMaps, g: F64) -> Self:
         """From the maps, and (B, A cos phi, A sin phi) of the frames, (t, 3)."""
         light = (maps.theta * (1.0 if maps.flat is None else maps.flat)).reshape(3, -1)
-        weight = 1 / np.maximum(g @ light, LEAST_SIGNAL)
+        weight = 1 / np.maximum(g @ light, MIN_SIGNAL)
         frames = _taken_by_frames(g, light)
         normal = np.einsum("ti,tj,tp->pij", g, g, weight, optimize=True)
         own = np.einsum("ti,tk,tp->pik", g, _between(_phase(g)), weight, optimize=True)
@@ -140,7 +140,7 @@ def _taken_by_frames(g: F64, light: F64) -> F64:
     mean, amplitude = np.median(light[0]), np.median(np.hypot(light[1], light[2]))
     psi = np.linspace(0, 2 * np.pi, 2 * MAP_PHASES, endpoint=False)
     usual = np.stack([np.full_like(psi, mean), amplitude * np.sin(psi), amplitude * np.cos(psi)])
-    weight = 1 / np.maximum(g @ usual, LEAST_SIGNAL)
+    weight = 1 / np.maximum(g @ usual, MIN_SIGNAL)
     of_pixels = np.einsum("tp,ti,tj->pij", weight, g, g)
     of_frames = np.einsum("tp,ip,jp->tij", weight, usual, usual)
     change = _between(psi + _phase(g)[:, None])

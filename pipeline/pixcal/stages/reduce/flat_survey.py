@@ -18,8 +18,8 @@ from pixcal.storage.frame_reader import Reader
 ROWS = 64  # rows that are looked at, in the middle of the frames
 TOGETHER = 64  # frames that are read at once: those of a chunk of a cube
 APART = 0.05  # relative distance of two levels that are not one lamp's flicker
-LEAST_SHARE = 1e-3  # of the samples of a frame that lie at the highest code at least
-LEAST_SAMPLES = 50
+MIN_SHARE = 1e-3  # of the samples of a frame that lie at the highest code at least
+MIN_SAMPLES = 50
 NEIGHBOURS = 16  # codes below the highest that are held against it
 PILED = 4  # how many times as many samples as at any of these are a pile
 
@@ -94,5 +94,5 @@ def _pile(tops: Sequence[tuple[int, I64, float]]) -> float | None:
     highest = max(top for top, _, _ in tops)
     own = [(counts, share) for top, counts, share in tops if top == highest]
     counts = np.sum([c for c, _ in own], axis=0)
-    piled = counts[0] >= LEAST_SAMPLES and counts[0] > PILED * counts[1:].max()
-    return float(highest) if piled and max(s for _, s in own) >= LEAST_SHARE else None
+    piled = counts[0] >= MIN_SAMPLES and counts[0] > PILED * counts[1:].max()
+    return float(highest) if piled and max(s for _, s in own) >= MIN_SHARE else None

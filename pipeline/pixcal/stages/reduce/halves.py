@@ -23,7 +23,7 @@ from pixcal.storage.cube import CHUNK, ArrayReader
 Window = tuple[tuple[int, int], tuple[int, int]]
 
 SIDE = 1024  # longest side of the middle of the detector whose nonuniformity is measured
-_LEAST_PIXELS = 16
+_MIN_PIXELS = 16
 _FRAMES = 64  # most frames of a series that are read for it
 
 
@@ -59,7 +59,7 @@ def read_halves(
     # Which pixels are bent depends on their response: without them it would look more uniform.
     good = mask & ~np.uint8(PixelFlag.NONLINEAR) == 0
     series = [group for group in (dark, flat) if group is not None]
-    if not series or good.sum() < _LEAST_PIXELS or min(good.shape) < 2:
+    if not series or good.sum() < _MIN_PIXELS or min(good.shape) < 2:
         return Halves(None, None, good)
     (y0, y1), columns = middle
     bands = [((y, min(y + CHUNK[1], y1)), columns) for y in range(y0, y1, CHUNK[1])]
@@ -69,7 +69,7 @@ def read_halves(
     whole = np.concatenate(parts, axis=1)
     # A pixel that a frame lacks is not used.
     good &= np.isfinite(whole).all(axis=0)
-    if good.sum() < _LEAST_PIXELS:
+    if good.sum() < _MIN_PIXELS:
         return Halves(None, None, good)
     if dark is None:
         pedestal = ArrayReader(made.folder / "calibration.zarr" / "bias").read(*middle)

@@ -15,7 +15,7 @@ from pixcal.model.arrays import F64, Indices
 
 NOISY = 3.0  # excess of the variance, in its own sigmas, from which a pixel's noise is looked at
 _OUTLIER = 5.0
-_LEAST = 8
+_MIN_FRAMES = 8
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def moments_of(series: Series) -> Moments | None:
     wild = np.abs(x) > _OUTLIER
     x[wild & (wild.sum(axis=0) == 1)] = np.nan
     n = np.isfinite(x).sum(axis=0).astype(float)
-    used = n > _LEAST
+    used = n > _MIN_FRAMES
     if not used.any():
         return None
     x, n = x[:, used], n[used]

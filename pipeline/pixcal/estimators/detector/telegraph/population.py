@@ -17,7 +17,10 @@ from pixcal.estimators.detector.telegraph.classes import AMPLITUDES, Classes, Mi
 from pixcal.estimators.detector.telegraph.moments import Moments
 from pixcal.model.arrays import F64, Indices
 
-_USUAL, _MOST = 1.5, 4.0  # logarithm of the shape: what is usual, and the most that is tried
+_USUAL, _MAX_LOG_SHAPE = (
+    1.5,
+    4.0,
+)  # logarithm of the shape: what is usual, and the most that is tried
 _CLEAR = 8.0  # by which another shape than the exponential's must be likelier
 # chance of telegraph noise from which a pixel's frames are looked at for how long it stays
 LIKELY = 0.1
@@ -82,7 +85,7 @@ def find_population(parts: Sequence[Moments], switching_s: float) -> Population:
 
 def _shape(p: F64) -> float:
     """Of the gamma distribution: exponential where it is not asked for."""
-    return float(np.exp(np.clip(p[2], -_MOST, _MOST))) if len(p) > 2 else 1.0
+    return float(np.exp(np.clip(p[2], -_MAX_LOG_SHAPE, _MAX_LOG_SHAPE))) if len(p) > 2 else 1.0
 
 
 def _curvature(cost: Callable[[F64], float], at: F64, step: float = 0.05) -> F64 | None:

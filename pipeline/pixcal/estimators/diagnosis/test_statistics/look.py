@@ -75,7 +75,7 @@ class Look:
     @property
     def thinned(self) -> int:
         """One of so many frames is enough for statistics of pairs of pixels."""
-        return max(1, len(self.residual) // MOST)
+        return max(1, len(self.residual) // MAX_FRAMES)
 
     @cached_property
     def neighbours(self) -> tuple[F64, F64]:
@@ -142,7 +142,7 @@ CODES = 64  # codes whose remainders are told apart, a power of two
 CELLS = 4  # cells of the window along each side
 # rows and columns to a neighbour
 STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4), (4, 0))
-MOST = 120  # frames for statistics of pairs of pixels
+MAX_FRAMES = 120  # frames for statistics of pairs of pixels
 
 
 def neighbour_sums(

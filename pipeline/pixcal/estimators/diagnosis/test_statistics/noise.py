@@ -19,7 +19,7 @@ from pixcal.kernels.sample_sums import count_beyond
 from pixcal.model.arrays import F32, F64, Mask
 
 OUTLIERS = (5.0, 7.0, 10.0)
-LEAST_DARKS = 5
+MIN_DARKS = 5
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
 
 
@@ -179,7 +179,7 @@ def outliers(look: Look) -> Curve:
 def dark_outliers(evidence: Evidence) -> Curve | None:
     """The same of samples of darks, which last longer and have less noise."""
     limits, counts = np.array(OUTLIERS), np.zeros((2, len(OUTLIERS)))
-    stacks = [s for s in evidence.of_kind("dark") if len(s.adu) >= LEAST_DARKS]
+    stacks = [s for s in evidence.of_kind("dark") if len(s.adu) >= MIN_DARKS]
     for stack in stacks:
         rest, sigma = evidence.dark_noise(stack)
         # The read noise is that of most pixels.

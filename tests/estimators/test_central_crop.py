@@ -1,12 +1,12 @@
-"""The middle of a part: the same samples, model and residuals, fewer of them."""
+"""Central crop: the same samples, model and residuals, fewer of them."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from pixcal.estimators.diagnosis.central_crop import MIN_SIZE, central_crop
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
-from pixcal.estimators.diagnosis.middle import LEAST, middle
 from pixcal.estimators.fringe_fit.fringes import grid
 
 RNG = np.random.default_rng(6)
@@ -36,13 +36,13 @@ def evidence() -> Evidence:
 
 @pytest.mark.parametrize("samples", [T * 40 * 50, T * NY * NX // 2, 5000])
 def test_every_array_is_of_the_same_pixels(evidence: Evidence, samples: int) -> None:
-    part, whole = middle(evidence, samples), evidence.fringes["set"]
+    part, whole = central_crop(evidence, samples), evidence.fringes["set"]
     (ny, nx), (y0, x0) = part.good.shape, part.origin
     y, x = slice(y0 - 10, y0 - 10 + ny), slice(x0 - 20, x0 - 20 + nx)
     cut = part.fringes["set"]
     t = slice(0, len(cut.g))
-    assert cut.electrons.size <= max(samples, LEAST**3) * 1.2
-    assert min(ny, nx, len(cut.g)) >= LEAST
+    assert cut.electrons.size <= max(samples, MIN_SIZE**3) * 1.2
+    assert min(ny, nx, len(cut.g)) >= MIN_SIZE
     assert cut.origin == part.origin
     assert np.array_equal(cut.electrons, whole.electrons[t, y, x])
     assert np.array_equal(part.stacks[0].adu, evidence.stacks[0].adu[:, y, x])
@@ -53,6 +53,6 @@ def test_every_array_is_of_the_same_pixels(evidence: Evidence, samples: int) -> 
 
 
 def test_little_evidence_stays_whole(evidence: Evidence) -> None:
-    assert middle(evidence) is evidence
+    assert central_crop(evidence) is evidence
     flats = replace(evidence, fringes={})
-    assert middle(flats) is flats
+    assert central_crop(flats) is flats

@@ -1,4 +1,4 @@
-"""Frames that an acquisition lacks and that would tell effects apart."""
+"""Frames that an acquisition lacks and that would separate similar effects."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -8,8 +8,8 @@ from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.parts import Table
 
 SAME_AXIS = 0.98  # cosine of the angle below which two sets measure along one axis
-LADDER = 3  # exposure times of flats that make a ladder
-# a ramp of equal steps shows nothing of light that a frame has of its neighbours
+LADDER = 3  # exposure times of flats for a linearity curve
+# equal phase steps do not show light of neighbouring frames
 RANDOM = "fringes with random phases"
 MORE = "more frames of the same kind"
 

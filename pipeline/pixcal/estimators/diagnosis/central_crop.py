@@ -1,4 +1,4 @@
-"""The middle of a part of the window, where less evidence is enough and sooner looked at."""
+"""Central crop of the evidence, for estimates that cost much for each sample."""
 
 from dataclasses import replace
 
@@ -6,20 +6,22 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 
-MOST = 1 << 21  # samples of a set that are looked at where every one costs some hundred operations
+MAX_SAMPLES = (
+    1 << 21
+)  # samples of a set that are looked at where every one costs some hundred operations
 
-LEAST = 32  # pixels that stay along each side, and frames, if there are as many
+MIN_SIZE = 32  # pixels that stay along each side, and frames, if there are as many
 
 
-def middle(evidence: Evidence, samples: int = MOST) -> Evidence:
-    """Pixels about the middle of the part; of very long sets also the first frames only."""
+def central_crop(evidence: Evidence, samples: int = MAX_SAMPLES) -> Evidence:
+    """Central pixels of a window; of very long sets also the first frames only."""
     ny, nx = evidence.good.shape
     longest = max((len(f.g) for f in evidence.fringes.values()), default=1)
     shrink = min(1.0, float(np.sqrt(samples / (longest * ny * nx))))
-    # As much is cut at both ends: what is counted from the middle stays right.
-    cut_y, cut_x = (max(0, int((n - max(LEAST, n * shrink)) / 2)) for n in (ny, nx))
+    # Both ends lose the same, so coordinates relative to the centre stay right.
+    cut_y, cut_x = (max(0, int((n - max(MIN_SIZE, n * shrink)) / 2)) for n in (ny, nx))
     rows, columns = slice(cut_y, ny - cut_y), slice(cut_x, nx - cut_x)
-    frames = max(LEAST, samples // ((ny - 2 * cut_y) * (nx - 2 * cut_x)))
+    frames = max(MIN_SIZE, samples // ((ny - 2 * cut_y) * (nx - 2 * cut_x)))
     if not cut_y and not cut_x and frames >= longest:
         return evidence
     return replace(
