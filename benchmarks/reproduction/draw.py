@@ -5,11 +5,13 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from pixcal.report.drawing import ColourScale, add_bar
+from pixcal.report.drawing import ColourScale
 from pixcal.report.text import number
 
 F64 = NDArray[np.float64]
@@ -24,8 +26,19 @@ def image(figure: Figure, axes: Axes, values: NDArray[Any], scale: ColourScale, 
         np.ma.masked_invalid(values), norm=scale.norm, cmap=scale.colours, origin="lower",
         interpolation="nearest", extent=(-0.5, nx - 0.5, -0.5, ny - 0.5),
     )  # fmt: skip
-    add_bar(figure, axes, drawn, unit, scale.beyond)
+    _add_bar(figure, axes, drawn, unit, scale.beyond)
     axes.tick_params(labelsize=8)
+
+
+def _add_bar(figure: Figure, axes: Axes, drawn: ScalarMappable, label: str, beyond: str) -> None:
+    """A colour bar as high as the map beside it."""
+    place = axes.inset_axes((1.04, 0, 0.05, 1))
+    bar = figure.colorbar(drawn, cax=place, extend=beyond)
+    bar.set_label(label)
+    bar.minorticks_off()
+    if not isinstance(drawn.norm, LogNorm):
+        place.ticklabel_format(useOffset=False, style="plain")
+        place.locator_params(axis="y", nbins=5)
 
 
 def logarithmic(axes: Axes) -> None:

@@ -107,7 +107,6 @@ def in_order(reader: ArrayReader) -> None:
 
 WAYS: dict[str, Callable[[ArrayReader], Any]] = {
     "whole": ArrayReader.read,
-    "verify": ArrayReader.verify,
     "one chunk": lambda reader: reader.read_chunk((2, 1, 1)),
     "read ahead": in_order,
 }

@@ -22,6 +22,7 @@ from pixcal.storage.artefact import (
     write_json,
 )
 from pixcal.storage.cube import ArrayReader, create_array, create_group, write_array
+from pixcal.storage.formats import STAGES
 from pixcal.storage.lock import damage_noted, lock
 from pixcal.storage.products import is_whole, read_map, write_map
 from pixcal.storage.stage import require
@@ -29,7 +30,7 @@ from pixcal.storage.stage import require
 
 def complete(run: Path, stage: str = "fit") -> str:
     """An artefact with a file, an array in a group, and a list of numbers in its manifest."""
-    format = 3 if stage == "sweep" else 1
+    format = STAGES[stage].format if stage == "sweep" else 1
     with lock(run), build(run, stage, format, {"limits": (1.5, 1e-7)}, {"reduce": "key"}) as made:
         write_json(made.folder / "facts.json", {"name": "Übung"})
         create_group(made.folder / "maps.zarr")
@@ -129,7 +130,7 @@ def test_a_damaged_chunk_is_noted_and_its_command_told(
         require(tmp_path, stage)
     complete(tmp_path, stage)
     assert require(tmp_path, stage).key == key
-    ArrayReader(chunk.parents[2]).verify()
+    ArrayReader(chunk.parents[2]).read()
 
 
 def test_a_note_that_is_damaged_itself_still_counts(tmp_path: Path) -> None:

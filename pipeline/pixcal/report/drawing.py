@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, LogNorm, Normalize
+from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
@@ -169,17 +169,6 @@ def draw_map(
     axes.set(xlim=(x0 - 0.5, x0 + nx - 0.5), ylim=(y0 - 0.5, y0 + ny - 0.5))
     axes.locator_params(nbins=5)
     return drawn
-
-
-def add_bar(figure: Figure, axes: Axes, drawn: ScalarMappable, label: str, beyond: str) -> None:
-    """A colour bar as high as the map beside it."""
-    place = axes.inset_axes((1.04, 0, 0.05, 1))
-    bar = figure.colorbar(drawn, cax=place, extend=beyond)
-    bar.set_label(label)
-    bar.minorticks_off()
-    if not isinstance(drawn.norm, LogNorm):
-        place.ticklabel_format(useOffset=False, style="plain")
-        place.locator_params(axis="y", nbins=5)
 
 
 def covered(

@@ -458,12 +458,6 @@ class ArrayReader:
         for y0, x0 in product(range(0, ny, cy), range(0, nx, cx)):
             yield (y0, min(y0 + cy, ny)), (x0, min(x0 + cx, nx))
 
-    def verify(self) -> None:
-        """Read every chunk and check it (DamagedError names the first bad one)."""
-        scratch = np.empty(self.chunks, self.dtype)
-        for index in np.ndindex(self._index.shape):
-            self.read_chunk(index, scratch)
-
 
 class CachedReader(ArrayReader):
     """An `ArrayReader` that keeps chosen chunks in memory.

@@ -139,7 +139,7 @@ def _plain(dense: Dense) -> tuple[F64, list[Coupling]]:
         if not directed:
             together = np.sum([column for group in both for column, _ in group], axis=0)
             if _sigmas(dense, together) > THERE:
-                directed = [_alike(dense, group) for group in both]
+                directed = [_alike(group) for group in both]
         columns += [column for column, _ in directed]
         couplings += [coupling for _, coupling in directed]
     return np.array(columns).T, couplings
@@ -155,7 +155,7 @@ def _of_step(dense: Dense, step: tuple[int, int]) -> list[Part]:
     return [(every[n], c) for n, c in enumerate(dense.couplings) if (c.dy, c.dx) == step]
 
 
-def _alike(dense: Dense, group: Sequence[Part]) -> Part:
+def _alike(group: Sequence[Part]) -> Part:
     """The shares of all classes as one."""
     column = np.sum([own for own, _ in group], axis=0)
     return column, replace(group[0][1], every_rows=1, row=0, every_columns=1, column=0)
@@ -169,7 +169,7 @@ def _significant(dense: Dense, group: Sequence[Part]) -> list[Part]:
     mean = float(precision.sum(0) @ shares) / weight
     apart = shares - mean
     if len(at) > 1 and chdtrc(len(at) - 1, max(float(apart @ precision @ apart), 0.0)) > ALIKE:
-        return [_alike(dense, group)] if abs(mean) > THERE * weight**-0.5 else []
+        return [_alike(group)] if abs(mean) > THERE * weight**-0.5 else []
     return [part for part in group if _sigmas(dense, part[0]) > THERE]
 
 

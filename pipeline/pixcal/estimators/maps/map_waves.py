@@ -109,13 +109,13 @@ def find_waves(evidence: Evidence) -> Waves | None:
     ways = {still: {f.name: _maps(f, evidence, still) for f in sets} for still in (False, True)}
     allowed = _allowed(sets)
     in_flats = max(ways, key=lambda way: _second_best(ways[way], allowed))
-    best = _strongest(ways[in_flats], sets, allowed, in_flats)
+    best = _strongest(ways[in_flats], allowed, in_flats)
     waves = list(best.waves)
     if best.significance > SIGNIFICANT:
         maps: Maps = ways[best.in_flats]
         for _ in range(MOST - 1):
             maps = _less(maps, waves[-len(sets) :])
-            more = _strongest(maps, sets, allowed, best.in_flats)
+            more = _strongest(maps, allowed, best.in_flats)
             if more.significance < SIGNIFICANT:
                 break
             waves += more.waves
@@ -152,7 +152,7 @@ def _second_best(maps: Maps, allowed: Mask) -> float:
     return sorted(gains.values())[-2]
 
 
-def _strongest(maps: Maps, sets: Sequence[FringeEvidence], allowed: Mask, in_flats: bool) -> Waves:
+def _strongest(maps: Maps, allowed: Mask, in_flats: bool) -> Waves:
     """The strongest wave of each set, of a vector common to all where that fits as well."""
     power = {name: _power(own, allowed) for name, own in maps.items()}
     common = sum(power.values(), np.zeros(allowed.shape))
