@@ -182,16 +182,23 @@ def test_the_blocks_of_a_page_run_one_after_the_other(
 
 
 @pytest.mark.long
-def test_the_readme_shows_what_the_demo_prints(demo: tuple[Path, str]) -> None:
-    """All words and lines; numbers may differ in their last digits from machine to machine."""
+def test_pages_show_what_the_demo_prints(demo: tuple[Path, str]) -> None:
+    """All words and lines; numbers may differ in their last digits from machine to machine.
+
+    The page of the reference shows all of it, the first page the lines on the maps to use.
+    """
 
     def words(text: str) -> list[list[str]]:
         return [re.sub(r"-?\d[\d.]*(e-\d+)?", "#", line).split() for line in text.splitlines()]
 
     (command,) = re.findall(r"^demo:.*\n\t\$\(BIN\)/(.*)$", (ROOT / "Makefile").read_text(), re.M)
     assert command == DEMO
-    (shown,) = (b.text for b in blocks_of(ROOT / "README.md") if b.language == "text")
-    assert words(demo[1].strip()) == words(shown)
+    page = ROOT / "docs/reference/terminal-output.md"
+    (whole,), (first,) = (
+        [b.text for b in blocks_of(p) if b.language == "text"] for p in (page, ROOT / "README.md")
+    )
+    assert words(demo[1].strip()) == words(whole)
+    assert first in whole
 
 
 @pytest.mark.parametrize("block", [b for b in BLOCKS if b.language in DATA], ids=str)

@@ -114,9 +114,7 @@ class SimulatedDetector:
         if self.bias_adu >= self.top_adu:
             raise InputError(f"bias_adu: {self.bias_adu:g} ADU leaves no room below saturation")
         if self.hot_fraction + self.dead_fraction > 0.5:
-            raise InputError(
-                "hot_fraction: more than half of the pixels together with dead_fraction; give less"
-            )
+            raise InputError("hot_fraction: above 0.5 together with dead_fraction; give less")
 
     @property
     def chip_shape(self) -> tuple[int, int]:

@@ -264,7 +264,7 @@ def _warnings(result: Mapping[str, Any]) -> list[str]:
         )
     if result["detector"]["modes_removed_px"] is None:
         sentences.append(
-            "without a truth, errors of the maps are those of SIGMA, without systematic errors"
+            "without --truth, the errors of the maps are SIGMA, without systematic errors"
         )
     return sentences
 

@@ -72,9 +72,9 @@ def _of_gain(fit: GainFit, declared: float, used: float) -> list[str]:
             f"photon transfer gives a gain of {value:.4g} ± {error:.2g} e-/ADU, not the "
             f"{declared:g} of detector.gain_e_per_adu: "
             + (
-                "correct it, or use '--gain measured'; all electrons are counted with it"
+                "correct it, or use '--gain measured'; the declared value is used now"
                 if used == declared
-                else "electrons are counted with the measured one"
+                else "the measured value is used"
             )
         )
     return found
