@@ -51,6 +51,7 @@ def compare(work: Workload) -> None:
     for name, took in two.items():
         share = f"{took / whole:6.0%}" if name in STAGES else " limit"
         print(f"{name:10} {one[name]:8.1f} s {took:8.1f} s {one[name] / took:6.2f} {share}")
+    print(f"allan and report together: {(two['allan'] + two['report']) / whole:.0%}")
     ratio = whole / (two["read"] + two["write"])
     print(f"whole: {whole:.1f} s, {gb / whole:.2f} GB/s, {ratio:.1f} times plain read and write")
     beside = size(work.run) / size(work.folder / "acq")

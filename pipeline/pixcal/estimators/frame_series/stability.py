@@ -73,19 +73,21 @@ def white_population(
     """
     draws = _draws(np.asarray(present, dtype=bool).tobytes(), tuple(lengths))
     pixels = draws.shape[1]
-    limits = np.quantile(draws, ONE_SIGMA, axis=1).astype(float)
+    # Sorted first: that is done in vectors, to find some of the ranks is not.
+    limits = np.quantile(np.sort(draws, axis=1), ONE_SIGMA, axis=1).astype(float)
+    middle = 0.0
     if noise is None:
         logs = np.log(draws, dtype=float)
-        bias = np.exp(np.median(logs, axis=1))
         covariance = np.atleast_2d(np.cov(logs))
     else:
         levels = np.log(noise, dtype=float)
         logs = np.log(draws[:, : pixels // len(levels) * len(levels)], dtype=float)
         logs = (logs.reshape(len(draws), -1, len(levels)) + levels).reshape(len(draws), -1)
-        bias = np.exp(np.median(logs, axis=1) - np.median(levels))
+        middle = float(np.median(levels))
         covariance = _median_covariance(logs, len(levels))
-    low, high = np.quantile(logs, ONE_SIGMA, axis=1)
-    return White(bias, (high - low) / 2, limits, covariance, pixels)
+    ranks = (ONE_SIGMA[0], 0.5, ONE_SIGMA[1])
+    low, median, high = np.quantile(np.sort(logs, axis=1), ranks, axis=1)
+    return White(np.exp(median - middle), (high - low) / 2, limits, covariance, pixels)
 
 
 def _median_covariance(logs: F64, n_levels: int) -> F64:

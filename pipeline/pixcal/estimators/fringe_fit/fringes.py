@@ -9,6 +9,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 from scipy.optimize import minimize
 
+from pixcal.kernels.robust import median
 from pixcal.model.arrays import C128, F32, F64, Mask
 from pixcal.model.errors import InputError
 
@@ -222,7 +223,7 @@ def smooth_phasor(
         inside = basis if n == use.size else basis * use[:, None]
         fit = np.linalg.lstsq(inside.T @ basis, inside.T @ parts, rcond=1e-10)[0]
         rest = ((parts - basis @ fit) ** 2).sum(axis=1)
-        kept = good.ravel()[::step] & (rest <= 25 * np.median(rest[use]) + 1e-24)
+        kept = good.ravel()[::step] & (rest <= 25 * median(rest[use]) + 1e-24)
         if np.array_equal(kept, use):
             break
         use = kept

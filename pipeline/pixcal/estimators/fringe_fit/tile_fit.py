@@ -7,6 +7,7 @@ import numpy as np
 
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, SmoothPhasor, smooth_phasor
 from pixcal.kernels.bilinear import N_SUMS, close_batch, solve_pixels, sweep_block
+from pixcal.kernels.robust import median
 from pixcal.model.arrays import C128, F32, F64, U16, Mask
 
 
@@ -170,7 +171,7 @@ def start_model(
     iota = theta[0]
     usable = np.isfinite(iota) & (iota > 0)
     good = tile.good & usable
-    level = float(np.median(iota[good])) if good.any() else 1.0
+    level = median(iota[good]) if good.any() else 1.0
     iota = np.where(usable, iota, level)
     phasor = np.asarray(np.where(usable, theta[2] + 1j * theta[1], 0.0) / iota, complex)
     smooth = smooth_phasor(phasor, good, k)
