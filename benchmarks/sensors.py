@@ -72,6 +72,8 @@ def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
     mask = np.asarray(opened.detector["mask"]) != 0
     true = np.zeros(mask.size, np.bool_)
     true[truth["defects"]] = True
+    mask.ravel()[truth["unclear"]] = True
+    true[truth["unclear"]] = True
     error = figures["conversion_gain"]["error"] or float("nan")
     return {
         **_diagnosis(run / "products" / "diagnosis.json", truth["causes"]),

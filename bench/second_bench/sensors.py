@@ -50,6 +50,8 @@ class Sensor:
     read_noise_e, bias_adu, response, dark_e_s : ndarray (y, x)
     well_e, top_e : float
         Full well; light of the brightest flats that are not meant to saturate.
+    defects, unclear : ndarray (y, x)
+        Pixels to mask, and those that may be masked or not.
     flicker : float
         Of the lamp, from frame to frame, relative rms.
     response_curve : callable
@@ -74,6 +76,7 @@ class Sensor:
     top_e: float
     flicker: float
     defects: NDArray[np.bool_]
+    unclear: NDArray[np.bool_]
     series: list[Series] = field(default_factory=list)
     response_curve: Callable[[F64], F64] = lambda e: e
     collected: list[Callable[[F64, int], F64]] = field(default_factory=list)
@@ -149,7 +152,7 @@ def ordinary(
     sensor = Sensor(
         rng, gain, gain * float(rng.uniform(0.98, 1.02)), bits, read * pixels,
         np.maximum(bias + offsets, 8), response, dark, well_e, top_e, 0.001,
-        np.zeros(shape, np.bool_),
+        np.zeros(shape, np.bool_), np.zeros(shape, np.bool_),
     )  # fmt: skip
     sensor.declared_gain = gain
     biases, flats = counts
@@ -288,6 +291,9 @@ def vignetted(sensor: Sensor) -> Drawn:
     sensor.response = sensor.response * shade
     tail = rng.pareto(1.5, sensor.shape) * np.median(sensor.dark_e_s)
     sensor.dark_e_s = sensor.dark_e_s + np.minimum(tail, 20 * sensor.read_noise_e.mean())
+    # A tail has no end: from where on a pixel is a hot one is for each program to say.
+    off = np.abs(sensor.dark_e_s - np.median(sensor.dark_e_s))
+    sensor.unclear = off > 4 * 1.4826 * np.median(off)
     return {"corner": float(shade.min())}
 
 
@@ -505,6 +511,7 @@ def make(
         "read_noise_e": float(np.sqrt(np.mean(sensor.read_noise_e[good] ** 2))),
         "bias_adu": float(np.median(sensor.bias_adu)), "well_e": sensor.well_e,
         "top_e": sensor.top_e, "defects": np.flatnonzero(sensor.defects).tolist(),
+        "unclear": np.flatnonzero(sensor.unclear).tolist(),
     }  # fmt: skip
     return sensor, truth
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 from pixcal.model.arrays import F64, I64
 from pixcal.storage.frame_reader import Reader
@@ -68,6 +69,12 @@ def share_at_zero(frames: Reader) -> float:
     """Share of the samples of the first frame that are zero, where no sample is below."""
     samples = middle_rows(frames, 0, 1)
     return 0.0 if samples.min() < 0 else float((samples == 0).mean())
+
+
+def noise_above(frames: Reader) -> float:
+    """Noise of the first frame (ADU) by its upper half alone: the lower may be cut off."""
+    lower, upper = np.quantile(middle_rows(frames, 0, 1), ndtr([1.0, 2.0]))
+    return float(upper - lower)
 
 
 def code_step(arrays: Sequence[Reader]) -> int:

@@ -24,6 +24,7 @@ from pixcal.estimators.detector.calibration import (
     unsaturated,
     usual_variance,
 )
+from pixcal.estimators.detector.cut_off import without_cut_off
 from pixcal.kernels.photon_transfer import COLUMNS, N_BINS, bin_pairs, pair_statistics
 from pixcal.kernels.robust import BATCH, Combination, Combined, lit, median_and_sigma
 from pixcal.model.arrays import F32, F64
@@ -84,6 +85,7 @@ class Measuring:
     saturation: float
     full: float
     quantum: float  # step of the samples (ADU), 0 for real numbers
+    cut_off: Mapping[str, float]  # arrays whose noise is cut off at code zero; it, roughly (ADU)
     # gain, read_noise: rough guess: e-/ADU, ADU
     gain: float
     read_noise: float
@@ -138,7 +140,7 @@ class _Column:
 def measure(job: Measuring, strip: Strip) -> None:
     """Combine the calibration frames of columns of chunks and write their statistics."""
     columns = [_Column.begin(job, index) for index in strip]
-    combined = [_combine(job, group, columns) for group in job.dark]
+    combined = [_combine_dark(job, group, columns) for group in job.dark]
     for column, *found in zip(columns, *combined, strict=True) if combined else []:
         _measure_dark(job, column, found)
     del combined
@@ -153,6 +155,18 @@ def measure(job: Measuring, strip: Strip) -> None:
         job.writers["maps"].write((0, y0, x0), block.astype(np.float32))
         job.writers["pairs"].write((*column.index, 0, 0, 0), column.pairs[None, None])
         job.writers["levels"].write((*column.index, 0, 0), column.levels[None, None])
+
+
+def _combine_dark(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[Combined]:
+    """Frames without light in each column, as they would be if no noise were cut off."""
+    every = _combine(job, group, columns)
+    if group.array not in job.cut_off:
+        return every
+    made = [without_cut_off(one, len(group.frames), job.quantum) for one in every]
+    if group == job.read_series:
+        for column, (_, factor) in zip(columns, made, strict=True):
+            column.pairs[0, :, 2:] *= factor
+    return [found for found, _ in made]
 
 
 def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined]) -> None:
@@ -215,7 +229,9 @@ def _measure_response(job: Measuring, column: _Column) -> None:
 def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[Combined]:
     """Robust combination of a group in each column; statistics of its pairs are added there."""
     lamp = group.array == "flat"
-    every = [Combination(clip=job.limits.clip, lamp=lamp, quantum=job.quantum) for _ in columns]
+    # Of noise that is cut off the median deviation may be nothing.
+    step = max(job.quantum, job.cut_off.get(group.array, 0.0))
+    every = [Combination(clip=job.limits.clip, lamp=lamp, quantum=step) for _ in columns]
     pedestals: list[F32 | None] = [None] * len(columns)
     if lamp:
         exptime = group.exptime if job.flats_timed else 0.0

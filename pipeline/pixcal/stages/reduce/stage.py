@@ -6,6 +6,7 @@ not copied, and holds them against their checksums.
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -25,7 +26,7 @@ from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, lineari
 from pixcal.stages.reduce.detector_warnings import detector_warnings
 from pixcal.stages.reduce.electrons import convert_bytes
 from pixcal.stages.reduce.figures_of_merit import characterise
-from pixcal.stages.reduce.flat_survey import share_at_zero
+from pixcal.stages.reduce.flat_survey import noise_above, share_at_zero
 from pixcal.stages.reduce.frame_statistics import (
     Limits,
     Measuring,
@@ -159,6 +160,7 @@ def _measuring(source: Ingested, config: Config, folder: Place) -> Measuring:
         saturation=source.saturation("flat") if exposures.flat else math.inf,
         full=min(map(source.saturation, source.tables)),
         quantum=source.quantum,
+        cut_off={name: noise_above(source.arrays[name]) for name in _cut_off(source)},
         gain=detector.gain_e_per_adu,
         read_noise=max(detector.read_noise_e / detector.gain_e_per_adu, ROUNDING_ADU),
         limits=_limits(config),
@@ -225,7 +227,7 @@ def _report(
 ) -> None:
     job, summary, sets = found.job, found.summary, found.sets
     piled = source.saturation_found if source.detector.saturation_adu is None else None
-    warnings = [*source.exposures.warnings, *_cut_off(source)]
+    warnings = [*source.exposures.warnings, *_of_cut_off(_cut_off(source))]
     warnings += detector_warnings(summary, found.gain, piled)
     declared = source.detector.saturation_adu is not None
     warnings += _dark_lines(ArrayReader(made.folder / "calibration.zarr" / "mask"), source.shape)
@@ -259,13 +261,22 @@ def _report(
     made.summary.update({key: report[key] for key in ("gain_e_per_adu", "flags", "warnings")})
 
 
-def _cut_off(source: Ingested) -> list[str]:
-    """What to say where the black level is so low that noise is cut off at code zero."""
+def _cut_off(source: Ingested) -> dict[str, float]:
+    """Arrays whose black level is so low that noise is cut off at code zero; their share of it."""
+    shares = {
+        name: share_at_zero(source.arrays[name])
+        for name in ("bias", "dark")
+        if name in source.arrays
+    }
+    return {name: share for name, share in shares.items() if share > _CUT_OFF}
+
+
+def _of_cut_off(shares: Mapping[str, float]) -> list[str]:
     return [
         f"{name} frames are cut off at code 0, where {100 * share:.2g} % of their samples lie: "
-        "bias, read noise and gain come out wrong; raise the black level (offset) of the camera"
-        for name in ("bias", "dark")
-        if name in source.arrays and (share := share_at_zero(source.arrays[name])) > _CUT_OFF
+        "level and noise are those of normal noise that would look so; raise the black level "
+        "(offset) of the camera"
+        for name, share in shares.items()
     ]
 
 
