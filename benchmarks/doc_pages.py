@@ -94,7 +94,7 @@ def key_table(name: str) -> str:
             unit = key.metadata.get("unit") or "–"
             if name in effects():
                 doc += _parts(typing.get_type_hints(kind)[key.name])
-            lines.append(f"| `{key.name}` | {unit} | {_default(key.default)} | {doc} |")
+            lines.append(f"| `{key.name}` | {unit} | {_default(key)} | {doc} |")
     return "\n".join(lines) + "\n"
 
 
@@ -115,9 +115,10 @@ def effect_table() -> str:
     return "\n".join(lines) + "\n"
 
 
-def _default(value: object) -> str:
+def _default(field: dataclasses.Field[typing.Any]) -> str:
+    value = field.default
     if value is dataclasses.MISSING:
-        return "needed"
+        return "needed" if field.default_factory is dataclasses.MISSING else "–"
     if value in (None, (), ""):
         return "–"
     if isinstance(value, tuple) and dataclasses.is_dataclass(value[0]):

@@ -47,11 +47,11 @@ class ScoreConfig:
     oracle: int = quantity(
         0,
         low=0,
-        doc="Also simulate the true effects of the first N cases of parts 1 and 4, for the share "
-        "of the gap that could be closed.",
+        doc="Also simulate the true effects of the first N cases of parts 1 and 4, and compare the "
+        "share of the gap that they close.",
     )
     write: Path | None = quantity(
-        None, metavar="PAGE", doc="Markdown page to write the tables into, between its marks."
+        None, metavar="PAGE", doc="Markdown page into which to write the tables, between its marks."
     )
     also: tuple[tuple[Path, Path], ...] = quantity(
         (),
