@@ -40,8 +40,7 @@ class Grade:
     named: tuple[str, ...]  # causes in their order
     marks: dict[str, bool]  # questions of the part, answered right or not
     why: str  # what went wrong; empty where nothing did
-    # what was claimed of each cause: significance of its estimate, share of the gap closed,
-    # chance
+    # what was claimed of each cause: significance of its estimate, share of the gap closed, chance
     claims: tuple[dict[str, Any], ...] = ()
     # where data and simulation differ most: domain, statistic, set, place
     worst: tuple[dict[str, str], ...] = ()

@@ -153,14 +153,12 @@ def _add_frames(
 class Combined:
     """What many frames of one scene say of each pixel; all (y, x) float64."""
 
-    mean: F64  # ndarray: of the samples within the limits; NaN where there is none
-    # ndarray: of one sample, unbiased, corrected for the clipping; NaN with fewer than two
-    # samples
+    mean: F64  # of the samples within the limits; NaN where there is none
+    # of one sample, unbiased, corrected for the clipping; NaN with fewer than two samples
     variance: F64
-    # ndarray: 0 for Gaussian noise, negative for noise with two levels; NaN with fewer than
-    # four samples
+    # 0 for Gaussian noise, negative for noise with two levels; NaN with fewer than four samples
     excess_kurtosis: F64
-    seen: F64  # seen, kept: ndarray: samples that were not NaN, and those of them within the limits
+    seen: F64  # seen, kept: samples that were not NaN, and those of them within the limits
     kept: F64
 
 

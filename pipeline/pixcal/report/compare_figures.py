@@ -37,8 +37,7 @@ class ComponentView:
     facts: Mapping[str, Any]  # of ``compare.json``
     picture: I64  # (bin, bin) pixels by the second map (y) and the first (x)
     reach: float  # half width of the picture, px
-    # (y, x) sigma of each block: of its mean difference, and of its pixels' scatter
-    shift: F64
+    shift: F64  # (y, x) sigma of each block: of its mean difference, and of its pixels' scatter
     scatter: F64
     # (n,), (n,) float64 of `columns` and `rows`: mean difference of each and its error, px
     profiles: Mapping[str, tuple[F64, F64]]

@@ -40,7 +40,7 @@ class CrestView:
     # sigma_px, residual_px: (point,) errors, and fit minus path, across the fringes, px
     sigma_px: F64
     residual_px: F64
-    # (2,) float64, (2,) float64: (x, y) of fibres A and B projected on the detector, px
+    # (x, y) of fibres A and B projected on the detector, px
     fibres: tuple[F64, F64]
     extracts: tuple[Extract, ...]  # about the first and the last path
     best: tuple[float, float]  # distance and baseline of the minimum, mm

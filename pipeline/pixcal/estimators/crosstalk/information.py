@@ -29,7 +29,7 @@ BACKED = 2.5  # sigmas of the noise's own share that back a single hot pixel
 class Information:
     """Least-squares sums of shares, by way of measuring."""
 
-    # normal, right: mapping of str to (..., u, u), (..., u) float64: unknown `2 c` is what
+    # normal, right: (..., u, u), (..., u): unknown `2 c` is what
     # pixels of class c give over the link, `2 c + 1` what their partners give back. With a
     # leading axis for many links
     normal: dict[str, F64]

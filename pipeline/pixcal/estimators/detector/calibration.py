@@ -23,12 +23,11 @@ NEARLY = 0.02  # relative distance from a pixel's own full well within which its
 class DarkLine:
     """Signal without light against exposure time, for each pixel; all (y, x) float64."""
 
-    # ndarray: at exposure zero (ADU); with a single exposure time, the signal at that time
-    bias: F64
-    rate: F64  # ndarray: dark signal (ADU/s); zero with a single exposure time
-    mean_time: F64  # ndarray: weighted mean of the exposure times (s)
-    # per_mean, per_rate: ndarray: variance of the signal at `mean_time`, and of the rate (s⁻²),
-    # for frames of unit variance
+    bias: F64  # at exposure zero (ADU); with a single exposure time, the signal at that time
+    rate: F64  # dark signal (ADU/s); zero with a single exposure time
+    mean_time: F64  # weighted mean of the exposure times (s)
+    # per_mean, per_rate: variance of the signal at `mean_time`, and of the rate (s⁻²), for frames
+    # of unit variance
     per_mean: F64
     per_rate: F64
 
@@ -82,8 +81,8 @@ class Rung:
 
     exptime: float  # seconds; any number above zero when there is a single rung
     frames: int  # how many were combined
-    signal: F64  # ndarray: mean (ADU); NaN where any of the frames is saturated or not finite
-    variance: F64  # ndarray: of `signal` (ADU²)
+    signal: F64  # mean (ADU); NaN where any of the frames is saturated or not finite
+    variance: F64  # of `signal` (ADU²)
 
 
 def usual_variance(variance: NDArray[Any], dof: int) -> float:

@@ -52,8 +52,7 @@ class SharedCharge:
 
     size: float  # size, variance: of the shift by an electron, px
     variance: float
-    # (2,), (2, 2) the same of boundaries between columns and of those between rows
-    axes: F64
+    axes: F64  # (2,), (2, 2) the same of boundaries between columns and of those between rows
     covariance: F64
 
 

@@ -142,8 +142,7 @@ def fit_curve(evidence: Evidence, response: Callable[[F32], F32], knots_e: F64) 
 class Boundaries:
     """Moving boundaries without a bent response, as the second harmonics of all sets show them."""
 
-    # falloff_px, falloff_error: the error infinite where one falloff does about as well as
-    # another
+    # falloff_px, falloff_error: the error infinite where one falloff does about as well as another
     falloff_px: float
     falloff_error: float
     shift: float  # shift, shift_error: by an electron, px, for this falloff

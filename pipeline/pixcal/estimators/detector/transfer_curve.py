@@ -31,15 +31,12 @@ _READ_KNOWN = 0.3  # relative error of the read noise's variance as it was used
 class TransferCurve:
     """Photon transfer of flats over that of the gain used, as a line over the level."""
 
-    # share, error: at level zero
-    share: float
+    share: float  # share, error: at level zero
     error: float
-    # slope, slope_error: change up to the top
-    slope: float
+    slope: float  # slope, slope_error: change up to the top
     slope_error: float
     top: float  # highest level, e-
-    # levels, shares, errors: (n,) of each level (e-)
-    levels: F64
+    levels: F64  # levels, shares, errors: (n,) of each level (e-)
     shares: F64
     errors: F64
 

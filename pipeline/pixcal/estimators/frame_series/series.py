@@ -46,8 +46,7 @@ class FrameSeries:
     values: F64
     apart: F64
     shapes: F64  # (t, p) what follows the phase of the fringes, which is no noise
-    # noise, apart_noise: (2, 2) covariance that the noise model predicts of them, mean over
-    # frames
+    # noise, apart_noise: (2, 2) covariance that the noise model predicts of them, mean over frames
     noise: F64
     apart_noise: F64
     share: float = 1.0  # of the frames' freedom that is left

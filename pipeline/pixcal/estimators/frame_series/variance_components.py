@@ -60,7 +60,7 @@ class Components:
 
     size: F64  # (m,)
     covariance: F64  # (m, m) of `size`; zero for those that were held
-    beta: F64  # beta, beta_covariance: (p,), (p, p) float64: coefficients of the known shapes
+    beta: F64  # beta, beta_covariance: (p,), (p, p) coefficients of the known shapes
     beta_covariance: F64
     likelihood: float  # logarithm, restricted; comparable where the known shapes are the same
     profile: float  # logarithm, not restricted; comparable whatever the known shapes

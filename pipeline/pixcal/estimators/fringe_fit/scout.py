@@ -86,7 +86,7 @@ class Scout:
     moving: bool = False
     moving_significance: float = 0.0
     noise: float = 1.0  # usual reduced chi-square of the pixels
-    theta: list[F64] = field(default_factory=list)  # list of (3, y, x) float64: of each tile
+    theta: list[F64] = field(default_factory=list)  # (3, y, x) of each tile
 
     def prime(self, codes: Sequence[U16]) -> FrameParameters:
         """Learn the pixels of the tiles from frames spread over the run; parameters of these.

@@ -30,12 +30,10 @@ _PARABOLA = 2
 class Ring:
     """Waves of one length that two maps share."""
 
-    # variance, noise: of the waves in this window, whatever a parabola takes of them, and its
-    # error
+    # variance, noise: of the waves in this window, whatever a parabola takes of them, and its error
     variance: float
     noise: float
-    # of the same as that of all waves of the kind, of which few beat with each other in a
-    # window
+    # of the same as that of all waves of the kind, of which few beat with each other in a window
     error: float
     # scale, scale_error: wavelength over 2 pi, px; the error is infinite where nothing is there
     scale: float

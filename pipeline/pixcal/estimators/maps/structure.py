@@ -119,8 +119,7 @@ class OffsetModel:
     # (term, y, x) what was taken out: all that an effect of the bench or the readout would
     # bring about
     terms: F64
-    # (term,) of the coefficients of the terms, by chance, in offsets such as those that were
-    # kept
+    # (term,) of the coefficients of the terms, by chance, in offsets such as those that were kept
     scatter: F64
 
     def drawn(self, rng: np.random.Generator) -> F64:

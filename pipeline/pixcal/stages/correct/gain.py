@@ -64,8 +64,7 @@ class SetSums:
     # the count
     rows: F64
     columns: F64
-    # (2, 3) before and after: squares of half the difference, what errors let expect of them,
-    # count
+    # (2, 3) before and after: squares of half the difference, what errors let expect of them, count
     halves: F64
     square: float  # sum of the squared offsets after
 

@@ -46,8 +46,7 @@ class CrestPaths:
 
     x: F64  # x, y: (point,) r_jk, pixel coordinates
     y: F64
-    # (point,) number of the path, consistent over the frame; grows along the fringe vector
-    k: I64
+    k: I64  # (point,) number of the path, consistent over the frame; grows along the fringe vector
     sigma: F64  # (point,) 1-sigma error of the phase there, rad, from the scatter of the samples
     slope: F64  # (point,) length of the local fringe vector, rad/px
     # (frame,) phase of each frame relative to the first, rad; NaN where a frame has no fringes

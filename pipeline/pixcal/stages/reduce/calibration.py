@@ -127,8 +127,7 @@ class Finishing:
     read_noise: float  # of the detector (e-)
     read_dof: int  # degrees of freedom of each pixel's own; zero to use the detector's for all
     floor: float  # least read noise of a pixel (e-): the rounding of the converter
-    # has_rate, has_flat: whether dark signal and response were measured
-    has_rate: bool
+    has_rate: bool  # has_rate, has_flat: whether dark signal and response were measured
     has_flat: bool
     limits: Limits  # of the flags
     writers: Mapping[str, ArrayWriter]  # arrays for the maps

@@ -27,11 +27,9 @@ class Exposures:
 
     dark: list[Group] = field(default_factory=list)  # frames without light, bias among them
     flat: list[Group] = field(default_factory=list)  # sorted by exposure time
-    # whether the exposure times of the flats are known; else there is one group, at one
-    # second
+    # whether the exposure times of the flats are known; else there is one group, at one second
     known: bool = True
-    # exposure times (s) of the frames of each set, float32, zero where dark is not to be
-    # scaled
+    # exposure times (s) of the frames of each set, float32, zero where dark is not to be scaled
     fringes: dict[str, F32] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)  # sentences
 

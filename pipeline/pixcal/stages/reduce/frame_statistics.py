@@ -75,19 +75,16 @@ class Measuring:
 
     frames: Mapping[str, Reader]  # a reader of each array
     shape: tuple[int, int]  # of the detector's window (y, x)
-    # dark, flat: frames without light, and flats
-    dark: Sequence[Group]
+    dark: Sequence[Group]  # dark, flat: frames without light, and flats
     flat: Sequence[Group]
     read_series: Group | None  # the one of ``dark`` whose noise is the read noise
     flats_timed: bool  # whether the exposure times of the flats are known
-    # saturation, full: level (ADU) from which on samples of flats are saturated; of any
-    # frames
+    # saturation, full: level (ADU) from which on samples of flats are saturated; of any frames
     saturation: float
     full: float
     quantum: float  # step of the samples (ADU), 0 for real numbers
     cut_off: Mapping[str, float]  # arrays whose noise is cut off at code zero; it, roughly (ADU)
-    # gain, read_noise: rough guess: e-/ADU, ADU
-    gain: float
+    gain: float  # gain, read_noise: rough guess: e-/ADU, ADU
     read_noise: float
     limits: Limits  # of outliers and flags
     writers: Mapping[str, ArrayWriter]  # arrays for the results

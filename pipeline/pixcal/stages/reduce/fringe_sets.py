@@ -30,8 +30,7 @@ class Bounds:
     """Extremes over the good pixels."""
 
     flat: tuple[float, float]  # least and largest relative response
-    # bias, dark_rate: largest (ADU; e-/s)
-    bias: float
+    bias: float  # bias, dark_rate: largest (ADU; e-/s)
     dark_rate: float
     read_noise: float  # usual (e-)
 

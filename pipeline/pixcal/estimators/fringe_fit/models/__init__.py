@@ -25,8 +25,7 @@ class Start:
     k: tuple[float, float]  # measured fringe vector (kx, ky) at the reference, rad/px
     reference: tuple[float, float]  # point (y, x), px
     scale: float  # half the window's size, px
-    # unwrapped `geometry.TilePlane` of every tile, relative to the carrier `k . (r -
-    # reference)`
+    # unwrapped `geometry.TilePlane` of every tile, relative to the carrier `k . (r - reference)`
     planes: Sequence[Any]
     nominal: Geometry  # of the bench, the fibres' centre before the reference
 

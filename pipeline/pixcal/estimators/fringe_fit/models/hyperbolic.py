@@ -29,10 +29,10 @@ class Hyperbolic(FringeShape):
 
     phase0: float
     geometry: Geometry  # present positions, from pixel (0, 0) of the window
-    # (6,) float64: nominal values of the geometry's parameters, mm, in the order of
+    # (6,) nominal values of the geometry's parameters, mm, in the order of
     # `pixcal.kernels.optics.PARAMETERS`
     nominal: tuple[float, ...]
-    # (6,) float64: their prior errors, mm; coefficients are counted in these
+    # (6,) their prior errors, mm; coefficients are counted in these
     sigma: tuple[float, ...]
     reference: tuple[float, float]  # point (y, x) where the phase is `phase0`, px
 
