@@ -1,5 +1,6 @@
 """How every stage of a run works: what it needs is there, then lock, key, build and products."""
 
+import gc
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -120,7 +121,12 @@ def make(
     stays = ready is not None and keep(ready)
     if ready is None or not stays:
         with build(run, stage.name, stage.format, config, dict(inputs), cubes=cubes) as made:
-            body(made)
+            # Objects that exist by now stay: the garbage collector skips them.
+            gc.freeze()
+            try:
+                body(made)
+            finally:
+                gc.unfreeze()
         ready = require(run, stage.name)
     if not (stays and published()):
         publish()
