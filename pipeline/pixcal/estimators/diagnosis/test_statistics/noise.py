@@ -20,6 +20,7 @@ from pixcal.model.arrays import F32, F64, Mask
 
 OUTLIERS = (5.0, 7.0, 10.0)
 MIN_DARKS = 5
+CUT_OFF = 1e-3  # share of samples at code zero from which noise is cut off
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
 
 
@@ -220,6 +221,9 @@ def read_noise(evidence: Evidence) -> Curve | None:
     """
     stacks = [s for s in evidence.of_kind("bias") if len(s.adu) >= 8]
     if not stacks or not evidence.dithered:
+        return None
+    # Where noise is cut off at code zero, its size tells the level of a pixel.
+    if (stacks[0].adu[:, evidence.good] == 0).mean() > CUT_OFF:
         return None
     # Of whole numbers a median jumps by a code.
     frames = stacks[0].adu - stacks[0].adu[:, evidence.good].mean(axis=1)[:, None, None]
