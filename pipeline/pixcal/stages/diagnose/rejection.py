@@ -105,4 +105,7 @@ def doubtful(
     why = f"the other causes produce {mimicked:.0%} of its significance"
     if sigmas < SIGNIFICANT:
         why = f"it is not significant ({sigmas:.1f} sigma) in the frames that it was fitted to"
-    return least, f"{closes}, and {why}; it may stand in for deviations of these from their laws"
+    return (
+        least,
+        f"{closes}, and {why}; it may only describe how the other causes deviate from their laws",
+    )
