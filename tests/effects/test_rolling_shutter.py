@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from joint_fit import fit_jointly
 
 from pixcal.effects.rolling_shutter import RollingShutter
 from pixcal.estimators.diagnosis.evidence import Evidence
@@ -12,6 +13,7 @@ from pixcal.estimators.frame_series.row_settling import profile
 from pixcal.kernels.scene import frame_states
 from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
+from pixcal.simulation.effect import FittedFrames, FringeMaps
 from pixcal.simulation.exposure import Camera, frames_of
 from pixcal.simulation.recording import recordings
 
@@ -134,3 +136,53 @@ def test_phases_that_stand_still_settle_nothing(acquired: Callable[..., Evidence
     found = RollingShutter.estimate(acquired())
     assert found is not None
     assert found.significance < 4
+
+
+@pytest.mark.parametrize(
+    "shutter",
+    [
+        RollingShutter(0.0, settling=RINGING),
+        RollingShutter(25.0, 100.0),
+        RollingShutter(25.0, LATE + 700.0),
+    ],
+)
+def test_what_the_rows_leave_in_the_maps_is_undone(shutter: RollingShutter) -> None:
+    """Random phases: what no fit of the frames can follow becomes a pattern of the pixels."""
+    rng = np.random.default_rng(8)
+    ny, nx, count, exptime = 31, 37, 80, 0.02
+    y, x = np.indices((ny, nx), float)
+    psi = 2 * np.pi / 7.3 * x + 0.05 * y
+    theta = np.stack([np.full(psi.shape, 2e4), 1.8e4 * np.sin(psi), 1.8e4 * np.cos(psi)])
+    phi = rng.uniform(0, 2 * np.pi, count)
+    g = np.stack([np.ones(count), np.cos(phi), np.sin(phi)], axis=1)
+    samples = np.einsum("ti,iyx->tyx", g, theta)
+    plain = samples.copy()
+    if any(shutter.settling):
+        step = np.angle(np.exp(1j * (phi - np.roll(phi, 1))))
+        step[0] = 0.0
+        turn = -step[:, None] * profile(shutter.settling, np.linspace(0, 1, ny))
+        at = psi + phi[:, None, None] + turn[:, :, None]
+        samples = theta[0] + 1.8e4 * np.sin(at)
+    else:
+        after, before = shutter.shares(np.arange(ny, dtype=float), exptime, 0.14)
+        samples[:-1] += after[:, None] * (plain[1:] - plain[:-1])
+        samples[1:] += before[:, None] * (plain[:-1] - plain[1:])
+    fitted, g = fit_jointly(samples, theta, g)
+    frames = FittedFrames(g, ny, 0.0, exptime, 0.14, vectors_free=False)
+    undone = shutter.undo(FringeMaps(fitted, (2 * np.pi / 7.3, 0.05), frames=frames))
+    assert undone is not None
+
+    def moved(maps: np.ndarray) -> float:
+        """Of the phases, but for their mean and the two harmonics that a fit leaves free."""
+        change = np.angle((maps[2] + 1j * maps[1]) / (theta[2] + 1j * theta[1])).ravel()
+        p = psi.ravel()
+        free = np.stack([p * 0 + 1, np.cos(p), np.sin(p), np.cos(2 * p), np.sin(2 * p)], axis=1)
+        return float((change - free @ np.linalg.lstsq(free, change, rcond=None)[0]).std())
+
+    assert moved(fitted) > 2e-4
+    assert moved(undone.theta) < 0.12 * moved(fitted)
+
+
+def test_frames_that_are_not_known_undo_nothing() -> None:
+    maps = FringeMaps(np.ones((3, 4, 5)), (0.7, 0.0))
+    assert RollingShutter(0.0, settling=RINGING).undo(maps) is None

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from joint_fit import fit_jointly
 
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.estimators.maps.corrected import phase_change
@@ -12,27 +13,13 @@ SHAPE = (23, 31)
 BENT = Nonlinearity(-0.05, 0.02)
 
 
-def fitted(samples, theta, g, turns=60):
-    """Maps and frames (B, A cos phi, A sin phi), fitted in turn, weighted by photon noise."""
-    maps, pixels = theta.reshape(3, -1).copy(), samples.reshape(len(samples), -1)
-    weight = 1 / np.maximum(g @ maps, 1)
-    for _ in range(turns):
-        normal = np.einsum("tp,ti,tj->pij", weight, g, g)
-        maps = np.linalg.solve(normal, np.einsum("tp,ti,tp->pi", weight, g, pixels)[..., None])
-        maps = maps[..., 0].T
-        normal = np.einsum("tp,ip,jp->tij", weight, maps, maps)
-        g = np.linalg.solve(normal, np.einsum("tp,ip,tp->ti", weight, maps, pixels)[..., None])
-        g = g[..., 0]
-    return maps.reshape(theta.shape), g
-
-
 def acquisition(phi):
     y, x = np.indices(SHAPE, float)
     psi = 0.03 * y + 2 * np.pi / 9.3 * x
     theta = np.stack([np.full(SHAPE, 2e4), 1.8e4 * np.sin(psi), 1.8e4 * np.cos(psi)])
     g = np.stack([np.ones_like(phi), np.cos(phi), np.sin(phi)], axis=1)
     samples = BENT.response(np.einsum("ti,iyx->tyx", g, theta).astype(np.float32))
-    return theta, fitted(samples.astype(float), theta, g), psi
+    return theta, fit_jointly(samples.astype(float), theta, g), psi
 
 
 def third_harmonic(before, after, psi):

@@ -1,18 +1,20 @@
 """Rows that are exposed one after the other while the phase modulator steps."""
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.frame_series.row_ramp import RowRamp, enough_for_rows, enough_frames
 from pixcal.estimators.frame_series.row_settling import find_settling, profile, steps_of
+from pixcal.estimators.maps.imprint import imprint
 from pixcal.kernels.synthesis import illuminate
 from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.effect import Effect, Estimate, FittedFrames, FringeMaps, Stage
 from pixcal.simulation.shot import Shot
 
 FEWEST = 4  # rows at which a profile of the settling is given
@@ -28,9 +30,8 @@ class RollingShutter(Effect):
     are still exposed hold a share of the next frame's light, which grows with the row. A delay of
     nearly a frame is a step that comes late: then the first rows hold a share of the last frame's.
     A modulator that settles while rows are read turns the phase of each row by a share of its step
-    instead (``settling``). Both depend on the order of the phases, so maps alone do not tell; of
-    random phases the fit loses a little contrast in these rows, and the rest is left in the
-    residuals.
+    instead (``settling``). Both depend on the order of the phases: most is left in the residuals,
+    and some in the maps, which `undo` takes off with the phases as fitted.
     """
 
     name = "rolling_shutter"
@@ -39,7 +40,6 @@ class RollingShutter(Effect):
     order = 9
     domains = ("time", "space")
     strengths = ("line_time_us", "settling")
-    left_because = "the part that the fit leaves is a tenth of the bound of 300 frames"
     frames_needed = ("random",)
     sources = (
         "Pyxalis GIGAPYX-4600 as in Rousset et al.: 5456 rows at 152 frames/s are 1.2 us a row; at "
@@ -132,6 +132,58 @@ class RollingShutter(Effect):
                 states.amplitude[shot.frame], columns, of_rows, found[-1],
             )  # fmt: skip
         return found[1] - found[0]
+
+    def undo(self, maps: FringeMaps) -> FringeMaps | None:
+        """Maps without what the rows' other phases left in them; None of unknown frames."""
+        if maps.frames is None:
+            return None
+        flat = 1.0 if maps.flat is None else maps.flat
+        theta = maps.theta * flat
+        rows = slice(maps.origin[0], maps.origin[0] + theta.shape[1])
+        g, noise = maps.frames.g, maps.frames.read_noise_e
+        for share, change in self._changes(maps.frames):
+            moved, _ = imprint(theta, g, change, noise)
+            theta = theta - share[rows, None] * moved
+        return replace(maps, theta=theta / flat)
+
+    def noise_factor(self, charge: float, read_noise: float, maps: FringeMaps) -> F64:
+        """As in `Effect.noise_factor`: errors were scaled by the usual residuals of a pixel."""
+        left = np.zeros(1)
+        if maps.frames is not None:
+            g, noise = maps.frames.g, maps.frames.read_noise_e
+            for share, change in self._changes(maps.frames):
+                left = left + share**2 * imprint(maps.theta, g, change, noise)[1]
+        return np.full(maps.theta.shape[1:], (1 + np.median(left)) ** -0.5)
+
+    def _changes(self, frames: FittedFrames) -> Iterator[tuple[F64, F64]]:
+        """Shares of the window's rows (y,), and by how much each frame (t, 3) is off at one.
+
+        Without what the frames' own parameters take up: a share that all rows have and, of the
+        phase, one that rises evenly where each frame has a fringe vector of its own.
+        """
+        g, rows = frames.g, np.arange(frames.rows, dtype=float)
+        turned = np.stack([np.zeros(len(g)), -g[:, 2], g[:, 1]], axis=1)
+        size = np.maximum(np.sum(turned**2, axis=1), 1e-30)[:, None]
+        even = rows - rows.mean()
+        for share, change in self._of_rows(frames, rows, turned):
+            if not share.any():
+                continue
+            own = share - share.mean()
+            along = np.sum(change * turned, axis=1, keepdims=True) / size * turned
+            straight = own - even * (even @ own) / (even @ even) if frames.vectors_free else own
+            yield straight, along
+            yield own, change - along
+
+    def _of_rows(self, frames: FittedFrames, rows: F64, turned: F64) -> Iterator[tuple[F64, F64]]:
+        g = frames.g
+        if self.line_time_us > 0 and frames.exptime_s > 0:
+            after, before = self.shares(rows, frames.exptime_s, frames.period_s)
+            yield after, np.append(g[1:] - g[:-1], np.zeros((1, 3)), axis=0)
+            yield before, np.append(np.zeros((1, 3)), g[:-1] - g[1:], axis=0)
+        if any(self.settling):
+            phi = np.arctan2(g[:, 2], g[:, 1])
+            step = steps_of(phi, -1 if self.of_step == "last" else 1, self.origin_rad)
+            yield profile(self.settling, rows / max(frames.rows - 1, 1)), step[:, None] * turned
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:

@@ -30,6 +30,18 @@ NONZERO = 3.0  # errors from which a strength of an effect counts as different f
 
 
 @dataclass(frozen=True)
+class FittedFrames:
+    """The frames that maps were fitted to, for effects that depend on their order."""
+
+    g: F64  # (t, 3) intensity, and amplitude times cosine and sine of the phase
+    rows: int  # of the detector's window
+    read_noise_e: float
+    exptime_s: float
+    period_s: float
+    vectors_free: bool  # whether each frame has a fringe vector of its own
+
+
+@dataclass(frozen=True)
 class FringeMaps:
     """What a fit finds of one fringe set, for effects that are linear in the intensity.
 
@@ -46,6 +58,7 @@ class FringeMaps:
         effect that acts on flats as well changes it.
     name : str
         Of the fringe set.
+    frames : FittedFrames, optional
     """
 
     theta: F64
@@ -53,6 +66,7 @@ class FringeMaps:
     origin: tuple[int, int] = (0, 0)
     flat: F64 | None = None
     name: str = ""
+    frames: FittedFrames | None = None
 
 
 @dataclass(frozen=True)

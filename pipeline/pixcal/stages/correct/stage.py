@@ -14,6 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pixcal import __version__
 from pixcal.engine.run import Runtime
 from pixcal.model.acquisition import Acquisition
@@ -216,6 +218,7 @@ def _swept_set(
 ) -> Swept:
     used = read_json(run_dir / "reduce" / "reduce.json")
     flat = run_dir / "reduce" / "calibration.zarr" / "flat"
+    exposures = Ingested(run_dir / "ingest").exposures.fringes[f"fringes/{name}"]
     return Swept(
         folder,
         ReducedSet(run_dir / "reduce" / "reduced.zarr" / name),
@@ -227,6 +230,7 @@ def _swept_set(
         run_dir / "sweep" / "sweep.zarr" / name,
         plan.errors,
         plan.covariances,
+        float(np.median(exposures)),
     )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from pixcal.estimators.maps.corrected import phase_change
 from pixcal.kernels.crosstalk import FILL_REACH, filled
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Effect, FringeMaps
+from pixcal.simulation.effect import Effect, FittedFrames, FringeMaps
 from pixcal.stages.correct.surroundings import BEYOND, CLOSED, Sides, usable
 from pixcal.stages.diagnose.undone import undone_on_samples
 from pixcal.stages.evidence import Part, fitted_theta
@@ -41,6 +42,7 @@ class Swept:
     errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     # mapping: by effect: of all its parameters, where they were measured together
     covariances: Mapping[str, F64] = field(default_factory=dict)
+    exptime_s: float = 0.0
     # where the detector goes on beyond the window: top, bottom, left, right
     open_sides: Sides = CLOSED
 
@@ -67,6 +69,14 @@ class Swept:
         facts = read_json(self.folder / "scout.json")
         (kx, ky), (y, x) = facts["k"], facts["reference"]
         return Carrier((float(kx), float(ky)), (float(y), float(x)))
+
+    @cached_property
+    def frames(self) -> FittedFrames:
+        """The frames that were fitted."""
+        g, dk, time = (ArrayReader(self.folder / name).read() for name in ("g", "dk", "time"))
+        period = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+        rows, free = self.source.shape[0], bool(np.any(dk))
+        return FittedFrames(g, rows, self.read_noise, self.exptime_s, period, free)
 
     @property
     def halo(self) -> int:
@@ -118,7 +128,8 @@ def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
     flat = None
     if swept.flat is not None:
         flat = padded(ArrayReader(swept.flat).read(*there).astype(float), swept, part, 1.0)
-    maps = FringeMaps(theta, swept.k, (part[0][0], part[1][0]), flat, swept.folder.name)
+    origin = part[0][0], part[1][0]
+    maps = FringeMaps(theta, swept.k, origin, flat, swept.folder.name, swept.frames)
     return maps, padded(good, swept, part, False), padded(known, swept, part, False)
 
 

@@ -10,7 +10,7 @@ from pixcal.estimators.maps.corrected import corrected_offsets, phase_change, st
 from pixcal.estimators.maps.structure import OffsetModel, smooth_surface, true_offsets
 from pixcal.kernels.crosstalk import filled
 from pixcal.model.arrays import F32, F64, Mask
-from pixcal.simulation.effect import Effect, FringeMaps
+from pixcal.simulation.effect import Effect, FittedFrames, FringeMaps
 from pixcal.stages.diagnose.undone import FitOfFrames, undone_on_samples
 
 # degree, over a window, of the logarithm of the contrast of two Gaussian beams (their intensities'
@@ -33,9 +33,7 @@ class FittedSet:
     # measured
     light: F32 | float = 1.0
     contrast: F32 | float = 1.0
-    # (t, 3) intensity, and amplitude times cosine and sine of the phase, of the frames that were
-    # fitted
-    g: F64 | None = None
+    frames: FittedFrames | None = None
 
     def without(self, effects: Sequence[Effect]) -> "FittedSet":
         """The same with effects undone that act on maps: offsets as fitted with them known."""
@@ -69,7 +67,7 @@ class FittedSet:
     def maps(self) -> FringeMaps:
         """As fitted; bad pixels are like those around them."""
         theta = filled(self.theta, self.k)
-        return FringeMaps(theta, self.k, self.origin, self.flat, self.name)
+        return FringeMaps(theta, self.k, self.origin, self.flat, self.name, self.frames)
 
     def undone(self, effect: Effect, maps: FringeMaps) -> FringeMaps | None:
         """Maps without an effect, as a fit of the same frames gives them; None where none tell."""
@@ -77,7 +75,7 @@ class FittedSet:
 
     @cached_property
     def _fit(self) -> FitOfFrames | None:
-        return None if self.g is None else FitOfFrames.of(self.maps, self.g)
+        return None if self.frames is None else FitOfFrames.of(self.maps, self.frames.g)
 
     @cached_property
     def offsets(self) -> OffsetModel:

@@ -18,6 +18,7 @@ from pixcal.kernels.sample_sums import calm_residuals, pixel_moments
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, Indices, Mask
+from pixcal.simulation.effect import FittedFrames
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.description import bench_of, recordings_of
 from pixcal.stages.diagnose.fitted_set import FittedSet, contrast_surface, light_surface
@@ -84,7 +85,7 @@ def nominal_bench(
         for name in names
     )
     known = flat.astype(float) if with_flats else None
-    fits = tuple(_fitted([e.fringes[name] for e in evidence], one.origin, known) for name in names)
+    fits = tuple(_fitted(evidence, name, known) for name in names)
     maps = DetectorMaps(
         delta_x=np.zeros(good.shape, np.float32),
         delta_y=np.zeros(good.shape, np.float32),
@@ -166,21 +167,15 @@ def _response_of_fringes(evidence: Sequence[Evidence]) -> F32:
     return np.asarray(1 + true * np.nan_to_num(mean), np.float32)
 
 
-def _fitted(
-    found: Sequence[FringeEvidence], origin: tuple[int, int], flat: F64 | None
-) -> FittedSet:
-    one = found[0]
+def _fitted(evidence: Sequence[Evidence], name: str, flat: F64 | None) -> FittedSet:
+    found = [e.fringes[name] for e in evidence]
+    one, read_noise_e = found[0], evidence[0].amplifier_noise
     good = np.all([f.good for f in found], axis=0)
     k = float(np.hypot(*one.k))
     # The scan starts anywhere: turn the others to the first before the mean is taken.
     phasors = [f.theta[2] + 1j * f.theta[1] for f in found]
     turns = [np.angle(np.vdot(phasors[0][good], z[good])) for z in phasors]
     z = np.mean([z * np.exp(-1j * a) for z, a in zip(phasors, turns, strict=True)], axis=0)
-    waves = [
-        (f.g[:, 1] + 1j * f.g[:, 2]) * np.exp(1j * a) for f, a in zip(found, turns, strict=True)
-    ]
-    wave = np.concatenate(waves)
-    g = np.stack([np.concatenate([f.g[:, 0] for f in found]), wave.real, wave.imag], axis=1)
     theta = np.stack([np.mean([f.theta[0] for f in found], axis=0), z.imag, z.real])
     delta = np.mean([f.delta for f in found], axis=0)
     sigma = np.sqrt(np.sum([f.sigma**2 for f in found], axis=0)) / len(found) / k
@@ -191,11 +186,26 @@ def _fitted(
         np.where(bad, np.nan, delta),
         np.where(bad, np.nan, sigma),
         one.k,
-        origin,
+        evidence[0].origin,
         flat,
         one.name,
-        g=g,
+        frames=_frames(found, turns, read_noise_e),
     )
+
+
+def _frames(
+    found: Sequence[FringeEvidence], turns: Sequence[float], read_noise_e: float
+) -> FittedFrames:
+    """All frames, with their phases turned along with the maps."""
+    wave = np.concatenate(
+        [(f.g[:, 1] + 1j * f.g[:, 2]) * np.exp(1j * a) for f, a in zip(found, turns, strict=True)]
+    )
+    g = np.stack([np.concatenate([f.g[:, 0] for f in found]), wave.real, wave.imag], axis=1)
+    one = found[0]
+    period = float(np.median(np.diff(one.time_s))) if len(one.time_s) > 1 else 0.0
+    rows = one.good.shape[0]
+    free = any(bool(np.any(f.dk)) for f in found)
+    return FittedFrames(g, rows, read_noise_e, one.exptime_s, period, free)
 
 
 def excess_scatter(found: Sequence[FringeEvidence], good: Mask) -> float:
