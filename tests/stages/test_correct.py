@@ -326,7 +326,7 @@ def test_an_effect_of_the_users_own_is_asked_for(coupled, tmp_path):
         correct.run(again, correct.Config(), SYNC)
     spoilt = GLOW + "\n    def undo(self, maps):\n        return None\n"
     file.write_text(spoilt)
-    with pytest.raises(InputError, match="'glow': undo gives no finite maps"):
+    with pytest.raises(InputError, match="'glow': undo does not return finite maps"):
         correct.run(again, correct.Config(own=(file,)), SYNC)
 
 
