@@ -23,7 +23,7 @@ def charge(mean: np.ndarray, w: np.ndarray, shot: bool = True, well: float = np.
 
 
 def test_a_key_always_gives_the_same_numbers_and_no_other_key_does() -> None:
-    keys = [(1, Stream.NOISE, 0, 1), (2, Stream.NOISE, 0, 1), (1, Stream.LASER, 0, 1)]
+    keys = [(1, Stream.NOISE, 0, 1), (2, Stream.NOISE, 0, 1), (1, Stream.PHASE, 0, 1)]
     keys += [(1, Stream.NOISE, 1, 0), (1, Stream.NOISE, 0), (1, Stream.NOISE, 0, 1, 0)]
     first = [generator(*key).random(4).tolist() for key in keys]
     assert first == [generator(*key).random(4).tolist() for key in keys]

@@ -129,5 +129,5 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["mask", "delta_x", "delta_fringe_sigma"])
 def test_a_set_is_not_named_as_a_result(name):
-    with pytest.raises(InputError, match=f"'{name}' is the name of a result"):
+    with pytest.raises(InputError, match=f"'{name}' is reserved for a result"):
         FringeSet(name, ("a.fits",), (6.0, 0.0))

@@ -448,7 +448,7 @@ def test_mistakes_are_named(make: Any, truth: Any, tmp_path: Path) -> None:
         compare.run([one, small], out, Config(), SYNC)
     lone = [make(n, vectors={n: v}, sigma={n: 1e-3}) for n, v in
             (("a", (0.6, 0.0)), ("b", (0.3, 0.5)))]  # fmt: skip
-    with pytest.raises(InputError, match="b: its fringes are turned by 59 degrees"):
+    with pytest.raises(InputError, match="b: its fringes are rotated by 59 degrees"):
         compare.run(lone, out, Config(), SYNC)
     with pytest.raises(InputError, match="single: set 'vertical' has too few batches"):
         compare.run([make("single", batches=1)], out, Config(), SYNC)
