@@ -536,7 +536,7 @@ def test_the_steps_one_by_one_give_the_same(
     monkeypatch.setattr(report_page, "png", lambda figure: b"")
     steps = f"STEPS-{len(stages)}"
     for line in (f"ingest ACQ --out {steps}", *(f"{stage} {steps}" for stage in stages[1:])):
-        out, err = typed(bench_run, f"{line} --cluster sync --memory 1GiB")
+        out, err = typed(bench_run, f"{line} --cluster sync --memory 3GiB")
         assert out.startswith(f"{line.split()[0]}: {steps}/{line.split()[0]} (written)\n")
         assert "━" not in out
         assert "━" in err
