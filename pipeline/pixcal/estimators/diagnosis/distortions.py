@@ -27,10 +27,8 @@ _TURNS = 4
 _INDEPENDENT = 1e-3
 _NEGLIGIBLE = 1e-6
 
-# steps, all with the slopes of no distortion: each gains a factor of the distortion's size, until
-# all sizes together move by less than this many standard errors
-_ROUNDS = 8
-_STILL = 0.1
+# steps, all with the slopes of no distortion; each gains a factor of the distortion's size
+_ROUNDS = 3
 
 
 class Freedom:
@@ -168,10 +166,7 @@ def fit_distortions(
     sizes = np.zeros(count)
     for _ in range(_ROUNDS):
         right = sum(fit.right(sizes) for fit in fits) + information * (known - sizes)
-        step = covariance @ right
-        sizes = sizes + step
-        if right @ step < _STILL**2:
-            break
+        sizes = sizes + covariance @ right
     return sizes, covariance
 
 
