@@ -168,7 +168,7 @@ def test_what_the_rows_leave_in_the_maps_is_undone(shutter: RollingShutter) -> N
         samples[:-1] += after[:, None] * (plain[1:] - plain[:-1])
         samples[1:] += before[:, None] * (plain[:-1] - plain[1:])
     fitted, g = fit_jointly(samples, theta, g)
-    frames = FittedFrames(g, ny, 0.0, exptime, 0.14, vectors_free=False)
+    frames = FittedFrames(g, (0, ny), 0.0, exptime, 0.14, vectors_free=False)
     undone = shutter.undo(FringeMaps(fitted, (2 * np.pi / 7.3, 0.05), frames=frames))
     assert undone is not None
 
@@ -181,6 +181,31 @@ def test_what_the_rows_leave_in_the_maps_is_undone(shutter: RollingShutter) -> N
 
     assert moved(fitted) > 2e-4
     assert moved(undone.theta) < 0.12 * moved(fitted)
+
+
+@pytest.mark.parametrize("first", [0, 700])
+def test_a_piece_is_undone_as_the_whole(first: int) -> None:
+    """Also where it goes on beyond the window, or the window is simulated by itself."""
+    ny, nx, halo = 29, 41, 8
+    y, x = np.indices((ny + 2 * halo, nx), float)
+    psi = 0.8 * x + 0.05 * y
+    theta = np.stack([np.full(psi.shape, 2e4), 1.8e4 * np.sin(psi), 1.8e4 * np.cos(psi)])
+    phi = np.random.default_rng(3).uniform(0, 2 * np.pi, 30)
+    g = np.stack([np.ones(30), np.cos(phi), np.sin(phi)], axis=1)
+    frames = FittedFrames(g, (first, ny), 16.0, 0.02, 0.14, vectors_free=True)
+    shutter = RollingShutter(0.0, settling=RINGING)
+
+    def change(rows: slice, origin: int) -> np.ndarray:
+        maps = FringeMaps(theta[:, rows], (0.8, 0.05), (first + origin, 0), frames=frames)
+        undone = shutter.undo(maps)
+        assert undone is not None
+        return undone.theta - maps.theta
+
+    whole = change(slice(halo, ny + halo), 0)
+    assert np.abs(whole).max() > 10
+    beyond = change(slice(None), -halo)
+    np.testing.assert_allclose(beyond[:, halo:-halo], whole, atol=0.01)
+    np.testing.assert_allclose(change(slice(halo + 5, halo + 19), 5), whole[:, 5:19], atol=0.01)
 
 
 def test_frames_that_are_not_known_undo_nothing() -> None:

@@ -22,8 +22,8 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 FALLOFF_PX = 0.5  # of the shift of boundaries by the brighter-fatter effect beside the response
-# levels, as shares of the brightest, at which a response is measured; with more of them it takes
-# after moving boundaries (brighter-fatter) where all fringes have the same spacing
+# levels, as shares of the brightest, at which a response is measured; a finer curve imitates
+# moving boundaries (brighter-fatter) where all fringes have the same spacing
 KNOTS = np.array([0, 1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 3 / 4, 7 / 8, 1])
 # chi-square of a measured response beside a polynomial, over that of the polynomial, from which it
 # is told

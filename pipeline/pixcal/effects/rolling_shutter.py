@@ -8,7 +8,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.frame_series.row_ramp import RowRamp, enough_for_rows, enough_frames
 from pixcal.estimators.frame_series.row_settling import find_settling, profile, steps_of
-from pixcal.estimators.maps.imprint import imprint
+from pixcal.estimators.maps.imprint import imprint, left_in_samples
 from pixcal.kernels.synthesis import illuminate
 from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench
@@ -139,11 +139,12 @@ class RollingShutter(Effect):
             return None
         flat = 1.0 if maps.flat is None else maps.flat
         theta = maps.theta * flat
-        rows = slice(maps.origin[0], maps.origin[0] + theta.shape[1])
+        first, count = maps.frames.rows
+        # Pixels beyond the window are like those at its edge.
+        rows = np.clip(maps.origin[0] - first + np.arange(theta.shape[1]), 0, count - 1)
         g, noise = maps.frames.g, maps.frames.read_noise_e
         for share, change in self._changes(maps.frames):
-            moved, _ = imprint(theta, g, change, noise)
-            theta = theta - share[rows, None] * moved
+            theta = theta - share[rows, None] * imprint(theta, g, change, noise)
         return replace(maps, theta=theta / flat)
 
     def noise_factor(self, charge: float, read_noise: float, maps: FringeMaps) -> F64:
@@ -152,7 +153,7 @@ class RollingShutter(Effect):
         if maps.frames is not None:
             g, noise = maps.frames.g, maps.frames.read_noise_e
             for share, change in self._changes(maps.frames):
-                left = left + share**2 * imprint(maps.theta, g, change, noise)[1]
+                left = left + share**2 * left_in_samples(maps.theta, g, change, noise)
         return np.full(maps.theta.shape[1:], (1 + np.median(left)) ** -0.5)
 
     def _changes(self, frames: FittedFrames) -> Iterator[tuple[F64, F64]]:
@@ -161,7 +162,7 @@ class RollingShutter(Effect):
         Without what the frames' own parameters take up: a share that all rows have and, of the
         phase, one that rises evenly where each frame has a fringe vector of its own.
         """
-        g, rows = frames.g, np.arange(frames.rows, dtype=float)
+        g, rows = frames.g, np.arange(frames.rows[1], dtype=float)
         turned = np.stack([np.zeros(len(g)), -g[:, 2], g[:, 1]], axis=1)
         size = np.maximum(np.sum(turned**2, axis=1), 1e-30)[:, None]
         even = rows - rows.mean()
@@ -183,7 +184,7 @@ class RollingShutter(Effect):
         if any(self.settling):
             phi = np.arctan2(g[:, 2], g[:, 1])
             step = steps_of(phi, -1 if self.of_step == "last" else 1, self.origin_rad)
-            yield profile(self.settling, rows / max(frames.rows - 1, 1)), step[:, None] * turned
+            yield profile(self.settling, rows / max(frames.rows[1] - 1, 1)), step[:, None] * turned
 
     @classmethod
     def estimate(cls, evidence: Evidence) -> Estimate | None:

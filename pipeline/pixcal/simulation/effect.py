@@ -34,7 +34,9 @@ class FittedFrames:
     """The frames that maps were fitted to, for effects that depend on their order."""
 
     g: F64  # (t, 3) intensity, and amplitude times cosine and sine of the phase
-    rows: int  # of the detector's window
+    # first and number of the rows that effects along rows extend over: those of the window or,
+    # where a part is simulated by itself, of the part
+    rows: tuple[int, int]
     read_noise_e: float
     exptime_s: float
     period_s: float

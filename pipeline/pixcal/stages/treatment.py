@@ -168,7 +168,7 @@ def fitted_shapes(run_dir: Path) -> tuple[str, Mapping[str, str]]:
 def treatment_of_kind(kind: type[Effect], model: str, models: Mapping[str, str]) -> tuple[str, str]:
     """How a kind of effect is treated, and why; parameters as in `treatments`."""
     if kind.undo is not Effect.undo:
-        return "undone on maps", "it acts linearly on the maps of the fit"
+        return "undone on maps", "its change of the maps is computed and removed"
     if kind.undo_samples is not Effect.undo_samples:
         return (
             "undone on samples",

@@ -10,11 +10,21 @@ import numpy as np
 from pixcal.model.arrays import F64
 
 PHASES = 64  # spread over a fringe
-LEAST_SIGNAL = 1.0  # of a sample (e-), below which its shot noise is not taken
+MIN_SIGNAL = 1.0  # of a sample (e-), below which its shot noise is not taken
 
 
-def imprint(theta: F64, g: F64, change: F64, read_noise_e: float) -> tuple[F64, float]:
-    """Change of the maps for a change of the frames' parameters, and the noise that it leaves.
+def usual_fringe(theta: F64, count: int) -> tuple[F64, F64]:
+    """Phases (count,) spread over a fringe, and the maps (3, count) of pixels of the usual light.
+
+    Of maps (3, ...), as those of `imprint`.
+    """
+    psi = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    mean, amplitude = np.median(theta[0]), np.median(np.hypot(theta[1], theta[2]))
+    return psi, np.stack([np.full(count, mean), amplitude * np.sin(psi), amplitude * np.cos(psi)])
+
+
+def imprint(theta: F64, g: F64, change: F64, read_noise_e: float) -> F64:
+    """Change (3, y, x) of the maps, e-, for a change of the frames' parameters.
 
     Parameters
     ----------
@@ -24,25 +34,35 @@ def imprint(theta: F64, g: F64, change: F64, read_noise_e: float) -> tuple[F64, 
         Intensity, and amplitude times cosine and sine of the phase, of each frame as fitted; and
         by how much they differ for the pixels.
     read_noise_e : float
-
-    Returns
-    -------
-    moved : (3, y, x) float64
-        What the maps take up, e-.
-    left : float
-        Mean square of what is left in the samples, in units of their noise.
     """
-    psi = np.linspace(0, 2 * np.pi, PHASES, endpoint=False)
-    mean, amplitude = np.median(theta[0]), np.median(np.hypot(theta[1], theta[2]))
-    usual = np.stack([np.full(PHASES, mean), amplitude * np.sin(psi), amplitude * np.cos(psi)])
-    weight = 1 / (np.maximum(g @ usual, LEAST_SIGNAL) + read_noise_e**2)
-    normal = np.einsum("tp,ti,tj->pij", weight, g, g)
-    taken = np.linalg.solve(normal, np.einsum("tp,ti,tj->pij", weight, g, change))
-    rest = change @ usual - np.einsum("ti,pij,jp->tp", g, taken, usual)
-    left = float(np.mean(weight * rest**2))
+    psi, usual = usual_fringe(theta, PHASES)
+    taken = _taken(g, change, _weight(g @ usual, read_noise_e))
     at = np.arctan2(theta[1], theta[2])
     moved = np.empty_like(theta)
     for i in range(3):
         of_each = [np.interp(at, psi, taken[:, i, j], period=2 * np.pi) for j in range(3)]
         moved[i] = np.einsum("jyx,jyx->yx", np.stack(of_each), theta)
-    return moved, left
+    return moved
+
+
+def left_in_samples(theta: F64, g: F64, change: F64, read_noise_e: float) -> float:
+    """Mean square of what the maps do not take up, in units of the noise of the samples.
+
+    Parameters as of `imprint`.
+    """
+    _, usual = usual_fringe(theta, PHASES)
+    weight = _weight(g @ usual, read_noise_e)
+    taken = _taken(g, change, weight)
+    rest = change @ usual - g @ np.einsum("pij,jp->ip", taken, usual)
+    return float(np.mean(weight * rest**2))
+
+
+def _weight(signal: F64, read_noise_e: float) -> F64:
+    return 1 / (np.maximum(signal, MIN_SIGNAL) + read_noise_e**2)
+
+
+def _taken(g: F64, change: F64, weight: F64) -> F64:
+    """What the fit of a pixel takes of the change: matrices (pixel, 3, 3) on its maps."""
+    normal = np.einsum("tp,ti,tj->pij", weight, g, g, optimize=True)
+    right = np.einsum("tp,ti,tj->pij", weight, g, change, optimize=True)
+    return np.linalg.solve(normal, right)

@@ -75,7 +75,7 @@ class Swept:
         """The frames that were fitted."""
         g, dk, time = (ArrayReader(self.folder / name).read() for name in ("g", "dk", "time"))
         period = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-        rows, free = self.source.shape[0], bool(np.any(dk))
+        rows, free = (0, self.source.shape[0]), bool(np.any(dk))
         return FittedFrames(g, rows, self.read_noise, self.exptime_s, period, free)
 
     @property

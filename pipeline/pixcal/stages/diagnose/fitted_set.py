@@ -22,7 +22,7 @@ TWO_BEAMS = 2
 class FittedSet:
     """What was fitted of a fringe set."""
 
-    theta: F64  # (3, y, x) naN in bad pixels
+    theta: F64  # (3, y, x) NaN in bad pixels
     delta: F64  # delta, sigma: (y, x) offset and its error, px; NaN in bad pixels
     sigma: F64
     k: tuple[float, float]  # rad/px
@@ -80,7 +80,7 @@ class FittedSet:
     @cached_property
     def offsets(self) -> OffsetModel:
         """Offsets that can be true."""
-        return true_offsets(self.delta, self.sigma, np.arctan2(*filled(self.theta, self.k)[1:]))
+        return true_offsets(self.delta, self.sigma, np.arctan2(*self.maps.theta[1:]))
 
 
 def light_surface(theta: F64, good: Mask) -> F64:

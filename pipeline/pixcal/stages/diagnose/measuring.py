@@ -189,12 +189,12 @@ def _fitted(evidence: Sequence[Evidence], name: str, flat: F64 | None) -> Fitted
         evidence[0].origin,
         flat,
         one.name,
-        frames=_frames(found, turns, read_noise_e),
+        frames=_frames(found, turns, read_noise_e, evidence[0].origin[0]),
     )
 
 
 def _frames(
-    found: Sequence[FringeEvidence], turns: Sequence[float], read_noise_e: float
+    found: Sequence[FringeEvidence], turns: Sequence[float], read_noise_e: float, first_row: int
 ) -> FittedFrames:
     """All frames, with their phases turned along with the maps."""
     wave = np.concatenate(
@@ -203,7 +203,7 @@ def _frames(
     g = np.stack([np.concatenate([f.g[:, 0] for f in found]), wave.real, wave.imag], axis=1)
     one = found[0]
     period = float(np.median(np.diff(one.time_s))) if len(one.time_s) > 1 else 0.0
-    rows = one.good.shape[0]
+    rows = first_row, one.good.shape[0]
     free = any(bool(np.any(f.dk)) for f in found)
     return FittedFrames(g, rows, read_noise_e, one.exptime_s, period, free)
 

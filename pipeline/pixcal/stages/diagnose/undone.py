@@ -10,6 +10,7 @@ from typing import Self
 
 import numpy as np
 
+from pixcal.estimators.maps.imprint import MIN_SIGNAL, usual_fringe
 from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import SimulatedDetector
 from pixcal.simulation.effect import Effect, FringeMaps
@@ -19,7 +20,6 @@ MAP_PHASES = 12  # spread over a fringe, at which an effect on samples is undone
 _PHASES = 2 * np.pi * np.arange(MAP_PHASES) / MAP_PHASES
 _EVEN = np.stack([np.ones(MAP_PHASES), np.cos(_PHASES), np.sin(_PHASES)], axis=1)
 TURNS = 5  # of the fits of pixels and frames: each gains a factor of three or more
-MIN_SIGNAL = 1.0  # of a sample (e-), below which its shot noise is not taken
 ACROSS = 9  # pixels along the side of a frame whose level is undone
 
 
@@ -137,9 +137,7 @@ def _taken_by_frames(g: F64, light: F64) -> F64:
 
     By fitting pixels and frames in turn, on pixels of the usual light spread over a fringe.
     """
-    mean, amplitude = np.median(light[0]), np.median(np.hypot(light[1], light[2]))
-    psi = np.linspace(0, 2 * np.pi, 2 * MAP_PHASES, endpoint=False)
-    usual = np.stack([np.full_like(psi, mean), amplitude * np.sin(psi), amplitude * np.cos(psi)])
+    psi, usual = usual_fringe(light, 2 * MAP_PHASES)
     weight = 1 / np.maximum(g @ usual, MIN_SIGNAL)
     of_pixels = np.einsum("tp,ti,tj->pij", weight, g, g)
     of_frames = np.einsum("tp,ip,jp->tij", weight, usual, usual)
