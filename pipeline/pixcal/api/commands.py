@@ -7,6 +7,7 @@ is quick.
 
 import warnings
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,10 @@ from pixcal.model.errors import InputError
 from pixcal.storage.artefact import read_json
 
 Json = dict[str, Any]
+
+
+def _stage(name: str) -> Any:
+    return import_module(f"pixcal.stages.{name}")
 
 
 def _json(file: Path) -> Json:
@@ -43,10 +48,10 @@ def run(
         In one line, with the file, key or option that is wrong. A diagnosis or correction
         that is not possible is a warning.
     """
-    from pixcal.stages import chain
-
     notes: list[str] = []
-    chain.run(Path(acquisition), Path(out), options, runtime or Runtime(), note=notes.append)
+    _stage("chain").run(
+        Path(acquisition), Path(out), options, runtime or Runtime(), note=notes.append
+    )
     for note in notes:
         warnings.warn(note, stacklevel=3)
     return open_run(out)
@@ -63,9 +68,7 @@ def ingest(
     InputError
         If a file, key or option is wrong.
     """
-    from pixcal.stages import ingest as stage
-
-    stage.run(Path(acquisition), Path(out), options, runtime or Runtime())
+    _stage("ingest").run(Path(acquisition), Path(out), options, runtime or Runtime())
     return open_run(out)
 
 
@@ -78,9 +81,7 @@ def reduce(run: StrPath, options: of.Reduce, *, runtime: Runtime | None = None) 
     InputError
         If the run was not ingested, or its gain is to be measured and cannot be.
     """
-    from pixcal.stages import reduce as stage
-
-    stage.run(Path(run), options, runtime or Runtime())
+    _stage("reduce").run(Path(run), options, runtime or Runtime())
     return open_run(run)
 
 
@@ -94,15 +95,10 @@ def fit(run: StrPath, options: of.Fit, *, runtime: Runtime | None = None) -> Run
         If the run was not reduced, or holds no fringes that can be fitted; with a diagnosis, if
         there is none.
     """
-    from pixcal.stages import correct
-    from pixcal.stages import fit as stage
-
     if options.own and not options.with_diagnosis:
-        raise InputError(
-            "pixcal.fit: own: has an effect only with with_diagnosis; give that as well"
-        )
-    body = correct.run if options.with_diagnosis else stage.run
-    body(Path(run), options, runtime or Runtime())
+        raise InputError("pixcal.fit: own: has an effect only with with_diagnosis; give both")
+    name = "correct" if options.with_diagnosis else "fit"
+    _stage(name).run(Path(run), options, runtime or Runtime())
     return open_run(run)
 
 
@@ -115,9 +111,7 @@ def allan(run: StrPath, options: of.Allan, *, runtime: Runtime | None = None) ->
     InputError
         If the run was not fitted, or a region is not inside its window.
     """
-    from pixcal.stages import allan as stage
-
-    stage.run(Path(run), options, runtime or Runtime())
+    _stage("allan").run(Path(run), options, runtime or Runtime())
     return open_run(run)
 
 
@@ -135,9 +129,7 @@ def write_report(run: StrPath, options: of.Report, *, runtime: Runtime | None = 
     InputError
         If the run was not reduced.
     """
-    from pixcal.stages import report as stage
-
-    stage.run(Path(run), options, runtime or Runtime())
+    _stage("report").run(Path(run), options, runtime or Runtime())
     return open_run(run)
 
 
@@ -155,9 +147,7 @@ def crests(run: StrPath, options: of.Crests, *, runtime: Runtime | None = None) 
     InputError
         If the run was not reduced, or a set has too few fringes.
     """
-    from pixcal.stages import crests as stage
-
-    stage.run(Path(run), options, runtime or Runtime())
+    _stage("crests").run(Path(run), options, runtime or Runtime())
     return _json(Path(run) / "crests" / "crests.json")
 
 
@@ -175,9 +165,7 @@ def diagnose(run: StrPath, options: of.Diagnose, *, runtime: Runtime | None = No
     InputError
         If the run was not reduced, or an effect is not known.
     """
-    from pixcal.stages import diagnose as stage
-
-    stage.run(Path(run), options, runtime or Runtime())
+    _stage("diagnose").run(Path(run), options, runtime or Runtime())
     return _json(Path(run) / "products" / "diagnosis.json")
 
 
@@ -195,9 +183,7 @@ def astrometry(run: StrPath, options: of.Astrometry, *, runtime: Runtime | None 
     InputError
         If the run was not fitted, or the truth is not that of this detector.
     """
-    from pixcal.stages import astrometry as stage
-
-    stage.run(Path(run), options, runtime or Runtime())
+    _stage("astrometry").run(Path(run), options, runtime or Runtime())
     return _json(Path(run) / "products" / "astrometry.json")
 
 
@@ -217,9 +203,7 @@ def compare(
     InputError
         If a run was not fitted, or the windows differ.
     """
-    from pixcal.stages import compare as stage
-
-    stage.run([Path(one) for one in runs], Path(out), options, runtime or Runtime())
+    _stage("compare").run([Path(one) for one in runs], Path(out), options, runtime or Runtime())
     return _json(Path(out) / "compare.json")
 
 
@@ -237,9 +221,8 @@ def budget(bench: StrPath, options: of.Budget, *, out: StrPath | None = None) ->
     InputError
         If the bench cannot be read, or its frames determine nothing.
     """
-    from pixcal.stages import budget as stage
-
-    return stage.run(Path(bench), options, None if out is None else Path(out))
+    result: Json = _stage("budget").run(Path(bench), options, None if out is None else Path(out))
+    return result
 
 
 @function_of(of.Simulate)
@@ -258,7 +241,5 @@ def simulate(
     InputError
         If the bench is wrong, or a directory holds what simulate did not put there.
     """
-    from pixcal.stages import simulate as stage
-
-    stage.run(Path(bench), Path(out), options, runtime or Runtime())
+    _stage("simulate").run(Path(bench), Path(out), options, runtime or Runtime())
     return Path(out)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,6 @@ from pixcal.storage.cube import ArrayReader
 from pixcal.storage.lock import damage_noted
 from pixcal.storage.products import read_map
 from pixcal.storage.stage import read_acquisition, require
-
-if TYPE_CHECKING:
-    pass
-
 
 DETECTOR_MAPS = ("bias", "dark_rate", "flat", "read_noise", "mask")
 SERIES = ("time", "B", "A", "phi", "dkx", "dky")

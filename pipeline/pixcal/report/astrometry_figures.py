@@ -11,7 +11,15 @@ from matplotlib.transforms import Bbox
 
 from pixcal.model.arrays import F64
 from pixcal.report.colours import BLUE, DIVERGING, GREEN, GREY, INK, RED, SEQUENTIAL
-from pixcal.report.drawing import WIDE, Unit, finish, new_figure, unit_for
+from pixcal.report.drawing import (
+    WIDE,
+    Unit,
+    draw_blocks,
+    finish,
+    new_figure,
+    second_axis,
+    unit_for,
+)
 
 PERFECT, MEASURED = RED, BLUE
 LABELS = {"perfect": "perfect grid", "measured": "measured maps"}
@@ -116,8 +124,7 @@ def _against_electrons(axes: Axes, view: AstrometryView) -> None:
     axes.set_xlim(electrons[0], electrons[-1])
     axes.set(xlabel="photo-electrons of the star (e-)", ylabel="error, one position (px)")
     axes.legend(fontsize=7.5, loc="upper right", framealpha=0.95)
-    finish(axes)
-    _on_the_sky(axes, view)
+    _finish_with_sky(axes, view)
 
 
 def _against_positions(axes: Axes, view: AstrometryView) -> None:
@@ -146,33 +153,20 @@ def _against_positions(axes: Axes, view: AstrometryView) -> None:
     axes.set_xticks(positions, [f"{n:g}" for n in positions])
     axes.minorticks_off()
     axes.set_ylim(0.4 * min(values), 2 * max(values))
-    axes.set(
-        xlabel="positions averaged (dotted: independent)", ylabel="error with photon noise (px)"
-    )
+    axes.set_xlabel("positions averaged (dotted: independent)")
+    axes.set_ylabel("error with photon noise (px)")
+    _finish_with_sky(axes, view)
+
+
+def _finish_with_sky(axes: Axes, view: AstrometryView) -> None:
     finish(axes)
-    _on_the_sky(axes, view)
-
-
-def _on_the_sky(axes: Axes, view: AstrometryView) -> None:
-    scale = view.uas_per_px
-
-    def to_sky(px: Any) -> Any:
-        return px * scale
-
-    def to_pixels(uas: Any) -> Any:
-        return uas / scale
-
-    sky = axes.secondary_yaxis("right", functions=(to_sky, to_pixels))
-    sky.set_ylabel("µas", labelpad=-2)
+    second_axis(axes, "right", view.uas_per_px).set_ylabel("µas", labelpad=-2)
 
 
 def _weights(figure: SubFigure, axes: Axes, view: AstrometryView) -> None:
     half = view.weights.shape[0] // 2
     top = float(np.max(np.abs(view.weights)))
-    drawn = axes.imshow(
-        view.weights, origin="lower", cmap=DIVERGING, vmin=-top, vmax=top, interpolation="nearest",
-        extent=(-half - 0.5, half + 0.5, -half - 0.5, half + 0.5),
-    )  # fmt: skip
+    drawn = draw_blocks(axes, view.weights, 1, (-half, -half), cmap=DIVERGING, vmin=-top, vmax=top)
     name = next(iter(view.result["axes"]))
     axes.set(xlabel="px from the star", title=f"weight of a pixel's offset, {name}")
     axes.title.set_fontsize(9.5)
@@ -184,13 +178,9 @@ def _detail(figure: SubFigure, view: AstrometryView) -> None:
     finite = np.abs(view.detail[np.isfinite(view.detail)])
     top = float(np.quantile(finite, 0.99)) if finite.size else 1.0
     unit = unit_for([top], "px")
-    (y0, x0), (ny, nx) = view.detail_at, view.detail.shape[1:]
+    span: Any = {"cmap": DIVERGING, "vmin": -unit.factor * top, "vmax": unit.factor * top}
     for axes, image, grid in zip(panels, view.detail, LABELS, strict=True):
-        drawn = axes.imshow(
-            unit.factor * image, origin="lower", cmap=DIVERGING, interpolation="nearest",
-            vmin=-unit.factor * top, vmax=unit.factor * top,
-            extent=(x0 - 0.5, x0 + nx - 0.5, y0 - 0.5, y0 + ny - 0.5),
-        )  # fmt: skip
+        drawn = draw_blocks(axes, unit.factor * image, 1, view.detail_at, **span)
         _map_labels(axes, f"error of a star at each place, {LABELS[grid]}")
     name = next(iter(view.result["axes"]))
     _bar(figure, panels, drawn, unit, f"along {name}")
@@ -198,19 +188,15 @@ def _detail(figure: SubFigure, view: AstrometryView) -> None:
 
 def _everywhere(figure: SubFigure, view: AstrometryView) -> None:
     panels: Any = figure.subplots(1, 2)
-    (ny, nx), side = view.rms.shape[1:], view.block
+    (height, width), side = view.result["detector"]["shape"], view.block
     for axes, image, grid in zip(panels, view.rms, LABELS, strict=True):
         finite = image[np.isfinite(image)]
         low, high = np.quantile(finite, [0.01, 0.99]) if finite.size else (0.0, 1.0)
         unit = unit_for([high], "px")
-        drawn = axes.imshow(
-            unit.factor * image, origin="lower", cmap=SEQUENTIAL, interpolation="nearest",
-            vmin=unit.factor * low, vmax=unit.factor * max(high, low * 1.001 + 1e-12),
-            extent=(-0.5, nx * side - 0.5, -0.5, ny * side - 0.5),
-        )  # fmt: skip
-        height, width = view.result["detector"]["shape"]
-        axes.set_xlim(-0.5, width - 0.5)
-        axes.set_ylim(-0.5, height - 0.5)
+        ends = unit.factor * low, unit.factor * max(high, low * 1.001 + 1e-12)
+        shown = unit.factor * image
+        drawn = draw_blocks(axes, shown, side, cmap=SEQUENTIAL, vmin=ends[0], vmax=ends[1])
+        axes.set(xlim=(-0.5, width - 0.5), ylim=(-0.5, height - 0.5))
         _map_labels(axes, f"rms of {side} × {side} px, {LABELS[grid]}")
         _bar(figure, axes, drawn, unit, "rms")
 

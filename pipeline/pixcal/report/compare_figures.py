@@ -14,7 +14,7 @@ from pixcal.model.arrays import F64, I64
 from pixcal.report.colours import BAND, BLUE, DIVERGING, GREEN, GREY, INK, RED, SEQUENTIAL
 from pixcal.report.drawing import (
     WIDE,
-    covered,
+    draw_blocks,
     finish,
     limits,
     new_figure,
@@ -144,11 +144,9 @@ def _places(figure: SubFigure, axes: Axes, view: ComponentView) -> None:
     """Blocks: by how many sigma their means differ; those whose pixels scatter are framed."""
     (ny, nx), side = view.window, view.facts["blocks"]["side_px"]
     scattered = np.argwhere(np.nan_to_num(view.scatter) > SHIFT_SPAN)
-    drawn = axes.imshow(
-        np.ma.masked_invalid(view.shift), origin="lower", cmap=DIVERGING, aspect="equal",
-        vmin=-SHIFT_SPAN, vmax=SHIFT_SPAN, interpolation="nearest",
-        extent=covered(view.shift.shape, side),
-    )  # fmt: skip
+    drawn = draw_blocks(
+        axes, view.shift, side, cmap=DIVERGING, vmin=-SHIFT_SPAN, vmax=SHIFT_SPAN, aspect="equal"
+    )
     for y, x in scattered:
         corner = x * side - 0.5, y * side - 0.5
         axes.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=INK, linewidth=1.1))

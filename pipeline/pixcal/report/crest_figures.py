@@ -9,11 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure, SubFigure
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from pixcal.model.arrays import F64, I64, Indices, Mask
 from pixcal.report.colours import BLUE, GREY, INK, RED, SEQUENTIAL
-from pixcal.report.drawing import WIDE, covered, finish, new_figure
+from pixcal.report.drawing import WIDE, draw_blocks, finish, new_figure, note
 
 SHOWN_PATHS = 4  # paths of each end (paper, figure 16)
 LONG_TITLE = 10  # points, so that numbers of many digits stay within their panel
@@ -121,43 +122,29 @@ def _stretched(axes: Axes, view: CrestView, paths: I64, title: str) -> None:
     foot = low - 0.09 * (high - low)
     left = axes.get_xlim()[0]
     axes.plot([left, left + length], [foot, foot], color=INK, linewidth=3, solid_capstyle="butt")
-    axes.annotate(
-        f"{length:.3g} px", (left + length, foot), xytext=(5, 0), textcoords="offset points",
-        va="center", fontsize=8,
-    )  # fmt: skip
+    note(axes, f"{length:.3g} px", (left + length, foot), (5, 0), va="center", fontsize=8)
     finish(axes, grid=False)
 
 
 def _whole(axes: Axes, view: CrestView, paths: I64) -> None:
     """The outermost paths over the whole frame, and the fibres before it."""
     ny, nx = view.frame
-    axes.plot(
-        [-0.5, nx - 0.5, nx - 0.5, -0.5, -0.5], [-0.5, -0.5, ny - 0.5, ny - 0.5, -0.5],
-        color=GREY, linewidth=1,
-    )  # fmt: skip
+    axes.add_patch(Rectangle((-0.5, -0.5), nx, ny, fill=False, edgecolor=GREY, linewidth=1))
     x, y = view.arrays["x"], view.arrays["y"]
     for k in paths:
         on = view.on(k)
         axes.plot(x[on], y[on], ".-", color=_colour(int(k)), markersize=3, linewidth=0.7)
     for (x, y), label in zip(view.fibres, ("A", "B"), strict=True):
         axes.plot(x, y, "+", color=INK, markersize=9)
-        axes.annotate(f"$s_{label}$", (x, y), xytext=(4, 4), textcoords="offset points", color=INK)
-    axes.set(
-        xlabel="x (px)",
-        ylabel="y (px)",
-        aspect="equal",
-        title=f"{view.name}: outermost paths, fibres",
-    )
-    axes.set_anchor("C")
+        note(axes, f"$s_{label}$", (x, y), (4, 4), color=INK)
+    title = f"{view.name}: outermost paths, fibres"
+    axes.set(xlabel="x (px)", ylabel="y (px)", aspect="equal", title=title, anchor="C")
     finish(axes, grid=False)
 
 
 def _extract(axes: Axes, view: CrestView, extract: Extract, title: str) -> None:
     (y0, x0), (ny, nx) = extract.start, extract.image.shape
-    axes.imshow(
-        extract.image / 1e3, origin="lower", cmap="gray", interpolation="nearest",
-        extent=covered(extract.image.shape, 1, extract.start),
-    )  # fmt: skip
+    draw_blocks(axes, extract.image / 1e3, 1, extract.start, cmap="gray")
     x, y, every = (view.arrays[name] for name in ("x", "y", "k"))
     for k in np.unique(every):
         axes.plot(x[view.on(k)], y[view.on(k)], color=_colour(int(k)), linewidth=1.2)
@@ -206,12 +193,9 @@ def _map(figure: SubFigure, axes: Axes, view: CrestView, *, by_ratio: bool) -> N
         trace = 1e6 * (arrays["valley_ratio"] / middle - 1)
         axes.plot(arrays["distance"], trace, color="white", linewidth=1, ls="--")
     axes.plot(distance, at, "x", color=RED, markersize=9, markeredgewidth=2)
-    axes.set(xlabel="D (mm)", ylabel=label,
-        title="cost per point, others " + ("refitted" if by_ratio else "held"),
-    )  # fmt: skip
-    axes.set_ylim(values[0], values[-1])
-    bar = figure.colorbar(drawn, ax=axes, pad=0.02)
-    bar.minorticks_off()
+    axes.set(xlabel="D (mm)", ylabel=label, ylim=(values[0], values[-1]))
+    axes.set_title("cost per point, others " + ("refitted" if by_ratio else "held"))
+    figure.colorbar(drawn, ax=axes, pad=0.02).minorticks_off()
 
 
 def _valley(axes: Axes, view: CrestView) -> None:

@@ -32,16 +32,13 @@ LAW_DIFFERS = 0.02  # difference of the shares closed by a cause and by its law 
 
 def causes(result: DiagnosisContents) -> Table:
     """What each cause closes."""
-    rows = [
-        [
-            f"{rank}. {effect_title(result, cause['effect'])}",
-            with_interval(cause["gap_closed"], cause["gap_closed_interval"]),
-            percent(cause["gain_over_rest"]),
-            chance(cause["p_value"]),
-            listed(cause["not_told_apart_from"] or ["–"], "or"),
-        ]
-        for rank, cause in enumerate(result.facts["causes"], 1)
-    ]
+    rows = []
+    for rank, cause in enumerate(result.facts["causes"], 1):
+        title = f"{rank}. {effect_title(result, cause['effect'])}"
+        alone = with_interval(cause["gap_closed"], cause["gap_closed_interval"])
+        alike = listed(cause["not_told_apart_from"] or ["–"], "or")
+        unique = percent(cause["gain_over_rest"])
+        rows.append([title, alone, unique, chance(cause["p_value"]), alike])
     header = [
         "cause", "gap closed alone", "gap reopened when removed", "p-value",
         "indistinguishable from",
@@ -51,17 +48,16 @@ def causes(result: DiagnosisContents) -> Table:
 
 def about_cause(cause: Facts) -> str:
     """What an effect is, its evidence, and its law with the share that this closes by itself."""
-    evidence, size, law = cause.get("why"), cause.get("sigmas"), cause.get("law")
+    sentences = [cause["about"]]
+    if evidence := cause.get("why"):
+        sentences.append(f"Evidence: {evidence.rstrip('.')}.")
+    if size := cause.get("sigmas"):
+        sentences.append(f"Detection significance in the fitted frames: {number(size, 2)}σ.")
+    if law := cause.get("law"):
+        sentences.append(f"Law: {law}.")
     by_law = cause.get("gap_closed_by_law", cause["gap_closed"])
-    sentences = [
-        cause["about"],
-        f"Evidence: {evidence.rstrip('.')}." if evidence else "",
-        f"Detection significance in the fitted frames: {number(size, 2)}σ." if size else "",
-        f"Law: {law}." if law else "",
-        f"The law alone closes {percent(by_law)} of the gap."
-        if abs(by_law - cause["gap_closed"]) > LAW_DIFFERS
-        else "",
-    ]
+    if abs(by_law - cause["gap_closed"]) > LAW_DIFFERS:
+        sentences.append(f"The law alone closes {percent(by_law)} of the gap.")
     return " ".join(filter(None, sentences))
 
 
@@ -112,30 +108,25 @@ def _list_of(name: str, entries: Sequence[Facts], errors: Facts) -> tuple[Table,
     """A list of like mappings, and what is the same in all of them."""
     keys = list(dict.fromkeys(key for entry in entries for key in entry))
     fitted = {k for k in keys if any(f"{name}[{n}].{k}" in errors for n in range(len(entries)))}
-    same = [
-        k for k in keys
-        if len(entries) > 1 and k not in fitted
-        and all(e.get(k) == entries[0].get(k) for e in entries)
-    ]  # fmt: skip
+
+    def cell(n: int, key: str) -> str:
+        value = entries[n].get(key)
+        if key in fitted:
+            return with_error(value, errors.get(f"{name}[{n}].{key}"))
+        return _in_short(value)
+
+    def alike(key: str) -> bool:
+        return key not in fitted and all(e.get(key) == entries[0].get(key) for e in entries)
+
+    same = [k for k in keys if len(entries) > 1 and alike(k)]
     columns = [k for k in keys if k not in same]
-    rows = [
-        [
-            with_error(entry.get(k), errors.get(f"{name}[{n}].{k}"))
-            if k in fitted
-            else _in_short(entry.get(k))
-            for k in columns
-        ]
-        for n, entry in enumerate(entries)
-    ]
+    rows = [[cell(n, k) for k in columns] for n in range(len(entries))]
     return Table(name, columns, rows), ", ".join(f"{k} {_in_short(entries[0][k])}" for k in same)
 
 
 def _is_long(value: Any) -> bool:
-    return (
-        isinstance(value, list)
-        and len(value) > LISTED
-        and all(isinstance(one, (int, float)) for one in value)
-    )
+    long = isinstance(value, list) and len(value) > LISTED
+    return long and all(isinstance(one, (int, float)) for one in value)
 
 
 def _in_short(value: Any) -> str:
@@ -193,14 +184,9 @@ def _row(curve: Facts, causes: bool) -> list[str]:
     measured, nominal = curve["measured"][at], curve["nominal"]["value"][at]
     of = "" if curve["set"] == DETECTOR else f"set {curve['set']}: "
     digits = _digits(measured, nominal)
-    row = [
-        curve["domain"],
-        curve["title"],
-        of + place(curve, at),
-        f"{number(measured, digits)} {unit(curve['unit'])}".strip(),
-        number(nominal, digits),
-        f"{curve['significance']:.1f}",
-    ]
+    value = f"{number(measured, digits)} {unit(curve['unit'])}".strip()
+    row = [curve["domain"], curve["title"], of + place(curve, at), value]
+    row += [number(nominal, digits), f"{curve['significance']:.1f}"]
     if causes:
         left = percent(curve["left"]) if curve["in_gap"] else "new"
         after = number(curve["with_effects"]["value"][at], digits)
@@ -252,19 +238,12 @@ def by_domain(gap: Facts) -> str:
 def rejected(result: DiagnosisContents) -> Table:
     """Candidates that are no causes, the likeliest first."""
     causes = {c["effect"] for c in result.facts["causes"]}
-    tried = sorted(
-        (c for c in result.facts["candidates"] if c["effect"] not in causes),
-        key=lambda c: (-c["gap_closed"], -(c.get("sigmas") or 0.0)),
-    )
-    rows = [
-        [
-            effect_title(result, c["effect"]),
-            _sigma(c["sigmas"]) if "sigmas" in c else "–",
-            percent(c["gap_closed"]) if c.get("tried_on_unseen_frames") else "–",
-            c["rejected_because"],
-        ]
-        for c in tried
-    ]
+    tried = [c for c in result.facts["candidates"] if c["effect"] not in causes]
+    rows = []
+    for c in sorted(tried, key=lambda c: (-c["gap_closed"], -(c.get("sigmas") or 0.0))):
+        size = _sigma(c["sigmas"]) if "sigmas" in c else "–"
+        closed = percent(c["gap_closed"]) if c.get("tried_on_unseen_frames") else "–"
+        rows.append([effect_title(result, c["effect"]), size, closed, c["rejected_because"]])
     header = ["effect", "significance (σ)", "gap closed alone", "reason"]
     return Table("Rejected effects", header, rows)
 

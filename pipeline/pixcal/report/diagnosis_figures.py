@@ -14,7 +14,7 @@ from pixcal.report.colours import BAND, BLUE, GREY, INK, RED
 from pixcal.report.contents import DiagnosisContents
 from pixcal.report.curve_places import axis_label, places
 from pixcal.report.diagnosis_words import DETECTOR, effect_title, percent, unit
-from pixcal.report.drawing import TITLE, WIDE, Unit, axes_grid, finish, plain_ticks, unit_for
+from pixcal.report.drawing import TITLE, WIDE, Unit, axes_grid, finish, note, plain_ticks, unit_for
 
 ROOM = 50  # letters that fit below a panel; where names of places have more, they are turned
 SPAN = 12.0  # ratio of values from which an axis is logarithmic
@@ -52,15 +52,10 @@ def gap(result: DiagnosisContents) -> Figure:
     rest = facts["after"] - sum(b.after for b in parts)
     if causes and parts and rest > 0.001:
         parts.append(Bar("introduced by the causes", 0.0, rest))
-    closed = [
-        Closed(
-            effect_title(result, c["effect"]),
-            c["gap_closed"],
-            tuple(c["gap_closed_interval"]),
-            c["gain_over_rest"],
-        )
-        for c in causes
-    ]
+    closed = []
+    for c in causes:
+        name, ends = effect_title(result, c["effect"]), tuple(c["gap_closed_interval"])
+        closed.append(Closed(name, c["gap_closed"], ends, c["gain_over_rest"]))
     return gap_figure([whole, *sorted(parts, key=lambda b: -b.before)], closed)
 
 
@@ -86,55 +81,53 @@ def _bars(axes: Axes, bars: Sequence[Bar], *, with_after: bool) -> None:
     at = np.arange(len(bars), dtype=float)
     thick = 0.34 if with_after else 0.5
     shift = thick / 2 if with_after else 0.0
-    before = [100 * b.before for b in bars]
-    axes.barh(at - shift, before, thick, color=RED, alpha=0.45, label=ORDER[1])
+    axes.barh(
+        at - shift, [100 * b.before for b in bars], thick, color=RED, alpha=0.45, label=ORDER[1]
+    )
     for y, bar in zip(at, bars, strict=True):
-        _note(axes, 100 * bar.before, y - shift, percent(bar.before))
+        _share(axes, bar.before, y - shift, bar.before)
     if with_after:
-        axes.barh(
-            at + shift, [100 * b.after for b in bars], thick, color=BLUE, label="with the causes"
-        )
+        axes.barh(at + shift, [100 * b.after for b in bars], thick, color=BLUE, label=ORDER[2])
         for y, bar in zip(at, bars, strict=True):
-            end = bar.after
-            if bar.interval is not None:
-                low, high = bar.interval
-                end = max(end, high)
+            low, high = bar.interval or (0.0, bar.after)
+            if bar.interval:
                 axes.plot([100 * low, 100 * high], [y + shift] * 2, color=INK, linewidth=1.6)
-            _note(axes, 100 * end, y + shift, percent(bar.after))
+            _share(axes, max(bar.after, high), y + shift, bar.after)
     axes.set_yticks(at, _domain_names(bars))
-    axes.set_ylim(len(bars) - 0.4, -0.6)
     axes.set_xlim(0, 118 * max([1e-9, *(max(b.before, b.after) for b in bars)]))
-    axes.set_xlabel("share of the gap (%)")
     axes.set_title("the gap by domain", **TITLE)
+    _share_axes(axes, len(bars))
+
+
+def _share(axes: Axes, end: float, y: float, value: float) -> None:
+    """Write a share beside its bar, which ends at ``end``."""
+    note(axes, percent(value), (100 * end, y), (5, 0), va="center", fontsize=9)
+
+
+def _share_axes(axes: Axes, rows: int) -> None:
+    axes.set(xlabel="share of the gap (%)", ylim=(rows - 0.4, -0.6))
     finish(axes)
     axes.grid(visible=False, axis="y")
-
-
-def _note(axes: Axes, x: float, y: float, text: str) -> None:
-    axes.annotate(text, (x, y), (5, 0), textcoords="offset points", va="center", fontsize=9)
 
 
 def _causes(axes: Axes, causes: Sequence[Closed]) -> None:
     for y, cause in enumerate(causes):
         low, high = (100 * v for v in cause.interval)
-        first = y == 0
         axes.plot([low, high], [y, y], color=BLUE, linewidth=3, solid_capstyle="butt")
-        axes.plot(
-            100 * cause.alone, y, "o", color=BLUE, markersize=8,
-            label="closed by the cause alone" if first else None,
-        )  # fmt: skip
-        axes.plot(
-            100 * cause.over_rest, y, "D", color=INK, markersize=7, fillstyle="none",
-            label="reopened when removed" if first else None,
-        )  # fmt: skip
-    axes.set_yticks(range(len(causes)), _cause_names(causes))
-    axes.set_ylim(len(causes) - 0.4, -0.6)
+    rows = range(len(causes))
+    axes.plot(
+        [100 * c.alone for c in causes], rows, "o", color=BLUE, markersize=8,
+        label="closed by the cause alone",
+    )  # fmt: skip
+    axes.plot(
+        [100 * c.over_rest for c in causes], rows, "D", color=INK, markersize=7, fillstyle="none",
+        label="reopened when removed",
+    )  # fmt: skip
+    axes.set_yticks(rows, _cause_names(causes))
     ends = [100 * v for c in causes for v in (*c.interval, c.over_rest, c.alone)]
     axes.set_xlim(min(-3.0, *ends) - 2, max(103.0, *ends) + 2)
-    axes.set_xlabel("share of the gap (%)")
     axes.set_title("what each cause closes", **TITLE)
-    finish(axes)
-    axes.grid(visible=False, axis="y")
+    _share_axes(axes, len(causes))
 
 
 def _domain_names(bars: Sequence[Bar]) -> list[str]:
@@ -176,9 +169,7 @@ def curves_figure(curves: Sequence[Mapping[str, Any]], *, with_effects: bool = T
             below.set_ylabel("deviation (σ)")
     handles, labels = axes[0, 0].get_legend_handles_labels()
     shown = dict(sorted(zip(labels, handles, strict=True), key=lambda pair: ORDER.index(pair[0])))
-    figure.legend(
-        shown.values(), shown, loc="upper center", ncols=3, fontsize=10, frameon=False
-    )  # fmt: skip
+    figure.legend(shown.values(), shown, loc="upper center", ncols=3, fontsize=10, frameon=False)
     return figure
 
 

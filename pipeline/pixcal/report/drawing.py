@@ -6,7 +6,7 @@ Figures are made without pyplot: no state is global, so threads do not interfere
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -161,14 +161,38 @@ def draw_map(
     """A map with x to the right and y upwards, in pixels."""
     ny, nx = summary.shape
     y0, x0 = start
-    shown = np.ma.masked_invalid(summary.image * factor)
-    drawn = axes.imshow(
-        shown, norm=scale.norm, cmap=scale.colours, origin="lower", interpolation="nearest",
-        extent=covered(summary.image.shape, summary.block, start), aspect="auto",
+    drawn = draw_blocks(
+        axes, summary.image * factor, summary.block, start, norm=scale.norm, cmap=scale.colours,
+        aspect="auto",
     )  # fmt: skip
     axes.set(xlim=(x0 - 0.5, x0 + nx - 0.5), ylim=(y0 - 0.5, y0 + ny - 0.5))
     axes.locator_params(nbins=5)
     return drawn
+
+
+def draw_blocks(
+    axes: Axes, image: NDArray[Any], side: int = 1, start: tuple[int, int] = (0, 0), **drawing: Any
+) -> ScalarMappable:
+    """An image of blocks of pixels at its place, y upwards; the first is at ``start`` (y, x)."""
+    return axes.imshow(
+        np.ma.masked_invalid(image), origin="lower", interpolation="nearest",
+        extent=covered(image.shape, side, start), **drawing,
+    )  # fmt: skip
+
+
+def note(
+    axes: Axes, text: str, at: tuple[float, float], aside: tuple[float, float], **style: Any
+) -> None:
+    """A text some points (right, up) aside of a place."""
+    axes.annotate(text, at, aside, textcoords="offset points", **style)
+
+
+def second_axis(axes: Axes, side: Literal["top", "right"], factor: float) -> Any:
+    """The same axis once more, its numbers times a factor."""
+    functions = (lambda v: np.asarray(v) * factor, lambda v: np.asarray(v) / factor)
+    if side == "top":
+        return axes.secondary_xaxis("top", functions=functions)
+    return axes.secondary_yaxis("right", functions=functions)
 
 
 def covered(

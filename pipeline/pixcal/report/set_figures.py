@@ -20,6 +20,7 @@ from pixcal.report.drawing import (
     finish,
     limits,
     plain_ticks,
+    second_axis,
     unit_for,
 )
 from pixcal.report.text import with_error
@@ -193,13 +194,7 @@ def _allan_lines(
     frames, adev, white = curve["frames"], curve["adev_px"], curve["white_expected_px"]
     low, high = curve["adev_lo_px"], curve["adev_hi_px"]
     bars = np.nan_to_num(np.abs(np.stack([adev - low, high - adev])))
-    drawing: dict[str, Any] = {
-        "fmt": "o",
-        "color": color,
-        "elinewidth": 1.3,
-        "capsize": 3,
-        "markersize": 6,
-    }
+    drawing: Any = {"fmt": "o", "color": color, "elinewidth": 1.3, "capsize": 3, "markersize": 6}
     label = f"{name}: measured{_slope_label(measured)}"
     at = frames * aside
     axes.errorbar(at, adev * unit.factor, bars * unit.factor, zorder=3, label=label, **drawing)
@@ -231,8 +226,7 @@ def _add_clock(axes: Axes, frames: F64, seconds: F64) -> None:
     if not len(seconds) or not seconds[0] > 0:
         return
     pace = float(seconds[0] / frames[0])
-    clock = (lambda f: np.asarray(f) * pace, lambda s: np.asarray(s) / pace)
-    top = axes.secondary_xaxis("top", functions=clock)
+    top = second_axis(axes, "top", pace)
     low, high = axes.get_xlim()
     plain_ticks(top.xaxis, pace * low, pace * high, most=9)
     top.set_xlabel("averaging time (s)")

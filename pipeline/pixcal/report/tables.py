@@ -32,8 +32,7 @@ FLAG_WORDS = {
 _GAIN_COLUMNS = ("declared", "measured", "error", "used")
 _REDUCTION_SHOWN = (
     "schema", "warnings", "flags", "figures_of_merit", "gain_e_per_adu", "read_noise_e",
-    "linearity", "sets",
-    "quantisation",
+    "linearity", "sets", "quantisation",
 )  # fmt: skip
 
 
@@ -51,17 +50,10 @@ def allan(measured: Sequence[SetContents]) -> Table:
     rows = []
     for s in measured:
         a = s.allan or {}
-        knee = a.get("knee_frames")
-        rows.append(
-            [
-                s.name,
-                with_error(a.get("slope"), a.get("slope_err")),
-                "none" if knee is None else f"{number(round(knee))} frames",
-                number(a.get("n_batches")),
-                number(a.get("batch_frames")),
-                number(a.get("gaps")) if not isinstance(a.get("gaps"), list) else str(a["gaps"]),
-            ]
-        )
+        knee, gaps = a.get("knee_frames"), a.get("gaps")
+        knee = "none" if knee is None else f"{number(round(knee))} frames"
+        batches = number(a.get("n_batches")), number(a.get("batch_frames")), number(gaps)
+        rows.append([s.name, with_error(a.get("slope"), a.get("slope_err")), knee, *batches])
     header = ["set", "slope", "knee", "batches", "frames a batch", "gaps"]
     return Table("Allan deviation in numbers", header, rows)
 
@@ -87,17 +79,10 @@ def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
     for key, label in (("gain_e_per_adu", "gain (e⁻/ADU)"), ("read_noise_e", "read noise (e⁻)")):
         entry = facts.get(key)
         if isinstance(entry, Mapping):
+            declared, used = (number(entry.get(k), 4) for k in ("declared", "used"))
             measured = with_error(entry.get("measured"), entry.get("error"))
-            others = {k: v for k, v in entry.items() if k not in _GAIN_COLUMNS}
-            rows.append(
-                [
-                    label,
-                    number(entry.get("declared"), 4),
-                    measured,
-                    number(entry.get("used"), 4),
-                    "; ".join(f"{k.replace('_', ' ')} {_plain(v)}" for k, v in others.items()),
-                ]
-            )
+            others = {k.replace("_", " "): v for k, v in entry.items() if k not in _GAIN_COLUMNS}
+            rows.append([label, declared, measured, used, _listed(others)])
     if rows:
         yield Table("Gain and read noise", ["", "declared", "measured", "used", ""], rows)
     straight = facts.get("linearity") or {}
@@ -116,6 +101,10 @@ def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
         yield Table("Other numbers of the reduction", ["quantity", "value"], _flat_rows(rest))
 
 
+def _listed(facts: Mapping[str, Any]) -> str:
+    return "; ".join(f"{key} {_plain(value)}" for key, value in facts.items())
+
+
 def merit(facts: Mapping[str, Any]) -> Iterator[Table]:
     """Figures of merit, as in a data sheet of the detector."""
     rows = [
@@ -123,11 +112,8 @@ def merit(facts: Mapping[str, Any]) -> Iterator[Table]:
         for f in (facts.get("figures_of_merit") or {}).values()
     ]
     if rows:
-        yield Table(
-            "Figures of merit (EMVA 1288), with the measured gain",
-            ["figure", "value", "unit", ""],
-            rows,
-        )
+        title = "Figures of merit (EMVA 1288), with the measured gain"
+        yield Table(title, ["figure", "value", "unit", ""], rows)
 
 
 def saturation(facts: Mapping[str, Any]) -> float | None:
@@ -195,29 +181,19 @@ def _list_table(title: str, entries: Sequence[Mapping[str, Any]]) -> Table:
 def _stages(stages: Sequence[StageRecord]) -> Iterator[Table]:
     """What each stage was made from, by key; and the digests of the files."""
     present = {stage.name: stage.key for stage in stages}
-    rows = []
+    rows, files = [], []
     for stage in stages:
         # The acquisition has a table of its own.
         options = {k: v for k, v in stage.config.items() if k != "acquisition"}
         made_from = [
-            name if name not in present or present[name] == key else f"another {name}, {key}"
+            name if present.get(name, key) == key else f"another {name}, {key}"
             for name, key in stage.inputs.items()
         ]
-        rows.append(
-            [
-                stage.name,
-                stage.pixcal,
-                str(stage.format),
-                stage.key,
-                ", ".join(made_from) or "–",
-                "; ".join(f"{k} {_plain(v)}" for k, v in options.items()) or "–",
-            ]
-        )
+        facts = [stage.name, stage.pixcal, str(stage.format), stage.key]
+        rows.append([*facts, ", ".join(made_from) or "–", _listed(options) or "–"])
+        files += [[name, key] for name, key in stage.inputs.items() if name not in present]
     header = ["stage", "pixcal", "format", "key", "made from", "options"]
     yield Table("Stages", header, rows)
-    files = [
-        [name, key] for stage in stages for name, key in stage.inputs.items() if name not in present
-    ]
     if files:
         yield Table("Digests of the files", ["array", "digest"], files)
 
@@ -237,20 +213,13 @@ def _frames(arrays: Sequence[ArrayRecord]) -> Table:
     """What was ingested."""
     rows = []
     for a in arrays:
+        size = "–" if a.shape is None else f"{a.shape[1]}\u00a0×\u00a0{a.shape[0]}"
+        first = "–" if a.first_mjd is None else date_of_mjd(a.first_mjd)
+        length = "–" if a.duration_s is None else duration(a.duration_s)
         exposures = ", ".join(exact(v) for v in a.exptimes_s[:8])
-        rows.append(
-            [
-                a.name,
-                number(a.files),
-                number(a.frames),
-                "–" if a.shape is None else f"{a.shape[1]}\u00a0×\u00a0{a.shape[0]}",
-                "–" if a.first_mjd is None else date_of_mjd(a.first_mjd),
-                "–" if a.duration_s is None else duration(a.duration_s),
-                exposures + (", …" if len(a.exptimes_s) > 8 else "") or "–",
-                _span(a.temperature_c),
-                a.time_source or "–",
-            ]
-        )
+        exposures += ", …" if len(a.exptimes_s) > 8 else ""
+        rows.append([a.name, number(a.files), number(a.frames), size, first, length])
+        rows[-1] += [exposures or "–", _span(a.temperature_c), a.time_source or "–"]
     header = [
         "array", "files", "frames", "x × y", "first frame (UTC)", "duration", "exposures (s)", "°C",
         "times from",

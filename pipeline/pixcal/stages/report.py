@@ -1,8 +1,8 @@
 """Report: one HTML page on the whole run."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import partial
+from operator import call
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +33,8 @@ from pixcal.report.summary import (
     DETAIL,
     SAMPLE,
     SEGMENT,
-    FlagSummary,
-    MapSummary,
     RatioSource,
     Source,
-    Spectrum,
     detail,
     spectrum,
     summarise,
@@ -128,69 +125,44 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
 # Maps
 
 
-@dataclass(frozen=True)
-class _Job:
-    """One pass over a map; ``kind`` says what is computed."""
-
-    name: str
-    kind: str
-    sources: tuple[Source, ...]
-
-
-def _jobs(run_dir: Path, fit: Mapping[str, Any] | None) -> list[_Job]:
-    """Every map to read, once for each summary of it."""
-    calibration = run_dir / "reduce" / "calibration.zarr"
-    jobs = [
-        _Job(f"detector/{name}", "map", (ArrayReader(calibration / name),))
-        for name in DETECTOR_MAPS
-        if (calibration / name / INDEX).exists()
-    ]
-    if (calibration / "mask" / INDEX).exists():
-        jobs.append(_Job("flags/detector", "flags", (ArrayReader(calibration / "mask"),)))
-    if fit is None:
-        return jobs
-    group = run_dir / "fit" / "fit.zarr"
-    for name in fit["outputs"]:
-        delta, sigma = ArrayReader(group / name), ArrayReader(group / f"{name}_sigma")
-        jobs += [
-            _Job(f"{name}/delta", "map", (delta,)),
-            _Job(f"{name}/sigma", "map", (sigma,)),
-            _Job(f"{name}/spectrum", "spectrum", (delta, sigma)),
-            _Job(f"{name}/detail", "detail", (delta, sigma)),
-        ]
-    jobs.append(_Job("flags/products", "flags", (ArrayReader(group / "mask"),)))
-    for name in fit["sets"]:
-        iota, alpha = ArrayReader(group / name / "iota"), ArrayReader(group / name / "alpha")
-        jobs += [
-            _Job(f"set/{name}/iota", "map", (iota,)),
-            _Job(f"set/{name}/visibility", "map", (RatioSource(alpha, iota),)),
-            _Job(f"set/{name}/chi2", "map", (ArrayReader(group / name / "chi2"),)),
-            _Job(f"flags/set/{name}", "flags", (ArrayReader(group / name / "mask"),)),
-        ]
-    return jobs
+def _jobs(run_dir: Path, fit: Mapping[str, Any] | None) -> dict[str, partial[Any]]:
+    """Every summary of a map that the page shows, by name."""
+    calibration, group = run_dir / "reduce" / "calibration.zarr", run_dir / "fit" / "fit.zarr"
+    there = [name for name in (*DETECTOR_MAPS, "mask") if (calibration / name / INDEX).exists()]
+    maps: dict[str, Source] = {f"detector/{n}": ArrayReader(calibration / n) for n in there}
+    masks = {"detector": maps.pop("detector/mask")} if "mask" in there else {}
+    jobs: dict[str, partial[Any]] = {}
+    if fit is not None:
+        for name in fit["outputs"]:
+            both = delta, sigma = ArrayReader(group / name), ArrayReader(group / f"{name}_sigma")
+            maps |= {f"{name}/delta": delta, f"{name}/sigma": sigma}
+            jobs[f"{name}/spectrum"] = partial(spectrum, *both)
+            jobs[f"{name}/detail"] = partial(_detail, *both)
+        masks["products"] = ArrayReader(group / "mask")
+        for name in fit["sets"]:
+            columns = ("iota", "alpha", "chi2", "mask")
+            iota, alpha, chi2, mask = (ArrayReader(group / name / n) for n in columns)
+            maps |= {f"set/{name}/iota": iota, f"set/{name}/chi2": chi2}
+            maps[f"set/{name}/visibility"] = RatioSource(alpha, iota)
+            masks[f"set/{name}"] = mask
+    jobs |= {name: partial(summarise, source) for name, source in maps.items()}
+    return jobs | {f"flags/{n}": partial(summarise_flags, source) for n, source in masks.items()}
 
 
-def _summaries(jobs: Sequence[_Job], runtime: Runtime) -> dict[str, Any]:
+def _summaries(jobs: Mapping[str, partial[Any]], runtime: Runtime) -> dict[str, Any]:
     if not jobs:
         return {}
-    columns = max(job.sources[0].shape[1] for job in jobs)
+    columns = max(job.args[0].shape[1] for job in jobs.values())
     # A band and some copies of it in float64; windows of the spectrum; the sample.
     per_task = 64 * BAND_ROWS * columns + 128 * SEGMENT**2 + 8 * SAMPLE
-    plan = make_plan("the report", per_task, FIGURE_BYTES, runtime)
-    results = run_tasks(_summary, jobs, runtime.with_workers(plan.workers), label="report maps")
-    return {job.name: result for job, result in zip(jobs, results, strict=True)}
+    runtime = runtime.with_workers(make_plan("the report", per_task, FIGURE_BYTES, runtime).workers)
+    results = run_tasks(call, list(jobs.values()), runtime, label="report maps")
+    return dict(zip(jobs, results, strict=True))
 
 
-def _summary(job: _Job) -> MapSummary | FlagSummary | Spectrum | Detail | None:
-    first, *rest = job.sources
-    if job.kind == "flags":
-        return summarise_flags(first)
-    if job.kind == "spectrum":
-        return spectrum(first, rest[0])
-    if job.kind == "detail":
-        (delta, start), (sigma, _) = detail(first), detail(rest[0])
-        return Detail(start, delta, sigma)
-    return summarise(first)
+def _detail(delta: Source, sigma: Source) -> Detail:
+    summary, start = detail(delta)
+    return Detail(start, summary, detail(sigma)[0])
 
 
 def _offset(name: str, results: Mapping[str, Any]) -> MapContents:

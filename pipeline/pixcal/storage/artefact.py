@@ -41,6 +41,7 @@ from pixcal.storage.manifest import (
     read_manifest,
     write_json,
     write_manifest,
+    write_whole,
 )
 from pixcal.storage.place import Local, Place
 
@@ -62,6 +63,7 @@ __all__ = [
     "up_to_date",
     "write_json",
     "write_manifest",
+    "write_whole",
 ]
 
 _KEY_IN_NAME = 16

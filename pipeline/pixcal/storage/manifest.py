@@ -71,10 +71,14 @@ def write_json(path: Local, data: Any) -> None:
     if isinstance(path, MemoryPath):
         # On one line: an indent takes ten times as long, and nobody reads it.
         path.keep(json.dumps(data, allow_nan=False).encode())
-        return
-    text = _json(data)
+    else:
+        write_whole(path, _json(data).encode())
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write a file aside, flush it to the disk, and rename it into place."""
     with written_aside(path, durable=True) as aside:
-        aside.write_text(text, encoding="utf-8")
+        aside.write_bytes(content)
 
 
 def read_json(path: Local) -> Any:

@@ -11,6 +11,7 @@ its frames are those of all sets, in the planned proportions. ``levers`` are cha
 the most helpful first; ``left_out`` and ``warnings`` are sentences.
 """
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -40,8 +41,8 @@ from pixcal.stages.budget.expected import (
     planned_split,
     sample_variance,
 )
-from pixcal.stages.budget.levers import Lever, levers
-from pixcal.storage.artefact import digest, write_json
+from pixcal.stages.budget.levers import levers
+from pixcal.storage.artefact import digest, write_json, write_whole
 
 SCHEMA = "pixcal/budget/1"
 PRECISION_PX = 5e-5  # what the paper asks for (section 1)
@@ -50,6 +51,7 @@ MARGIN = 4.0  # standard deviations that the brightest fringe should keep below 
 DOMINANT = 1.5  # a factor of the frames below this does not limit a set: photons do
 
 Config = Budget
+Reached = tuple[int, float, float]  # frames, and the variances (px²) of the median and worst pixel
 
 
 def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, Any]:
@@ -100,9 +102,7 @@ def _write(out: Path, result: dict[str, Any]) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
         raise InputError(f"--out {out}: is a file; choose another directory") from error
-    aside = out / ".budget.png.aside"
-    aside.write_bytes(png(budget_figure(result)))
-    aside.replace(out / "budget.png")
+    write_whole(out / "budget.png", png(budget_figure(result)))
     write_json(out / "budget.json", result)
 
 
@@ -125,10 +125,18 @@ def _budget(
             for scan, s in zip(f.fringes, bound.sets, strict=True)
         },
         "joined": _joined_facts(bench, bound, split, precision, frames),
-        "levers": [_lever_facts(lever, precision) for lever in levers(bench, bound)],
+        "levers": [
+            asdict(lever) | _time(lever.variance, lever.period_s, precision)
+            for lever in levers(bench, bound)
+        ],
         "left_out": _left_out(bench),
         "warnings": _warnings(bench, bound),
     }
+
+
+def _time(variance: float, period_s: float, precision: float | None) -> dict[str, Any]:
+    frames = None if precision is None else frames_needed(variance, precision)
+    return {"frames": frames, "hours": None if frames is None else frames * period_s / 3600}
 
 
 def _cost(bench: Bench, frames: int) -> dict[str, Any]:
@@ -145,31 +153,46 @@ def _set_facts(
     bench: Bench, s: SetBound, planned: int, precision: float | None, frames: int | None
 ) -> dict[str, Any]:
     median, worst = float(np.median(s.per_frame)), s.worst
-
-    def reached(n: int) -> dict[str, Any]:
-        return {"frames": n, "median_px": (median / n) ** 0.5, "worst_px": (worst / n) ** 0.5}
-
     shares = s.shares()
     factors = {name: value for name, value in shares.items() if name != "photons"}
     largest = max(factors, key=lambda name: factors[name])
-    facts = {
+    if precision is not None:
+        shares["photons_frames"] = frames_needed(shares["photons"], precision)
+
+    def reached(n: int) -> Reached:
+        return n, median / n, worst / n
+
+    given = None if frames is None else reached(frames)
+    return {
         "interfringe_px": s.interfringe,
         "mean_e": float(np.median(s.iota)),
         "visibility": s.visibility,
-        "frame_px": {"median": median**0.5, "worst": worst**0.5},
-        "planned": reached(planned),
-        "given": None if frames is None else reached(frames),
-        "wanted": None,
+        **_precision_facts(bench, reached(1), reached(planned), given, precision),
         "shares": shares,
         "limited_by": largest if factors[largest] > DOMINANT else "photons",
         "calibration": _calibration(bench, s),
     }
+
+
+def _precision_facts(
+    bench: Bench, one: Reached, planned: Reached, given: Reached | None, precision: float | None
+) -> dict[str, Any]:
+    """What one frame and others reach, and the cost of the wanted precision."""
+    _, median, worst = one
+    wanted = None
     if precision is not None:
-        facts["wanted"] = _cost(bench, frames_needed(median, precision)) | {
-            "frames_worst": frames_needed(worst, precision)
-        }
-        shares["photons_frames"] = frames_needed(shares["photons"], precision)
-    return facts
+        wanted = _cost(bench, frames_needed(median, precision))
+        wanted["frames_worst"] = frames_needed(worst, precision)
+    return {
+        "frame_px": {"median": median**0.5, "worst": worst**0.5},
+        "planned": _reached(*planned),
+        "given": None if given is None else _reached(*given),
+        "wanted": wanted,
+    }
+
+
+def _reached(frames: int, median: float, worst: float) -> dict[str, Any]:
+    return {"frames": frames, "median_px": median**0.5, "worst_px": worst**0.5}
 
 
 def _calibration(bench: Bench, s: SetBound) -> dict[str, Any]:
@@ -193,41 +216,23 @@ def _joined_facts(
 ) -> dict[str, Any]:
     """Of each component: its unit is a frame of all sets, shared as planned."""
     counts = [s.count for s in bench.frames.fringes]
-    one = bound.variance(split)
-    median, worst = np.median(one, axis=1), bound.variance(split, worst=True).max(axis=1)
+
+    def reached(shares: Sequence[float] | F64, n: int) -> Reached:
+        median, worst = bound.median(shares)[n], bound.variance(shares, worst=True)[n].max()
+        return round(sum(shares)), float(median), float(worst)
+
     facts = {}
     for n, name in enumerate(bound.components):
-        facts[name] = {
-            "frame_px": {"median": float(median[n]) ** 0.5, "worst": float(worst[n]) ** 0.5},
-            "planned": _reached(bound, counts, n),
-            "given": None if frames is None else _reached(bound, [frames] * len(counts), n),
-            "wanted": None
-            if precision is None
-            else _cost(bench, frames_needed(float(median[n]), precision))
-            | {"frames_worst": frames_needed(float(worst[n]), precision)},
-        }
-    both = None if precision is None else frames_needed(float(median.max()), precision)
+        given = None if frames is None else reached([frames] * len(counts), n)
+        facts[name] = _precision_facts(
+            bench, reached(split, n), reached(counts, n), given, precision
+        )
+    both = float(bound.median(split).max())
     return {
         "components": facts,
-        "wanted": None if both is None else _cost(bench, both),
+        "wanted": None if precision is None else _cost(bench, frames_needed(both, precision)),
         "split": split.tolist(),
         "best_split": bound.best_split().tolist(),
-    }
-
-
-def _reached(bound: JoinedBound, counts: list[int], component: int) -> dict[str, Any]:
-    return {
-        "frames": sum(counts),
-        "median_px": float(np.median(bound.variance(counts)[component])) ** 0.5,
-        "worst_px": float(bound.variance(counts, worst=True)[component].max()) ** 0.5,
-    }
-
-
-def _lever_facts(lever: Lever, precision: float | None) -> dict[str, Any]:
-    frames = None if precision is None else frames_needed(lever.variance, precision)
-    return asdict(lever) | {
-        "frames": frames,
-        "hours": None if frames is None else frames * lever.period_s / 3600,
     }
 
 

@@ -140,7 +140,7 @@ class StructuralLine(NamedTuple):
 class Part:
     """The two maps at one scale, as sums of squares over the window's good pixels (px²)."""
 
-    pixels: int  # good pixels of the window
+    pixels: float  # good pixels of the window
     freedom: float  # degrees of freedom, without those of the removed modes
     first: float  # first, second, both: squares of the maps, and their product
     second: float

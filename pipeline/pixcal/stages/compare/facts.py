@@ -1,5 +1,6 @@
 """What ``compare.json`` says of two sides along one direction, and what its figure shows."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -52,8 +53,8 @@ def describe(
             "beyond_5_sigma": pixels.beyond,
             "expected": float(2 * ndtr(-DISAGREE) * known),
             "worst": [
-                {"x": x, "y": y, "difference_px": d, "error_px": e}
-                for y, x, d, e in pixels.far[:LISTED]
+                dict(zip(("y", "x", "difference_px", "error_px"), one, strict=True))
+                for one in pixels.far[:LISTED]
             ],
         },
     }
@@ -112,17 +113,11 @@ def _amounts(p: Part, accuracy: float) -> dict[str, Any]:
         "common": p.common().facts(),
         "difference_px": (p.difference / p.pixels) ** 0.5,
         "expected_px": (p.expected / p.pixels) ** 0.5,
-        **_against_noise(p, accuracy),
-        "beyond_noise": p.beyond_noise(accuracy).facts(),
-        "own": [estimate.facts() for estimate in p.own(accuracy)],
-    }
-
-
-def _against_noise(p: Part, accuracy: float) -> dict[str, Any]:
-    return {
         "ratio": (p.difference / p.expected) ** 0.5 if p.expected > 0 else None,
         "ratio_error": float(np.hypot((2 * p.freedom) ** -0.5, accuracy)),
         "significance": p.significance(accuracy),
+        "beyond_noise": p.beyond_noise(accuracy).facts(),
+        "own": [estimate.facts() for estimate in p.own(accuracy)],
     }
 
 
@@ -131,21 +126,16 @@ def _profile(p: Part, mean: F64, error: F64, accuracy: float) -> dict[str, Any]:
     if p.freedom < 1 or p.expected <= 0:
         return {"ratio": None, "significance": 0.0, "worst": None, "period": None}
     worst = int(np.argmax(np.abs(np.nan_to_num(mean / error))))
+    at = {"at": worst, "difference_px": float(mean[worst]), "error_px": float(error[worst])}
     wave = strongest_period(mean, error)
     claimed = wave is not None and wave.chance < SHARE
-    pixels = p.freedom * (p.pixels / len(mean))
-    against = _against_noise(p, accuracy)
+    amounts = _amounts(replace(p, pixels=p.freedom * (p.pixels / len(mean))), accuracy)
+    kept = ("ratio", "ratio_error", "significance", "difference_px", "expected_px")
     return {
-        "ratio": against.pop("ratio"),
-        "significance": against.pop("significance"),
-        "worst": {
-            "at": worst, "difference_px": float(mean[worst]), "error_px": float(error[worst])
-        },
+        **{key: amounts[key] for key in kept},
+        "worst": at,
         "period": wave._asdict() if wave is not None and claimed else None,
-        "difference_px": (p.difference / pixels) ** 0.5,
-        "expected_px": (p.expected / pixels) ** 0.5,
-        **against,
-    }  # fmt: skip
+    }
 
 
 def _blocks(pair: Pair, sums: PairSums, pixels: Pixels) -> tuple[dict[str, Any], F64, F64]:
@@ -157,33 +147,30 @@ def _blocks(pair: Pair, sums: PairSums, pixels: Pixels) -> tuple[dict[str, Any],
     count = np.where(squares[1] > 0, squares[1], np.nan)
     chance, square = 2 / (9 * count), squares[0] / count
     scatter = np.asarray((square ** (1 / 3) - (1 - chance)) / np.sqrt(chance))
-    kinds = {"mean": mean / error, "scatter": scatter}
+    shift = mean / error
     number, side = int((squares[1] > 0).sum()), pair.shown
     share = SHARE / max(1, number)
     # Means differ in either direction, scatter only by an excess.
     limits = {"mean": float(-ndtri(share / 2)), "scatter": float(-ndtri(share))}
-    places = [
-        (kind, int(y), int(x))
-        for kind, z in kinds.items()
-        for y, x in np.argwhere((np.abs(z) if kind == "mean" else z) > limits[kind])
-    ]
+    beyond = {"mean": np.abs(shift) > limits["mean"], "scatter": scatter > limits["scatter"]}
     listed: list[dict[str, Any]] = [
         {
             "kind": kind,
             "y": [y * side, (y + 1) * side],
             "x": [x * side, (x + 1) * side],
-            "significance": float(kinds[kind][y, x]),
+            "significance": float((shift if kind == "mean" else scatter)[y, x]),
             "difference_px": float(mean[y, x]),
             "error_px": float(error[y, x]),
             "pull_rms": float(square[y, x] ** 0.5),
         }
-        for kind, y, x in places
+        for kind, where in beyond.items()
+        for y, x in np.argwhere(where).tolist()
     ]
     facts = {
         "side_px": side,
         "number": number,
         "limit_sigma": limits,
-        "beyond": {kind: sum(place[0] == kind for place in places) for kind in kinds},
+        "beyond": {kind: int(where.sum()) for kind, where in beyond.items()},
         "worst": sorted(listed, key=lambda place: -abs(place["significance"]))[:LISTED],
     }
-    return facts, kinds["mean"], scatter
+    return facts, shift, scatter

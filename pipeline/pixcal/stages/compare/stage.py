@@ -34,6 +34,7 @@ from pixcal.storage.artefact import (
     read_manifest,
     write_json,
     write_manifest,
+    write_whole,
 )
 from pixcal.storage.formats import STAGES
 from pixcal.storage.lock import damage_noted, lock
@@ -86,9 +87,7 @@ def _run(sides: Sequence[Side], out: Path, config: Config, runtime: Runtime) -> 
         for view in views:
             first, second = view.numbers
             name = "compare.png" if len(views) == 1 else f"compare-{first}-{second}.png"
-            aside = out / f".{name}.aside"
-            aside.write_bytes(png(compare_figure(view)))
-            aside.replace(out / name)
+            write_whole(out / name, png(compare_figure(view)))
         write_json(out / RESULT, result)
         manifest = Manifest(STAGE.name, STAGE.format, key, plain, inputs)
         write_manifest(out, manifest)
@@ -202,13 +201,13 @@ def _summary(pairs: list[dict[str, Any]], components: Iterable[str]) -> dict[str
 
 def _warnings(sides: Sequence[Side], components: dict[str, Vector]) -> list[str]:
     sentences = []
-    if "delta_fringe" in components:
-        for side in sides:
-            turned = 0.0 if side.both else _angle(side.axes[0], components["delta_fringe"])
-            if turned > NOTED_DEG:
-                share = np.sin(np.radians(turned))
-                sentences.append(
-                    f"{side.label}: fringes rotated by {turned:.1f} degrees: {100 * share:.1g} % "
-                    "of the offsets along the fringes count as a difference"
-                )
+    direction = components.get("delta_fringe")
+    for side in sides:
+        turned = 0.0 if side.both or direction is None else _angle(side.axes[0], direction)
+        if turned > NOTED_DEG:
+            sentences.append(
+                f"{side.label}: fringes rotated by {turned:.1f} degrees: "
+                f"{100 * np.sin(np.radians(turned)):.1g} % of the offsets along the fringes count "
+                "as a difference"
+            )
     return sentences
