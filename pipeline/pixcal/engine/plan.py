@@ -61,6 +61,11 @@ def make_plan(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtim
     return plan
 
 
+def within_memory(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtime) -> Runtime:
+    """The same runtime with as many workers as `make_plan` allows."""
+    return runtime.with_workers(make_plan(what, bytes_per_task, shared_bytes, runtime).workers)
+
+
 @cache
 def _tell(note: str) -> None:
     """On stderr, once."""

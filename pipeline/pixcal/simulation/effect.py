@@ -70,6 +70,12 @@ class FringeMaps:
     name: str = ""
     frames: FittedFrames | None = None
 
+    def turned(self, phase: F64) -> "FringeMaps":
+        """The same with the phase (y, x) moved, rad; where that is NaN it stays."""
+        iota, sine, cosine = self.theta
+        z = (cosine + 1j * sine) * np.exp(1j * np.nan_to_num(phase))
+        return dataclasses.replace(self, theta=np.stack([iota, z.imag, z.real]))
+
 
 @dataclass(frozen=True)
 class Estimate:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from pixcal.effects import effects
-from pixcal.engine.plan import make_plan
+from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.gap import CHANCE, sigmas_among, sigmas_of
 from pixcal.model.config import result_options
@@ -155,7 +155,7 @@ def _summaries(jobs: Mapping[str, partial[Any]], runtime: Runtime) -> dict[str, 
     columns = max(job.args[0].shape[1] for job in jobs.values())
     # A band and some copies of it in float64; windows of the spectrum; the sample.
     per_task = 64 * BAND_ROWS * columns + 128 * SEGMENT**2 + 8 * SAMPLE
-    runtime = runtime.with_workers(make_plan("the report", per_task, FIGURE_BYTES, runtime).workers)
+    runtime = within_memory("the report", per_task, FIGURE_BYTES, runtime)
     results = run_tasks(call, list(jobs.values()), runtime, label="report maps")
     return dict(zip(jobs, results, strict=True))
 

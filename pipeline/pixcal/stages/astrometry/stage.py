@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from pixcal import __version__
-from pixcal.engine.plan import make_plan
+from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime
 from pixcal.estimators.star_centroids.centroids import Star
 from pixcal.model.acquisition import Acquisition
@@ -136,7 +136,7 @@ def _measure(
             f"px (x × y); give an odd number up to {min(shape)}"
         )
     need = planned(shape, modes.number if modes else 0, observed.side, config)
-    runtime = runtime.with_workers(make_plan("astrometry", *need, runtime).workers)
+    runtime = within_memory("astrometry", *need, runtime)
     removed = None
     if modes is not None:
         components, removed = free_from_modes(components, modes, runtime)

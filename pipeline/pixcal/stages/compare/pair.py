@@ -9,7 +9,7 @@ from operator import add
 import numpy as np
 from scipy.special import ndtr
 
-from pixcal.engine.plan import make_plan
+from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.arrays import F64, I64
 from pixcal.stages.compare.agreement import Grouping, Part, Projection, double, halve
@@ -98,8 +98,7 @@ class Pair:
         task = int(np.prod(self.tile_side)) * (8 * (4 * k + 12 * len(sets)) + 40 * batches)
         blocks = np.prod([-(-n // 2**self.coarse) for n in self.window])
         held = int(8 * (k + 4) * (3 * blocks + 2 * sum(self.window)))
-        plan = make_plan(f"the comparison of {self.name}", task, held, runtime)
-        return runtime.with_workers(plan.workers)
+        return within_memory(f"the comparison of {self.name}", task, held, runtime)
 
 
 def _power_of_two(value: float) -> int:

@@ -27,10 +27,11 @@ def measured_again(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatme
 
     Where the memory does not suffice, effects stay as the diagnosis found them.
     """
-    remeasured = [t for t in plan.every if t.how == "undone on maps" and t.origin == "diagnosis"]
     remeasured = [
-        t for t in remeasured if type(t.effect).measured_again is not Effect.measured_again
-    ]
+        t for t in plan.every
+        if t.how == "undone on maps" and t.origin == "diagnosis"
+        and type(t.effect).measured_again is not Effect.measured_again
+    ]  # fmt: skip
     if not remeasured:
         return plan
     try:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pixcal.engine.plan import make_plan
+from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.arrays import F64, Mask
 from pixcal.stages.correct.swept import HALVES
@@ -79,25 +79,21 @@ class TileGain:
 
 def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
     """Statistics of ``sets``, by name, and of ``pairs`` of sets along one axis."""
-    ny, nx = maps.source.shape
     cy, cx = maps.source.signal.chunks[1:]
     variants = HALVES + maps.effects
     batches = max(_batches(maps.before / name) for name in maps.names)
     need = cy * cx * (16 * (variants + 2 * batches) + 60 * len(maps.names) + 100)
-    plan = make_plan("measuring the gain", need, 0, runtime)
-    tiles = maps.source.tiles()
-    sums = run_tasks(partial(_tile, maps), tiles, runtime.with_workers(plan.workers), label="gain")
-    sets = {}
-    for n, name in enumerate(maps.names):
-        total = _empty(ny, nx, maps.effects)
-        for at, one in zip(tiles, sums, strict=True):
-            _add(total, one.sets[n], *maps.source.ranges(at))
-        sets[name] = total
+    runtime = within_memory("measuring the gain", need, 0, runtime)
+    sums = run_tasks(partial(_tile, maps), maps.source.tiles(), runtime, label="gain")
+    sets = {
+        name: _described(_total([one.sets[n] for one in sums], maps.source))
+        for n, name in enumerate(maps.names)
+    }
     pairs = [
         {"sets": [a, b]} | _agreement(np.sum([t.pairs[n] for t in sums], axis=0))
         for n, (a, b, _) in enumerate(maps.pairs)
     ]
-    return {"sets": {name: _described(total) for name, total in sets.items()}, "pairs": pairs}
+    return {"sets": sets, "pairs": pairs}
 
 
 def worsened(sets: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> str:
@@ -138,13 +134,11 @@ def _batches(folder: Path) -> int:
 
 def _tile(maps: Maps, at: tuple[int, int]) -> TileGain:
     y, x = maps.source.ranges(at)
-    delta: dict[str, tuple[F64, F64]] = {}
-    error: dict[str, tuple[F64, F64]] = {}
-    for name in maps.names:
-        delta[name], error[name] = (
-            (maps.read(maps.before, name, array, y, x), maps.read(maps.after, name, array, y, x))
-            for array in ("delta", "sigma")
-        )
+    groups = (maps.before, maps.after)
+    delta, error = (
+        {name: [maps.read(group, name, array, y, x) for group in groups] for name in maps.names}
+        for array in ("delta", "sigma")
+    )
     sets = [_of_set(maps, name, delta[name], (y, x)) for name in maps.names]
     pairs = []
     for a, b, sign in maps.pairs:
@@ -155,7 +149,7 @@ def _tile(maps: Maps, at: tuple[int, int]) -> TileGain:
 
 
 def _of_set(
-    maps: Maps, name: str, delta: tuple[F64, F64], part: tuple[tuple[int, int], tuple[int, int]]
+    maps: Maps, name: str, delta: Sequence[F64], part: tuple[tuple[int, int], tuple[int, int]]
 ) -> SetSums:
     before, after = delta
     good = np.isfinite(before) & np.isfinite(after)
@@ -172,7 +166,7 @@ def _of_set(
     profiles = np.stack([np.where(good, values, 0.0) for values in (before, after, good)])
     return SetSums(
         int(good.sum()),
-        np.array([_square_and_most(m[good]) for m in moved]),
+        np.array([[(m[good] ** 2).sum(), np.abs(m[good]).max(initial=0.0)] for m in moved]),
         profiles.sum(axis=2),
         profiles.sum(axis=1),
         halves,
@@ -180,58 +174,45 @@ def _of_set(
     )
 
 
-def _square_and_most(values: F64) -> tuple[float, float]:
-    return float((values**2).sum()), float(np.abs(values).max(initial=0.0))
-
-
 def _of_halves(
     maps: Maps, name: str, good: Mask, part: tuple[tuple[int, int], tuple[int, int]]
 ) -> F64:
     """Of half the difference between the halves of the frames, which is the noise of the map."""
-    batches = (0, _batches(maps.before / name))
-    stored = [
-        ArrayReader(maps.before / name / array).read(batches, *part)
-        for array in ("batch_delta", "batch_sigma")
-    ]
-    middle = batches[1] // 2
-    parts = (slice(middle), slice(middle, None))
-    before = [mean_of(stored[0][cut], stored[1][cut]) for cut in parts]
-    after = [
-        maps.read(maps.after, name, array, (0, HALVES), *part)
-        for array in ("batch_delta", "batch_sigma")
-    ]
-    apart = [before[0][0].astype(float) - before[1][0], after[0][0] - after[0][1]]
-    variance = [before[0][1].astype(float) ** 2 + before[1][1] ** 2, (after[1] ** 2).sum(axis=0)]
-    return _squares(
-        [np.where(good, a / 2, np.nan) for a in apart], [v / 4 for v in variance]
-    )  # fmt: skip
+    batches = _batches(maps.before / name)
+    arrays = ("batch_delta", "batch_sigma")
+    stored = [ArrayReader(maps.before / name / array).read((0, batches), *part) for array in arrays]
+    parts = (slice(batches // 2), slice(batches // 2, None))
+    before = np.stack([mean_of(stored[0][cut], stored[1][cut]) for cut in parts], axis=1)
+    after = np.stack([maps.read(maps.after, name, array, (0, HALVES), *part) for array in arrays])
+    apart, variance = [], []
+    for delta, sigma in (before.astype(float), after):
+        apart.append(np.where(good, (delta[0] - delta[1]) / 2, np.nan))
+        variance.append((sigma**2).sum(axis=0) / 4)
+    return _squares(apart, variance)
 
 
 def _squares(apart: Sequence[F64], expected: Sequence[F64]) -> F64:
     """Sums (before or after; square, expected square, count) over pixels that have all."""
     good = np.isfinite(np.stack([*apart, *expected])).all(axis=0)
-    return np.array(
-        [
-            [(a[good] ** 2).sum(), v[good].sum(), good.sum()]
-            for a, v in zip(apart, expected, strict=True)
-        ]
-    )
+    both = zip(apart, expected, strict=True)
+    return np.array([[(a[good] ** 2).sum(), v[good].sum(), good.sum()] for a, v in both])
 
 
-def _empty(ny: int, nx: int, effects: int) -> SetSums:
+def _total(tiles: Sequence[SetSums], source: ReducedSet) -> SetSums:
+    rows, columns = (np.zeros((3, n)) for n in source.shape)
+    for at, one in zip(source.tiles(), tiles, strict=True):
+        y, x = source.ranges(at)
+        rows[:, slice(*y)] += one.rows
+        columns[:, slice(*x)] += one.columns
+    squares, most = np.moveaxis(np.stack([one.moved for one in tiles]), -1, 0)
     return SetSums(
-        0, np.zeros((2 + effects, 2)), np.zeros((3, ny)), np.zeros((3, nx)), np.zeros((2, 3)), 0.0
+        sum(one.count for one in tiles),
+        np.stack([squares.sum(axis=0), most.max(axis=0)], axis=1),
+        rows,
+        columns,
+        np.sum([one.halves for one in tiles], axis=0),
+        sum(one.square for one in tiles),
     )
-
-
-def _add(total: SetSums, tile: SetSums, y: tuple[int, int], x: tuple[int, int]) -> None:
-    total.count += tile.count
-    total.moved[:, 0] += tile.moved[:, 0]
-    total.moved[:, 1] = np.maximum(total.moved[:, 1], tile.moved[:, 1])
-    total.rows[:, slice(*y)] += tile.rows
-    total.columns[:, slice(*x)] += tile.columns
-    total.halves += tile.halves
-    total.square += tile.square
 
 
 def _described(total: SetSums) -> dict[str, Any]:

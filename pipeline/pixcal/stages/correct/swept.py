@@ -171,11 +171,8 @@ def undone(maps: FringeMaps, effects: Sequence[Effect]) -> tuple[FringeMaps, lis
     steps = []
     for effect in effects:
         after = effect.undo(maps)
-        if (
-            not isinstance(after, FringeMaps)
-            or after.theta.shape != maps.theta.shape
-            or not np.isfinite(after.theta).all()
-        ):
+        theta = after.theta if isinstance(after, FringeMaps) else np.empty(0)
+        if after is None or theta.shape != maps.theta.shape or not np.isfinite(theta).all():
             raise InputError(
                 f"effect {effect.name!r}: undo does not return finite maps of the same shape; "
                 "fix its file"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pixcal.effects import parse_effects
-from pixcal.engine.plan import make_plan
+from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.fringe_fit.modes import solve_modes
 from pixcal.estimators.maps.corrected import phase_change, straight_modes
@@ -57,17 +57,13 @@ def parameter_errors(swept: Swept, runtime: Runtime) -> dict[str, float | None]:
     None where no errors are given.
     """
     tiles = scout_tiles(swept.source.grid, TILES)
-    plan = make_plan("errors of the parameters", task_bytes(swept), 0, runtime)
-    sums = run_tasks(
-        partial(_tile, swept), tiles, runtime.with_workers(plan.workers), label="parameters"
-    )
-    total = np.sum(sums, axis=0)
-    return {
-        effect.name: float(np.sqrt(square / max(count, 1)))
-        if swept.errors.get(effect.name)
-        else None
-        for effect, (square, count) in zip(swept.effects, total, strict=True)
-    }
+    runtime = within_memory("errors of the parameters", task_bytes(swept), 0, runtime)
+    total = np.sum(run_tasks(partial(_tile, swept), tiles, runtime, label="parameters"), axis=0)
+    left: dict[str, float | None] = dict.fromkeys(effect.name for effect in swept.effects)
+    for name, (square, count) in zip(left, total, strict=True):
+        if swept.errors.get(name):
+            left[name] = float(np.sqrt(square / max(count, 1)))
+    return left
 
 
 def task_bytes(swept: Swept) -> int:
@@ -114,10 +110,8 @@ def left_over(swept: Swept, maps: FringeMaps, good: Mask, inside: tuple[slice, s
         if len(slopes):
             modes = straight_modes(theta, swept.k).reshape(-1, variance.size)
             change = slopes[(slice(None), *inside)].reshape(len(slopes), -1)
-            good_modes = modes[:, good[inside].ravel()]
-            taken = solve_modes(
-                good_modes @ good_modes.T, good_modes @ change[:, good[inside].ravel()].T
-            )
+            use = good[inside].ravel()
+            taken = solve_modes(modes[:, use] @ modes[:, use].T, modes[:, use] @ change[:, use].T)
             change = change - taken.T @ modes
             variance = np.einsum("np,np->p", covariance @ change, change).reshape(variance.shape)
         variances.append(variance)

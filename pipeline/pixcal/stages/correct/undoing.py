@@ -9,13 +9,12 @@ chunks of the cube, so results depend neither on memory nor on workers.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from pixcal.engine.plan import make_plan
+from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.fringe_fit.combine import weighted_mean
 from pixcal.estimators.fringe_fit.fringes import wrapped
@@ -52,11 +51,10 @@ def undo_on_maps(swept: Swept, target: Path, runtime: Runtime, name: str) -> Non
     tiles = swept.source.tiles()
     if swept.has_halves:
         halves = _create(target, swept, ("half_phase", "half_sigma"), HALVES)
-        plan = make_plan(f"halves of {name}", cy * cx * (44 * swept.n_batches + 100), 0, runtime)
-        run_tasks(
-            partial(_halve, swept, halves, middle), tiles, runtime.with_workers(plan.workers),
-            label=f"halves {name}",
-        )  # fmt: skip
+        need = cy * cx * (44 * swept.n_batches + 100)
+        fitting = within_memory(f"halves of {name}", need, 0, runtime)
+        task = partial(_halve, swept, halves, middle)
+        run_tasks(task, tiles, fitting, label=f"halves {name}")
         _finish(halves)
     writers = _create(target, swept, ("iota", "alpha", "phase", "sigma"))
     writers |= _create(target, swept, ("batch_phase", "batch_sigma"), swept.variants)
@@ -65,11 +63,8 @@ def undo_on_maps(swept: Swept, target: Path, runtime: Runtime, name: str) -> Non
         target / "sums", (*swept.source.grid, width), "<f8", dims=("row", "column", "fact"),
         chunks=(1, 1, width), fill_value=np.nan,
     )  # fmt: skip
-    plan = make_plan(f"undoing effects of {name}", task_bytes(swept), 0, runtime)
-    run_tasks(
-        partial(_undo_tile, swept, target, writers), tiles, runtime.with_workers(plan.workers),
-        label=f"undo {name}",
-    )  # fmt: skip
+    fitting = within_memory(f"undoing effects of {name}", task_bytes(swept), 0, runtime)
+    run_tasks(partial(_undo_tile, swept, target, writers), tiles, fitting, label=f"undo {name}")
     _finish(writers)
 
 
@@ -120,13 +115,11 @@ def _undo_tile(
     inside = swept.inside(y, x)
     maps, good, known = maps_of(swept, part)
     border = border_change(swept, part)
-    maps = _turned(maps, border)
+    maps = maps.turned(border)
     after, steps = undone(maps, swept.effects)
     change = np.sum(steps, axis=0) if steps else np.zeros(maps.theta.shape[1:])
-    phase = wrapped(
-        ArrayReader(swept.folder / "phase").read(y, x)
-        + (change + border)[inside].astype(np.float32)
-    )
+    moved = (change + border)[inside].astype(np.float32)
+    phase = wrapped(ArrayReader(swept.folder / "phase").read(y, x) + moved)
     factor = np.prod(_noise_factors(swept, maps), axis=0)[inside]
     own_error = ArrayReader(swept.folder / "sigma").read(y, x) * factor
     beside = _of_neighbours(swept, maps, after, known, part)[inside]
@@ -137,11 +130,9 @@ def _undo_tile(
     errors: list[F64] = []
     if swept.has_halves:
         for n in range(HALVES):
-            half = ArrayReader(target / "half_phase")
-            half_phase = padded(
-                half.read((n, n + 1), *swept.within(part))[0].astype(float), swept, part
-            )
-            its = undone(_turned(maps, half_phase), swept.effects)[1]
+            half = ArrayReader(target / "half_phase").read((n, n + 1), *swept.within(part))[0]
+            half_phase = padded(half.astype(float), swept, part)
+            its = undone(maps.turned(half_phase), swept.effects)[1]
             rest = np.sum(its, axis=0) - change if its else 0.0
             variants.append((half_phase + rest)[inside])
             error = ArrayReader(target / "half_sigma").read((n, n + 1), y, x)[0]
@@ -174,13 +165,6 @@ def _of_neighbours(
     return np.asarray(np.where(known, error, 0.0))
 
 
-def _turned(maps: FringeMaps, phase: F64) -> FringeMaps:
-    """Maps with their phase moved."""
-    iota, sine, cosine = maps.theta
-    z = (cosine + 1j * sine) * np.exp(1j * np.nan_to_num(phase))
-    return replace(maps, theta=np.stack([iota, z.imag, z.real]))
-
-
 def _noise_factors(swept: Swept, maps: FringeMaps) -> F64:
     """Of each effect (effect, y, x); of one that does nothing, where there is none."""
     light = maps.theta[0] if maps.flat is None else maps.theta[0] * maps.flat
@@ -196,7 +180,6 @@ def _sums(
     """What shapes are fitted to, as the sweep leaves it."""
     stored = ArrayReader(swept.folder / "sums").read((at[0], at[0] + 1), (at[1], at[1] + 1))
     (old,) = TileSums.of_rows(stored.reshape(1, -1)).planes
-    plane = tile_plane(
-        phase, sigma, ratio.astype(np.float32), good, (old.kx, old.ky), old.centre
-    )  # fmt: skip
+    k, ratios = (old.kx, old.ky), ratio.astype(np.float32)
+    plane = tile_plane(phase, sigma, ratios, good, k, old.centre)
     return sum_row(phase, sigma, good, variants, swept.carrier, plane)

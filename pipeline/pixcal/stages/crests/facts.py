@@ -66,13 +66,10 @@ def agreement(paths: CrestPaths, fit: CrestFit, other: Geometry, sigma: F64) -> 
     px = paths.interfringe / (2 * np.pi)
     return {
         "parameters": {
-            name: {
-                "difference_mm": float(d),
-                "sigma_mm": float(s),
-                "difference_sigma": float(d / s),
-                "from_prior": bool(prior),
-            }
-            for name, d, s, prior in zip(PARAMETERS, difference, both, fit.from_prior, strict=True)
+            name: {"difference_mm": d, "sigma_mm": s, "difference_sigma": d / s, "from_prior": held}
+            for name, d, s, held in zip(
+                PARAMETERS, difference.tolist(), both.tolist(), fit.from_prior.tolist(), strict=True
+            )
         },
         "phase_rms_px": float(np.std(difference_rad) * px),
         "phase_max_px": float(np.max(np.abs(difference_rad - difference_rad.mean())) * px),

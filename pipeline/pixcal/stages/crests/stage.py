@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal import __version__
-from pixcal.engine.plan import make_plan
+from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels.demodulation import N_SUMS
 from pixcal.kernels.optics import paraxial_vector
@@ -118,12 +118,7 @@ def _measure(
         raise
     except InputError as error:
         raise InputError(f"{run_dir}: fringe set {name!r}: {error}") from error
-    arrays = _arrays(paths, fit)
-    folder = made.folder / "crests.zarr" / name
-    create_group(folder)
-    for array, (data, dims, attrs) in arrays.items():
-        write_array(folder / array, data, dims=dims, attrs=attrs)
-    maps = {array: data for array, (data, _, _) in arrays.items()}
+    maps = _write_arrays(made.folder / "crests.zarr" / name, paths, fit)
     picture = crest_figure(_view(name, source, frames[0], paths, fit, maps))
     (made.folder / f"crests-{name}.png").write_bytes(png(picture))
     costs = (maps["cost_baseline"], maps["cost_ratio"], maps["valley_cost"])
@@ -162,7 +157,7 @@ def _extract(
     # Codes, packed and not, and a tile's maps; the sums, those on their way, and their solution.
     task = 3 * chunk + 40 * int(np.prod(source.signal.chunks[1:]))
     held = 4 * 8 * N_SUMS * number + FIGURE_BYTES
-    runtime = runtime.with_workers(make_plan(f"the crests of {name}", task, held, runtime).workers)
+    runtime = within_memory(f"the crests of {name}", task, held, runtime)
 
     def accumulate(frame: int, windows: Windows, carrier: CrestCarrier) -> F64:
         task = partial(_row_task, source, frames[frame], windows, carrier)
@@ -218,10 +213,8 @@ def _row_task(
     return index, merged
 
 
-def _arrays(
-    paths: CrestPaths, fit: CrestFit
-) -> dict[str, tuple[NDArray[Any], tuple[str, ...], dict[str, str]]]:
-    """Arrays of ``crests.zarr`` with their axes and attributes: the points and figure 17.
+def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit) -> dict[str, NDArray[Any]]:
+    """Write the points and figure 17, and return them.
 
     That is the cost over (D, B) with the others held, over (D, B/D) with the others refitted, and
     the valley of the latter.
@@ -235,26 +228,27 @@ def _arrays(
     ratios = middle + max(2 * float(np.max(np.abs(best - middle))), 1e-5 * middle) * steps
     held = cost_map(paths, fit, distances, lengths, ratio=False, refit=False)
     refitted = cost_map(paths, fit, distances, ratios, ratio=True, refit=True)
-    points: dict[str, tuple[NDArray[Any], str]] = {
-        "x": (paths.x, "pixel"), "y": (paths.y, "pixel"), "k": (paths.k, "1"),
-        "sigma": (paths.sigma, "rad"), "residual": (fit.residual, "rad"),
-        "used": (fit.used.astype(np.uint8), "1"),
-    }  # fmt: skip
-    return {
-        **{name: (data, ("point",), {"units": units}) for name, (data, units) in points.items()},
+    arrays: dict[str, tuple[NDArray[Any], str, dict[str, str]]] = {
+        "x": (paths.x, "point", {"units": "pixel"}),
+        "y": (paths.y, "point", {"units": "pixel"}),
+        "k": (paths.k, "point", {"units": "1"}),
+        "sigma": (paths.sigma, "point", {"units": "rad"}),
+        "residual": (fit.residual, "point", {"units": "rad"}),
+        "used": (fit.used.astype(np.uint8), "point", {"units": "1"}),
+        "distance": (distances, "distance", {"units": "mm"}),
+        "baseline": (lengths, "baseline", {"units": "mm"}),
+        "ratio": (ratios, "ratio", {"units": "1"}),
         "cost_baseline": (
-            held, ("distance", "baseline"),
-            {"units": "1", "comment": "phase refitted, others held"},
+            held, "distance baseline", {"units": "1", "comment": "phase refitted, others held"}
         ),
-        "baseline": (lengths, ("baseline",), {"units": "mm"}),
-        "cost_ratio": (
-            refitted, ("distance", "ratio"), {"units": "1", "comment": "others refitted"},
-        ),
-        "ratio": (ratios, ("ratio",), {"units": "1"}),
-        "distance": (distances, ("distance",), {"units": "mm"}),
-        "valley_ratio": (best, ("distance",), {}),
-        "valley_cost": (cost, ("distance",), {}),
+        "cost_ratio": (refitted, "distance ratio", {"units": "1", "comment": "others refitted"}),
+        "valley_ratio": (best, "distance", {}),
+        "valley_cost": (cost, "distance", {}),
     }  # fmt: skip
+    create_group(folder)
+    for name, (data, dims, attrs) in arrays.items():
+        write_array(folder / name, data, dims=dims.split(), attrs=attrs)
+    return {name: data for name, (data, _, _) in arrays.items()}
 
 
 def _view(
