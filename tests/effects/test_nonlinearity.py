@@ -138,6 +138,26 @@ def test_another_response_is_measured_beside_the_polynomial(
     assert rest.std() > 8.0
 
 
+def test_a_knee_is_measured_to_a_hundredth_of_its_size(acquired: Callable[..., Evidence]) -> None:
+    """Straight up to a knee, and 1500 e- too low at the top: no polynomial has that response."""
+    levels = np.linspace(0, 60_000, 241)
+    lost = -1500 * np.maximum(levels / 45_000 - 0.6, 0) ** 2 / 0.16
+    points = [
+        {"level_e": float(a), "change_e": float(b)} for a, b in zip(levels, lost, strict=True)
+    ]
+    on = {"quadratic": 0.0, "cubic": 0.0, "bends": points}
+    evidence = acquired(None, {"nonlinearity": on})
+    found = Nonlinearity.estimate(evidence)
+    assert found is not None
+    assert isinstance(found.effect, Nonlinearity)
+    # Charge that gives the same signal: but for an offset and a factor, that of the truth.
+    lit = np.linspace(2_500, 42_000, 200, dtype=np.float32)
+    truth = Nonlinearity(0.0, 0.0, bends=tuple(Bend(**point) for point in points))
+    charge = found.effect.linearised(truth.response(lit)).astype(float)
+    rest = charge - np.polyval(np.polyfit(lit, charge, 1), lit)
+    assert rest.std() < 12.0
+
+
 def test_bad_samples_do_not_matter(acquired: Callable[..., Evidence]) -> None:
     evidence = acquired(None, {"nonlinearity": {}})
     fringes = {}

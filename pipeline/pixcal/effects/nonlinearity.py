@@ -22,9 +22,10 @@ from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 FALLOFF_PX = 0.5  # of the shift of boundaries by the brighter-fatter effect beside the response
-# levels, as shares of the brightest, at which a response is measured; a finer curve imitates
-# moving boundaries (brighter-fatter) where all fringes have the same spacing
-KNOTS = np.array([0, 1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 3 / 8, 1 / 2, 5 / 8, 3 / 4, 7 / 8, 1])
+# levels at which a response is measured, as shares of the way from the darkest samples to the
+# brightest
+KNOTS = np.array([0, 1 / 64, 1 / 32, *np.arange(1, 17) / 16])
+TAIL = 1e-3  # share of the samples that are darker, and brighter
 # chi-square of a measured response beside a polynomial, over that of the polynomial, from which it
 # is told
 BESIDE = 0.05
@@ -194,8 +195,10 @@ def _bends(
     evidence: Evidence, response: Callable[[F32], F32], chi2_of_polynomial: float
 ) -> tuple[tuple[Bend, ...], list[float]] | None:
     """Points of the response beside a polynomial, and their errors; None where it has none."""
-    top = max(float(np.nanquantile(f.electrons[::7], 0.999)) for f in evidence.fringes.values())
-    knots = KNOTS * top
+    ends = [np.nanquantile(f.electrons[::7], [TAIL, 1 - TAIL]) for f in evidence.fringes.values()]
+    low, top = max(min(float(a) for a, _ in ends), 0.0), max(float(b) for _, b in ends)
+    seen = low + KNOTS * (top - low)
+    knots = np.array([0.0, *seen[seen >= KNOTS[1] * top]])
     change, covariance = fit_curve(evidence, response, knots)
     chi2 = float(change @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ change)
     told = sigmas_of_chi2(chi2, len(change) - 2) > SIGNIFICANT

@@ -27,8 +27,10 @@ _TURNS = 4
 _INDEPENDENT = 1e-3
 _NEGLIGIBLE = 1e-6
 
-# steps, all with the slopes of no distortion; each gains a factor of the distortion's size
-_ROUNDS = 3
+# steps, all with the slopes of no distortion: each gains a factor of the distortion's size, until
+# all sizes together move by less than this many standard errors
+_ROUNDS = 8
+_STILL = 0.1
 
 
 class Freedom:
@@ -166,7 +168,10 @@ def fit_distortions(
     sizes = np.zeros(count)
     for _ in range(_ROUNDS):
         right = sum(fit.right(sizes) for fit in fits) + information * (known - sizes)
-        sizes = sizes + covariance @ right
+        step = covariance @ right
+        sizes = sizes + step
+        if right @ step < _STILL**2:
+            break
     return sizes, covariance
 
 

@@ -28,6 +28,11 @@ class Candidate:
         """Of the estimate, sigma; zero without one."""
         return 0.0 if self.estimate is None else self.estimate.significance
 
+    @property
+    def law(self) -> Effect | None:
+        """The best of its laws, where the estimate is a measured curve instead."""
+        return None if self.estimate is None else self.estimate.by_law
+
     def variants(self, share: float) -> list[Effect]:
         """Effects to simulate: as estimated, with sure parameters alone, scaled down, replayed.
 

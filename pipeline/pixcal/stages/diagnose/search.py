@@ -43,6 +43,7 @@ CONFIRM = 8  # and of the accepted causes
 PROMISING = 0.25  # share of the best gain from which a candidate is simulated more than once,
 KNOWN_TO = 3.0  # with its effect known to one part in this: what one simulation leaves open
 MAX_CAUSES = 5  # causes that are accepted at most
+AS_GOOD = 0.1  # by which the gain of a candidate may be less than the best, to count as its equal
 SIMILAR = 0.7  # fraction of a candidate's significance that another effect may produce
 
 Simulate = Callable[[Sequence[Effects], int, str, Sequence[str]], Sequence[list[Curves] | str]]
@@ -97,7 +98,7 @@ class Search:
         if not remaining:
             return False
         laws, replays = self._tried(causes, remaining)
-        gains, effect, best = self._favoured(laws, replays, candidates)
+        gains, effect, best = self._favoured(laws, replays, causes, candidates)
         if effect is None:
             return False
         del remaining[best]
@@ -118,7 +119,11 @@ class Search:
         return True
 
     def _favoured(
-        self, laws: Additions, replays: Additions, candidates: Mapping[str, Candidate]
+        self,
+        laws: Additions,
+        replays: Additions,
+        causes: Accepted,
+        candidates: Mapping[str, Candidate],
     ) -> tuple[dict[str, float], Effect | None, str]:
         """Gain of every candidate, and effect and name of the best that gains enough.
 
@@ -135,13 +140,29 @@ class Search:
             candidates[name].reason = too_little(gains[name])
         if not enough:
             return gains, None, ""
-        best = max(enough, key=lambda n: enough[n])
+        best = self._best(enough, causes, candidates)
         effect = laws[best].effect
         if best in replays and self.comparison.replay_fits_better(
             replays[best].trial, laws[best].trial
         ):
             effect = replays[best].effect
         return gains, effect, best
+
+    def _best(
+        self, gains: dict[str, float], causes: Accepted, candidates: Mapping[str, Candidate]
+    ) -> str:
+        """The candidate that gains most; among equals, the one that does so by its law.
+
+        A curve measured at many levels can imitate another effect.
+        """
+        most = max(gains.values())
+        equals = {n: g for n, g in gains.items() if g >= (1 - AS_GOOD) * most}
+        if len(equals) > 1:
+            curves = [(n, law) for n in equals if (law := candidates[n].law) is not None]
+            label = f"laws, round {len(causes.effects) + 1}"
+            by_law = self._added(causes, {n: candidates[n] for n in equals}, curves, SCREEN, label)
+            equals |= {one.name: one.gain for one in by_law}
+        return max(equals, key=lambda n: equals[n])
 
     def _reject_insignificant(self, causes: Accepted, remaining: dict[str, Candidate]) -> None:
         """Leave out candidates that the fitted frames do not show beyond what the causes produce.
