@@ -404,7 +404,7 @@ def test_cut_short_it_leaves_nothing_that_looks_whole(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(simulate, "_finish", killed)
+        patch.setattr(simulate, "call", killed)
         with pytest.raises(KeyboardInterrupt):
             simulated(tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == {"bench.yaml"}

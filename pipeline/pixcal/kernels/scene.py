@@ -199,20 +199,13 @@ def with_margin(light: LightMaps, margin: int) -> LightMaps:
     z = light.alpha_cos + 1j * light.alpha_sin
     beyond = np.arange(1, margin + 1)
     step = np.angle(np.sum(z[:, 1:] * z[:, :-1].conj(), axis=1))[:, None]
-    z = np.hstack(
-        [z[:, :1] * np.exp(-1j * step * beyond[::-1]), z, z[:, -1:] * np.exp(1j * step * beyond)]
-    )
+    left, right = np.exp(-1j * step * beyond[::-1]), np.exp(1j * step * beyond)
+    z = np.hstack([z[:, :1] * left, z, z[:, -1:] * right])
     up, down = (np.angle(np.sum(b * a.conj())) for a, b in ((z[:2][-1], z[0]), (z[-2:][0], z[-1])))
-    z = np.vstack(
-        [
-            z[:1] * np.exp(1j * up * beyond[::-1, None]),
-            z,
-            z[-1:] * np.exp(1j * down * beyond[:, None]),
-        ]
-    )
-    return LightMaps(
-        np.pad(light.iota, margin, "edge"), z.imag.astype(np.float32), z.real.astype(np.float32)
-    )
+    above, below = np.exp(1j * up * beyond[::-1, None]), np.exp(1j * down * beyond[:, None])
+    z = np.vstack([z[:1] * above, z, z[-1:] * below])
+    iota = np.pad(light.iota, margin, "edge")
+    return LightMaps(iota, z.imag.astype(np.float32), z.real.astype(np.float32))
 
 
 def light_maps(
@@ -237,11 +230,8 @@ def light_maps(
     psi = optics.paraxial_phase(x, y, geometry(bench, number))
     iota = electrons * maps.response * (a + b)
     alpha = electrons * maps.response * 2 * bench.optics.visibility * np.sqrt(a * b)
-    return LightMaps(
-        iota.astype(np.float32),
-        (alpha * np.sin(psi)).astype(np.float32),
-        (alpha * np.cos(psi)).astype(np.float32),
-    )
+    parts = (iota, alpha * np.sin(psi), alpha * np.cos(psi))
+    return LightMaps(*(part.astype(np.float32) for part in parts))
 
 
 @dataclass(frozen=True)

@@ -183,14 +183,7 @@ def poisson_quantile(mean: float, w: float) -> int:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def amplify(
-    signal: F32,
-    bias: F32,
-    normal: F32,
-    read_noise: F32,
-    adu_per_e: F32,
-    out: F32,
-) -> None:
+def amplify(signal: F32, bias: F32, normal: F32, read_noise: F32, adu_per_e: F32, out: F32) -> None:
     """Electrons in ADU, with read noise and bias.
 
     Parameters

@@ -65,9 +65,7 @@ class Ingest:
         False, in_key=False, doc="Replace the ingested frames of another acquisition."
     )
     copy: bool = quantity(
-        False,
-        in_key=False,
-        doc="Copy all samples into RUN, so that later steps do not need ACQ.",
+        False, in_key=False, doc="Copy all samples into RUN, so that later steps do not need ACQ."
     )
     cubes: StrPath | None = quantity(
         None,

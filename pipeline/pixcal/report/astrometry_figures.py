@@ -11,15 +11,7 @@ from matplotlib.transforms import Bbox
 
 from pixcal.model.arrays import F64
 from pixcal.report.colours import BLUE, DIVERGING, GREEN, GREY, INK, RED, SEQUENTIAL
-from pixcal.report.drawing import (
-    WIDE,
-    Unit,
-    draw_blocks,
-    finish,
-    new_figure,
-    second_axis,
-    unit_for,
-)
+from pixcal.report.drawing import WIDE, Unit, draw_blocks, finish, new_figure, second_axis, unit_for
 
 PERFECT, MEASURED = RED, BLUE
 LABELS = {"perfect": "perfect grid", "measured": "measured maps"}

@@ -8,14 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from pixcal.model.arrays import F64
-from pixcal.report.colours import (
-    BAND,
-    BAR,
-    BLUE,
-    GREY,
-    INK,
-    LINES,
-)
+from pixcal.report.colours import BAND, BAR, BLUE, GREY, INK, LINES
 from pixcal.report.contents import MapContents
 from pixcal.report.drawing import (
     DPI,

@@ -1,8 +1,7 @@
 """Summary of the run: the precision reached, and the warnings."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,8 +17,7 @@ FAR_MM = 40.0
 GOOD, CHECK, BAD = SEVERITY = ("good", "check", "bad")
 
 
-@dataclass(frozen=True)
-class Card:
+class Card(NamedTuple):
     """One key number and its reference."""
 
     title: str
@@ -28,8 +26,7 @@ class Card:
     level: str
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """One sentence and its severity (``good``, ``check`` or ``bad``)."""
 
     level: str
@@ -67,9 +64,8 @@ def detector_headline(facts: dict[str, Any]) -> str:
     ):
         known = facts.get(entry, {})
         if key in figures and not figures[key]["note"]:
-            parts.append(
-                f"{name} {with_error(figures[key]['value'], figures[key]['error'])} {unit}"
-            )
+            value, error = figures[key]["value"], figures[key]["error"]
+            parts.append(f"{name} {with_error(value, error)} {unit}")
         elif known.get("measured") is not None:
             parts.append(f"{name} {with_error(known['measured'], known.get('error'))} {unit}")
         elif known.get("used") is not None:
@@ -89,9 +85,8 @@ def cards(contents: Contents) -> Iterator[Card]:
         )
     if contents.sets:
         yield _bound_card(contents.sets)
-    slopes = {
-        s.name: s.allan for s in contents.sets if s.allan and s.allan.get("slope") is not None
-    }
+    measured = {s.name: s.allan for s in contents.sets if s.allan}
+    slopes = {name: allan for name, allan in measured.items() if allan.get("slope") is not None}
     if slopes:
         yield _allan_card(slopes)
     if not contents.has_fringes:
@@ -153,13 +148,8 @@ def _mask_card(contents: Contents) -> Card:
     if flags is None:
         return Card("masked pixels", "–", "not measured", CHECK)
     whole = flags.shape[0] * flags.shape[1]
-    part = flags.masked / whole
-    return Card(
-        "masked pixels",
-        share(flags.masked, whole),
-        f"{number(flags.masked)} of {number(whole)}",
-        _level(part, 0.01, 0.1),
-    )
+    shown, part = f"{number(flags.masked)} of {number(whole)}", flags.masked / whole
+    return Card("masked pixels", share(flags.masked, whole), shown, _level(part, 0.01, 0.1))
 
 
 def findings(contents: Contents) -> list[Finding]:
@@ -180,12 +170,8 @@ def findings(contents: Contents) -> list[Finding]:
             effect = "an effect that depends on the fringe vector is present"
             made.append((BAD, f"{words} do not agree: {chi2}; {effect}"))
     ranked = sorted(made, key=lambda f: -SEVERITY.index(f[0]))
-    return [Finding(level, _sentence(text)) for level, text in ranked]
-
-
-def _sentence(text: str) -> str:
-    """With a capital letter and a full stop."""
-    return text[:1].upper() + text[1:].rstrip(".") + "."
+    # With a capital letter and a full stop.
+    return [Finding(level, text[:1].upper() + text[1:].rstrip(".") + ".") for level, text in ranked]
 
 
 # severity, sentence with a `{}` for each value, and the values

@@ -44,12 +44,7 @@ class Camera:
     """
 
     def __init__(
-        self,
-        bench: Bench,
-        rows: Rows,
-        effects: Sequence[ForwardModel] = (),
-        *,
-        noise: bool = True,
+        self, bench: Bench, rows: Rows, effects: Sequence[ForwardModel] = (), *, noise: bool = True
     ) -> None:
         self.bench = bench if noise else replace(bench, shot_noise=False)
         self.noise = noise
@@ -67,17 +62,19 @@ class Camera:
         ADU; the array is used again.
         """
         chain = _Chain(self, recording)
-        skip = self.inside[0] - self.rows[0]
-        keep = slice(skip, skip + self.inside[1] - self.inside[0])
         for frame in frames:
-            yield frame, chain.samples(frame)[keep]
+            yield frame, chain.samples(frame)[self._kept]
 
     def analogue(self, recording: Recording, frames: range) -> Iterator[F32]:
         """The same before the converter: float32 (y, x), ADU; a new array each."""
         chain = _Chain(self, recording)
-        skip = self.inside[0] - self.rows[0]
         for frame in frames:
-            yield chain.adu(frame)[skip : skip + self.inside[1] - self.inside[0]]
+            yield chain.adu(frame)[self._kept]
+
+    @property
+    def _kept(self) -> slice:
+        """The rows asked for among those at hand."""
+        return slice(self.inside[0] - self.rows[0], self.inside[1] - self.rows[0])
 
     def light(self, recording: Recording) -> LightMaps:
         """Mean and fringe amplitude of a recording on these rows and those around, e-."""
@@ -112,15 +109,13 @@ class _Shot:
 
     def mean(self, frame: int) -> F32 | None:
         """Mean electrons of another frame, without this effect; None outside the recording."""
-        if not 0 <= frame < self.recording.count:
-            return None
-        return self._chain.mean(frame, self._at)
+        inside = 0 <= frame < self.recording.count
+        return self._chain.mean(frame, self._at) if inside else None
 
     def charge(self, frame: int) -> F32 | None:
         """Charge of another frame, without this effect; None outside the recording."""
-        if not 0 <= frame < self.recording.count:
-            return None
-        return self._chain.charge(frame, self._at)
+        inside = 0 <= frame < self.recording.count
+        return self._chain.charge(frame, self._at) if inside else None
 
     def surrounded(self, charge: F32, reach: int) -> F32:
         """Charge of this frame with a margin, in which its light goes on."""
@@ -192,29 +187,27 @@ class _Chain:
 
     def mean(self, frame: int, upto: int) -> F32:
         """Mean electrons, by the first ``upto`` effects."""
-        states, light = self.states, self.light
-        columns, lines = states.turns(frame, self.camera.bench.detector.shape, self.camera.rows)
-        mean = np.empty_like(self.dark)
-        synthesis.illuminate(
-            light.iota, light.alpha_sin, light.alpha_cos,
-            states.level[frame], states.amplitude[frame], columns, lines, mean,
-        )  # fmt: skip
+        mean = self._illuminated(self.light, frame, np.empty_like(self.dark))
         for at, effect in enumerate(self.effects[:upto]):
             mean = effect.photons(mean, _Shot(self, frame, at))
         return mean
+
+    def _illuminated(self, light: LightMaps, frame: int, out: F32, reach: int = 0) -> F32:
+        """Mean electrons of a frame with a margin, into an array, before effects on photons."""
+        states, shape = self.states, self.camera.bench.detector.shape
+        columns, lines = states.turns(frame, shape, self.camera.rows, reach)
+        synthesis.illuminate(
+            light.iota, light.alpha_sin, light.alpha_cos,
+            states.level[frame], states.amplitude[frame], columns, lines, out,
+        )  # fmt: skip
+        return out
 
     def beyond(self, frame: int, reach: int) -> F32:
         """Mean charge of a frame around the rows at hand; in their middle it is undefined."""
         if reach not in self._margins:
             self._margins[reach] = with_margin(self.light, reach), np.pad(self.dark, reach, "edge")
         light, dark = self._margins[reach]
-        states, shape = self.states, self.camera.bench.detector.shape
-        columns, lines = states.turns(frame, shape, self.camera.rows, reach)
-        wide = np.empty_like(dark)
-        synthesis.illuminate(
-            light.iota, light.alpha_sin, light.alpha_cos,
-            states.level[frame], states.amplitude[frame], columns, lines, wide,
-        )  # fmt: skip
+        wide = self._illuminated(light, frame, np.empty_like(dark), reach)
         return np.asarray(np.minimum(wide + dark, np.float32(self.well)))
 
     def charge(self, frame: int, upto: int) -> F32:
@@ -299,12 +292,10 @@ def states_of(recording: Recording, effects: Sequence[ForwardModel]) -> FrameSta
 
 def frames_of(bench: Bench, recording: Recording, effects: Sequence[ForwardModel] = ()) -> U16:
     """All frames (time, y, x) of a recording, in memory."""
-    shape = bench.detector.shape
-    out = np.empty((recording.count, *shape), np.uint16)
-    for first in range(0, shape[0], BLOCK_ROWS):
-        rows = (first, min(first + BLOCK_ROWS, shape[0]))
-        for frame, samples in Camera(bench, rows, effects).expose(
-            recording, range(recording.count)
-        ):
-            out[frame, rows[0] : rows[1]] = samples
+    out = np.empty((recording.count, *bench.detector.shape), np.uint16)
+    for first in range(0, out.shape[1], BLOCK_ROWS):
+        rows = (first, min(first + BLOCK_ROWS, out.shape[1]))
+        camera = Camera(bench, rows, effects)
+        for frame, samples in camera.expose(recording, range(recording.count)):
+            out[frame, slice(*rows)] = samples
     return out

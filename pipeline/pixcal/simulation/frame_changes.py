@@ -8,6 +8,7 @@ is a part of the covariance of the series' cosine modes.
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -138,10 +139,8 @@ def _strength(
         value = getattr(own, other.name)
         if other.name not in own.strengths and isinstance(value, float):
             changed = replace(own, **{other.name: OTHER * value or 1.0})
-            if any(
-                not np.array_equal(v, w.changes(changed, 2))
-                for v, w in zip(drawn, every, strict=True)
-            ):
+            both = zip(drawn, every, strict=True)
+            if any(not np.array_equal(v, w.changes(changed, 2)) for v, w in both):
                 shape = other.name
                 break
     steady, power = all(np.array_equal(*v) for v in drawn), 1.0
@@ -197,16 +196,13 @@ def _rounded(bench: Bench) -> Bench:
 
     Of what is measured, the visibility bounds the contrast.
     """
-    visibility = max(round(bench.optics.visibility, 2), 0.01)
+    electronics: Any = {"gain_e_per_adu": 1.0, "read_noise_e": 0.0, "bias_adu": 0.0}
+    sets = tuple(replace(s, peak_e=1.0) for s in bench.frames.fringes)
     return replace(
         bench,
-        detector=replace(
-            bench.detector, gain_e_per_adu=1.0, read_noise_e=0.0, saturation_adu=None, bias_adu=0.0
-        ),
-        optics=replace(bench.optics, visibility=visibility),
-        frames=replace(
-            bench.frames, fringes=tuple(replace(s, peak_e=1.0) for s in bench.frames.fringes)
-        ),
+        detector=replace(bench.detector, saturation_adu=None, **electronics),
+        optics=replace(bench.optics, visibility=max(round(bench.optics.visibility, 2), 0.01)),
+        frames=replace(bench.frames, fringes=sets),
     )
 
 

@@ -29,13 +29,7 @@ from pixcal.estimators.frame_series.variance_components import (
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.simulation.forward import ForwardModel
 from pixcal.simulation.frame_basis import FrameBasis
-from pixcal.simulation.frame_changes import (
-    LIGHT,
-    FrameChanges,
-    Strength,
-    strengths_of,
-    with_number,
-)
+from pixcal.simulation.frame_changes import LIGHT, FrameChanges, Strength, strengths_of, with_number
 
 ALIKE = (
     "; with fringes of one direction, motion of the fibres along the fringe axis and drift of the "

@@ -69,9 +69,7 @@ class Fitted(ForwardModel):
             more = maps.response / np.where(self.maps.response > 0, self.maps.response, 1)
             phasor = (of_cosine + 1j * of_sine) * np.exp(1j * turn) * more
             iota, of_sine, of_cosine = iota * more, phasor.imag, phasor.real
-        return LightMaps(
-            iota.astype(np.float32), of_sine.astype(np.float32), of_cosine.astype(np.float32)
-        )
+        return LightMaps(*(v.astype(np.float32) for v in (iota, of_sine, of_cosine)))
 
     def states(self, states: FrameStates, recording: Recording) -> FrameStates:
         """As in `ForwardModel.states`."""
@@ -144,22 +142,16 @@ def _fitted(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Fitted:
         along = np.stack([np.where(np.isfinite(s.delta), s.delta, 0.0) for s in sets])
         delta = np.tensordot(np.linalg.pinv(directions), along, 1)
 
-    def same(value: float) -> F32:
-        return np.full(shape, value, np.float32)
-
+    response, rate = np.nan_to_num(flat, nan=1.0), np.nan_to_num(evidence.dark_rate)
+    each = (*delta, response, np.nan_to_num(evidence.bias), np.maximum(rate, 0))
+    dx, dy, relative, bias, dark = (values.astype(np.float32) for values in each)
     maps = DetectorMaps(
-        delta[0].astype(np.float32),
-        delta[1].astype(np.float32),
-        np.nan_to_num(flat, nan=1.0).astype(np.float32),
-        np.nan_to_num(evidence.bias).astype(np.float32),
-        np.maximum(np.nan_to_num(evidence.dark_rate), 0).astype(np.float32),
-        same(evidence.amplifier_noise),
-        same(1 / evidence.gain),
+        dx, dy, relative, bias, dark,
+        np.full(shape, evidence.amplifier_noise, np.float32),
+        np.full(shape, 1 / evidence.gain, np.float32),
         np.where(evidence.good, 0, 1).astype(np.uint8),
-    )
-    theta = tuple(
-        filled(np.where(s.good, s.theta, np.nan), s.k) * np.nan_to_num(flat, nan=1.0) for s in sets
-    )
+    )  # fmt: skip
+    theta = tuple(filled(np.where(s.good, s.theta, np.nan), s.k) * response for s in sets)
     return Fitted(maps, theta, tuple(s.k for s in sets), tuple(_states(s) for s in sets))
 
 
@@ -207,16 +199,13 @@ def _starts(evidence: Evidence, sets: Sequence[FringeEvidence]) -> dict[str | in
 def _of_set(
     bench: Bench, number: int, found: FringeEvidence, start_s: float
 ) -> tuple[Recording, int]:
-    first = _first(found)
+    first, period = _first(found), _period(found.time_s)
     exposure = found.exptime_s if np.isfinite(found.exptime_s) else 0.0
-    count = first + len(found.g)
-    period = _period(found.time_s)
-    return (
-        Recording(
-            bench, "fringes", number, found.name, found.name, count, exposure, start_s, period, 1.0
-        ),
-        first,
-    )
+    recording = Recording(
+        bench, "fringes", number, found.name, found.name, first + len(found.g), exposure, start_s,
+        period, 1.0,
+    )  # fmt: skip
+    return recording, first
 
 
 def _of_stack(

@@ -20,11 +20,7 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.variance_components import (
-    log_chance,
-    log_chance_of_any,
-    sigmas,
-)
+from pixcal.estimators.frame_series.variance_components import log_chance, log_chance_of_any, sigmas
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64
 from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way, dot
@@ -264,13 +260,8 @@ class _Fit:
 
 def _shapes(model: ForwardModel) -> list[str]:
     """Parameters that are no strengths and can be fitted."""
-    return [
-        f.name
-        for f in dataclasses.fields(model)
-        if f.name not in model.strengths
-        and isinstance(getattr(model, f.name), float)
-        and getattr(model, f.name) != 0
-    ]
+    others = {f.name: getattr(model, f.name) for f in dataclasses.fields(model)}
+    return [n for n, v in others.items() if n not in model.strengths and isinstance(v, float) and v]
 
 
 def _moved(model: ForwardModel, step: Mapping[str, float]) -> ForwardModel:

@@ -90,10 +90,9 @@ def _correction(run_dir: Path) -> Json | None:
 
 def _sigma(fit: Json, correction: Json | None) -> dict[str, float]:
     """Error of the median pixel of each set, px, in the maps to use."""
+    each = {name: s["sigma_median_px"] for name, s in fit["sets"].items()}
     if correction is not None and correction["outputs"]:
         each = {name: s["sigma_median_px"]["after"] for name, s in correction["sets"].items()}
-    else:
-        each = {name: s["sigma_median_px"] for name, s in fit["sets"].items()}
     return {name: sigma for name, sigma in each.items() if sigma and math.isfinite(sigma)}
 
 
@@ -172,7 +171,9 @@ def _action(
 ) -> str:
     """How an effect was treated, or what to do about it."""
     action, treated = _on_map(cause)["action"], _treated(cause, correction)
-    why = treated["why"] if treated else _reason(cause["effect"], *shapes)
+    # An effect of the user's own is not known here.
+    kind = known_effects().get(cause["effect"])
+    why = treated["why"] if treated else treatment_of_kind(kind, *shapes)[1] if kind else ""
     because = f": {why}" if why else ""
     if action == "corrected":
         if not with_maps:
@@ -189,12 +190,6 @@ def _action(
         others = " or ".join(cause["not_told_apart_from"])
         text += f"; to distinguish it from {others}, retake with {', '.join(cause['would_decide'])}"
     return text
-
-
-def _reason(effect: str, model: str, models: Mapping[str, str]) -> str:
-    """Why an effect is treated as it is; nothing on an effect of the user's own."""
-    kind = known_effects().get(effect)
-    return treatment_of_kind(kind, model, models)[1] if kind else ""
 
 
 def size_of(cause: Json) -> str:

@@ -18,13 +18,7 @@ import numpy as np
 from astropy.io import fits
 
 from pixcal.model.errors import InputError
-from pixcal.storage.fits_facts import (
-    exposure_s,
-    integer,
-    number,
-    temperature_c,
-    time_stamp_mjd,
-)
+from pixcal.storage.fits_facts import exposure_s, integer, number, temperature_c, time_stamp_mjd
 from pixcal.storage.sources import SourceFile, unreadable
 
 Container = Literal["plain", "gzip", "tiles", "picture"]

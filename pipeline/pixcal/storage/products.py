@@ -221,9 +221,7 @@ def _checked(path: Path) -> Iterator[fits.HDUList]:
             yield hdus
 
 
-def read_map(
-    path: Path,
-) -> tuple[F32, F32, U8, dict[str, Any]]:
+def read_map(path: Path) -> tuple[F32, F32, U8, dict[str, Any]]:
     """Read a map written by `write_map`: data, sigma, mask, primary header.
 
     Raises

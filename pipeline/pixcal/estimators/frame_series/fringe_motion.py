@@ -9,17 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.fft import idct
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.series import (
-    MEDIAN,
-    FrameSeries,
-    mode_variance,
-    motion_series,
-)
+from pixcal.estimators.frame_series.series import MEDIAN, FrameSeries, mode_variance, motion_series
 from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
-from pixcal.estimators.frame_series.variance_components import cosine_modes, walk_power
+from pixcal.estimators.frame_series.variance_components import cosine_modes, from_modes, walk_power
 from pixcal.model.arrays import F64
 
 CROSSED = 0.5  # sine of the angle between fringes from which they count as different
@@ -97,16 +91,10 @@ def vector_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
         noise = np.diag(series.noise) * np.mean(cosine_modes(series.apart) ** 2, axis=0)
         noise /= np.diag(series.apart_noise)
         near = np.where(near > level * (1 + SLOW_SIGMAS * np.sqrt(2 / few)), near, level)
-        shares = (
-            np.where(slow, 1 - level / power, 0),
-            np.where(slow, 0, np.sqrt(np.maximum(1 - noise / near, 0))),
-        )
-        nothing = np.zeros((1, 2))
-        courses = [
-            idct(np.vstack([nothing, modes * share]), type=2, norm="ortho", axis=0)
-            for share in shares
-        ]
-        found.append((series.name, series.time_s, courses[0], courses[1]))
+        of_slow = np.where(slow, 1 - level / power, 0)
+        of_fast = np.where(slow, 0, np.sqrt(np.maximum(1 - noise / near, 0)))
+        courses = from_modes(modes * of_slow), from_modes(modes * of_fast)
+        found.append((series.name, series.time_s, *courses))
     return found
 
 
@@ -221,13 +209,8 @@ def motion_part(name: str, series: FrameSeries) -> F64:
     kind, _, axis = name.partition("_")
     n = len(series)
     power = np.ones(n - 1) if kind == "jitter" else walk_power(n) * series.step_s
-    k = np.array(series.k)
-    direction = {
-        "x": np.diag([1.0, 0.0]),
-        "y": np.diag([0.0, 1.0]),
-        "k": np.outer(k, k),
-        "": np.eye(2),
-    }
+    x, y = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
+    direction = {"x": x, "y": y, "k": np.outer(series.k, series.k), "": x + y}
     return np.asarray(power[:, None, None] * direction[axis])
 
 

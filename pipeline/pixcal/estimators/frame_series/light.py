@@ -12,17 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, stripes
-from pixcal.estimators.frame_series.series import (
-    FrameSeries,
-    assemble,
-    light_series,
-    mode_variance,
-)
+from pixcal.estimators.frame_series.series import FrameSeries, assemble, light_series, mode_variance
 from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
-from pixcal.estimators.frame_series.variance_components import (
-    Modes,
-    walk_power,
-)
+from pixcal.estimators.frame_series.variance_components import Modes, walk_power
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 

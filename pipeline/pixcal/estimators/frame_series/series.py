@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.fft import idct
 from scipy.ndimage import median_filter
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
@@ -17,6 +16,7 @@ from pixcal.estimators.frame_series.variance_components import (
     Modes,
     cosine_modes,
     estimate_components,
+    from_modes,
 )
 from pixcal.model.arrays import F64, Mask
 
@@ -102,9 +102,8 @@ def _lit(found: FringeEvidence) -> Mask:
     """Frames with light, fringes and samples in both halves of the pixels."""
     usable = np.ones(len(found.free), bool)
     for free, covariance in ((found.free, found.free_covariance), *found.halves):
-        usable &= np.isfinite(free).all(axis=1) & (np.einsum("tii->ti", covariance)[:, :3] > 0).all(
-            axis=1
-        )
+        known = np.einsum("tii->ti", covariance)[:, :3] > 0
+        usable &= np.isfinite(free).all(axis=1) & known.all(axis=1)
         b, a = free[:, 0], np.hypot(free[:, 1], free[:, 2])
         usable &= (b > DARK * np.median(b)) & (a > DARK * np.median(a))
     return usable
@@ -160,8 +159,7 @@ def without(values: F64, shapes: F64) -> F64:
             own = wanted - left @ (left.T @ (wanted * root)) / root
         kept = 1 - np.einsum("kp,kp->k", left, left)
         rest[:, channel] = own / np.sqrt(np.maximum(kept, 0.1))
-    nothing = np.zeros((1, modes.shape[1]))
-    return np.asarray(idct(np.vstack([nothing, rest]), type=2, norm="ortho", axis=0))
+    return from_modes(rest)
 
 
 def _follows_phase(phase: F64) -> F64:

@@ -4,10 +4,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.fft import idct
 
 from pixcal.estimators.frame_series.series import FrameSeries, without
-from pixcal.estimators.frame_series.variance_components import cosine_modes, log_chance, sigmas
+from pixcal.estimators.frame_series.variance_components import (
+    cosine_modes,
+    from_modes,
+    log_chance,
+    sigmas,
+)
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 
@@ -104,7 +108,7 @@ def _spectrum(s: FrameSeries, level: F64, channels: Sequence[int], grid: F64) ->
     n = len(s)
     level = level[:, list(channels)]
     modes = cosine_modes(s.values[:, list(channels)]) / np.sqrt(level)
-    white = idct(np.vstack([np.zeros(len(channels)), modes]), type=2, norm="ortho", axis=0)
+    white = from_modes(modes)
     size = 1 << int(np.ceil(np.log2(2 * FINER * n)))
     power = np.abs(np.fft.rfft(white, size, axis=0)) ** 2 / n
     own = np.arange(len(power)) / (size * s.step_s)

@@ -170,12 +170,7 @@ NO_CURVE = Curve(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0), None, None,
 
 
 def fit_curve(
-    lengths: Sequence[int],
-    median: F64,
-    spread: F64,
-    pixels: int,
-    shared: F64,
-    white: White,
+    lengths: Sequence[int], median: F64, spread: F64, pixels: int, shared: F64, white: White
 ) -> Curve:
     """Unbias a window's medians, and find slope and knee.
 

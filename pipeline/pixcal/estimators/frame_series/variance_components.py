@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import dct
+from scipy.fft import dct, idct
 from scipy.optimize import brentq
 from scipy.special import ndtri_exp
 
@@ -27,6 +27,12 @@ CONVERGED = 1e-5  # growth of the log-likelihood at which scoring ends
 def cosine_modes(series: F64) -> F64:
     """Orthonormal cosine transform of series (t, ...) without their mean: (t - 1, ...)."""
     return np.asarray(dct(series, type=2, norm="ortho", axis=0)[1:])
+
+
+def from_modes(modes: F64) -> F64:
+    """Series (t, ...) of some cosine modes (t - 1, ...), without mean."""
+    whole = np.concatenate([np.zeros((1, *modes.shape[1:])), modes])
+    return np.asarray(idct(whole, type=2, norm="ortho", axis=0))
 
 
 def walk_power(frames: int) -> F64:
@@ -168,13 +174,9 @@ class _State:
         self.beta = self.spread @ np.einsum("nap,na->p", self.weighted, modes.values)
         rest = modes.values - np.einsum("nap,p->na", modes.known, self.beta)
         self.pull = np.einsum("nab,nb->na", self.weight, rest)
-        self.profile = (
-            -0.5
-            * modes.share
-            * float(
-                2 * np.log(np.einsum("naa->na", root)).sum() + np.einsum("na,na->", rest, self.pull)
-            )
-        )
+        log_determinant = 2 * np.log(np.einsum("naa->na", root)).sum()
+        square = float(log_determinant + np.einsum("na,na->", rest, self.pull))
+        self.profile = -0.5 * modes.share * square
         self.likelihood = self.profile - 0.5 * modes.share * _log_determinant(normal)
 
     def score(self) -> F64:

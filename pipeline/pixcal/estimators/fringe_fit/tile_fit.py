@@ -82,11 +82,7 @@ def phase_sigma(theta: F64, covariance: F64) -> F64:
 
 
 def residual_chi2(
-    tile: Tile,
-    codes: U16,
-    coding: Coding,
-    frames: FrameParameters,
-    theta: F64,
+    tile: Tile, codes: U16, coding: Coding, frames: FrameParameters, theta: F64
 ) -> float:
     """Median over a tile's pixels of the reduced chi-square."""
     sums = accumulate(tile, [codes], coding, frames, theta.astype(np.float32))

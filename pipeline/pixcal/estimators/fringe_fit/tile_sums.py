@@ -129,12 +129,7 @@ def local_modes(carrier: Carrier, plane: TilePlane, shape: tuple[int, int]) -> F
 
 
 def sum_row(
-    phase: F32,
-    sigma: F32,
-    good: Mask,
-    batches: F32,
-    carrier: Carrier,
-    plane: TilePlane,
+    phase: F32, sigma: F32, good: Mask, batches: F32, carrier: Carrier, plane: TilePlane
 ) -> F64:
     """The sums of one tile, as a row of `TileSums.of_rows`.
 

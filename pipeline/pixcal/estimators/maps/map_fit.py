@@ -73,12 +73,8 @@ def fit_maps(parts: Sequence[MapPart]) -> MapFit:
             right += part.signals.T @ part.data / variance
         values = np.linalg.pinv(normal, rcond=1e-12, hermitian=True) @ right
         left = [p.data - p.signals @ values for p in parts]
-        variances = np.array(
-            [
-                max(r @ r / max(p.dof - n, 1), _MIN_VARIANCE)
-                for p, r in zip(parts, left, strict=True)
-            ]
-        )
+        squares = np.array([r @ r / max(p.dof - n, 1) for p, r in zip(parts, left, strict=True)])
+        variances = np.maximum(squares, _MIN_VARIANCE)
     covariance = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     meat = np.zeros((n, n))
     for part, rest, variance in zip(parts, left, variances, strict=True):
@@ -87,10 +83,8 @@ def fit_maps(parts: Sequence[MapPart]) -> MapFit:
         meat += scores.T @ scores
     inside = covariance @ meat @ covariance
     more = float(np.mean(np.diag(inside) / np.diag(covariance)))
-    wider = np.asarray(covariance * max(1.0, more), np.float64)
-    return MapFit(
-        np.asarray(values, np.float64), wider, float(values @ normal @ values) / max(1.0, more)
-    )
+    more = max(1.0, more)
+    return MapFit(values, np.asarray(covariance * more), float(values @ normal @ values) / more)
 
 
 def phase_map(fringes: FringeEvidence) -> F64:

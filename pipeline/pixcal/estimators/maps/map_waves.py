@@ -167,10 +167,8 @@ def _strongest(maps: Maps, allowed: Mask, in_flats: bool) -> Waves:
         own = [(n, m) for n in names for m in maps[n]]
         fitted, q = _fitted(own, names, start)
         waves += fitted
-        for kind in dict.fromkeys(m.kind for _, m in own):
-            gains[kind] = gains.get(kind, 0.0) + sum(
-                _plain_gain(m, q) for _, m in own if m.kind == kind
-            )
+        for _, m in own:
+            gains[m.kind] = gains.get(m.kind, 0.0) + _plain_gain(m, q)
     by_map = {kind: sigmas_of_chi2(gain, dof) for kind, gain in gains.items()}
     order = sorted(by_map, key=lambda kind: -by_map[kind])
     first = _best_of(gains[order[0]], trials * len(groups), dof)

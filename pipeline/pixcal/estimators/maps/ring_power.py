@@ -52,10 +52,8 @@ def ring_power(power: F64) -> Ring:
     data = power.ravel()
     fits = [np.linalg.lstsq(np.stack([white, t], axis=1), data, rcond=None)[0] for t in templates]
     # Waves that take power away are none.
-    left = [
-        np.sum((data - c[0] * white - max(c[1], 0.0) * t) ** 2)
-        for c, t in zip(fits, templates, strict=True)
-    ]
+    both = zip(fits, templates, strict=True)
+    left = [np.sum((data - c[0] * white - max(c[1], 0.0) * t) ** 2) for c, t in both]
     best = int(np.clip(np.argmin(left), 1, len(scales) - 2))
     variance, noise, modes = _sum_of_ring(data, templates[best])
     if variance <= 0:

@@ -126,15 +126,9 @@ def _measure(
     runtime: Runtime,
 ) -> None:
     """Everything; writes the artefact's files."""
-    psf, half = telescope.psf(config.window)
-    observed = star(psf, half, config.electrons, config.background_e, acquisition.detector)
     shape = components[0].delta.shape
-    if observed.side > min(shape):
-        by_itself = "" if config.window else ", which a star of --wavelength and --diameter takes,"
-        raise InputError(
-            f"--window: {observed.side} px{by_itself} do not fit maps of {shape[1]} × {shape[0]} "
-            f"px (x × y); give an odd number up to {min(shape)}"
-        )
+    observed = _star(telescope, config, acquisition, shape)
+    psf, half = observed.psf, observed.half
     need = planned(shape, modes.number if modes else 0, observed.side, config)
     runtime = within_memory("astrometry", *need, runtime)
     removed = None
@@ -149,14 +143,26 @@ def _measure(
         )
     plan = Observation(observed, config.stars, config.positions, config.dither_px)
     errors = observe(detector, plan, runtime)
-    facts = _facts(detector, maps, plan, errors, removed, config)
     result = {
         "schema": SCHEMA,
         "pixcal": __version__,
-        "detector": facts["detector"],
+        "detector": {
+            "pixels": "the maps plus random errors of size SIGMA" if detector.drawn else "truth",
+            "truth": None if config.truth is None else str(config.truth),
+            "shape": list(shape),
+            "places": int(maps.places.sum()),
+            "modes_removed_px": removed,
+        },
         "telescope": telescope.facts(),
-        "stars": facts["stars"]
-        | {
+        "stars": {
+            "number": config.stars,
+            "positions": config.positions,
+            "positions_used": int(np.isfinite(errors).all(axis=(2, 3)).sum()),
+            "dither_px": config.dither_px,
+            "electrons": config.electrons,
+            "background_e": config.background_e,
+            "window_px": observed.side,
+            "seed": config.seed,
             "exposures": exposures(psf, config.electrons, acquisition.detector),
             "read_noise_e": acquisition.detector.read_noise_e,
         },
@@ -173,34 +179,19 @@ def _measure(
     made.summary = {"warnings": result["warnings"]}
 
 
-def _facts(
-    detector: PixelPositions,
-    maps: ErrorMaps,
-    plan: Observation,
-    errors: F64,
-    removed: dict[str, dict[str, float]] | None,
-    config: Config,
-) -> dict[str, dict[str, Any]]:
-    """What was simulated."""
-    return {
-        "detector": {
-            "pixels": "the maps plus random errors of size SIGMA" if detector.drawn else "truth",
-            "truth": None if config.truth is None else str(config.truth),
-            "shape": list(detector.shape),
-            "places": int(maps.places.sum()),
-            "modes_removed_px": removed,
-        },
-        "stars": {
-            "number": plan.stars,
-            "positions": plan.positions,
-            "positions_used": int(np.isfinite(errors).all(axis=(2, 3)).sum()),
-            "dither_px": plan.dither,
-            "electrons": config.electrons,
-            "background_e": config.background_e,
-            "window_px": plan.star.side,
-            "seed": config.seed,
-        },
-    }
+def _star(
+    telescope: Telescope, config: Config, acquisition: Acquisition, shape: tuple[int, int]
+) -> Star:
+    """The star to observe, whose window must fit maps of a shape (y, x)."""
+    psf, half = telescope.psf(config.window)
+    observed = star(psf, half, config.electrons, config.background_e, acquisition.detector)
+    if observed.side > min(shape):
+        by_itself = "" if config.window else ", which a star of --wavelength and --diameter takes,"
+        raise InputError(
+            f"--window: {observed.side} px{by_itself} do not fit maps of {shape[1]} × {shape[0]} "
+            f"px (x × y); give an odd number up to {min(shape)}"
+        )
+    return observed
 
 
 def planned(shape: tuple[int, int], modes: int, side: int, config: Config) -> tuple[int, int]:

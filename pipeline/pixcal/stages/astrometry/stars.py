@@ -93,8 +93,9 @@ def observe(detector: PixelPositions, plan: Observation, runtime: Runtime) -> F6
     failed.
     """
     batches = [range(n, min(n + BATCH, plan.stars)) for n in range(0, plan.stars, BATCH)]
-    errors = run_tasks(partial(_batch, detector, plan), batches, runtime, label="stars")
-    return np.concatenate(errors)
+    core = core_weights(plan.star, detector.axes)
+    task = partial(_batch, detector, plan, core)
+    return np.concatenate(run_tasks(task, batches, runtime, label="stars"))
 
 
 def core_weights(star: Star, axes: F64) -> F64:
@@ -103,8 +104,7 @@ def core_weights(star: Star, axes: F64) -> F64:
     return np.asarray(np.einsum("ka,abyx,kb->kyx", axes, weights, axes))
 
 
-def _batch(detector: PixelPositions, plan: Observation, stars: range) -> F64:
-    core = core_weights(plan.star, detector.axes)
+def _batch(detector: PixelPositions, plan: Observation, core: F64, stars: range) -> F64:
     return np.stack([observe_star(detector, plan, core, n) for n in stars])
 
 

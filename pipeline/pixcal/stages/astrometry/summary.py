@@ -65,7 +65,9 @@ def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -
     square_error = np.std(again[:, 3])
     if not rms[3] > SEEN * square_error:
         rms[0] = rms[2] = np.nan
-    return Comparison(*(Value(float(rms[n]), _spread(again[:, n])) for n in range(3)))
+    finite = [column[np.isfinite(column)] for column in again.T[:3]]
+    errors = [float(np.std(values)) if len(values) > 1 else math.nan for values in finite]
+    return Comparison(*(Value(float(rms[n]), errors[n]) for n in range(3)))
 
 
 def _roots(sums: F64) -> F64:
@@ -75,12 +77,6 @@ def _roots(sums: F64) -> F64:
     root = np.sqrt(square) if square > 0 else np.nan
     other = np.sqrt(measured)
     return np.array([root, other, root / other if other > 0 else np.nan, square])
-
-
-def _spread(values: F64) -> float:
-    """Standard deviation of the finite values."""
-    finite = values[np.isfinite(values)]
-    return float(np.std(finite)) if len(finite) > 1 else float("nan")
 
 
 def running_means(errors: F64, lengths: list[int]) -> list[F64]:
@@ -127,6 +123,10 @@ def axis_facts(
     pairs = {kind: v[1::2] - v[: len(v) // 2 * 2 : 2] for kind, v in last.items()}
     photons = compared(kinds, "_photons")
     curve = {grid: np.array([getattr(c, grid) for c in averaged]) for grid in GRIDS}
+    times = {grid: getattr(photons, grid).value / TARGET_PX for grid in GRIDS}
+    positions_needed = {g: math.ceil(t**2) if math.isfinite(t) else None for g, t in times.items()}
+    second = kinds["perfect"] - kinds["linear"]
+    second = second[np.isfinite(second)]
     return {
         "floor": _facts(compared(kinds, ""), uas_per_px),
         "photon_bound": number(Value(bound, math.nan), uas_per_px),
@@ -139,19 +139,9 @@ def axis_facts(
             for grid in GRIDS
             for n, suffix in enumerate(("", "_err"))
         },
-        "positions_to_target": {"target_px": TARGET_PX}
-        | {grid: _positions(getattr(photons, grid).value) for grid in GRIDS},
-        "second_order_px": _finite(_rms(kinds["perfect"] - kinds["linear"])),
+        "positions_to_target": {"target_px": TARGET_PX, **positions_needed},
+        "second_order_px": _finite(float(np.sqrt(np.mean(second**2)))) if len(second) else None,
     }
-
-
-def _rms(values: F64) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean(finite**2))) if len(finite) else math.nan
-
-
-def _positions(error: float) -> int | None:
-    return math.ceil((error / TARGET_PX) ** 2) if math.isfinite(error) else None
 
 
 def _finite(value: float) -> float | None:
@@ -184,17 +174,12 @@ def table(result: Mapping[str, Any]) -> list[Row]:
     }
     if stars["positions"] == 1:
         del cases["averaged"]
-    return [
-        Row(
-            case,
-            name,
-            _length(axis[key]["perfect"]),
-            _length(axis[key]["measured"]),
-            _times(axis[key]["gain"]),
-        )
-        for key, case in cases.items()
-        for name, axis in result["axes"].items()
-    ]
+    rows = []
+    for key, case in cases.items():
+        for name, axis in result["axes"].items():
+            perfect, measured = (_length(axis[key][grid]) for grid in GRIDS)
+            rows.append(Row(case, name, perfect, measured, _times(axis[key]["gain"])))
+    return rows
 
 
 def scientific(value: float) -> str:

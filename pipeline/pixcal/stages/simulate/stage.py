@@ -11,15 +11,15 @@ and its frames (``B``, ``A``, ``phi``, ``dkx``, ``dky``); and the bench file.
 
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from datetime import datetime, timedelta
 from functools import partial
 from itertools import product
+from operator import call
 from pathlib import Path
 from typing import Any, Protocol
 
 from pixcal.effects import known_effects, parse_effects
-from pixcal.engine.plan import make_plan
+from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.kernels import synthesis
 from pixcal.kernels.scene import Rows
@@ -166,8 +166,7 @@ def _fitting(
         if recording.folder in bench.frames.compress:
             planes = min(bench.frames.per_file, recording.count)
             need = max(need, planes * ny * nx * _BYTES_PER_COMPRESSED_SAMPLE)
-    workers = make_plan("simulate", need, 0, runtime).workers
-    return replace(runtime, workers=workers)
+    return within_memory("simulate", need, 0, runtime)
 
 
 def _write_frames(
@@ -179,14 +178,15 @@ def _write_frames(
     camera: Cameras = Camera,
 ) -> None:
     spans: list[Span] = []
-    ready: list[tuple[FrameWriter, bool]] = []
+    ready: list[Callable[[], Path]] = []
     for recording in recorded:
         files = _create_files(bench, recording, folder)
-        ready += [(file, recording.folder in bench.frames.compress) for file in files]
+        packed = recording.folder in bench.frames.compress
+        ready += [file.finish_compressed if packed else file.finish for file in files]
         spans += _spans(recording, files, bench.frames.per_file)
     pieces = list(product(row_blocks(bench), _batches(spans)))
     run_tasks(partial(_write_piece, bench, effects, camera), pieces, runtime, label="frames")
-    run_tasks(_finish, ready, runtime, label="files")
+    run_tasks(call, ready, runtime, label="files")
 
 
 def _spans(recording: Recording, files: list[FrameWriter], per_file: int) -> list[Span]:
@@ -253,14 +253,6 @@ def _write_piece(
             files[number].write_rows(rows[0], samples, plane)
 
 
-def _finish(ready: tuple[FrameWriter, bool]) -> None:
-    file, compress = ready
-    if compress:
-        file.finish_compressed()
-    else:
-        file.finish()
-
-
 def _write_description(bench: Bench, folder: Path) -> None:
     """``acquisition.yaml``: what the owner of such a bench would declare."""
     d, o, f = bench.detector, bench.optics, bench.frames
@@ -268,6 +260,7 @@ def _write_description(bench: Bench, folder: Path) -> None:
     def globs(name: str) -> tuple[str, ...]:
         return (f"{name}/*{COMPRESSED if name in f.compress else '.fits'}",)
 
+    sets = (described.FringeSet(s.name, globs(s.name), s.baseline_mm) for s in f.fringes)
     contents = described.Acquisition(
         schema=described.SCHEMA,
         detector=described.Detector(
@@ -287,9 +280,7 @@ def _write_description(bench: Bench, folder: Path) -> None:
             bias=globs("bias") if f.bias else (),
             dark=globs("dark") if f.darks else (),
             flat=globs("flat") if f.flats else (),
-            fringes=tuple(
-                described.FringeSet(s.name, globs(s.name), s.baseline_mm) for s in f.fringes
-            ),
+            fringes=tuple(sets),
         ),
     )
     (folder / "acquisition.yaml").write_text(to_yaml(contents), encoding="utf-8")

@@ -72,9 +72,6 @@ def _set_truth(bench: Bench, effects: Effects, recording: Recording) -> dict[str
         "kx": float(kx),
         "ky": float(ky),
         "electrons": recording.electrons,
-        "B": states.level.tolist(),
-        "A": states.amplitude.tolist(),
-        "phi": states.phi.tolist(),
-        "dkx": states.dkx.tolist(),
-        "dky": states.dky.tolist(),
+        **{"B": states.level.tolist(), "A": states.amplitude.tolist()},
+        **{name: getattr(states, name).tolist() for name in ("phi", "dkx", "dky")},
     }

@@ -51,11 +51,7 @@ class Hyperbolic(FringeShape):
         first = nominal.vector()
         first[3:5] = np.array(start.k) / per_mm
         shape = cls(
-            0.0,
-            nominal.with_vector(first),
-            tuple(nominal.vector()),
-            tuple(sigma),
-            start.reference,
+            0.0, nominal.with_vector(first), tuple(nominal.vector()), tuple(sigma), start.reference
         )
         return shape._fit_planes(start)
 
@@ -134,9 +130,7 @@ class Hyperbolic(FringeShape):
     def moved(self, step: F64) -> Self:
         values = self.geometry.vector() + np.asarray(step[1:]) * np.array(self.sigma)
         return replace(
-            self,
-            phase0=self.phase0 + float(step[0]),
-            geometry=self.geometry.with_vector(values),
+            self, phase0=self.phase0 + float(step[0]), geometry=self.geometry.with_vector(values)
         )
 
     def vector(self, y: float, x: float) -> tuple[float, float]:
