@@ -303,6 +303,20 @@ def test_a_large_share_of_the_gap_is_claimed_whatever_another_cause_brings_about
     assert set(found.accepted) == {"left", "right"}
 
 
+@pytest.mark.parametrize("curve", [0.0300, 0.0302])
+def test_of_two_that_gain_alike_the_one_that_does_so_by_its_law_is_taken(curve: float) -> None:
+    """A measured curve that imitates it may gain a little more."""
+    true, other = candidate("left", 0.0301), candidate("left", curve)
+    for one in (other, other.estimate.effect):  # type: ignore[union-attr]
+        object.__setattr__(one, "name", "other")
+    assert other.estimate is not None
+    poor = replace(other.estimate.effect, size=0.02)
+    other.estimate = replace(other.estimate, law="a poor one", by_law=poor)
+    found, _ = search({"left": 0.03}, [other, true], {"left": 50.0, "other": 50.0})
+    assert found.accepted == ("left",)
+    assert found.alike == {"left": ("other",)}
+
+
 def test_of_a_vague_law_and_its_replay_the_one_that_leaves_less_of_the_gap_is_taken() -> None:
     data = REFERENCE.on_scale(curves((), 500, {"left": 0.03}))
     judged = Comparison(REFERENCE, data)
