@@ -96,6 +96,7 @@ def _diagnosis(file: Path, causes: list[list[str]]) -> dict[str, Any]:
         "right": right and (bool(causes) or found["verdict"] == "no gap"),
         "verdict": found["verdict"], "named": named,
         "p": [cause["p_value"] for cause in found["causes"]],
+        "parameters": [[cause["parameters"], cause["uncertainty"]] for cause in found["causes"]],
         "where": [w["statistic"] for w in found["gap"].get("where", [])][:4],
     }  # fmt: skip
 

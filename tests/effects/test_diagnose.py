@@ -3,6 +3,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from pixcal.simulation.effect import Effect
 from pixcal.stages import correct, diagnose, fit, ingest, reduce, simulate
 from pixcal.stages.diagnose import inquiry, stage, trial, windows
 from pixcal.stages.diagnose.look import look_at
-from pixcal.stages.diagnose.windows import chosen_windows, split
+from pixcal.stages.diagnose.windows import chosen_windows, frames_of_half, split, whole_of
 from pixcal_cli.main import invoke
 
 SYNC = Runtime(cluster="sync")
@@ -422,16 +423,36 @@ def test_windows_that_are_tried_do_not_overlap(shape: tuple[int, int]) -> None:
 @pytest.mark.parametrize("shape", [(512, 640), (1024, 1280), (257, 1000), (3000, 3000)])
 def test_few_frames_without_fringes_are_looked_at_in_more_pixels(shape: tuple[int, int]) -> None:
     plain, tried = chosen_windows(shape)
-    wide, same = chosen_windows(shape, 60)
-    assert same == tried
+    wide, also = chosen_windows(shape, 60)
     sides = [np.diff(window).ravel() for window in (plain, wide)]
     assert np.prod(sides[1]) > 1.5 * np.prod(sides[0])
     assert (sides[1] >= sides[0]).all()
-    assert np.prod(sides[1]) * 60 <= 6e6
-    for rows, columns in tried:
-        apart = [b[0] >= a[1] or b[1] <= a[0] for a, b in zip(wide, (rows, columns), strict=True)]
-        assert any(apart)
+    pixels = [np.prod(np.diff(window).ravel()) for window in (wide, *also)]
+    assert pixels[0] * 60 <= 6e6
+    assert sum(pixels[1:]) * 60 <= 6e6
+    assert sum(pixels[1:]) > len(tried) * 128 * 128
+    for a, b in combinations((wide, *also), 2):
+        assert any(p[0] >= q[1] or p[1] <= q[0] for p, q in zip(a, b, strict=True))
     assert chosen_windows(shape, 5000) == (plain, tried)
+
+
+def test_detectors_of_few_enough_samples_are_looked_at_whole() -> None:
+    shape = (300, 400)
+    assert chosen_windows(shape, 50)[1] == (whole_of(shape),)
+    assert len(chosen_windows(shape, 51)[1]) == 4
+
+
+def test_stacks_without_fringes_are_cut_to_the_samples_of_a_half() -> None:
+    """Where a level has a hundred frames, they do not take the memory of all the others."""
+    flat = {"exptime_s": [1.0] * 2 + [2.0] * 100 + [3.0] * 100 + [4.0] * 100}
+    tables = {"bias": {"exptime_s": [0.0] * 100}, "flat": flat}
+    pixels = 51_200
+    own = split(tables, pixels)
+    for half in (own.learn, own.test):
+        assert sum(len(frames) for frames in half.frames.values()) * pixels <= 6e6
+        counts = np.unique(np.array(flat["exptime_s"])[half.frames["flat"]], return_counts=True)[1]
+        assert list(counts) == [2, 28, 28, 28]
+    assert frames_of_half(tables) == 202
 
 
 @pytest.mark.quick(1)

@@ -216,6 +216,22 @@ def test_a_bias_that_wanders_does_not_bias_the_gain() -> None:
     assert np.sqrt(np.mean(np.square(off[3.0]))) < 0.004
 
 
+def test_levels_tell_the_noise_without_light() -> None:
+    """Where it is hardly known, the curve that meets level zero there does, within its error."""
+    rng = np.random.default_rng(15)
+    level, dof = np.linspace(5, 200, 12), np.full(12, 65_000.0)
+    pulls = []
+    for _ in range(30):
+        seen = (level / GAIN + READ_ADU**2) * (1 + rng.standard_normal(12) * np.sqrt(2 / dof))
+        sums = np.stack([dof, dof * level, dof * seen], 1)
+        fitted = fit_gain(sums, (0.7 * READ_ADU**2, READ_ADU**2), np.inf)
+        assert fitted is not None
+        value, error = fitted.read_variance
+        assert error < 0.1 * READ_ADU**2
+        pulls.append((value - READ_ADU**2) / error)
+    assert np.sqrt(np.mean(np.square(pulls))) < 1.5
+
+
 def test_without_light_there_is_no_gain() -> None:
     rng = np.random.default_rng(7)
     assert fit_gain(np.zeros((N_BINS, 3)), (25.0, 0.1), np.inf) is None

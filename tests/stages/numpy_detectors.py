@@ -23,7 +23,7 @@ from pixcal.stages.diagnose.windows import Split, split, whole_of
 from pixcal.storage.artefact import read_json
 
 F64 = NDArray[np.float64]
-Frames = dict[str, NDArray[np.uint16]]
+Frames = dict[str, NDArray[Any]]
 Tables = dict[str, dict[str, list[Any]]]
 
 
@@ -43,6 +43,7 @@ class Detector:
     prnu: float = 0.01
     flats: Sequence[tuple[float, int, float]] = ((0.1, 10, 1), (0.3, 10, 1), (0.6, 10, 1))
     response: Callable[[F64], F64] = lambda electrons: electrons
+    real: bool = False  # real numbers, negative ones too, instead of codes
 
     def frames(self, seed: int, bias: int = 20, dark: int = 8) -> tuple[Frames, Tables]:
         """Bias, dark (1 s) and flat frames as a camera writes them."""
@@ -50,10 +51,12 @@ class Detector:
         offset = self.bias + self.scatter * rng.standard_normal(self.shape)
         pixels = 1 + self.prnu * rng.standard_normal(self.shape)
 
-        def frame(seconds: float, light: float) -> NDArray[np.uint16]:
+        def frame(seconds: float, light: float) -> NDArray[Any]:
             charge = rng.poisson((self.dark + light * self.rate * pixels) * seconds).astype(float)
             noise = self.noise * rng.standard_normal(self.shape)
             adu = (self.response(charge) + noise) / self.gain + offset
+            if self.real:
+                return adu.astype(np.float32)
             codes = np.rint(adu / self.step) * self.step
             return np.clip(codes, 0, self.top).astype(np.uint16)
 
@@ -107,11 +110,17 @@ class Nominal:
     differences: Mapping[Key, Difference]
 
 
-def held_against_nominal(detector: Detector, seed: int, count: int = 12) -> Nominal:
+def held_against_nominal(
+    detector: Detector,
+    seed: int,
+    count: int = 12,
+    full_flats: Sequence[int] = (),
+    **declared: float,
+) -> Nominal:
     """Measure the nominal bench of a recording, and hold its second half against simulations."""
     arrays, tables = detector.frames(seed)
-    acquisition, part = detector.described(), whole_of(detector.shape)
-    own = split(tables, detector.shape[0] * detector.shape[1])
+    acquisition, part = detector.described(**declared), whole_of(detector.shape)
+    own = split(tables, detector.shape[0] * detector.shape[1], full_flats)
 
     def look(raw: Raw) -> Evidence:
         return evidence_of(raw, part, detector.shape)

@@ -1,10 +1,12 @@
 """Without fringes: the nominal bench of a plain camera makes frames like those of the camera."""
 
+import numpy as np
 import pytest
 from numpy_detectors import Detector, held_against_nominal
 
 from pixcal.effects.quantisation import Quantisation
 from pixcal.estimators.diagnosis.gap import flagged
+from pixcal.model.errors import InputError
 
 
 @pytest.mark.quick(2)
@@ -33,3 +35,36 @@ def test_frames_without_light_get_none() -> None:
     found = held_against_nominal(detector, 2, count=2)
     frames = found.bench.simulate(found.split.test, (), 5).arrays["bias"]
     assert frames.mean() == pytest.approx(detector.bias, abs=0.1)
+
+
+def test_eight_bits_may_saturate() -> None:
+    """A level of saturation below any usual bias leaves a bench to simulate."""
+    detector = Detector(gain=32.0, noise=22.0, bias=28.3, top=255, rate=9000.0)
+    found = held_against_nominal(detector, 3, saturation_adu=255.0)
+    assert flagged(found.differences) == set()
+
+
+def test_flats_of_full_pixels_do_not_pull_the_light_of_the_others() -> None:
+    """Levels that are not looked at are not known, and the line of the lamp is that of the rest."""
+    flats = [(t, 2, 1.0) for t in (0.1, 0.2, 0.3, 0.4, 0.8, 0.9)]
+    detector = Detector(flats=flats, response=lambda e: np.minimum(e, 10_000.0))
+    found = held_against_nominal(detector, 4, count=2, full_flats=(8, 9, 10, 11))
+    light = found.bench.simulate(found.split.test, (), 5).arrays["flat"].mean(axis=(1, 2))
+    truth = detector.bias + 2e4 * np.repeat([0.1, 0.2, 0.3, 0.4], 2) / detector.gain
+    assert light == pytest.approx(truth, rel=0.01)
+
+
+def test_samples_below_zero_keep_their_noise() -> None:
+    """Frames that a program freed of their bias are real numbers about zero."""
+    detector = Detector(gain=1.0, noise=3.0, bias=0.0, real=True)
+    found = held_against_nominal(detector, 5)
+    frames = found.bench.simulate(found.split.test, (), 5).arrays["bias"]
+    assert frames.mean() == pytest.approx(0.0, abs=0.1)
+    assert np.diff(frames, axis=0).std() / np.sqrt(2) == pytest.approx(3.0, rel=0.02)
+    assert flagged(found.differences) == set()
+
+
+def test_real_numbers_that_whole_ones_cannot_stand_for_are_refused() -> None:
+    detector = Detector(gain=6e4, noise=30.0, bias=0.01, real=True)
+    with pytest.raises(InputError, match="multiply all frames"):
+        held_against_nominal(detector, 6, count=1)

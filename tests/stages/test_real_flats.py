@@ -120,6 +120,20 @@ def test_noise_that_is_cut_off_at_code_zero_is_told_of(tmp_path: Path) -> None:
     assert "raise the black level" in cut[0]
 
 
+def test_a_gain_does_not_hang_on_noise_that_is_cut_off_at_code_zero(tmp_path: Path) -> None:
+    """Of noise below a code hardly anything is left; the flats tell what it is, and the gain."""
+    flats = ladder([(t, 1) for t in LEVELS], 10)
+    camera = Detector(
+        gain=45.0, noise=20.0, bias=0.0, top=255, dark=0.0, rate=9000.0, prnu=0.008,
+        shape=(192, 192), flats=flats,
+    )  # fmt: skip
+    _, report = reduced(camera, 15, tmp_path)
+    gain, noise = report["gain_e_per_adu"], report["read_noise_e"]
+    assert gain["measured"] == pytest.approx(45.0, abs=max(0.45, 3 * gain["error"]))
+    assert gain["error"] < 0.45
+    assert noise["measured"] == pytest.approx(20.0, abs=min(3 * noise["error"], 1.0))
+
+
 def test_saturation_is_found_and_what_is_below_it_used(tmp_path: Path) -> None:
     camera = Detector(**CAMERA, flats=ladder([(2.4 * t, 1) for t in LEVELS]))
     evidence, report = reduced(camera, 3, tmp_path)

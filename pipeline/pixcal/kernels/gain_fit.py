@@ -36,6 +36,7 @@ class GainFit:
     error: float
     chi2_reduced: float  # of the points about the curve
     levels: tuple[float, float]  # lowest and highest level used, ADU
+    read_variance: tuple[float, float]  # at level zero, where the curve meets what was known; error
     # slope at the highest level (variance over level) relative to that at zero, less one; zero
     # where a straight line fits
     curved: float = 0.0
@@ -110,11 +111,13 @@ def fit_gain(
         rest = weight @ (shot - found[-1][0] @ design) ** 2
         chi2 = max(1.0, float(rest / max(freedom[-1], 1)))
     scatter = share @ [one[1][1, 1] + (one[0][1] - slope) ** 2 for one in found]
+    of_zero = [one[1][0, 0] + (one[0][0] - mean[0]) ** 2 for one in found]
     return GainFit(
         1 / slope,
         math.sqrt(scatter) / slope**2,
         float(weight @ (shot - expected) ** 2 / max(share @ freedom, 1)),
         (float(level.min()), top),
+        (read_variance[0] + float(mean[0]), math.sqrt(share @ of_zero)),
         float(mean[2:].sum() / slope) if share[0] < _CURVED else 0.0,
     )
 

@@ -241,6 +241,7 @@ def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:
             chip=sets[0].window if sets else None,
             origin_px=evidence.origin if sets else None,
             saturation_adu=min(evidence.saturation_adu, TOP_ADU),
+            bias_adu=0.0,
         ),
         float(np.mean(contrast)) if contrast else 1.0,
         (max([*exposures[:1], MIN_S]), _period(sets[0].time_s) if sets else 0.0),
@@ -262,7 +263,7 @@ def plain_bench(
     evidence : Evidence
         Tells bias, laser and distance.
     detector : SimulatedDetector
-        The rest of the detector.
+        The rest of the detector; its bias is not used.
     times_s : (float, float)
         Exposure time and period.
     sets : sequence of (str, (float, float), int, float)

@@ -1,5 +1,6 @@
 """What effects ask a bench for, and when its frames were taken: as an acquisition tells."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,6 +16,9 @@ from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import plain_bench
 from pixcal.stages.diagnose.nominal import SetTruth
 from pixcal.stages.diagnose.parts import Half, Table, groups
+
+_LIFTED = 8.0  # read noise that the level without light is lifted to
+_LEAST_NOISE = 0.5  # of real numbers (ADU)
 
 
 def bench_of(
@@ -49,6 +53,7 @@ def bench_of(
         chip=whole,
         origin_px=evidence.origin,
         saturation_adu=_top(acquisition, evidence, sets, dtypes),
+        bias_adu=0.0,
         full_well_e=d.full_well_e,
     )
     listed_sets = [
@@ -62,6 +67,29 @@ def bench_of(
     ]
     visibility = float(np.mean(contrast)) if contrast else 1.0
     return plain_bench(evidence, detector, visibility, (exposure, period), listed_sets)
+
+
+def pedestal_of(
+    evidence: Sequence[Evidence], dtypes: Mapping[str, np.dtype[Any]], step: int
+) -> int:
+    """Steps (ADU) that lift the noise without light above zero, where samples may be negative.
+
+    Raises
+    ------
+    InputError
+        If samples are real numbers with less noise than whole numbers can show.
+    """
+    low = min(float(np.min(e.bias[e.good], initial=0.0)) for e in evidence)
+    noise = max(e.read_noise / e.gain for e in evidence)
+    if all(dtype.kind == "f" for dtype in dtypes.values()) and noise < _LEAST_NOISE:
+        raise InputError(
+            f"the frames hold real numbers with a read noise of {noise:.2g}, but simulated samples "
+            "are whole numbers; multiply all frames so that the noise is 1 or more, and divide "
+            "detector.gain_e_per_adu by the same"
+        )
+    signed = all(dtype.kind != "u" for dtype in dtypes.values())
+    lifted = _LIFTED * noise - low if signed and low < _LIFTED * noise else 0.0
+    return math.ceil(lifted / step) * step
 
 
 def recordings_of(
@@ -92,7 +120,8 @@ def recordings_of(
                 step = int(table["step"][numbers[0]]) if "step" in table else 0
                 light[n] = _light(evidence, halves, name, numbers, (exposure, step))
                 lit = np.isfinite(light[n])
-                electrons = float(light[n][lit].mean()) if lit.any() else 1.0
+                # Of flats that are not looked at nothing is known.
+                electrons = float(light[n][lit].mean()) if lit.any() else 0.0
             recordings.append(
                 Recording(
                     bench, kind, listed.get(name, n), name, name, len(numbers), exposure,

@@ -18,7 +18,7 @@ from pixcal.stages.diagnose.measuring import nominal_bench
 from pixcal.stages.diagnose.parts import Half, Raw, evidence_of, take
 from pixcal.stages.diagnose.recommended_frames import missing_frames
 from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, looked_at
-from pixcal.stages.diagnose.windows import Split, chosen_windows, split
+from pixcal.stages.diagnose.windows import Split, chosen_windows, frames_of_half, split
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.artefact import read_json
@@ -73,8 +73,8 @@ def look_at(
     ingested = Ingested(run_dir / "ingest")
     acquisition, reduction = _acquisition(run_dir, ingested), _reduction(run_dir)
     shape = ingested.shape
-    calibrations = sum(len(table["file"]) for table in ingested.tables.values())
-    first, parts = chosen_windows(shape, 0 if acquisition.frames.fringes else calibrations)
+    fringes = acquisition.frames.fringes
+    first, parts = chosen_windows(shape, 0 if fringes else frames_of_half(ingested.tables))
     pixels = (first[0][1] - first[0][0]) * (first[1][1] - first[1][0])
     saturated = read_json(run_dir / "reduce" / "reduce.json")["saturation_adu"]
     own = split(ingested.tables, pixels, saturated.get("full_frames", ()))

@@ -20,7 +20,7 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, Indices, Mask
 from pixcal.simulation.effect import FittedFrames
 from pixcal.stages import reduce
-from pixcal.stages.diagnose.description import bench_of, recordings_of
+from pixcal.stages.diagnose.description import bench_of, pedestal_of, recordings_of
 from pixcal.stages.diagnose.fitted_set import FittedSet, contrast_surface, light_surface
 from pixcal.stages.diagnose.flat_light import FlatLight
 from pixcal.stages.diagnose.measured_gain import MeasuredGain
@@ -108,6 +108,7 @@ def nominal_bench(
         _pixel_noise(evidence, halves, good),
         _gain(evidence, flat.astype(float), good, with_flats),
         fits,
+        pedestal_of(evidence, dtypes, bench.detector.step_adu),
         tuple(recordings),
         tuple(places),
     )

@@ -24,6 +24,7 @@ from pixcal.model.bench import Bench
 from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import SEEDS_APART, Recording
+from pixcal.simulation.replica import TOP_ADU
 from pixcal.simulation.shot import Shot
 from pixcal.stages import reduce
 from pixcal.stages.diagnose.fitted_set import FittedSet
@@ -125,6 +126,8 @@ class NominalBench:
     noise: PixelNoise | None  # read noise of the pixels
     gain: MeasuredGain
     fits: tuple[FittedSet, ...]  # what was fitted of each fringe set
+    # ADU that samples are higher by in the simulated converter, which has no negative codes
+    pedestal: int
     # in the order of their arrays; one for each exposure time of calibration frames
     recordings: tuple[Recording, ...]
     # array of each recording and the numbers of its frames there
@@ -160,7 +163,10 @@ class NominalBench:
         """
         own_seed = seed + SEEDS_APART * window
         undone = IntensityBeforeEffects(effects if fitted else (), self.bench.detector)
-        detector = replace(self.bench.detector, seed=own_seed)
+        detector = replace(
+            self.bench.detector, seed=own_seed,
+            saturation_adu=min(self.bench.detector.top_adu + self.pedestal, TOP_ADU),
+        )  # fmt: skip
         bench = replace(self.bench, seed=seed, detector=detector)
         for effect in effects:
             effect.check(bench)
@@ -187,7 +193,7 @@ class NominalBench:
             for first, after in _runs(wanted):
                 for frame, samples in camera.expose(own, range(first, after)):
                     at = int(np.searchsorted(half.frames[name], numbers[frame]))
-                    arrays[name][at] = samples
+                    arrays[name][at] = samples - np.float32(self.pedestal)
         return Raw(self.acquisition, arrays, select(self.tables, half), self.reduction)
 
     def _of_measured_k(
@@ -224,6 +230,7 @@ class NominalBench:
         """With gain and read noise drawn within what is known of them; samples keep their level."""
         gain = self.gain.drawn(np.random.default_rng([seed, _GAIN]), change)
         m = measured.maps
+        m = replace(m, bias=m.bias + np.float32(self.pedestal))
         noise = m.read_noise * gain
         if self.noise is not None:
             noise = noise * self.noise.drawn(np.random.default_rng([own_seed, _NOISE]))

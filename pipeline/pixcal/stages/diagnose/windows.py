@@ -23,17 +23,18 @@ def chosen_windows(shape: tuple[int, int], frames: int = 0) -> tuple[Part, tuple
 
     A small detector is one window, and only the frames are parted. On a large one, effects are
     fitted in the middle and tried in four other places (two, where one side is short). Where there
-    are no fringes but few ``frames``, more pixels in the middle make up for them.
+    are no fringes but few ``frames`` in each half, more pixels make up for them.
     """
-    if max(shape) <= LARGEST:
+    if max(shape) <= LARGEST or 0 < frames * math.prod(shape) <= SAMPLES:
         return whole_of(shape), (whole_of(shape),)
+    widest = math.isqrt(SAMPLES // frames) if frames else SIDE
 
-    def place(share_y: float, share_x: float) -> Part:
+    def place(share_y: float, share_x: float, wanted: int = SIDE) -> Part:
         spans = []
         for size, share in zip(shape, (share_y, share_x), strict=True):
             if size <= LARGEST:
                 share = 0.5
-            side = min(SIDE, size)
+            side = min(max(SIDE, min(wanted, size // 3)), size)
             # On chunks of the cube, where there are enough to lie apart on.
             grid = SIDE if size >= APART * SIDE else 1
             first = min(round((size - side) * share / grid) * grid, size - side)
@@ -41,13 +42,11 @@ def chosen_windows(shape: tuple[int, int], frames: int = 0) -> tuple[Part, tuple
         return spans[0], spans[1]
 
     middle = place(0.5, 0.5)
-    others = {place(y, x) for y, x in ((0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9))}
-    tried = tuple(sorted(others))
-    if not frames:
-        return middle, tried
-    side = math.isqrt(SAMPLES // frames)
+    corners = ((0.1, 0.1), (0.1, 0.9), (0.9, 0.1), (0.9, 0.9))
+    # All of them have as many samples as the one in the middle.
+    tried = tuple(sorted({place(y, x, widest // 2) for y, x in corners}))
     rows, columns = (
-        _widened(own, side, (a[1], b[0]) if a != b else (0, size))
+        _widened(own, widest, (a[1], b[0]) if a != b else (0, size))
         for own, size, a, b in zip(middle, shape, tried[0], tried[-1], strict=True)
     )
     return (rows, columns), tried
@@ -78,7 +77,8 @@ class Split:
 def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = ()) -> Split:
     """First and second half, in order of time, of every array and exposure time.
 
-    Of long fringe sets the first and the last frames only, `SAMPLES` in each half.
+    Of long fringe sets the first and the last frames only, `SAMPLES` in each half; without fringes
+    as many of all frames together.
 
     Parameters
     ----------
@@ -90,19 +90,55 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
         Flats whose pixels are full; left out unless all are.
     """
     learn, test = {}, {}
-    for name, table in tables.items():
-        exposures = np.array([np.nan if t is None else t for t in table["exptime_s"]], float)
-        fringes = "/" in name
+    every = {name: _groups(name, table, full_flats) for name, table in tables.items()}
+    most = SAMPLES // pixels
+    if not any("/" in name for name in tables):
+        most = _equal_share([len(own) for of_name in every.values() for own in of_name], most)
+    for name, of_name in every.items():
         early, late = [], []
-        every = [np.arange(len(exposures))] if fringes else groups(table)
-        kept = [own for own in every if name != "flat" or not np.isin(own, full_flats).any()]
-        for own in kept or every:
-            one, other = _halves(own, SAMPLES // pixels)
+        for own in of_name:
+            one, other = _halves(own, most)
             early.append(one)
             late.append(other)
         learn[name] = np.sort(np.concatenate(early))
         test[name] = np.sort(np.concatenate(late))
     return Split(Half(learn), Half(test))
+
+
+def _groups(name: str, table: Table, full_flats: Sequence[int]) -> list[Indices]:
+    """Frames of an array that are halved together."""
+    if "/" in name:
+        return [np.arange(len(table["exptime_s"]))]
+    every = groups(table)
+    kept = [own for own in every if name != "flat" or not np.isin(own, full_flats).any()]
+    return kept or every
+
+
+def _of_half(count: int) -> int:
+    """Frames of a half of so many."""
+    return count if count < FEWEST else count // 2
+
+
+def frames_of_half(tables: Mapping[str, Table]) -> int:
+    """Calibration frames in each half."""
+    return sum(
+        _of_half(len(own))
+        for name, table in tables.items()
+        if "/" not in name
+        for own in groups(table)
+    )
+
+
+def _equal_share(counts: Sequence[int], total: int) -> int:
+    """Most frames of each group in a half, so that all together are no more than a total."""
+    left, share = total, total
+    ordered = sorted(map(_of_half, counts))
+    for n, count in enumerate(ordered):
+        share = left // (len(ordered) - n)
+        if count > share:
+            return max(share, FEWEST // 2)
+        left -= count
+    return total
 
 
 def _halves(frames: Indices, most: int) -> tuple[Indices, Indices]:

@@ -17,7 +17,13 @@ from pixcal.model.errors import InputError
 from pixcal.stages.reduce.calibration import Usual, usual
 from pixcal.stages.reduce.columns import grid
 from pixcal.stages.reduce.frame_statistics import Measuring
-from pixcal.stages.reduce.read_noise import bias_wander, dark_charge, read_noise
+from pixcal.stages.reduce.read_noise import (
+    bias_wander,
+    dark_charge,
+    is_cut_off,
+    of_variance,
+    read_noise,
+)
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.place import Place
 
@@ -138,6 +144,8 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
         shot = charge / (job.gain if gain is None else gain.gain)
         noise, own = read_noise(sums[0], shot, folder, job)
         gain = _gain(sums, own, wander, top, job)
+    if gain is not None and is_cut_off(job):
+        noise, own = of_variance(gain.read_variance, job.quantum)
     return Summary(
         declared, job.quantum or 1.0, medians, light, noise, own, gain, levels, usable, full,
         straight,

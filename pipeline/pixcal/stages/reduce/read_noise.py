@@ -15,6 +15,10 @@ from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.storage.place import Place
 
 _SHARED = 5.0  # errors of the noise that a row shares from which it is there
+# Error of the variance of noise that is cut off at code zero, whose samples are taken for those of
+# normals: relative; in square steps below so many steps, where few codes are left to tell.
+_CUT_OFF, _COARSE_CUT_OFF, _FEW_STEPS = 0.02, 0.2, 0.75
+_LEAST = 0.05  # steps of noise that are told from none
 
 
 def shared_by_lines(dark: F64) -> dict[str, Measure]:
@@ -73,9 +77,28 @@ def read_noise(
     if whole is None:
         return None, None
     variance = max(whole[0] - shot, SHEPPARD * job.quantum**2), whole[1]
+    if is_cut_off(job):
+        own = variance[0] - SHEPPARD * job.quantum**2
+        coarse = own < (_FEW_STEPS * job.quantum) ** 2
+        unsure = _COARSE_CUT_OFF * job.quantum**2 if coarse else _CUT_OFF * own
+        return of_variance((variance[0], math.hypot(variance[1], unsure)), job.quantum)
     noise = math.sqrt(variance[0])
     measured = noise, variance[1] / (2 * noise) if noise else 0.0
     return measured, _before_rounding(variance, folder, job) if job.quantum else measured
+
+
+def is_cut_off(job: Measuring) -> bool:
+    """Whether frames that tell the read noise are cut off at code zero."""
+    return job.read_series is not None and job.read_series.array in job.cut_off
+
+
+def of_variance(variance: Measure, step: float) -> tuple[Measure, Measure]:
+    """Noise (ADU) with and without rounding of some variance (ADU²), whatever the levels are."""
+    least = _LEAST * step
+    whole, own = (
+        max(math.sqrt(max(v, 0.0)), least) for v in (variance[0], variance[0] - SHEPPARD * step**2)
+    )
+    return (whole, variance[1] / (2 * whole)), (own, variance[1] / (2 * own))
 
 
 def _before_rounding(
