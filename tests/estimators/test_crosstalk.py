@@ -8,8 +8,8 @@ import pytest
 
 from pixcal.estimators.crosstalk.covariance import NORMAL, NORMALS, TERMS, Products
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels
-from pixcal.estimators.crosstalk.information import Measured
-from pixcal.estimators.crosstalk.links import Classes, class_sums, links, periods, sums_of
+from pixcal.estimators.crosstalk.information import MeasuredLinks
+from pixcal.estimators.crosstalk.links import PixelClasses, class_sums, links, periods, sums_of
 from pixcal.estimators.crosstalk.pattern import visibility_pattern
 from pixcal.estimators.crosstalk.support import Choice, choose
 from pixcal.estimators.fringe_fit.modes import solve_modes
@@ -49,12 +49,12 @@ def test_sums_of_classes_are_those_of_their_pixels():
 
 @pytest.mark.parametrize("step", [(1, 0), (-2, 3), (5, -5)])
 def test_a_partner_has_the_class_that_is_told(step):
-    classes = Classes(4, 3, (2, 1))
+    classes = PixelClasses(4, 3, (2, 1))
     y, x = np.indices((20, 20))
     here, there = classes.of(y, x), classes.of(y + step[0], x + step[1])
     for n in range(classes.count):
         assert set(there[here == n]) == {classes.shifted(n, step)}
-    coarse = Classes(2, 3, (2, 1))
+    coarse = PixelClasses(2, 3, (2, 1))
     np.testing.assert_array_equal(coarse.groups_of(classes)[here], coarse.of(y, x))
 
 
@@ -62,7 +62,7 @@ def test_significance_is_that_of_the_best_of_many_looks():
     """The largest of N squares of normals; a million draws against the formula's quantiles."""
 
     def of(best, looks):
-        return Choice((), Classes(1, 1, (0, 0)), best, looks).significance
+        return Choice((), PixelClasses(1, 1, (0, 0)), best, looks).significance
 
     rng = np.random.default_rng(2)
     looks, drawn = 1000, []
@@ -84,7 +84,7 @@ def noise_shared(steps, alike):
     right = np.zeros((len(steps), TERMS, *shape))
     for n, step in enumerate(steps):
         right[n, :2] = 1e2 if step in alike else 0.0
-    return Measured(Products(right, normal, 1.0, 1e-3, 0.02), None, steps, shape, (0, 0))
+    return MeasuredLinks(Products(right, normal, 1.0, 1e-3, 0.02), None, steps, shape, (0, 0))
 
 
 def test_noise_that_far_pixels_share_is_refused_at_once():
@@ -127,8 +127,8 @@ def test_visibility_of_rows_has_the_chi_square_of_its_period():
     falls = []
     for depth in (0.0, 2e-3):
         gain = visibility_pattern(striped(np.random.default_rng(5), period=3, depth=depth))
-        alone = gain(Classes(1, 1, (0, 0)))
-        falls.append([gain(Classes(n, 1, (0, 0))) - alone for n in (2, 3, 5)])
+        alone = gain(PixelClasses(1, 1, (0, 0)))
+        falls.append([gain(PixelClasses(n, 1, (0, 0))) - alone for n in (2, 3, 5)])
     noise, with_pattern = falls
     assert max(noise) < 25
     # Pixels scatter by 0.2 % too: 2/9 a pixel, less what the pattern adds to the scatter.
@@ -149,7 +149,7 @@ def hot(value, charge=None, sigma=2e-4):
 
 
 def shown(pixels):
-    return pixels.by_class(Classes(4, 1, (0, 0)), ((1, 0),))
+    return pixels.by_class(PixelClasses(4, 1, (0, 0)), ((1, 0),))
 
 
 def test_hot_pixels_that_agree_are_averaged():

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from pixcal.estimators.crosstalk.links import Classes, links
+from pixcal.estimators.crosstalk.links import PixelClasses, links
 from pixcal.estimators.crosstalk.maps import response_slopes
-from pixcal.estimators.crosstalk.shrinkage import Shrinkage
+from pixcal.estimators.crosstalk.shrinkage import ShareShrinkage
 from pixcal.kernels.crosstalk import Coupling, couple_fringes
 
 STEPS = links((40, 40), 2)
@@ -33,7 +33,7 @@ def test_shares_are_found_within_their_errors_and_better_than_each_by_itself():
     found, expected = [], []
     for _ in range(20):
         shares = shares_of(rng, 0.025)
-        values, covariance, _ = Shrinkage.of(STEPS, ROWS).solve(*measured(rng, shares), None)
+        values, covariance, _ = ShareShrinkage.of(STEPS, ROWS).solve(*measured(rng, shares), None)
         found.append(values - shares)
         expected.append(np.diag(covariance))
     assert np.mean(np.square(found)) < 0.6 * ERROR**2
@@ -56,8 +56,8 @@ def test_the_pattern_of_maps_is_taken_where_the_noise_agrees_with_it():
     slopes = [rng.standard_normal((len(shares), ROWS)) for _ in range(2)]
     maps = pattern_of(shares, slopes, rng.normal(0, 1e-4, 2 * ROWS))
     own = measured(rng, shares)
-    alone, *_ = Shrinkage.of(STEPS, ROWS).solve(*own, None)
-    joined, covariance, size = Shrinkage.of(STEPS, ROWS).solve(*own, maps)
+    alone, *_ = ShareShrinkage.of(STEPS, ROWS).solve(*own, None)
+    joined, covariance, size = ShareShrinkage.of(STEPS, ROWS).solve(*own, maps)
     left = [np.hstack([(v - shares) @ s for s in slopes]) for v in (alone, joined)]
     assert np.std(left[1]) < 0.2 * np.std(left[0])
     told = np.sqrt(np.mean([np.diag(s.T @ covariance @ s) for s in slopes]))
@@ -72,7 +72,7 @@ def test_a_pattern_that_no_kernel_explains_is_left_to_the_offsets():
     slopes = [rng.standard_normal((len(shares), ROWS)) for _ in range(2)]
     true = rng.normal(0, 0.04, 2 * ROWS)
     own = measured(rng, shares)
-    values, covariance, size = Shrinkage.of(STEPS, ROWS).solve(
+    values, covariance, size = ShareShrinkage.of(STEPS, ROWS).solve(
         *own, pattern_of(shares, slopes, true)
     )
     assert size == pytest.approx(np.std(true), rel=0.4)
@@ -85,7 +85,7 @@ def test_slopes_are_those_of_maps_that_are_coupled():
     y, x = np.indices(shape, float)
     psi = k[0] * x + k[1] * y
     theta = np.stack([np.full(shape, 1.0), np.sin(psi), np.cos(psi)])
-    classes = Classes(4, 1, (0, 0))
+    classes = PixelClasses(4, 1, (0, 0))
     one = [Coupling(1, 0, 0.02, 4, 2), Coupling(-2, 1, 0.01, 4, 3)]
 
     def log_response(couplings):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.frame_series.stability import (
     ONE_SIGMA,
-    Curve,
+    AllanCurve,
     White,
     fit_curve,
     shared_noise,
@@ -46,7 +46,7 @@ def curves(
     *,
     noise: F64 | None = None,
     gap: slice = slice(0, 0),
-) -> Iterator[Curve]:
+) -> Iterator[AllanCurve]:
     """Curves of runs of white noise plus a drift, run after run."""
     present = np.ones(n, bool)
     present[gap] = False
@@ -69,7 +69,7 @@ def fitting_lengths(present: NDArray[np.bool_]) -> tuple[int, ...]:
     return tuple(m for m, value in zip(lengths, found, strict=True) if np.isfinite(value))
 
 
-def measure(series: F64, noise: F64, lengths: tuple[int, ...], white: White) -> Curve:
+def measure(series: F64, noise: F64, lengths: tuple[int, ...], white: White) -> AllanCurve:
     low, median, high = np.quantile(
         allan_deviation(series, lengths), (ONE_SIGMA[0], 0.5, ONE_SIGMA[1]), axis=1
     )

@@ -19,7 +19,7 @@ from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
-from pixcal.storage.fits_in import Coding, FrameFile, inspect
+from pixcal.storage.fits_in import FrameFile, SampleFormat, inspect
 from pixcal.storage.frames import tabulate
 from pixcal.storage.sources import SourceFile
 from pixcal_cli.click_options import memory_size, region
@@ -176,7 +176,7 @@ def test_any_stamps_give_every_frame_a_finite_time(times: list[Any], period: flo
     files = [
         FrameFile(
             SourceFile(Path(f"{n}.fits"), f"{n}.fits", 1, 1), "plain", 0, 0, (planes, 7, 5),
-            Coding(16), mjd=mjd, exptime_s=exptime,
+            SampleFormat(16), mjd=mjd, exptime_s=exptime,
         )
         for n, (planes, mjd, exptime) in enumerate(times)
     ]  # fmt: skip

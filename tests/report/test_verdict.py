@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pixcal.report.contents import Contents, FrameSeries, MapContents, SetContents
+from pixcal.report.contents import Contents, FrameHistory, MapContents, SetContents
 from pixcal.report.summary import ArraySource, summarise, summarise_flags
 from pixcal.report.verdict import cards, findings, headline
 
@@ -31,7 +31,7 @@ def contents(
     } | (facts or {})  # fmt: skip
     one = summarise(ArraySource(np.ones(shape)))
     zeros = np.zeros(3)
-    series = FrameSeries(zeros, zeros, zeros, zeros, zeros, zeros)
+    series = FrameHistory(zeros, zeros, zeros, zeros, zeros, zeros)
     summary = summarise_flags(ArraySource(flags))
     fringes = SetContents("s", chosen, one, one, one, summary, series, allan or dict(WHITE))
     sigma = summarise(ArraySource(np.full(shape, 2e-4)))

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pixcal.storage.fits_in import Coding, FrameFile
+from pixcal.storage.fits_in import FrameFile, SampleFormat
 from pixcal.storage.frames import columns, natural_key, tabulate
 from pixcal.storage.sources import SourceFile
 
@@ -17,7 +17,9 @@ def frame_file(
 ) -> FrameFile:
     source = SourceFile(Path("/acq", name), name, 1, 1)
     shape = (planes, 7, 5)
-    return FrameFile(source, "plain", 0, 2880, shape, Coding(16), mjd=mjd, exptime_s=exptime_s)
+    return FrameFile(
+        source, "plain", 0, 2880, shape, SampleFormat(16), mjd=mjd, exptime_s=exptime_s
+    )
 
 
 def table(

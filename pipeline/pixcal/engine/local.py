@@ -67,9 +67,8 @@ def run_in_processes(
         try:
             # One by one: a task is noted when it ends, not when some others do.
             _run_graph(
-                tasks, noted, dask.multiprocessing.get,
-                num_workers=workers, pool=pool, chunksize=1,
-            )  # fmt: skip
+                tasks, noted, dask.multiprocessing.get, num_workers=workers, pool=pool, chunksize=1
+            )
         except BrokenProcessPool as error:
             _process_pool.cache_clear()
             deaths += 1

@@ -31,7 +31,7 @@ class MapContents:
 
 
 @dataclass(frozen=True)
-class FrameSeries:
+class FrameHistory:
     """Parameters of each frame (t,): time in s, phi in rad, dkx and dky in rad/px."""
 
     time: F64
@@ -57,7 +57,7 @@ class SetContents:
     visibility: MapSummary
     chi2: MapSummary
     flags: FlagSummary
-    series: FrameSeries
+    series: FrameHistory
     allan: dict[str, Any] | None = None  # its entry in ``allan.json``
 
 

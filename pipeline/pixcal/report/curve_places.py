@@ -18,43 +18,30 @@ class _Axis:
     names: tuple[str, ...] = ()
 
 
+_SIDES = ("x−1", "x+1", "y−1", "y+1")
+_ROWS_OF_FOUR = tuple(f"{step} r{row}" for step in ("y+1", "x+1") for row in range(4))
+_LINES = tuple(f"{n} {of}{'s' * (n > 1)}" for of in ("row", "column") for n in range(1, 5))
+_BANDS = ("8 px and more", "4 to 8 px", "2.7 to 4 px", "2 to 2.7 px", "2 rows", "2 columns")
+_HALF_WAVES = ("1 to 3", "4 to 9", "10 on")
+_CELLS = tuple(f"{row},{column}" for row in range(1, 5) for column in range(1, 5))
+_TERMS = tuple(f"{of} {f} {n}φ" for of in "VB" for n in ("", 2, 3) for f in ("cos", "sin"))
+_SIGMAS = ("−5", "−7", "−10", "+5", "+7", "+10")
+
 # by `x_label` of `curves.json`, where numbers alone would say little
 _AXES = {
     "neighbour": _Axis("neighbour", "neighbour {}", _STEPS),
-    "row of four, down then right": _Axis(
-        "neighbour, row modulo 4",
-        "neighbour {}",
-        tuple(f"{step} r{row}" for step in ("y+1", "x+1") for row in range(4)),
-    ),
-    "left, right, above, below": _Axis("neighbour", "neighbour {}", ("x−1", "x+1", "y−1", "y+1")),
+    "row of four, down then right": _Axis("neighbour, row modulo 4", "neighbour {}", _ROWS_OF_FOUR),
+    "left, right, above, below": _Axis("neighbour", "neighbour {}", _SIDES),
     "rows, columns": _Axis("", "{}", ("rows", "columns")),
-    "distance: rows, then columns": _Axis(
-        "lines apart",
-        "{} apart",
-        tuple(f"{n} {of}{'s' * (n > 1)}" for of in ("row", "column") for n in range(1, 5)),
-    ),
-    "band, then two rows, two columns": _Axis(
-        "period",
-        "periods of {}",
-        ("8 px and more", "4 to 8 px", "2.7 to 4 px", "2 to 2.7 px", "2 rows", "2 columns"),
-    ),
+    "distance: rows, then columns": _Axis("lines apart", "{} apart", _LINES),
+    "band, then two rows, two columns": _Axis("period", "periods of {}", _BANDS),
     "bin of frequency": _Axis(
-        "half-waves over the frames", "{} half-waves over the frames", ("1 to 3", "4 to 9", "10 on")
+        "half-waves over the frames", "{} half-waves over the frames", _HALF_WAVES
     ),
-    "cell of 4 × 4": _Axis(
-        "cell of the window",
-        "cell {}",
-        tuple(f"{row},{column}" for row in range(1, 5) for column in range(1, 5)),
-    ),
+    "cell of 4 × 4": _Axis("cell of the window", "cell {}", _CELLS),
     "contrast, light of each pair": _Axis("maps", "{}", ("contrast", "light") * 20),
-    "term": _Axis(
-        "contrast V, then intensity B",
-        "{}",
-        tuple(f"{of} {f} {n}φ" for of in "VB" for n in ("", 2, 3) for f in ("cos", "sin")),
-    ),
-    "sigma, low then high": _Axis(
-        "beyond so many σ", "beyond {} σ", ("−5", "−7", "−10", "+5", "+7", "+10")
-    ),
+    "term": _Axis("contrast V, then intensity B", "{}", _TERMS),
+    "sigma, low then high": _Axis("beyond so many σ", "beyond {} σ", _SIGMAS),
     "quantile": _Axis("quantile of the pixels", "{} quantile"),
     "bin of level": _Axis("level, dark to bright", "level bin {} (0: darkest)"),
     "period, rows": _Axis("period, rows", "every {} rows"),

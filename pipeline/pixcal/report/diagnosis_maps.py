@@ -31,7 +31,7 @@ class Spot:
 
 
 @dataclass(frozen=True)
-class Panel:
+class DeviationMap:
     """A map of one statistic or domain."""
 
     title: str
@@ -45,7 +45,7 @@ class Panel:
 
 def panels(
     shape: tuple[int, int], places: Sequence[Mapping[str, Any]], curves: Sequence[Mapping[str, Any]]
-) -> list[Panel]:
+) -> list[DeviationMap]:
     """Maps with a notable deviation, the largest first.
 
     Parameters
@@ -62,21 +62,18 @@ def panels(
     return sorted(maps, key=lambda panel: -panel.largest)[:MAX_MAPS]
 
 
-def _of_windows(places: Sequence[Mapping[str, Any]]) -> list[Panel]:
-    domains = list(places[0]["domains"])
-    return [
-        Panel(
-            domain,
-            tuple(
-                Spot(tuple(p["window"][0]), tuple(p["window"][1]), tuple(p["domains"][domain]))
-                for p in places
-            ),
-        )
-        for domain in domains
-    ]
+def _of_windows(places: Sequence[Mapping[str, Any]]) -> list[DeviationMap]:
+    maps = []
+    for domain in places[0]["domains"]:
+        spots = []
+        for place in places:
+            rows, columns = map(tuple, place["window"])
+            spots.append(Spot(rows, columns, tuple(place["domains"][domain])))
+        maps.append(DeviationMap(domain, tuple(spots)))
+    return maps
 
 
-def _of_cells(shape: tuple[int, int], curves: Sequence[Mapping[str, Any]]) -> list[Panel]:
+def _of_cells(shape: tuple[int, int], curves: Sequence[Mapping[str, Any]]) -> list[DeviationMap]:
     maps = []
     for curve in curves:
         if curve["x_label"] != CELLS:
@@ -88,11 +85,13 @@ def _of_cells(shape: tuple[int, int], curves: Sequence[Mapping[str, Any]]) -> li
             row, column = divmod(n, count)
             rows, columns = edges[0][row : row + 2], edges[1][column : column + 2]
             spots.append(Spot((rows[0], rows[1]), (columns[0], columns[1]), sigmas))
-        maps.append(Panel(f"{curve['title']}\nset {curve['set']}", tuple(spots)))
+        maps.append(DeviationMap(f"{curve['title']}\nset {curve['set']}", tuple(spots)))
     return maps
 
 
-def where_figure(shape: tuple[int, int], maps: Sequence[Panel], *, with_after: bool) -> Figure:
+def where_figure(
+    shape: tuple[int, int], maps: Sequence[DeviationMap], *, with_after: bool
+) -> Figure:
     """Maps side by side, in the nominal simulation and, below, with the causes."""
     rows = 1 + with_after
     figure, axes = axes_grid(
@@ -115,7 +114,7 @@ def where_figure(shape: tuple[int, int], maps: Sequence[Panel], *, with_after: b
 
 
 def _draw(
-    axes: Axes, shape: tuple[int, int], panel: Panel, scale: Normalize, *, after: bool
+    axes: Axes, shape: tuple[int, int], panel: DeviationMap, scale: Normalize, *, after: bool
 ) -> None:
     ny, nx = shape
     axes.add_patch(Rectangle((0, 0), nx, ny, fill=False, edgecolor=GREY, linewidth=1))

@@ -6,7 +6,7 @@ The browser enlarges the image. Matplotlib would take 80 ms for each map with it
 import base64
 import io
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from matplotlib.colors import to_hex, to_rgb
@@ -108,35 +108,30 @@ def map_panel(title: str, label: str, summary: MapSummary, factor: float = 1.0) 
     factor : float
         What values are multiplied by to be in the unit of ``label``.
     """
-    scale = span_scale(summary.image * factor)
-    width, height, x, y = _axes(summary.shape, summary.image.shape, summary.block)
-    return Panel(
-        title=", ".join(filter(None, (title, block_note(summary)))),
-        src=_image(scaled(summary.image * factor, scale.low, scale.high), [*BAR_COLOURS, MASKED]),
-        width=width,
-        height=height,
-        labels=("x (px)", "y (px)"),
-        x=x,
-        y=y,
-        bar=_BAR,
-        label=label,
-        colours=ticks(scale.low, scale.high, height, upwards=True),
-        beyond=scale.beyond,
-    )
+    image = summary.image * factor
+    scale = span_scale(image)
+    title = ", ".join(filter(None, (title, block_note(summary))))
+    panel = _panel(title, scaled(image, scale.low, scale.high), [*BAR_COLOURS, MASKED], summary)
+    return _with_bar(panel, label, scale.low, scale.high, scale.beyond)
 
 
-def _axes(
-    shape: tuple[int, ...], blocks: tuple[int, ...], side: int
-) -> tuple[float, float, Ticks, Ticks]:
-    """Size of a map on the page, and the ticks of x and y."""
-    width, height = fit_box((shape[0], shape[1]), BOX, BOX, 60.0)
-    left, right, bottom, top = covered(blocks, side)
-    return (
-        width,
-        height,
-        ticks(left, right, width, upwards=False),
-        ticks(bottom, top, height, upwards=True),
-    )
+def _panel(
+    title: str, classes: U8, colours: Sequence[str], summary: MapSummary | FlagSummary
+) -> Panel:
+    """A map in the colours of some classes, with axes in pixels of the detector."""
+    width, height = fit_box(summary.shape, BOX, BOX, 60.0)
+    left, right, bottom, top = covered(summary.image.shape, summary.block)
+    x = ticks(left, right, width, upwards=False)
+    y = ticks(bottom, top, height, upwards=True)
+    return Panel(title, _image(classes, colours), width, height, ("x (px)", "y (px)"), x, y)
+
+
+def _with_bar(
+    panel: Panel, label: str, low: float, high: float, beyond: str, *, log: bool = False
+) -> Panel:
+    """The same with a colour bar."""
+    colours = ticks(low, high, panel.height, upwards=True, log=log)
+    return replace(panel, bar=_BAR, label=label, colours=colours, beyond=beyond)
 
 
 def levels(sets: Sequence[SetContents]) -> Iterator[Panel]:
@@ -189,25 +184,17 @@ def _spectrum(symbol: str, spectrum: Spectrum, vectors: Mapping[str, tuple[float
     positive = relative[relative > 0]
     low, high = np.percentile(positive, [1, 99.9]) if len(positive) else (0.1, 10.0)
     high = max(high, 3 * low)
+    src = _image(scaled(relative, low, high, log=True), [*BAR_COLOURS, MASKED])
+    x, y = (ticks(-0.5, 0.5, BOX, upwards=upwards) for upwards in (False, True))
+    labels = ("fx (cycles/px)", "fy (cycles/px)")
+    panel = Panel(f"spectrum of {symbol}", src, BOX, BOX, labels, x, y)
     marks = [
         mark
         for n, (name, vector) in enumerate(vectors.items())
         for mark in fringe_marks(name, vector, MARKS[n % len(MARKS)])
     ]
-    return Panel(
-        title=f"spectrum of {symbol}",
-        src=_image(scaled(relative, low, high, log=True), [*BAR_COLOURS, MASKED]),
-        width=BOX,
-        height=BOX,
-        labels=("fx (cycles/px)", "fy (cycles/px)"),
-        x=ticks(-0.5, 0.5, BOX, upwards=False),
-        y=ticks(-0.5, 0.5, BOX, upwards=True),
-        bar=_BAR,
-        label="power / white noise",
-        colours=ticks(low, high, BOX, upwards=True, log=True),
-        beyond="both",
-        marks=tuple(marks),
-    )
+    panel = replace(panel, marks=tuple(marks))
+    return _with_bar(panel, "power / white noise", low, high, "both", log=True)
 
 
 def fringe_marks(name: str, vector: tuple[float, float], colour: str) -> Iterator[Mark]:
@@ -246,22 +233,13 @@ def flags(masks: Mapping[str, FlagSummary]) -> tuple[list[Panel], Legend]:
 
 
 def _flags(title: str, summary: FlagSummary, most: float) -> Panel:
-    width, height, x, y = _axes(summary.shape, summary.image.shape, summary.block)
     if summary.block == 1:
-        src = _image(_classes(summary.image), [UNFLAGGED, *FLAGS.values(), SEVERAL])
-        return Panel(title, src, width, height, ("x (px)", "y (px)"), x, y)
-    return Panel(
-        title=title,
-        src=_image(scaled(100 * summary.share, 0, most), [*BAR_COLOURS, MASKED]),
-        width=width,
-        height=height,
-        labels=("x (px)", "y (px)"),
-        x=x,
-        y=y,
-        bar=_BAR,
-        label=f"masked (%) of {summary.block} × {summary.block} px",
-        colours=ticks(0, most, height, upwards=True),
-    )
+        colours = [UNFLAGGED, *FLAGS.values(), SEVERAL]
+        return _panel(title, _classes(summary.image), colours, summary)
+    shown = scaled(100 * summary.share, 0, most)
+    panel = _panel(title, shown, [*BAR_COLOURS, MASKED], summary)
+    label = f"masked (%) of {summary.block} × {summary.block} px"
+    return _with_bar(panel, label, 0, most, "neither")
 
 
 def _classes(image: U8) -> U8:

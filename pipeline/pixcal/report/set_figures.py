@@ -27,9 +27,7 @@ from pixcal.report.text import with_error
 
 Facts = Mapping[str, Any]
 
-ALLAN_COLUMNS = (
-    "frames", "seconds", "adev_px", "adev_lo_px", "adev_hi_px", "white_expected_px",
-)  # fmt: skip
+ALLAN_COLUMNS = ("frames", "seconds", "adev_px", "adev_lo_px", "adev_hi_px", "white_expected_px")
 PHASE_BINS = 24
 POINTS = 6000  # most frames that are drawn one by one; of longer runs, every n-th
 

@@ -179,9 +179,7 @@ def summarise(source: Source, most: int = SHOWN_PIXELS) -> MapSummary:
         total, count = _block_sums(rest, good, side)
         image.append(_ratio(total, count) + (origin or 0.0))
         columns += [good.sum(axis=0), rest.sum(axis=0), (rest**2).sum(axis=0)]
-        rows[:, y0 : y0 + len(values)] = [
-            good.sum(axis=1), rest.sum(axis=1), (rest**2).sum(axis=1)
-        ]  # fmt: skip
+        rows[:, y0 : y0 + len(values)] = [good.sum(axis=1), rest.sum(axis=1), (rest**2).sum(axis=1)]
         picked = values.ravel()[-(y0 * nx) % step :: step]
         samples.append(picked[np.isfinite(picked)].astype(np.float32))
     count, total, square = columns.sum(axis=1)

@@ -22,7 +22,7 @@ from pixcal.report.contents import (
     Detail,
     DetectorContents,
     DiagnosisContents,
-    FrameSeries,
+    FrameHistory,
     MapContents,
     SetContents,
     StageRecord,
@@ -181,7 +181,7 @@ def _set(
 ) -> SetContents:
     maps = {of: results[f"set/{name}/{of}"] for of in ("iota", "visibility", "chi2")}
     columns = ("time", "B", "A", "phi", "dkx", "dky")
-    series = FrameSeries(*(ArrayReader(group / name / n).read().astype(float) for n in columns))
+    series = FrameHistory(*(ArrayReader(group / name / n).read().astype(float) for n in columns))
     flags = results[f"flags/set/{name}"]
     return SetContents(name, facts, **maps, flags=flags, series=series, allan=allan.get(name))
 

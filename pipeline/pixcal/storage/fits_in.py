@@ -42,7 +42,7 @@ _STORED = {8: "u1", 16: "i2", 32: "i4", -32: "f4"}
 
 
 @dataclass(frozen=True)
-class Coding:
+class SampleFormat:
     """How samples are coded: value = bscale × stored + bzero."""
 
     bitpix: int  # FITS code of the stored type
@@ -77,7 +77,7 @@ class FrameFile:
     hdu: int  # number of the header and data unit that holds the image
     offset: int  # byte where its data begin (once decompressed, for ``gzip``)
     shape: tuple[int, int, int]  # (planes, y, x)
-    coding: Coding  # how the samples are stored
+    coding: SampleFormat  # how the samples are stored
     # (planes, rows) of a compressed tile; (1, 1) for other containers
     tile: tuple[int, int] = (1, 1)
     mjd: float | None = None  # time stamp of the first plane (modified Julian date, days)
@@ -265,7 +265,7 @@ def _tile(header: fits.Header) -> tuple[int, int]:
     return max(1, math.prod(lengths[2:])), max(1, lengths[1])
 
 
-def _coding(header: fits.Header, prefix: str) -> Coding:
+def _coding(header: fits.Header, prefix: str) -> SampleFormat:
     bitpix = integer(header, f"{prefix}BITPIX")
     if bitpix not in _STORED:
         raise ValueError(
@@ -279,7 +279,7 @@ def _coding(header: fits.Header, prefix: str) -> Coding:
     # Only integers have a BLANK; ZBLANK is the name that compressors give it.
     key = "BLANK" if "BLANK" in header else "ZBLANK"
     blank = integer(header, key) if bitpix > 0 and key in header else None
-    return Coding(bitpix, scale, zero, blank)
+    return SampleFormat(bitpix, scale, zero, blank)
 
 
 def _check_gzip_length(file: FrameFile, handle: io.FileIO) -> None:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pixcal.model.arrays import F32, F64
 from pixcal.model.errors import InputError
 from pixcal.storage.cube import CHUNK
-from pixcal.storage.fits_in import Coding, FrameFile, damaged_gzip
+from pixcal.storage.fits_in import FrameFile, SampleFormat, damaged_gzip
 from pixcal.storage.pictures import picture_bytes, unpack_picture
 from pixcal.storage.sources import SourceFile, unreadable
 
@@ -84,7 +84,7 @@ def read_rows(
     return found
 
 
-def _values(raw: NDArray[Any], coding: Coding) -> NDArray[Any]:
+def _values(raw: NDArray[Any], coding: SampleFormat) -> NDArray[Any]:
     """Samples (ADU) of what a file holds, which is changed in place where that will do."""
     # The BZERO that makes unsigned integers of signed ones (and the reverse) turns the sign bit.
     turned = 1 << (8 * raw.itemsize - 1) if coding.exact and coding.bzero else 0
@@ -107,7 +107,7 @@ def _read_exactly(handle: io.FileIO, start: int, raw: NDArray[Any], path: Path) 
         raise unreadable(path, error) from error
 
 
-def _scale(raw: NDArray[Any], coding: Coding) -> F32:
+def _scale(raw: NDArray[Any], coding: SampleFormat) -> F32:
     values = raw.astype(np.float64)
     values *= coding.bscale
     values += coding.bzero

@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 @dataclass(frozen=True)
-class Stage:
+class ArtefactKind:
     """What makes one kind of artefact, ``RUN/<name>``."""
 
     name: str
@@ -25,19 +25,19 @@ class Stage:
 STAGES = {
     stage.name: stage
     for stage in (
-        Stage("ingest", 2, "ingest ACQ --out RUN", earlier=(1,), of_fringes=False),
-        Stage("reduce", 1, "reduce RUN", of_fringes=False),
-        Stage("sweep", 4, "fit RUN"),
-        Stage("fit", 1, "fit RUN"),
-        Stage("allan", 1, "allan RUN"),
-        Stage("crests", 1, "crests RUN"),
-        Stage("diagnose", 6, "diagnose RUN", of_fringes=False),
-        Stage("corrected", 2, "fit RUN --with-diagnosis"),
-        Stage("astrometry", 1, "astrometry RUN"),
-        Stage("report", 2, "report RUN", of_fringes=False),
+        ArtefactKind("ingest", 2, "ingest ACQ --out RUN", earlier=(1,), of_fringes=False),
+        ArtefactKind("reduce", 1, "reduce RUN", of_fringes=False),
+        ArtefactKind("sweep", 4, "fit RUN"),
+        ArtefactKind("fit", 1, "fit RUN"),
+        ArtefactKind("allan", 1, "allan RUN"),
+        ArtefactKind("crests", 1, "crests RUN"),
+        ArtefactKind("diagnose", 6, "diagnose RUN", of_fringes=False),
+        ArtefactKind("corrected", 2, "fit RUN --with-diagnosis"),
+        ArtefactKind("astrometry", 1, "astrometry RUN"),
+        ArtefactKind("report", 2, "report RUN", of_fringes=False),
         # In directories of their own.
-        Stage("compare", 1, "compare RUN --out DIR"),
-        Stage("simulate", 1, "simulate BENCH.yaml --out ACQ"),
-        Stage("simulate-truth", 1, "simulate BENCH.yaml --out ACQ"),
+        ArtefactKind("compare", 1, "compare RUN --out DIR"),
+        ArtefactKind("simulate", 1, "simulate BENCH.yaml --out ACQ"),
+        ArtefactKind("simulate-truth", 1, "simulate BENCH.yaml --out ACQ"),
     )
 }

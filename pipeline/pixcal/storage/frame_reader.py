@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pixcal.model.errors import InputError
 from pixcal.storage.cube import ArrayReader
-from pixcal.storage.fits_in import Coding, FrameFile
+from pixcal.storage.fits_in import FrameFile, SampleFormat
 from pixcal.storage.fits_rows import BAND, read_rows
 from pixcal.storage.sources import SourceFile
 
@@ -48,7 +48,7 @@ def described(columns: Columns, number: int, folder: Path, frame: Sequence[int])
     """One of the files that `describe` described, with frames (y, x) of a size."""
     row = {name: column[number] for name, column in columns.items()}
     source = _Ingested(folder / row["file"], row["file"], row["size"], row["mtime_ns"])
-    coding = Coding(row["bitpix"], row["bscale"], row["bzero"], row["blank"])
+    coding = SampleFormat(row["bitpix"], row["bscale"], row["bzero"], row["blank"])
     shape = (row["planes"], frame[0], frame[1])
     return FrameFile(source, "plain", -1, row["offset"], shape, coding)
 

@@ -16,19 +16,19 @@ from PIL import ExifTags, Image
 
 from pixcal.model.errors import InputError
 from pixcal.storage.fits_facts import exposure_s, temperature_c, time_stamp_mjd
-from pixcal.storage.fits_in import Coding, FrameFile
+from pixcal.storage.fits_in import FrameFile, SampleFormat
 from pixcal.storage.sources import SourceFile
 
 # PNG; TIFF and BigTIFF in both byte orders.
 _MAGIC = (b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # modes of Pillow that hold one sample a pixel, and how `unpack_picture` writes them
 _CODINGS = {
-    "L": Coding(8),
-    "I;16": Coding(16, bzero=1 << 15),
-    "I;16L": Coding(16, bzero=1 << 15),
-    "I;16B": Coding(16, bzero=1 << 15),
-    "I": Coding(32),
-    "F": Coding(-32),
+    "L": SampleFormat(8),
+    "I;16": SampleFormat(16, bzero=1 << 15),
+    "I;16L": SampleFormat(16, bzero=1 << 15),
+    "I;16B": SampleFormat(16, bzero=1 << 15),
+    "I": SampleFormat(32),
+    "F": SampleFormat(-32),
 }
 
 

@@ -12,7 +12,7 @@ from pixcal.model.config import parse
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.storage.artefact import Build, artefact_key, build, up_to_date
 from pixcal.storage.folder import written_aside
-from pixcal.storage.formats import STAGES, Stage
+from pixcal.storage.formats import STAGES, ArtefactKind
 from pixcal.storage.lock import lock
 from pixcal.storage.manifest import Manifest, check_intact, read_json, read_manifest
 from pixcal.storage.place import Local, Place
@@ -83,7 +83,7 @@ def working(run: Path, *needed: str) -> Iterator[dict[str, str]]:
 
 def make(
     run: Path,
-    stage: Stage,
+    stage: ArtefactKind,
     config: dict[str, Any],
     inputs: Mapping[str, str],
     body: Callable[[Build], object],
@@ -133,7 +133,7 @@ def make(
     return ready
 
 
-def copy_products(run: Path, stage: Stage, pattern: str) -> None:
+def copy_products(run: Path, stage: ArtefactKind, pattern: str) -> None:
     """Copy files of an artefact to ``RUN/products``; others there that match the pattern go."""
     folder, products = run / stage.name, run / "products"
     products.mkdir(exist_ok=True)

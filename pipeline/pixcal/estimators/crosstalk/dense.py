@@ -13,11 +13,11 @@ from scipy.linalg import block_diag
 
 from pixcal.estimators.crosstalk.covariance import Products, products
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels, hot_pixels
-from pixcal.estimators.crosstalk.information import Measured
-from pixcal.estimators.crosstalk.links import Classes, Place, links
+from pixcal.estimators.crosstalk.information import MeasuredLinks
+from pixcal.estimators.crosstalk.links import PixelClasses, Place, links
 from pixcal.estimators.crosstalk.pattern import pattern_information
 from pixcal.estimators.crosstalk.second_order import to_first_order
-from pixcal.estimators.crosstalk.shrinkage import Shrinkage
+from pixcal.estimators.crosstalk.shrinkage import ShareShrinkage
 from pixcal.estimators.crosstalk.support import coupling_of
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling, outflow
@@ -48,7 +48,7 @@ class Dense:
 
 
 @dataclass(frozen=True)
-class Frames:
+class CouplingFrames:
     """What frames tell of the couplings of some steps, before it is joined to classes."""
 
     evidence: Evidence
@@ -61,13 +61,13 @@ class Frames:
         """Rows and columns."""
         return self.evidence.good.shape[0], self.evidence.good.shape[1]
 
-    def of(self, links: Sequence[int]) -> "Frames":
+    def of(self, links: Sequence[int]) -> "CouplingFrames":
         """Some of the steps."""
-        every = Measured(self.noise, self.hot, self.steps, self.shape, self.evidence.origin)
+        every = MeasuredLinks(self.noise, self.hot, self.steps, self.shape, self.evidence.origin)
         some = every.of(links)
-        return Frames(self.evidence, some.products, some.hot, some.links)
+        return CouplingFrames(self.evidence, some.products, some.hot, some.links)
 
-    def measured(self, known: Sequence[Coupling], per_ke: float = 0.0) -> Measured:
+    def measured(self, known: Sequence[Coupling], per_ke: float = 0.0) -> MeasuredLinks:
         """The same to the first order of shares, those known giving the second."""
         large = [replace(c, per_ke=per_ke) for c in known if abs(c.share) > NEGLIGIBLE]
         first = self.evidence.origin
@@ -76,10 +76,10 @@ class Frames:
             noise = to_first_order(noise, large, self.steps, first)
         if hot is not None:
             hot = hot.corrected(outflow(large, self.shape, first), per_ke)
-        return Measured(noise, hot, self.steps, self.shape, first)
+        return MeasuredLinks(noise, hot, self.steps, self.shape, first)
 
     def kernel(
-        self, classes: Classes, known: Sequence[Coupling], per_ke: float = 0.0
+        self, classes: PixelClasses, known: Sequence[Coupling], per_ke: float = 0.0
     ) -> "Dense | None":
         """All couplings of the steps for the classes of a period; None for more than `MAX_SHARES`.
 
@@ -92,7 +92,7 @@ class Frames:
         )  # fmt: skip
         if len(every) > MAX_SHARES:
             return None
-        shrinkage = Shrinkage.of(self.steps, classes.count)
+        shrinkage = ShareShrinkage.of(self.steps, classes.count)
         shares = _shares_of(every, known)
         found = None
         for _ in range(ROUNDS):
@@ -120,7 +120,7 @@ def frames_of(
     parts: Iterable[Evidence],
     steps_in: Callable[[Place], tuple[Place, ...]],
     known: Sequence[Coupling] = (),
-) -> Frames | None:
+) -> CouplingFrames | None:
     """What some parts of the frames tell together; None without light and dark signal.
 
     Parameters
@@ -143,7 +143,7 @@ def frames_of(
     total = _sum(noise)
     if first is None or (total is None and hot is None):
         return None
-    return Frames(first, total, hot, steps)
+    return CouplingFrames(first, total, hot, steps)
 
 
 def dense_kernel(parts: Iterable[Evidence], start: Sequence[Coupling]) -> Dense | None:
@@ -161,7 +161,7 @@ def dense_kernel(parts: Iterable[Evidence], start: Sequence[Coupling]) -> Dense 
     frames = frames_of(parts, lambda shape: within(shape, far), start)
     if frames is None:
         return None
-    return frames.kernel(Classes(rows, columns, frames.evidence.origin), start)
+    return frames.kernel(PixelClasses(rows, columns, frames.evidence.origin), start)
 
 
 def within(shape: Place, far: Collection[Place] = ()) -> tuple[Place, ...]:

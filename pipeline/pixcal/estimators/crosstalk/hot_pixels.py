@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from scipy.ndimage import maximum_filter, median_filter
 
-from pixcal.estimators.crosstalk.links import REACH, Classes, Place
+from pixcal.estimators.crosstalk.links import REACH, PixelClasses, Place
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling, couple, outflow
 from pixcal.kernels.robust import median_and_sigma
@@ -59,7 +59,7 @@ class HotPixels:
         return replace(self, charge=charge, value=self.value * at, sigma=self.sigma * np.abs(at))
 
     def by_class(
-        self, classes: Classes, links: tuple[Place, ...], doubt: float = 0.0
+        self, classes: PixelClasses, links: tuple[Place, ...], doubt: float = 0.0
     ) -> "ClassShares":
         """What the hot pixels of each class show together.
 
@@ -88,7 +88,7 @@ class HotPixels:
         right = weight = 0.0
         for c in couplings:
             step, side = ((c.dy, c.dx), 0) if (c.dy, c.dx) in links else ((-c.dy, -c.dx), 1)
-            classes = Classes(c.every_rows, c.every_columns, first)
+            classes = PixelClasses(c.every_rows, c.every_columns, first)
             own = classes.of(self.y, self.x) == c.row * c.every_columns + c.column
             value = self.value[own, links.index(step), side]
             sigma = self.sigma[own, links.index(step), side]

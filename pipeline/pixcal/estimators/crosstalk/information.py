@@ -11,7 +11,7 @@ import numpy as np
 
 from pixcal.estimators.crosstalk.covariance import NORMAL, TERMS, Products
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels
-from pixcal.estimators.crosstalk.links import Classes, Place, class_sums, sums_of
+from pixcal.estimators.crosstalk.links import PixelClasses, Place, class_sums, sums_of
 from pixcal.estimators.crosstalk.residuals import UNIT
 from pixcal.model.arrays import F64, Indices, Mask
 
@@ -57,7 +57,7 @@ class Information:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MeasuredLinks:
     """What was measured of some links, freed of what is known already (second order)."""
 
     products: Products | None
@@ -66,7 +66,7 @@ class Measured:
     shape: Place  # shape, first: rows and columns of the arrays; their first in the window
     first: Place
 
-    def of(self, numbers: Sequence[int]) -> "Measured":
+    def of(self, numbers: Sequence[int]) -> "MeasuredLinks":
         """Some of the links."""
         at, products, hot = list(numbers), self.products, self.hot
         if products is not None:
@@ -82,7 +82,7 @@ class Measured:
             return none, none
         return self.products.right, self.products.normal
 
-    def every_period(self) -> Iterator[tuple[Classes, Information]]:
+    def every_period(self) -> Iterator[tuple[PixelClasses, Information]]:
         """All links for each period; single hot pixels are taken with `DOUBT`."""
         every = (class_sums(sums, self.first) for sums in self._sums)
         for (classes, products), (_, terms) in zip(*every, strict=True):
@@ -92,7 +92,7 @@ class Measured:
                 normal["hot pixels"], right["hot pixels"] = shown.sums()
             yield classes, Information(normal, right)
 
-    def of_period(self, classes: Classes) -> Information:
+    def of_period(self, classes: PixelClasses) -> Information:
         """All links for one period, hot pixels taken at their word where they agree.
 
         A hot pixel that is alone in its class counts where the noise says the same.

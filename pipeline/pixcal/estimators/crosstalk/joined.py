@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc
 
-from pixcal.estimators.crosstalk.dense import Dense, Frames, frames_of, within
+from pixcal.estimators.crosstalk.dense import CouplingFrames, Dense, frames_of, within
 from pixcal.estimators.crosstalk.links import links
 from pixcal.estimators.crosstalk.pattern import visibility_pattern
 from pixcal.estimators.crosstalk.support import Choice, choose
@@ -77,7 +77,7 @@ def measure(evidence: Evidence) -> Kernel | None:
     return _told(dense, replace(none, per_ke=per_ke, per_ke_error=error))
 
 
-def _level(frames: Frames, dense: Dense, found: Choice) -> tuple[float, float]:
+def _level(frames: CouplingFrames, dense: Dense, found: Choice) -> tuple[float, float]:
     """By how much (1/ke-) shares fall with the signal, zero if they may not, and its error.
 
     Shares that rise may be brighter-fatter; those that fall cannot.

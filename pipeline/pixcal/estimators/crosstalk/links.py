@@ -28,7 +28,7 @@ def links(shape: Place, reach: int = REACH) -> tuple[Place, ...]:
 
 
 @dataclass(frozen=True)
-class Classes:
+class PixelClasses:
     """Pixels whose row and column leave the same rest by the period."""
 
     rows: int  # rows, columns: period
@@ -50,7 +50,7 @@ class Classes:
         row, column = divmod(number, self.columns)
         return (row + by[0]) % self.rows * self.columns + (column + by[1]) % self.columns
 
-    def divisors(self) -> list["Classes"]:
+    def divisors(self) -> list["PixelClasses"]:
         """Classes of all periods that divide this one, the shortest first."""
         found = [
             replace(self, rows=n, columns=m)
@@ -60,7 +60,7 @@ class Classes:
         ]
         return sorted(found, key=lambda classes: classes.count)
 
-    def groups_of(self, finer: "Classes") -> Indices:
+    def groups_of(self, finer: "PixelClasses") -> Indices:
         """Own class of each class of a finer period, which this one divides."""
         row, column = np.divmod(np.arange(finer.count), finer.columns)
         return np.asarray(row % self.rows * self.columns + column % self.columns)
@@ -79,7 +79,7 @@ def periods(shape: Place, longest: int = MAX_PERIOD) -> list[Place]:
     return sorted(both, key=lambda p: (p[0] * p[1], p))
 
 
-def class_sums(values: F64, first: Place) -> Iterator[tuple[Classes, F64]]:
+def class_sums(values: F64, first: Place) -> Iterator[tuple[PixelClasses, F64]]:
     """Sums (..., class) of maps (..., y, x) over the pixels of each class, for every period.
 
     Rows first, then columns of those sums: the cost is that of the row periods.
@@ -95,10 +95,10 @@ def class_sums(values: F64, first: Place) -> Iterator[tuple[Classes, F64]]:
     for n, m in wanted:
         rows = by_rows[n]
         both = np.stack([rows[..., (b - first[1]) % m :: m].sum(-1) for b in range(m)], -1)
-        yield Classes(n, m, first), both.reshape(*both.shape[:-2], n * m)
+        yield PixelClasses(n, m, first), both.reshape(*both.shape[:-2], n * m)
 
 
-def sums_of(values: F64, classes: Classes) -> F64:
+def sums_of(values: F64, classes: PixelClasses) -> F64:
     """Sums (..., class) of maps (..., y, x) over the pixels of each class."""
     (n, m), (y, x) = (classes.rows, classes.columns), classes.first
     return np.stack(

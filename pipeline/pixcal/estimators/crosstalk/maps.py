@@ -14,7 +14,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pixcal.estimators.crosstalk.links import REACH, Classes
+from pixcal.estimators.crosstalk.links import REACH, PixelClasses
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid, polynomial_basis
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
@@ -89,7 +89,7 @@ def _slope_at(
 
 
 def response_slopes(
-    k: tuple[float, float], couplings: Sequence[Coupling], classes: Classes
+    k: tuple[float, float], couplings: Sequence[Coupling], classes: PixelClasses
 ) -> C128:
     """Derivative (n, class) of the log of what couplings multiply the fringe k (rad/px) by.
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixcal.estimators.crosstalk.links import Classes
+from pixcal.estimators.crosstalk.links import PixelClasses
 from pixcal.estimators.crosstalk.maps import (
     MIN_PIXELS,
     WIDTH,
@@ -49,7 +49,7 @@ class _Pattern:
 
 
 def pattern_information(
-    evidence: Evidence, couplings: Sequence[Coupling], classes: Classes
+    evidence: Evidence, couplings: Sequence[Coupling], classes: PixelClasses
 ) -> tuple[F64, F64] | None:
     """Least-squares sums (m, m), (m,) of the shares and of a true pattern of the offsets.
 
@@ -77,7 +77,7 @@ def pattern_information(
     return total, total_right + total[:, :size] @ known
 
 
-def visibility_pattern(evidence: Evidence) -> Callable[[Classes], float]:
+def visibility_pattern(evidence: Evidence) -> Callable[[PixelClasses], float]:
     """How well a period describes the visibility of the pixels.
 
     Gives the fall in chi-square, of all sets together, if each class of a period has its own mean
@@ -91,7 +91,7 @@ def visibility_pattern(evidence: Evidence) -> Callable[[Classes], float]:
     smooth = smooth_modes(sets, good)
     maps = [_clipped(without(log_visibility(one.theta, good), smooth)) for one in sets]
 
-    def gain(classes: Classes) -> float:
+    def gain(classes: PixelClasses) -> float:
         number = classes.of(y, x)
         count = np.maximum(np.bincount(number, minlength=classes.count), 1)
         sums = [np.bincount(number, values / sigma, classes.count) for values, sigma in maps]
@@ -103,7 +103,7 @@ def visibility_pattern(evidence: Evidence) -> Callable[[Classes], float]:
 def _of_set(
     found: FringeEvidence,
     couplings: Sequence[Coupling],
-    classes: Classes,
+    classes: PixelClasses,
     good: Mask,
     smooth: F64,
     members: F64,

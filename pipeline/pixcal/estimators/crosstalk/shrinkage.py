@@ -22,7 +22,7 @@ START = (1e-2, 1e-3)  # sizes of these to start from
 
 
 @dataclass(frozen=True)
-class Shrinkage:
+class ShareShrinkage:
     """Parts of shares, and which of them are of one size."""
 
     basis: F64  # (share, part) shares are this times their parts
@@ -30,7 +30,7 @@ class Shrinkage:
     classes: int
 
     @classmethod
-    def of(cls, steps: Sequence[Place], classes: int) -> "Shrinkage":
+    def of(cls, steps: Sequence[Place], classes: int) -> "ShareShrinkage":
         """Parts of the couplings of each step: there and back of every class."""
         size = 2 * classes
         common = np.kron(np.eye(len(steps)), np.ones((size, 1)))

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr, ndtri, ndtri_exp
 
-from pixcal.estimators.crosstalk.information import Measured
-from pixcal.estimators.crosstalk.links import Classes, Place, periods
+from pixcal.estimators.crosstalk.information import MeasuredLinks
+from pixcal.estimators.crosstalk.links import PixelClasses, Place, periods
 from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F64
 from pixcal.model.errors import InputError
@@ -32,7 +32,7 @@ class Choice:
     """All that is taken, and how far the best of it is from chance."""
 
     links: tuple[int, ...]  # that stand out
-    classes: Classes  # of the period
+    classes: PixelClasses  # of the period
     best: float  # largest chi-square of one number
     looks: int  # numbers that were tried
 
@@ -53,7 +53,7 @@ class Choice:
         return float(-ndtri_exp(np.log(-np.expm1(none)) if none < -1e-9 else one + np.log(looks)))
 
 
-def choose(measured: Measured, pattern: Callable[[Classes], float]) -> Choice:
+def choose(measured: MeasuredLinks, pattern: Callable[[PixelClasses], float]) -> Choice:
     """Take what stands out.
 
     First the links that do, at any period; then the one period that serves all of them and the maps
@@ -81,7 +81,7 @@ def choose(measured: Measured, pattern: Callable[[Classes], float]) -> Choice:
             f"them beyond {NEAR} pixels (at most {MAX_FAR} are measured), unlike a crosstalk "
             "kernel"
         )
-    none = Classes(1, 1, measured.first)
+    none = PixelClasses(1, 1, measured.first)
     classes = _period(measured.of(there), pattern, critical) if there else none
     return Choice(there, classes, max(float(gains.max()), 1e-9), looks)
 
@@ -90,7 +90,9 @@ def _critical(looks: int) -> float:
     return float(ndtri(FALSE_ALARM / looks / 2) ** 2)
 
 
-def _period(present: Measured, pattern: Callable[[Classes], float], critical: float) -> Classes:
+def _period(
+    present: MeasuredLinks, pattern: Callable[[PixelClasses], float], critical: float
+) -> PixelClasses:
     """The shortest period that is good enough for all links together, and for the maps."""
     scores = []
     for classes, information in present.every_period():
@@ -104,7 +106,7 @@ def _period(present: Measured, pattern: Callable[[Classes], float], critical: fl
     return next(classes for score, classes in scores if score >= enough)
 
 
-def _directions(classes: Classes) -> F64:
+def _directions(classes: PixelClasses) -> F64:
     """Numbers that shares may be made of, (u, direction): each has some shares alike.
 
     There, back and both, of each class of every period that divides the one at hand.
@@ -151,7 +153,7 @@ def _greedy(normal: F64, right: F64, directions: F64) -> tuple[F64, float]:
     return basis, gain
 
 
-def coupling_of(classes: Classes, number: int, back: int, step: Place) -> Coupling:
+def coupling_of(classes: PixelClasses, number: int, back: int, step: Place) -> Coupling:
     """What a class gives over a step, or gets back; without its share."""
     if not back:
         return classes.coupling(number, step, 0.0)

@@ -47,11 +47,8 @@ def transfer_curve(evidence: Evidence) -> TransferCurve | None:
 
 
 def _transfer_curve(evidence: Evidence) -> TransferCurve | None:
-    darks = [
-        s for stack in evidence.stacks
-        if stack.kind != "flat" and _is_enough(stack)
-        and (s := _of_stack(stack, evidence)) is not None
-    ]  # fmt: skip
+    without = (s for s in evidence.stacks if s.kind != "flat" and _is_enough(s))
+    darks = [sums for s in without if (sums := _of_stack(s, evidence)) is not None]
     points = []
     for stack in filter(_is_enough, evidence.ladder):
         sums = _of_stack(stack, evidence)

@@ -147,10 +147,8 @@ def _light_of(evidence: Evidence) -> FrameLight | None:
     sets = [s.cleaned() for s in found.values() if s is not None]
     if not sets:
         return None
-    level = {
-        f.name: float(np.median(f.theta[0][f.good]) * f.free[:, 0].mean())
-        for f in evidence.fringes.values()
-    }
+    every = evidence.fringes.values()
+    level = {f.name: float(np.median(f.theta[0][f.good]) * f.free[:, 0].mean()) for f in every}
     stacks = (*evidence.of_kind("bias"), *evidence.of_kind("dark"))
     dark = [_dark_series(s, n, evidence) for n, s in enumerate(stacks)]
     light = FrameLight(tuple(sets), tuple(d for d in dark if d is not None), level)

@@ -13,7 +13,7 @@ FARTHEST = 3.0  # largest error of the logarithm of a parameter: beyond, it is n
 HALVINGS = 4  # of the distance to the values on either side
 
 
-class Fit(Protocol):
+class ProfiledFit(Protocol):
     """Components for a value of the parameter, and where to begin."""
 
     def __call__(self, value: float, start: Components | None, steps: int = ...) -> Components:
@@ -39,7 +39,9 @@ class Profiled:
         return abs(sizes[1] - sizes[0]) / (2 * self.log_width) * log_error
 
 
-def best_shape(fit: Fit, trials: F64, steady: bool, start: Components | None = None) -> Profiled:
+def best_shape(
+    fit: ProfiledFit, trials: F64, steady: bool, start: Components | None = None
+) -> Profiled:
     """The best of some values (n,), in equal steps of the logarithm, and between them.
 
     Likelihoods of a steady one, of known shapes, are compared without restriction; known shapes are

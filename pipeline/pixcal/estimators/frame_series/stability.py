@@ -149,7 +149,7 @@ def shared_noise(grams: Sequence[F64], pixels: int) -> F64:
 
 
 @dataclass(frozen=True)
-class Curve:
+class AllanCurve:
     """An Allan curve, all in px and batches."""
 
     # adev, error, low, high: (length,) deviation, its one-sigma error and one-sigma limits
@@ -166,12 +166,12 @@ class Curve:
     knee: float | None
 
 
-NO_CURVE = Curve(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0), None, None, None)
+NO_CURVE = AllanCurve(np.zeros(0), np.zeros(0), np.zeros(0), np.zeros(0), None, None, None)
 
 
 def fit_curve(
     lengths: Sequence[int], median: F64, spread: F64, pixels: int, shared: F64, white: White
-) -> Curve:
+) -> AllanCurve:
     """Unbias a window's medians, and find slope and knee.
 
     Parameters
@@ -210,7 +210,7 @@ def fit_curve(
     part = added < WHITE_SHARE
     line = _fit_slope(m[part], (logs - np.log1p(added) / 2)[part], covariance[np.ix_(part, part)])
     knee = None if rest is None else _knee(rest)
-    return Curve(adev, adev * error, low, high, *line, knee)
+    return AllanCurve(adev, adev * error, low, high, *line, knee)
 
 
 def _fit_slope(m: F64, logs: F64, covariance: F64) -> tuple[float | None, float | None]:

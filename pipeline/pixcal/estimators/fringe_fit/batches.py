@@ -13,7 +13,7 @@ WANTED = 24  # batches wanted of a run too short for `DEFAULT_FRAMES`
 
 
 @dataclass(frozen=True)
-class Batches:
+class FrameBatches:
     """Batches of equal duration."""
 
     frames: int  # frames of a full batch
@@ -29,7 +29,7 @@ class Batches:
         return np.array([b - a for a, b in self.ranges], dtype=np.int32)
 
 
-def plan_batches(time_s: F64, frames: int | None = None) -> Batches:
+def plan_batches(time_s: F64, frames: int | None = None) -> FrameBatches:
     """Divide a run into batches, by the time (t,) of its frames.
 
     Frames fall into slots of the median period, so that a pause of the camera shows as slots
@@ -53,4 +53,4 @@ def plan_batches(time_s: F64, frames: int | None = None) -> Batches:
     # A batch with few frames left has other noise than the rest: it counts as a gap.
     ranges = tuple((a, b) if b - a >= 0.75 * length else (a, a) for a, b in ranges)
     centre = np.asarray((np.arange(n_batches) + 0.5) * length * period, dtype=np.float64)
-    return Batches(length, period, ranges, centre, note)
+    return FrameBatches(length, period, ranges, centre, note)

@@ -10,9 +10,9 @@ from pixcal.model.arrays import F64
 def axes_span_plane(axes: Sequence[tuple[float, float]]) -> bool:
     """Whether unit vectors (x, y) differ enough to give both components (by 10 degrees)."""
     a = np.asarray(axes, float)
-    return (
-        len(a) > 1 and float(np.linalg.svd(a.T @ a / len(a))[1][-1]) > 0.5 * np.sin(0.17) ** 2 / 2
-    )
+    if len(a) < 2:
+        return False
+    return bool(np.linalg.svd(a.T @ a / len(a))[1][-1] > np.sin(0.17) ** 2 / 4)
 
 
 def combine_sets(
@@ -40,11 +40,8 @@ def combine_sets(
     good = np.isfinite(delta) & np.isfinite(sigma) & (sigma > 0)
     w = np.where(good, 1 / np.where(good, sigma, 1.0) ** 2, 0.0)
     d = np.where(good, delta, 0.0)
-    xx, xy, yy = (
-        (w * a[:, 0] ** 2).sum(0),
-        (w * a[:, 0] * a[:, 1]).sum(0),
-        (w * a[:, 1] ** 2).sum(0),
-    )
+    xx, xy = (w * a[:, 0] ** 2).sum(0), (w * a[:, 0] * a[:, 1]).sum(0)
+    yy = (w * a[:, 1] ** 2).sum(0)
     rx, ry = (w * a[:, 0] * d).sum(0), (w * a[:, 1] * d).sum(0)
     det = xx * yy - xy * xy
     # Whether they give both is a matter of the axes alone, however unequal the errors.

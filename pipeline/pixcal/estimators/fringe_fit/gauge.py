@@ -57,12 +57,10 @@ def gauge_matrix(tiles: list[tuple[F64, Mask, C128]]) -> F64:
     matrix = np.eye(3)
     if not rows:
         return matrix
-    cos1, sin1, cos2, sin2 = np.linalg.lstsq(
-        np.concatenate(rows), np.concatenate(rights), rcond=None
-    )[0]
-    light_cos, light_sin = np.linalg.lstsq(
-        np.concatenate(light_rows), np.concatenate(light_rights), rcond=None
-    )[0]
+    (cos1, sin1, cos2, sin2), (light_cos, light_sin) = (
+        np.linalg.lstsq(np.concatenate(design), np.concatenate(right), rcond=None)[0]
+        for design, right in ((rows, rights), (light_rows, light_rights))
+    )
     # Im(c e^-i psi) = c_i cos - c_r sin and Im(b e^-2i psi) = b_i cos 2 - b_r sin 2, taken off z.
     c, b = complex(-sin1, cos1), complex(-sin2, cos2)
     # theta = (iota, Im z, Re z); z -= b conj(z) + c iota.

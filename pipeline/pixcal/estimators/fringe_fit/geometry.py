@@ -85,28 +85,28 @@ def unwrap(planes: Sequence[TilePlane], grid_shape: tuple[int, int]) -> list[Til
     done = np.zeros((rows, columns), bool)
     if not usable.any():
         return list(planes)
-    distance = np.hypot(
-        *np.ogrid[-(rows // 2) : rows - rows // 2, -(columns // 2) : columns - columns // 2]
-    )
+    y, x = np.ogrid[:rows, :columns]
+    distance = np.hypot(y - rows // 2, x - columns // 2)
     seed = np.unravel_index(int(np.argmin(np.where(usable, distance, np.inf))), (rows, columns))
     queue = [(int(seed[0]), int(seed[1]))]
     done[seed] = True
+
+    def join(here: tuple[int, ...], there: tuple[int, ...]) -> None:
+        result[there] = _joined(result[here], table[there])
+        done[there] = True
+        queue.append((there[0], there[1]))
+
     while queue:
         i, j = queue.pop(0)
         for ni, nj in ((i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)):
             if not (0 <= ni < rows and 0 <= nj < columns) or done[ni, nj] or not usable[ni, nj]:
                 continue
-            result[ni, nj] = _joined(result[i, j], table[ni, nj])
-            done[ni, nj] = True
-            queue.append((ni, nj))
+            join((i, j), (ni, nj))
         if not queue and (left := np.argwhere(usable & ~done)).size:
             reached = np.argwhere(done)
             apart = ((left[:, None] - reached) ** 2).sum(axis=2)
             n, m = np.unravel_index(int(np.argmin(apart)), apart.shape)
-            (ni, nj), (i, j) = left[n], reached[m]
-            result[ni, nj] = _joined(result[i, j], table[ni, nj])
-            done[ni, nj] = True
-            queue.append((int(ni), int(nj)))
+            join(tuple(reached[m].tolist()), tuple(left[n].tolist()))
     return list(result.ravel())
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixcal.estimators.fringe_fit.batches import Batches
+from pixcal.estimators.fringe_fit.batches import FrameBatches
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, SmoothPhasor, plane_wave, wrapped
 from pixcal.estimators.fringe_fit.tile_fit import Coding, PixelSums, Tile, start_model
 from pixcal.model.arrays import F32, F64, U16
@@ -49,7 +49,7 @@ def sweep_tile(
     coding: Coding,
     frames: FrameParameters,
     k: tuple[float, float],
-    batches: Batches,
+    batches: FrameBatches,
     prime: int,
     bound_pixels: int = BOUND_PIXELS,
 ) -> TileMaps:
@@ -99,7 +99,7 @@ class _BatchSums:
         self,
         tile: Tile,
         frames: FrameParameters,
-        batches: Batches,
+        batches: FrameBatches,
         smooth: SmoothPhasor,
         sums: PixelSums,
     ) -> None:

@@ -24,7 +24,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.frame_series.stability import (
     MAX_DRAWS,
     NO_CURVE,
-    Curve,
+    AllanCurve,
     fit_curve,
     shared_noise,
     white_population,
@@ -238,7 +238,7 @@ def _has_difference(present: Mask, m: int) -> bool:
 def _as_json(
     batches: Batches,
     lengths: Sequence[int],
-    curve: Curve,
+    curve: AllanCurve,
     expected: list[float],
     warnings: list[str],
 ) -> dict[str, Any]:

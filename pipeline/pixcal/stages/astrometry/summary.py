@@ -29,7 +29,7 @@ class Value(NamedTuple):
     error: float
 
 
-class Comparison(NamedTuple):
+class GridComparison(NamedTuple):
     """Root mean square errors of centroids, px, and the ratio of both."""
 
     # perfect, measured: pixels taken for a perfect grid, and where the maps say. `perfect` is
@@ -49,7 +49,7 @@ class Row(NamedTuple):
     gain: str
 
 
-def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -> Comparison:
+def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -> GridComparison:
     """Root mean squares of errors (star, position), px, NaN where there are none.
 
     ``noise`` are errors whose mean square ``perfect`` holds twice without having it on a real
@@ -67,7 +67,7 @@ def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -
         rms[0] = rms[2] = np.nan
     finite = [column[np.isfinite(column)] for column in again.T[:3]]
     errors = [float(np.std(values)) if len(values) > 1 else math.nan for values in finite]
-    return Comparison(*(Value(float(rms[n]), errors[n]) for n in range(3)))
+    return GridComparison(*(Value(float(rms[n]), errors[n]) for n in range(3)))
 
 
 def _roots(sums: F64) -> F64:
@@ -106,7 +106,7 @@ def axis_facts(
     """
     kinds = dict(zip(KINDS, np.moveaxis(errors, -1, 0), strict=True))
 
-    def compared(of: Mapping[str, F64], suffix: str) -> Comparison:
+    def compared(of: Mapping[str, F64], suffix: str) -> GridComparison:
         noise = of["measured"] if drawn else np.zeros_like(of["measured"])
         return compare(of["perfect" + suffix], of["measured" + suffix], noise, rng)
 
@@ -158,7 +158,7 @@ def number(value: Value, uas_per_px: float) -> dict[str, float | None]:
     }
 
 
-def _facts(comparison: Comparison, uas_per_px: float) -> dict[str, Any]:
+def _facts(comparison: GridComparison, uas_per_px: float) -> dict[str, Any]:
     gain = {"value": _finite(comparison.gain.value), "err": _finite(comparison.gain.error)}
     return {grid: number(getattr(comparison, grid), uas_per_px) for grid in GRIDS} | {"gain": gain}
 

@@ -1,15 +1,16 @@
 """Changes of a bench that save frames, the most helpful first."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from pixcal.model.arrays import F64
-from pixcal.model.bench import Bench
+from pixcal.model.bench import Bench, SimulatedFrames, SimulatedSet
 from pixcal.stages.budget.bound import phase_information, unweighted_variance
 from pixcal.stages.budget.expected import (
     JoinedBound,
-    SetBound,
     brightest_allowed,
     joined,
     pixel_contrast,
@@ -35,33 +36,26 @@ def levers(bench: Bench, now: JoinedBound) -> list[Lever]:
     """Possible changes of the bench, the most helpful first, and the loss of equal weights."""
     split, period = planned_split(bench), bench.frames.period_s
     best = now.best_split()
-    candidates = [
-        Lever("as planned", _worse(now, split), period),
-        *(
-            Lever(name, _worse(joined(changed, contrast), split), changed.frames.period_s, note)
-            for name, changed, contrast, note in _changes(bench, now)
-        ),
-    ]
+    candidates = [Lever("as planned", _worse(now, split), period)]
+    for name, changed, contrast, note in _changes(bench, now):
+        variance = _worse(joined(changed, contrast), split)
+        candidates.append(Lever(name, variance, changed.frames.period_s, note))
     if len(now.components) == 2 and np.abs(best - split).max() > 0.02:
         shares = " : ".join(f"{100 * s:.0f}" for s in best)
         candidates.append(Lever(f"frames shared {shares} %", _worse(now, best), period))
-    plain = tuple(
-        replace(s, loss=(s.loss[0] * ratio, s.loss[1] * ratio))
-        for s, ratio in ((s, _unweighted_ratio(s)) for s in now.sets)
-    )
-    candidates.append(
-        Lever("equal weights", _worse(JoinedBound(plain), split), period, "a loss: do not")
-    )
+    plain = []
+    for s in now.sets:
+        unweighted = unweighted_variance(s.iota, s.alpha, s.variance, s.frames)
+        information = phase_information(s.iota, s.alpha, s.variance, s.frames)
+        ratio = float(np.median(unweighted * information))
+        plain.append(replace(s, loss=(s.loss[0] * ratio, s.loss[1] * ratio)))
+    equal = _worse(JoinedBound(tuple(plain)), split)
+    candidates.append(Lever("equal weights", equal, period, "a loss: do not"))
     return sorted(candidates, key=lambda lever: lever.variance * lever.period_s)
 
 
 def _worse(bound: JoinedBound, split: F64) -> float:
     return float(bound.median(split).max())
-
-
-def _unweighted_ratio(s: SetBound) -> float:
-    plain = unweighted_variance(s.iota, s.alpha, s.variance, s.frames)
-    return float(np.median(plain * phase_information(s.iota, s.alpha, s.variance, s.frames)))
 
 
 Change = tuple[str, Bench, list[float] | None, str]
@@ -71,36 +65,32 @@ def _changes(bench: Bench, now: JoinedBound) -> list[Change]:
     """(name, bench, contrast of each set, note) of every change that is one."""
     d, o, f = bench.detector, bench.optics, bench.frames
     changes = _finer_fringes(bench, now)
+
+    def add(name: str, note: str = "", **parts: Any) -> None:
+        changes.append((name, replace(bench, **parts), None, note))
+
+    def with_sets(**of_set: Callable[[SimulatedSet], Any]) -> SimulatedFrames:
+        new = [replace(s, **{key: value(s) for key, value in of_set.items()}) for s in f.fringes]
+        return replace(f, fringes=tuple(new))
+
     limit = brightest_allowed(bench)
     if limit is not None and min(s.peak_e for s in f.fringes) < 0.95 * limit:
-        fuller = tuple(replace(s, peak_e=max(s.peak_e, limit)) for s in f.fringes)
-        name = f"brightest fringe at {limit / 1e3:.3g} ke-"
-        changes.append((name, replace(bench, frames=replace(f, fringes=fuller)), None, "no margin"))
-    doubled = tuple(replace(s, peak_e=2 * s.peak_e) for s in f.fringes)
-    changes.append(
-        ("twice the light in each frame", replace(bench, frames=replace(f, fringes=doubled)), None,
-         "needs twice the full well")
-    )  # fmt: skip
+        fuller = with_sets(peak_e=lambda s: max(s.peak_e, limit))
+        add(f"brightest fringe at {limit / 1e3:.3g} ke-", "no margin", frames=fuller)
+    doubled = with_sets(peak_e=lambda s: 2 * s.peak_e)
+    add("twice the light in each frame", "needs twice the full well", frames=doubled)
     if d.read_noise_e > 0:
         quiet = replace(d, read_noise_e=d.read_noise_e / 2)
-        changes.append(
-            (f"read noise {quiet.read_noise_e:.3g} e-", replace(bench, detector=quiet), None, "")
-        )
+        add(f"read noise {quiet.read_noise_e:.3g} e-", detector=quiet)
     if o.visibility < 0.995:
-        clear = replace(o, visibility=1.0)
-        changes.append(("visibility 1", replace(bench, optics=clear), None, ""))
+        add("visibility 1", optics=replace(o, visibility=1.0))
     if abs(np.log(o.power_ratio)) > 0.02:
-        equal = replace(o, power_ratio=1.0)
-        changes.append(("fibres of equal power", replace(bench, optics=equal), None, ""))
+        add("fibres of equal power", optics=replace(o, power_ratio=1.0))
     if any(s.loss[0] > 1.01 for s in now.sets):
-        random = tuple(replace(s, phase_law="random") for s in f.fringes)
-        changes.append(
-            ("phases over the whole period", replace(bench, frames=replace(f, fringes=random)),
-             None, "")
-        )  # fmt: skip
+        add("phases over the whole period", frames=with_sets(phase_law=lambda _: "random"))
     if f.period_s > 1.05 * f.exptime_s:
-        fast = replace(bench, frames=replace(f, period_s=f.exptime_s))
-        changes.append((f"a frame every {f.exptime_s:.3g} s", fast, None, "no dead time"))
+        faster = replace(f, period_s=f.exptime_s)
+        add(f"a frame every {f.exptime_s:.3g} s", "no dead time", frames=faster)
     return changes
 
 

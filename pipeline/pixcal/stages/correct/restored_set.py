@@ -66,21 +66,16 @@ class RestoredSet(ReducedSet):
         """Codes (t, y, x) of one block of frames of a tile, of `coding`."""
         if keep:
             self.signal.keep((block, *tile))
-        y, x = self.ranges(tile)
-        ny, nx = self.shape
-        around = (
-            (max(0, y[0] - self.halo), min(ny, y[1] + self.halo)),
-            (max(0, x[0] - self.halo), min(nx, x[1] + self.halo)),
-        )
+        part, halo = self.ranges(tile), self.halo
+        sides = zip(part, self.shape, strict=True)
+        around = [(max(0, a - halo), min(n, b + halo)) for (a, b), n in sides]
         first = block * self.block
         frames = (first, min(first + self.block, self.n_frames))
         codes = self.signal.read(frames, *around)
-        inside = (
-            slice(y[0] - around[0][0], y[1] - around[0][0]),
-            slice(x[0] - around[1][0], x[1] - around[1][0]),
-        )
+        both = zip(part, around, strict=True)
+        inside = tuple(slice(a - start, b - start) for (a, b), (start, _) in both)
         flat, rate = (self._maps_of_charge[n].read(*around) for n in ("flat", "dark_rate"))
-        out = np.empty((len(codes), y[1] - y[0], x[1] - x[0]), np.uint16)
+        out = np.empty((len(codes), *(b - a for a, b in part)), np.uint16)
         for n, frame in enumerate(codes):
             dark = rate * self.exptime_s[first + n]
             out[n] = self._restored(frame, flat, dark)[inside]

@@ -87,14 +87,9 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     acquisition = load_run(run_dir)
     with lock(run_dir):
         body = partial(_correct, run_dir, plan, acquisition, runtime)
+        publish, published = partial(_publish, run_dir), partial(_published, run_dir)
         return make(
-            run_dir,
-            STAGES["corrected"],
-            plain,
-            inputs,
-            body,
-            publish=partial(_publish, run_dir),
-            published=partial(_published, run_dir),
+            run_dir, STAGES["corrected"], plain, inputs, body, publish=publish, published=published
         )
 
 
@@ -150,12 +145,12 @@ def _corrected_maps(
     swept, facts = _sweep(run_dir, made, plan, acquisition, runtime)
     model = HYPERBOLIC if plan.bent else before["model"]
     fitted, halves, left = [], {}, {}
-    own_sets = [
-        _swept_set(run_dir, swept / name, before["sets"][name], plan, acquisition, name)
+    closed_sets = {
+        name: _swept_set(run_dir, swept / name, before["sets"][name], plan, acquisition, name)
         for name in names
-    ]
-    sides = sides_of(own_sets)
-    for name, closed in zip(names, own_sets, strict=True):
+    }
+    sides = sides_of([*closed_sets.values()])
+    for name, closed in closed_sets.items():
         opened = replace(closed, open_sides=sides)
         left[name] = parameter_errors(opened, runtime)
         target = made.scratch / "undone" / name
@@ -182,10 +177,8 @@ def _corrected_maps(
             for f in fitted
         },
         "pairs": gain["pairs"],
-        "sets_chi2_reduced": {
-            "before": before["sets_chi2_reduced"], "after": totals.consistency
-        },
-    }  # fmt: skip
+        "sets_chi2_reduced": {"before": before["sets_chi2_reduced"], "after": totals.consistency},
+    }
 
 
 def _sweep(

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from pixcal import __version__
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.fringe_fit.tile_fit import Coding
 from pixcal.kernels.demodulation import N_SUMS
 from pixcal.kernels.optics import paraxial_vector
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.arrays import F32, F64, I64, Mask
+from pixcal.model.arrays import F32, F64, I64, U8, U16, Mask
 from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Crests
@@ -46,7 +47,7 @@ from pixcal.stages.fit.sweep import load_run
 from pixcal.stages.fitted_shape import nominal_geometry
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import MANIFEST, Build, Manifest, read_json, write_json
-from pixcal.storage.cube import create_group, write_array
+from pixcal.storage.cube import ArrayReader, create_group, write_array
 from pixcal.storage.formats import STAGES
 from pixcal.storage.stage import copy_products, make, require, working
 
@@ -173,24 +174,12 @@ def _extract(
 
 def read_patch(source: ReducedSet, frame: int, y: Range, x: Range) -> tuple[F32, Mask]:
     """Electrons (y, x) of a part of one frame, and its good samples."""
-    values = np.zeros((y[1] - y[0], x[1] - x[0]), np.float32)
-    good = np.zeros(values.shape, bool)
-    for at in source.tiles():
-        (ty0, ty1), (tx0, tx1) = source.ranges(at)
-        y0, y1, x0, x1 = max(y[0], ty0), min(y[1], ty1), max(x[0], tx0), min(x[1], tx1)
-        if y0 < y1 and x0 < x1:
-            part = (slice(y0 - ty0, y1 - ty0), slice(x0 - tx0, x1 - tx0))
-            to = (slice(y0 - y[0], y1 - y[0]), slice(x0 - x[0], x1 - x[0]))
-            tile, fine = _tile(source, at, frame)
-            values[to], good[to] = tile[part], fine[part]
-    return values, good
+    mask = ArrayReader(source.place / "mask").read(y, x)
+    return _electrons(source.signal.read((frame, frame + 1), y, x)[0], mask, source.coding)
 
 
-def _tile(source: ReducedSet, at: tuple[int, int], frame: int) -> tuple[F32, Mask]:
-    """Electrons and good samples of a tile of one frame."""
-    coding = source.coding
-    codes = source.codes(at, frame // source.block)[frame % source.block]
-    good = (source.mask(at) == 0) & (codes != coding.fill)
+def _electrons(codes: U16, mask: U8, coding: Coding) -> tuple[F32, Mask]:
+    good = (mask == 0) & (codes != coding.fill)
     return codes.astype(np.float32) * np.float32(coding.scale) + np.float32(coding.offset), good
 
 
@@ -201,7 +190,8 @@ def _row_task(
     numbers, parts = [], []
     for column in range(source.grid[1]):
         at = (row, column)
-        signal, good = _tile(source, at, frame)
+        codes = source.codes(at, frame // source.block)[frame % source.block]
+        signal, good = _electrons(codes, source.mask(at), source.coding)
         y, x = source.ranges(at)
         (i, j), sums = tile_sums(signal, good, (y[0], x[0]), windows, carrier)
         there = np.nonzero(sums[..., -1])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pixcal.engine.plan import make_plan
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.fringe_fit.batches import Batches, plan_batches
+from pixcal.estimators.fringe_fit.batches import FrameBatches, plan_batches
 from pixcal.estimators.fringe_fit.fit_flags import fit_flags, usual_chi2
 from pixcal.estimators.fringe_fit.fringes import FrameParameters
 from pixcal.estimators.fringe_fit.geometry import tile_plane
@@ -121,7 +121,7 @@ class _Job:
     writers: dict[str, ArrayWriter]
     frames: FrameParameters
     carrier: Carrier
-    batches: Batches
+    batches: FrameBatches
     prime: int
     noise: float
     chi2_limit: float

@@ -18,7 +18,7 @@ from pixcal.model.errors import DamagedError
 from pixcal.storage.artefact import Build, Manifest, damaged_files, digest, file_digest, read_json
 from pixcal.storage.cube import ArrayWriter, create_array, create_group
 from pixcal.storage.cube_place import cubes_of
-from pixcal.storage.fits_in import Coding, FrameFile
+from pixcal.storage.fits_in import FrameFile, SampleFormat
 from pixcal.storage.fits_rows import BAND
 from pixcal.storage.folder import DISK_FULL
 from pixcal.storage.frame_reader import Columns, described
@@ -180,7 +180,7 @@ def _described(
     for source in sources:
         n = first[source.name]
         frame = (planes[source.name], shape[1], shape[2])
-        file = FrameFile(source, "plain", -1, -1, frame, Coding(8))
+        file = FrameFile(source, "plain", -1, -1, frame, SampleFormat(8))
         if places is not None:
             file = described(places, rows[source.name], source.path.parent, frame[1:])
         headers = {name: table[name][n] for name in ("mjd", "exptime_s", "temperature_c")}

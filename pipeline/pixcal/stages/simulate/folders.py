@@ -6,7 +6,7 @@ from typing import Any
 
 from pixcal.model.errors import InputError
 from pixcal.storage.artefact import MANIFEST, Manifest, read_manifest, write_manifest
-from pixcal.storage.formats import Stage
+from pixcal.storage.formats import ArtefactKind
 
 
 def resolved(folder: Path, option: str) -> Path:
@@ -19,7 +19,7 @@ def resolved(folder: Path, option: str) -> Path:
     return folder
 
 
-def up_to_date(folder: Path, stage: Stage, key: str, option: str) -> Manifest | None:
+def up_to_date(folder: Path, stage: ArtefactKind, key: str, option: str) -> Manifest | None:
     """Manifest of a directory that was made with this key and is whole, if it is.
 
     Raises
@@ -52,7 +52,7 @@ def _sizes(folder: Path) -> dict[str, int]:
 
 
 def put_in_place(
-    made: Path, final: Path, stage: Stage, key: str, config: dict[str, Any]
+    made: Path, final: Path, stage: ArtefactKind, key: str, config: dict[str, Any]
 ) -> Manifest:
     """Write the manifest and put a complete directory in place of what stood there."""
     summary = {"files": _sizes(made)}

@@ -20,7 +20,7 @@ _UNDERFLOW = 1e-200
 
 
 @dataclass(frozen=True)
-class Classes:
+class AmplitudeClasses:
     """Pixels of a series, for each amplitude that they may have."""
 
     likely: F64  # (n, class) likelihood of each pixel's variance over the largest of its own
@@ -30,7 +30,7 @@ class Classes:
     products: F64
 
     @classmethod
-    def of(cls, m: Moments, unit: float, switching_s: float) -> "Classes":
+    def of(cls, m: Moments, unit: float, switching_s: float) -> "AmplitudeClasses":
         """Likelihoods of the moments of each pixel."""
         added = (AMPLITUDES * unit / m.sigma / 2) ** 2
         levels = m.variance[:, None] * (added / (1 + added))
@@ -94,7 +94,7 @@ def _levels(keep: float, count: int) -> tuple[F64, F64]:
     return chances, products
 
 
-def joined(pixels: Indices, parts: Sequence[Moments], classes: Iterable[Classes]) -> F64:
+def joined(pixels: Indices, parts: Sequence[Moments], classes: Iterable[AmplitudeClasses]) -> F64:
     """Logarithms (pixel, class) of the likelihood ratios of all series together."""
     total = np.zeros((len(pixels), len(AMPLITUDES)))
     for m, one in zip(parts, classes, strict=True):

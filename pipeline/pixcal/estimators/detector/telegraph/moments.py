@@ -68,8 +68,7 @@ def moments_of(series: Series) -> Moments | None:
         return None
     x, n = x[:, used], n[used]
     x = np.nan_to_num(x - np.nanmean(x, axis=0))
-    square = (x**2).sum(axis=0)
-    square = np.maximum(square, 1e-12)
+    square = np.maximum((x**2).sum(axis=0), 1e-12)
     variance = square / (n - 1)
     kurtosis = n * (x**4).sum(axis=0) / square**2 - 3
     kurtosis = (n - 1) / ((n - 2) * (n - 3)) * ((n + 1) * kurtosis + 6)

@@ -13,14 +13,17 @@ import numpy as np
 from scipy.optimize import brentq, minimize
 from scipy.special import expit, gammaln, xlogy
 
-from pixcal.estimators.detector.telegraph.classes import AMPLITUDES, Classes, Mixture, joined
+from pixcal.estimators.detector.telegraph.classes import (
+    AMPLITUDES,
+    AmplitudeClasses,
+    Mixture,
+    joined,
+)
 from pixcal.estimators.detector.telegraph.moments import Moments
 from pixcal.model.arrays import F64, Indices
 
-_USUAL, _MAX_LOG_SHAPE = (
-    1.5,
-    4.0,
-)  # logarithm of the shape: what is usual, and the most that is tried
+# logarithm of the shape: what is usual, and the most that is tried
+_USUAL, _MAX_LOG_SHAPE = 1.5, 4.0
 _CLEAR = 8.0  # by which another shape than the exponential's must be likelier
 # chance of telegraph noise from which a pixel's frames are looked at for how long it stays
 LIKELY = 0.1
@@ -49,7 +52,7 @@ def find_population(parts: Sequence[Moments], switching_s: float) -> Population:
     pixels = np.unique(np.concatenate([m.pixel for m in parts]))
     unit = min(m.sigma for m in parts)
     # One after the other: each is large.
-    classes = (Classes.of(m, unit, switching_s) for m in parts)
+    classes = (AmplitudeClasses.of(m, unit, switching_s) for m in parts)
     mixture = Mixture.of(joined(pixels, parts, classes))
 
     def weights(p: F64) -> F64:
@@ -91,15 +94,11 @@ def _shape(p: F64) -> float:
 def _curvature(cost: Callable[[F64], float], at: F64, step: float = 0.05) -> F64 | None:
     """Inverse of the second derivatives; None where it is not a minimum."""
     moves = step * np.eye(len(at))
-    second = np.array(
-        [
-            [
-                cost(at + a + b) - cost(at + a - b) - cost(at - a + b) + cost(at - a - b)
-                for b in moves
-            ]
-            for a in moves
-        ]
-    ) / (4 * step**2)
+
+    def change(a: F64, b: F64) -> float:
+        return cost(at + a + b) - cost(at + a - b) - cost(at - a + b) + cost(at - a - b)
+
+    second = np.array([[change(a, b) for b in moves] for a in moves]) / (4 * step**2)
     if np.linalg.eigvalsh(second)[0] <= 1e-9:
         return None
     return np.asarray(np.linalg.inv(second))
@@ -116,7 +115,7 @@ def find_switching(parts: Sequence[Moments], population: "Population") -> tuple[
 
     def rest(log_time: float) -> tuple[float, float]:
         """Products of neighbours beyond those for a time, and their error."""
-        classes = [Classes.of(m, population.unit, float(np.exp(log_time))) for m in own]
+        classes = [AmplitudeClasses.of(m, population.unit, float(np.exp(log_time))) for m in own]
         mixture = Mixture.of(joined(few, own, classes))
         chance = mixture.chance(population.weight)
         of_class = mixture.shares(population.weight)
