@@ -151,7 +151,8 @@ def _of_fringes(found: FringeEvidence) -> F64 | None:
     sums = of_time.T @ weight / np.array([1, 2, 2, 1, 2, 1], np.float32)[:, None]
     n00, n01, n02, n11, n12, n22 = sums.astype(float)
     normal = np.stack([[n00, n01, n02], [n01, n11, n12], [n02, n12, n22]]).transpose(2, 0, 1)
-    good = found.good.ravel() & (np.linalg.det(normal / normal[:, :1, :1]) > 1e-6)
+    normal[~(found.good.ravel() & (n00 > 0))] = 0
+    good = np.linalg.det(normal / np.where(n00 > 0, n00, 1)[:, None, None]) > 1e-6
     normal[~good] = np.eye(3)
     inverse = np.linalg.inv(normal)
     of_pixels = inverse[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)].T
