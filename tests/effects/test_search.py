@@ -279,6 +279,23 @@ def test_a_cause_that_closes_much_less_than_stays_open_is_not_claimed(
     assert claimed or "stays unexplained" in rejected[1]
 
 
+@pytest.mark.parametrize(
+    ("open_still", "alone", "claimed"),
+    [(0.5, 1.0, False), (0.5, 0.8, True), (0.1, 1.0, True)],
+)
+def test_two_causes_that_only_make_good_for_each_other_are_not_claimed(
+    monkeypatch: pytest.MonkeyPatch, open_still: float, alone: float, claimed: bool
+) -> None:
+    """Each opens what the other closes, while alone it closes nothing and much stays open."""
+    comparison = Comparison(REFERENCE, REFERENCE.on_scale(curves((), 500)))
+    both, without, single = (replace(comparison.nominal, log_likelihood=n) for n in (2.0, 1.0, 0.0))
+    left = {2.0: open_still, 1.0: 1.0, 0.0: alone}
+    monkeypatch.setattr(comparison, "residual", lambda trial, _: left[trial.log_likelihood])
+    named = {name: replace(candidate(name, 1.0), alone=single) for name in ("left", "right")}
+    rejected = doubtful(comparison, both, dict.fromkeys(named, without), named)
+    assert (rejected is None) == claimed
+
+
 def test_candidates_without_promise_are_simulated_once() -> None:
     """The best is simulated further in the round that takes it, the others are not."""
     rounds: list[tuple[int, set[str]]] = []

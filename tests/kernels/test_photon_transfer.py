@@ -92,6 +92,25 @@ def test_charge_that_neighbours_share_does_not_bias_the_gain(share: list[list[fl
     assert biased.gain > 1.05 * GAIN
 
 
+def test_a_lamp_that_flickers_by_rows_is_no_charge_that_neighbours_share() -> None:
+    """Bands of light move from frame to frame; what pixels share of it does not fall off."""
+    rng = np.random.default_rng(16)
+
+    def one(electrons: float) -> NDArray[np.float32]:
+        phase = np.arange(512)[:, None] / 90 + rng.random()
+        return frame(rng, electrons * (1 + 0.01 * np.sin(2 * np.pi * phase)) * np.ones((1, 400)))
+
+    def pairs(electrons: float) -> F64:
+        return bin_pairs(
+            pair_statistics(one(electrons), one(electrons), gain=1.5, read_noise=3.0, quantum=1.0)
+        )
+
+    lit = np.asarray(sum(pairs(level) for level in (1e4, 2e4, 4e4)))
+    sums, added = add_neighbours(lit, pairs(0.0))
+    assert added == [(0, 0)]
+    assert (sums == lit[:, :3]).all()
+
+
 @pytest.mark.parametrize("rows", [0.0, 3.0])
 def test_noise_that_neighbours_share_without_light_is_not_counted(rows: float) -> None:
     scenes = flats((701, 513), (2e3, 1e4, 4e4))

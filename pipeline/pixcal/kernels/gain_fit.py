@@ -42,6 +42,8 @@ class GainFit:
     curved: float = 0.0
     # lags whose covariances were added to the variance: see `photon_transfer.add_neighbours`
     neighbours: tuple[tuple[int, int], ...] = ()
+    # whether noise is common to pixels however far apart: the lamp does not light all at once
+    uneven: bool = False
 
 
 def fit_gain(

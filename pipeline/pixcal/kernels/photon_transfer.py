@@ -37,6 +37,7 @@ COLUMNS = 3 + len(LAGS)
 
 # errors beyond which neighbours share noise, and beyond which others do where some do
 _SHARED, _ALSO = 4.0, 2.0
+_EVERYWHERE = 0.5  # least covariance at any lag over the largest of noise that is not of neighbours
 # least share of a block's pixels, along each axis, that have a neighbour at a lag in it
 _PAIRED = 1 - REACH / BLOCK
 _CLIP = 5.0
@@ -192,7 +193,8 @@ def add_neighbours(lit: F64, dark: F64) -> tuple[F64, list[tuple[int, int]]]:
     sums : (N_BINS, 3) float64
         Of the flats; the degrees of freedom are those that their scatter has.
     added : list of (int, int)
-        The lags that were added.
+        The lags that were added; (0, 0) alone where noise is the same at all of them. Charge does
+        not reach that far: it is the light of the lamp, and is not added.
     """
     sums = lit[:, :3].copy()
     used = np.flatnonzero((lit[:, 0] > 0) & (lit[:, 1] > 0))
@@ -207,7 +209,10 @@ def add_neighbours(lit: F64, dark: F64) -> tuple[F64, list[tuple[int, int]]]:
         math.sqrt((weight**2 * variance**2 / dof).sum()),
         weight.sum() * without[2] / without[0] / math.sqrt(without[0]),
     )
-    errors = np.abs(weight @ beyond) * _PAIRED / error
+    shared = weight @ beyond
+    if shared.min() > _EVERYWHERE * shared.max() and shared.min() > _SHARED * error:
+        return sums, [(0, 0)]
+    errors = np.abs(shared) * _PAIRED / error
     significant = errors > (_ALSO if (errors > _SHARED).any() else _SHARED)
     sums[used, 2] += dof * 2 * beyond[:, significant].sum(axis=1)
     sums[used] /= 1 + 2 * significant.sum() / _PAIRED**2

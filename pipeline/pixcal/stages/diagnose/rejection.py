@@ -92,6 +92,12 @@ def doubtful(
         for name in closed
     }
     among = [name for name in closed if closed[name] < needed[name]]
+    alone = [candidates[name].alone for name in closed]
+    # Causes that each only make good for what another spoils.
+    if open_still > OPEN and all(
+        one is not None and comparison.residual(one, where) > 1 - LITTLE for one in alone
+    ):
+        among = list(closed)
     least = min(among, key=lambda name: closed[name], default=None)
     if least is None:
         return None

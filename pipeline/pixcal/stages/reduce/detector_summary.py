@@ -191,7 +191,8 @@ def _gain(
     )
     if fitted is None or not fitted.error < _GAIN_ERROR * fitted.gain:
         return None
-    return replace(fitted, neighbours=tuple(added))
+    everywhere = added == [(0, 0)]
+    return replace(fitted, neighbours=() if everywhere else tuple(added), uneven=everywhere)
 
 
 def _rungs(tables: F64, job: Measuring) -> tuple[F64, Mask]:

@@ -59,6 +59,12 @@ def _of_gain(fit: GainFit, declared: float, used: float) -> list[str]:
             "crosstalk: the noise of neighbours in the flats is correlated at (rows, columns) "
             f"{lags}; the gain includes it"
         )
+    if fit.uneven:
+        found.append(
+            "parts of the flats brighten and fade by themselves from frame to frame, as rows do "
+            "under a rolling shutter and a lamp that flickers (mains, dimmed LED): gain and "
+            "diagnosis suffer; take flats with a steady (DC) lamp, or exposures of many periods"
+        )
     if fit.curved:
         found.append(
             "the photon-transfer curve is not straight: variance over level changes by "
