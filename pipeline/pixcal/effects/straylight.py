@@ -5,19 +5,16 @@ from typing import Self
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
-from pixcal.estimators.maps.map_fit import MapFit, MapPart, fit_maps, gauge_terms, polynomial
-from pixcal.estimators.maps.structure import legendre, legendre_at
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.maps.structure import legendre_at
 from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows
-from pixcal.kernels.significance import sigmas_of_chi2
-from pixcal.model.arrays import F64, Mask
+from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
-from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
+from pixcal.simulation.effect import Effect, FringeMaps, Stage
+from pixcal.simulation.light_fit import Start
 from pixcal.simulation.recording import Recording
 
 DEGREE = 8  # of the polynomials that a measured pattern is made of
-BEAMS = 2  # degree of what two Gaussian beams do to the logarithm of the visibility
-_MIN_PIXELS = 200
 
 
 @dataclass(frozen=True)
@@ -65,6 +62,7 @@ class Straylight(Effect):
     order = 8
     domains = ("space",)
     strengths = ("share", "slope_per_px", "bump", "patterns")
+    smooth_degree = 2  # of what two Gaussian beams do to the logarithm of the visibility
     frames_needed = ("axis",)
     sources = (
         "Rousset et al., eq. 3: straylight is a part of the mean term B iota",
@@ -127,65 +125,12 @@ class Straylight(Effect):
         return 1 + self.pattern((row, row + ny), (column, column + nx), maps.name)
 
     @classmethod
-    def estimate(cls, evidence: Evidence) -> Estimate | None:
-        """Pattern of each set from what its visibility has beyond that of two Gaussian beams.
-
-        Light that does not interfere raises the mean light where it lowers the visibility; a loss
-        of contrast leaves the mean light alone, and is not claimed.
-        """
-        sets = [f for f in evidence.fringes.values() if np.count_nonzero(f.good) > _MIN_PIXELS]
-        if not sets:
-            return None
-        patterns, errors, shares = [], {}, []
-        gain, dof, skipped = 0.0, 0, len(polynomial((4, 4), BEAMS))
-        for n, f in enumerate(sets):
-            fit = _structure(f)
-            shares.append(_in_light(f, fit.values))
-            gain += fit.gain
-            dof += len(fit.values)
-            values = tuple(float(v) for v in np.clip(fit.values, -20, 20))
-            (y0, x0), (ny, nx) = f.origin, f.good.shape
-            patterns.append(
-                StrayPattern(f.name, (y0, y0 + ny), (x0, x0 + nx), (0.0,) * skipped + values)
-            )
-            for place, error in enumerate(np.sqrt(np.diag(fit.covariance)), start=skipped):
-                errors[f"patterns[{n}].coefficients[{place}]"] = float(error)
-        in_light = float(np.median(shares))
-        return Estimate(
-            cls(0.0, (0.0, 0.0), patterns=tuple(patterns)),
-            errors,
-            sigmas_of_chi2(gain, dof) if in_light > 0.5 else 0.0,
-            "structure of the visibility that two beams cannot make, also seen in the mean light",
-            {"share_in_mean_light": in_light},
-            law="smooth pattern of any shape",
-        )
-
-
-def _usable(found: FringeEvidence) -> Mask:
-    alpha = np.hypot(found.theta[1], found.theta[2])
-    return np.asarray(found.good & (alpha > 0) & (found.theta[0] > 0))
-
-
-def _free(found: FringeEvidence) -> F64:
-    return np.concatenate([polynomial(found.good.shape, BEAMS), gauge_terms(found)])
-
-
-def _terms(found: FringeEvidence) -> F64:
-    """Legendre products (term, y, x) beyond those of the beams."""
-    return legendre(found.good.shape, DEGREE)[len(polynomial((4, 4), BEAMS)) :]
-
-
-def _structure(found: FringeEvidence) -> MapFit:
-    """Coefficients of log(1 + share) in the logarithm of iota over alpha."""
-    good = _usable(found)
-    ratio = found.theta[0] / np.maximum(np.hypot(found.theta[1], found.theta[2]), 1e-9)
-    inverse = np.log(np.where(good, ratio, 1.0))
-    return fit_maps([MapPart.of(_terms(found), inverse, _free(found), good)])
-
-
-def _in_light(found: FringeEvidence, coefficients: F64) -> float:
-    """How much of the pattern, of one, the mean light has."""
-    good = _usable(found)
-    light = np.log(np.where(good, found.theta[0], 1.0))
-    pattern = np.tensordot(coefficients, _terms(found), 1)[None]
-    return float(fit_maps([MapPart.of(pattern, light, _free(found), good)]).values[0])
+    def starts(cls, evidence: Evidence) -> list[Start]:
+        """A pattern of each set by itself, of any smooth shape."""
+        nothing = (0.0,) * ((DEGREE + 1) * (DEGREE + 2) // 2)
+        patterns = []
+        for f in evidence.fringes.values():
+            (y, x), (ny, nx) = f.origin, f.good.shape
+            patterns.append(StrayPattern(f.name, (y, y + ny), (x, x + nx), nothing))
+        start = cls(0.0, (0.0, 0.0), patterns=tuple(patterns))
+        return [Start(start, ("patterns",), "smooth pattern of any shape")]

@@ -6,7 +6,6 @@ to the maps of a fit, and how that is undone.
 """
 
 import dataclasses
-import re
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,12 +15,13 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.arrays import F32, F64
-from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.changes import Template, Way
 from pixcal.simulation.forward import DOMAINS, ForwardModel, Stage
 from pixcal.simulation.frame_changes import acts_on_frames_alone
 from pixcal.simulation.frame_fit import fit_frames
+from pixcal.simulation.light_fit import LightFit, Start, fit_light
+from pixcal.simulation.numbers import numbers, with_numbers
 from pixcal.simulation.score import score, score_again
 
 __all__ = ["DOMAINS", "Effect", "Estimate", "FringeMaps", "Stage"]
@@ -136,15 +136,15 @@ class Estimate:
         What is zero in it stays so; beyond the range of a parameter nothing is moved.
         """
         rng = np.random.default_rng([seed, zlib.crc32(effect.name.encode())])
-        plain = to_plain(effect)
+        values = numbers(effect)
         for steps in self.together or [{key: self.errors[key]} for key in sorted(self.errors)]:
             size = rng.standard_normal()
-            for key, step in steps.items():
-                _move(plain, re.findall(r"[^.\[\]]+", key), step * size)
+            values |= {k: values[k] + step * size for k, step in steps.items() if values.get(k)}
         try:
-            return parse(type(effect), plain, effect.name)
+            moved = with_numbers(effect, values)
         except InputError:
             return effect
+        return moved if numbers(moved) == values else effect
 
     def _is_sure(self, name: str) -> bool:
         value = getattr(self.effect, name)
@@ -167,11 +167,14 @@ class Effect(ForwardModel):
         Why maps need no correction for it all the same: it is noise, or small.
     fit_model : str
         Shape of the fringes (`pixcal.estimators.fringe_fit.models`) that takes it up.
+    smooth_degree : int
+        Of surfaces that the maps have for other reasons, where ``starts`` are given.
     """
 
     absorbed_because: ClassVar[str] = ""
     left_because: ClassVar[str] = ""
     fit_model: ClassVar[str] = ""
+    smooth_degree: ClassVar[int] = 3
 
     # What is learnt of it, and what becomes of the maps.
 
@@ -180,8 +183,12 @@ class Effect(ForwardModel):
         """Parameters and errors from an acquisition; None where it holds no evidence of it.
 
         By the forward model alone, unless an effect knows a better way: from the series of the
-        frames where it acts on whole frames, else from frames that are taken again.
+        frames where it acts on whole frames, from the maps where it gives ``starts``, else from
+        frames that are taken again.
         """
+        if starts := cls.starts(evidence):
+            found_light = fit_light(starts, evidence, cls.smooth_degree)
+            return None if found_light is None else _of_light(found_light)
         if acts_on_frames_alone(cls):
             series = fit_frames(cls, evidence)
             if series is None:
@@ -194,6 +201,14 @@ class Effect(ForwardModel):
             return None
         again = Again(found.model, found.way, found.template)
         return Estimate(found.model, found.errors, found.significance, found.why, again=again)
+
+    @classmethod
+    def starts(cls, evidence: Evidence) -> Sequence[Start]:
+        """Where a fit to the maps begins, if it acts on the light of the fringes alone.
+
+        Those of fewer numbers first; none: its frames are taken again.
+        """
+        return ()
 
     def replayed(self, evidence: Evidence) -> Self | None:
         """The same effect doing to each frame what it did to these, whatever its law.
@@ -291,13 +306,16 @@ class Again:
         return Estimate(self.effect, {}, size, "")
 
 
-def _move(plain: Any, path: Sequence[str], step: float) -> None:
-    """Add to the number at a path of keys and places, if there is one that is not zero."""
-    for key in path[:-1]:
-        plain = plain[int(key)] if isinstance(plain, list) else plain.get(key)
-        if not plain:
-            return
-    last: Any = int(path[-1]) if isinstance(plain, list) else path[-1]
-    value = plain[last] if isinstance(plain, list) else plain.get(last)
-    if isinstance(value, float) and value:
-        plain[last] = value + step
+def _of_light(found: LightFit) -> Estimate:
+    """An estimate from the maps."""
+    return Estimate(
+        found.model,
+        found.errors,
+        found.significance,
+        found.why,
+        {
+            f"in_{kind.removeprefix('the ').replace(' ', '_')}": v
+            for kind, v in found.agreed.items()
+        },
+        law=found.start.law,
+    )

@@ -22,6 +22,7 @@ from pixcal.kernels.scene import FrameStates
 from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench
 from pixcal.simulation.forward import ForwardModel
+from pixcal.simulation.numbers import field_of, numbers, with_numbers
 from pixcal.simulation.recording import Recording
 from pixcal.simulation.replica import set_recordings
 
@@ -77,17 +78,16 @@ class Strength:
     """One number of a model's strengths, and how it shows."""
 
     model: ForwardModel  # of this strength alone
-    field: str
-    place: int | None  # in a tuple
+    key: str  # as errors name it
     unit: float  # the strength in `model`
     shape: str | None  # the parameter, no strength, that changes how it shows
     steady: bool  # whether draws are the same: a shape, and no part of a covariance
     power: float  # of the strength, that the part goes with
 
     @property
-    def key(self) -> str:
-        """As errors name it."""
-        return self.field if self.place is None else f"{self.field}[{self.place}]"
+    def field(self) -> str:
+        """That it is a number of."""
+        return field_of(self.key)
 
     @property
     def of_line(self) -> bool:
@@ -112,13 +112,11 @@ def strengths_of(
 ) -> list[Strength]:
     """Strengths of a model that change some series."""
     start, found = _heard(start), []
-    for name in [f for f in start.strengths if f not in leave]:
-        values = getattr(start, name)
-        for place, value in enumerate(values if isinstance(values, tuple) else (values,)):
-            at = place if isinstance(values, tuple) else None
-            if isinstance(value, float):
-                own = with_number(start.scaled(0.0), name, at, value or UNIT)
-                found += _strength(every, own, name, at, value or UNIT)
+    for key, value in numbers(start).items():
+        field = field_of(key)
+        if field in start.strengths and field not in leave:
+            own = with_numbers(start.scaled(0.0), {key: value or UNIT})
+            found += _strength(every, own, key, value or UNIT)
     return found
 
 
@@ -128,9 +126,7 @@ def _heard(start: ForwardModel) -> ForwardModel:
     return replace(start, **{name: OTHER * getattr(start, name) for name in lines})
 
 
-def _strength(
-    every: Sequence[Watched], own: ForwardModel, field: str, place: int | None, unit: float
-) -> list[Strength]:
+def _strength(every: Sequence[Watched], own: ForwardModel, key: str, unit: float) -> list[Strength]:
     drawn = [w.changes(own, 2) for w in every]
     if not any(v.any() for v in drawn):
         return []
@@ -146,11 +142,11 @@ def _strength(
     steady, power = all(np.array_equal(*v) for v in drawn), 1.0
     if not steady:
         # Of the same random numbers: two draws tell.
-        half = with_number(own, field, place, unit / 2)
+        half = with_numbers(own, {key: unit / 2})
         less = [w.changes(half, 2) for w in every]
         whole, part = (sum(float(np.diff(v, axis=0).var()) for v in d) for d in (drawn, less))
         power = float(np.log2(whole / part))
-    return [Strength(own, field, place, unit, shape, steady, power)]
+    return [Strength(own, key, unit, shape, steady, power)]
 
 
 class FrameChanges:
@@ -215,15 +211,3 @@ def acts_on_frames_alone(kind: type[ForwardModel]) -> bool:
     """Whether a model changes the states of frames, and nothing else."""
     steps = ("states", "detector", "light", "photons", "charge", "signal", "readout")
     return [s for s in steps if getattr(kind, s) is not getattr(ForwardModel, s)] == ["states"]
-
-
-def with_number(model: ForwardModel, field: str, place: int | None, value: float) -> ForwardModel:
-    """The model with another number in a field, or in a place of its tuple, within its range."""
-    limits = next(f.metadata for f in fields(model) if f.name == field)
-    low, high, above = (limits.get(key) for key in ("low", "high", "above"))
-    if above is not None:
-        value = max(value, float(np.nextafter(above, np.inf)))
-    value = float(np.clip(value, -np.inf if low is None else low, np.inf if high is None else high))
-    held = getattr(model, field)
-    new = value if place is None else (*held[:place], value, *held[place + 1 :])
-    return replace(model, **{field: new})

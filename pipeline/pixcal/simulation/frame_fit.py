@@ -29,7 +29,8 @@ from pixcal.estimators.frame_series.variance_components import (
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.simulation.forward import ForwardModel
 from pixcal.simulation.frame_basis import FrameBasis
-from pixcal.simulation.frame_changes import LIGHT, FrameChanges, Strength, strengths_of, with_number
+from pixcal.simulation.frame_changes import LIGHT, FrameChanges, Strength, strengths_of
+from pixcal.simulation.numbers import with_numbers
 
 ALIKE = (
     "; with fringes of one direction, motion of the fibres along the fringe axis and drift of the "
@@ -140,7 +141,7 @@ class _Fit:
         model, errors = self.start.scaled(0.0), {}
         for field, (profile, _) in self.profiles.items():
             name = next(s.shape for s in self.taken if s.field == field) or ""
-            model, errors[name] = with_number(model, name, None, profile.value), profile.error
+            model, errors[name] = with_numbers(model, {name: profile.value}), profile.error
         for number, s in enumerate(self.taken):
             n = self._place(s)
             if s.steady:
@@ -156,7 +157,7 @@ class _Fit:
                 if number < fitted
             ]
             errors[s.key] = float(np.hypot(error, np.linalg.norm(owed)))
-            model = with_number(model, s.field, s.place, self._value(s, found))
+            model = with_numbers(model, {s.key: self._value(s, found)})
         return model, {key: error for key, error in errors.items() if error > 0}
 
     def _place(self, of: Strength) -> int:
@@ -172,14 +173,14 @@ def _swung(
 ) -> tuple[ForwardModel, dict[str, float]]:
     """The model with a line, whose strengths are those of its amplitude in the series."""
     name = own[0].shape or ""
-    model, errors = with_number(model, name, None, line.hz), {name: line.hz_error}
+    model, errors = with_numbers(model, {name: line.hz}), {name: line.hz_error}
     for s in own:
         # rms over draws of a random phase, in the channel that the line is in.
         drawn = [w.changes(s.at(line.hz), 8) for w in basis.every if w.recording is not None]
         rms = np.sqrt(np.mean([(v**2).mean(axis=(0, 1)) for v in drawn], axis=0))
         channel = int(np.argmax(rms * (line.amplitude_error > 0)))
         per = s.unit / max(float(np.sqrt(2) * rms[channel]), 1e-300)
-        model = with_number(model, s.field, s.place, per * float(line.amplitude[channel]))
+        model = with_numbers(model, {s.key: per * float(line.amplitude[channel])})
         errors[s.key] = per * float(line.amplitude_error[channel])
     return model, errors
 

@@ -25,7 +25,7 @@ from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64
 from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way, dot
 from pixcal.simulation.forward import ForwardModel
-from pixcal.simulation.frame_changes import with_number
+from pixcal.simulation.numbers import with_numbers
 
 STEP = 1.1  # factor on a parameter for its derivative
 # factors on the default of a parameter that is no strength, where the score test is made too, and
@@ -173,7 +173,7 @@ class _Fit:
             for factors in GRID:
                 value = getattr(best, name)
                 for factor in factors:
-                    changed = _replaced(best, {name: value * factor})
+                    changed = with_numbers(best, {name: value * factor})
                     if changed == best:
                         continue
                     tried += 1
@@ -204,7 +204,7 @@ class _Fit:
             values[name] = float(getattr(shape, name) * np.sign(a) * abs(a) ** power)
             above = (max(a, 0.0) + da) ** power - max(a, 0.0) ** power
             errors[name] = float(abs(getattr(shape, name)) * (above if self.way.random else da))
-        return _replaced(shape, values), {n: e for n, e in errors.items() if e > 0}
+        return with_numbers(shape, values), {n: e for n, e in errors.items() if e > 0}
 
     def _fitted(
         self, model: ForwardModel, errors: dict[str, float]
@@ -240,9 +240,9 @@ class _Fit:
         slopes = {}
         for name in names:
             value = getattr(model, name)
-            moved = _replaced(model, {name: value * STEP})
+            moved = with_numbers(model, {name: value * STEP})
             if moved == model:
-                moved = _replaced(model, {name: value / STEP})
+                moved = with_numbers(model, {name: value / STEP})
             if step := getattr(moved, name) - value:
                 slopes[name] = at.slope(self.template(moved), step)
         return slopes
@@ -271,11 +271,4 @@ def _moved(model: ForwardModel, step: Mapping[str, float]) -> ForwardModel:
         value = getattr(model, name)
         low, high = sorted((value / MAX_FACTOR, value * MAX_FACTOR))
         new[name] = float(np.clip(value + size, low, high))
-    return _replaced(model, new)
-
-
-def _replaced(model: ForwardModel, values: Mapping[str, float]) -> ForwardModel:
-    """The model with other parameters, held within their ranges."""
-    for name, value in values.items():
-        model = with_number(model, name, None, value)
-    return model
+    return with_numbers(model, new)

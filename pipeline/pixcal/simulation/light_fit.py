@@ -1,0 +1,282 @@
+"""Parameters of an effect that acts on the light of the fringes alone, from the maps of the fit.
+
+What the effect does to mean light, visibility and phase of every pixel follows from its forward
+model (`ForwardModel.light`), without a frame being simulated. Its numbers are fitted to the maps of
+all sets by Gauss-Newton steps, beside smooth surfaces and the fringe modes that a fit leaves open.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.maps.map_fit import (
+    MapFit,
+    MapPart,
+    fit_maps,
+    gauge_terms,
+    phase_map,
+    polynomial,
+)
+from pixcal.kernels.crosstalk import filled
+from pixcal.kernels.scene import DetectorMaps, LightMaps
+from pixcal.kernels.significance import sigmas_of_chi2
+from pixcal.model.arrays import C128, F64, Mask
+from pixcal.simulation.forward import ForwardModel
+from pixcal.simulation.numbers import field_of, numbers, with_numbers
+from pixcal.simulation.recording import Recording
+from pixcal.simulation.replica import set_recordings
+
+CLIP = 8.0  # medians of the differences of pixels side by side, beyond which they do not count
+KINDS = ("the mean light", "the visibility", "the phase")
+MIN_PIXELS, MIN_SIDE = 200, 9
+ROUNDS = 4  # Gauss-Newton steps
+# change of a map (relative, or rad) by a step for a derivative; the first such step, and how often
+# and by how much it is lengthened
+SEEN, STEP, LONGER, MOST = 1e-4, 1e-3, 3, 1e3
+# chi-square, and share of all of it, by which a start of more numbers must explain more
+APART, MODEL = 25.0, 0.02
+STRAIGHT = 0.02  # part of a step's change by which derivatives may fail to tell it
+UNTOLD = 1e-8  # share of a signal's square that is left where smooth surfaces take all of it
+# of what an effect must do to a map, as much has to be there; where it shows by so many errors
+AGREED, SHOWN = 0.5, 2.0
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a fit begins, and what it may change."""
+
+    model: Any
+    free: tuple[str, ...]  # fields whose numbers are fitted
+    law: str = ""  # in words
+
+
+@dataclass(frozen=True)
+class LightFit:
+    """What the maps let know of an effect."""
+
+    start: Start
+    model: Any
+    errors: dict[str, float]  # 1-sigma errors of the numbers that were fitted
+    gain: float  # fall in chi-square from none of it
+    agreed: dict[str, float]  # share of what it must do that is there, by kind of map
+    dof: int  # numbers that the maps determine
+
+    @property
+    def significance(self) -> float:
+        """In standard deviations; zero where a map that must show the effect does not."""
+        if min(self.agreed.values(), default=1.0) < AGREED:
+            return 0.0
+        return sigmas_of_chi2(self.gain, max(self.dof, 1))
+
+    @property
+    def why(self) -> str:
+        """One sentence."""
+        shown = " and ".join(self.agreed) or "maps"
+        return f"{shown} of the pixels, as its forward model predicts"
+
+
+def fit_light(starts: Sequence[Start], evidence: Evidence, degree: int) -> LightFit | None:
+    """The best of some starts, those of fewer numbers first; None without enough pixels.
+
+    Surfaces up to a degree are left to the beams.
+    """
+    lit = evidence.once("light of the pixels", make=lambda: _lit(evidence))
+    best: LightFit | None = None
+    for start in starts if lit else ():
+        found = _fitted(start, lit, degree)
+        if best is None or found.gain - best.gain >= max(APART, MODEL * found.gain):
+            best = found
+    return best
+
+
+@dataclass(frozen=True)
+class _Lit:
+    """One fringe set: its maps, and the light that a model may change."""
+
+    recording: Recording
+    rows: tuple[int, int]
+    first: int  # column
+    good: Mask
+    # (3, y, x) of `KINDS`: logarithms, and rad; the light without what noise it shares with the
+    # visibility
+    data: F64 = field(repr=False)
+    shared: float  # share of the visibility that is taken off the light
+    gauge: F64 = field(repr=False)  # (4, y, x) fringe modes that the fit leaves open
+    light: LightMaps = field(repr=False)  # of all columns up to the part's last
+    maps: DetectorMaps = field(repr=False)
+
+    @classmethod
+    def of(cls, found: FringeEvidence, recording: Recording) -> "_Lit":
+        """A set, by places in its whole window."""
+        (y0, x0), (ny, nx) = found.origin, found.good.shape
+        alpha = np.hypot(found.theta[1], found.theta[2])
+        good = found.good & (alpha > 0) & (found.theta[0] > 0)
+        iota = np.where(good, found.theta[0], 1.0)
+        visibility = np.where(good, alpha, 1.0) / iota
+        data = np.stack([np.log(iota), np.log(visibility), np.nan_to_num(phase_map(found))])
+        shared = _shared(*data[:2], good)
+        data[0] -= shared * data[1]
+        plain = filled(np.where(good, found.theta, np.nan), found.k)
+        nothing = np.zeros((ny, x0 + nx), np.float32)
+        one = np.ones_like(nothing)
+        bench, window = recording.bench, (found.window[0], x0 + nx)
+        detector = replace(bench.detector, shape=window, chip=found.window, origin_px=(0, 0))
+        return cls(
+            replace(recording, bench=replace(bench, detector=detector)),
+            (y0, y0 + ny),
+            x0,
+            good,
+            data,
+            shared,
+            gauge_terms(found),
+            LightMaps(*(np.pad(m, ((0, 0), (x0, 0)), "edge").astype(np.float32) for m in plain)),
+            DetectorMaps(nothing, nothing, one, nothing, nothing, nothing, one,
+                         nothing.astype(np.uint8)),
+        )  # fmt: skip
+
+    def change(self, model: ForwardModel) -> F64:
+        """What a model does to the maps (3, y, x)."""
+        own, light = model.light(self.light, self.recording, self.rows, self.maps), self.light
+        found = np.zeros((3, *light.iota.shape))
+        if own.iota is not light.iota:
+            found[0] = np.log(np.maximum(own.iota / light.iota.astype(float), 1e-9))
+        found[1] = -found[0]
+        if own.alpha_cos is not light.alpha_cos:
+            ratio = _phasor(own) / _phasor(light)
+            found[1] += np.log(np.maximum(np.abs(ratio), 1e-9))
+            found[2] = _bent(ratio)
+        found[0] -= self.shared * found[1]
+        return found[:, :, self.first :]
+
+
+def _shared(light: F64, visibility: F64, good: Mask) -> float:
+    """Slope of the light's noise against the visibility's, from pixels side by side."""
+    used = good[:, 1:] & good[:, :-1]
+    steps = [np.diff(own, axis=1)[used] for own in (light, visibility)]
+    kept = np.all([abs(own) < CLIP * np.median(abs(own)) for own in steps], axis=0)
+    of_light, other = (own[kept] for own in steps)
+    return float(of_light @ other / max(other @ other, 1e-300))
+
+
+def _phasor(light: LightMaps) -> C128:
+    found = light.alpha_cos.astype(float) + 1j * light.alpha_sin
+    return np.where(found == 0, 1e-9, found)
+
+
+def _bent(turn: C128) -> F64:
+    """Phase (y, x) less its mean and slopes, rad: a fit has them free, and they may be large."""
+    for axis in (0, 1):
+        steps = np.diff(np.unwrap(np.angle(turn), axis=axis), axis=axis)
+        place = np.expand_dims(np.arange(turn.shape[axis]), 1 - axis)
+        turn = turn * np.exp(-1j * float(np.median(steps)) * place)
+    return np.asarray(np.angle(turn * np.exp(-1j * np.angle(turn.mean()))))
+
+
+def _lit(evidence: Evidence) -> list[_Lit]:
+    recordings = set_recordings(evidence)
+    return [
+        _Lit.of(found, recordings[name][0])
+        for name, found in evidence.fringes.items()
+        if np.count_nonzero(found.good) > MIN_PIXELS and min(found.good.shape) >= MIN_SIDE
+    ]
+
+
+def _fitted(start: Start, lit: Sequence[_Lit], degree: int) -> LightFit:
+    model, here = start.model, [one.change(start.model) for one in lit]
+    errors: dict[str, float] = {}
+    for _ in range(ROUNDS):
+        values = {k: v for k, v in numbers(model).items() if field_of(k) in start.free}
+        slopes = _slopes(model, values, lit, here)
+        rest = [one.data - at for one, at in zip(lit, here, strict=True)]
+        found = _least_squares(lit, rest, slopes, degree)
+        step = dict(zip(values, found.values, strict=True))
+        errors = dict(zip(values, map(float, np.sqrt(np.diag(found.covariance))), strict=True))
+        model = with_numbers(model, {k: values[k] + v for k, v in step.items() if errors[k] > 0})
+        there = [one.change(model) for one in lit]
+        straight = [
+            _is_straight(b - a, np.tensordot(found.values, own, 1))
+            for a, b, own in zip(here, there, slopes, strict=True)
+        ]
+        here = there
+        if all(straight):
+            break
+    errors = {key: error for key, error in errors.items() if error > 0}
+    return LightFit(start, model, errors, *_gain(lit, here, degree), len(errors))
+
+
+def _slopes(
+    model: Any, values: Mapping[str, float], lit: Sequence[_Lit], here: Sequence[F64]
+) -> list[F64]:
+    """Derivatives (n, 3, y, x) of the maps of each set by some numbers."""
+    found = [np.zeros((len(values), *at.shape)) for at in here]
+    for n, (key, value) in enumerate(values.items()):
+        step = STEP * max(abs(value), 1.0)
+        for _ in range(LONGER):
+            moved = with_numbers(model, {key: value + step})
+            if numbers(moved)[key] <= value:
+                moved = with_numbers(model, {key: value - step})
+            size = numbers(moved)[key] - value
+            changes = [one.change(moved) - at for one, at in zip(lit, here, strict=True)]
+            largest = max(float(np.abs(c).max()) for c in changes)
+            if largest > SEEN or not size:
+                break
+            step *= 1.5 * SEEN / max(largest, SEEN / MOST)
+        for own, change in zip(found, changes, strict=True):
+            own[n] = change / (size or 1.0)
+    return found
+
+
+def _is_straight(change: F64, expected: F64) -> bool:
+    """Whether maps (3, y, x) changed as their derivatives said, but for a constant."""
+    off = change - expected
+    off = off - off.mean(axis=(1, 2), keepdims=True)
+    size = expected - expected.mean(axis=(1, 2), keepdims=True)
+    return bool((off**2).sum() <= STRAIGHT**2 * (size**2).sum())
+
+
+def _least_squares(
+    lit: Sequence[_Lit],
+    rest: Sequence[F64],
+    signals: Sequence[F64],
+    degree: int,
+    kinds: Sequence[int] = range(len(KINDS)),
+) -> MapFit:
+    """Fit of signals (n, 3, y, x) to maps (3, y, x) of all sets; errors are zero of the untold."""
+    parts = []
+    whole = np.zeros(len(signals[0]))
+    for one, data, own in zip(lit, rest, signals, strict=True):
+        for kind in (k for k in kinds if own[:, k].any()):
+            free = np.concatenate([polynomial(one.good.shape, degree), one.gauge])
+            parts.append(MapPart.of(own[:, kind], data[kind], free, one.good))
+            whole += (own[:, kind][:, one.good] ** 2).sum(axis=1)
+    left = sum((p.signals**2).sum(axis=0) for p in parts)
+    told = np.flatnonzero(left > UNTOLD * whole)
+    found = MapFit(np.zeros(len(whole)), np.zeros((len(whole),) * 2), 0.0)
+    if not len(told):
+        return found
+    size = np.sqrt(np.asarray(left)[told])
+    fit = fit_maps([replace(p, signals=p.signals[:, told] / size) for p in parts])
+    found.values[told] = fit.values / size
+    found.covariance[np.ix_(told, told)] = fit.covariance / np.outer(size, size)
+    return replace(found, gain=fit.gain)
+
+
+def _gain(
+    lit: Sequence[_Lit], changes: Sequence[F64], degree: int
+) -> tuple[float, dict[str, float]]:
+    """Chi-square by which changes are there, and as what share of them each kind of map has them.
+
+    Of the kinds that must show them.
+    """
+    data, signals = [one.data for one in lit], [change[None] for change in changes]
+    gain, agreed = 0.0, {}
+    for kind, name in enumerate(KINDS):
+        own = _least_squares(lit, data, signals, degree, (kind,))
+        share, error = float(own.values[0]), float(np.sqrt(own.covariance[0, 0]))
+        gain += own.gain * (share > 0)
+        if 0 < SHOWN * error < 1:
+            agreed[name] = share
+    return gain, agreed
