@@ -32,7 +32,7 @@ from pixcal.simulation.replica import set_recordings
 CLIP = 8.0  # medians of the differences of pixels side by side, beyond which they do not count
 KINDS = ("the mean light", "the visibility", "the phase")
 MIN_PIXELS, MIN_SIDE = 200, 9
-ROUNDS = 4  # Gauss-Newton steps
+ROUNDS = 3  # Gauss-Newton steps
 # change of a map (relative, or rad) by a step for a derivative; the first such step, and how often
 # and by how much it is lengthened
 SEEN, STEP, LONGER, MOST = 1e-4, 1e-3, 3, 1e3
@@ -187,9 +187,10 @@ def _lit(evidence: Evidence) -> list[_Lit]:
 def _fitted(start: Start, lit: Sequence[_Lit], degree: int) -> LightFit:
     model, here = start.model, [one.change(start.model) for one in lit]
     errors: dict[str, float] = {}
+    lengths: dict[str, float] = {}
     for _ in range(ROUNDS):
         values = {k: v for k, v in numbers(model).items() if field_of(k) in start.free}
-        slopes = _slopes(model, values, lit, here)
+        slopes = _slopes(model, values, lit, here, lengths)
         rest = [one.data - at for one, at in zip(lit, here, strict=True)]
         found = _least_squares(lit, rest, slopes, degree)
         step = dict(zip(values, found.values, strict=True))
@@ -208,12 +209,19 @@ def _fitted(start: Start, lit: Sequence[_Lit], degree: int) -> LightFit:
 
 
 def _slopes(
-    model: Any, values: Mapping[str, float], lit: Sequence[_Lit], here: Sequence[F64]
+    model: Any,
+    values: Mapping[str, float],
+    lit: Sequence[_Lit],
+    here: Sequence[F64],
+    lengths: dict[str, float],
 ) -> list[F64]:
-    """Derivatives (n, 3, y, x) of the maps of each set by some numbers."""
+    """Derivatives (n, 3, y, x) of the maps of each set by some numbers.
+
+    By steps of lengths that are kept for the next time.
+    """
     found = [np.zeros((len(values), *at.shape)) for at in here]
     for n, (key, value) in enumerate(values.items()):
-        step = STEP * max(abs(value), 1.0)
+        step = lengths.get(key, STEP * max(abs(value), 1.0))
         for _ in range(LONGER):
             moved = with_numbers(model, {key: value + step})
             if numbers(moved)[key] <= value:
@@ -224,6 +232,7 @@ def _slopes(
             if largest > SEEN or not size:
                 break
             step *= 1.5 * SEEN / max(largest, SEEN / MOST)
+        lengths[key] = step
         for own, change in zip(found, changes, strict=True):
             own[n] = change / (size or 1.0)
     return found

@@ -25,7 +25,7 @@ from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64
 from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way, dot
 from pixcal.simulation.forward import ForwardModel
-from pixcal.simulation.numbers import with_numbers
+from pixcal.simulation.numbers import field_of, numbers, with_numbers
 
 STEP = 1.1  # factor on a parameter for its derivative
 # factors on the default of a parameter that is no strength, where the score test is made too, and
@@ -62,9 +62,9 @@ def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
     strengths is a number.
     """
     start = kind()
-    names = tuple(n for n in kind.strengths if isinstance(getattr(start, n), float))
+    names = tuple(key for key in numbers(start) if field_of(key) in kind.strengths)
     if not names:
-        raise NotImplementedError("none of its strengths is a single number: define estimate")
+        raise NotImplementedError("none of its strengths is a number: define estimate")
     changes = _changes(evidence)
     way = changes.way(start)
     fit = _Fit(changes, way, names)
@@ -144,8 +144,8 @@ class _Fit:
         return size, error, sigmas(log_chance(square / 2, (len(size) + 1) // 2))
 
     def _each_strength(self, model: ForwardModel) -> list[ForwardModel]:
-        null = model.scaled(0.0)
-        return [dataclasses.replace(null, **{n: getattr(model, n)}) for n in self.strengths]
+        null, values = model.scaled(0.0), numbers(model)
+        return [with_numbers(null, {key: values[key]}) for key in self.strengths]
 
     def result(self, start: ForwardModel) -> Scored | None:
         """The fit, from the effect as it is by default."""
@@ -160,7 +160,7 @@ class _Fit:
             # One acquisition holds one draw: where it is well seen, that decides.
             scatter = self.changes.scatter(model, self.way, self.template(model)) / 2
             for name in set(errors) & set(self.strengths):
-                errors[name] = float(np.hypot(errors[name], scatter * abs(getattr(model, name))))
+                errors[name] = float(np.hypot(errors[name], scatter * abs(numbers(model)[name])))
         why = RANDOM if self.way.random else STEADY
         keys, template = self.telling(shape)
         telling = dataclasses.replace(self.way, keys=keys)
@@ -171,7 +171,7 @@ class _Fit:
         best, found, tried = start, self.amplitudes(self._each_strength(start)), 1
         for name in _shapes(start):
             for factors in GRID:
-                value = getattr(best, name)
+                value = numbers(best)[name]
                 for factor in factors:
                     changed = with_numbers(best, {name: value * factor})
                     if changed == best:
@@ -199,18 +199,18 @@ class _Fit:
     ) -> tuple[ForwardModel, dict[str, float]]:
         """A model of these amplitudes: roots, where second moments tell of it."""
         power = 0.5 if self.way.random else 1.0
-        values, errors = {}, {}
+        values, errors, usual = {}, {}, numbers(shape)
         for name, a, da in zip(self.strengths, size, error, strict=True):
-            values[name] = float(getattr(shape, name) * np.sign(a) * abs(a) ** power)
+            values[name] = float(usual[name] * np.sign(a) * abs(a) ** power)
             above = (max(a, 0.0) + da) ** power - max(a, 0.0) ** power
-            errors[name] = float(abs(getattr(shape, name)) * (above if self.way.random else da))
+            errors[name] = float(abs(usual[name]) * (above if self.way.random else da))
         return with_numbers(shape, values), {n: e for n, e in errors.items() if e > 0}
 
     def _fitted(
         self, model: ForwardModel, errors: dict[str, float]
     ) -> tuple[ForwardModel, dict[str, float]]:
         """Gauss-Newton steps of all parameters."""
-        names = [n for n in self.strengths if getattr(model, n)] + _shapes(model)
+        names = [n for n in self.strengths if numbers(model)[n]] + _shapes(model)
         at = self.template(model)
         misfit = self._misfit(at)
         for _ in range(ROUNDS):
@@ -239,11 +239,11 @@ class _Fit:
         """Derivatives of the deviations by parameters."""
         slopes = {}
         for name in names:
-            value = getattr(model, name)
+            value = numbers(model)[name]
             moved = with_numbers(model, {name: value * STEP})
             if moved == model:
                 moved = with_numbers(model, {name: value / STEP})
-            if step := getattr(moved, name) - value:
+            if step := numbers(moved)[name] - value:
                 slopes[name] = at.slope(self.template(moved), step)
         return slopes
 
@@ -259,16 +259,15 @@ class _Fit:
 
 
 def _shapes(model: ForwardModel) -> list[str]:
-    """Parameters that are no strengths and can be fitted."""
-    others = {f.name: getattr(model, f.name) for f in dataclasses.fields(model)}
-    return [n for n, v in others.items() if n not in model.strengths and isinstance(v, float) and v]
+    """Numbers that are no strengths and can be fitted."""
+    return [k for k, v in numbers(model).items() if v and field_of(k) not in model.strengths]
 
 
 def _moved(model: ForwardModel, step: Mapping[str, float]) -> ForwardModel:
     """The model with parameters moved, none by more than a factor of `MAX_FACTOR`."""
-    new = {}
+    new, values = {}, numbers(model)
     for name, size in step.items():
-        value = getattr(model, name)
+        value = values[name]
         low, high = sorted((value / MAX_FACTOR, value * MAX_FACTOR))
         new[name] = float(np.clip(value + size, low, high))
     return with_numbers(model, new)
