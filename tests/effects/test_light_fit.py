@@ -11,7 +11,7 @@ from pixcal.effects.straylight import Straylight
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.scene import DetectorMaps, LightMaps
 from pixcal.simulation.effect import Effect
-from pixcal.simulation.light_fit import Start
+from pixcal.simulation.light_fit import LightStart
 from pixcal.simulation.numbers import field_of, numbers, with_numbers
 from pixcal.simulation.replica import set_recordings
 
@@ -83,7 +83,7 @@ def test_numbers_are_found_by_the_keys_of_errors_and_stay_in_range(
     acquired: Callable[..., Evidence],
 ) -> None:
     start = Straylight.starts(acquired())[0]
-    assert isinstance(start, Start)
+    assert isinstance(start, LightStart)
     key = "patterns[1].coefficients[7]"
     assert numbers(start.model)[key] == 0
     moved = with_numbers(start.model, {key: 99.0, "share": -1.0})

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 import pixcal
 from pixcal.effects import effect_of_file, effects, known_effects
 from pixcal.engine.run import Runtime
-from pixcal.model.errors import InputError
+from pixcal.model.errors import InputError, PixcalError
 from pixcal.stages.evidence import load_evidence
 from pixcal_cli.main import cli
 
@@ -113,3 +113,21 @@ def test_where_it_shows_must_be_said(tmp_path: Path, written: str) -> None:
     file.write_text(text.replace(given, f'strengths = ("rate",)\n    {written}'))
     with pytest.raises(InputError, match="domains is missing or not a tuple out of space, time"):
         known_effects([file])
+
+
+@pytest.mark.parametrize(
+    ("starts", "reason"),
+    [
+        ("[1]", "TypeError: gives no list of LightStart of a Glow"),
+        ("[LightStart(cls(), ('rat',))]", "ValueError: free: rat is not a parameter"),
+        ("[cls.nothing]", "AttributeError: .*nothing"),
+    ],
+)
+def test_starts_that_cannot_be_used_name_the_file(tmp_path: Path, starts: str, reason: str) -> None:
+    file = tmp_path / "mine.py"
+    text = GLOW.read_text().replace("import Effect", "import Effect, LightStart")
+    file.write_text(
+        text + f"\n    @classmethod\n    def starts(cls, evidence):\n        return {starts}\n"
+    )
+    with pytest.raises(PixcalError, match=rf"mine.py: starts: {reason}.*; fix the file"):
+        known_effects([file])["glow"].starts(None)  # type: ignore[arg-type]

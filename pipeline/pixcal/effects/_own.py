@@ -10,7 +10,7 @@ import numpy as np
 
 from pixcal.model.config import parse, to_plain
 from pixcal.model.errors import InputError, PixcalError
-from pixcal.simulation.effect import DOMAINS, Effect, Estimate, Stage
+from pixcal.simulation.effect import DOMAINS, Effect, Estimate, LightStart, Stage
 
 # steps of the exposure: each gives back what it is given first, changed
 STEPS = ("states", "detector", "light", "photons", "charge", "signal", "readout")
@@ -31,9 +31,9 @@ def checked(effect: type[Effect], file: Path) -> type[Effect]:
             setattr(effect, name, _told(vars(effect)[name], file, name in STEPS))
     try:
         _check(effect)
-        if "estimate" in vars(effect):
-            # mypy: a class may be given another method
-            effect.estimate = _estimate(vars(effect)["estimate"], file)  # type: ignore[method-assign]
+        for name, check in (("estimate", _check_estimate), ("starts", _check_starts)):
+            if name in vars(effect):
+                setattr(effect, name, _asked(name, vars(effect)[name], check, file))
     except (Exception, SystemExit) as error:
         raise InputError(f"{file}: {_reason(error)}; see docs/how-to/own-effect.md") from error
     return effect
@@ -79,26 +79,36 @@ def _told(step: Callable[..., Any], file: Path, gives_back: bool) -> Callable[..
     return told
 
 
-def _estimate(method: Any, file: Path) -> Any:
-    """The class method `estimate`, which names the file where it fails or gives another thing.
+def _asked(name: str, method: Any, check: Callable[[Any, type[Effect]], None], file: Path) -> Any:
+    """A class method of the evidence, which names the file where it fails or gives another thing.
 
     That ends a diagnosis (no InputError): of frames that cannot tell, it gives None instead.
     """
     if not isinstance(method, classmethod):
-        raise InputError("estimate is not a class method: put @classmethod above it")
+        raise InputError(f"{name} is not a class method: put @classmethod above it")
 
-    def told(cls: type[Effect], evidence: Any) -> Estimate | None:
+    def asked(cls: type[Effect], evidence: Any) -> Any:
         try:
-            found: Estimate | None = method.__func__(cls, evidence)
+            found = method.__func__(cls, evidence)
             if found is not None:
-                _check_estimate(found, cls)
+                check(found, cls)
         except (InputError, NotImplementedError):
             raise
         except (Exception, SystemExit) as error:
-            raise PixcalError(f"{file}: estimate: {_reason(error)}; fix the file") from error
+            raise PixcalError(f"{file}: {name}: {_reason(error)}; fix the file") from error
         return found
 
-    return classmethod(told)
+    return classmethod(asked)
+
+
+def _check_starts(found: Any, effect: type[Effect]) -> None:
+    """Raise TypeError or ValueError unless a fit can begin there."""
+    fields = {field.name for field in dataclasses.fields(effect)}
+    for start in found:
+        if not isinstance(start, LightStart) or not isinstance(start.model, effect):
+            raise TypeError(f"gives no list of LightStart of a {effect.__name__}")
+        if unknown := set(start.free) - fields:
+            raise ValueError(f"free: {', '.join(sorted(unknown))} is not a parameter")
 
 
 def _check_estimate(found: Any, effect: type[Effect]) -> None:

@@ -11,8 +11,7 @@ from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows, geometry
 from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
-from pixcal.simulation.effect import Effect, Stage
-from pixcal.simulation.light_fit import Start
+from pixcal.simulation.effect import Effect, LightStart, Stage
 from pixcal.simulation.recording import Recording
 
 
@@ -118,7 +117,7 @@ class HyperbolicFringes(Effect):
         )
 
     @classmethod
-    def starts(cls, evidence: Evidence) -> list[Start]:
+    def starts(cls, evidence: Evidence) -> list[LightStart]:
         """One foot for all sets, or a position of each set's fibres, at the nominal distance.
 
         The share, and the distance, would need the third order, which a small window does not show;
@@ -128,8 +127,8 @@ class HyperbolicFringes(Effect):
         common = cls((0.0, 0.0), evidence.distance_mm)
         own = cls(None, evidence.distance_mm, pairs=pairs)
         return [
-            Start(common, ("foot_mm",), "one fibre position for all sets"),
-            Start(own, ("pairs",), "a separate fibre position for each set"),
+            LightStart(common, ("foot_mm",), "one fibre position for all sets"),
+            LightStart(own, ("pairs",), "a separate fibre position for each set"),
         ]
 
 

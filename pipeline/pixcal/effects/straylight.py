@@ -4,14 +4,13 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
+from numpy.polynomial.legendre import leggrid2d
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.maps.structure import legendre_at
 from pixcal.kernels.scene import DetectorMaps, LightMaps, Rows
 from pixcal.model.arrays import F64
 from pixcal.model.config import quantity
-from pixcal.simulation.effect import Effect, FringeMaps, Stage
-from pixcal.simulation.light_fit import Start
+from pixcal.simulation.effect import Effect, FringeMaps, LightStart, Stage
 from pixcal.simulation.recording import Recording
 
 DEGREE = 8  # of the polynomials that a measured pattern is made of
@@ -37,11 +36,12 @@ class StrayPattern:
         (y0, y1), (x0, x1) = self.rows, self.columns
         y = np.clip(2 * (rows - y0) / max(y1 - y0 - 1, 1) - 1, -1, 1)
         x = np.clip(2 * (columns - x0) / max(x1 - x0 - 1, 1) - 1, -1, 1)
+        orders = [(i, n - i) for n in range(DEGREE + 1) for i in range(n + 1)]
+        products = np.zeros((DEGREE + 1, DEGREE + 1))
+        for at, value in zip(orders, self.coefficients, strict=False):
+            products[at] = value
         grid = np.linspace(-1, 1, 33)
-        inside, terms = (
-            np.tensordot(self.coefficients, legendre_at(*at, DEGREE)[: len(self.coefficients)], 1)
-            for at in ((grid, grid), (y, x))
-        )
+        inside, terms = (leggrid2d(*at, products) for at in ((grid, grid), (y, x)))
         return np.asarray(np.expm1(np.maximum(terms - inside.min(), 0.0)))
 
 
@@ -125,7 +125,7 @@ class Straylight(Effect):
         return 1 + self.pattern((row, row + ny), (column, column + nx), maps.name)
 
     @classmethod
-    def starts(cls, evidence: Evidence) -> list[Start]:
+    def starts(cls, evidence: Evidence) -> list[LightStart]:
         """A pattern of each set by itself, of any smooth shape."""
         nothing = (0.0,) * ((DEGREE + 1) * (DEGREE + 2) // 2)
         patterns = []
@@ -133,4 +133,4 @@ class Straylight(Effect):
             (y, x), (ny, nx) = f.origin, f.good.shape
             patterns.append(StrayPattern(f.name, (y, y + ny), (x, x + nx), nothing))
         start = cls(0.0, (0.0, 0.0), patterns=tuple(patterns))
-        return [Start(start, ("patterns",), "smooth pattern of any shape")]
+        return [LightStart(start, ("patterns",), "smooth pattern of any shape")]

@@ -20,11 +20,11 @@ from pixcal.simulation.changes import Template, Way
 from pixcal.simulation.forward import DOMAINS, ForwardModel, Stage
 from pixcal.simulation.frame_changes import acts_on_frames_alone
 from pixcal.simulation.frame_fit import fit_frames
-from pixcal.simulation.light_fit import LightFit, Start, fit_light
+from pixcal.simulation.light_fit import LightFit, LightStart, fit_light
 from pixcal.simulation.numbers import numbers, with_numbers
 from pixcal.simulation.score import score, score_again
 
-__all__ = ["DOMAINS", "Effect", "Estimate", "FringeMaps", "Stage"]
+__all__ = ["DOMAINS", "Effect", "Estimate", "FringeMaps", "LightStart", "Stage"]
 
 NONZERO = 3.0  # errors from which a strength of an effect counts as different from zero
 
@@ -203,7 +203,7 @@ class Effect(ForwardModel):
         return Estimate(found.model, found.errors, found.significance, found.why, again=again)
 
     @classmethod
-    def starts(cls, evidence: Evidence) -> Sequence[Start]:
+    def starts(cls, evidence: Evidence) -> Sequence[LightStart]:
         """Where a fit to the maps begins, if it acts on the light of the fringes alone.
 
         Those of fewer numbers first; none: its frames are taken again.

@@ -45,7 +45,7 @@ AGREED, SHOWN = 0.5, 2.0
 
 
 @dataclass(frozen=True)
-class Start:
+class LightStart:
     """Where a fit begins, and what it may change."""
 
     model: Any
@@ -57,7 +57,7 @@ class Start:
 class LightFit:
     """What the maps let know of an effect."""
 
-    start: Start
+    start: LightStart
     model: Any
     errors: dict[str, float]  # 1-sigma errors of the numbers that were fitted
     gain: float  # fall in chi-square from none of it
@@ -78,7 +78,7 @@ class LightFit:
         return f"{shown} of the pixels, as its forward model predicts"
 
 
-def fit_light(starts: Sequence[Start], evidence: Evidence, degree: int) -> LightFit | None:
+def fit_light(starts: Sequence[LightStart], evidence: Evidence, degree: int) -> LightFit | None:
     """The best of some starts, those of fewer numbers first; None without enough pixels.
 
     Surfaces up to a degree are left to the beams.
@@ -117,7 +117,7 @@ class _Lit:
         iota = np.where(good, found.theta[0], 1.0)
         visibility = np.where(good, alpha, 1.0) / iota
         data = np.stack([np.log(iota), np.log(visibility), np.nan_to_num(phase_map(found))])
-        shared = _shared(*data[:2], good)
+        shared = _shared(data[0], data[1], good)
         data[0] -= shared * data[1]
         plain = filled(np.where(good, found.theta, np.nan), found.k)
         nothing = np.zeros((ny, x0 + nx), np.float32)
@@ -158,7 +158,7 @@ def _shared(light: F64, visibility: F64, good: Mask) -> float:
     steps = [np.diff(own, axis=1)[used] for own in (light, visibility)]
     kept = np.all([abs(own) < CLIP * np.median(abs(own)) for own in steps], axis=0)
     of_light, other = (own[kept] for own in steps)
-    return float(of_light @ other / max(other @ other, 1e-300))
+    return float(of_light @ other) / max(float(other @ other), 1e-300)
 
 
 def _phasor(light: LightMaps) -> C128:
@@ -184,7 +184,7 @@ def _lit(evidence: Evidence) -> list[_Lit]:
     ]
 
 
-def _fitted(start: Start, lit: Sequence[_Lit], degree: int) -> LightFit:
+def _fitted(start: LightStart, lit: Sequence[_Lit], degree: int) -> LightFit:
     model, here = start.model, [one.change(start.model) for one in lit]
     errors: dict[str, float] = {}
     lengths: dict[str, float] = {}
@@ -255,18 +255,18 @@ def _least_squares(
 ) -> MapFit:
     """Fit of signals (n, 3, y, x) to maps (3, y, x) of all sets; errors are zero of the untold."""
     parts = []
-    whole = np.zeros(len(signals[0]))
+    whole, left = np.zeros((2, len(signals[0])))
     for one, data, own in zip(lit, rest, signals, strict=True):
         for kind in (k for k in kinds if own[:, k].any()):
             free = np.concatenate([polynomial(one.good.shape, degree), one.gauge])
             parts.append(MapPart.of(own[:, kind], data[kind], free, one.good))
             whole += (own[:, kind][:, one.good] ** 2).sum(axis=1)
-    left = sum((p.signals**2).sum(axis=0) for p in parts)
+            left += (parts[-1].signals ** 2).sum(axis=0)
     told = np.flatnonzero(left > UNTOLD * whole)
     found = MapFit(np.zeros(len(whole)), np.zeros((len(whole),) * 2), 0.0)
     if not len(told):
         return found
-    size = np.sqrt(np.asarray(left)[told])
+    size = np.sqrt(left[told])
     fit = fit_maps([replace(p, signals=p.signals[:, told] / size) for p in parts])
     found.values[told] = fit.values / size
     found.covariance[np.ix_(told, told)] = fit.covariance / np.outer(size, size)

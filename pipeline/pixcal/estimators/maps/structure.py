@@ -34,12 +34,7 @@ def without_outliers(values: F64) -> F64:
 
 def legendre(shape: tuple[int, ...], degree: int) -> F64:
     """Products of Legendre polynomials (term, y, x) up to a total degree, the constant first."""
-    return legendre_at(np.linspace(-1, 1, shape[0]), np.linspace(-1, 1, shape[1]), degree)
-
-
-def legendre_at(rows: F64, columns: F64, degree: int) -> F64:
-    """The same at rows (y,) and columns (x,) from -1 to 1."""
-    y, x = legvander(rows, degree), legvander(columns, degree)
+    y, x = (legvander(np.linspace(-1, 1, n), degree) for n in shape)
     orders = [(i, n - i) for n in range(degree + 1) for i in range(n + 1)]
     return np.stack([np.outer(y[:, i], x[:, j]) for i, j in orders])
 
