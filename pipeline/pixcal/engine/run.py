@@ -13,7 +13,6 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
@@ -124,16 +123,9 @@ def run_tasks(
         Results in the order of the items.
     """
     results: dict[int, R] = {}
-    progress = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        console=Console(file=sys.stderr),
-        disable=runtime.quiet,
-    )
+    times = (TimeElapsedColumn(), "left", TimeRemainingColumn())
+    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), *times)
+    progress = Progress(*columns, console=Console(file=sys.stderr), disable=runtime.quiet)
     shown = progress.add_task(label, total=len(items))
     with progress, one_blas_thread():
 

@@ -137,18 +137,11 @@ def fringe_vector(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[Array
 def phase_jacobian(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
     """Derivative (..., 6), rad/mm, of `phase` by the geometry's `PARAMETERS`, in their order."""
     path = _Paths(x, y, geometry)
-    bx, by, bz = geometry.baseline_x, geometry.baseline_y, geometry.baseline_z
-    (ax, ay, az), (ex, ey, ez) = path.ua, path.ub
-    qx, qy, qz = path.q
-    columns = (
-        path.quotient(-2 * bx, -(ax + ex)),
-        path.quotient(-2 * by, -(ay + ey)),
-        path.quotient(-2 * bz, -(az + ez)),
-        path.quotient(2 * qx, (ax - ex) / 2),
-        path.quotient(2 * qy, (ay - ey) / 2),
-        path.quotient(2 * qz, (az - ez) / 2),
-    )
-    return geometry.wavenumber * np.stack(columns, axis=-1)
+    baseline = (geometry.baseline_x, geometry.baseline_y, geometry.baseline_z)
+    both, apart = path.ua + path.ub, (path.ua - path.ub) / 2
+    of_centre = [path.quotient(-2 * b, -u) for b, u in zip(baseline, both, strict=True)]
+    of_baseline = [path.quotient(2 * q, u) for q, u in zip(path.q, apart, strict=True)]
+    return geometry.wavenumber * np.stack([*of_centre, *of_baseline], axis=-1)
 
 
 class _Paths:
@@ -161,13 +154,9 @@ class _Paths:
     def __init__(self, x: ArrayLike, y: ArrayLike, geometry: Geometry) -> None:
         xs, ys = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
         b = np.array([geometry.baseline_x, geometry.baseline_y, geometry.baseline_z])
-        q = np.stack(
-            [
-                xs * geometry.pitch - geometry.centre_x,
-                ys * geometry.pitch - geometry.centre_y,
-                np.full(xs.shape, -geometry.distance),
-            ]
-        )
+        across = xs * geometry.pitch - geometry.centre_x
+        along = ys * geometry.pitch - geometry.centre_y
+        q = np.stack([across, along, np.full(xs.shape, -geometry.distance)])
         half = (b / 2).reshape((3,) + (1,) * xs.ndim)
         to_a, to_b = q + half, q - half
         rho_a, rho_b = np.sqrt((to_a**2).sum(0)), np.sqrt((to_b**2).sum(0))

@@ -125,17 +125,7 @@ def axes_grid(
     -------
     Figure, ndarray of Axes (rows, columns)
     """
-    figure = Figure(figsize=size, dpi=DPI)
-    _margins(figure, rows, columns, left, right, bottom, top, beside, between)
-    return figure, figure.subplots(rows, columns, squeeze=False, **drawing)
-
-
-def _margins(
-    figure: Figure, rows: int, columns: int, left: float, right: float, bottom: float, top: float,
-    beside: float, between: float,
-) -> None:  # fmt: skip
-    """Margins and gaps in inches."""
-    width, height = figure.get_size_inches()
+    figure, (width, height) = Figure(figsize=size, dpi=DPI), size
     # Gaps are shares of the mean width and height of the axes.
     wide = (width - left - right - (columns - 1) * beside) / columns
     high = (height - bottom - top - (rows - 1) * between) / rows
@@ -143,6 +133,7 @@ def _margins(
         left / width, bottom / height, 1 - right / width, 1 - top / height,
         beside / wide, between / high,
     )  # fmt: skip
+    return figure, figure.subplots(rows, columns, squeeze=False, **drawing)
 
 
 def place(figure: Figure, left: float, bottom: float, width: float, height: float) -> Axes:

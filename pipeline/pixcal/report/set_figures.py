@@ -44,7 +44,8 @@ def temporal(sets: Sequence[SetContents]) -> Figure:
         step = -(-len(fringes.series.time) // POINTS)
         time, clock = _clock(fringes.series.time[::step])
         for axes, (label, values) in zip(column, _parameters(fringes, moving), strict=False):
-            drawing: Any = {"markersize": _dot(len(time)), "markeredgewidth": 0}
+            size = float(np.clip(70 / np.sqrt(max(len(time), 1)), 1.2, 4.5))
+            drawing: Any = {"markersize": size, "markeredgewidth": 0}
             axes.plot(time, values[::step], "o", color=BLUE, **drawing)
             axes.set_ylabel(label)
             axes.set_ylim(*limits([values], 0.0))
@@ -102,10 +103,6 @@ def _clock(time: F64) -> tuple[F64, str]:
     return time, "s"
 
 
-def _dot(frames: int) -> float:
-    return float(np.clip(70 / np.sqrt(max(frames, 1)), 1.2, 4.5))
-
-
 def chi2(sets: Sequence[SetContents]) -> Figure:
     """Histograms of the reduced chi-square against the expected distributions."""
     figure, ((axes,),) = axes_grid((WIDE, 3.8))
@@ -160,7 +157,8 @@ def allan_figure(sets: Mapping[str, tuple[Facts, Facts]]) -> Figure:
         (WIDE, 6.2), 2, 1, top=0.65, between=0.2, sharex=True, height_ratios=[3, 1.1]
     )
     curves = {
-        name: {key: _floats(measured.get(key)) for key in ALLAN_COLUMNS}
+        # Where there is no value, None becomes NaN.
+        name: {key: np.array(measured.get(key) or (), dtype=float) for key in ALLAN_COLUMNS}
         for name, (measured, _) in sets.items()
     }
     unit = unit_for(np.concatenate([c["adev_px"] for c in curves.values()]), "px")
@@ -193,7 +191,9 @@ def _allan_lines(
     low, high = curve["adev_lo_px"], curve["adev_hi_px"]
     bars = np.nan_to_num(np.abs(np.stack([adev - low, high - adev])))
     drawing: Any = {"fmt": "o", "color": color, "elinewidth": 1.3, "capsize": 3, "markersize": 6}
-    label = f"{name}: measured{_slope_label(measured)}"
+    label = f"{name}: measured"
+    if (slope := measured.get("slope")) is not None:
+        label += f", slope {with_error(slope, measured.get('slope_err'))}"
     at = frames * aside
     axes.errorbar(at, adev * unit.factor, bars * unit.factor, zorder=3, label=label, **drawing)
     below.errorbar(at, adev / white, bars / white, **drawing)
@@ -214,11 +214,6 @@ def _allan_lines(
         )  # fmt: skip
 
 
-def _slope_label(measured: Facts) -> str:
-    slope, error = measured.get("slope"), measured.get("slope_err")
-    return "" if slope is None else f", slope {with_error(slope, error)}"
-
-
 def _add_clock(axes: Axes, frames: F64, seconds: F64) -> None:
     """The same axis in seconds, on top."""
     if not len(seconds) or not seconds[0] > 0:
@@ -228,10 +223,6 @@ def _add_clock(axes: Axes, frames: F64, seconds: F64) -> None:
     low, high = axes.get_xlim()
     plain_ticks(top.xaxis, pace * low, pace * high, most=9)
     top.set_xlabel("averaging time (s)")
-
-
-def _floats(values: Any) -> F64:
-    return np.array([np.nan if v is None else v for v in values or ()], dtype=float)
 
 
 def _reduced_chi2_density(at: F64, freedom: int) -> F64:

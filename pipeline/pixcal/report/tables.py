@@ -88,7 +88,9 @@ def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
     straight = facts.get("linearity") or {}
     if is_table(straight.get("levels")):
         title = f"Ladder of flats, intercept {number(straight.get('intercept_adu'), 2)} ADU"
-        yield _list_table(title, straight["levels"])
+        keys = list(dict.fromkeys(key for level in straight["levels"] for key in level))
+        rows = [[_plain(level.get(key)) for key in keys] for level in straight["levels"]]
+        yield Table(title, keys, rows)
     sets = {
         name: dict(_flat({k: v for k, v in entry.items() if k != "flags"}))
         | {f"quantisation.{k}": v for k, v in facts.get("quantisation", {}).get(name, {}).items()}
@@ -170,12 +172,6 @@ def _columns_table(title: str, columns: Mapping[str, Mapping[str, Any]]) -> Tabl
 def is_table(value: Any) -> bool:
     """Whether a value is a list of mappings."""
     return isinstance(value, list) and bool(value) and all(isinstance(v, Mapping) for v in value)
-
-
-def _list_table(title: str, entries: Sequence[Mapping[str, Any]]) -> Table:
-    """A list of like mappings, one row each."""
-    keys = list(dict.fromkeys(key for entry in entries for key in entry))
-    return Table(title, keys, [[_plain(entry.get(key)) for key in keys] for entry in entries])
 
 
 def _stages(stages: Sequence[StageRecord]) -> Iterator[Table]:

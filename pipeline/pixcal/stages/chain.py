@@ -24,16 +24,12 @@ class Done:
     diagnosed: bool
 
 
-def _silent(_name: str, _folder: Path) -> AbstractContextManager[None]:
-    return nullcontext()
-
-
 def run(
     acquisition: Path,
     out: Path,
     config: Config,
     runtime: Runtime,
-    step: Step = _silent,
+    step: Step = lambda _name, _folder: nullcontext(),
     note: Callable[[str], object] = lambda _text: None,
 ) -> Done:
     """Run all steps; a diagnosis or correction that is impossible is not an error.

@@ -101,8 +101,7 @@ def _fringes(
         raise InputError(f"fringe set {name!r}: more than {MAX_SAMPLES} samples; take a part")
     codes = source.signal.read((first, last), y, x).astype(np.uint16, copy=False)
     coding = source.coding
-    electrons = codes * np.float32(coding.scale)
-    electrons += np.float32(coding.offset)
+    electrons = coding.electrons(codes)
     np.copyto(electrons, np.float32(np.nan), where=codes == coding.fill)
 
     found = read_frames(swept)

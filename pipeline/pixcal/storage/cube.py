@@ -91,6 +91,8 @@ def _array_metadata(
 ) -> bytes:
     """What zarr-python writes for an array; attributes as JSON."""
     made: dict[str, Any] = {}
+    size = np.dtype(dtype).itemsize
+    blosc_codec = BloscCodec(typesize=size, cname="lz4", clevel=1, shuffle="bitshuffle")
     zarr.create_array(
         store=made,
         shape=shape,
@@ -98,12 +100,7 @@ def _array_metadata(
         dtype=np.dtype(dtype),
         fill_value=fill_value,
         serializer=BytesCodec(endian="little"),
-        compressors=[
-            BloscCodec(
-                typesize=np.dtype(dtype).itemsize, cname="lz4", clevel=1, shuffle="bitshuffle"
-            ),
-            Crc32cCodec(),
-        ],
+        compressors=[blosc_codec, Crc32cCodec()],
         filters=None,
         dimension_names=dims,
         attributes=json.loads(attrs),

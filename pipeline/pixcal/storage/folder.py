@@ -204,19 +204,12 @@ class UrlFolder:
     def ends(self, names: Sequence[str]) -> Iterator[tuple[int, bytes]]:
         system, root = self.path.filesystem()
         sizes = self._sizes(names)
-        for name in names:
-            if name not in sizes:
-                raise FileNotFoundError(
-                    errno.ENOENT, os.strerror(errno.ENOENT), f"{self.path}/{name}"
-                )
+        if lost := next((name for name in names if name not in sizes), None):
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), f"{self.path}/{lost}")
         whole = [name for name in names if sizes[name] >= 4]
+        paths, ends = [f"{root}/{name}" for name in whole], [sizes[name] for name in whole]
         with explained(self.path.url):
-            tails = system.cat_ranges(
-                [f"{root}/{name}" for name in whole],
-                [sizes[name] - 4 for name in whole],
-                [sizes[name] for name in whole],
-                on_error="raise",
-            )
+            tails = system.cat_ranges(paths, [end - 4 for end in ends], ends, on_error="raise")
         tail = dict(zip(whole, tails, strict=True))
         yield from ((sizes[name], tail.get(name, b"")) for name in names)
 

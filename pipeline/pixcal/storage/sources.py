@@ -50,7 +50,12 @@ def read_headers(folder: Path, names: Iterable[str]) -> dict[str, Header]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as handle:
             rows = csv.DictReader(handle, skipinitialspace=True)
-            _check_columns(path, list(rows.fieldnames or ()))
+            columns = list(rows.fieldnames or ())
+            if columns[:1] != ["file"] or not set(columns[1:]) <= set(KEYWORDS):
+                raise InputError(
+                    f"{path}: the columns are {', '.join(columns) or 'missing'}; write file, then "
+                    f"any of {', '.join(KEYWORDS)}"
+                )
             for row in rows:
                 place = f"{path}: line {rows.line_num}"
                 header = tuple(_cards(place, row))
@@ -65,14 +70,6 @@ def read_headers(folder: Path, names: Iterable[str]) -> dict[str, Header]:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: cannot be read ({reason}); write it as UTF-8 text") from error
     return found
-
-
-def _check_columns(path: Path, columns: list[str]) -> None:
-    if columns[:1] != ["file"] or not set(columns[1:]) <= set(KEYWORDS):
-        raise InputError(
-            f"{path}: the columns are {', '.join(columns) or 'missing'}; write file, then any of "
-            f"{', '.join(KEYWORDS)}"
-        )
 
 
 def _cards(place: str, row: dict[str, str | None]) -> Iterable[tuple[str, str | float]]:

@@ -54,14 +54,9 @@ def nonuniformity(a: F64, b: F64, lost: int) -> Nonuniformity:
     pixel = float(shared[2])
     row, column = float(shared[0] - pixel) / nx, float(shared[1] - pixel) / ny
     errors = np.sqrt([(spread[0] + spread[2]) / nx**2, (spread[1] + spread[2]) / ny**2, spread[2]])
-    total = row + column + pixel
     total_error = math.sqrt(spread[0] / nx**2 + spread[1] / ny**2 + spread[2])
-    return Nonuniformity(
-        _root(total, total_error),
-        _root(row, errors[0]),
-        _root(column, errors[1]),
-        _root(pixel, errors[2]),
-    )
+    each = map(_root, (row, column, pixel), errors)
+    return Nonuniformity(_root(row + column + pixel, total_error), *each)
 
 
 def without_gaps(values: F64, good: Mask) -> F64:

@@ -61,12 +61,13 @@ def _motion_of(evidence: Evidence) -> Motion | None:
     # A hop is in all cosine modes: what follows the phase is sought where none is left.
     still = [_with_hops(s, hops[s.name], -1.0).cleaned() for s in found]
     line, cleared = cleared_of_line(still, _level)
+    angles = [np.arctan2(s.k[1], s.k[0]) for s in found]
     return Motion(
         series=cleared,
         raw=tuple(_with_hops(s, hops[s.name], 1.0) for s in still),
         hops=hops,
         line=line,
-        crossed=_crossed(found),
+        crossed=any(abs(np.sin(a - b)) > CROSSED for a in angles for b in angles),
     )
 
 
@@ -218,8 +219,3 @@ def _level(series: FrameSeries) -> F64:
     """Variance (t - 1, 2) of the cosine modes, of noise, jitter and walk."""
     names = ("jitter_x", "jitter_y", "walk_x", "walk_y")
     return mode_variance(series, np.stack([motion_part(name, series) for name in names]))
-
-
-def _crossed(every: Sequence[FrameSeries]) -> bool:
-    angles = [np.arctan2(s.k[1], s.k[0]) for s in every]
-    return any(abs(np.sin(a - b)) > CROSSED for a in angles for b in angles)

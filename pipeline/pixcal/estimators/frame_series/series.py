@@ -70,7 +70,10 @@ class FrameSeries:
 
 def motion_series(found: FringeEvidence) -> FrameSeries | None:
     """Change of the fringe vector (x, y), rad/px; None where too few frames tell."""
-    return _series(found, lambda free: free[:, 3:5], lambda free: _rows(free, 3, 4))
+    slopes = np.eye(5)[3:]
+    return _series(
+        found, lambda free: free[:, 3:5], lambda free: np.broadcast_to(slopes, (len(free), 2, 5))
+    )
 
 
 def light_series(found: FringeEvidence) -> FrameSeries | None:
@@ -90,12 +93,6 @@ def light_series(found: FringeEvidence) -> FrameSeries | None:
 
     mean = float(found.free[_lit(found), 0].mean()) if _lit(found).any() else 1.0
     return _series(found, values, slopes)
-
-
-def _rows(free: F64, *columns: int) -> F64:
-    jacobian = np.zeros((len(free), len(columns), 5))
-    jacobian[:, np.arange(len(columns)), columns] = 1.0
-    return jacobian
 
 
 def _lit(found: FringeEvidence) -> Mask:

@@ -110,48 +110,14 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
     coefficients = np.linalg.lstsq(basis, flat.T, rcond=None)[0]
     light = (flat - (basis @ coefficients).T).reshape(maps.shape)
 
-    size = [2 * n for n in shape]
-    power = (np.abs(np.fft.fft2(light, s=size)) ** 2).sum(axis=0)
-    fy, fx = np.meshgrid(*(np.fft.fftfreq(n) for n in size), indexing="ij")
-    fringes_across = np.hypot(fy * shape[0], fx * shape[1])
-    allowed = fringes_across >= MIN_FRINGES
-    # Nominal positions are good to some 10 %: the peak there wins unless it is no peak at all.
-    near = np.hypot(2 * np.pi * fx - nominal[0], 2 * np.pi * fy - nominal[1])
-    reach = 0.25 * np.hypot(*nominal) + 2 * np.pi * 1.5 / min(shape)
-    floor = np.median(power[allowed]) if allowed.any() else np.inf
-    # The foot of a peak beyond is none, nor are its side lobes.
-    within = np.where(allowed, power, 0.0)
-    crest = (power >= maximum_filter(within, 3, mode="wrap")) & (power > 0.1 * within.max())
-    peak = None
-    for region in (allowed & crest & (near < reach), allowed):
-        if region.any():
-            candidate = int(np.argmax(np.where(region, power, -1)))
-            if power.flat[candidate] > 50 * floor:
-                peak = candidate
-                break
-    if peak is None:
+    start = _peak(light, nominal)
+    if start is None:
         raise InputError(
             "no fringes found: the frames are constant in phase or without contrast, or the "
             f"fringes are wider than the window of {shape[1]} x {shape[0]} px allows; look at the "
             "frames, and at which files the set lists"
         )
-
-    def minus_power(k: F64) -> float:
-        phasor = np.exp(-1j * k[0] * x) * np.exp(-1j * k[1] * y)
-        return -float((np.abs((light * phasor).sum(axis=(1, 2))) ** 2).sum())
-
-    start = 2 * np.pi * np.array([fx.flat[peak], fy.flat[peak]])
-    scale = -minus_power(start)
-    found = minimize(
-        lambda k: minus_power(k) / scale,
-        start,
-        method="Nelder-Mead",
-        options={
-            "initial_simplex": start + np.array([[0, 0], [0.3, 0], [0, 0.3]]) / min(shape),
-            "xatol": 1e-7,
-            "fatol": 1e-12,
-        },
-    ).x
+    found = _refined(light, start)
     cosine = found @ np.array(nominal) / max(np.hypot(*found) * np.hypot(*nominal), 1e-300)
     if abs(cosine) < MOST_TURNED:
         raise InputError(
@@ -160,6 +126,48 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
         )
     sign = np.sign(cosine)
     return float(sign * found[0]), float(sign * found[1])
+
+
+def _peak(light: F64, nominal: tuple[float, float]) -> F64 | None:
+    """Highest peak (kx, ky), rad/px, of the spectra of maps (n, y, x); None if none stands out.
+
+    Nominal positions are good to some 10 %: the peak there wins unless it is no peak at all.
+    """
+    shape = light.shape[1:]
+    size = [2 * n for n in shape]
+    power = (np.abs(np.fft.fft2(light, s=size)) ** 2).sum(axis=0)
+    fy, fx = np.meshgrid(*(np.fft.fftfreq(n) for n in size), indexing="ij")
+    allowed = np.hypot(fy * shape[0], fx * shape[1]) >= MIN_FRINGES
+    near = np.hypot(2 * np.pi * fx - nominal[0], 2 * np.pi * fy - nominal[1])
+    reach = 0.25 * np.hypot(*nominal) + 2 * np.pi * 1.5 / min(shape)
+    floor = np.median(power[allowed]) if allowed.any() else np.inf
+    # The foot of a peak beyond is none, nor are its side lobes.
+    within = np.where(allowed, power, 0.0)
+    crest = (power >= maximum_filter(within, 3, mode="wrap")) & (power > 0.1 * within.max())
+    for region in (allowed & crest & (near < reach), allowed):
+        if region.any():
+            at = int(np.argmax(np.where(region, power, -1)))
+            if power.flat[at] > 50 * floor:
+                return 2 * np.pi * np.array([fx.flat[at], fy.flat[at]])
+    return None
+
+
+def _refined(light: F64, start: F64) -> F64:
+    """Peak (kx, ky), rad/px, of the continuous power spectrum of maps (n, y, x) near a start."""
+    shape = (light.shape[1], light.shape[2])
+    y, x = grid(shape)
+
+    def minus_power(k: F64) -> float:
+        phasor = np.exp(-1j * k[0] * x) * np.exp(-1j * k[1] * y)
+        return -float((np.abs((light * phasor).sum(axis=(1, 2))) ** 2).sum())
+
+    scale = -minus_power(start)
+    simplex = start + np.array([[0, 0], [0.3, 0], [0, 0.3]]) / min(shape)
+    options = {"initial_simplex": simplex, "xatol": 1e-7, "fatol": 1e-12}
+    solved = minimize(
+        lambda k: minus_power(k) / scale, start, method="Nelder-Mead", options=options
+    )
+    return np.asarray(solved.x)
 
 
 @lru_cache(maxsize=8)

@@ -177,7 +177,7 @@ class Scout:
         frame that has no other samples is zero.
         """
         flat = _taken(codes, picked)
-        electrons = flat * np.float32(self.coding.scale) + np.float32(self.coding.offset)
+        electrons = self.coding.electrons(flat)
         lost = flat == self.coding.fill
         if lost.any():
             electrons[lost] = 0
@@ -319,21 +319,11 @@ class Scout:
             tile, theta, (picked, codes) = self.tiles[number], self.theta[number], samples[number]
             packed, right = np.zeros((n, 15)), np.zeros((n, 5))
             yy, xx = np.divmod(picked, tile.shape[1])
-            frame_sums(
-                codes.astype(np.float32),
-                self.coding.scale,
-                self.coding.offset,
-                self.coding.fill,
-                g,
-                dk,
-                (yy + tile.y[0] - self.reference[0]).astype(np.float32),
-                (xx + tile.x[0] - self.reference[1]).astype(np.float32),
-                np.ascontiguousarray(theta[:, yy, xx], np.float32),
-                tile.read[yy, xx],
-                tile.shot[yy, xx],
-                packed,
-                right,
-            )
+            y = (yy + tile.y[0] - self.reference[0]).astype(np.float32)
+            x = (xx + tile.x[0] - self.reference[1]).astype(np.float32)
+            own = np.ascontiguousarray(theta[:, yy, xx], np.float32)
+            pixels = (y, x, own, tile.read[yy, xx], tile.shot[yy, xx])
+            frame_sums(codes.astype(np.float32), *self.coding, g, dk, *pixels, packed, right)
             return packed, right
 
         every = self.each(sums_of, range(len(self.tiles)))

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,13 +12,18 @@ from pixcal.kernels.robust import median
 from pixcal.model.arrays import C128, F32, F64, U16, Mask
 
 
-@dataclass(frozen=True)
-class Coding:
+class Coding(NamedTuple):
     """Electrons of a code: ``scale * code + offset``; ``fill`` marks a sample without weight."""
 
     scale: float
     offset: float
     fill: int
+
+    def electrons(self, codes: U16) -> F32:
+        """Electrons of codes, as float32 numbers."""
+        found = codes * np.float32(self.scale)
+        found += np.float32(self.offset)
+        return found
 
 
 @dataclass
@@ -117,25 +123,14 @@ def accumulate(
     read, shot = variance or (tile.read, tile.shot)
     g = frames.at(*tile.centre).astype(np.float32)
     dk = frames.dk.astype(np.float32)
+    corner = (-(n - 1) / 2 for n in tile.shape)
+    around = (*corner, theta, read, shot)
     start = 0
     for block in blocks:
         for first in range(0, len(block), 64):
             part = block[first : first + 64]
             at = slice(start + first, start + first + len(part))
-            sweep_block(
-                part,
-                coding.scale,
-                coding.offset,
-                coding.fill,
-                g[at],
-                dk[at],
-                -(tile.shape[0] - 1) / 2,
-                -(tile.shape[1] - 1) / 2,
-                theta,
-                read,
-                shot,
-                sums,
-            )
+            sweep_block(part, *coding, g[at], dk[at], *around, sums)
         start += len(block)
     return sums
 

@@ -178,7 +178,9 @@ def table(result: Mapping[str, Any]) -> list[Row]:
     for key, case in cases.items():
         for name, axis in result["axes"].items():
             perfect, measured = (_length(axis[key][grid]) for grid in GRIDS)
-            rows.append(Row(case, name, perfect, measured, _times(axis[key]["gain"])))
+            gain, error = axis[key]["gain"]["value"], axis[key]["gain"]["err"]
+            times = "-" if gain is None else with_error(gain, error)
+            rows.append(Row(case, name, perfect, measured, times))
     return rows
 
 
@@ -206,7 +208,3 @@ def _length(entry: Mapping[str, Any]) -> str:
     if entry["px"] is None:
         return "not significant"
     return f"{with_error(entry['px'], entry['err_px'])} px, {entry['uas']:.3g} µas"
-
-
-def _times(entry: Mapping[str, Any]) -> str:
-    return "-" if entry["value"] is None else with_error(entry["value"], entry["err"])

@@ -90,7 +90,7 @@ class RestoredSet(ReducedSet):
         """Codes (y, x) of `coding` of a frame, from the stored ones."""
         stored, new = super().coding, self.coding
         missing = codes == stored.fill
-        charge = (codes * np.float32(stored.scale) + np.float32(stored.offset)) * flat + dark
+        charge = stored.electrons(codes) * flat + dark
         # What lies there is not known; to its neighbours it is like the frame.
         charge[missing] = charge[~missing].mean() if not missing.all() else 0.0
         frames = np.asarray(charge[None], np.float32)

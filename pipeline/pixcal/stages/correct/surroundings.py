@@ -6,8 +6,6 @@ window may be a part of a larger detector, whose pixels give to those at its bor
 the chip, where nothing comes from beyond: the maps tell, side by side.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from pixcal.model.arrays import F64, U8, Mask
@@ -47,10 +45,9 @@ def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, scatter: float) -> 
     variants = []
     for a, b in SIGNS:
         sign = 1.0 - 2.0 * ((a * y + b * x) % 2)
-        z = (maps.theta[2] + 1j * maps.theta[1]) * np.exp(1j * scatter * sign * beyond)
-        z *= np.where(unknown, 1 + sign, 1.0)
-        theta = np.stack([maps.theta[0], z.imag, z.real])
-        variants.append(replace(maps, theta=theta))
+        moved = maps.turned(scatter * sign * beyond)
+        moved.theta[1:] *= np.where(unknown, 1 + sign, 1.0)
+        variants.append(moved)
     return variants
 
 

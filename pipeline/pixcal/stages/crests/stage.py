@@ -180,7 +180,7 @@ def read_patch(source: ReducedSet, frame: int, y: Range, x: Range) -> tuple[F32,
 
 def _electrons(codes: U16, mask: U8, coding: Coding) -> tuple[F32, Mask]:
     good = (mask == 0) & (codes != coding.fill)
-    return codes.astype(np.float32) * np.float32(coding.scale) + np.float32(coding.offset), good
+    return coding.electrons(codes), good
 
 
 def _row_task(

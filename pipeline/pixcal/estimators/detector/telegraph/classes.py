@@ -39,7 +39,8 @@ class AmplitudeClasses:
         largest = levels.max(axis=1, keepdims=True)
         levels -= largest
         np.exp(levels, out=levels)
-        of_levels = _levels(_keep(switching_s, m.period_s), m.frames)
+        keep = float(np.exp(-2 * m.period_s / switching_s)) if switching_s > 0 else 0.0
+        of_levels = _levels(keep, m.frames)
         return cls(levels, largest, added, *of_levels)
 
     def mixed(self) -> F64:
@@ -57,10 +58,6 @@ class AmplitudeClasses:
     def neighbours(self) -> F64:
         """Products of neighbouring frames (n, class) to be expected, as in `Moments`."""
         return np.asarray((self.likely @ self.products) * self.added / self.mixed())
-
-
-def _keep(switching_s: float, period_s: float) -> float:
-    return float(np.exp(-2 * period_s / switching_s)) if switching_s > 0 else 0.0
 
 
 @lru_cache(maxsize=64)
