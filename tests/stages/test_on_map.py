@@ -7,8 +7,9 @@ from pixcal.effects.brighter_fatter import BrighterFatter
 from pixcal.effects.ipc import Ipc
 from pixcal.effects.lag import Lag
 from pixcal.effects.nonlinearity import Nonlinearity
+from pixcal.estimators.detector.traps import FittedLoss
 from pixcal.simulation.effect import FringeMaps
-from pixcal.stages.advice import size_of
+from pixcal.stages.advice import limit, moved_by, size_of
 from pixcal.stages.diagnose.fitted_set import FittedSet
 from pixcal.stages.diagnose.on_map import on_map
 
@@ -71,3 +72,24 @@ def test_the_size_of_an_effect_is_told_in_its_units():
     own = glow | {"units": {"rate": "e-/s", "reach_px": "px"}, "strengths": ["rate"]}
     assert size_of(own) == "rate 118.0 ± 2.0 e⁻/s"
     assert size_of({"parameters": {"share": 0.0}, **size("share")}) == "-"
+
+
+def test_what_nothing_is_known_of_is_not_said_to_do_nothing():
+    """An effect of one's own without `predict` or `undo` may bias the maps."""
+    sigma = {"vertical": 1e-3}
+    on_map_of = {
+        "unaffected": (0.0, "none"),
+        "fix the bench": (0.0, "not known"),
+        "corrected": (2e-3, "0.0020 px rms (2.0 σ), 0.0040 px maximum"),
+    }
+    for action, (rms, said) in on_map_of.items():
+        moved = {"rms_px": rms, "max_px": 2 * rms, "action": action}
+        cause = {"effect": "glow", "on_map": moved}
+        assert moved_by(cause, sigma) == said
+        limited = limit(sigma, {"causes": [cause], "verdict": "explained"}, None)
+        assert ("glow may bias" in limited) == (said == "not known")
+
+
+def test_a_parameter_that_the_frames_do_not_tell_has_an_error_as_large_as_itself():
+    found = FittedLoss(np.array([0.01, 4e3]), np.diag([1e-8, 1.6e-29]), 1.0)
+    assert found.errors == pytest.approx([1e-4, 4e3])

@@ -318,9 +318,9 @@ def _by_level(evidence: Evidence, lag: Lag) -> tuple[Lag, dict[str, float]]:
         found = _trapped(lag, traps.value)
         names += ["decay_frames", "capacity_e"]
         scale = [*(1 / found.share for _ in BANDS), found.decay_frames**2 / found._keep, 1.0]
-        errors = np.sqrt(np.diag(traps.covariance)) * scale
+        errors = traps.errors * scale
     elif bands is not None:
-        found, errors = _banded(lag, bands.value), np.sqrt(np.diag(bands.covariance)) / lag.share
+        found, errors = _banded(lag, bands.value), bands.errors / lag.share
     else:
         return lag, {}
     return found, dict(zip(names, map(float, errors), strict=True))

@@ -42,7 +42,7 @@ def advice(run_dir: Path) -> Advice:
     causes = diagnosis["causes"] if diagnosis else ()
     shapes = fitted_shapes(run_dir)
     rows: tuple[tuple[str, ...], ...] = tuple(
-        (c["effect"], size_of(c), _moved(c, sigma), _action(c, correction, shapes, bool(sigma)))
+        (c["effect"], size_of(c), moved_by(c, sigma), _action(c, correction, shapes, bool(sigma)))
         for c in causes
     )
     rows = (_HEADER, *rows) if rows else ()
@@ -56,7 +56,7 @@ def advice(run_dir: Path) -> Advice:
     names = [path.name for path in maps_to_use(run_dir).values()]
     it_needs = "They need" if len(names) > 1 else "It needs"
     use = f"Use {' and '.join(names)}{_as_what(diagnosis, correction, it_needs)}."
-    return Advice((use, _limit(sigma, diagnosis, correction)), rows, settled)
+    return Advice((use, limit(sigma, diagnosis, correction)), rows, settled)
 
 
 def maps_to_use(run_dir: Path) -> dict[str, Path]:
@@ -109,14 +109,23 @@ def _as_what(diagnosis: Json | None, correction: Json | None, it_needs: str) -> 
         return f", corrected for {' and '.join(freed)}"
     if any(_on_map(c)["action"] == "corrected" for c in diagnosis["causes"]):
         return " as fitted, NOT corrected for the effects below"
+    if unknown := _unknown(diagnosis):
+        return f" as fitted. What {' and '.join(unknown)} does to the offsets is not known"
     return f" as fitted. {it_needs} no correction"
+
+
+def _unknown(diagnosis: Json | None) -> list[str]:
+    """Causes that are neither absorbed nor undone, so that nothing tells what they do to maps."""
+    causes = (diagnosis or {}).get("causes", ())
+    left = [c for c in causes if _on_map(c)["action"] == "fix the bench"]
+    return [c["effect"] for c in left if not _on_map(c)["rms_px"]]
 
 
 def _corrects(how: str) -> bool:
     return how.startswith("undone") or how == "in the corrected fit"
 
 
-def _limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json | None) -> str:
+def limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json | None) -> str:
     """What limits the maps: the largest bias, or noise."""
     made = correction if correction is not None and correction["outputs"] else None
     least = min(sigma.values(), default=math.nan)
@@ -134,6 +143,8 @@ def _limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json 
         return (
             f"The noise is {noise}. Part of the gap has no known cause, so the maps may be biased."
         )
+    if unknown := _unknown(diagnosis):
+        return f"The noise is {noise}. {' and '.join(unknown)} may bias the maps."
     sets = made["sets"].values() if made else ()
     kept = max((e for s in sets for e in s["parameter_error_px"].values() if e), default=0.0)
     if kept > MATTERS * least:
@@ -144,11 +155,11 @@ def _limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json 
     return f"Limited by photon and read noise: {noise}. More frames reduce it."
 
 
-def _moved(cause: Json, sigma: Mapping[str, float]) -> str:
+def moved_by(cause: Json, sigma: Mapping[str, float]) -> str:
     """Change of the offsets, against the error of the best set's median pixel."""
     rms, most = _on_map(cause)["rms_px"], _on_map(cause)["max_px"]
     if not rms or not sigma:
-        return "none"
+        return "not known" if _unknown({"causes": [cause]}) else "none"
     in_sigma = number(rms / min(sigma.values()), 2)
     return f"{number(rms, 2)} px rms ({in_sigma} σ), {number(most, 2)} px maximum"
 

@@ -29,6 +29,7 @@ NOT_EVEN = 25.0  # chi-square from which what stays is taken to depend on the le
 # they would take of full scale
 KEEPS, ROOMS = (0.3, 0.6), (0.1, 0.2, 0.4, 0.7)
 STEPS = 12  # of all parameters of such traps
+_UNTOLD = 1e-9  # relative error that is none, of a parameter without influence on the frames
 
 Loss = Callable[[F64, F32], F32]
 
@@ -47,6 +48,12 @@ class FittedLoss:
     value: F64  # (p,)
     covariance: F64  # (p, p), from the noise of samples and of the contrast
     chi2: float
+
+    @property
+    def errors(self) -> F64:
+        """1-sigma (p,); as large as the parameter itself where the frames do not tell it."""
+        errors, size = np.sqrt(np.diag(self.covariance).clip(0)), np.abs(self.value)
+        return np.where(errors > _UNTOLD * size, errors, size)
 
 
 class LossFit:
