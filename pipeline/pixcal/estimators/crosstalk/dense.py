@@ -194,14 +194,10 @@ def _sum(found: Sequence[Products | None]) -> Products | None:
 
 def _shares_of(every: Sequence[Coupling], known: Sequence[Coupling]) -> F64:
     """Shares of all couplings where some, of shorter periods too, are known."""
-    return np.array(
-        [
-            sum(
-                k.share for k in known
-                if (k.dy, k.dx) == (c.dy, c.dx)
-                and c.row % k.every_rows == k.row and c.column % k.every_columns == k.column
-            )
-            for c in every
-        ],
-        float,
-    )  # fmt: skip
+    shares = np.zeros(len(every))
+    for k in known:
+        for n, c in enumerate(every):
+            same = (k.dy, k.dx, k.row, k.column)
+            if same == (c.dy, c.dx, c.row % k.every_rows, c.column % k.every_columns):
+                shares[n] += k.share
+    return shares

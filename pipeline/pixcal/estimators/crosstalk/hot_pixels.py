@@ -133,9 +133,8 @@ class ClassShares:
         is free, up to `RISE`.
         """
         links = len(self.weight)
-        weight, value, charge = (
-            a.reshape(links, -1) for a in (self.weight, self.value, self.charge)
-        )
+        parts = (self.weight, self.value, self.charge)
+        weight, value, charge = (part.reshape(links, -1) for part in parts)
         cross = weight * charge
         rise = (cross * charge).sum(1) + self.square.reshape(links, -1).sum(1) + RISE**-2
         risen = (cross * value).sum(1) + self.product.reshape(links, -1).sum(1)

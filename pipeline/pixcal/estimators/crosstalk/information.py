@@ -13,7 +13,7 @@ from pixcal.estimators.crosstalk.covariance import NORMAL, TERMS, Products
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels
 from pixcal.estimators.crosstalk.links import PixelClasses, Place, class_sums, sums_of
 from pixcal.estimators.crosstalk.residuals import UNIT
-from pixcal.model.arrays import F64, Indices, Mask
+from pixcal.model.arrays import F64, Mask
 
 # how large the covariance of neighbours over the square of their charge may well be, 1/e-
 BRIGHTER_FATTER = 1e-6
@@ -40,14 +40,6 @@ class Information:
         return Information(
             {way: m[link] for way, m in self.normal.items()},
             {way: r[link] for way, r in self.right.items()},
-        )
-
-    def only(self, unknowns: Indices) -> "Information":
-        """Of some of the unknowns, the others being zero."""
-        at = np.ix_(unknowns, unknowns)
-        return Information(
-            {way: m[at] for way, m in self.normal.items()},
-            {way: r[unknowns] for way, r in self.right.items()},
         )
 
     @property

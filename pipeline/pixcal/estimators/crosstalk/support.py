@@ -37,11 +37,6 @@ class Choice:
     looks: int  # numbers that were tried
 
     @property
-    def critical(self) -> float:
-        """Chi-square that chance passes in `FALSE_ALARM` of the cases."""
-        return _critical(self.looks)
-
-    @property
     def significance(self) -> float:
         """Sigmas of a normal variate as rare as the best of so many looks."""
         looks = INDEPENDENT * self.looks
