@@ -100,13 +100,14 @@ def encode(
     codes: Any,
     saturated: Any,
     lost: Any,
+    x0: int = 0,
 ) -> int:
     """Convert raw frames of a tile to codes: ``raw * slope + start - dark * exptime``, rounded.
 
     Parameters
     ----------
-    raw : (t, y, x) any real type
-        Samples in ADU.
+    raw : (t, y, at least x0 + x) any real type
+        Samples in ADU; the tile's columns begin at ``x0``.
     slope, start, dark : (y, x) float32
         In codes per ADU, codes, and codes per second, see `coefficients`.
     exptime : (t,) float32
@@ -117,6 +118,8 @@ def encode(
         Result; samples that are saturated, not finite or out of range get `FILL`.
     saturated, lost : (y, x) uint32
         Counts to add to: saturated samples; others that got the fill value.
+    x0 : int
+        Rows of a wider block are taken where they lie: to copy them takes as long as this.
 
     Returns
     -------
@@ -124,14 +127,16 @@ def encode(
         Sum of the codes of the samples that have weight.
     """
     total = 0
+    nx = codes.shape[2]
     for y in range(raw.shape[1]):
         for t in range(raw.shape[0]):
+            row = raw[t, y, x0 : x0 + nx]
             good, part = _encode_row(
-                raw[t, y], slope[y], start[y], dark[y], exptime[t], saturation, codes[t, y]
+                row, slope[y], start[y], dark[y], exptime[t], saturation, codes[t, y]
             )
             total += part
-            if good < raw.shape[2]:
-                _count_row(raw[t, y], saturation, codes[t, y], saturated[y], lost[y])
+            if good < nx:
+                _count_row(row, saturation, codes[t, y], saturated[y], lost[y])
     return total
 
 
@@ -170,13 +175,13 @@ def _extremes_of_row(raw: Any, saturation: float, lowest: Any, highest: Any) -> 
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def extremes(raw: Any, saturation: float, lowest: Any, highest: Any) -> None:
+def extremes(raw: Any, saturation: float, lowest: Any, highest: Any, x0: int = 0) -> None:
     """Widen the range of each pixel's samples below saturation by those of more frames.
 
     Parameters
     ----------
-    raw : (t, y, x) any real type
-        Samples in ADU.
+    raw : (t, y, at least x0 + x) any real type
+        Samples in ADU; the tile's columns begin at ``x0``.
     saturation : float32
         Samples at or above do not count, nor does NaN.
     lowest, highest : (y, x) float32
@@ -184,4 +189,5 @@ def extremes(raw: Any, saturation: float, lowest: Any, highest: Any) -> None:
     """
     for y in range(raw.shape[1]):
         for t in range(raw.shape[0]):
-            _extremes_of_row(raw[t, y], saturation, lowest[y], highest[y])
+            row = raw[t, y, x0 : x0 + lowest.shape[1]]
+            _extremes_of_row(row, saturation, lowest[y], highest[y])

@@ -36,7 +36,12 @@ def bands(rows: tuple[int, int]) -> list[tuple[int, int]]:
 
 
 def read_rows(
-    file: FrameFile, planes: Sequence[int], rows: tuple[int, int], out: NDArray[Any] | None = None
+    file: FrameFile,
+    planes: Sequence[int],
+    rows: tuple[int, int],
+    out: NDArray[Any] | None = None,
+    *,
+    largest: bool = True,
 ) -> F64:
     """Read rows of some planes of a plain file, each byte once.
 
@@ -51,11 +56,14 @@ def read_rows(
     out : ndarray (plane, y, x), optional
         Filled with the values (ADU); each plane of it contiguous, of the file's type or one
         that holds it.
+    largest : bool
+        Look for the largest samples, which takes half as long as reading them.
 
     Returns
     -------
     (plane, band, 2) float64
-        Of each `BAND` rows: CRC-32C of the bytes in the file, and the largest sample (ADU).
+        Of each `BAND` rows: CRC-32C of the bytes in the file, and the largest sample (ADU), NaN
+        where that was not looked for.
 
     Raises
     ------
@@ -76,7 +84,7 @@ def read_rows(
             _read_exactly(handle, start, raw, file.source.path)
             found[n, b, 0] = google_crc32c.value(raw)
             values = _values(raw, coding)
-            found[n, b, 1] = np.fmax.reduce(values, axis=None)
+            found[n, b, 1] = np.fmax.reduce(values, axis=None) if largest else np.nan
             if target is not None and not direct:
                 target[...] = values
         # Written to since it was opened, it is partly another file.

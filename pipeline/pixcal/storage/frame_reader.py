@@ -119,7 +119,7 @@ class FrameReader:
 
     def _read_frame(self, t: int, rows: tuple[int, int], out: NDArray[Any]) -> None:
         file = self._files[t]
-        found = read_rows(file, [self._planes[t]], rows, out)[0, :, 0]
+        found = read_rows(file, [self._planes[t]], rows, out, largest=False)[0, :, 0]
         first = rows[0] // BAND
         if (found != self._checksums[t, first : first + len(found)]).any():
             raise InputError(

@@ -75,18 +75,15 @@ def strip_width(readers: Iterable[Reader], need: Callable[[int], int], runtime: 
     return width
 
 
-def blocks(reader: Reader, strip: Strip) -> Iterator[tuple[int, Iterator[NDArray[Any]]]]:
-    """First frame and samples (t, y, x) of each column of a strip, 64 frames at a time."""
+def blocks(reader: Reader, strip: Strip) -> Iterator[tuple[int, NDArray[Any]]]:
+    """First frame and samples (t, y, x) of a strip, 64 frames at a time in the same memory."""
     window = reader.shape[1], reader.shape[2]
     (rows, (x0, _)), (_, (_, x1)) = extent(window, strip[0]), extent(window, strip[-1])
     frames = reader.shape[0]
     buffer = np.empty((min(CHUNK[0], frames), rows[1] - rows[0], x1 - x0), reader.dtype)
-    borders = range(CHUNK[2], x1 - x0, CHUNK[2])
     for first in range(0, frames, CHUNK[0]):
         last = min(first + CHUNK[0], frames)
-        block = reader.read((first, last), rows, (x0, x1), out=buffer[: last - first])
-        # Contiguous: kernels run along rows whose samples follow one another.
-        yield first, map(np.ascontiguousarray, np.split(block, borders, axis=2))
+        yield first, reader.read((first, last), rows, (x0, x1), out=buffer[: last - first])
 
 
 def run_noted(

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.kernels.quantise import FILL, Scale, coefficients, encode, extremes
-from pixcal.model.arrays import F32, U16
+from pixcal.model.arrays import F32
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.calibration import FLAG_ATTRS
 from pixcal.stages.reduce.columns import Index, Strip, blocks, extent, grid
@@ -61,9 +61,9 @@ def signal_range(fringes: FringeSet, strip: Strip) -> tuple[float, float]:
     every = [fringes.maps(index) for index in strip]
     lowest = [np.full(maps["bias"].shape, np.inf, np.float32) for maps in every]
     highest = [-low for low in lowest]
-    for _, parts in blocks(fringes.raw, strip):
-        for samples, low, high in zip(parts, lowest, highest, strict=True):
-            extremes(samples, np.float32(fringes.saturation), low, high)
+    for _, samples in blocks(fringes.raw, strip):
+        for n, (low, high) in enumerate(zip(lowest, highest, strict=True)):
+            extremes(samples, np.float32(fringes.saturation), low, high, n * CHUNK[2])
     found = [_range_e(fringes, *of) for of in zip(every, lowest, highest, strict=True)]
     return min(low for low, _ in found), max(high for _, high in found)
 
@@ -121,7 +121,7 @@ def set_writers(
             folder / name, shape, dtype, dims=("y", "x"), chunks=CHUNK[1:], attrs=attrs
         )
     made["counts"] = create_array(
-        scratch, (*grid(shape), 5), np.int64, dims=("i", "j", "count"), chunks=(1, 1, 5)
+        scratch, (*grid(shape), 4), np.int64, dims=("i", "j", "count"), chunks=(1, 1, 4)
     )
     return made
 
@@ -155,19 +155,18 @@ class _Column:
         )  # fmt: skip
         self.saturated = np.zeros(self.maps["flat"].shape, np.uint32)
         self.lost = np.zeros_like(self.saturated)
-        self.total = self.largest = 0
+        self.total = 0
 
-    def add(self, first: int, samples: NDArray[Any], codes: U16) -> None:
-        """Write the chunk that begins at a frame."""
+    def add(self, first: int, samples: NDArray[Any], begin: int) -> None:
+        """Write the chunk that begins at a frame, from samples that begin so many columns before."""
         fringes = self.job.fringes
         (y0, _), (x0, _) = fringes.extent(self.index)
+        codes = np.empty((len(samples), *self.lost.shape), np.uint16)
         self.total += encode(
             samples, *self.coefficients, fringes.exptime[first : first + len(samples)],
-            np.float32(fringes.saturation), codes, self.saturated, self.lost,
+            np.float32(fringes.saturation), codes, self.saturated, self.lost, begin,
         )  # fmt: skip
         self.job.writers["signal"].write((first, y0, x0), codes)
-        if samples.dtype.kind in "iu":
-            self.largest = max(self.largest, int(samples.max()))
 
     def close(self) -> None:
         """Write maps and counts."""
@@ -182,7 +181,7 @@ class _Column:
             writers[name].write((y0, x0), data.astype(writers[name].dtype))
         without = int(self.saturated.sum()), int(self.lost.sum())
         weighted = flat.size * fringes.frames - sum(without)
-        counts = np.array([[[*without, weighted, self.total, self.largest]]])
+        counts = np.array([[[*without, weighted, self.total]]])
         writers["counts"].write((*self.index, 0), counts)
 
 
@@ -190,11 +189,11 @@ def convert(job: Converting, strip: Strip) -> None:
     """Write columns of chunks in electrons, their maps, and their counts.
 
     The counts are: samples that are saturated; others without weight; samples with weight; the sum
-    of their codes; the largest sample (ADU; zero for real numbers).
+    of their codes.
     """
     columns = [_Column(job, index) for index in strip]
-    for first, parts in blocks(job.fringes.raw, strip):
-        for column, samples in zip(columns, parts, strict=True):
-            column.add(first, samples, np.empty(samples.shape, np.uint16))
+    for first, samples in blocks(job.fringes.raw, strip):
+        for n, column in enumerate(columns):
+            column.add(first, samples, n * CHUNK[2])
     for column in columns:
         column.close()
