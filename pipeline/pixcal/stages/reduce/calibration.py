@@ -9,15 +9,26 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pixcal.estimators.detector.bad_pixels import dead, hot, noisy
 from pixcal.estimators.detector.calibration import usual_variance
 from pixcal.kernels.robust import median_and_sigma
-from pixcal.model.arrays import F64, U8
+from pixcal.model.arrays import F32, F64, U8
 from pixcal.model.flags import PixelFlag
-from pixcal.stages.reduce.columns import Index, extent, indices
+from pixcal.stages.reduce.columns import (
+    Index,
+    Strip,
+    by_column,
+    extent,
+    indices,
+    map_chunk,
+    span,
+    strips,
+)
 from pixcal.stages.reduce.frame_statistics import STATISTICS, Limits
-from pixcal.storage.cube import CHUNK, ArrayReader, ArrayWriter, create_array, create_group
+from pixcal.stages.reduced_set import STRIP
+from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group
 from pixcal.storage.place import Place
 
 _SAMPLES = 1 << 20
@@ -78,14 +89,15 @@ def on_grid(
     stride = int(np.ceil(np.sqrt(shape[0] * shape[1] / _SAMPLES)))
     wanted = [STATISTICS.index(name) for name in names]
     parts = []
-    for index in indices(shape):
-        (y0, y1), (x0, x1) = extent(shape, index)
-        block = reader.read((0, len(STATISTICS)), (y0, y1), (x0, x1))
-        some = block[wanted, -y0 % stride :: stride, -x0 % stride :: stride]
-        part = some.reshape(len(wanted), -1).astype(float)
-        if light is not None:
-            part[[name.startswith("response") for name in names]] *= light[index]
-        parts.append(part)
+    for strip in strips(indices(shape), STRIP):
+        blocks = by_column(reader.read((0, len(STATISTICS)), *span(shape, strip)))
+        for index, block in zip(strip, blocks, strict=True):
+            (y0, _), (x0, _) = extent(shape, index)
+            some = block[wanted, -y0 % stride :: stride, -x0 % stride :: stride]
+            part = some.reshape(len(wanted), -1).astype(float)
+            if light is not None:
+                part[[name.startswith("response") for name in names]] *= light[index]
+            parts.append(part)
     return np.concatenate(parts, axis=1)
 
 
@@ -137,22 +149,33 @@ def calibration_writers(folder: Place, shape: tuple[int, int]) -> dict[str, Arra
     """Make the arrays of ``calibration.zarr``."""
     create_group(folder, {"Conventions": "CF-1.11", "title": "calibration of the detector"})
     return {
-        name: create_array(folder / name, shape, dtype, dims=("y", "x"), chunks=CHUNK[1:], attrs=a)
+        name: create_array(
+            folder / name, shape, dtype, dims=("y", "x"), chunks=map_chunk(shape), attrs=a
+        )
         for name, (dtype, a) in _MAPS.items()
     }
 
 
-def finish(job: Finishing, index: Index) -> F64:
-    """Write the calibration maps of a column.
+def finish(job: Finishing, strip: Strip) -> F64:
+    """Write the calibration maps of `STRIP` columns.
 
     Returns
     -------
-    (4,) float64
+    (column, 4) float64
         Over the good pixels: least and largest flat, largest bias (ADU) and dark signal (e-/s);
         infinite of the other sign when there is none.
     """
-    (y0, y1), (x0, x1) = extent(job.shape, index)
-    block = ArrayReader(job.statistics / "maps").read((0, len(STATISTICS)), (y0, y1), (x0, x1))
+    rows, columns = span(job.shape, strip)
+    block = ArrayReader(job.statistics / "maps").read((0, len(STATISTICS)), rows, columns)
+    parts = [_maps(job, *one) for one in zip(strip, by_column(block), strict=True)]
+    for name, writer in job.writers.items():
+        data = np.concatenate([maps[name] for maps in parts], axis=1)
+        writer.write((rows[0], columns[0]), data.astype(writer.dtype))
+    return np.array([_ends(maps) for maps in parts])
+
+
+def _maps(job: Finishing, index: Index, block: F32) -> dict[str, NDArray[Any]]:
+    """Calibration maps (y, x) of a column, from what `measure` wrote."""
     found = dict(zip(STATISTICS, block.astype(float), strict=True))
     flat = np.ones_like(found["bias"])
     error = np.zeros_like(flat)
@@ -166,20 +189,22 @@ def finish(job: Finishing, index: Index) -> F64:
         shared = job.read_dof * own + _PRIOR_DOF * job.read_noise**2
         of_pixel = np.sqrt(shared / (job.read_dof + _PRIOR_DOF))
         read = np.where(np.isfinite(of_pixel), np.maximum(of_pixel, job.floor), read)
-    good = mask == 0
-    maps = {
+    return {
         "bias": np.nan_to_num(found["bias"]),
         "dark_rate": job.gain * np.nan_to_num(found["dark_rate"]),
         "flat": np.where(np.isfinite(flat), np.maximum(flat, _FLAT_FLOOR), 1.0),
         "read_noise": read,
         "mask": mask,
     }
-    for name, data in maps.items():
-        job.writers[name].write((y0, x0), data.astype(job.writers[name].dtype))
+
+
+def _ends(maps: Mapping[str, NDArray[Any]]) -> tuple[float, float, float, float]:
+    """What `finish` returns of a column."""
+    good = maps["mask"] == 0
     if not good.any():
-        return np.array([np.inf, -np.inf, -np.inf, -np.inf])
+        return np.inf, -np.inf, -np.inf, -np.inf
     bias, rate, flat = (maps[name][good] for name in ("bias", "dark_rate", "flat"))
-    return np.array([flat.min(), flat.max(), bias.max(), rate.max()])
+    return float(flat.min()), float(flat.max()), float(bias.max()), float(rate.max())
 
 
 def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U8:

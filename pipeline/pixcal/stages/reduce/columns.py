@@ -1,6 +1,7 @@
 """Columns of chunks, 128 by 128 pixels of all frames, and strips of neighbours, the unit of work.
 
-FITS files hold rows: a strip as wide as memory allows is read in one go.
+FITS files hold rows: a strip as wide as memory allows is read in one go. Maps lie in chunks of
+`STRIP` columns, so a task has so many at least, whatever it reads at a time.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from pixcal.engine.plan import Plan
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.stages.reduced_set import STRIP
 from pixcal.storage.artefact import Workspace
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.frame_reader import Reader
@@ -38,6 +40,22 @@ def extent(shape: tuple[int, int], index: Index) -> tuple[tuple[int, int], tuple
     """((y0, y1), (x0, x1)) of a column of chunks."""
     (i, j), (_, cy, cx), (ny, nx) = index, CHUNK, shape
     return (i * cy, min((i + 1) * cy, ny)), (j * cx, min((j + 1) * cx, nx))
+
+
+def map_chunk(shape: tuple[int, int]) -> tuple[int, int]:
+    """Rows and columns of a chunk of maps (y, x)."""
+    return CHUNK[1], CHUNK[2] * min(STRIP, grid(shape)[1])
+
+
+def span(shape: tuple[int, int], strip: Sequence[Index]) -> tuple[tuple[int, int], tuple[int, int]]:
+    """((y0, y1), (x0, x1)) of a strip."""
+    (rows, (x0, _)), (_, (_, x1)) = extent(shape, strip[0]), extent(shape, strip[-1])
+    return rows, (x0, x1)
+
+
+def by_column(block: NDArray[Any]) -> list[NDArray[Any]]:
+    """Views of a strip's samples or maps (..., y, x), column of chunks by column."""
+    return np.split(block, range(CHUNK[2], block.shape[-1], CHUNK[2]), axis=-1)
 
 
 def strips(todo: Sequence[Index], width: int) -> list[Strip]:
@@ -72,13 +90,13 @@ def strip_width(readers: Iterable[Reader], need: Callable[[int], int], runtime: 
     at_once = CAUTIOUS if runtime.remote else runtime.n_workers
     while width > 1 and Plan(need(width), 0, at_once).total > SHARE * runtime.memory:
         width = -(-width // 2)
+        width -= width % STRIP if width > STRIP else 0
     return width
 
 
 def blocks(reader: Reader, strip: Strip) -> Iterator[tuple[int, NDArray[Any]]]:
     """First frame and samples (t, y, x) of a strip, 64 frames at a time in the same memory."""
-    window = reader.shape[1], reader.shape[2]
-    (rows, (x0, _)), (_, (_, x1)) = extent(window, strip[0]), extent(window, strip[-1])
+    rows, (x0, x1) = span((reader.shape[1], reader.shape[2]), strip)
     frames = reader.shape[0]
     buffer = np.empty((min(CHUNK[0], frames), rows[1] - rows[0], x1 - x0), reader.dtype)
     for first in range(0, frames, CHUNK[0]):
@@ -88,24 +106,24 @@ def blocks(reader: Reader, strip: Strip) -> Iterator[tuple[int, NDArray[Any]]]:
 
 def run_noted(
     made: Workspace,
-    task: Callable[[Strip], None],
+    task: Callable[[list[Strip]], None],
     todo: Sequence[Index],
     width: int,
     runtime: Runtime,
     label: str,
 ) -> None:
-    """Run a task that writes whole chunks on strips of columns, but for those noted as done.
+    """Run a task that writes whole chunks on columns side by side, but for those noted as done.
 
     Parameters
     ----------
     made : Workspace
         Whose journal to use.
     task : callable
-        All that it leaves is written when it returns.
+        Given the strips to read one after the other. All that it leaves is written when it returns.
     todo : sequence of (int, int)
         Columns.
     width : int
-        Columns of a strip at most.
+        Columns to read at a time, from `strip_width`.
     runtime : Runtime
         How to run.
     label : str
@@ -113,10 +131,11 @@ def run_noted(
     """
     journal = made.journal()
     steps = {index: f"{label} {index[0]} {index[1]}" for index in todo}
-    left = strips([index for index in todo if steps[index] not in journal], width)
+    left = strips([index for index in todo if steps[index] not in journal], max(width, STRIP))
 
     def note(number: int, _: Any) -> None:
         for index in left[number]:
             made.note(steps[index])
 
-    run_tasks(task, left, runtime, label=label, done=note)
+    parts = [strips(strip, width) for strip in left]
+    run_tasks(task, parts, runtime, label=label, done=note)

@@ -1,5 +1,6 @@
 """Fringe frames in electrons: from FITS files, or ``raw.zarr``, to ``reduced.zarr``."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +11,18 @@ from pixcal.kernels.quantise import FILL, Scale, coefficients, encode, extremes
 from pixcal.model.arrays import F32
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.calibration import FLAG_ATTRS
-from pixcal.stages.reduce.columns import Index, Strip, blocks, extent, grid
+from pixcal.stages.reduce.columns import (
+    Index,
+    Strip,
+    blocks,
+    by_column,
+    extent,
+    grid,
+    map_chunk,
+    span,
+    strips,
+)
+from pixcal.stages.reduced_set import STRIP
 from pixcal.storage.cube import (
     CHUNK,
     ArrayReader,
@@ -26,7 +38,9 @@ from pixcal.storage.place import Place
 def convert_bytes(itemsize: int, width: int) -> int:
     """Peak of `convert`: a chunk, its codes, both compressed; of each column, a chunk and maps."""
     tile = CHUNK[1] * CHUNK[2]
-    return 4 * 4 * CHUNK[0] * tile + width * tile * (CHUNK[0] * itemsize + 16 * 4)
+    return 4 * 4 * CHUNK[0] * tile + tile * (
+        width * CHUNK[0] * itemsize + max(width, STRIP) * 16 * 4
+    )
 
 
 @dataclass(frozen=True)
@@ -49,16 +63,17 @@ class FringeSet:
         """((y0, y1), (x0, x1)) of a column of chunks."""
         return extent((self.raw.shape[1], self.raw.shape[2]), index)
 
-    def maps(self, index: Index) -> dict[str, NDArray[Any]]:
-        """Calibration maps of a column of chunks."""
-        ranges = self.extent(index)
+    def maps(self, strip: Strip) -> list[dict[str, NDArray[Any]]]:
+        """Calibration maps of each column of chunks."""
+        ranges = span((self.raw.shape[1], self.raw.shape[2]), strip)
         names = ("bias", "dark_rate", "flat", "read_noise", "mask")
-        return {name: ArrayReader(self.calibration / name).read(*ranges) for name in names}
+        found = [by_column(ArrayReader(self.calibration / name).read(*ranges)) for name in names]
+        return [dict(zip(names, of_column, strict=True)) for of_column in zip(*found, strict=True)]
 
 
 def signal_range(fringes: FringeSet, strip: Strip) -> tuple[float, float]:
     """Least and largest electrons of the samples of good pixels in columns of chunks."""
-    every = [fringes.maps(index) for index in strip]
+    every = fringes.maps(strip)
     lowest = [np.full(maps["bias"].shape, np.inf, np.float32) for maps in every]
     highest = [-low for low in lowest]
     for _, samples in blocks(fringes.raw, strip):
@@ -118,11 +133,12 @@ def set_writers(
         ("mask", np.uint8, FLAG_ATTRS),
     ):
         made[name] = create_array(
-            folder / name, shape, dtype, dims=("y", "x"), chunks=CHUNK[1:], attrs=attrs
+            folder / name, shape, dtype, dims=("y", "x"), chunks=map_chunk(shape), attrs=attrs
         )
     made["counts"] = create_array(
-        scratch, (*grid(shape), 4), np.int64, dims=("i", "j", "count"), chunks=(1, 1, 4)
-    )
+        scratch, (*grid(shape), 4), np.int64, dims=("i", "j", "count"),
+        chunks=(1, min(STRIP, grid(shape)[1]), 4),
+    )  # fmt: skip
     return made
 
 
@@ -146,9 +162,8 @@ STRAY_SAMPLES = 2  # saturated samples that a pixel may have in a short run
 class _Column:
     """A column of chunks as it is converted."""
 
-    def __init__(self, job: Converting, index: Index) -> None:
-        self.job, self.index = job, index
-        self.maps = job.fringes.maps(index)
+    def __init__(self, job: Converting, index: Index, maps: dict[str, NDArray[Any]]) -> None:
+        self.job, self.index, self.maps = job, index, maps
         self.coefficients = coefficients(
             job.scale, job.fringes.gain,
             *(self.maps[name] for name in ("bias", "dark_rate", "flat")),
@@ -158,7 +173,7 @@ class _Column:
         self.total = 0
 
     def add(self, first: int, samples: NDArray[Any], begin: int) -> None:
-        """Write the chunk that begins at a frame, from samples that begin so many columns before."""
+        """Write the chunk that begins at a frame, from the columns of a strip from ``begin`` on."""
         fringes = self.job.fringes
         (y0, _), (x0, _) = fringes.extent(self.index)
         codes = np.empty((len(samples), *self.lost.shape), np.uint16)
@@ -168,32 +183,38 @@ class _Column:
         )  # fmt: skip
         self.job.writers["signal"].write((first, y0, x0), codes)
 
-    def close(self) -> None:
-        """Write maps and counts."""
-        fringes, maps, writers = self.job.fringes, self.maps, self.job.writers
-        (y0, _), (x0, _) = fringes.extent(self.index)
+    def result(self) -> dict[str, NDArray[Any]]:
+        """Maps and counts, by names of their arrays."""
+        fringes, maps = self.job.fringes, self.maps
         flat, rate, seconds = maps["flat"], maps["dark_rate"], float(fringes.exptime.mean())
         read = (maps["read_noise"] ** 2 + np.maximum(rate, 0) * seconds) / flat**2
         read = read + self.job.scale.variance
         often = self.saturated > max(STRAY_SHARE * fringes.frames, STRAY_SAMPLES)
         mask = maps["mask"] | PixelFlag.SATURATED * often | PixelFlag.NO_DATA * (self.lost > 0)
-        for name, data in (("read_variance", read), ("shot_factor", 1 / flat), ("mask", mask)):
-            writers[name].write((y0, x0), data.astype(writers[name].dtype))
         without = int(self.saturated.sum()), int(self.lost.sum())
         weighted = flat.size * fringes.frames - sum(without)
         counts = np.array([[[*without, weighted, self.total]]])
-        writers["counts"].write((*self.index, 0), counts)
+        return {"read_variance": read, "shot_factor": 1 / flat, "mask": mask, "counts": counts}
 
 
-def convert(job: Converting, strip: Strip) -> None:
+def convert(job: Converting, parts: Sequence[Strip]) -> None:
     """Write columns of chunks in electrons, their maps, and their counts.
 
     The counts are: samples that are saturated; others without weight; samples with weight; the sum
     of their codes.
     """
-    columns = [_Column(job, index) for index in strip]
-    for first, samples in blocks(job.fringes.raw, strip):
-        for n, column in enumerate(columns):
-            column.add(first, samples, n * CHUNK[2])
-    for column in columns:
-        column.close()
+    found: dict[Index, dict[str, NDArray[Any]]] = {}
+    for strip in parts:
+        own = zip(strip, job.fringes.maps(strip), strict=True)
+        columns = [_Column(job, index, maps) for index, maps in own]
+        for first, samples in blocks(job.fringes.raw, strip):
+            for n, column in enumerate(columns):
+                column.add(first, samples, n * CHUNK[2])
+        found |= {column.index: column.result() for column in columns}
+    for strip in strips(list(found), STRIP):
+        (y0, _), (x0, _) = job.fringes.extent(strip[0])
+        for name in found[strip[0]]:
+            writer = job.writers[name]
+            data = np.concatenate([found[index][name] for index in strip], axis=1)
+            start = (*strip[0], 0) if name == "counts" else (y0, x0)
+            writer.write(start, data.astype(writer.dtype))

@@ -29,9 +29,19 @@ from pixcal.kernels.photon_transfer import COLUMNS, N_BINS, bin_pairs, pair_stat
 from pixcal.kernels.robust import BATCH, Combination, Combined, lit, median_and_sigma
 from pixcal.model.arrays import F32, F64
 from pixcal.model.flags import PixelFlag
-from pixcal.stages.reduce.columns import Index, Strip, extent, grid
+from pixcal.stages.reduce.columns import (
+    Index,
+    Strip,
+    by_column,
+    extent,
+    grid,
+    map_chunk,
+    span,
+    strips,
+)
 from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.ingested import MOST_ADU
+from pixcal.stages.reduced_set import STRIP
 from pixcal.storage.cube import CHUNK, ArrayWriter, create_array, create_group
 from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import Place
@@ -91,14 +101,15 @@ class Measuring:
 
 
 def statistics_writers(folder: Place, shape: tuple[int, int], flats: int) -> dict[str, ArrayWriter]:
-    """Make the arrays that `measure` writes: one chunk of each for a column."""
+    """Make the arrays that `measure` writes: one chunk of each for `STRIP` columns."""
     tiles, n, rungs = grid(shape), len(STATISTICS), max(flats, 1)
+    wide = min(STRIP, tiles[1])
     create_group(folder)
     made = {}
     for name, whole, chunks, dtype in (
-        ("maps", (n, *shape), (n, *CHUNK[1:]), np.float32),
-        ("pairs", (*tiles, 2, N_BINS, COLUMNS), (1, 1, 2, N_BINS, COLUMNS), np.float64),
-        ("levels", (*tiles, rungs, 3), (1, 1, rungs, 3), np.float64),
+        ("maps", (n, *shape), (n, *map_chunk(shape)), np.float32),
+        ("pairs", (*tiles, 2, N_BINS, COLUMNS), (1, wide, 2, N_BINS, COLUMNS), np.float64),
+        ("levels", (*tiles, rungs, 3), (1, wide, rungs, 3), np.float64),
     ):
         dims = [f"axis{axis}" for axis in range(len(whole))]
         made[name] = create_array(folder / name, whole, dtype, chunks=chunks, dims=dims)
@@ -108,7 +119,8 @@ def statistics_writers(folder: Place, shape: tuple[int, int], flats: int) -> dic
 def measure_bytes(dark: Sequence[Group], flat: Sequence[Group], width: int) -> int:
     """Peak of `measure`: a column's batch in copies; of each column, one chunk and maps."""
     chunk, tile = 4 * CHUNK[0] * CHUNK[1] * CHUNK[2], 8 * CHUNK[1] * CHUNK[2]
-    return 6 * chunk + width * (chunk + tile * (60 + 8 * len(dark) + 16 * len(flat)))
+    maps = max(width, STRIP) * tile * (60 + 8 * len(dark) + 16 * len(flat))
+    return (6 + width) * chunk + maps
 
 
 @dataclass
@@ -134,8 +146,20 @@ class _Column:
         return cls(index, maps, pairs, levels, np.zeros(shape), np.zeros(shape, np.bool_))
 
 
-def measure(job: Measuring, strip: Strip) -> None:
+def measure(job: Measuring, parts: Sequence[Strip]) -> None:
     """Combine the calibration frames of columns of chunks and write their statistics."""
+    found = {column.index: column for strip in parts for column in _measured(job, strip)}
+    for strip in strips(list(found), STRIP):
+        columns = [found[index] for index in strip]
+        (i, j), ((y0, _), (x0, _)) = strip[0], span(job.shape, strip)
+        maps = [np.stack([column.maps[name] for name in STATISTICS]) for column in columns]
+        job.writers["maps"].write((0, y0, x0), np.concatenate(maps, axis=2).astype(np.float32))
+        job.writers["pairs"].write((i, j, 0, 0, 0), np.stack([c.pairs for c in columns])[None])
+        job.writers["levels"].write((i, j, 0, 0), np.stack([c.levels for c in columns])[None])
+
+
+def _measured(job: Measuring, strip: Strip) -> list[_Column]:
+    """Columns that are read together."""
     columns = [_Column.begin(job, index) for index in strip]
     combined = [_combine_dark(job, group, columns) for group in job.dark]
     for column, *found in zip(columns, *combined, strict=True) if combined else []:
@@ -147,11 +171,7 @@ def measure(job: Measuring, strip: Strip) -> None:
     for column in columns:
         if job.flat:
             _measure_response(job, column)
-        (y0, _), (x0, _) = extent(job.shape, column.index)
-        block = np.stack([column.maps[name] for name in STATISTICS])
-        job.writers["maps"].write((0, y0, x0), block.astype(np.float32))
-        job.writers["pairs"].write((*column.index, 0, 0, 0), column.pairs[None, None])
-        job.writers["levels"].write((*column.index, 0, 0), column.levels[None, None])
+    return columns
 
 
 def _combine_dark(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[Combined]:
@@ -299,7 +319,7 @@ def _usable(job: Measuring, samples: NDArray[Any], lamp: bool) -> F32:
 def _batches(job: Measuring, group: Group, strip: Strip) -> Iterator[list[NDArray[Any]]]:
     """Frames (t, y, x) of a group in each column of a strip, `BATCH` at a time."""
     reader = job.frames[group.array]
-    (rows, (x0, _)), (_, (_, x1)) = extent(job.shape, strip[0]), extent(job.shape, strip[-1])
+    rows, (x0, x1) = span(job.shape, strip)
     for first in range(0, len(group.frames), BATCH):
         numbers = group.frames[first : first + BATCH]
         batch = np.empty((len(numbers), rows[1] - rows[0], x1 - x0), reader.dtype)
@@ -308,4 +328,4 @@ def _batches(job: Measuring, group: Group, strip: Strip) -> Iterator[list[NDArra
             (n, frame), *more = run
             last = n + 1 + len(more)
             reader.read((frame, frame + last - n), rows, (x0, x1), out=batch[n:last])
-        yield np.split(batch, range(CHUNK[2], x1 - x0, CHUNK[2]), axis=2)
+        yield by_column(batch)

@@ -21,7 +21,7 @@ from pixcal.model.errors import InputError
 from pixcal.model.flags import PixelFlag
 from pixcal.model.options import Reduce
 from pixcal.stages.reduce.calibration import Finishing, calibration_writers, finish
-from pixcal.stages.reduce.columns import extent, indices, run_noted, strip_width
+from pixcal.stages.reduce.columns import indices, run_noted, span, strip_width, strips
 from pixcal.stages.reduce.detector_summary import ROUNDING_ADU, Summary, linearity_report, summarise
 from pixcal.stages.reduce.detector_warnings import detector_warnings
 from pixcal.stages.reduce.electrons import convert_bytes
@@ -36,6 +36,7 @@ from pixcal.stages.reduce.frame_statistics import (
 )
 from pixcal.stages.reduce.fringe_sets import Bounds, set_warnings, share_at_mean, write_set
 from pixcal.stages.reduce.ingested import Ingested
+from pixcal.stages.reduced_set import STRIP
 from pixcal.storage.artefact import Build, Manifest, Workspace, write_json
 from pixcal.storage.cube import ArrayReader, create_group
 from pixcal.storage.cube_place import base_of, chosen_base
@@ -205,8 +206,8 @@ def _calibrate(
         limits=_limits(config),
         writers=calibration_writers(made.folder / "calibration.zarr", source.shape),
     )
-    todo = indices(source.shape)
-    ends = np.array(run_tasks(partial(finish, job), todo, runtime, label="calibration"))
+    todo = strips(indices(source.shape), STRIP)
+    ends = np.concatenate(run_tasks(partial(finish, job), todo, runtime, label="calibration"))
     for writer in job.writers.values():
         writer.finish()
     least, largest = float(ends[:, 0].min()), ends[:, 1:].max(axis=0)
@@ -283,8 +284,8 @@ def _of_cut_off(shares: Mapping[str, float]) -> list[str]:
 def _dark_lines(mask: ArrayReader, shape: tuple[int, int]) -> list[str]:
     """What to say of neighbouring rows or columns that see no light at all."""
     dark = {"rows": np.ones(shape[0], np.bool_), "columns": np.ones(shape[1], np.bool_)}
-    for index in indices(shape):
-        (y0, y1), (x0, x1) = extent(shape, index)
+    for strip in strips(indices(shape), STRIP):
+        (y0, y1), (x0, x1) = span(shape, strip)
         dead = mask.read((y0, y1), (x0, x1)) & PixelFlag.DEAD > 0
         dark["rows"][y0:y1] &= dead.all(axis=1)
         dark["columns"][x0:x1] &= dead.all(axis=0)
@@ -330,8 +331,8 @@ def _count_flags(mask: Place, shape: tuple[int, int]) -> dict[str, int]:
     """Pixels with each flag, and without any."""
     reader = ArrayReader(mask)
     counts: Counter[str] = Counter()
-    for index in indices(shape):
-        values = reader.read(*extent(shape, index))
+    for strip in strips(indices(shape), STRIP):
+        values = reader.read(*span(shape, strip))
         counts["good"] += int((values == 0).sum())
         for flag in PixelFlag:
             counts[str(flag.name).lower()] += int((values & flag > 0).sum())
