@@ -130,12 +130,14 @@ def run_noted(
         Name of the task in the journal, and for the progress.
     """
     journal = made.journal()
-    steps = {index: f"{label} {index[0]} {index[1]}" for index in todo}
-    left = strips([index for index in todo if steps[index] not in journal], max(width, STRIP))
+    # Those whose maps share a chunk are noted together.
+    steps = {strip[0]: f"{label} {strip[0][0]} {strip[0][1]}" for strip in strips(todo, STRIP)}
+    undone = [s for s in strips(todo, STRIP) if steps[s[0]] not in journal]
+    left = strips([index for strip in undone for index in strip], max(width, STRIP))
 
     def note(number: int, _: Any) -> None:
-        for index in left[number]:
-            made.note(steps[index])
+        for strip in strips(left[number], STRIP):
+            made.note(steps[strip[0]])
 
     parts = [strips(strip, width) for strip in left]
     run_tasks(task, parts, runtime, label=label, done=note)

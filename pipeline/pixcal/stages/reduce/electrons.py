@@ -136,8 +136,8 @@ def set_writers(
             folder / name, shape, dtype, dims=("y", "x"), chunks=map_chunk(shape), attrs=attrs
         )
     made["counts"] = create_array(
-        scratch, (*grid(shape), 4), np.int64, dims=("i", "j", "count"),
-        chunks=(1, min(STRIP, grid(shape)[1]), 4),
+        scratch, (*grid(shape), 5), np.int64, dims=("i", "j", "count"),
+        chunks=(1, min(STRIP, grid(shape)[1]), 5),
     )  # fmt: skip
     return made
 
@@ -170,7 +170,7 @@ class _Column:
         )  # fmt: skip
         self.saturated = np.zeros(self.maps["flat"].shape, np.uint32)
         self.lost = np.zeros_like(self.saturated)
-        self.total = 0
+        self.total = self.largest = 0
 
     def add(self, first: int, samples: NDArray[Any], begin: int) -> None:
         """Write the chunk that begins at a frame, from the columns of a strip from ``begin`` on."""
@@ -182,6 +182,9 @@ class _Column:
             np.float32(fringes.saturation), codes, self.saturated, self.lost, begin,
         )  # fmt: skip
         self.job.writers["signal"].write((first, y0, x0), codes)
+        if samples.dtype.kind in "iu":
+            own = samples[..., begin : begin + codes.shape[2]]
+            self.largest = max(self.largest, int(own.max()))
 
     def result(self) -> dict[str, NDArray[Any]]:
         """Maps and counts, by names of their arrays."""
@@ -193,7 +196,7 @@ class _Column:
         mask = maps["mask"] | PixelFlag.SATURATED * often | PixelFlag.NO_DATA * (self.lost > 0)
         without = int(self.saturated.sum()), int(self.lost.sum())
         weighted = flat.size * fringes.frames - sum(without)
-        counts = np.array([[[*without, weighted, self.total]]])
+        counts = np.array([[[*without, weighted, self.total, self.largest]]])
         return {"read_variance": read, "shot_factor": 1 / flat, "mask": mask, "counts": counts}
 
 
@@ -201,7 +204,7 @@ def convert(job: Converting, parts: Sequence[Strip]) -> None:
     """Write columns of chunks in electrons, their maps, and their counts.
 
     The counts are: samples that are saturated; others without weight; samples with weight; the sum
-    of their codes.
+    of their codes; the largest sample (ADU; zero for real numbers).
     """
     found: dict[Index, dict[str, NDArray[Any]]] = {}
     for strip in parts:

@@ -112,7 +112,6 @@ def write_set(
     return {
         "frames": fringes.frames,
         **_describe_counts(ArrayReader(scratch).read(), scale),
-        "largest_adu": source.largest(name),
         "quantisation": _describe_scale(scale, (low, high), origin, bounds),
     }
 
@@ -136,6 +135,7 @@ def _describe_counts(counts: I64, scale: Scale) -> dict[str, Any]:
         "saturated_samples": saturated,
         "lost_samples": lost,
         "mean_e": total / weighted * scale.step + scale.offset if weighted else None,
+        "largest_adu": int(counts[..., 4].max()),
     }
 
 

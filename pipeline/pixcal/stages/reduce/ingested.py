@@ -145,13 +145,6 @@ class Ingested:
         """Level (ADU) at which flats pile up; None where they do not."""
         return None if self.survey is None else self.survey.saturation
 
-    def largest(self, name: str) -> int:
-        """Largest sample (ADU) of an array, as ingest found it; zero of real numbers."""
-        if not self._is_integer(name):
-            return 0
-        of_frames = self.tables[name].get("largest_adu", ())
-        return int(max((v for v in of_frames if v is not None), default=0))
-
     def lowest(self, name: str) -> float:
         """Least sample (ADU) that an array can hold."""
         if self._is_integer(name):
