@@ -238,7 +238,7 @@ def test_a_reduction_cut_short_goes_on(
 ) -> None:
     before = set(store.keys())
     with monkeypatch.context() as patch:
-        cut = Cut(6 + 10 + 7 + 2, KeyboardInterrupt)  # in the second column of the signal
+        cut = Cut(3 + 5 + 3 + 2, KeyboardInterrupt)  # in the second column of the signal
         patch.setattr(ArrayWriter, "write", lambda *args: cut(*args))
         with pytest.raises(KeyboardInterrupt):
             reduce.run(ingested, reduce.Config(), SYNC)
