@@ -183,7 +183,7 @@ class _Column:
         )  # fmt: skip
         self.job.writers["signal"].write((first, y0, x0), codes)
         if samples.dtype.kind in "iu":
-            own = samples[..., begin : begin + codes.shape[2]]
+            own = samples[:, :, begin : begin + codes.shape[-1]]
             self.largest = max(self.largest, int(own.max()))
 
     def result(self) -> dict[str, NDArray[Any]]:
