@@ -55,6 +55,22 @@ def test_rows_in_the_offsets_show_with_their_size(plain: Evidence) -> None:
         np.testing.assert_array_equal(found[key].value, same[key].value)
 
 
+def test_fringes_in_the_contrast_are_told_apart_from_its_other_patterns(plain: Evidence) -> None:
+    """As errors of four phases leave them: a second harmonic, whose size is chance."""
+    one = plain.fringes["vertical"]
+    psi = np.arctan2(one.theta[1], one.theta[2])
+    size = 0.3 * measure(plain)["contrast_by_place", "vertical"].value.mean() ** 0.5
+    theta = one.theta * np.stack([np.ones_like(psi), *2 * [1 + size * np.cos(2 * psi)]])
+    found, before = measure(changed(plain, theta=theta)), measure(plain)
+    rise = (
+        found["contrast_fringes", "vertical"].value - before["contrast_fringes", "vertical"].value
+    )
+    assert rise[2] == pytest.approx(size, rel=0.05)
+    for name in ("contrast_by_place", "contrast_scales", "contrast_peak"):
+        powers, usual = found[name, "vertical"].value, before[name, "vertical"].value
+        np.testing.assert_allclose(powers, usual, rtol=0.02)
+
+
 def test_neighbours_that_share_noise_correlate(plain: Evidence) -> None:
     one = plain.fringes["horizontal"]
     shared = one.residual + 0.1 * np.roll(np.nan_to_num(one.residual), 1, axis=1)

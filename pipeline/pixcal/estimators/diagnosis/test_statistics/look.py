@@ -9,7 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
-from pixcal.estimators.maps.structure import flattened, smooth_surface, without_outliers
+from pixcal.estimators.maps.structure import (
+    fit_terms,
+    flattened,
+    smooth_surface,
+    without_outliers,
+)
 from pixcal.kernels.sample_sums import (
     calm_residuals,
     level_sums,
@@ -116,6 +121,23 @@ class Look:
     def flat_maps(self) -> dict[str, F64]:
         """The maps less their smooth surfaces."""
         return {name: flattened(values) for name, values in self.maps.items()}
+
+    @cached_property
+    def fringe_terms(self) -> F64:
+        """First and second harmonic of the fringes (term, y, x): cosine and sine of each."""
+        psi = self.psi
+        return np.stack([np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)])
+
+    @cached_property
+    def maps_beside_fringes(self) -> dict[str, F64]:
+        """The flat maps without residual fringes, which have a statistic of their own.
+
+        With four phases, errors of the phases leave fringes whose power varies widely.
+        """
+        return {
+            name: values - np.tensordot(fit_terms(values, self.fringe_terms), self.fringe_terms, 1)
+            for name, values in self.flat_maps.items()
+        }
 
     @cached_property
     def frames(self) -> dict[str, F64]:

@@ -86,7 +86,7 @@ def _power(name: str, title: str, x: str) -> Callable[[Callable[[Any], Curve | N
 
 def _repeats(name: str, axis: int) -> Statistic:
     def measured(look: Look) -> Curve:
-        size = np.abs(repeats(look.flat_maps[name], axis))
+        size = np.abs(repeats(look.maps_beside_fringes[name], axis))
         return Curve(np.array(PERIODS, float), size)
 
     measured.__name__ = f"{name}_{LINES[axis]}_repeat"
@@ -97,7 +97,7 @@ def _repeats(name: str, axis: int) -> Statistic:
 
 def _profile(name: str, axis: int) -> Statistic:
     def measured(look: Look) -> Curve:
-        along = profile(look.flat_maps[name], axis)
+        along = profile(look.maps_beside_fringes[name], axis)
         power = np.abs(np.fft.rfft(along)[1:]) ** 2 * 2 / len(along) ** 2
         return _binned(np.arange(1, len(power) + 1) / len(along), power)
 
@@ -108,9 +108,8 @@ def _profile(name: str, axis: int) -> Statistic:
 
 def _fringes(name: str) -> Statistic:
     def measured(look: Look) -> Curve:
-        values, psi = look.flat_maps[name], look.psi
-        terms = np.stack([np.cos(psi), np.sin(psi), np.cos(2 * psi), np.sin(2 * psi)])
-        return Curve(np.array([1.0, 1.25, 2.0, 2.25]), fit_terms(values, terms))
+        sizes = fit_terms(look.flat_maps[name], look.fringe_terms)
+        return Curve(np.array([1.0, 1.25, 2.0, 2.25]), sizes)
 
     measured.__name__ = f"{name}_fringes"
     title = f"{name}: residual fringes, first and second harmonic"
@@ -148,7 +147,7 @@ def _low_orders(name: str) -> Statistic:
 
 def _scales(name: str) -> Statistic:
     def measured(look: Look) -> Curve:
-        values = np.nan_to_num(look.flat_maps[name])
+        values = np.nan_to_num(look.maps_beside_fringes[name])
         power = np.abs(np.fft.rfft2(values)) ** 2 / values.size**2
         fy = np.fft.fftfreq(values.shape[0])[:, None]
         fx = np.fft.rfftfreq(values.shape[1])[None, :]
@@ -164,7 +163,7 @@ def _scales(name: str) -> Statistic:
 
 def _peak(name: str) -> Statistic:
     def measured(look: Look) -> Curve:
-        values = np.nan_to_num(look.flat_maps[name])
+        values = np.nan_to_num(look.maps_beside_fringes[name])
         power = np.abs(np.fft.rfft2(values)) ** 2
         fy = np.fft.fftfreq(values.shape[0])[:, None]
         fx = np.fft.rfftfreq(values.shape[1])[None, :]
@@ -180,7 +179,7 @@ def _peak(name: str) -> Statistic:
 
 def _by_place(name: str) -> Statistic:
     def measured(look: Look) -> Curve | None:
-        squares = look.flat_maps[name] ** 2
+        squares = look.maps_beside_fringes[name] ** 2
         cells = by_cell(squares, np.isfinite(squares))
         return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
 
