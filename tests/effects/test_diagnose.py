@@ -235,6 +235,7 @@ def test_a_part_of_a_large_detector_is_enough_without_fringes(
 ) -> None:
     monkeypatch.setattr(windows, "LARGEST", 60)
     monkeypatch.setattr(windows, "SIDE", 40)
+    monkeypatch.setattr(windows, "SAMPLES", 400_000)
     run = reduced(None, {"detector.shape": [131, 127], "frames.fringes": []})
     look = look_at(run, SYNC)
     assert len(look.windows) == 4
