@@ -14,7 +14,7 @@ class TwoGlows(Effect):
 
     name, title, acts_at = "two_glows", "glow of two amplifiers", Stage.LIGHT
     domains, strengths = ("space", "intensity"), ("rates",)
-    sources = ("invented",)
+    sources = ("invented for the tests",)
 
     rates: tuple[float, float] = quantity((200.0, 200.0), unit="e-/s", low=0, doc="left and right")
     reach_px: float = quantity(15.0, unit="px", above=0, doc="where it has fallen to 1/e")
