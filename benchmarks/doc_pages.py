@@ -106,10 +106,11 @@ def _parts(kind: object) -> str:
 
 
 def effect_table() -> str:
-    """All effects by the stage at which they act, in their order."""
+    """All effects that have a page, by the stage at which they act, in their order."""
     lines = ["| where | effects, in the order in which they act |", "|---|---|"]
+    told = [e for e in effects().values() if (DOCS / f"reference/effects/{e.name}.md").is_file()]
     for stage in Stage:
-        own = sorted((e for e in effects().values() if e.acts_at == stage), key=lambda e: e.order)
+        own = sorted((e for e in told if e.acts_at == stage), key=lambda e: e.order)
         links = ", ".join(f"[{e.name}](effects/{e.name}.md)" for e in own)
         lines.append(f"| {stage.name.lower()} | {links} |")
     return "\n".join(lines) + "\n"

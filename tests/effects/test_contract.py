@@ -1,6 +1,7 @@
 """What holds for every effect that is found, whatever it is."""
 
 import dataclasses
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -8,6 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import pixcal.effects
+from blind_examination.draw import draw_examination
+from doc_pages import effect_table
 from pixcal.effects import effect_of_file, effects, known_effects, parse_effects
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.model.bench import Bench
@@ -24,6 +28,8 @@ GLOW = ROOT / "docs" / "examples" / "glow.py"
 KNOWN = known_effects([GLOW, *sorted((Path(__file__).parent / "own").glob("*.py"))])
 EVERY = pytest.mark.parametrize("cls", KNOWN.values(), ids=KNOWN)
 EVERY_OF_PIXCAL = pytest.mark.parametrize("cls", effects().values(), ids=effects())
+PAGES = sorted((ROOT / "docs" / "reference" / "effects").glob("*.md"))
+"""What effects are, their sources, and pictures of what they do to the offsets; optional."""
 DOMAINS = {"space", "time", "intensity", "noise"}
 SELDOM = {"cosmic_hits": 1e6}
 """Times the default strength at which an effect shows in a dozen small frames; 3 for others."""
@@ -71,12 +77,11 @@ def test_it_says_what_it_is(cls: type[Effect]) -> None:
 
 
 def test_which_of_one_stage_acts_first_is_said_and_not_left_to_names() -> None:
-    turns = [(cls.acts_at, cls.order) for cls in effects().values()]
-    assert len(set(turns)) == len(turns)
-    assert all(cls.order < Effect.order for cls in effects().values())
-    # Those of a user's own, without an order, come last of their stage.
+    ordered = [cls for cls in effects().values() if "order" in vars(cls)]
+    assert len({(cls.acts_at, cls.order) for cls in ordered}) == len(ordered)
+    # Those without an order come last of their stage.
     own = effect_of_file(GLOW)()
-    assert own.turn > max(cls().turn for cls in effects().values() if cls.acts_at == own.acts_at)
+    assert own.turn > max(cls().turn for cls in ordered if cls.acts_at == own.acts_at)
 
 
 def test_what_was_measured_of_a_bench_is_set_before_any_effect_acts() -> None:
@@ -174,12 +179,14 @@ def test_what_is_undone_is_what_was_done(cls: type[Effect]) -> None:
 
 
 @EVERY_OF_PIXCAL
-def test_it_has_its_page(cls: type[Effect]) -> None:
+def test_its_file_is_named_like_it(cls: type[Effect]) -> None:
     assert cls.name == cls.__module__.rpartition(".")[2]
-    page = ROOT / "docs" / "reference" / "effects" / f"{cls.name}.md"
-    assert page.is_file(), "what it is, source, parameters, the picture of what it does to delta"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_page_tells_every_parameter_of_its_effect(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
-    for field in dataclasses.fields(cls):
+    for field in dataclasses.fields(effects()[page.stem]):
         assert f"`{field.name}`" in text, f"parameter {field.name} is not told"
 
 
@@ -233,3 +240,21 @@ def test_a_file_without_an_effect_is_refused(tmp_path: Path, text: str | None, r
         file.write_text(text)
     with pytest.raises(InputError, match=reason):
         effect_of_file(file)
+
+
+def test_a_file_in_the_folder_is_all_that_a_new_effect_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = GLOW.read_text(encoding="utf-8").replace('"glow"', '"amplifier_light"')
+    (tmp_path / "amplifier_light.py").write_text(text, encoding="utf-8")
+    before, table = set(effects()), effect_table()
+    monkeypatch.setattr(pixcal.effects, "__path__", [*pixcal.effects.__path__, str(tmp_path)])
+    effects.cache_clear()
+    try:
+        assert set(effects()) == before | {"amplifier_light"}
+        assert parse_effects({"amplifier_light": {"rate": 1.0}}, "file")[0].turn
+        assert effect_table() == table
+        assert draw_examination(len(before), 17, "small", "own").truths
+    finally:
+        effects.cache_clear()
+        sys.modules.pop("pixcal.effects.amplifier_light", None)

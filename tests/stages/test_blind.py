@@ -62,11 +62,12 @@ BLOCK = 2880
 # What is drawn.
 
 
-def test_every_effect_has_its_ways_and_its_turn() -> None:
-    assert {way.effect for way in VARIANTS} == set(effects())
-    examination = draw_examination(3 * len(effects()), 17, "small", "own")
+def test_every_effect_with_variants_has_its_turn() -> None:
+    names = {way.effect for way in VARIANTS}
+    assert names <= set(effects())
+    examination = draw_examination(3 * len(names), 17, "small", "own")
     turns = Counter(t.names[0] for t in examination.truths if t.part == ONE)
-    assert set(turns) == set(effects())
+    assert set(turns) == names
     assert max(turns.values()) - min(turns.values()) <= 1
 
 
