@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from pixcal.estimators.diagnosis.distortions import Freedom
+from pixcal.estimators.diagnosis.distortions import Freedom, TwoWay
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.boundaries import REACH, boundary_pushes, shared_noise
 from pixcal.kernels.normal_matrix import inverse_normal
@@ -164,7 +164,8 @@ def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Iterator[_Noise]
         frames = slice(first, min(first + BLOCK, count))
 
         def taken(one: Mask, other: Mask, frames: slice = frames) -> F32:
-            return freedom.taken_by_frames(frames, one, other) * flat[one] * flat[other]
+            pairs = one[good], other[good]
+            return freedom.taken_by_frames(frames, *pairs) * flat[one] * flat[other]
 
         residual = np.zeros(fringes.electrons[frames].shape, np.float32)
         residual[:, good] = left[frames]
@@ -181,17 +182,19 @@ def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[_Noise]:
     charge = np.maximum(frames.mean(axis=0), 0).astype(np.float32)
     dark = (evidence.dark_rate * stack.exptime_s).astype(np.float32)
     light = np.where(good, np.maximum(charge - dark, 0), 0)
-    variance = charge + np.float32(evidence.read_noise**2)
-    power = np.float32((light**2 / variance).sum())
-    if power <= 0:
+    if not light.any():
         return
-    lamp = ((frames - dark) * light / variance)[:, good].sum(axis=1) / power
-    factor = (lamp / lamp.mean())[:, None, None].astype(np.float32)
-    residual = np.where(good, frames - charge - (factor - 1) * light, 0).astype(np.float32)
-    residual[np.abs(residual) > _CLIP * np.sqrt(variance)] = 0
+    variance = np.broadcast_to(charge + np.float32(evidence.read_noise**2), frames.shape)
+    weight = np.where(good, 1 / variance, np.float32(0)).reshape(len(frames), -1)
+    level = np.ones((1, len(frames)), np.float32)
+    freedom = TwoWay(weight, level, light.reshape(1, -1).astype(np.float32))
+    residual = freedom.left_over((frames - charge).reshape(weight.shape))
+    residual[np.abs(residual) * np.sqrt(weight) > _CLIP] = 0
 
     def taken(one: Mask, other: Mask) -> F32:
-        return np.tile(light[one] * light[other] / power, (len(frames), 1)).astype(np.float32)
+        return freedom.taken_by_frames(slice(None), one.ravel(), other.ravel())
 
-    every = [np.broadcast_to(a, frames.shape) for a in (variance, charge)]
-    yield _Noise(residual, every[0], every[1], taken, 1 - 1 / len(frames), good)
+    yield _Noise(
+        residual.reshape(frames.shape), variance, np.broadcast_to(charge, frames.shape), taken,
+        1 - 1 / len(frames), good,
+    )  # fmt: skip

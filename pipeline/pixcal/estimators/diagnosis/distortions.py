@@ -33,61 +33,23 @@ _ROUNDS = 8
 _STILL = 0.1
 
 
-class Freedom:
-    """The directions in which a fit of a fringe set is free.
-
-    Of the frames (B, A cos phi, A sin phi) and the fringe vector; of the pixels the three maps and,
-    where asked, as much again for each higher harmonic of the phase.
+class TwoWay:
+    """A table of frames by pixels whose rows and columns are each free in some functions.
 
     Parameters
     ----------
-    harmonics : int
-        Highest harmonic of the phase that a pixel is free to have.
-    margin : int
-        Pixels along the edges that are left out.
-
-    Attributes
-    ----------
-    good : (y, x) bool
-        The n pixels that are used.
     weight : (t, n) float32
         One over the variance; zero where a sample has no weight.
     of_time : (k, t) float32
-        The functions of time that a pixel is free to have, orthonormal.
-    of_place : (7, n) float32
-        The functions of place that a frame is free to have: the maps, and their slopes.
+        The functions of time that a pixel is free to have.
+    of_place : (j, n) float32
+        The functions of place that a frame is free to have.
+    slopes : (t, p, j) float64, optional
+        Shares of the functions of place in each parameter of a frame, where these are fewer.
     """
 
-    def __init__(self, fringes: FringeEvidence, harmonics: int = 1, margin: int = 0) -> None:
-        inside = np.zeros_like(fringes.good)
-        ny, nx = inside.shape
-        inside[margin : ny - margin, margin : nx - margin] = True
-        self.good = good = fringes.good & inside
-        usable = np.isfinite(self.of_good(fringes.electrons))
-        self.weight: F32 = np.where(usable, 1 / self.of_good(fringes.variance), np.float32(0))
-        of_time = [fringes.g / np.abs(fringes.g).max(axis=0)]
-        for n in range(2, harmonics + 1):
-            of_time += [np.cos(n * fringes.phi)[:, None], np.sin(n * fringes.phi)[:, None]]
-        # Where there are few different phases, harmonics are not independent.
-        independent, size, _ = np.linalg.svd(np.hstack(of_time), full_matrices=False)
-        independent = independent[:, size > _INDEPENDENT * size[0]]
-        self.of_time = np.ascontiguousarray(independent.T, np.float32)
-        y, x = (np.broadcast_to(v, good.shape)[good] for v in grid((good.shape[0], good.shape[1])))
-        theta = fringes.theta[:, good]
-        # The maps, and their slopes along x and y; the latter turn with the phase of the frame.
-        self.of_place = np.stack(
-            [*theta, x * theta[1], x * theta[2], y * theta[1], y * theta[2]]
-        ).astype(np.float32)
-        slopes = np.zeros((len(fringes.g), 5, 7))
-        slopes[:, [0, 1, 2], [0, 1, 2]] = 1
-        for row, column in ((3, 3), (4, 5)):
-            slopes[:, row, column] = -fringes.g[:, 2]
-            slopes[:, row, column + 1] = fringes.g[:, 1]
-        self._slopes = slopes
-
-    def of_good(self, samples: F32) -> F32:
-        """The good pixels (t, n) of samples (t, y, x)."""
-        return np.take(samples.reshape(len(samples), -1), np.flatnonzero(self.good), axis=1)
+    def __init__(self, weight: F32, of_time: F32, of_place: F32, slopes: F64 | None = None) -> None:
+        self.weight, self.of_time, self.of_place, self._slopes = weight, of_time, of_place, slopes
 
     @cached_property
     def pixel_inverse(self) -> F64:
@@ -102,15 +64,17 @@ class Freedom:
 
     @cached_property
     def frame_covariance(self) -> F64:
-        """Covariance (t, 7, 7) of the frames' share of the maps and slopes, from the noise."""
-        upper = np.triu_indices(7)
+        """Covariance (t, j, j) of the frames' share of the functions of place, from the noise."""
+        upper = np.triu_indices(len(self.of_place))
         products = self.of_place[upper[0]] * self.of_place[upper[1]]
         normal = symmetric(self.weight @ products.T)
-        inverse = inverse_normal(self._slopes @ normal @ self._slopes.swapaxes(1, 2), 1e-7)
-        return self._slopes.swapaxes(1, 2) @ inverse @ self._slopes
+        if self._slopes is None:
+            return inverse_normal(normal, 1e-7)
+        turned = self._slopes.swapaxes(1, 2)
+        return turned @ inverse_normal(self._slopes @ normal @ turned, 1e-7) @ self._slopes
 
     def left_over(self, change: F32) -> F32:
-        """What the fit leaves of a change (t, n) of the samples of the good pixels, e-.
+        """What the freedom leaves of a change (t, n) of the samples.
 
         Zero where a sample has no weight.
         """
@@ -127,16 +91,77 @@ class Freedom:
         rest[self.weight == 0] = 0
         return rest
 
-    def taken_by_frames(self, frames: slice, one: Mask, other: Mask) -> F32:
-        """Covariance (t, pair), e-², that the free frames take off residuals of pairs of pixels.
+    def taken_by_pixels(self) -> F32:
+        """Share (t, n) of the variance that the free pixels take off the residuals."""
+        k, count = self.of_time.shape
+        products = (self.of_time[:, None] * self.of_time).reshape(k * k, count)
+        inverse = self.pixel_inverse.reshape(-1, k * k).astype(np.float32)
+        return np.asarray(products.T @ inverse.T * self.weight)
 
-        These are good pixels (y, x), and as many others, in the same order.
+    def taken_by_frames(self, frames: slice, one: Mask, other: Mask) -> F32:
+        """Covariance (t, pair) that the free frames take off residuals of pairs of pixels.
+
+        These are some of the n pixels, and as many others, in the same order.
         """
-        a, b = self.of_place[:, one[self.good]], self.of_place[:, other[self.good]]
+        a, b = self.of_place[:, one], self.of_place[:, other]
         pairs = (a[:, None] * b[None]).reshape(len(a) ** 2, -1)
         covariance = self.frame_covariance[frames].astype(np.float32)
         taken: F32 = covariance.reshape(len(covariance), -1) @ pairs
         return taken
+
+
+class Freedom(TwoWay):
+    """The directions in which a fit of a fringe set is free.
+
+    Of the frames (B, A cos phi, A sin phi) and the fringe vector; of the pixels the three maps and,
+    where asked, as much again for each higher harmonic of the phase.
+
+    Parameters
+    ----------
+    harmonics : int
+        Highest harmonic of the phase that a pixel is free to have.
+    margin : int
+        Pixels along the edges that are left out.
+
+    Attributes
+    ----------
+    good : (y, x) bool
+        The n pixels that are used.
+    of_time : (k, t) float32
+        Orthonormal.
+    of_place : (7, n) float32
+        The maps, and their slopes along x and y.
+    """
+
+    def __init__(self, fringes: FringeEvidence, harmonics: int = 1, margin: int = 0) -> None:
+        inside = np.zeros_like(fringes.good)
+        ny, nx = inside.shape
+        inside[margin : ny - margin, margin : nx - margin] = True
+        self.good = good = fringes.good & inside
+        usable = np.isfinite(self.of_good(fringes.electrons))
+        weight: F32 = np.where(usable, 1 / self.of_good(fringes.variance), np.float32(0))
+        of_time = [fringes.g / np.abs(fringes.g).max(axis=0)]
+        for n in range(2, harmonics + 1):
+            of_time += [np.cos(n * fringes.phi)[:, None], np.sin(n * fringes.phi)[:, None]]
+        # Where there are few different phases, harmonics are not independent.
+        independent, size, _ = np.linalg.svd(np.hstack(of_time), full_matrices=False)
+        independent = independent[:, size > _INDEPENDENT * size[0]]
+        y, x = (np.broadcast_to(v, good.shape)[good] for v in grid((good.shape[0], good.shape[1])))
+        theta = fringes.theta[:, good]
+        # The maps, and their slopes along x and y; the latter turn with the phase of the frame.
+        of_place = np.stack(
+            [*theta, x * theta[1], x * theta[2], y * theta[1], y * theta[2]]
+        ).astype(np.float32)
+        slopes = np.zeros((len(fringes.g), 5, 7))
+        slopes[:, [0, 1, 2], [0, 1, 2]] = 1
+        for row, column in ((3, 3), (4, 5)):
+            slopes[:, row, column] = -fringes.g[:, 2]
+            slopes[:, row, column + 1] = fringes.g[:, 1]
+        super().__init__(weight, np.ascontiguousarray(independent.T, np.float32), of_place, slopes)
+
+    def of_good(self, samples: F32) -> F32:
+        """The good pixels (t, n) of samples (t, y, x)."""
+        return np.take(samples.reshape(len(samples), -1), np.flatnonzero(self.good), axis=1)
 
 
 def fit_distortions(
