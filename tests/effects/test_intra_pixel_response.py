@@ -82,3 +82,20 @@ def test_one_interfringe_tells_nothing(acquired: Callable[..., Evidence]) -> Non
     one = {"vertical": evidence.fringes["vertical"]}
     bare = replace(evidence, fringes=one)
     assert IntraPixelResponse.estimate(bare) is None
+
+
+@pytest.mark.quick(1)
+def test_hot_pixels_that_no_dark_shows_are_no_scatter(acquired: Callable[..., Evidence]) -> None:
+    evidence, rng = acquired(), np.random.default_rng(3)
+    places = (rng.choice(n, 12, replace=False) for n in evidence.good.shape)
+    share = np.zeros(evidence.good.shape)
+    share[*places] = np.exp(rng.uniform(np.log(0.02), np.log(0.2), 12))
+    fringes = {}
+    for name, found in evidence.fringes.items():
+        hot = share * np.median(found.theta[0]) * (2 if name == "vertical" else 1)
+        added = np.stack([hot, np.zeros_like(hot), np.zeros_like(hot)])
+        more = np.tensordot(found.g, added, 1).astype(np.float32)
+        fringes[name] = replace(found, theta=found.theta + added, electrons=found.electrons + more)
+    estimate = IntraPixelResponse.estimate(replace(evidence, fringes=fringes))
+    assert estimate is not None
+    assert abs(estimate.significance) < 4

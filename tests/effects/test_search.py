@@ -111,6 +111,26 @@ def test_what_is_there_is_taken_and_what_is_not_is_left() -> None:
     assert found.candidates["right"].reason == "the held-out frames are not fitted better"
 
 
+@dataclass(frozen=True)
+class ToyOfMaps(Toy):
+    """Shows in static maps alone."""
+
+    domains = ("space",)
+
+
+def test_what_maps_may_have_by_chance_is_not_taken_for_an_effect() -> None:
+    """Held-out frames have the same offsets, so a pattern must be beyond chance by itself."""
+    weak, strong = 1.7e-3, 1e-2
+    for kind, size, accepted in (
+        (Toy, weak, ("unknown",)), (ToyOfMaps, weak, ()), (ToyOfMaps, strong, ("unknown",)),
+    ):  # fmt: skip
+        effect = kind("unknown", size)
+        object.__setattr__(effect, "name", "unknown")
+        one = Candidate("unknown", Estimate(effect, {"size": size / 5}, 5.0, "told"))
+        found, _ = search({"unknown": size}, [one])
+        assert found.accepted == accepted
+
+
 def test_two_effects_are_both_found_in_any_order() -> None:
     both = [candidate("left", 0.03), candidate("right", 0.01), candidate("little", 0.02)]
     results = [search({"left": 0.03, "right": 0.01}, order) for order in (both, both[::-1])]

@@ -7,10 +7,11 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.estimators.maps.map_fit import gauge_terms, half_theta, neighbour_products, without
+from pixcal.estimators.maps.structure import without_outliers
 from pixcal.kernels import optics
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.kernels.scene import TILE, DetectorMaps, LightMaps, Rows, chip_map, geometry
-from pixcal.model.arrays import F64
+from pixcal.model.arrays import F64, Mask
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
@@ -18,7 +19,6 @@ from pixcal.simulation.recording import Recording
 REPEAT = 0.002  # to what part the visibility of two pairs of fibres is taken to be the same
 _MIN_PIXELS = 200
 _APART = 1.1
-_CLIP = 5.0
 _TURNS = 60
 
 
@@ -152,9 +152,10 @@ def _scatter(sets: list[FringeEvidence], width: float, bias_variance: float) -> 
     """Variance of the width from pixel to pixel and its error, px²."""
     normal, right = np.zeros((2, 2)), np.zeros(2)
     for found in sets:
-        one, other = (_structure(found, half) for half in (0, 1))
-        products = neighbour_products(one, other, found.good)
-        white = (products[0] - (4 * products[1] - products[2]) / 3)[found.good]
+        one, other = (_visibility(found, half) for half in (0, 1))
+        kept = np.isfinite(one) & np.isfinite(other)
+        products = neighbour_products(_structure(one, kept), _structure(other, kept), kept)
+        white = (products[0] - (4 * products[1] - products[2]) / 3)[kept]
         error = white.std() / np.sqrt(len(white))
         of_bias = bias_variance / float(np.median(found.theta[0][found.good])) ** 2
         # Widths along both axes scatter by themselves; what does not depend on the fringe is free.
@@ -166,17 +167,27 @@ def _scatter(sets: list[FringeEvidence], width: float, bias_variance: float) -> 
     return float(covariance[0] @ right), float(np.sqrt(covariance[0, 0]))
 
 
-def _structure(found: FringeEvidence, half: int) -> F64:
-    """Logarithm of the visibility (y, x) of half the frames, without rows, columns, fringes."""
+def _visibility(found: FringeEvidence, half: int) -> F64:
+    """Logarithm of the visibility (y, x) of half the frames, without fringes; NaN of outliers.
+
+    A hot pixel without a dark has so little of it that the mean of its row would show it.
+    """
     good = found.good
     theta = half_theta(found, half, good)
-    ratio = np.hypot(theta[1], theta[2]) / np.maximum(theta[0], 1e-9)
-    rest = np.log(np.maximum(ratio, 1e-9))
-    rest = without((rest - rest.mean())[:, None], gauge_terms(found)[:, good].T)[:, 0]
-    for index in np.nonzero(good):
+    rest = np.full(good.shape, np.nan)
+    rest[good] = np.log(np.maximum(np.hypot(theta[1], theta[2]), 1e-9) / np.maximum(theta[0], 1e-9))
+    rest = without_outliers(rest)
+    used = np.isfinite(rest)
+    rest[used] = without(rest[used][:, None], gauge_terms(found)[:, used].T)[:, 0]
+    return rest
+
+
+def _structure(visibility: F64, kept: Mask) -> F64:
+    """Of it (y, x), without rows and columns; zero where not kept."""
+    rest = visibility[kept]
+    for index in np.nonzero(kept):
         count = np.maximum(np.bincount(index), 1)
         rest = rest - (np.bincount(index, rest) / count)[index]
-    limit = _CLIP * 1.4826 * np.median(np.abs(rest))
-    out = np.zeros(good.shape)
-    out[good] = np.where(np.abs(rest) < limit, rest, 0.0)
+    out = np.zeros(kept.shape)
+    out[kept] = rest
     return out

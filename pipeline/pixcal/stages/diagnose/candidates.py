@@ -29,6 +29,14 @@ class Candidate:
         return 0.0 if self.estimate is None else self.estimate.significance
 
     @property
+    def in_maps_alone(self) -> bool:
+        """Whether it shows in static maps alone, whose pattern all frames have in common.
+
+        What offsets look like by chance is then the same in the held-out frames.
+        """
+        return self.estimate is not None and self.estimate.effect.domains == ("space",)
+
+    @property
     def law(self) -> Effect | None:
         """The best of its laws, where the estimate is a measured curve instead."""
         return None if self.estimate is None else self.estimate.by_law

@@ -11,7 +11,7 @@ from pixcal.estimators.diagnosis.expectation import (
     expect_nominal,
     expect_with,
 )
-from pixcal.estimators.diagnosis.gap import compare, flagged, log_likelihood, remaining
+from pixcal.estimators.diagnosis.gap import compare, flagged, likelier, log_likelihood, remaining
 from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.model.arrays import F64
 from pixcal.stages.diagnose.shrinkage import Trial, differing
@@ -61,6 +61,11 @@ class Comparison:
         for key, mean in accepted.expected.mean.items():
             variance[key] = variance[key] + (LAW_ERROR * (mean - nominal[key])) ** 2
         return self._trial(trial.effects, replace(trial.expected, variance=variance))
+
+    def gain_where_differing(self, start: Trial, trial: Trial) -> float:
+        """Rise of the log-likelihood by the test statistics that differ from ``start``."""
+        gains = likelier(self.data, start.expected, trial.expected)
+        return sum(gains[key] for key in flagged(compare(self.data, start.expected)))
 
     def differs(self, trial: Trial) -> bool:
         """Whether any test statistic of the data differs from a bench by more than chance."""

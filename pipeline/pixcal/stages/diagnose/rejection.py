@@ -26,8 +26,10 @@ def needed_gain(candidate: Candidate) -> float:
     return MIN_LOGLIK_GAIN if candidate.significance >= SIGNIFICANT else MIN_LOGLIK_GAIN_WEAK
 
 
-def too_little(gain: float) -> str:
+def too_little(gain: float, candidate: Candidate) -> str:
     """Why a candidate that was tried is rejected."""
+    if candidate.in_maps_alone and gain < MIN_LOGLIK_GAIN:
+        return "the maps of the held-out frames show no more of it than true offsets may by chance"
     if gain < MIN_LOGLIK_GAIN:
         return "the held-out frames are not fitted better"
     return (

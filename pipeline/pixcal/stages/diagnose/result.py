@@ -152,8 +152,9 @@ def _cause(
     own = estimate.significance * candidate.share
     log_both = max(float(log_ndtr(-own)) - max(gain, 0.0), -600.0)
     chance = np.exp(log_both) * (1 - log_both)
-    if facts["shared"] and not facts["sets"] and _on_the_same_pixels(facts):
-        # Both parts hold the same samples: the second says nothing new.
+    same_samples = facts["shared"] and not facts["sets"] and _on_the_same_pixels(facts)
+    if same_samples or candidate.in_maps_alone:
+        # Both parts hold the same samples, or the same offsets: the second says nothing new.
         chance = float(ndtr(-own))
     chance *= len(found.candidates) * candidate.ways
     return {

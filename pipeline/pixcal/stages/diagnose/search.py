@@ -137,7 +137,7 @@ class Search:
             gains |= enough
             laws |= {name: replays[name] for name in enough}
         for name in gains.keys() - enough.keys():
-            candidates[name].reason = too_little(gains[name])
+            candidates[name].reason = too_little(gains[name], candidates[name])
         if not enough:
             return gains, None, ""
         best = self._best(enough, causes, candidates)
@@ -250,7 +250,12 @@ class Search:
                 sure = min(sure, KNOWN_TO)
             trial = self.comparison.trial(bench, curves, sure)
             trial = self.comparison.allowing_for_laws(trial, causes.current)
-            made.append(Addition(name, effect, trial, trial.log_likelihood - start.log_likelihood))
+            gain = trial.log_likelihood - start.log_likelihood
+            if remaining[name].in_maps_alone:
+                # Chance does the same to all statistics of a pattern, which are no more unlikely
+                # together than one of them.
+                gain = min(gain, self.comparison.gain_where_differing(start, trial))
+            made.append(Addition(name, effect, trial, gain))
         for name in refused.keys() - {one.name for one in made}:
             remaining.pop(name).reason = refused[name]
         return made
