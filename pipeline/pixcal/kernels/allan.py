@@ -20,25 +20,21 @@ def averaging_lengths(n_batches: int) -> tuple[int, ...]:
 
 
 def allan_deviation(series: NDArray[np.floating], lengths: Sequence[int]) -> F64:
-    r"""Overlapping Allan deviation of each column.
+    r"""Overlapping Allan deviation of each column, in the unit of the series.
 
     .. math:: \sigma^2(m) = \tfrac12 \langle (\bar y_{k+m} - \bar y_k)^2 \rangle_k
 
-    with :math:`\bar y_k` the mean of ``m`` batches from ``k`` on, over all ``k`` for which both
-    means exist. A missing batch takes away every mean that it is part of; what it leaves is never
-    joined over the gap.
+    with :math:`\bar y_k` the mean of ``m`` batches from ``k`` on. A missing batch takes away every
+    mean that it is part of; what it leaves is never joined over the gap.
 
     Parameters
     ----------
-    series : (batch, pixel) float
-        Evenly spaced in time; NaN where there is no batch.
-    lengths : sequence of int
-        Averaging lengths in batches.
+    series : (batch, pixel) float, evenly spaced in time; NaN where there is no batch
+    lengths : averaging lengths, batches
 
     Returns
     -------
-    (length, pixel) float64
-        In the unit of ``series``; NaN where no two means are left.
+    (length, pixel) float64; NaN where no two means are left
     """
     out = np.empty((len(lengths), series.shape[1]))
     _deviations(np.ascontiguousarray(series), np.array(lengths, dtype=np.int64), out)
@@ -79,23 +75,10 @@ def _add_difference(total, missing, k, m, squares, count):  # type: ignore[no-un
 
 
 def disjoint_differences(series: NDArray[np.floating], m: int, most: int) -> F64:
-    """Differences of neighbouring means of ``m`` batches that share no batch.
+    """Differences (difference, pixel) of neighbouring means of ``m`` batches that share no batch.
 
     In white noise they are independent in time, so that their products measure what pixels share.
-
-    Parameters
-    ----------
-    series : (batch, pixel) float
-        NaN where there is no batch.
-    m : int
-        Averaging length in batches.
-    most : int
-        How many differences to take of those there are, spread over the series.
-
-    Returns
-    -------
-    (difference, pixel) float64
-        NaN where a batch is missing.
+    Of a series as in `allan_deviation`; at most ``most`` of them, spread over it.
     """
     pairs = len(series) // (2 * m)
     chosen = np.unique(np.linspace(0, pairs - 1, min(pairs, most)).round().astype(np.int64))

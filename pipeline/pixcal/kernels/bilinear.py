@@ -90,24 +90,16 @@ def sweep_block(
 
     Parameters
     ----------
-    codes : (t, y, x) array of unsigned integers
-        Stored samples; ``fill`` marks one without weight. At most some 100 frames, so that the
-        float32 sums of the block keep their precision; blocks are added in float64.
-    scale, offset : float
-        Electrons of a code.
-    g : (t, 3) float32
-        Frame parameters at the tile's centre.
-    dk : (t, 2) float32
-        Change of the fringe vector (x, y) in rad/px; used to second order inside the tile.
-    y0, x0 : float
-        Coordinates of the tile's first pixel relative to its centre.
-    theta : (3, y, x) float32
-        Start model, in electrons.
-    read, shot : (y, x) float32
-        Variance of a sample, ``shot * model + read`` (e-²).
-    sums : (N_SUMS, y, x) float64
-        Added to: normal sums 00, 01, 02, 11, 12, 22, right-hand sums 0 to 2 (of the residual to
-        the start model), weighted square of that residual, number of samples.
+    codes : (t, y, x) unsigned int, stored samples, of which ``fill`` has no weight; at most some
+        100 frames, so that the block's float32 sums keep their precision
+    scale, offset : electrons of a code
+    g : (t, 3) float32, frame parameters at the tile's centre
+    dk : (t, 2) float32, change of the fringe vector (x, y), rad/px; used to second order
+    y0, x0 : the tile's first pixel relative to its centre, px
+    theta : (3, y, x) float32, start model, e-
+    read, shot : (y, x) float32, variance of a sample: ``shot * model + read``, e-²
+    sums : (N_SUMS, y, x) float64, added to: normal sums 00, 01, 02, 11, 12, 22, right-hand sums 0
+        to 2 (of the residual to the start model), its weighted square, number of samples
     """
     ny, nx = codes.shape[1], codes.shape[2]
     p = np.empty((11, nx), np.float32)
@@ -151,18 +143,12 @@ def frame_sums(
 
     Parameters
     ----------
-    codes : (t, p) float32
-        Stored samples of p pixels; of other types it would be compiled again.
-    g, dk : (t, 3), (t, 2) float32
-        Current frame parameters; the sums are of the residual to them.
-    y, x : (p,) float32
-        Pixel coordinates relative to the point where ``g`` holds.
-    theta, read, shot : (3, p), (p,), (p,) float32
-        As in `sweep_block`.
-    normal : (t, 15) float64
-        Added to: upper triangle, row by row, of the normal matrix for (g0, g1, g2, dkx, dky).
-    right : (t, 5) float64
-        Added to: right-hand sides.
+    codes : (t, p) float32, stored samples of p pixels; of other types it would be compiled again
+    g, dk : (t, 3), (t, 2) float32, current frame parameters; sums are of the residual to them
+    y, x : (p,) float32, pixel coordinates relative to the point where ``g`` holds, px
+    theta, read, shot : (3, p), (p,), (p,) float32, as in `sweep_block`
+    normal : (t, 15) float64, added to: upper triangle, by row, for (g0, g1, g2, dkx, dky)
+    right : (t, 5) float64, added to: right-hand sides
     """
     s, o, f = np.float32(scale), np.float32(offset), np.float32(fill)
     n = codes.shape[1]
@@ -282,19 +268,9 @@ def add_right(
 def solve_pixels(sums: F64) -> tuple[F64, F64, F64]:
     """Solve the pixels' 3 x 3 systems.
 
-    Parameters
-    ----------
-    sums : (10 or more, ...) float64
-        Normal sums 00, 01, 02, 11, 12, 22; right-hand sums 0 to 2; weighted square.
-
-    Returns
-    -------
-    step : (3, ...) float64
-        Correction to the start model; NaN where the system cannot be solved.
-    covariance : (6, ...) float64
-        Upper triangle of the covariance of theta (00, 01, 02, 11, 12, 22).
-    chi2 : (...) float64
-        Weighted square of the residual that remains.
+    Of sums (10 or more, ...) as in `sweep_block`: the correction to the start model (3, ...), NaN
+    where it is not determined; the upper triangle (6, ...) of the covariance of theta; and the
+    weighted square (...) of the residual that remains.
     """
     shape = sums.shape[1:]
     flat = np.ascontiguousarray(sums, float).reshape(len(sums), -1)
@@ -335,12 +311,9 @@ def close_batch(part: F64, total: F64, model: F32, turn: F32, sigma: F32) -> Non
 
     Parameters
     ----------
-    part, total : (N_SUMS, p) float64
-        Sums of the batch, zero afterwards, and of the run, added to.
-    model : (3, p) float32
-        Start model, e-.
-    turn, sigma : (p,) float32
-        Written: rad; NaN where the batch does not give all three unknowns.
+    part, total : (N_SUMS, p) float64, sums of the batch (zero afterwards) and of the run (added to)
+    model : (3, p) float32, start model, e-
+    turn, sigma : (p,) float32, written, rad; NaN where three unknowns are not determined
     """
     _close_pixels(
         part[0], part[1], part[2], part[3], part[4], part[5], part[6], part[7], part[8],

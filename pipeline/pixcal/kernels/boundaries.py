@@ -22,16 +22,9 @@ REACH = 2  # pixels on either side of a boundary whose charge acts on it
 def boundary_shifts(falloff_px: float) -> F64:
     """Shift of the boundary between a pixel and the next one along x, by the charges around it.
 
-    Parameters
-    ----------
-    falloff_px : float
-        Distance over which the shift falls by a factor e.
-
-    Returns
-    -------
-    (2 REACH + 1, 2 REACH) float64
-        For the charges at rows ``-REACH`` to ``REACH`` and columns ``1 - REACH`` to ``REACH`` from
-        the pixel; in units of the shift by the pixel's own charge, positive to the right.
+    The shift falls by a factor e in ``falloff_px``. Of charges at rows ``-REACH`` to ``REACH`` and
+    columns ``1 - REACH`` to ``REACH`` from the pixel: (2 REACH + 1, 2 REACH) in units of the shift
+    by the pixel's own charge, positive to the right.
     """
     y = np.arange(-REACH, REACH + 1)[:, None]
     x = 0.5 - np.arange(1 - REACH, REACH + 1)[None, :]
@@ -44,13 +37,8 @@ def area_changes(falloff_px: float) -> F64:
     """Area that a pixel gains by a charge in its neighbour: a_ij of Astier et al. 2019.
 
     In flats the covariance of two pixels is this, times the shift by an electron, times the mean
-    charge squared; that of a pixel with itself is the mean charge and this.
-
-    Returns
-    -------
-    (2 REACH + 1, 2 REACH + 1) float64
-        For the charges at rows and columns ``-REACH`` to ``REACH`` from the pixel, in units of the
-        shift by an electron in px; of charges at the rim only the nearer boundaries.
+    charge squared. Of charges at rows and columns ``-REACH`` to ``REACH``, in units of the shift by
+    an electron in px; of those at the rim only the nearer boundaries count.
     """
     size = 2 * REACH + 1
     right = np.pad(boundary_shifts(falloff_px), ((0, 0), (1, 0)))
@@ -115,23 +103,16 @@ def _pushes(charge: F32, shifts: F64) -> tuple[F32, F32]:
 
 
 def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0) -> F32:
-    """What each pixel gains.
+    """What each pixel gains, (y, x) e-; its sum is zero.
+
+    Within `REACH` of the first and last row it is right only if these are edges of the window.
 
     Parameters
     ----------
-    charge : (y, x) float32
-        e-, as it would be with boundaries that stay. Beyond the edges the charge goes on as it is
-        at them; through the edges nothing moves.
-    shifts : (2 REACH + 1, 2 REACH) float64
-        From `boundary_shifts`, times the shift by an electron (px).
-    along_y : float
-        Shift of the boundaries between rows over that of those between columns.
-
-    Returns
-    -------
-    (y, x) float32
-        e-; its sum is zero. Of rows within `REACH` of the first and last row it is wrong, unless
-        these are the edges of the window.
+    charge : (y, x) float32, e-, as if boundaries stayed. Beyond the edges it goes on as it is at
+        them; through the edges nothing moves
+    shifts : from `boundary_shifts`, times the shift by an electron (px)
+    along_y : shift of the boundaries between rows over that of those between columns
     """
     charge = np.ascontiguousarray(charge, np.float32)
     push_x, push_y = _pushes(charge, shifts)
@@ -156,27 +137,17 @@ def shared_noise(
     step: tuple[int, int],
     axes: tuple[float, float] = (1.0, 1.0),
 ) -> F32:
-    """Covariance of the shot noise of each pixel and the one at a step from it.
+    """Covariance (t, y, x) of the shot noise of each pixel and the one at a step from it, e-².
 
-    To first order in the shift, for any scene.
+    To first order in the shift, for any scene; zero where either lies within `REACH` of the edges.
 
     Parameters
     ----------
-    charge : (t, y, x) float32
-        Mean charge, e-.
-    pushes
-        From `boundary_pushes`.
-    shifts
-        As in `moved_charge`.
-    step : (int, int)
-        Rows and columns.
-    axes : (float, float)
-        Factors of the shifts of boundaries between columns and between rows.
-
-    Returns
-    -------
-    (t, y, x) float32
-        e-²; zero for pixels within `REACH` of the edges, or with the other one there.
+    charge : (t, y, x) float32, mean charge, e-
+    pushes : from `boundary_pushes`
+    shifts : as in `moved_charge`
+    step : rows and columns
+    axes : factors of the shifts of boundaries between columns and between rows
     """
     out = np.zeros_like(charge)
     (dy, dx), (_, ny, nx) = step, charge.shape

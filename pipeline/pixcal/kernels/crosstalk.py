@@ -91,14 +91,10 @@ def _acts(coupling: Coupling) -> bool:
 def couple(
     signal: NDArray[Any], couplings: Sequence[Coupling], first: tuple[int, int] = (0, 0)
 ) -> NDArray[Any]:
-    """Signal that is read, from the signal collected.
+    """Signal (..., y, x) that is read, from the signal collected.
 
-    Parameters
-    ----------
-    signal : (..., y, x) float
-        Electrons (where shares change with the signal; else any unit).
-    first : (int, int)
-        First row and column of the array in the window.
+    In electrons where shares change with the signal, else in any unit; ``first`` is the array's
+    first row and column in the window.
     """
     out = signal.copy()
     for c in filter(_acts, couplings):
@@ -115,18 +111,11 @@ def couple(
 def couple_fringes(
     theta: F64, couplings: Sequence[Coupling], first: tuple[int, int] = (0, 0)
 ) -> F64:
-    """What becomes of the three maps of a fit (physics note, section 5).
+    """What becomes of the maps theta (3, y, x), e-, of a fit (physics note, section 5).
 
-    A share that changes with the signal is taken at frames of intensity and amplitude 1: the mean
-    takes the mean of the squared signal, ``iota² + alpha² / 2``, the fringe its slope,
-    ``2 iota alpha``; the second harmonic is not in the maps.
-
-    Parameters
-    ----------
-    theta : (3, y, x) float64
-        (iota, alpha sin psi, alpha cos psi), e-, as collected: not divided by a flat.
-    first : (int, int)
-        First row and column of the maps in the window.
+    They are as collected: not divided by a flat. A share that changes with the signal is taken at
+    frames of intensity and amplitude 1: the mean takes the mean of the squared signal, ``iota² +
+    alpha² / 2``, the fringe its slope, ``2 iota alpha``; the second harmonic is not in the maps.
     """
     out = theta.copy()
     for c in filter(_acts, couplings):
@@ -157,8 +146,8 @@ def uncouple_fringes(
 def _inverse(data: F64, forward: Callable[[F64], F64]) -> F64:
     """By fixed point: what is left over is given back.
 
-    Each step shrinks the rest by the shares that leave a pixel: for kernels of a tenth, some 15
-    steps to the last digit. It exists for any kernel that leaves every pixel most of its own.
+    Each step shrinks the rest by the shares that leave a pixel: for a tenth, some 15 steps to the
+    last digit.
     """
     found = data.copy()
     size = float(np.max(np.abs(data), initial=0.0))
@@ -196,15 +185,10 @@ def largest_outflow(couplings: Sequence[Coupling]) -> float:
 def noise_shares(
     couplings: Sequence[Coupling], shape: tuple[int, int], first: tuple[int, int] = (0, 0)
 ) -> tuple[F64, F64]:
-    """Variance of a pixel read through the couplings, and of one after they are undone.
+    """Noise of a pixel read through the couplings, and after they are undone, both (y, x).
 
-    Returns
-    -------
-    read : (y, x) float64
-        Of the sum of squares of what a pixel keeps and gets: shot noise after the couplings, for
-        shot noise of 1 in every pixel.
-    undone : (y, x) float64
-        The same of the inverse, to second order in the shares: read noise after undoing.
+    The first is the variance for shot noise of 1 in every pixel; the second that of read noise of 1
+    after the inverse, to second order in the shares.
     """
     kept, got = 1 - outflow(couplings, shape, first), np.zeros(shape)
     for c in couplings:

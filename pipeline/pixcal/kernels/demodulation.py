@@ -47,25 +47,15 @@ def window_sums(
 
     Parameters
     ----------
-    signal : (y, x) float32 or float64
-        Tile of a frame, electrons.
-    good : (y, x) bool
-        Samples to use.
-    start : (int, int)
-        (y, x) of the tile's first pixel.
-    layout : (6,) float64
-        Direction cosines (x, y) across the fringes, first edge across and along, and size across
-        and along of the windows, px.
-    first : (int, int)
-        Number across and along of the window that ``sums[0, 0]`` belongs to.
-    carrier : (n, n) float64
-        Phase P in rad: ``sum carrier[i, j] Y^i X^j``.
-    light : (n, n) float64
-        Logarithm of the smooth illumination, in the same way.
-    frame : (3,) float64
-        ``X = (x - frame[0]) / frame[2]``, ``Y = (y - frame[1]) / frame[2]``.
-    sums : (across, along, N_SUMS) float64
-        Added to.
+    signal, good : (y, x) electrons, and samples to use
+    start : (y, x) of the tile's first pixel
+    layout : (6,) direction cosines (x, y) across the fringes, first edge across and along, and size
+        across and along of the windows, px
+    first : number across and along of the window that ``sums[0, 0]`` belongs to
+    carrier, light : (n, n) phase P in rad, ``sum carrier[i, j] Y^i X^j``, and logarithm of the
+        smooth illumination in the same way
+    frame : (3,) ``X = (x - frame[0]) / frame[2]``, ``Y = (y - frame[1]) / frame[2]``
+    sums : (across, along, N_SUMS), added to
     """
     ux, uy, edge_u, edge_v, width, length = layout
     row, light_row = np.empty(carrier.shape[0]), np.empty(light.shape[0])
@@ -106,21 +96,11 @@ def window_sums(
 
 
 def solve_windows(sums: F64) -> tuple[F64, F64, F64]:
-    """Phase of each window from its sums.
+    """Phase of each window from its sums (window, N_SUMS), its error and its light.
 
-    Parameters
-    ----------
-    sums : (window, N_SUMS) float64
-        As `window_sums` leaves them.
-
-    Returns
-    -------
-    phase : (window,) float64
-        delta in ``cos(P + delta)`` at the window's centre, rad, in ±pi.
-    sigma : (window,) float64
-        Its error, from the scatter about the model, rad; infinite where nothing can be said.
-    background : (window,) float64
-        Mean light at the centre, in units of the illumination.
+    The phase is delta in ``cos(P + delta)`` at the window's centre, rad, in ±pi; the error is from
+    the scatter about the model, rad, infinite where nothing can be said; the light is the mean at
+    the centre, in units of the illumination.
     """
     count = sums[:, -1]
     phase, background = np.zeros(len(sums)), np.zeros(len(sums))

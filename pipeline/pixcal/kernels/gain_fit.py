@@ -56,27 +56,17 @@ def fit_gain(
 ) -> GainFit | None:
     """Fit the curve through the points of variance against level, from the read noise on.
 
-    The weights come from the curve itself, never from the measured variances: those that are low
-    by chance would weigh more.
+    The weights come from the curve itself: measured variances that are low by chance would weigh
+    more. None when nothing is above the read noise.
 
     Parameters
     ----------
-    sums : (N_BINS, 3) float64
-        As `photon_transfer.add_neighbours` gives them.
-    read_variance : (float, float)
-        Variance at level zero and its error (ADU²).
-    highest : float
-        Highest level to use (ADU).
-    level_error : float
-        By which all levels may be too high or too low (ADU): the bias wanders.
-    straight : bool
-        Fit a line only: within few flats the level changes from place to place, as the amplifiers
-        do.
-
-    Returns
-    -------
-    GainFit or None
-        None when nothing is above the read noise.
+    sums : (N_BINS, 3) from `photon_transfer.add_neighbours`
+    read_variance : variance at level zero and its error, ADU²
+    highest : highest level to use, ADU
+    level_error : by which all levels may be too high or too low, ADU: the bias wanders
+    straight : fit a line only: within few flats the level changes from place to place, as the
+        amplifiers do
     """
     dof = sums[:, 0]
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -30,25 +30,18 @@ def product_sums(
 
     Parameters
     ----------
-    rest, model : (t, y, x) float32
-        Residuals, NaN without weight, and what they are left of, e-.
-    shot_factor, read : (y, x) float32
-        Variance of a sample: ``shot_factor * model + read``, e-².
+    rest, model : (t, y, x) float32, residuals (NaN without weight) and their model, e-
+    shot_factor, read : (y, x) float32, variance of a sample: ``shot_factor * model + read``, e-²
     good : (y, x) bool
-    of_time, of_pixels : (t, k), (k, y, x) float32
-        Their product over the variance is the share of a sample's variance that its pixel's own
-        fit took up.
-    steps : (n, 2) int64
-        Rows and columns; rows not negative.
-    taken : (n,) float32
-        Covariance that the fits of the frames took off such products, as a share of the variance.
-    limit : float
-        Standard deviations beyond which a residual has no weight.
+    of_time, of_pixels : (t, k), (k, y, x) float32; their product over the variance is the share of
+        a sample's variance that its pixel's own fit took up
+    steps : (n, 2) int64, rows (not negative) and columns
+    taken : (n,) float32, covariance that the frames' fits took off, as a share of the variance
+    limit : standard deviations beyond which a residual has no weight
 
     Returns
     -------
-    (n, 7) float64
-        Number, normal matrix (11, 12, 22), right-hand side (1, 2), sum of squared products.
+    (n, N_SUMS) float64
     """
     frames, ny, nx = rest.shape
     sums = np.zeros((len(steps), 7))

@@ -58,22 +58,10 @@ class Geometry:
 
 
 def phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
-    """Exact fringe phase, good to 1e-9 rad.
+    """Exact fringe phase psi, rad, good to 1e-9 rad, at pixel coordinates.
 
     The difference of the two paths (paper, eq. 3) loses seven digits when taken as written; this
     is ``(s_A - s_B)·(s_A + s_B - 2 r) / (|r - s_A| + |r - s_B|)`` (physics note, section 1).
-
-    Parameters
-    ----------
-    x, y : array_like
-        Pixel coordinates, px; broadcast against each other.
-    geometry : Geometry
-        From the same origin.
-
-    Returns
-    -------
-    ndarray of float64
-        psi in rad, of the broadcast shape.
     """
     xs, ys = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
     out = np.empty(xs.shape)
@@ -110,7 +98,7 @@ def paraxial_vector(geometry: Geometry) -> tuple[float, float]:
 def paraxial_phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
     """Phase of straight fringes (paper, eq. 4), zero at the foot of the fibres' centre.
 
-    Parameters and result as `phase`; the tilt of the baseline is left out, as in the paper.
+    As `phase`; the tilt of the baseline is left out, as in the paper.
     """
     kx, ky = paraxial_vector(geometry)
     xs, ys = np.asarray(x, float), np.asarray(y, float)

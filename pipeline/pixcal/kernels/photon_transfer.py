@@ -116,21 +116,18 @@ def pair_statistics(
 
     Parameters
     ----------
-    first, second : (y, x) float32
-        Two frames of the same scene, made equally bright, in ADU above bias and dark; NaN where a
-        sample is not to be used.
-    gain, read_noise : float
-        Rough guess (e-/ADU; ADU, above zero), only to tell outliers from noise where the level
-        changes within a block.
-    quantum : float
-        Step of the samples (ADU).
+    first, second : (y, x) float32, frames of the same scene, made equally bright, ADU above bias
+        and dark; NaN is not used
+    gain, read_noise : rough guess, e-/ADU and ADU, only to tell outliers from noise where the level
+        changes within a block
+    quantum : step of the samples, ADU
 
     Returns
     -------
     (block, COLUMNS) float64
         Degrees of freedom, level (ADU), variance of one sample (ADU²) without outliers, corrected
-        for the clipping, and covariance (ADU²) of pixels apart by each of `LAGS`. All zero for the
-        rest of a block at the edge that has fewer than 32 pixels.
+        for the clipping, and covariance (ADU²) of pixels apart by each of `LAGS`. All zero for
+        blocks of fewer than 32 pixels.
     """
     blocks = math.prod(-(-n // BLOCK) for n in first.shape)
     ratios = np.full((BLOCK * BLOCK, blocks), np.nan, np.float32)
@@ -176,25 +173,13 @@ def neighbour_noise(frames: F32, lags: Sequence[tuple[int, int]]) -> float:
 
 
 def add_neighbours(lit: F64, dark: F64) -> tuple[F64, list[tuple[int, int]]]:
-    """Noise with that which neighbours share.
+    """Noise with that which neighbours share, (N_BINS, 3), and the lags (y, x) it came from.
 
     Covariances beyond those without light are added to the variance of the pixel itself, twice for
-    the two neighbours, where they are significant over all levels: the rest would only add noise.
-    Where any is, less is needed of the others: a kernel that reaches the nearest pixels reaches
-    those on the diagonal a little, and in twelve lags a little adds up.
-
-    Parameters
-    ----------
-    lit, dark : (N_BINS, COLUMNS) float64
-        As `bin_pairs` gives them, of flats and of frames without light.
-
-    Returns
-    -------
-    sums : (N_BINS, 3) float64
-        Of the flats; the degrees of freedom are those that their scatter has.
-    added : list of (int, int)
-        The lags that were added; (0, 0) alone where noise is the same at all of them. Charge does
-        not reach that far: it is the light of the lamp, and is not added.
+    the two neighbours, where they are significant over all levels. Where any is, less is needed of
+    the others: a kernel that reaches the nearest pixels reaches those on the diagonal a little, and
+    in twelve lags a little adds up. The lag is (0, 0) alone where all pixels share noise. ``lit``
+    and ``dark`` are from `bin_pairs`, of flats and of frames without light.
     """
     sums = lit[:, :3].copy()
     used = np.flatnonzero((lit[:, 0] > 0) & (lit[:, 1] > 0))

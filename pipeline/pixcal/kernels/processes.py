@@ -81,13 +81,9 @@ def swing(time_s: F64, hz: float, phase: float, exptime_s: float = 0.0) -> F64:
 def brownian(time: float, normal: Callable[[int, int], float]) -> float:
     """Random walk of unit variance a unit of time, at one time from 0 to `HORIZON`.
 
-    Lévy's construction by ever finer hats: any time can be asked for by itself. Straight between
-    multiples of ``HORIZON / 2**LEVELS``.
-
-    Parameters
-    ----------
-    normal : callable
-        Standard normal of a level and a place in it, the same whenever it is asked for.
+    Lévy's construction by ever finer hats, so that any time can be asked for by itself; straight
+    between multiples of ``HORIZON / 2**LEVELS``. ``normal`` gives the standard normal of a level
+    and a place in it, the same whenever it is asked for.
     """
     at = min(max(time / HORIZON, 0.0), 1.0)
     value = at * normal(0, 0)

@@ -47,18 +47,9 @@ class Psf:
         return float(self.at(0.0, 0.0)[0])
 
     def at(self, x: ArrayLike, y: ArrayLike) -> F64:
-        """Share of the light and its derivatives along x and y.
+        """Share of the light and its derivatives along x and y: (3, ...) of 1, 1/px, 1/px.
 
-        Parameters
-        ----------
-        x, y : array_like
-            Centre of the pixel minus the star, px; broadcast against each other. Beyond `reach`
-            the share is that at its edge.
-
-        Returns
-        -------
-        (3, ...) float64
-            1, 1/px, 1/px.
+        At the centre of a pixel minus the star (px); beyond `reach` it is that at the edge.
         """
         xs, ys = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
         found = _shares(self.coefficients, self.step, xs.ravel(), ys.ravel())
@@ -66,14 +57,10 @@ class Psf:
 
 
 def diffraction_psf(sampling: float, obscuration: float, half: int) -> Psf:
-    """The pattern of a telescope, averaged over square pixels, up to so far (px) from the star.
+    """The pattern of a telescope, averaged over square pixels, up to ``half`` px from the star.
 
-    Parameters
-    ----------
-    sampling : float
-        q, pixels in lambda / D.
-    obscuration : float
-        Diameter of the central obscuration over that of the aperture, 0 to below 1.
+    ``sampling`` is q, pixels in lambda / D; ``obscuration`` the diameter of the central obscuration
+    over that of the aperture, 0 to below 1.
     """
     step = sampling / KNOTS
     side = math.ceil((half + MARGIN) / step) + 3

@@ -12,10 +12,9 @@ _DIGIT = 16  # bits that are counted at a time
 def quantiles_of_parts(
     parts: Callable[[], Iterable[F32]], levels: Sequence[float] | F64
 ) -> tuple[F64, int]:
-    """Quantiles of positive numbers in parts, the same as `numpy.quantile` gives of all at once.
+    """Quantiles of positive finite numbers in parts (n,), as `numpy.quantile` of all at once.
 
-    With them, empty if there are no numbers, how many there are. ``parts`` is called twice, and
-    gives the parts, (n,) float32 each, above zero and finite.
+    Returns them, empty if there are no numbers, and how many there are; ``parts`` is called twice.
     """
     # The bits of positive floats, as integers, are in the order of their values.
     counts = np.zeros(1 << _DIGIT, np.int64)

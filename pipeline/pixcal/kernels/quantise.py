@@ -32,24 +32,10 @@ class Scale:
 
 
 def choose_scale(low: float, high: float, smallest_variance: float, share: float) -> Scale:
-    """Coarsest step that costs less than a share of the variance, and covers a range.
+    """Coarsest step that covers a range (e-) and adds less than a share of the variance (e-²).
 
-    Steps are powers of two where one will do, so that integers stay what they were. Where the
-    range needs a coarser step than the noise allows, the range wins.
-
-    Parameters
-    ----------
-    low, high : float
-        Range to cover (e-).
-    smallest_variance : float
-        Of any sample (e-²).
-    share : float
-        Of that variance that rounding may add.
-
-    Returns
-    -------
-    Scale
-        Its offset is a whole number of steps.
+    Steps are powers of two where one will do, so that integers stay what they were, and offsets
+    whole steps. Where the range needs a coarser step than the noise allows, the range wins.
     """
     span = max(high - low, 1e-6)
     # Two codes in reserve: the offset is rounded down, the ends are rounded.
@@ -104,27 +90,17 @@ def encode(
 ) -> int:
     """Convert raw frames of a tile to codes: ``raw * slope + start - dark * exptime``, rounded.
 
+    Returns the sum of the codes that have weight.
+
     Parameters
     ----------
-    raw : (t, y, at least x0 + x) any real type
-        Samples in ADU; the tile's columns begin at ``x0``.
-    slope, start, dark : (y, x) float32
-        In codes per ADU, codes, and codes per second, see `coefficients`.
-    exptime : (t,) float32
-        Exposure times (s).
-    saturation : float32
-        Samples at or above this level (ADU) get the fill value.
-    codes : (t, y, x) uint16
-        Result; samples that are saturated, not finite or out of range get `FILL`.
-    saturated, lost : (y, x) uint32
-        Counts to add to: saturated samples; others that got the fill value.
-    x0 : int
-        Rows of a wider block are taken where they lie: to copy them takes as long as this.
-
-    Returns
-    -------
-    int
-        Sum of the codes of the samples that have weight.
+    raw : (t, y, at least x0 + x) real, ADU; the tile's columns begin at ``x0``: a copy of them
+        would take as long as this
+    slope, start, dark : (y, x) float32, from `coefficients`
+    exptime : (t,) float32, s
+    saturation : float32, ADU; samples at or above it get `FILL`, as do those out of range
+    codes : (t, y, x) uint16, written
+    saturated, lost : (y, x) uint32, added to: saturated samples; others without weight
     """
     total = 0
     nx = codes.shape[2]
@@ -145,18 +121,8 @@ def coefficients(
 ) -> tuple[F32, F32, F32]:
     """What `encode` needs, so that the codes mean ``(gain (raw - bias) - dark t) / flat``.
 
-    Parameters
-    ----------
-    scale : Scale
-        Step and offset of the codes.
-    gain : float
-        e-/ADU.
-    bias, dark_rate, flat : (y, x) float32
-        ADU; e-/s; relative response.
-
-    Returns
-    -------
-    slope, start, dark : (y, x) float32
+    From ``gain`` (e-/ADU), ``bias`` (ADU), ``dark_rate`` (e-/s) and relative ``flat``, all (y, x):
+    slope (codes/ADU), start (codes) and dark (codes/s).
     """
     to_codes = 1 / (scale.step * flat.astype(float))
     slope = gain * to_codes
@@ -178,14 +144,7 @@ def _extremes_of_row(raw: Any, saturation: float, lowest: Any, highest: Any) -> 
 def extremes(raw: Any, saturation: float, lowest: Any, highest: Any, x0: int = 0) -> None:
     """Widen the range of each pixel's samples below saturation by those of more frames.
 
-    Parameters
-    ----------
-    raw : (t, y, at least x0 + x) any real type
-        Samples in ADU; the tile's columns begin at ``x0``.
-    saturation : float32
-        Samples at or above do not count, nor does NaN.
-    lowest, highest : (y, x) float32
-        Begin with +inf and -inf.
+    Of frames as in `encode`; ``lowest`` and ``highest`` (y, x) float32 begin with +inf and -inf.
     """
     for y in range(raw.shape[1]):
         for t in range(raw.shape[0]):

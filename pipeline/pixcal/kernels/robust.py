@@ -99,18 +99,7 @@ def _median_and_deviation(frames: Any, median: Any, deviation: Any) -> None:
 
 
 def median_and_deviation(frames: F32) -> tuple[F32, F32]:
-    """Median of each pixel over the frames, and the median of the absolute deviations from it.
-
-    Parameters
-    ----------
-    frames : (t, y, x) float32
-        NaN where there is no sample.
-
-    Returns
-    -------
-    median, deviation : (y, x) float32
-        NaN where a pixel has no sample at all.
-    """
+    """Median (y, x) of frames (t, y, x), NaN apart, and of the absolute deviations from it."""
     median = np.empty(frames.shape[1:], np.float32)
     deviation = np.empty_like(median)
     _median_and_deviation(frames, median, deviation)
@@ -167,12 +156,9 @@ class Combination:
 
     Parameters
     ----------
-    clip : float
-        Limit in sigmas.
-    lamp : bool
-        What frames have in common is a factor (a lamp's power); else it is an offset.
-    quantum : float
-        Step of the samples, added to the limits, so that noise below it does not close them.
+    clip : limit, sigmas
+    lamp : what frames have in common is a factor (a lamp's power); else an offset
+    quantum : step of the samples, added to the limits, so that noise below it does not close them
     """
 
     def __init__(self, *, clip: float, lamp: bool, quantum: float) -> None:
@@ -186,18 +172,10 @@ class Combination:
         self._levels: list[F32] = []
 
     def update(self, frames: F32) -> F32:
-        """Add frames; the first call sets the limits, so give it `BATCH` frames or all.
+        """Add frames (t, y, x), NaN without sample; the first `BATCH` of them, or all, set limits.
 
-        Parameters
-        ----------
-        frames : (t, y, x) float32
-            NaN where there is no sample.
-
-        Returns
-        -------
-        (t,) float32
-            What each frame has in common with no other: its factor, or its offset, to the first
-            batch; NaN for a frame without samples.
+        Returns what each frame has in common with the first batch (t,), its factor or offset; NaN
+        for a frame without samples.
         """
         if self._reference is None:
             self._start(frames)

@@ -52,22 +52,15 @@ def level_before_rounding(mean: F64, sigma: float) -> F64:
 def noise_before_rounding(
     variance: float, error: float, means: F64, frames: float
 ) -> tuple[float, float] | None:
-    """Noise that has some variance, on average over pixels, once it is rounded.
+    """Noise that has some variance, on average over pixels, once it is rounded; and its error.
+
+    None where the samples do not tell: noise far below a step, in pixels whose levels all lie at
+    about the same distance from the next change of code.
 
     Parameters
     ----------
-    variance, error : float
-        Of a sample, on average over the pixels; its standard error.
-    means : (n,) float64
-        Mean samples of pixels like these, over the frames.
-    frames : float
-        How many.
-
-    Returns
-    -------
-    sigma, error : float
-        None where the samples do not tell: noise far below a step, in pixels whose levels all lie
-        at about the same distance from the next change of code.
+    variance, error : of a sample, on average over the pixels, and its standard error
+    means : (n,) mean samples of pixels like these, over so many ``frames``
     """
     if variance > SMOOTH**2 + SHEPPARD:
         sigma = float(np.sqrt(variance - SHEPPARD))

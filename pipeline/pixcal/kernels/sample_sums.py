@@ -22,23 +22,15 @@ def row_sums(
 
     Parameters
     ----------
-    rest, weight, light : (t, y, x) float32
-        Residuals, finite; their weight; what is looked for in them.
-    g : (t, 3) float32
-    theta : (3, y, x) float32
-        Finite.
+    rest, weight, light : (t, y, x) float32, finite: residuals, weights, what to look for in them
+    g, theta : (t, 3), (3, y, x) float32, finite
     y, x : (y,), (x,) float32
 
     Returns
     -------
-    inner : (t, 15) float64
-        Of the modes with each other, over the frame: the upper triangle, row by row.
-    of_rest : (t, 5) float64
-        Of the modes with the residuals, over the frame.
-    across : (t, y, 5) float64
-        Of the modes with the light, by row.
-    own : (y, 2) float64
-        Of the light with itself and with the residuals, over all frames.
+    inner, of_rest : (t, 15), (t, 5), of the modes with each other (upper triangle) and with rest
+    across : (t, y, 5), of the modes with the light, by row
+    own : (y, 2), of the light with itself and with the residuals, over all frames
     """
     nt, ny, nx = rest.shape
     packed, of_rest = np.zeros((nt, MODES * (MODES + 1) // 2)), np.zeros((nt, MODES))
@@ -68,10 +60,7 @@ _FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def calm_residuals(rest: F32, variance: F32, good: Mask, limit: float) -> tuple[F32, F32]:
-    """Residuals (t, y, x) over their noise, and as they are; zero for outliers and without weight.
-
-    They are NaN without weight, and outliers beyond a limit in standard deviations.
-    """
+    """Residuals (t, y, x) over their noise, and as they are; zero for outliers and NaN."""
     calm, kept = np.empty_like(rest), np.empty_like(rest)
     most, zero = np.float32(limit), np.float32(0)
     for t in range(rest.shape[0]):
@@ -87,19 +76,7 @@ def calm_residuals(rest: F32, variance: F32, good: Mask, limit: float) -> tuple[
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def count_beyond(rest: F32, variance: F32, good: Mask, limits: F64) -> tuple[F64, F64]:
-    """How many residuals of good pixels are below and above some standard deviations.
-
-    Parameters
-    ----------
-    rest, variance, good
-        As in `calm_residuals`.
-    limits : (n,) float64
-        Ascending.
-
-    Returns
-    -------
-    below, above : (n,) float64
-    """
+    """How many residuals of good pixels are below and above ascending limits (n,), in sigmas."""
     below, above = np.zeros(len(limits)), np.zeros(len(limits))
     least = np.float32(limits[0] ** 2)
     for t in range(rest.shape[0]):
@@ -120,14 +97,8 @@ def level_sums(
 ) -> None:
     """Add samples of good pixels to bins of their level; beyond the last bin they are in it.
 
-    Parameters
-    ----------
-    level, values, squared : (t, y, x) float32
-    good : (y, x) bool
-    low, step : float
-        Where the first bin begins, and how wide bins are.
-    sums : (n, 3) float64
-        Added to: count, sum of values, sum of the squares of the others.
+    Of ``level``, ``values``, ``squared`` (t, y, x); bins begin at ``low`` and are ``step`` wide.
+    To ``sums`` (n, 3) are added count, sum of values, sum of the squares of the others.
     """
     first, scale, last = np.float32(low), np.float32(1 / step), len(sums) - 1
     for t in range(level.shape[0]):
@@ -173,23 +144,19 @@ def frame_means(values: Any, good: Mask) -> F64:
 
 @njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
 def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) -> F64:
-    """Sums of the products of samples with those some rows and columns on, all steps in one sweep.
+    """Sums of the products of samples with those some rows and columns on, by the first row.
 
     Parameters
     ----------
     values : (t, y, x) float32
-    pairs : (step, y, x) float32
-        Weight of each pair, by the place of its first row and of its column that is further left;
-        those that reach beyond the edges are not looked at.
-    steps : (step, 2) int
-        Rows down, not negative, and columns to the right.
-    every : int
-        Only every so many frames.
+    pairs : (step, y, x) float32, weight of each pair, by the place of its first row and of its
+        column that is further left; those beyond the edges are not looked at
+    steps : (step, 2) int, rows down (not negative) and columns to the right
+    every : only every so many frames
 
     Returns
     -------
     (step, y) float64
-        By the first row.
     """
     sums = np.zeros((len(steps), values.shape[1]))
     for t in range(0, values.shape[0], every):

@@ -54,19 +54,10 @@ def chip_map(
     effect: str,
     draw: Callable[[np.random.Generator], NDArray[Any]],
 ) -> F32:
-    """What an effect does to each pixel of the chip, on rows of the window (first, one after).
+    """What an effect does to each pixel, (y, x), on rows of the window (first, one after).
 
-    Parameters
-    ----------
-    effect : str
-        Whose random numbers.
-    draw : callable
-        From a generator, the values of a tile of the chip, of shape `TILE`; the same chip has the
-        same values in every window.
-
-    Returns
-    -------
-    (y, x) float32
+    ``effect`` names its random numbers; ``draw`` makes the values of a tile of the chip, of shape
+    `TILE`, from a generator: the same chip has the same values in every window.
     """
     out = np.empty((rows[1] - rows[0], detector.shape[1]), np.float32)
     name = zlib.crc32(effect.encode())
@@ -213,16 +204,7 @@ def light_maps(
 ) -> LightMaps:
     """Mean and amplitude of straight fringes, through the pixels' response and at their offsets.
 
-    Parameters
-    ----------
-    number : int
-        Of the fringe set.
-    rows : tuple of int
-        First row of the window and the one after the last.
-    maps : DetectorMaps
-        Of the same rows.
-    electrons : float
-        From `electrons_per_unit`.
+    On rows of the window with their maps; ``electrons`` is from `electrons_per_unit`.
     """
     a, b = fibre_light(bench, number, rows)
     x = np.arange(bench.detector.shape[1]) + maps.delta_x.astype(np.float64)

@@ -90,15 +90,11 @@ def illuminate(
 
     Parameters
     ----------
-    iota, alpha_sin, alpha_cos : ndarray of float32, shape (y, x)
-        e-; alpha times sin psi and cos psi.
-    level, amplitude : float
-        B and A of the frame.
-    column_turn, row_turn : ndarray of float32, shape (2, x) and (2, y)
-        cos and sin of the frame's phase: phi and what grows along y in the rows, what grows along
-        x in the columns.
-    out : ndarray of float32, shape (y, x)
-        e-.
+    iota, alpha_sin, alpha_cos : (y, x) float32, e-; alpha times sin psi and cos psi
+    level, amplitude : B and A of the frame
+    column_turn, row_turn : (2, x), (2, y) float32, cos and sin of the frame's phase: phi and what
+        grows along y in the rows, what grows along x in the columns
+    out : (y, x) float32, e-
     """
     b, a = np.float32(level), np.float32(amplitude)
     for i in range(out.shape[0]):
@@ -111,27 +107,15 @@ def illuminate(
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def collect(light: F32, dark: F32, normal: F32, shot: bool, full_well: float, out: F32) -> None:
-    """Charge of each pixel: whole electrons when there is shot noise.
+    """Charge ``out`` of each pixel, (y, x) e-, clipped at the full well; whole with shot noise.
 
     The Poisson variate is the quantile of its distribution at the probability of a standard normal
     w, so that the same random numbers serve every level. From `EXACT_BELOW` up the quantile is
     Giles' expansion in 1/sqrt(mean) to second order (ACM TOMS 42(1), 6, 2016, function Q_N2),
     rounded down: there its distribution function is within 2e-5 of the exact one, mean, variance
     and skewness within 1e-8, 1.1e-4 and 2e-4 of theirs (computed at mean 16, falling fast above it;
-    the tests repeat it). Below, it is exact.
-
-    Parameters
-    ----------
-    light, dark : ndarray of float32, shape (y, x)
-        Mean electrons from light and from dark current.
-    normal : ndarray of float32, shape (y, x)
-        Standard normals.
-    shot : bool
-        False: the charge is its mean.
-    full_well : float
-        Charge is clipped here, e-.
-    out : ndarray of float32, shape (y, x)
-        e-.
+    the tests repeat it). Below, it is exact. ``light`` and ``dark`` are mean electrons, ``normal``
+    standard normals; without ``shot`` the charge is its mean.
     """
     well, least = np.float32(full_well), np.float32(EXACT_BELOW)
     if not shot:
@@ -184,21 +168,7 @@ def poisson_quantile(mean: float, w: float) -> int:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def amplify(signal: F32, bias: F32, normal: F32, read_noise: F32, adu_per_e: F32, out: F32) -> None:
-    """Electrons in ADU, with read noise and bias.
-
-    Parameters
-    ----------
-    signal : ndarray of float32, shape (y, x)
-        e-.
-    bias : ndarray of float32, shape (y, x)
-        ADU.
-    normal : ndarray of float32, shape (y, x)
-        Standard normals.
-    read_noise, adu_per_e : ndarray of float32, shape (y, x)
-        e- rms, and the inverse of the gain.
-    out : ndarray of float32, shape (y, x)
-        ADU.
-    """
+    """Electrons (y, x) in ADU, with read noise (e- rms) times standard normals, and bias (ADU)."""
     for i in range(out.shape[0]):
         for j in range(out.shape[1]):
             electrons = signal[i, j] + read_noise[i, j] * normal[i, j]
@@ -221,22 +191,8 @@ def block_normals(
 ) -> list[F32]:
     """Standard normals for some rows of the window, whichever blocks they lie in.
 
-    Parameters
-    ----------
-    rows : tuple of int
-        First row and the one after the last.
-    columns : int
-        Width of the window.
-    seed : int
-        Of the bench.
-    key : tuple of int
-        Kind, sequence and frame.
-    count : int
-        How many independent arrays (shot noise, read noise).
-
-    Returns
-    -------
-    list of ndarray of float32, shape (y, x)
+    ``count`` independent arrays (y, x) for shot noise, read noise, ...; the key is kind, sequence
+    and frame.
     """
     first, last = rows
     begin, end = first // BLOCK_ROWS, -(-last // BLOCK_ROWS)

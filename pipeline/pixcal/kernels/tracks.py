@@ -30,18 +30,14 @@ def _spread(centre: float, first: int, sigma: float, out: Any) -> None:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def add_tracks(charge: F32, tracks: F64, sigma: float, first_row: int) -> None:
-    """Add the charge of tracks to a frame.
+    """Add the charge of tracks to a frame (y, x), e-; what falls beside it is lost.
 
     Parameters
     ----------
-    charge : (y, x) float32
-        e-, changed in place; what falls beside it is lost.
-    tracks : (n, 5) float64
-        Row and column where a track begins, its length along each (px), its charge (e-).
-    sigma : float
-        Width of the blur, px.
-    first_row : int
-        Of the frame, among those that the tracks are counted in.
+    charge : (y, x) float32, e-, changed in place
+    tracks : (n, 5) row and column where a track begins, its length along each (px), its charge (e-)
+    sigma : width of the blur, px
+    first_row : of the frame, among those that the tracks are counted in
     """
     ny, nx = charge.shape
     reach = math.ceil(_RANGE * sigma)
@@ -72,23 +68,14 @@ def draw_tracks(
     electrons_per_px: float,
     straggling: float,
 ) -> F64:
-    """Tracks of particles that arrive evenly from a half space.
+    """Tracks (count, 5), as in `add_tracks`, of particles that arrive evenly from a half space.
 
     Parameters
     ----------
-    area_px, margin_px : (int, int), int
-        Rows and columns that tracks begin in, and how far beside them.
-    depth_px : float
-        Of the sensitive layer.
-    electrons_per_px : float
-        Most probable charge for a length of the track as long as a pixel is wide.
-    straggling : float
-        Width of the distribution of charge (Moyal's form of Landau's), relative to its maximum.
-
-    Returns
-    -------
-    (count, 5) float64
-        As in `add_tracks`.
+    area_px, margin_px : rows and columns that tracks begin in, and how far beside them
+    depth_px : of the sensitive layer
+    electrons_per_px : most probable charge for a length as long as a pixel is wide
+    straggling : relative width of the distribution of charge (Moyal's form of Landau's)
     """
     # A flux that is even in direction meets a plane with the cosine of the angle.
     cosine = np.sqrt(rng.random(count))

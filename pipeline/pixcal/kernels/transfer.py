@@ -12,16 +12,12 @@ def left_behind(charge: F32, share: F32, begins: F32, weights: F32, normal: F32,
 
     Parameters
     ----------
-    charge : (y, x) float32
-        e-.
-    share : (y, x) float32
-        Chance of an electron, on the mean.
-    begins, weights : (band,) float32
-        Where bands of the charge begin (e-), and the chance in each over the mean one.
-    normal : (y, x) float32
-        Standard normals; zero for the mean.
-    out : (y, x) float32
-        e-, from zero to the charge.
+    charge : (y, x) float32, e-
+    share : (y, x) float32, chance of an electron, on the mean
+    begins, weights : (band,) float32, where bands of the charge begin (e-), and the chance in each
+        over the mean one
+    normal : (y, x) float32, standard normals; zero for the mean
+    out : (y, x) float32, written, e-
     """
     zero, one = np.float32(0), np.float32(1)
     for y in range(charge.shape[0]):
@@ -47,16 +43,9 @@ def fill_traps(taken: F32, keep: float, most: float, lost: F32, released: F32) -
 
     Parameters
     ----------
-    taken : (t, n) float32
-        Charge that empty traps would take, e-; before the first frame they are empty.
-    keep : float
-        Part of what is held that stays for another frame.
-    most : float
-        That traps hold, e-.
-    lost : (t, n) float32
-        Net loss of each frame, e-.
-    released : (t, n) float32
-        What comes out with each frame, e-.
+    taken : (t, n) float32, charge that empty traps would take, e-; they are empty at first
+    keep, most : part of what is held that stays for another frame; what they hold at most, e-
+    lost, released : (t, n) float32, written: net loss, and what comes out with each frame, e-
     """
     part, full = np.float32(keep), np.float32(most)
     held = np.zeros(taken.shape[1], np.float32)

@@ -8,23 +8,11 @@ from pixcal.model.arrays import F64
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def likely_states(odds: F64, change: float) -> tuple[F64, float, float]:
-    """Forward and backward through a series (Rabiner 1989, Proc. IEEE 77, 257).
+    """Chance of the second state, expected number of changes, and gain in log-likelihood.
 
-    Parameters
-    ----------
-    odds : (t,) float64
-        Of each frame by itself, the log-likelihood of the second state less that of the first.
-    change : float
-        Chance of a change from frame to frame; both states are as likely at the beginning.
-
-    Returns
-    -------
-    second : (t,) float64
-        Chance of the second state.
-    changes : float
-        Expected number of changes.
-    likelihood : float
-        Logarithm, over that of the first state alone.
+    Forward and backward through a series (Rabiner 1989, Proc. IEEE 77, 257). ``odds`` (t,) are of
+    each frame by itself, the log-likelihood of the second state less that of the first; ``change``
+    is the chance of a change from frame to frame.
     """
     n = len(odds)
     ahead, second = np.empty(n), np.empty(n)

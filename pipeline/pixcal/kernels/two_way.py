@@ -43,19 +43,11 @@ def turn(
 
     Parameters
     ----------
-    rest : (t, n) float32
-        The table, changed in place.
-    weight : (t, n) float32
-    place : (j, n) float32
-        Functions of place.
-    covariance : (t, j, j) float64
-        Inverse of each frame's normal matrix for them.
-    time : (k, t) float32
-        Functions of time.
-    share : (k, n) float32
-        What the pixels have of them, to be taken off first.
-    right : (k, n) float32
-        Right-hand sides of what they have of them after the turn.
+    rest, weight : (t, n) float32, the table, changed in place, and its weights
+    place, time : (j, n), (k, t) float32, functions of place and of time
+    covariance : (t, j, j) float64, inverse of each frame's normal matrix for those of place
+    share : (k, n) float32, what the pixels have of those of time, to be taken off first
+    right : (k, n) float32, written: right-hand sides of what they have of them after the turn
     """
     weighted = np.empty_like(rest[0])
     found = np.empty(len(place))

@@ -11,17 +11,7 @@ from pixcal.model.arrays import F64
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def trace_products(weight: F64, parts: F64) -> F64:
-    """Sum over modes of tr(W D_i W D_j).
-
-    Parameters
-    ----------
-    weight : (n, c, c) float64
-    parts : (m, n, c, c) float64
-
-    Returns
-    -------
-    (m, m) float64
-    """
+    """Sum over modes of tr(W D_i W D_j), (m, m), of weights (n, c, c) and parts (m, n, c, c)."""
     m, n, c = parts.shape[0], parts.shape[1], parts.shape[2]
     out = np.zeros((m, m))
     product, there = np.empty((m, c, c)), np.empty(m, np.int64)
