@@ -19,27 +19,27 @@ from typing import Any
 import numpy as np
 
 from pixcal import __version__
-from pixcal.engine.plan import make_plan
+from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.frame_series.stability import (
     MAX_DRAWS,
     NO_CURVE,
+    ONE_SIGMA,
     AllanCurve,
     fit_curve,
     shared_noise,
     white_population,
 )
 from pixcal.kernels.allan import allan_deviation, averaging_lengths
-from pixcal.model.arrays import F32, F64, Mask
+from pixcal.model.arrays import F32, F64
 from pixcal.model.config import result_options
-from pixcal.model.errors import InputError
+from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Allan, Region
 from pixcal.stages.allan.batches import (
     TILES_HIGH,
     Batches,
     Tile,
-    noise_levels,
-    quantiles_of_region,
+    positive_values,
     region_name,
     sums_of_region,
 )
@@ -51,7 +51,8 @@ from pixcal.storage.stage import copy_products, make, working
 STAGE = STAGES["allan"]
 SCHEMA = "pixcal/allan/1"
 MIN_BATCHES = 3
-COUNT_BYTES = 64 << 20  # of the digits of all values of a map (`quantiles_of_parts`)
+# levels of the quantiles that describe the noise over a region
+NOISE_LEVELS = (np.arange(64) + 0.5) / 64
 
 Config = Allan
 
@@ -109,11 +110,9 @@ def _measure_set(
     lengths = averaging_lengths(batches.n)
     cy, cx = batches.chunks
     tile_bytes = 4 * cy * cx * (2 * batches.n + len(lengths) * (TILES_HIGH + 2))
-    # Some rows of a map in copies; counts of its values; draws of the curve.
-    rows = 16 * TILES_HIGH * cy * batches.window[1]
-    held = rows + COUNT_BYTES + 40 * MAX_DRAWS * len(lengths)
-    plan = make_plan(f"the Allan deviation of {name}", tile_bytes, held, runtime)
-    runtime = runtime.with_workers(plan.workers)
+    # A map and two copies of its values; draws of the curve.
+    held = 16 * batches.window[0] * batches.window[1] + 40 * MAX_DRAWS * len(lengths)
+    runtime = within_memory(f"the Allan deviation of {name}", tile_bytes, held, runtime)
     if lengths:
         _write_maps(made, folder, name, batches, lengths, runtime)
     whole = (0, batches.window[0], 0, batches.window[1])
@@ -210,14 +209,23 @@ def _measure_region(
     present = counts > counts.max(initial=0) / 2
     filled = int(present.sum())
     common = {"n_batches": batches.n, "gaps": batches.n - filled}
-    usable = [n for n, m in enumerate(lengths) if _has_difference(present, m)]
-    quantiles, pixels = quantiles_of_region(folder / "adev", region, usable)
+    quantiles, pixels = {}, 0
+    for n, m in enumerate(lengths):
+        # Gaps may leave no two neighbouring means.
+        if np.isin(2 * m, np.convolve(present, np.ones(2 * m, int), "valid")):
+            values = positive_values(folder / "adev", region, n)
+            pixels = max(pixels, len(values))
+            if len(values):
+                quantiles[n] = np.quantile(values, (ONE_SIGMA[0], 0.5, ONE_SIGMA[1]))
     if filled < MIN_BATCHES or not quantiles:
         reason = f"{filled} of {batches.n} batches have data: too few for an Allan deviation"
         return _as_json(batches, [], NO_CURVE, [], [reason]) | common | {"pixels": 0}
     chosen = [lengths[n] for n in quantiles]
-    low, median, high = np.array(list(quantiles.values())).T
-    noise = noise_levels(folder / "expected", region)
+    low, median, high = np.array(list(quantiles.values()), float).T
+    errors = positive_values(folder / "expected", region)
+    if not len(errors):
+        raise DamagedError(f"{folder / 'expected'}: no errors of batches", folder / "expected")
+    noise = np.quantile(errors, NOISE_LEVELS).astype(float)
     white = white_population(present, chosen, noise if pixels > 1 else None)
     shared = shared_noise([grams[n] for n in quantiles], pixels)
     curve = fit_curve(chosen, median, np.log(high / low) / 2, pixels, shared, white)
@@ -229,10 +237,6 @@ def _measure_region(
     expected = float(np.median(noise)) / np.sqrt(chosen)
     facts = _as_json(batches, chosen, curve, expected.tolist(), warnings)
     return facts | common | {"pixels": pixels}
-
-
-def _has_difference(present: Mask, m: int) -> bool:
-    return bool(np.isin(2 * m, np.convolve(present, np.ones(2 * m, int), "valid")))
 
 
 def _as_json(
