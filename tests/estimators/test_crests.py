@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pixcal.kernels.demodulation import N_SUMS
 from pixcal.kernels.optics import Geometry, paraxial_vector, phase
 from pixcal.model.errors import InputError
 from pixcal.stages.crests.crest_fit import (
@@ -20,8 +19,8 @@ from pixcal.stages.crests.crest_fit import (
     relative_phase,
     valley,
 )
-from pixcal.stages.crests.crests import SEED_PIXELS, CrestPaths, find_crests, seed_vector, tile_sums
-from pixcal.stages.crests.windows import CrestCarrier, Windows
+from pixcal.stages.crests.crests import SEED_PIXELS, CrestPaths, find_crests, seed_vector
+from pixcal.stages.crests.windows import N_SUMS, CrestCarrier, Windows, tile_sums
 
 F64 = NDArray[np.float64]
 WIDE_PITCH = 40e-3

@@ -1,6 +1,6 @@
 """Fibre positions from crests and valleys (paper, section 6, equation 7, and figure 17)."""
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,11 +18,9 @@ from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
 from pixcal.stages.crests.crests import CrestPaths
 
-# unknowns (n,) but the phase -> the geometry, and derivatives (6, n) of its parameters
-Parametrisation = Callable[[F64], tuple[Geometry, F64]]
-
 OUTLIER = 5.0  # points farther from the fit, in robust standard deviations, are left out
 MAP_POINTS = 400  # points that a cost map is computed with; its numbers are scaled to all of them
+NOTABLE_CHI2 = 3.0  # from here on the reduced chi-square of the points is pointed out
 
 
 @dataclass(frozen=True)
@@ -30,7 +28,8 @@ class Prior:
     """Prior knowledge of the geometry."""
 
     nominal: Geometry
-    # (6,) 1-sigma errors, mm, in the order of `PARAMETERS`; 0 holds a parameter, infinity frees it
+    # (6,) 1-sigma errors, mm, in the order of `PARAMETERS`; 0 holds a parameter, infinity frees
+    # it; the same for baseline_x and baseline_y
     sigma: F64
 
     @classmethod
@@ -45,12 +44,6 @@ class Prior:
     def none(cls, nominal: Geometry) -> "Prior":
         """Nothing known: every parameter is free."""
         return cls(nominal, np.full(len(PARAMETERS), np.inf))
-
-    @property
-    def scale(self) -> F64:
-        """Scale of each unknown, mm."""
-        known = np.isfinite(self.sigma) & (self.sigma > 0)
-        return np.where(known, self.sigma, Prior.of_bench(self.nominal).sigma)
 
 
 @dataclass(frozen=True)
@@ -81,6 +74,27 @@ class CrestFit:
         """Parameters (6,) that the prior constrains more than the points."""
         return np.asarray(self.sigma > np.sqrt(0.5) * self.prior.sigma)
 
+    def warnings(self) -> list[str]:
+        """Sentences on the scatter of the points and on outliers."""
+        sentences = []
+        if self.chi2_reduced > NOTABLE_CHI2:
+            sentences.append(
+                f"points scatter {np.sqrt(self.chi2_reduced):.1f} times more than their noise. The "
+                "errors include this, but are too small if whole blocks of pixels are offset"
+            )
+        lost = int((~self.used).sum())
+        if lost > 0.05 * len(self.used):
+            sentences.append(f"{lost} of {len(self.used)} points are outliers and were left out")
+        return sentences
+
+    def geometry_facts(self) -> dict[str, float]:
+        """Each parameter with its error, its nominal value and the error of the prior, mm."""
+        nominal = self.prior.nominal.vector()
+        columns = np.array([self.geometry.vector(), self.sigma, nominal, self.prior.sigma])
+        suffixes = ("_mm", "_sigma_mm", "_nominal_mm", "_prior_sigma_mm")
+        names = [name + suffix for name in PARAMETERS for suffix in suffixes]
+        return dict(zip(names, columns.T.ravel().tolist(), strict=True))
+
 
 def relative_phase(paths: CrestPaths, geometry: Geometry) -> F64:
     """Model phase at the points, counted from the frame's centre, rad."""
@@ -93,11 +107,9 @@ def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -
 
     Parameters
     ----------
-    start : Geometry
-        Where to begin; far starts converge (tested: 10 mm of distance, 18 mm of offset, 5 % of
-        the baseline).
-    prior : Prior, optional
-        Default `Prior.none`: only a large window determines all six parameters.
+    start : where to begin; far starts converge (tested: 10 mm of distance, 18 mm of offset, 5 % of
+        the baseline)
+    prior : default `Prior.none`: only a large window determines all six parameters
 
     Raises
     ------
@@ -111,67 +123,76 @@ def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -
             f"too few fringes: {len(paths)} points on {number} crests and valleys, {unknown} "
             "unknowns"
         )
-    used, spread, geometry = np.ones(len(paths), bool), 1.0, start
+    nominal, sigma = _polar(prior.nominal), prior.sigma.copy()
+    sigma[ANGLE] /= nominal[LENGTH]
+    origin = np.where(sigma > 0, _polar(start), nominal)
+    used, spread = np.ones(len(paths), bool), 1.0
     for _ in range(4):
         some = paths.take(used)
-        solved, at = _minimise(replace(some, sigma=some.sigma * np.sqrt(spread)), geometry, prior)
-        geometry, phase0 = at(solved.x[1:])[0], float(solved.x[0])
-        residual = phase0 + relative_phase(paths, geometry) - paths.k * np.pi
+        some = replace(some, sigma=some.sigma * np.sqrt(spread))
+        solved, geometry, chain = _solve(some, start, origin, nominal, sigma, 1e-15)
+        origin = _polar(geometry)
+        residual = float(solved.x[0]) + relative_phase(paths, geometry) - paths.k * np.pi
         pull = residual / paths.sigma
         chi2 = float((pull[used] ** 2).sum() / max(used.sum() - unknown, 1))
-        limit = OUTLIER * max(1.4826 * float(np.median(np.abs(pull))), 1.0)
-        kept = np.abs(pull) <= limit
+        kept = np.abs(pull) <= OUTLIER * max(1.4826 * float(np.median(np.abs(pull))), 1.0)
         same = np.array_equal(kept, used) and abs(spread - max(1.0, chi2)) < 1e-3 * spread
         used, spread = kept, max(1.0, chi2)
         if same:
             break
-    # From (phase, unknowns) to the parameters in mm.
-    root = at(solved.x[1:])[1] @ np.linalg.pinv(solved.jac, rcond=1e-13)[1:]
+    root = chain @ np.linalg.pinv(solved.jac, rcond=1e-13)[1:]
     return CrestFit(
-        geometry, phase0, root @ root.T, used, residual, float((residual[used] ** 2).sum()),
-        chi2, spread, int(solved.nfev), prior,
+        geometry, float(solved.x[0]), root @ root.T, used, residual,
+        float((residual[used] ** 2).sum()), chi2, spread, int(solved.nfev), prior,
     )  # fmt: skip
 
 
-def _minimise(
-    paths: CrestPaths, start: Geometry, prior: Prior
-) -> tuple[OptimizeResult, Parametrisation]:
-    """Least squares over what the prior does not hold, in units of `Prior.scale`."""
-    free, nominal = prior.sigma > 0, prior.nominal.vector()
-    origin = np.where(free, start.vector(), nominal)
-    unit = np.diag(prior.scale)[:, free]
+DISTANCE, LENGTH, ANGLE = 2, 3, 4
+
+
+def _polar(geometry: Geometry) -> F64:
+    """The parameters, with length and direction (rad) of the baseline in place of its x and y."""
+    x, y, distance, bx, by, bz = geometry.vector()
+    return np.array([x, y, distance, np.hypot(bx, by), np.arctan2(by, bx), bz])
+
+
+def _solve(
+    paths: CrestPaths, base: Geometry, origin: F64, nominal: F64, sigma: F64, tolerance: float
+) -> tuple[OptimizeResult, Geometry, F64]:
+    """Least squares over the phase and the polar parameters (6,) whose prior error is not zero.
+
+    With the solution its geometry, and the derivatives (6, n) of that by the n free parameters.
+    """
+    free, weight, (ry, rx) = sigma > 0, 1 / paths.sigma, paths.reference
+    precision, expected = 1 / sigma[free], nominal - origin
+    expected[ANGLE] = np.angle(np.exp(1j * expected[ANGLE]))
+    expected = (origin + expected)[free]
 
     def at(c: F64) -> tuple[Geometry, F64]:
-        return start.with_vector(origin + unit @ c), unit
-
-    expected = ((nominal - origin) / prior.scale)[free]
-    precision = (prior.scale / np.where(free, prior.sigma, 1.0))[free]
-    shift = paths.k * np.pi - relative_phase(paths, start.with_vector(origin))
-    first = np.append(shift.mean(), np.zeros(free.sum()))
-    exact = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15, "max_nfev": 200}
-    return _least_squares(paths, at, first, expected, precision, **exact), at
-
-
-def _least_squares(
-    paths: CrestPaths, at: Parametrisation, start: F64, expected: F64, precision: F64, **limits: Any
-) -> OptimizeResult:
-    """Phase and unknowns (1 + n,) that the points, and prior knowledge of the unknowns, suggest.
-
-    That is their expected values and inverse errors, (n,).
-    """
-    weight, (ry, rx) = 1 / paths.sigma, paths.reference
+        u, chain = origin.copy(), np.eye(len(origin))
+        u[free] = c[1:]
+        unit = np.array([np.cos(u[ANGLE]), np.sin(u[ANGLE])])
+        chain[3:5, 3:5] = np.column_stack([unit, u[LENGTH] * unit[::-1] * [-1, 1]])
+        u[3:5] = u[LENGTH] * unit
+        return base.with_vector(u), chain[:, free]
 
     def residual(c: F64) -> F64:
-        points = c[0] + relative_phase(paths, at(c[1:])[0]) - paths.k * np.pi
+        points = c[0] + relative_phase(paths, at(c)[0]) - paths.k * np.pi
         return np.concatenate([points * weight, (c[1:] - expected) * precision])
 
     def derivative(c: F64) -> F64:
-        geometry, chain = at(c[1:])
+        geometry, chain = at(c)
         here = phase_jacobian(paths.x, paths.y, geometry) - phase_jacobian(rx, ry, geometry)
         points = np.column_stack([np.ones(len(paths)), here @ chain]) * weight[:, None]
         return np.vstack([points, np.diag(np.append(0.0, precision))[1:]])
 
-    return least_squares(residual, start, derivative, method="lm", x_scale="jac", **limits)
+    start = np.append(0.0, origin[free])
+    start[0] = np.mean(paths.k * np.pi - relative_phase(paths, at(start)[0]))
+    tolerances = dict.fromkeys(("ftol", "xtol", "gtol"), tolerance)
+    solved = least_squares(
+        residual, start, derivative, method="lm", x_scale="jac", max_nfev=200, **tolerances
+    )
+    return solved, *at(solved.x)
 
 
 def cost_map(
@@ -181,16 +202,12 @@ def cost_map(
 
     Parameters
     ----------
-    fit : CrestFit
-        The minimum, whose errors, outliers and priors are taken over. Priors of distance and
-        length do not count: the map shows what the points say of these.
-    distance : (d,) float64
-        mm.
-    second : (s,) float64
-        B in mm or, with ``ratio``, B / D. B is the length in the detector's plane.
-    refit : bool
-        Whether centre, direction and tilt of the baseline are fitted again at each place, as the
-        phase always is; else they are those of the minimum.
+    fit : the minimum, whose errors, outliers and priors are taken over; priors of distance and
+        length do not count: the map shows what the points say of these
+    distance, second : (d,), (s,) mm; of B in mm or, with ``ratio``, of B / D, where B is the length
+        in the detector's plane
+    refit : whether centre, direction and tilt of the baseline are fitted again at each place, as
+        the phase always is; else they are those of the minimum
 
     Returns
     -------
@@ -198,13 +215,19 @@ def cost_map(
         Sum of ``(residual / sigma)²``, priors of the parameters fitted again included.
     """
     few = _thinned(paths, fit)
-    lengths = np.multiply.outer(distance, second) if ratio else np.tile(second, (len(distance), 1))
-    return np.array(
-        [
-            [_least_cost(few, fit, float(d), float(length), refit=refit)[0] for length in row]
-            for d, row in zip(distance, lengths, strict=True)
-        ]
-    )
+    lengths = np.multiply.outer(distance if ratio else np.ones_like(distance), second)
+    places = zip(distance, lengths, strict=True)
+    return np.array([[_least_cost(few, fit, d, b, refit)[0] for b in row] for d, row in places])
+
+
+def valley(paths: CrestPaths, fit: CrestFit, distance: F64) -> tuple[F64, F64]:
+    """Best ratio B / D and its cost, (d,), with the distance (d,) mm held (figure 17, right).
+
+    The other parameters are fitted again, with the priors that `cost_map` takes.
+    """
+    few = _thinned(paths, fit)
+    cost, length = np.array([_least_cost(few, fit, d, None, True) for d in distance]).T
+    return length / distance, cost
 
 
 def _thinned(paths: CrestPaths, fit: CrestFit) -> CrestPaths:
@@ -216,49 +239,21 @@ def _thinned(paths: CrestPaths, fit: CrestFit) -> CrestPaths:
 
 
 def _least_cost(
-    paths: CrestPaths, fit: CrestFit, distance: float, length: float | None, *, refit: bool
+    paths: CrestPaths, fit: CrestFit, distance: float, length: float | None, refit: bool
 ) -> tuple[float, float]:
-    """Cost with the distance held, and the length too unless it is None; and that length.
-
-    Unknowns beside the phase: foot of the centre (x, y), direction, tilt and length of the
-    baseline.
-    """
-    best, nominal, sigma = fit.geometry, fit.prior.nominal, fit.prior.sigma
-    best_length = float(np.hypot(best.baseline_x, best.baseline_y))
+    """Cost with the distance held, and the length too unless it is None; and that length."""
+    origin = _polar(fit.geometry)
     # With the ratio kept the phases hardly change: the way along the valley.
-    first = best_length * distance / best.distance if length is None else length
-    angle = np.arctan2(best.baseline_y, best.baseline_x)
-    start = np.array([best.centre_x, best.centre_y, angle, best.baseline_z, first])
-    angle = np.arctan2(nominal.baseline_y, nominal.baseline_x)
-    expected = np.array([nominal.centre_x, nominal.centre_y, angle, nominal.baseline_z, 0.0])
-    known = np.array([*sigma[:2], sigma[4] / best_length, sigma[5], np.inf])
-    free = (known > 0) & ([refit] * 4 + [length is None])
-
-    def at(c: F64) -> tuple[Geometry, F64]:
-        u = start.copy()
-        u[free] = c
-        x, y, angle, tilt, b = u
-        cos, sin = np.cos(angle), np.sin(angle)
-        chain = np.zeros((len(PARAMETERS), len(u)))
-        chain[[0, 1, 5], [0, 1, 3]] = 1
-        chain[3:5, 2], chain[3:5, 4] = (-b * sin, b * cos), (cos, sin)
-        return best.with_vector([x, y, distance, b * cos, b * sin, tilt]), chain[:, free]
-
-    first_guess = np.append(fit.phase0, start[free])
-    solved = _least_squares(paths, at, first_guess, expected[free], 1 / known[free], ftol=1e-9)
-    geometry = at(solved.x[1:])[0]
-    return 2 * float(solved.cost), float(np.hypot(geometry.baseline_x, geometry.baseline_y))
-
-
-def valley(paths: CrestPaths, fit: CrestFit, distance: F64) -> tuple[F64, F64]:
-    """Best ratio B / D and its cost, (d,), with the distance (d,) mm held (figure 17, right).
-
-    The other parameters are fitted again, with the priors that `cost_map` takes.
-    """
-    few = _thinned(paths, fit)
-    results = [_least_cost(few, fit, float(d), None, refit=True) for d in distance]
-    cost, length = np.array(results).T
-    return length / distance, cost
+    origin[LENGTH] *= distance / origin[DISTANCE]
+    origin[DISTANCE] = distance
+    sigma = fit.prior.sigma.copy() if refit else np.zeros(len(origin))
+    sigma[ANGLE] /= origin[LENGTH]
+    sigma[DISTANCE], sigma[LENGTH] = 0.0, np.inf
+    if length is not None:
+        origin[LENGTH], sigma[LENGTH] = length, 0.0
+    nominal = _polar(fit.prior.nominal)
+    solved, geometry, _ = _solve(paths, fit.geometry, origin, nominal, sigma, 1e-9)
+    return 2 * float(solved.cost), float(_polar(geometry)[LENGTH])
 
 
 def falls_then_rises(cost: F64) -> bool:
@@ -272,3 +267,38 @@ def falls_then_rises(cost: F64) -> bool:
     steps[np.abs(steps) < 1e-5 * np.atleast_2d(cost)[:, 1:]] = 0
     rising = np.cumsum(steps > 0, axis=1) > 0
     return not bool(np.any(rising & (steps < 0)))
+
+
+def agreement(
+    paths: CrestPaths, fit: CrestFit, facts: Mapping[str, Any] | None
+) -> tuple[dict[str, Any] | None, str]:
+    """Differences to the geometry in a set's part of ``fit.json``, or why there are none.
+
+    Parameter by parameter (mm), and of the phases that both predict over the frame (px).
+    """
+    if facts is None:
+        return None, "RUN/fit is not there yet"
+    if facts["model"] != "hyperbolic":
+        return None, f"the fit took {facts['model']} fringes, which have no positions of the fibres"
+    fitted = facts["geometry"]
+    other = fit.geometry.with_vector([fitted[f"{name}_mm"] for name in PARAMETERS])
+    sigma = np.hypot(fit.sigma, [fitted[f"{name}_sigma_mm"] for name in PARAMETERS])
+    difference = fit.geometry.vector() - other.vector()
+    ny, nx = paths.frame
+    y, x = (a.ravel() for a in np.mgrid[0 : ny - 1 : 33j, 0 : nx - 1 : 33j])
+    apart = phase(x, y, fit.geometry) - phase(x, y, other)
+    modes = phase_jacobian(x, y, fit.geometry)
+    modes -= modes.mean(axis=0)
+    expected = np.einsum("ni,ij,nj->n", modes, fit.covariance, modes)
+    px = paths.interfringe / (2 * np.pi)
+    values = (column.tolist() for column in (difference, sigma, fit.from_prior))
+    of_each = zip(PARAMETERS, *values, strict=True)
+    return {
+        "parameters": {
+            name: {"difference_mm": d, "sigma_mm": s, "difference_sigma": d / s, "from_prior": held}
+            for name, d, s, held in of_each
+        },
+        "phase_rms_px": float(np.std(apart) * px),
+        "phase_max_px": float(np.max(np.abs(apart - apart.mean())) * px),
+        "phase_sigma_px": float(np.sqrt(expected.mean()) * px),
+    }, ""

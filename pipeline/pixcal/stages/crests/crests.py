@@ -20,10 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.fringe_fit.fringes import find_fringe_vector
-from pixcal.kernels.demodulation import N_SUMS, solve_windows, window_sums
 from pixcal.model.arrays import F64, I64, Mask
 from pixcal.model.errors import InputError
-from pixcal.stages.crests.windows import FRINGES_A_WINDOW, CrestCarrier, Smooth, Vector, Windows
+from pixcal.stages.crests.windows import (
+    FRINGES_A_WINDOW,
+    CrestCarrier,
+    Smooth,
+    Vector,
+    Windows,
+    solve_windows,
+)
 
 MAX_SIGMA = 0.2  # windows whose phase is known worse (rad) hold no fringes to speak of
 MIN_COVERAGE = 0.5  # share of a window's pixels that must be there and good
@@ -34,7 +40,6 @@ MAX_DEGREE = 5  # of the polynomial that follows the phase
 SEED_PIXELS = 256  # side of the patch where the fringe vector is first sought
 # passes over the first frame: curvature left by the second moves points by some 1e-6 rad
 SETTLING = 2
-_SOLVED_AT_ONCE = 2048
 
 # (number of a frame, windows, carrier) -> sums (across, along, N_SUMS) of the whole frame
 Accumulate = Callable[[int, Windows, CrestCarrier], F64]
@@ -81,8 +86,7 @@ class CrestPaths:
     def outermost(self, paths: int) -> "CrestPaths":
         """The outermost paths at each end, the most informative ones (paper, figure 16)."""
         every = np.unique(self.k)
-        ends = np.union1d(every[:paths], every[-paths:])
-        return self.take(np.isin(self.k, ends))
+        return self.take(np.isin(self.k, [*every[:paths], *every[-paths:]]))
 
 
 def seed_vector(patch: NDArray[Any], good: Mask, nominal: Vector) -> Vector:
@@ -104,28 +108,6 @@ def seed_vector(patch: NDArray[Any], good: Mask, nominal: Vector) -> Vector:
     return k
 
 
-def tile_sums(
-    signal: NDArray[Any],
-    good: Mask,
-    start: tuple[int, int],
-    windows: Windows,
-    carrier: CrestCarrier,
-) -> tuple[tuple[int, int], F64]:
-    """Sums (across, along, N_SUMS) of the windows that a tile touches, and the first one's numbers.
-
-    Of electrons (y, x) and the samples to use, from pixel ``start`` (y, x) of the frame on.
-    """
-    ny, nx = signal.shape
-    (i0, i1), (j0, j1) = windows.touched((start[0], start[0] + ny), (start[1], start[1] + nx))
-    sums = np.zeros((i1 - i0, j1 - j0, N_SUMS))
-    phase, light = carrier.phase, carrier.light
-    window_sums(
-        signal, good, start, windows.layout, (i0, j0), phase.coefficients, light.coefficients,
-        np.array([phase.centre[1], phase.centre[0], phase.scale]), sums,
-    )  # fmt: skip
-    return (i0, j0), sums
-
-
 def find_crests(
     accumulate: Accumulate,
     n_frames: int,
@@ -137,14 +119,10 @@ def find_crests(
 
     Parameters
     ----------
-    accumulate : callable
-        Makes the sums of a frame; called once for each frame, and twice more for the first.
-    frame : (int, int)
-        (y, x) size.
-    k : (float, float)
-        Fringe vector (kx, ky) near the frame's centre, rad/px.
-    segment : int, optional
-        Pixels along the fringes that share a point; by default an eighth of the frame, 8 to 128.
+    accumulate : makes the sums of a frame; called once for each, and twice more for the first
+    frame : (y, x) size
+    k : fringe vector (kx, ky) near the frame's centre, rad/px
+    segment : pixels along the fringes that share a point; an eighth of the frame, 8 to 128
 
     Raises
     ------
@@ -154,19 +132,19 @@ def find_crests(
     carrier, windows = CrestCarrier.straight(k, frame), Windows.lay(frame, k, segment)
     for _ in range(SETTLING):
         phase, sigma, light = _window_phases(accumulate(0, windows, carrier), windows)
+        _check(np.isfinite(sigma))
         carrier = CrestCarrier(
             _follow(windows, phase, sigma, carrier.phase),
             _brightened(windows, light, sigma, carrier.light),
         )
-        cy, cx = np.array(carrier.phase.centre)
-        kx, ky = (float(v) for v in carrier.phase.gradient(cy, cx))
+        kx, ky = (float(v) for v in carrier.phase.gradient(*np.array(carrier.phase.centre)))
         windows = Windows.lay(frame, (kx, ky), segment)
 
     phi = np.full(n_frames, np.nan)
     total, weight = np.zeros(windows.shape), np.zeros(windows.shape)
     for n in range(n_frames):
         phase, sigma, _ = _window_phases(accumulate(n, windows, carrier), windows)
-        precision = np.where(np.isfinite(sigma), 1 / sigma**2, 0.0)
+        precision = sigma**-2.0
         if not precision.any():
             continue
         phi[n] = np.angle((precision * np.exp(1j * phase)).sum())
@@ -177,8 +155,24 @@ def find_crests(
         weight += precision
     use = weight > 0
     _check(use)
-    rest = np.where(use, total, 0.0) / np.where(use, weight, 1.0) + np.nan_to_num(phi[0])
-    return _points(windows, carrier.phase, rest, weight, phi - np.nan_to_num(phi[0]), (kx, ky))
+    # A column of windows follows one path as long as that path runs through its windows.
+    start = np.nan_to_num(phi[0])
+    rest = np.where(use, total / np.where(use, weight, 1.0), 0.0) + start
+    y, x = windows.centres
+    here = carrier.phase.on(y, x) + rest
+    column = [np.median(p[u]) if u.any() else 0.0 for p, u in zip(here, use, strict=True)]
+    number = np.broadcast_to(np.rint(np.array(column) / np.pi)[:, None], here.shape)
+    near = np.abs(here - number * np.pi) < np.pi * FRINGES_A_WINDOW / 2
+    number = np.where(near, number, np.rint(here / np.pi))[use]
+    y, x, rest = y[use], x[use], rest[use]
+    for _ in range(4):
+        gx, gy = carrier.phase.gradient(y, x)
+        step = (number * np.pi - carrier.phase.on(y, x) - rest) / (gx**2 + gy**2)
+        y, x = y + step * gy, x + step * gx
+    return CrestPaths(
+        x, y, number.astype(np.int64), weight[use] ** -0.5, np.hypot(*carrier.phase.gradient(y, x)),
+        phi - start, (kx, ky), frame, windows.size[1],
+    )  # fmt: skip
 
 
 def _check(use: Mask) -> None:
@@ -195,13 +189,7 @@ def _wrapped(phase: F64) -> F64:
 
 def _window_phases(sums: F64, windows: Windows) -> tuple[F64, F64, F64]:
     """Phases relative to the carrier, errors (infinite where not usable), light (across, along)."""
-    flat = sums.reshape(-1, N_SUMS)
-    parts = [
-        solve_windows(flat[n : n + _SOLVED_AT_ONCE]) for n in range(0, len(flat), _SOLVED_AT_ONCE)
-    ]
-    phase, sigma, light = (
-        np.concatenate(part).reshape(windows.shape) for part in zip(*parts, strict=True)
-    )
+    phase, sigma, light = (np.stack(part) for part in zip(*map(solve_windows, sums), strict=True))
     y, x = windows.centres
     inside = (y > -0.5) & (y < windows.frame[0] - 0.5) & (x > -0.5) & (x < windows.frame[1] - 0.5)
     enough = sums[..., -1] >= MIN_COVERAGE * windows.size[0] * windows.size[1]
@@ -237,9 +225,7 @@ def _follow(windows: Windows, phase: F64, sigma: F64, before: Smooth) -> Smooth:
     cycle of the phases beyond: gaps are bridged, and single bad windows have no effect.
     """
     use = np.isfinite(sigma)
-    _check(use)
-    cy, cx = (c[use] for c in windows.centres)
-    y, x = before.scaled(cy, cx)
+    y, x = before.scaled(*(c[use] for c in windows.centres))
     measured, precision = phase[use], 1 / sigma[use]
     distance = np.hypot(y, x)
     highest = _highest_degree(windows, len(measured))
@@ -250,40 +236,14 @@ def _follow(windows: Windows, phase: F64, sigma: F64, before: Smooth) -> Smooth:
         near = distance <= reach
         number = int(near.sum())
         degree = min(highest, 1 if number < 40 else 2 if number < 150 else 3)
-        if near.all():
-            degree = highest
-        basis, powers = _design(y, x, degree)
+        basis, powers = _design(y, x, highest if near.all() else degree)
         for _ in range(3):
-            value = known + _wrapped(measured - known)
-            off = np.abs(_wrapped(measured - known))
-            kept = near & (off <= max(1.0, 6 * float(np.median(off[near]))))
+            off = _wrapped(measured - known)
+            kept = near & (np.abs(off) <= max(1.0, 6 * float(np.median(np.abs(off[near])))))
             scaled = basis[kept] * precision[kept, None]
-            fit = np.linalg.lstsq(scaled, value[kept] * precision[kept], rcond=1e-12)[0]
+            value = (known + off)[kept] * precision[kept]
+            fit = np.linalg.lstsq(scaled, value, rcond=1e-12)[0]
             known = basis @ fit
         if near.all():
-            break
+            return before.plus(powers, fit)
         reach *= 1.33
-    return before.plus(powers, fit)
-
-
-def _points(
-    windows: Windows, carrier: Smooth, rest: F64, weight: F64, phi: F64, vector: Vector
-) -> CrestPaths:
-    """Where the phase, carrier plus ``rest`` (constant in a window), crosses k pi."""
-    use = weight > 0
-    y, x = windows.centres
-    here = carrier.on(y, x) + rest
-    # A column of windows follows one path as long as that path runs through its windows.
-    column = np.array([np.median(p[u]) if u.any() else 0.0 for p, u in zip(here, use, strict=True)])
-    k = np.broadcast_to(np.rint(column / np.pi)[:, None], here.shape)
-    k = np.where(np.abs(here - k * np.pi) < np.pi * FRINGES_A_WINDOW / 2, k, np.rint(here / np.pi))
-    y, x, rest, k = y[use], x[use], rest[use], k[use]
-    for _ in range(4):
-        kx, ky = carrier.gradient(y, x)
-        step = (k * np.pi - carrier.on(y, x) - rest) / (kx**2 + ky**2)
-        y, x = y + step * ky, x + step * kx
-    kx, ky = carrier.gradient(y, x)
-    return CrestPaths(
-        x, y, k.astype(np.int64), 1 / np.sqrt(weight[use]), np.hypot(kx, ky),
-        phi, vector, windows.frame, windows.size[1],
-    )  # fmt: skip

@@ -22,11 +22,8 @@ from numpy.typing import NDArray
 from pixcal import __version__
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
-from pixcal.estimators.fringe_fit.tile_fit import Coding
-from pixcal.kernels.demodulation import N_SUMS
 from pixcal.kernels.optics import paraxial_vector
-from pixcal.model.acquisition import Acquisition
-from pixcal.model.arrays import F32, F64, I64, U8, U16, Mask
+from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Crests
@@ -35,14 +32,14 @@ from pixcal.report.drawing import png
 from pixcal.stages.crests.crest_fit import (
     CrestFit,
     Prior,
+    agreement,
     cost_map,
     falls_then_rises,
     fit_crests,
     valley,
 )
-from pixcal.stages.crests.crests import SEED_PIXELS, CrestPaths, find_crests, seed_vector, tile_sums
-from pixcal.stages.crests.facts import agreement, fitted_geometry, geometry_facts, warnings
-from pixcal.stages.crests.windows import CrestCarrier, Windows
+from pixcal.stages.crests.crests import SEED_PIXELS, CrestPaths, find_crests, seed_vector
+from pixcal.stages.crests.windows import N_SUMS, CrestCarrier, Vector, Windows, tile_sums
 from pixcal.stages.fit.sweep import load_run
 from pixcal.stages.fitted_shape import nominal_geometry
 from pixcal.stages.reduced_set import ReducedSet
@@ -86,10 +83,25 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
         def body(made: Build) -> None:
             create_group(made.folder / "crests.zarr")
-            sets = {
-                s.name: _measure(run_dir, made, acquisition, s.name, facts, config, runtime)
-                for s in acquisition.frames.fringes
-            }
+            sets = {}
+            for name in (s.name for s in acquisition.frames.fringes):
+                source = ReducedSet(run_dir / "reduce" / "reduced.zarr" / name)
+                centre = ((source.shape[0] - 1) / 2, (source.shape[1] - 1) / 2)
+                nominal = nominal_geometry(acquisition, name, centre)
+                try:
+                    frames, paths = _trace(source, paraxial_vector(nominal), config, runtime)
+                    fit = fit_crests(paths, nominal, Prior.of_bench(nominal))
+                except DamagedError:
+                    raise
+                except InputError as error:
+                    raise InputError(f"{run_dir}: fringe set {name!r}: {error}") from error
+                maps = _write_arrays(made.folder / "crests.zarr" / name, paths, fit)
+                picture = crest_figure(_view(source, frames[0], paths, fit, maps))
+                (made.folder / f"crests-{name}.png").write_bytes(png(picture))
+                used = [n for n, phi in zip(frames, paths.phi, strict=True) if np.isfinite(phi)]
+                agrees, note = agreement(paths, fit, facts.get(name))
+                sets[name] = {"frames": used, **_facts(paths, fit, maps)}
+                sets[name] |= {"agreement": agrees, "agreement_note": note}
             whole = {"schema": SCHEMA, "pixcal": __version__, "sets": sets}
             write_json(made.folder / "crests.json", whole)
 
@@ -97,110 +109,63 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
         return make(run_dir, STAGE, result_options(config), inputs, body, publish=publish)
 
 
-def _measure(
-    run_dir: Path,
-    made: Build,
-    acquisition: Acquisition,
-    name: str,
-    facts: Mapping[str, Any],
-    config: Config,
-    runtime: Runtime,
-) -> dict[str, Any]:
-    """One fringe set: its part of ``crests.json``; writes its arrays and figure."""
-    source = ReducedSet(run_dir / "reduce" / "reduced.zarr" / name)
-    count = min(config.frames, source.n_frames)
-    frames = np.unique(np.linspace(0, source.n_frames - 1, count).astype(int)).tolist()
-    ny, nx = source.shape
-    nominal = nominal_geometry(acquisition, name, ((ny - 1) / 2, (nx - 1) / 2))
-    try:
-        paths = _extract(source, frames, paraxial_vector(nominal), name, config, runtime)
-        fit = fit_crests(paths, nominal, Prior.of_bench(nominal))
-    except DamagedError:
-        raise
-    except InputError as error:
-        raise InputError(f"{run_dir}: fringe set {name!r}: {error}") from error
-    maps = _write_arrays(made.folder / "crests.zarr" / name, paths, fit)
-    picture = crest_figure(_view(name, source, frames[0], paths, fit, maps))
-    (made.folder / f"crests-{name}.png").write_bytes(png(picture))
+def _facts(paths: CrestPaths, fit: CrestFit, maps: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
     costs = (maps["cost_baseline"], maps["cost_ratio"], maps["valley_cost"])
-    other, note = fitted_geometry(facts.get(name), nominal)
     return {
-        "frames": [n for n, phi in zip(frames, paths.phi, strict=True) if np.isfinite(phi)],
         "points": len(paths),
         "points_used": int(fit.used.sum()),
         "paths": len(np.unique(paths.k)),
         "interfringe_px": paths.interfringe,
         "segment_px": paths.segment,
         "point_sigma_median_px": float(np.median(paths.sigma_px)),
-        "geometry": geometry_facts(fit),
+        "geometry": fit.geometry_facts(),
         "cost_rad2": fit.cost,
         "chi2_reduced": fit.chi2_reduced,
         "evaluations": fit.evaluations,
         "unique_minimum": all(falls_then_rises(cost) for cost in costs),
-        "warnings": warnings(fit),
-        "agreement": None if other is None else agreement(paths, fit, *other),
-        "agreement_note": note,
+        "warnings": fit.warnings(),
     }
 
 
-def _extract(
-    source: ReducedSet,
-    frames: list[int],
-    nominal: tuple[float, float],
-    name: str,
-    config: Config,
-    runtime: Runtime,
-) -> CrestPaths:
-    y, x = ((max(0, (n - SEED_PIXELS) // 2), min(n, (n + SEED_PIXELS) // 2)) for n in source.shape)
+def _trace(
+    source: ReducedSet, nominal: Vector, config: Config, runtime: Runtime
+) -> tuple[list[int], CrestPaths]:
+    """Numbers of some frames, and points on their crests and valleys."""
+    name, count = source.folder.name, min(config.frames, source.n_frames)
+    frames = np.unique(np.linspace(0, source.n_frames - 1, count).astype(int)).tolist()
+    y, x = (((n - SEED_PIXELS) // 2, (n + SEED_PIXELS) // 2) for n in source.shape)
     k = seed_vector(*read_patch(source, frames[0], y, x), nominal)
-    number = int(np.prod(Windows.lay(source.shape, k, config.segment).shape))
-    chunk = int(np.prod(source.signal.chunks)) * source.signal.dtype.itemsize
-    # Codes, packed and not, and a tile's maps; the sums, those on their way, and their solution.
-    task = 3 * chunk + 40 * int(np.prod(source.signal.chunks[1:]))
-    held = 4 * 8 * N_SUMS * number + FIGURE_BYTES
-    runtime = within_memory(f"the crests of {name}", task, held, runtime)
+    _, rows, columns = source.signal.chunks
+    strips = [(at, at + rows) for at in range(0, source.shape[0], rows)]
+    # A chunk, a strip of one frame with its mask; the sums, those on their way, their solution.
+    task = 2 * int(np.prod(source.signal.chunks)) + 16 * rows * (source.shape[1] + columns)
+    held = 4 * 8 * N_SUMS * int(np.prod(Windows.lay(source.shape, k, config.segment).shape))
+    runtime = within_memory(f"the crests of {name}", task, held + FIGURE_BYTES, runtime)
 
     def accumulate(frame: int, windows: Windows, carrier: CrestCarrier) -> F64:
-        task = partial(_row_task, source, frames[frame], windows, carrier)
-        sums = np.zeros((int(np.prod(windows.shape)), N_SUMS))
-        # In the order of the rows, whoever was first: the same sums to the last bit.
-        for index, part in run_tasks(task, range(source.grid[0]), runtime, label=f"crests {name}"):
-            sums[index] += part
-        return sums.reshape(*windows.shape, N_SUMS)
+        task = partial(_strip_task, source, frames[frame], windows, carrier)
+        sums = np.zeros((*windows.shape, N_SUMS))
+        # In the order of the strips, whoever was first: the same sums to the last bit.
+        for (i, j), part in run_tasks(task, strips, runtime, label=f"crests {name}"):
+            sums[i : i + part.shape[0], j : j + part.shape[1]] += part
+        return sums
 
     paths = find_crests(accumulate, len(frames), source.shape, k, config.segment)
-    return paths if config.paths is None else paths.outermost(config.paths)
+    return frames, paths if config.paths is None else paths.outermost(config.paths)
 
 
 def read_patch(source: ReducedSet, frame: int, y: Range, x: Range) -> tuple[F32, Mask]:
     """Electrons (y, x) of a part of one frame, and its good samples."""
     mask = ArrayReader(source.place / "mask").read(y, x)
-    return _electrons(source.signal.read((frame, frame + 1), y, x)[0], mask, source.coding)
+    codes = source.signal.read((frame, frame + 1), y, x)[0]
+    return source.coding.electrons(codes), (mask == 0) & (codes != source.coding.fill)
 
 
-def _electrons(codes: U16, mask: U8, coding: Coding) -> tuple[F32, Mask]:
-    good = (mask == 0) & (codes != coding.fill)
-    return coding.electrons(codes), good
-
-
-def _row_task(
-    source: ReducedSet, frame: int, windows: Windows, carrier: CrestCarrier, row: int
-) -> tuple[I64, F64]:
-    """Numbers and sums of the windows that a row of tiles touches."""
-    numbers, parts = [], []
-    for column in range(source.grid[1]):
-        at = (row, column)
-        codes = source.codes(at, frame // source.block)[frame % source.block]
-        signal, good = _electrons(codes, source.mask(at), source.coding)
-        y, x = source.ranges(at)
-        (i, j), sums = tile_sums(signal, good, (y[0], x[0]), windows, carrier)
-        there = np.nonzero(sums[..., -1])
-        numbers.append(np.ravel_multi_index((there[0] + i, there[1] + j), windows.shape))
-        parts.append(sums[there])
-    index, place = np.unique(np.concatenate(numbers), return_inverse=True)
-    merged = np.zeros((len(index), N_SUMS))
-    np.add.at(merged, place, np.concatenate(parts))
-    return index, merged
+def _strip_task(
+    source: ReducedSet, frame: int, windows: Windows, carrier: CrestCarrier, rows: Range
+) -> tuple[tuple[int, int], F64]:
+    signal, good = read_patch(source, frame, rows, (0, source.shape[1]))
+    return tile_sums(signal, good, (rows[0], 0), windows, carrier)
 
 
 def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit) -> dict[str, NDArray[Any]]:
@@ -218,36 +183,34 @@ def _write_arrays(folder: Path, paths: CrestPaths, fit: CrestFit) -> dict[str, N
     ratios = middle + max(2 * float(np.max(np.abs(best - middle))), 1e-5 * middle) * steps
     held = cost_map(paths, fit, distances, lengths, ratio=False, refit=False)
     refitted = cost_map(paths, fit, distances, ratios, ratio=True, refit=True)
-    arrays: dict[str, tuple[NDArray[Any], str, dict[str, str]]] = {
-        "x": (paths.x, "point", {"units": "pixel"}),
-        "y": (paths.y, "point", {"units": "pixel"}),
-        "k": (paths.k, "point", {"units": "1"}),
-        "sigma": (paths.sigma, "point", {"units": "rad"}),
-        "residual": (fit.residual, "point", {"units": "rad"}),
-        "used": (fit.used.astype(np.uint8), "point", {"units": "1"}),
-        "distance": (distances, "distance", {"units": "mm"}),
-        "baseline": (lengths, "baseline", {"units": "mm"}),
-        "ratio": (ratios, "ratio", {"units": "1"}),
+    px, rad, mm, none = ({"units": unit} for unit in ("pixel", "rad", "mm", "1"))
+    arrays: dict[str, tuple[str, dict[str, str], NDArray[Any]]] = {
+        "x": ("point", px, paths.x),
+        "y": ("point", px, paths.y),
+        "k": ("point", none, paths.k),
+        "sigma": ("point", rad, paths.sigma),
+        "residual": ("point", rad, fit.residual),
+        "used": ("point", none, fit.used.astype(np.uint8)),
+        "distance": ("distance", mm, distances),
+        "baseline": ("baseline", mm, lengths),
+        "ratio": ("ratio", none, ratios),
         "cost_baseline": (
-            held, "distance baseline", {"units": "1", "comment": "phase refitted, others held"}
+            "distance baseline",
+            none | {"comment": "phase refitted, others held"},
+            held,
         ),
-        "cost_ratio": (refitted, "distance ratio", {"units": "1", "comment": "others refitted"}),
-        "valley_ratio": (best, "distance", {}),
-        "valley_cost": (cost, "distance", {}),
-    }  # fmt: skip
+        "cost_ratio": ("distance ratio", none | {"comment": "others refitted"}, refitted),
+        "valley_ratio": ("distance", {}, best),
+        "valley_cost": ("distance", {}, cost),
+    }
     create_group(folder)
-    for name, (data, dims, attrs) in arrays.items():
+    for name, (dims, attrs, data) in arrays.items():
         write_array(folder / name, data, dims=dims.split(), attrs=attrs)
-    return {name: data for name, (data, _, _) in arrays.items()}
+    return {name: data for name, (_, _, data) in arrays.items()}
 
 
 def _view(
-    name: str,
-    source: ReducedSet,
-    frame: int,
-    paths: CrestPaths,
-    fit: CrestFit,
-    arrays: Mapping[str, NDArray[Any]],
+    source: ReducedSet, frame: int, paths: CrestPaths, fit: CrestFit, arrays: Mapping[str, Any]
 ) -> CrestView:
     """What the figure shows."""
     best = fit.geometry
@@ -255,13 +218,18 @@ def _view(
     foot = np.array([best.centre_x, best.centre_y])
     half = np.array([best.baseline_x, best.baseline_y]) / 2
     return CrestView(
-        name=name, frame=paths.frame, direction=paths.vector, arrays=arrays,
-        sigma_px=paths.sigma_px * np.sqrt(fit.spread), residual_px=fit.residual / paths.slope,
+        name=source.folder.name,
+        frame=paths.frame,
+        direction=paths.vector,
+        arrays=arrays,
+        sigma_px=paths.sigma_px * np.sqrt(fit.spread),
+        residual_px=fit.residual / paths.slope,
         fibres=((foot - half) / best.pitch, (foot + half) / best.pitch),
         extracts=tuple(_extract_at(source, frame, paths, k) for k in (first[0], last[-1])),
         best=(best.distance, 2 * float(np.hypot(*half))),
-        distance_sigma=float(fit.sigma[2]), distance_from_prior=bool(fit.from_prior[2]),
-    )  # fmt: skip
+        distance_sigma=float(fit.sigma[2]),
+        distance_from_prior=bool(fit.from_prior[2]),
+    )
 
 
 def _extract_at(source: ReducedSet, frame: int, paths: CrestPaths, k: int) -> Extract:
@@ -270,9 +238,7 @@ def _extract_at(source: ReducedSet, frame: int, paths: CrestPaths, k: int) -> Ex
     ry, rx = paths.reference
     near = on[np.argmin((paths.x[on] - rx) ** 2 + (paths.y[on] - ry) ** 2)]
     side = int(np.clip(max(8 * paths.interfringe, 1.7 * paths.segment), 32, 320))
-    ranges = []
-    for at, n in ((paths.y[near], source.shape[0]), (paths.x[near], source.shape[1])):
-        first = int(np.clip(round(at) - side // 2, 0, max(0, n - side)))
-        ranges.append((first, min(n, first + side)))
-    values, good = read_patch(source, frame, ranges[0], ranges[1])
-    return Extract(np.where(good, values, np.nan), (ranges[0][0], ranges[1][0]))
+    places = zip((paths.y[near], paths.x[near]), source.shape, strict=True)
+    y, x = (int(np.clip(round(at) - side // 2, 0, max(0, n - side))) for at, n in places)
+    values, good = read_patch(source, frame, (y, y + side), (x, x + side))
+    return Extract(np.where(good, values, np.nan), (y, x))
