@@ -16,6 +16,7 @@ from pixcal.estimators.frame_series.variance_components import (
     log_chance_of_any,
     sigmas,
     signed_sigmas,
+    trace_products,
     walk_power,
 )
 from pixcal.kernels.processes import damped_walk
@@ -177,3 +178,17 @@ def test_a_time_constant_is_found() -> None:
         pulls.append((profile.value - 10) / profile.error)
         assert abs(rms - 2) < 4 * np.hypot(error, owed) < 2.0
     assert np.max(np.abs(pulls)) < 3.5
+
+
+def test_sums_of_traces() -> None:
+    rng = np.random.default_rng(2)
+    n, m = 23, 5
+    weight = rng.standard_normal((n, 2, 2))
+    weight = weight + np.swapaxes(weight, 1, 2)
+    parts = rng.standard_normal((m, n, 2, 2))
+    parts = parts + np.swapaxes(parts, 2, 3)
+    parts[1, 3:], parts[4, :10] = 0.0, 0.0
+    product = np.einsum("nab,inbc->inac", weight, parts)
+    np.testing.assert_allclose(
+        trace_products(weight, parts), np.einsum("inab,jnba->ij", product, product), rtol=1e-10
+    )

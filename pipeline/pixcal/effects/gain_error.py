@@ -139,7 +139,7 @@ def _joined(found: dict[str, tuple[float, float]]) -> tuple[float, float]:
 
 
 def _of_fringes(found: FringeEvidence) -> F64 | None:
-    """Sums of `product_sums` of a fringe set's residuals; None of too few."""
+    """Sums of `residual_sums` of a fringe set's residuals; None of too few."""
     pixels = np.count_nonzero(found.good)
     if len(found.g) < _MIN_FRAMES or pixels < MIN_PIXELS:
         return None

@@ -272,37 +272,23 @@ def solve_pixels(sums: F64) -> tuple[F64, F64, F64]:
     where it is not determined; the upper triangle (6, ...) of the covariance of theta; and the
     weighted square (...) of the residual that remains.
     """
-    shape = sums.shape[1:]
-    flat = np.ascontiguousarray(sums, float).reshape(len(sums), -1)
-    step, covariance = np.empty((3, flat.shape[1])), np.empty((6, flat.shape[1]))
-    chi2 = np.empty(flat.shape[1])
-    _solve(flat, step, covariance, chi2)
-    return step.reshape(3, *shape), covariance.reshape(6, *shape), chi2.reshape(shape)
+    a, b, c, d, e, f, r0, r1, r2, square = np.asarray(sums[:10], float)
+    *adjugate, det = _adjugate.py_func(a, b, c, d, e, f)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        i00, i01, i02, i11, i12, i22 = adjugate / np.where(det > SINGULAR * a * d * f, det, np.nan)
+    s0 = i00 * r0 + i01 * r1 + i02 * r2
+    s1 = i01 * r0 + i11 * r1 + i12 * r2
+    s2 = i02 * r0 + i12 * r1 + i22 * r2
+    covariance = np.stack([i00, i01, i02, i11, i12, i22])
+    return np.stack([s0, s1, s2]), covariance, square - (s0 * r0 + s1 * r1 + s2 * r2)
 
 
 @njit(inline="always")  # type: ignore[untyped-decorator]
 def _adjugate(a: float, b: float, c: float, d: float, e: float, f: float) -> Any:
-    """Upper triangle of a pixel's inverse normal matrix times the determinant, and one over it."""
+    """Upper triangle of a pixel's inverse normal matrix times the determinant, and that."""
     i00, i01, i02 = d * f - e * e, c * e - b * f, b * e - c * d
     i11, i12, i22 = a * f - c * c, b * c - a * e, a * d - b * b
-    det = a * i00 + b * i01 + c * i02
-    return i00, i01, i02, i11, i12, i22, (1.0 / det if det > SINGULAR * a * d * f else np.nan)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def _solve(sums: F64, step: F64, covariance: F64, chi2: F64) -> None:
-    for p in range(sums.shape[1]):
-        r0, r1, r2 = sums[6, p], sums[7, p], sums[8, p]
-        i00, i01, i02, i11, i12, i22, inverse = _adjugate(
-            sums[0, p], sums[1, p], sums[2, p], sums[3, p], sums[4, p], sums[5, p]
-        )
-        for k, value in enumerate((i00, i01, i02, i11, i12, i22)):
-            covariance[k, p] = value * inverse
-        s0 = (i00 * r0 + i01 * r1 + i02 * r2) * inverse
-        s1 = (i01 * r0 + i11 * r1 + i12 * r2) * inverse
-        s2 = (i02 * r0 + i12 * r1 + i22 * r2) * inverse
-        step[0, p], step[1, p], step[2, p] = s0, s1, s2
-        chi2[p] = sums[9, p] - (s0 * r0 + s1 * r1 + s2 * r2)
+    return i00, i01, i02, i11, i12, i22, a * i00 + b * i01 + c * i02
 
 
 @njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
@@ -329,7 +315,8 @@ def _fringe(
     b0: float, b1: float, b2: float, m1: float, m2: float,
 ) -> Any:  # fmt: skip
     """Fringe of a pixel across and along that of the model, and the variance of its phase."""
-    _, i01, i02, i11, i12, i22, inverse = _adjugate(n00, n01, n02, n11, n12, n22)
+    _, i01, i02, i11, i12, i22, det = _adjugate(n00, n01, n02, n11, n12, n22)
+    inverse = 1.0 / det if det > SINGULAR * n00 * n11 * n22 else np.nan
     s = m1 + (i01 * b0 + i11 * b1 + i12 * b2) * inverse
     c = m2 + (i02 * b0 + i12 * b1 + i22 * b2) * inverse
     square = s * s + c * c

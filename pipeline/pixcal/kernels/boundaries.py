@@ -50,16 +50,6 @@ def area_changes(falloff_px: float) -> F64:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _surround(charge: Any, out: Any) -> None:
-    """A frame with a margin of `REACH`, in which it goes on as it is at its edges."""
-    ny, nx = charge.shape
-    for y in range(out.shape[0]):
-        row = min(max(y - REACH, 0), ny - 1)
-        for x in range(out.shape[1]):
-            out[y, x] = charge[row, min(max(x - REACH, 0), nx - 1)]
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _push(charge: Any, shifts: Any, along_x: bool, out: Any) -> None:
     """Mean shift of the boundaries after each pixel, of a frame with a margin of `REACH`."""
     ny, nx = out.shape
@@ -75,27 +65,9 @@ def _push(charge: Any, shifts: Any, along_x: bool, out: Any) -> None:
                     out[y, x] += s * charge[y + dy, x + dx]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _move(charge: Any, push_x: Any, push_y: Any, out: Any) -> None:
-    ny, nx = charge.shape
-    half = np.float32(0.5)
-    out[:] = 0
-    for y in range(ny):
-        for x in range(nx - 1):
-            flow = half * (charge[y, x] + charge[y, x + 1]) * push_x[y, x]
-            out[y, x] += flow
-            out[y, x + 1] -= flow
-    for y in range(ny - 1):
-        for x in range(nx):
-            flow = half * (charge[y, x] + charge[y + 1, x]) * push_y[y, x]
-            out[y, x] += flow
-            out[y + 1, x] -= flow
-
-
 def _pushes(charge: F32, shifts: F64) -> tuple[F32, F32]:
     """Mean shift of the boundaries to the right of and below each pixel (y, x)."""
-    around = np.empty((charge.shape[0] + 2 * REACH, charge.shape[1] + 2 * REACH), np.float32)
-    _surround(charge, around)
+    around = np.pad(charge, REACH, "edge")
     push_x, push_y = np.empty_like(charge), np.empty_like(charge)
     _push(around, shifts, True, push_x)
     _push(around, shifts, False, push_y)
@@ -116,8 +88,13 @@ def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0) -> F32:
     """
     charge = np.ascontiguousarray(charge, np.float32)
     push_x, push_y = _pushes(charge, shifts)
-    out = np.empty_like(charge)
-    _move(charge, push_x, push_y * np.float32(along_y), out)
+    half, out = np.float32(0.5), np.zeros_like(charge)
+    flow = half * (charge[:, :-1] + charge[:, 1:]) * push_x[:, :-1]
+    out[:, 1:] -= flow
+    out[:, :-1] += flow
+    flow = half * (charge[:-1] + charge[1:]) * (push_y[:-1] * np.float32(along_y))
+    out[1:] -= flow
+    out[:-1] += flow
     return out
 
 

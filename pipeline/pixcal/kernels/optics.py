@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from pixcal.model.arrays import F64
@@ -63,25 +62,13 @@ def phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
     The difference of the two paths (paper, eq. 3) loses seven digits when taken as written; this
     is ``(s_A - s_B)·(s_A + s_B - 2 r) / (|r - s_A| + |r - s_B|)`` (physics note, section 1).
     """
-    xs, ys = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
-    out = np.empty(xs.shape)
-    _phase(
-        xs.ravel(), ys.ravel(), geometry.wavenumber, geometry.pitch, geometry.vector(), out.ravel()
-    )
-    return out
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _phase(
-    x: Array, y: Array, wavenumber: float, pitch: float, parameters: Array, out: Array
-) -> None:
-    cx, cy, d, bx, by, bz = parameters
-    for n in range(x.size):
-        qx, qy = x[n] * pitch - cx, y[n] * pitch - cy
-        ax, ay, az = qx + 0.5 * bx, qy + 0.5 * by, 0.5 * bz - d
-        ex, ey, ez = qx - 0.5 * bx, qy - 0.5 * by, -0.5 * bz - d
-        paths = np.sqrt(ax * ax + ay * ay + az * az) + np.sqrt(ex * ex + ey * ey + ez * ez)
-        out[n] = wavenumber * 2.0 * (bx * qx + by * qy - bz * d) / paths
+    cx, cy, d, bx, by, bz = geometry.vector()
+    qx, qy = np.asarray(x, float) * geometry.pitch - cx, np.asarray(y, float) * geometry.pitch - cy
+    # With x a row and y a column only their sides are computed.
+    paths: Array = np.sqrt((qx + 0.5 * bx) ** 2 + (qy + 0.5 * by) ** 2 + (0.5 * bz - d) ** 2)
+    paths += np.sqrt((qx - 0.5 * bx) ** 2 + (qy - 0.5 * by) ** 2 + (-0.5 * bz - d) ** 2)
+    result: Array = geometry.wavenumber * 2.0 * (bx * qx + by * qy - bz * d) / paths
+    return result
 
 
 def opd(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:

@@ -5,10 +5,9 @@ blurs the track by a Gaussian.
 """
 
 import math
-from typing import Any
 
 import numpy as np
-from numba import njit
+from scipy.special import erf
 
 from pixcal.model.arrays import F32, F64
 
@@ -17,18 +16,6 @@ GRAZING = 0.02  # least cosine to the layer's normal: no track is longer than 50
 _RANGE = 4.0
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _spread(centre: float, first: int, sigma: float, out: Any) -> None:
-    """Share of a Gaussian at ``centre`` in the pixels from ``first`` on."""
-    scale = 1 / (math.sqrt(2.0) * sigma)
-    before = math.erf((first - 0.5 - centre) * scale)
-    for i in range(out.size):
-        after = math.erf((first + i + 0.5 - centre) * scale)
-        out[i] = 0.5 * (after - before)
-        before = after
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def add_tracks(charge: F32, tracks: F64, sigma: float, first_row: int) -> None:
     """Add the charge of tracks to a frame (y, x), e-; what falls beside it is lost.
 
@@ -39,24 +26,22 @@ def add_tracks(charge: F32, tracks: F64, sigma: float, first_row: int) -> None:
     sigma : width of the blur, px
     first_row : of the frame, among those that the tracks are counted in
     """
-    ny, nx = charge.shape
     reach = math.ceil(_RANGE * sigma)
-    along_y, along_x = np.empty(2 * reach + 2), np.empty(2 * reach + 2)
-    for n in range(len(tracks)):
-        y0, x0, dy, dx, electrons = tracks[n]
+    edges = np.arange(2 * reach + 3) - 0.5
+    for *start, dy, dx, electrons in tracks:
         points = math.ceil(STEPS_PER_PX * math.hypot(dy, dx)) + 1
-        for p in range(points):
-            y, x = y0 + dy * (p + 0.5) / points, x0 + dx * (p + 0.5) / points
-            top, left = math.floor(y) - reach, math.floor(x) - reach
-            below = top - first_row
-            if below >= ny or left >= nx or below + along_y.size <= 0 or left + along_x.size <= 0:
-                continue
-            _spread(y, top, sigma, along_y)
-            _spread(x, left, sigma, along_x)
-            for i in range(max(0, -below), min(along_y.size, ny - below)):
-                part = electrons / points * along_y[i]
-                for j in range(max(0, -left), min(along_x.size, nx - left)):
-                    charge[below + i, left + j] += part * along_x[j]
+        at = start + np.outer((np.arange(points) + 0.5) / points, [dy, dx])
+        first = np.floor(at).astype(int) - reach
+        # Shares of a Gaussian in the rows, and in the columns, from the first on.
+        away = first[:, :, None] + edges - at[:, :, None]
+        along_y, along_x = np.diff(erf(away / (math.sqrt(2.0) * sigma)) / 2).swapaxes(0, 1)
+        rows, columns = (first[:, n, None] + np.arange(2 * reach + 2) for n in (0, 1))
+        rows -= first_row
+        along_y[(rows < 0) | (rows >= charge.shape[0])] = 0
+        along_x[(columns < 0) | (columns >= charge.shape[1])] = 0
+        where = np.clip(rows, 0, len(charge) - 1)[:, :, None]
+        there = where, np.clip(columns, 0, charge.shape[1] - 1)[:, None, :]
+        np.add.at(charge, there, electrons / points * along_y[:, :, None] * along_x[:, None, :])
 
 
 def draw_tracks(

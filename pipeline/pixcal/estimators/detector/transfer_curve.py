@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
-from pixcal.kernels.noise_sums import product_sums
-from pixcal.model.arrays import F32, F64, Mask
+from pixcal.model.arrays import F32, F64, Indices, Mask
 
 # rows and columns from a pixel to itself and to those that it may share its noise with
 STEPS = np.array([(0, 0), (0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)])
@@ -148,14 +147,46 @@ def _of_stack(stack: Stack, evidence: Evidence) -> F64 | None:
 def residual_sums(
     rest: F32, model: F32, shot_factor: F64, read: F64,
     good: Mask, of_time: NDArray[np.floating], of_pixels: NDArray[np.floating],
-    taken: F64,
+    taken: F64, steps: Indices = STEPS, limit: float = _CLIP,
 ) -> F64:  # fmt: skip
-    """Sums of `product_sums` of residuals (t, y, x), e-, for each of `STEPS`."""
-    single = (np.ascontiguousarray(a, np.float32) for a in (rest, model, shot_factor, read))
-    return np.asarray(
-        product_sums(
-            *single, np.ascontiguousarray(good),
-            np.ascontiguousarray(of_time, np.float32), np.ascontiguousarray(of_pixels, np.float32),
-            STEPS, taken.astype(np.float32), _CLIP,
-        )
-    )  # fmt: skip
+    """Sums (step, 7) for ``product = a shot + b read`` of residuals, by steps between pixels.
+
+    ``shot`` and ``read`` are means of the two pixels' variances; all is divided by the root of the
+    product of their variances, so that every product has the same weight. Summed are the number,
+    the normal matrix (11, 12, 22), the right-hand side (1, 2) and the squared products.
+
+    Parameters
+    ----------
+    rest, model : (t, y, x) residuals (NaN without weight) and their model, e-
+    shot_factor, read : (y, x) variance of a sample: ``shot_factor * model + read``, e-²
+    of_time, of_pixels : (t, k), (k, y, x); their product over the variance is the share of a
+        sample's variance that its pixel's own fit took up
+    taken : (step,) covariance that the frames' fits took off, as a share of the variance
+    steps : (step, 2) rows (not negative) and columns
+    limit : standard deviations beyond which a residual has no weight
+    """
+    of_time, of_pixels = of_time.astype(np.float32), of_pixels.astype(np.float32)
+    factor, still_variance = shot_factor.astype(np.float32), read.astype(np.float32)
+    sums = np.zeros((len(steps), 7))
+    ny, nx = good.shape
+    for residual, level, share in zip(rest, model, of_time, strict=True):
+        signal = np.maximum(level, np.float32(0)) * factor
+        weight = 1 / (signal + still_variance)
+        root = np.sqrt(weight)
+        value = residual * root
+        # False of NaN.
+        root[~(good & (np.abs(value) <= limit))] = 0
+        left = np.sqrt(1 - np.tensordot(share, of_pixels, 1) * weight)
+        size = np.where(root > 0, value / left, np.float32(0))
+        shot, still = signal * root, still_variance * root
+        for n, (dy, dx) in enumerate(steps):
+            one = np.s_[: ny - dy, max(0, -dx) : nx - max(0, dx)]
+            two = np.s_[dy:, max(0, dx) : nx - max(0, -dx)]
+            first = (shot[one] * root[two] + root[one] * shot[two]) / 2
+            second = (still[one] * root[two] + root[one] * still[two]) / 2
+            there = second > 0
+            product = size[one] * size[two] + np.float32(taken[n]) * there
+            columns = np.stack([first, second, product]).reshape(3, -1)
+            (s11, s12, p1), (_, s22, p2), (_, _, square) = columns @ columns.T
+            sums[n] += there.sum(), s11, s12, s22, p1, p2, square
+    return sums

@@ -15,7 +15,6 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
-from pixcal.kernels.two_way import turn
 from pixcal.model.arrays import F32, F64, Mask
 
 Distortion = Callable[[FringeEvidence, F32, F64], tuple[F32, Iterable[F32]]]
@@ -79,15 +78,13 @@ class TwoWay:
         Zero where a sample has no weight.
         """
         rest = np.where(self.weight > 0, change, np.float32(0))
-        k, n = len(self.of_time), rest.shape[1]
-        share, right = np.zeros((k, n), np.float32), np.empty((k, n), np.float32)
+        covariance = self.frame_covariance.astype(np.float32)
         for _ in range(_TURNS):
-            turn(
-                rest, self.weight, self.of_place, self.frame_covariance,
-                self.of_time, share, right,
-            )  # fmt: skip
-            share[:] = np.einsum("nij,jn->in", self.pixel_inverse, right)
-        rest -= self.of_time.T @ share
+            of_frames = (self.weight * rest) @ self.of_place.T
+            rest -= np.einsum("tij,tj->ti", covariance, of_frames) @ self.of_place
+            of_pixels = self.of_time @ (self.weight * rest)
+            share = np.einsum("nij,jn->in", self.pixel_inverse, of_pixels).astype(np.float32)
+            rest -= self.of_time.T @ share
         rest[self.weight == 0] = 0
         return rest
 

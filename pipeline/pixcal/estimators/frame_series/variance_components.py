@@ -17,11 +17,17 @@ from scipy.optimize import brentq
 from scipy.special import ndtri_exp
 
 from pixcal.kernels.normal_matrix import inverse_normal, root_diagonal
-from pixcal.kernels.variance_sums import trace_products
 from pixcal.model.arrays import F64
 
 MAX_STEPS = 60
 CONVERGED = 1e-5  # growth of the log-likelihood at which scoring ends
+
+
+def trace_products(weight: F64, parts: F64) -> F64:
+    """Sum over modes of tr(W D_i W D_j), (m, m), of weights (n, c, c) and parts (m, n, c, c)."""
+    products = weight @ parts
+    turned = products.swapaxes(2, 3)
+    return np.asarray(products.reshape(len(parts), -1) @ turned.reshape(len(parts), -1).T)
 
 
 def cosine_modes(series: F64) -> F64:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.kernels.noise_sums import product_sums
+from pixcal.estimators.detector.transfer_curve import residual_sums
 
 STEPS = np.array([(0, 0), (0, 1), (1, 0), (1, -1), (2, 0)])
 TAKEN = np.array([0.01, 0.02, 0.0, -0.01, 0.03])
@@ -27,7 +27,7 @@ def test_they_are_those_of_the_definition() -> None:
     size = rest / np.sqrt(variance * left)
     single = [a.astype(np.float32) for a in (rest, model, factor, read)]
     fitted = [a.astype(np.float32) for a in (of_time, of_pixels)]
-    found = product_sums(*single, good, *fitted, STEPS, TAKEN.astype(np.float32), LIMIT)
+    found = residual_sums(*single, good, *fitted, TAKEN, STEPS, LIMIT)
     for (dy, dx), lost, sums in zip(STEPS, TAKEN, found, strict=True):
         one = (slice(None), slice(0, y - dy), slice(max(0, -dx), x - max(0, dx)))
         two = (slice(None), slice(dy, y), slice(max(0, dx), x - max(0, -dx)))
