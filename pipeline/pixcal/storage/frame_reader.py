@@ -18,6 +18,9 @@ from pixcal.storage.fits_in import FrameFile, SampleFormat
 from pixcal.storage.fits_rows import BAND, read_rows
 from pixcal.storage.sources import SourceFile
 
+_CACHED = 1 << 20
+_FRAMES = (64, 32, 16, 8, 4, 2)  # that the frames of a chunk of a cube are a multiple of
+
 # what `files.json` holds of the files of an array, in columns of equal length
 Columns = Mapping[str, Sequence[Any]]
 
@@ -86,6 +89,10 @@ class FrameReader:
         files = {name: described(columns, n, folder, self.shape[1:]) for n, name in names}
         self._files = [files[name] for name in table["file"]]
         self._planes = list(table["plane"])
+        # Samples to read at a time (time, y, x): they stay in the cache of a core.
+        band = BAND * self.shape[2] * self.dtype.itemsize
+        frames = next((n for n in _FRAMES if n * band <= _CACHED), 1)
+        self.chunks: tuple[int, ...] = (frames, BAND, self.shape[2])
         self._checksums = checksums
 
     def __reduce__(self) -> tuple[Any, ...]:

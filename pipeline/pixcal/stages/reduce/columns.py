@@ -95,12 +95,12 @@ def strip_width(readers: Iterable[Reader], need: Callable[[int], int], runtime: 
 
 
 def blocks(reader: Reader, strip: Strip) -> Iterator[tuple[int, NDArray[Any]]]:
-    """First frame and samples (t, y, x) of a strip, 64 frames at a time in the same memory."""
+    """First frame and samples (t, y, x) of a strip, a few frames at a time in the same memory."""
     rows, (x0, x1) = span((reader.shape[1], reader.shape[2]), strip)
-    frames = reader.shape[0]
-    buffer = np.empty((min(CHUNK[0], frames), rows[1] - rows[0], x1 - x0), reader.dtype)
-    for first in range(0, frames, CHUNK[0]):
-        last = min(first + CHUNK[0], frames)
+    frames, step = reader.shape[0], reader.chunks[0]
+    buffer = np.empty((min(step, frames), rows[1] - rows[0], x1 - x0), reader.dtype)
+    for first in range(0, frames, step):
+        last = min(first + step, frames)
         yield first, reader.read((first, last), rows, (x0, x1), out=buffer[: last - first])
 
 

@@ -35,12 +35,11 @@ from pixcal.storage.frame_reader import Reader
 from pixcal.storage.place import Place
 
 
-def convert_bytes(itemsize: int, width: int) -> int:
-    """Peak of `convert`: a chunk, its codes, both compressed; of each column, a chunk and maps."""
+def convert_bytes(itemsize: int, width: int, frames: int = CHUNK[0]) -> int:
+    """Peak of `convert`: two chunks, compressed too; of each column, frames, codes and maps."""
     tile = CHUNK[1] * CHUNK[2]
-    return 4 * 4 * CHUNK[0] * tile + tile * (
-        width * CHUNK[0] * itemsize + max(width, STRIP) * 16 * 4
-    )
+    column = frames * itemsize + CHUNK[0] * np.dtype(np.uint16).itemsize
+    return tile * (4 * 4 * CHUNK[0] + width * column + max(width, STRIP) * 16 * 4)
 
 
 @dataclass(frozen=True)
@@ -170,21 +169,21 @@ class _Column:
         )  # fmt: skip
         self.saturated = np.zeros(self.maps["flat"].shape, np.uint32)
         self.lost = np.zeros_like(self.saturated)
+        self.codes = np.empty((CHUNK[0], *self.lost.shape), np.uint16)
         self.total = self.largest = 0
 
     def add(self, first: int, samples: NDArray[Any], begin: int) -> None:
-        """Write the chunk that begins at a frame, from the columns of a strip from ``begin`` on."""
-        fringes = self.job.fringes
-        (y0, _), (x0, _) = fringes.extent(self.index)
-        codes = np.empty((len(samples), *self.lost.shape), np.uint16)
+        """Convert frames from the columns of a strip from ``begin`` on; write full chunks."""
+        fringes, last = self.job.fringes, first + len(samples)
+        at = first % CHUNK[0]
+        held = at + len(samples)
         self.total += encode(
-            samples, *self.coefficients, fringes.exptime[first : first + len(samples)],
-            np.float32(fringes.saturation), codes, self.saturated, self.lost, begin,
+            samples, *self.coefficients, fringes.exptime[first:last],
+            np.float32(fringes.saturation), self.codes[at:held], self.saturated, self.lost, begin,
         )  # fmt: skip
-        self.job.writers["signal"].write((first, y0, x0), codes)
-        if samples.dtype.kind in "iu":
-            own = samples[:, :, begin : begin + codes.shape[-1]]
-            self.largest = max(self.largest, int(own.max()))
+        if held == CHUNK[0] or last == fringes.frames:
+            (y0, _), (x0, _) = fringes.extent(self.index)
+            self.job.writers["signal"].write((last - held, y0, x0), self.codes[:held])
 
     def result(self) -> dict[str, NDArray[Any]]:
         """Maps and counts, by names of their arrays."""
@@ -204,15 +203,17 @@ def convert(job: Converting, parts: Sequence[Strip]) -> None:
     """Write columns of chunks in electrons, their maps, and their counts.
 
     The counts are: samples that are saturated; others without weight; samples with weight; the sum
-    of their codes; the largest sample (ADU; zero for real numbers).
+    of their codes; the largest sample of the strip (ADU; zero for real numbers).
     """
     found: dict[Index, dict[str, NDArray[Any]]] = {}
     for strip in parts:
         own = zip(strip, job.fringes.maps(strip), strict=True)
         columns = [_Column(job, index, maps) for index, maps in own]
         for first, samples in blocks(job.fringes.raw, strip):
+            largest = int(samples.max()) if samples.dtype.kind in "iu" else 0
             for n, column in enumerate(columns):
                 column.add(first, samples, n * CHUNK[2])
+                column.largest = max(column.largest, largest)
         found |= {column.index: column.result() for column in columns}
     for strip in strips(list(found), STRIP):
         (y0, _), (x0, _) = job.fringes.extent(strip[0])
