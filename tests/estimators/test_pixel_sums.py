@@ -30,7 +30,7 @@ def case(bench):
 
 def total(sums, codes):
     for start in range(0, len(codes), 64):
-        sums.add(codes[start : start + 64], slice(start, min(start + 64, len(codes))))
+        sums.add(codes[start : start + 64])
     return sums.finish()
 
 
@@ -75,15 +75,16 @@ def test_a_batch_is_what_a_run_of_its_frames_is(make_bench):
     # Also far from the start model.
     model[1:, 3, 5] *= -1
     model[1:, 4, 6] = model[2:0:-1, 4, 6]
-    sums, whole_run, alone, empty = (PixelSums(tile, CODING, frames, model) for _ in range(4))
-    for pixels in (sums, whole_run, alone):
-        pixels.add(codes[:40], slice(0, 40))
-    turn, sigma = sums.close()
+    batches = [(0, 40), (40, 40), (42, 97)]
+    sums = PixelSums(tile, CODING, frames, model, batches)
+    whole_run, alone = (PixelSums(tile, CODING, frames, model) for _ in range(2))
+    alone.add(codes[:40])
     theta, own, _, _ = alone.finish()
     whole = np.angle((theta[2] + 1j * theta[1]) * (model[2] - 1j * model[1]))
-    np.testing.assert_allclose(np.angle(np.exp(1j * (turn - whole))), 0, atol=2e-7)
-    np.testing.assert_allclose(sigma, own, rtol=1e-6)
-    for pixels in (sums, whole_run):
-        pixels.add(codes[40:], slice(40, 100))
-    np.testing.assert_allclose(sums.finish()[0], whole_run.finish()[0], rtol=1e-9)
-    assert np.isnan(np.stack(empty.close())).all()
+    for part in np.split(codes, [40, 42, 64, 97]):
+        whole_run.add(part)
+    np.testing.assert_allclose(total(sums, codes)[0], whole_run.finish()[0], rtol=1e-9)
+    np.testing.assert_allclose(np.angle(np.exp(1j * (sums.turn[0] - whole))), 0, atol=2e-7)
+    np.testing.assert_allclose(sums.sigma[0], own, rtol=1e-6)
+    assert np.isnan([sums.turn[1], sums.sigma[1]]).all()
+    assert np.isfinite([sums.turn[2], sums.sigma[2]]).all()

@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from pixcal.model.arrays import F32, F64
+from pixcal.model.arrays import F32, F64, I64
 
 # sums kept for each pixel: 6 normal, 3 right-hand, weighted square of the residual, samples
 N_SUMS = 11
+GAP, GOES_ON = -1, -2  # no batch, see `sweep_batches`
 # determinant over the product of the diagonal: without three phases it is zero up to rounding
 SINGULAR = 1e-9
 FAST = {"reassoc", "contract", "nsz", "arcp", "afn"}
@@ -64,11 +65,69 @@ def _sweep_row(
             rr[i] += wr * r
 
 
+@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _sweep_still_row(
+    codes: Any, row: int, scale: float, offset: float, fill: float, g: Any,
+    t0: Any, t1: Any, t2: Any, read: Any, shot: Any,
+    n00: Any, n01: Any, n02: Any, n11: Any, n12: Any, n22: Any,
+    b0: Any, b1: Any, b2: Any, rr: Any,
+) -> None:  # fmt: skip
+    # The same without a turn of the phase within the tile: half the operations.
+    one, zero = np.float32(1), np.float32(0)
+    for t in range(codes.shape[0]):
+        a0, a1, a2 = g[t, 0], g[t, 1], g[t, 2]
+        a00, a01, a02, a11, a12, a22 = a0 * a0, a0 * a1, a0 * a2, a1 * a1, a1 * a2, a2 * a2
+        for i in range(codes.shape[2]):
+            code = np.float32(codes[t, row, i])
+            model = t0[i] * a0 + t1[i] * a1 + t2[i] * a2
+            w = (one if code != fill else zero) / (shot[i] * max(model, zero) + read[i])
+            r = scale * code + offset - model
+            wr = w * r
+            n00[i] += w * a00
+            n01[i] += w * a01
+            n02[i] += w * a02
+            n11[i] += w * a11
+            n12[i] += w * a12
+            n22[i] += w * a22
+            b0[i] += wr * a0
+            b1[i] += wr * a1
+            b2[i] += wr * a2
+            rr[i] += wr * r
+
+
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _count_row(codes: Any, row: int, fill: int, count: Any) -> None:
     for t in range(codes.shape[0]):
         for i in range(codes.shape[2]):
             count[i] += np.float32(codes[t, row, i] != fill)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _sum_row(
+    codes: Any, row: int, scale: float, offset: float, fill: int, g: Any, dk: Any, moving: bool,
+    y: float, x0: float, t0: Any, t1: Any, t2: Any, read: Any, shot: Any, p: Any,
+) -> None:  # fmt: skip
+    s, o, f = np.float32(scale), np.float32(offset), np.float32(fill)
+    if moving:
+        _sweep_row(
+            codes, row, s, o, f, g, dk, np.float32(y), np.float32(x0), t0, t1, t2, read, shot,
+            p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9],
+        )  # fmt: skip
+    else:
+        _sweep_still_row(
+            codes, row, s, o, f, g, t0, t1, t2, read, shot,
+            p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9],
+        )  # fmt: skip
+    _count_row(codes, row, fill, p[10])
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _pour(part: Any, total: Any) -> None:
+    """Add sums to others, and begin again."""
+    for k in range(part.shape[0]):
+        for i in range(part.shape[1]):
+            total[k, i] += part[k, i]
+            part[k, i] = 0
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -101,23 +160,14 @@ def sweep_block(
     sums : (N_SUMS, y, x) float64, added to: normal sums 00, 01, 02, 11, 12, 22, right-hand sums 0
         to 2 (of the residual to the start model), its weighted square, number of samples
     """
-    ny, nx = codes.shape[1], codes.shape[2]
-    p = np.empty((11, nx), np.float32)
-    s, o, f = np.float32(scale), np.float32(offset), np.float32(fill)
-    for row in range(ny):
-        for k in range(11):
-            for i in range(nx):
-                p[k, i] = 0
-        t0, t1, t2 = theta[0, row], theta[1, row], theta[2, row]
-        _sweep_row(
-            codes, row, s, o, f, g, dk, np.float32(y0 + row), np.float32(x0),
-            t0, t1, t2, read[row], shot[row],
-            p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9],
+    moving = np.any(dk != 0)
+    p = np.zeros((N_SUMS, codes.shape[2]), np.float32)
+    for row in range(codes.shape[1]):
+        _sum_row(
+            codes, row, scale, offset, fill, g, dk, moving, y0 + row, x0,
+            theta[0, row], theta[1, row], theta[2, row], read[row], shot[row], p,
         )  # fmt: skip
-        _count_row(codes, row, fill, p[10])
-        for k in range(11):
-            for i in range(nx):
-                sums[k, row, i] += p[k, i]
+        _pour(p, sums[:, row])
 
 
 GROUP = 1024  # pixels summed at a time: what is kept of them stays in the first cache
@@ -291,24 +341,6 @@ def _adjugate(a: float, b: float, c: float, d: float, e: float, f: float) -> Any
     return i00, i01, i02, i11, i12, i22, a * i00 + b * i01 + c * i02
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def close_batch(part: F64, total: F64, model: F32, turn: F32, sigma: F32) -> None:
-    """Phase of a batch relative to the start model, and its error; its sums go to the run's.
-
-    Parameters
-    ----------
-    part, total : (N_SUMS, p) float64, sums of the batch (zero afterwards) and of the run (added to)
-    model : (3, p) float32, start model, e-
-    turn, sigma : (p,) float32, written, rad; NaN where three unknowns are not determined
-    """
-    _close_pixels(
-        part[0], part[1], part[2], part[3], part[4], part[5], part[6], part[7], part[8],
-        model[1], model[2], turn, sigma,
-    )  # fmt: skip
-    total += part
-    part[:] = 0
-
-
 @njit(inline="always")  # type: ignore[untyped-decorator]
 def _fringe(
     n00: float, n01: float, n02: float, n11: float, n12: float, n22: float,
@@ -347,3 +379,65 @@ def _close_pixels(
                 n00[i], n01[i], n02[i], n11[i], n12[i], n22[i], b0[i], b1[i], b2[i], m1[i], m2[i]
             )
             turn[i] = np.arctan2(across, along)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def sweep_batches(
+    codes: Any,
+    scale: float,
+    offset: float,
+    fill: int,
+    g: F32,
+    dk: F32,
+    y0: float,
+    x0: float,
+    theta: F32,
+    read: F32,
+    shot: F32,
+    stops: I64,
+    closes: I64,
+    part: F64,
+    total: F64,
+    turn: F32,
+    sigma: F32,
+) -> None:
+    """Add a block of frames to the sums of batches, and those of full batches to the run's.
+
+    Row by row, so that the sums of a row stay in the first cache whatever the number of batches.
+
+    Parameters
+    ----------
+    codes, scale, offset, fill, g, dk, y0, x0, theta, read, shot
+        As in `sweep_block`.
+    stops : (n,) int64
+        Frames of the block at which its sums are cut; the last is their number.
+    closes : (n,) int64
+        Batch that ends there; `GAP` where frames of none do, `GOES_ON` where none does.
+    part, total : (y, N_SUMS, x) float64
+        Sums of the batch at hand, and of all that have ended; added to.
+    turn, sigma : (batch, y, x) float32
+        Written: phase of a batch relative to the start model and its error, rad; NaN where it
+        does not give all three unknowns.
+    """
+    moving = np.any(dk != 0)
+    p = np.zeros((N_SUMS, codes.shape[2]), np.float32)
+    for row in range(codes.shape[1]):
+        t0, t1, t2 = theta[0, row], theta[1, row], theta[2, row]
+        q, whole = part[row], total[row]
+        first = 0
+        for n in range(stops.size):
+            stop = stops[n]
+            _sum_row(
+                codes[first:stop], row, scale, offset, fill, g[first:stop], dk[first:stop], moving,
+                y0 + row, x0, t0, t1, t2, read[row], shot[row], p,
+            )  # fmt: skip
+            _pour(p, q)
+            first = stop
+            if closes[n] == GOES_ON:
+                continue
+            if closes[n] != GAP:
+                _close_pixels(
+                    q[0], q[1], q[2], q[3], q[4], q[5], q[6], q[7], q[8], t1, t2,
+                    turn[closes[n], row], sigma[closes[n], row],
+                )  # fmt: skip
+            _pour(q, whole)

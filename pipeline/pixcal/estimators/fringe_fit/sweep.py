@@ -68,89 +68,61 @@ def sweep_tile(
         Pixels for which to work out the Cramér-Rao bound.
     """
     held: list[U16] = []
-    sums: _BatchSums | None = None
-    position = 0
+    sums: PixelSums | None = None
     for block in blocks:
-        if sums is None:
-            held.append(block.copy())
-            n_held = sum(map(len, held))
-            if n_held < prime and n_held < len(frames.g):
-                continue
-            first = FrameParameters(frames.g[:n_held], frames.dk[:n_held], frames.reference)
-            model, smooth = start_model(tile, held, coding, first, k)
-            pixels = PixelSums(tile, coding, frames, model)
-            sums = _BatchSums(tile, frames, batches, smooth, pixels)
-            for part in held:
-                sums.add(part, position)
-                position += len(part)
-            held = []
-        else:
-            sums.add(block, position)
-            position += len(block)
-    if sums is None or position != len(frames.g):
-        raise ValueError(f"{position} frames given, {len(frames.g)} expected")
-    return sums.finish(k, bound_pixels)
+        if sums is not None:
+            sums.add(block)
+            continue
+        held.append(block.copy())
+        n_held = sum(map(len, held))
+        if n_held < prime and n_held < len(frames.g):
+            continue
+        first = FrameParameters(frames.g[:n_held], frames.dk[:n_held], frames.reference)
+        model, smooth = start_model(tile, held, coding, first, k)
+        sums = PixelSums(tile, coding, frames, model, batches.ranges)
+        while held:
+            sums.add(held.pop(0))
+    if sums is None or sums.position != len(frames.g):
+        given = sum(map(len, held)) if sums is None else sums.position
+        raise ValueError(f"{given} frames given, {len(frames.g)} expected")
+    return _maps(tile, frames, smooth, sums, k, bound_pixels)
 
 
-class _BatchSums:
-    """Sums of the whole run and of the batch at hand, cut where batches begin and end."""
+def _maps(
+    tile: Tile,
+    frames: FrameParameters,
+    smooth: SmoothPhasor,
+    sums: PixelSums,
+    k: tuple[float, float],
+    bound_pixels: int,
+) -> TileMaps:
+    theta, sigma, chi2, count = sums.finish()
+    z = theta[2] + 1j * theta[1]
+    (cy, cx), (ry, rx) = tile.centre, frames.reference
+    carrier = plane_wave(tile.shape, k, k[0] * (cx - rx) + k[1] * (cy - ry))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reduced = np.where(count > 3, chi2 / (count - 3), np.nan)
+    turn = np.angle(z * smooth.map.conj()).astype(np.float32)
+    return TileMaps(
+        iota=theta[0].astype(np.float32),
+        alpha=np.abs(z).astype(np.float32),
+        phase=np.angle(z * carrier.conj()).astype(np.float32),
+        sigma=sigma.astype(np.float32),
+        chi2=reduced.astype(np.float32),
+        count=count.astype(np.float32),
+        smooth=smooth,
+        batch_phase=_relative(sums.turn, turn),
+        batch_sigma=sums.sigma,
+        bound=phase_bound(tile, theta, frames, bound_pixels),
+    )
 
-    def __init__(
-        self,
-        tile: Tile,
-        frames: FrameParameters,
-        batches: FrameBatches,
-        smooth: SmoothPhasor,
-        sums: PixelSums,
-    ) -> None:
-        self.tile, self.frames, self.smooth, self.sums = tile, frames, smooth, sums
-        shape = (len(batches.ranges), *tile.shape)
-        # Phases relative to the start model, and their errors.
-        self.turn = np.full(shape, np.nan, np.float32)
-        self.sigma = np.full(shape, np.nan, np.float32)
-        # Where the sums are cut: at the ends of batches (those of gaps do not cut).
-        self.ends = {b: n for n, (a, b) in enumerate(batches.ranges) if b > a}
-        self.cuts = sorted({a for a, b in batches.ranges if b > a} | set(self.ends))
 
-    def add(self, block: U16, position: int) -> None:
-        stop = position + len(block)
-        cuts = [c for c in self.cuts if position < c < stop]
-        for a, b in zip([position, *cuts], [*cuts, stop], strict=True):
-            self.sums.add(block[a - position : b - position], slice(a, b))
-            if b in self.ends:
-                n = self.ends[b]
-                self.turn[n], self.sigma[n] = self.sums.close()
-            elif b in self.cuts:
-                self.sums.close()
-
-    def finish(self, k: tuple[float, float], bound_pixels: int) -> TileMaps:
-        theta, sigma, chi2, count = self.sums.finish()
-        z = theta[2] + 1j * theta[1]
-        cy, cx = self.tile.centre
-        ry, rx = self.frames.reference
-        carrier = plane_wave(self.tile.shape, k, k[0] * (cx - rx) + k[1] * (cy - ry))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            reduced = np.where(count > 3, chi2 / (count - 3), np.nan)
-        turn = np.angle(z * self.smooth.map.conj()).astype(np.float32)
-        return TileMaps(
-            iota=theta[0].astype(np.float32),
-            alpha=np.abs(z).astype(np.float32),
-            phase=np.angle(z * carrier.conj()).astype(np.float32),
-            sigma=sigma.astype(np.float32),
-            chi2=reduced.astype(np.float32),
-            count=count.astype(np.float32),
-            smooth=self.smooth,
-            batch_phase=self._relative_to(turn),
-            batch_sigma=self.sigma,
-            bound=phase_bound(self.tile, theta, self.frames, bound_pixels),
-        )
-
-    def _relative_to(self, turn: F32) -> F32:
-        """Phases of the batches (batch, y, x) relative to those of the run; the batches' change."""
-        self.turn -= turn
-        # Most are near: to wrap them all would take longer than to look.
-        near = not len(self.turn) or np.abs(self.turn).max() < np.pi
-        return self.turn if near else wrapped(self.turn)
+def _relative(batches: F32, turn: F32) -> F32:
+    """Phases of batches (batch, y, x) relative to those of the run (y, x); the former change."""
+    batches -= turn
+    # Most are near: to wrap them all would take longer than to look.
+    near = not len(batches) or np.abs(batches).max() < np.pi
+    return batches if near else wrapped(batches)
 
 
 def phase_bound(tile: Tile, theta: F64, frames: FrameParameters, number: int = BOUND_PIXELS) -> F64:

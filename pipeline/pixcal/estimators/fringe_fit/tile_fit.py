@@ -7,9 +7,18 @@ from typing import NamedTuple
 import numpy as np
 
 from pixcal.estimators.fringe_fit.fringes import FrameParameters, SmoothPhasor, smooth_phasor
-from pixcal.kernels.bilinear import N_SUMS, close_batch, solve_pixels, sweep_block
+from pixcal.kernels.bilinear import (
+    GAP,
+    GOES_ON,
+    N_SUMS,
+    solve_pixels,
+    sweep_batches,
+    sweep_block,
+)
 from pixcal.kernels.robust import median
 from pixcal.model.arrays import C128, F32, F64, U16, Mask
+
+MOST_FRAMES = 64  # summed in float32
 
 
 class Coding(NamedTuple):
@@ -48,34 +57,70 @@ class Tile:
 
 
 class PixelSums:
-    """Sums that grow block by block, about a start model (3, y, x)."""
+    """Sums that grow block by block about a start model, of the run and of batches of its frames.
 
-    def __init__(self, tile: Tile, coding: Coding, frames: FrameParameters, model: F32) -> None:
-        self.tile, self.coding, self.frames, self.model = tile, coding, frames, model
-        self.total: F64 = np.zeros((N_SUMS, *tile.shape))
-        self.part: F64 = np.zeros((N_SUMS, *tile.shape))
+    Parameters
+    ----------
+    tile, coding, frames
+        As in `accumulate`.
+    model : (3, y, x) float32
+        Start model.
+    ranges : sequence of (int, int)
+        First frame and the one after the last of each batch; empty for a gap.
 
-    def add(self, codes: U16, at: slice) -> None:
-        """Add the codes (t, y, x) of the frames ``at``."""
-        part = FrameParameters(self.frames.g[at], self.frames.dk[at], self.frames.reference)
-        accumulate(self.tile, [codes], self.coding, part, self.model, self.part)
+    Attributes
+    ----------
+    turn, sigma : (batch, y, x) float32
+        Phases of the batches relative to the start model and their errors, rad; NaN in gaps.
+    """
 
-    def close(self) -> tuple[F32, F32]:
-        """End the batch: its phase relative to the start model and the error, each (y, x), rad.
+    def __init__(
+        self,
+        tile: Tile,
+        coding: Coding,
+        frames: FrameParameters,
+        model: F32,
+        ranges: Sequence[tuple[int, int]] = (),
+    ) -> None:
+        self.model, self.position = model, 0
+        self._fixed = (*_corner(tile), model, tile.read, tile.shot)
+        self._coding = coding
+        self._g, self._dk = _moved(tile, frames)
+        ny, nx = tile.shape
+        self._part, self._total = np.zeros((2, ny, N_SUMS, nx))
+        self.turn, self.sigma = np.full((2, len(ranges), ny, nx), np.nan, np.float32)
+        # Where sums are cut: at the ends of batches, and where one begins after a gap.
+        self._cuts = {a: GAP for a, b in ranges if b > a}
+        self._cuts |= {b: n for n, (a, b) in enumerate(ranges) if b > a}
 
-        Its sums go to the run's.
-        """
-        turn, sigma = np.empty((2, *self.tile.shape), np.float32)
-        part, total = (a.reshape(N_SUMS, -1) for a in (self.part, self.total))
-        close_batch(part, total, self.model.reshape(3, -1), turn.ravel(), sigma.ravel())
-        return turn, sigma
+    def add(self, codes: U16) -> None:
+        """Add the codes (t, y, x) of the frames that follow."""
+        first, last = self.position, self.position + len(codes)
+        inside = {c - first for c in self._cuts if first < c < last}
+        stops = sorted(inside | {*range(MOST_FRAMES, len(codes), MOST_FRAMES), len(codes)})
+        closes = [self._cuts.get(first + stop, GOES_ON) for stop in stops]
+        sweep_batches(
+            codes, *self._coding, self._g[first:last], self._dk[first:last], *self._fixed,
+            np.array(stops), np.array(closes), self._part, self._total, self.turn, self.sigma,
+        )  # fmt: skip
+        self.position = last
 
     def finish(self) -> tuple[F64, F64, F64, F64]:
         """End the run: theta (3, y, x); phase errors, chi-square and samples, each (y, x)."""
-        self.total += self.part
-        step, covariance, chi2 = solve_pixels(self.total)
+        sums = np.moveaxis(self._total + self._part, 1, 0)
+        step, covariance, chi2 = solve_pixels(sums)
         theta = self.model + step
-        return theta, phase_sigma(theta, covariance), chi2, self.total[10]
+        return theta, phase_sigma(theta, covariance), chi2, sums[10]
+
+
+def _moved(tile: Tile, frames: FrameParameters) -> tuple[F32, F32]:
+    """Parameters of the frames at a tile's centre, and the changes of their fringe vector."""
+    return frames.at(*tile.centre).astype(np.float32), frames.dk.astype(np.float32)
+
+
+def _corner(tile: Tile) -> tuple[float, float]:
+    """First pixel (y, x) relative to the tile's centre."""
+    return -(tile.shape[0] - 1) / 2, -(tile.shape[1] - 1) / 2
 
 
 def phase_sigma(theta: F64, covariance: F64) -> F64:
@@ -121,14 +166,12 @@ def accumulate(
     """
     sums = np.zeros((N_SUMS, *tile.shape)) if sums is None else sums
     read, shot = variance or (tile.read, tile.shot)
-    g = frames.at(*tile.centre).astype(np.float32)
-    dk = frames.dk.astype(np.float32)
-    corner = (-(n - 1) / 2 for n in tile.shape)
-    around = (*corner, theta, read, shot)
+    g, dk = _moved(tile, frames)
+    around = (*_corner(tile), theta, read, shot)
     start = 0
     for block in blocks:
-        for first in range(0, len(block), 64):
-            part = block[first : first + 64]
+        for first in range(0, len(block), MOST_FRAMES):
+            part = block[first : first + MOST_FRAMES]
             at = slice(start + first, start + first + len(part))
             sweep_block(part, *coding, g[at], dk[at], *around, sums)
         start += len(block)

@@ -83,9 +83,7 @@ def write_set(
         gain=gain,
     )
     todo = indices(source.shape)
-    need = partial(
-        convert_bytes, fringes.raw.dtype.itemsize, frames=fringes.raw.chunks[0]
-    )
+    need = partial(convert_bytes, fringes.raw.dtype.itemsize, frames=fringes.raw.chunks[0])
     width = strip_width([fringes.raw], need, runtime)
     low, high = _possible_range(source, name, gain, bounds)
     origin = "saturation"
