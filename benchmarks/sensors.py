@@ -1,63 +1,53 @@
 """Examination on simulated cameras without fringes: right causes, gain, read noise, masks, time.
 
-Every draw is made by ``second_bench.sensors``, which shares no code with pixcal, and run by the
-command line::
+Every draw is made by ``second_bench.sensors``, which shares no code with pixcal, and run without a
+report, all in this process::
 
     python benchmarks/sensors.py --draws 8 --seed 1 --out /tmp/sensors [KIND ...]
 
-Time is that of the processors (user and system). ``--out`` keeps a line of JSON for each draw.
+Time is that of the processors. ``--out`` keeps a line of JSON for each draw.
 """
 
 import argparse
 import json
-import os
-import resource
 import shutil
-import subprocess
-import sys
 import tempfile
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-PROGRAM = [sys.executable, "-m"]
+import pixcal
+from second_bench.sensors import KINDS, make, write
+
 GAIN_WITHIN, NOISE_WITHIN, MASK_WITHIN = 0.01, 0.01, 1e-3
 
 
-def _processor_s() -> float:
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
-
-
 def examine(
-    kind: str, seed: int, folder: Path, options: list[str], commands: list[str]
+    kind: str, seed: int, folder: Path, options: dict[str, Any], diagnose: bool
 ) -> dict[str, Any]:
     """Simulate, run and mark one draw."""
-    acquisition, run, truth_file = (folder / name for name in ("acq", "run", "truth.json"))
-    quiet = {"capture_output": True, "text": True, "env": os.environ | {"OMP_NUM_THREADS": "1"}}
-    made = ["second_bench.sensors", kind, "--seed", str(seed), *options]
-    subprocess.run(
-        [*PROGRAM, *made, "--out", acquisition, "--truth", truth_file], check=True, **quiet
-    )  # fmt: skip
-    truth = json.loads(truth_file.read_text())
-    before = _processor_s()
-    done = subprocess.run(
-        [*PROGRAM, "pixcal_cli", "run", acquisition, "--out", run, "--quiet", *commands],
-        check=False, **quiet,
-    )  # fmt: skip
-    marks = {"kind": kind, "seed": seed, "cpu_s": round(_processor_s() - before, 1)}
+    acquisition, run = folder / "acq", folder / "run"
+    sensor, truth = make(kind, seed, **options)
+    write(sensor, acquisition)
+    marks = {"kind": kind, "seed": seed}
     marks |= {key: truth[key] for key in ("ladder", "bits", "drawn")}
     marks["e_per_adu"], marks["noise_e"] = round(truth["gain"], 3), round(truth["read_noise_e"], 3)
-    if done.returncode:
-        return marks | {"failed": done.stderr.strip()[-400:]}
+    before = time.process_time()
+    try:
+        pixcal.ingest(acquisition, run)
+        pixcal.reduce(run)
+        if diagnose:
+            pixcal.diagnose(run)
+    except Exception as error:  # every failure of a draw is a result
+        return marks | {"cpu_s": 0.0, "failed": f"{type(error).__name__}: {error}"[-400:]}
+    marks["cpu_s"] = round(time.process_time() - before, 1)
     return marks | mark(run, truth)
 
 
 def mark(run: Path, truth: dict[str, Any]) -> dict[str, Any]:
     """What a run found, beside the truth."""
-    import pixcal
-
     opened = pixcal.open_run(run)
     figures = opened.reduction["figures_of_merit"]
 
@@ -124,27 +114,25 @@ def main() -> None:
     parser.add_argument("kinds", nargs="*")
     parser.add_argument("--draws", type=int, default=8)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--size", nargs=2, default=["257", "383"])
-    parser.add_argument("--bias", default="0")
-    parser.add_argument("--flats", default="0")
+    parser.add_argument("--size", nargs=2, type=int, default=(257, 383))
+    parser.add_argument("--bias", type=int, default=0)
+    parser.add_argument("--flats", type=int, default=0)
     parser.add_argument("--ladder")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument(
-        "--no-diagnose", action="store_const", dest="commands", const=["--no-diagnose"], default=[],
+        "--no-diagnose", action="store_false", dest="diagnose",
         help="gain, read noise and masks only",
     )  # fmt: skip
     parser.add_argument("--keep", action="store_true", help="keep frames and runs")
     asked = parser.parse_args()
-    from second_bench.sensors import KINDS
-
-    options = ["--size", *asked.size, "--bias", asked.bias, "--flats", asked.flats]
-    options += ["--ladder", asked.ladder] if asked.ladder else []
+    counts = asked.bias, asked.flats
+    options = {"shape": tuple(asked.size), "ladder": asked.ladder, "counts": counts}
     asked.out.mkdir(parents=True, exist_ok=True)
     lines = []
     for kind in asked.kinds or KINDS:
         for seed in range(asked.seed, asked.seed + asked.draws):
             folder = Path(tempfile.mkdtemp(prefix=f"{kind}-{seed}-", dir=asked.out))
-            lines.append(examine(kind, seed, folder, options, asked.commands))
+            lines.append(examine(kind, seed, folder, options, asked.diagnose))
             print(json.dumps(lines[-1]), flush=True)
             with (asked.out / "draws.jsonl").open("a") as file:
                 file.write(json.dumps(lines[-1]) + "\n")

@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from pixcal.estimators.detector.frame_lag import CLEAR, MAX_DECAY, common_lag, share_of_flats
+from pixcal.estimators.detector.frame_lag import CLEAR, MAX_DECAY, common_lag, lag_of_flats
 from pixcal.estimators.detector.noiseless_charge import missing_noise
 from pixcal.estimators.detector.pixel_lag import Uneven
 from pixcal.estimators.detector.traps import BANDS, LossFit, in_bands
@@ -28,8 +28,9 @@ _TURNS = 3  # of the inverse: each gains a factor of the share
 class Lag(Effect):
     """Part of the charge of a frame appears in later frames.
 
-    It comes out with the next frame, or over several. No charge is lost, and before the first frame
-    of a recording the pixels were dark and empty. A barrier may hold back another share of each
+    It comes out with the next frame, or over several. No charge is lost. Before the first frame of
+    a recording the pixels were empty, or held what the last frame of the recording before left
+    (`carried`). A barrier may hold back another share of each
     band of the level; traps take charge as long as they have room (`capacity_e`), so that what they
     hold of earlier frames limits what they take.
 
@@ -47,7 +48,7 @@ class Lag(Effect):
     absorbed_because = (
         "the fit absorbs a uniform lag; its variation moves phases by hundredths of the bound"
     )
-    optional_parameters = ("decay_frames", "spread", "quiet")
+    optional_parameters = ("decay_frames", "spread", "quiet", "carried")
     frames_needed = ("random",)
     quick = False
     sources = (
@@ -90,6 +91,11 @@ class Lag(Effect):
         "over decay_frames; 0: no limit"
     )  # fmt: skip
 
+    carried: float = quantity(
+        0.0, low=0, high=1, doc="part of the charge left by the last frame before a recording that "
+        "is still there when it begins; 0: the detector is cleared"
+    )  # fmt: skip
+
     @property
     def releases(self) -> F64:
         """Share of what stayed behind that comes out 1, 2, ... frames later; their sum is one."""
@@ -116,19 +122,26 @@ class Lag(Effect):
             return self._with_traps(charge, shot)
         found = charge - self._left_behind(charge, shot, shot.frame)
         for back, release in enumerate(self.releases, start=1):
-            before = shot.charge(shot.frame - back)
+            before = self._charge_before(shot, back)
             if before is None:
                 break
             stayed = self._left_behind(before, shot, shot.frame - back, 1 - self.quiet)
             found += np.float32(release) * stayed
         return found
 
+    def _charge_before(self, shot: Shot, back: int) -> F32 | None:
+        """Charge of a frame before this one, as far as it was carried; None where there is none."""
+        if back <= shot.frame:
+            return shot.charge(shot.frame - back)
+        charge = shot.charge(shot.frame - back) if self.carried else None
+        return None if charge is None else np.float32(self.carried) * charge
+
     def _with_traps(self, charge: F32, shot: Shot) -> F32:
         """A frame without what traps take of it, and with what they give back of earlier ones."""
         scale = _shares(self, shot.bench.detector, shot.rows) / np.float32(self.share)
         held = np.zeros_like(charge)
         for back in range(self.frames_back, 0, -1):
-            before = shot.charge(shot.frame - back)
+            before = self._charge_before(shot, back)
             if before is not None:
                 held = self._held(held, before, scale, shot, shot.frame - back, 1 - self.quiet)
         return np.asarray(charge + held - self._held(held, charge, scale, shot, shot.frame))
@@ -228,16 +241,17 @@ class Lag(Effect):
         frame of each flat tells, which lacks what the dark before it could not give.
         """
         if not evidence.fringes:
-            of_flats = share_of_flats(evidence)
-            if of_flats is None:
+            found = lag_of_flats(evidence)
+            if found is None:
                 return None
-            share, error = of_flats
-            why = (
-                "the first flat of a level is fainter; after another flat, rather than darkness, "
-                "the share is a lower limit"
+            before = "charge of the frame before" if found.carried else "a clear"
+            return Estimate(
+                cls(float(np.clip(found.share, 0, 0.5)), 0.0, 0.0, carried=found.carried),
+                {"share": found.error},
+                found.share / found.error,
+                f"the first flat of each level is fainter, as after {before}",
+                {"share": found.share},
             )
-            effect = cls(float(np.clip(share, 0, 0.5)), 0.0, 0.0)
-            return Estimate(effect, {"share": error}, share / error, why, {"share": share})
         fringes = tuple(evidence.fringes.values())
         common = common_lag([f.free[:, :3] for f in fringes], cls._undone)
         if common is None:

@@ -114,8 +114,9 @@ class _Shot:
 
     def charge(self, frame: int) -> F32 | None:
         """Charge of another frame, without this effect; None outside the recording."""
-        inside = 0 <= frame < self.recording.count
-        return self._chain.charge(frame, self._at) if inside else None
+        chain, frame = self._chain.of(frame)
+        inside = 0 <= frame < chain.recording.count
+        return chain.charge(frame, self._at) if inside else None
 
     def surrounded(self, charge: F32, reach: int) -> F32:
         """Charge of this frame with a margin, in which its light goes on."""
@@ -130,9 +131,9 @@ class _Shot:
 
     def normals(self, effect: str, frame: int | None = None) -> F32:
         """Standard normals (y, x) of an effect, the same however rows are cut; read only."""
-        frame = self.frame if frame is None else frame
-        looks_back = self._chain.effects[self._at].frames_back > 0
-        return self._chain.normals(effect, frame, keep=looks_back)
+        chain, frame = self._chain.of(self.frame if frame is None else frame)
+        looks_back = chain.effects[self._at].frames_back > 0
+        return chain.normals(effect, frame, keep=looks_back)
 
 
 class _Latest(dict[K, F32]):
@@ -168,6 +169,18 @@ class _Chain:
         self._kept_normals = _Latest[tuple[int, str]](sum(back))
         self._margins: dict[int, tuple[LightMaps, F32]] = {}
         self._samples = np.empty(self.dark.shape, np.uint16)
+
+    @cached_property
+    def _before(self) -> "_Chain | None":
+        """The recording before this one."""
+        before = self.recording.before
+        return None if before is None else _Chain(self.camera, before)
+
+    def of(self, frame: int) -> "tuple[_Chain, int]":
+        """The chain that makes a frame and its number there, of those before this recording too."""
+        if frame >= 0 or self._before is None:
+            return self, frame
+        return self._before, frame + self._before.recording.count
 
     @cached_property
     def states(self) -> FrameStates:

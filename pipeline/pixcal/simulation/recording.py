@@ -32,6 +32,7 @@ class Recording:
     # which, where several windows of a detector are simulated by themselves: they share what
     # happens to a frame, and not the noise of their pixels
     window: int = 0
+    before: "Recording | None" = None  # that ended when this one began, where it is known
 
     @property
     def key(self) -> tuple[int, int]:

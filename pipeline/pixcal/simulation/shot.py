@@ -48,7 +48,10 @@ class Shot(Protocol):
         """Mean electrons of another frame, without this effect; None outside the recording."""
 
     def charge(self, frame: int) -> F32 | None:
-        """Charge of another frame, without this effect; None outside the recording."""
+        """Charge of another frame, without this effect; None outside the recording.
+
+        Frames -1, -2, ... are the last ones of the recording before, where it is known.
+        """
 
     def surrounded(self, charge: F32, reach: int) -> F32:
         """Charge (y, x) of this frame with ``reach`` more pixels on every side, e-.

@@ -160,18 +160,53 @@ def _freely(found: CommonLag, information: F64, right: F64) -> CommonLag:
     return replace(found, share=total, share_error=error, later=tuple(map(float, kept / total)))
 
 
-def share_of_flats(evidence: Evidence) -> tuple[float, float] | None:
-    """Share by the first frame of each flat against the rest, over the level, and its error.
+@dataclass(frozen=True)
+class LagOfFlats:
+    """Lag as the first frames of flats show it."""
 
-    Any offset of first frames is taken from stacks without light.
+    share: float  # that stays behind
+    error: float
+    carried: float  # one where the frame before a series adds its charge to it, zero after a clear
+
+
+def lag_of_flats(evidence: Evidence) -> LagOfFlats | None:
+    """Share by which the first frame of each series of flats is fainter than the rest.
+
+    It lacks a share of its own level, and has one of the frame before, unless the detector was
+    cleared in between: the levels tell which. An offset of first frames is taken from series
+    without light. None where the levels do not tell.
     """
-    found = np.array([f for s in evidence.stacks if (f := _first_frame(s, evidence)) is not None])
-    if len(found) < 2 or np.ptp(found[:, 0]) < 10 * found[:, 2].min():
+    found = [(s, f) for s in evidence.stacks if (f := _first_frame(s, evidence)) is not None]
+    if len(found) <= 2:
         return None
-    level, step, error = found.T
-    design = np.stack([-level, np.ones_like(level)]) / error
-    covariance = np.linalg.inv(design @ design.T)
-    return float((covariance @ (design @ (step / error)))[0]), float(np.sqrt(covariance[0, 0]))
+    level, step, error = np.array([f for _, f in found]).T
+    if np.ptp(level) < 10 * error.min():
+        return None
+    before = np.array([_level_before(s, evidence) for s, _ in found])
+    fits = []
+    for carried in (0.0, 1.0) if before.any() else (0.0,):
+        design = np.stack([carried * before - level, np.ones_like(level)]) / error
+        covariance = np.linalg.inv(design @ design.T)
+        share, offset = covariance @ (design @ (step / error))
+        chi2 = float(((step / error - np.array([share, offset]) @ design) ** 2).sum())
+        scatter = max(chi2 / (len(level) - 2), 1.0)
+        error_of = float(np.sqrt(covariance[0, 0] * scatter))
+        fits.append((chi2, LagOfFlats(float(share), error_of, carried)))
+    return min(fits, key=lambda one: one[0])[1]
+
+
+def _level_before(stack: Stack, evidence: Evidence) -> float:
+    """Level (e-) of the frame before a series; zero where time stamps do not tell which it is."""
+    start = stack.start_s + stack.time_s[0]
+    earlier = [
+        (float(times[times < start].max()), n)
+        for n, times in enumerate(s.start_s + s.time_s for s in evidence.stacks)
+        if (times < start).any()
+    ]
+    if not earlier:
+        return 0.0
+    frame = evidence.stacks[max(earlier)[1]].adu[-1]
+    return max(float((frame - evidence.bias)[evidence.good].mean()) * evidence.gain, 0.0)
 
 
 def _first_frame(stack: Stack, evidence: Evidence) -> tuple[float, float, float] | None:

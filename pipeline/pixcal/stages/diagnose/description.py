@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -129,7 +130,28 @@ def recordings_of(
                 )
             )  # fmt: skip
             places.append((name, numbers))
-    return recordings, places, light
+    return _in_sequence(recordings, places, tables), places, light
+
+
+def _in_sequence(
+    recordings: Sequence[Recording],
+    places: Sequence[tuple[str, Indices]],
+    tables: Mapping[str, Table],
+) -> list[Recording]:
+    """Each recording with the one before it, where all frames have time stamps."""
+    stamps = [np.array(tables[name]["mjd"], float)[numbers] for name, numbers in places]
+    if not all(np.isfinite(own).all() for own in stamps):
+        return list(recordings)
+    found = []
+    for recording, own in zip(recordings, stamps, strict=True):
+        earlier = [
+            (float(other[other < own[0]].max()), n)
+            for n, other in enumerate(stamps)
+            if (other < own[0]).any()
+        ]
+        before = recordings[max(earlier)[1]] if earlier else None
+        found.append(replace(recording, before=before))
+    return found
 
 
 def _start(tables: Mapping[str, Table]) -> dict[str, float]:

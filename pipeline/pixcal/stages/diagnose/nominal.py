@@ -184,12 +184,17 @@ class NominalBench:
             for name, frames in half.frames.items()
         }
         levels = measured.lamp.levels(self.recordings, undone)
+        taken = {
+            r.key: replace(
+                r, bench=bench, window=window, before=None,
+                electrons=levels.get(r.number, r.electrons) if r.kind == "flat" else r.electrons,
+            )
+            for r in self.recordings
+        }  # fmt: skip
         for recording, (name, numbers) in zip(self.recordings, self.places, strict=True):
             wanted = np.flatnonzero(np.isin(numbers, half.frames[name]))
-            electrons = recording.electrons
-            if recording.kind == "flat":
-                electrons = levels.get(recording.number, electrons)
-            own = replace(recording, bench=bench, window=window, electrons=electrons)
+            before = None if recording.before is None else taken[recording.before.key]
+            own = replace(taken[recording.key], before=before)
             for first, after in _runs(wanted):
                 for frame, samples in camera.expose(own, range(first, after)):
                     at = int(np.searchsorted(half.frames[name], numbers[frame]))
