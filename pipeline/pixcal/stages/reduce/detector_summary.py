@@ -8,6 +8,7 @@ import numpy as np
 
 from pixcal.estimators.detector.calibration import Linearity, linearity
 from pixcal.estimators.detector.emva import Measure, full_level, saturation, transfer_points
+from pixcal.estimators.detector.pair_noise import lost_in_blocks
 from pixcal.kernels.gain_fit import LADDER, GainFit, fit_gain
 from pixcal.kernels.photon_transfer import add_neighbours
 from pixcal.kernels.rounding import SHEPPARD, UNTOLD
@@ -174,9 +175,10 @@ def _gain(
         return None
     noise, error = read_noise or (job.read_noise, _GUESS_ERROR * job.read_noise)
     # With light there is noise enough that rounding adds no more and no less than this.
-    variance = noise**2 + SHEPPARD * job.quantum**2
-    highest = _LINEAR_SHARE * top
     dark, lit = sums
+    lost = lost_in_blocks(dark)
+    variance = noise**2 + SHEPPARD * job.quantum**2 - lost
+    highest = _LINEAR_SHARE * top
     lit = np.where(lit[:, 1:2] <= highest * lit[:, :1], lit, 0.0)
     # Noise of less than half a code is rounded up or down by where its level lies.
     smooth = lit[:, 2:3] > _SMOOTH * job.quantum**2 * lit[:, :1]
@@ -192,7 +194,13 @@ def _gain(
     if fitted is None or not fitted.error < _GAIN_ERROR * fitted.gain:
         return None
     everywhere = added == [(0, 0)]
-    return replace(fitted, neighbours=() if everywhere else tuple(added), uneven=everywhere)
+    at_zero, of_zero = fitted.read_variance
+    return replace(
+        fitted,
+        read_variance=(at_zero + lost, of_zero),
+        neighbours=() if everywhere else tuple(added),
+        uneven=everywhere,
+    )
 
 
 def _rungs(tables: F64, job: Measuring) -> tuple[F64, Mask]:

@@ -24,13 +24,13 @@ from pixcal.estimators.detector.emva import (
     without_gaps,
     without_trend,
 )
+from pixcal.estimators.detector.pair_noise import shared_by_lines
 from pixcal.kernels.photon_transfer import add_neighbours
 from pixcal.model.arrays import F64, Mask
 from pixcal.stages.reduce.detector_summary import Summary, pair_sums
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.stages.reduce.halves import Window, frames_of, middle_of, read_halves
 from pixcal.stages.reduce.ingested import Ingested
-from pixcal.stages.reduce.read_noise import shared_by_lines
 from pixcal.storage.artefact import Build, write_json
 from pixcal.storage.cube import CHUNK, ArrayReader
 

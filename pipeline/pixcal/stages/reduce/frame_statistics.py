@@ -25,7 +25,8 @@ from pixcal.estimators.detector.calibration import (
     usual_variance,
 )
 from pixcal.estimators.detector.cut_off import without_cut_off
-from pixcal.kernels.photon_transfer import COLUMNS, N_BINS, bin_pairs, pair_statistics
+from pixcal.estimators.detector.pair_noise import LineNoise, dark_pair_sums, flat_pair_sums
+from pixcal.kernels.photon_transfer import COLUMNS, N_BINS
 from pixcal.kernels.robust import BATCH, Combination, Combined, lit, median_and_sigma
 from pixcal.model.arrays import F32, F64
 from pixcal.model.flags import PixelFlag
@@ -62,7 +63,6 @@ STATISTICS = (
     "flags",
 )
 
-_PAIR_LAMP_CHANGE = 0.05
 # noise, in steps of the samples, below which the median of few frames' variances jumps
 _COARSE = 3.0
 
@@ -133,6 +133,7 @@ class _Column:
     levels: F64
     noise: F64  # variance of a sample that is usual here (ADU²)
     loud: NDArray[np.bool_]  # pixels that are noisy without light: left out of the photon transfer
+    line_noise: LineNoise = field(default_factory=LineNoise)
     line: DarkLine | None = None
     rungs: list[Rung] = field(default_factory=list)
 
@@ -266,8 +267,20 @@ def _combine(job: Measuring, group: Group, columns: Sequence[_Column]) -> list[C
                 column.loud |= _loud(job, frames - levels[:, None, None])
             if lamp or group == job.read_series:
                 frames[:, column.loud] = np.nan
-                column.pairs[int(lamp)] += _pair_sums(job, frames, levels, lamp)
+                _add_pairs(job, column, frames, levels, lamp)
     return [combination.result() for combination in every]
+
+
+def _add_pairs(job: Measuring, column: _Column, frames: F32, levels: F32, lamp: bool) -> None:
+    """Add the photon transfer of frames 0 and 1, 2 and 3, and so on."""
+    of_samples = job.read_noise, job.quantum
+    if lamp:
+        column.pairs[1] += flat_pair_sums(frames, levels, job.gain, *of_samples, column.line_noise)
+        return
+    frames -= levels[:, None, None]
+    sums = dark_pair_sums(frames, *of_samples)
+    column.line_noise.add(frames, sums, *of_samples)
+    column.pairs[0] += sums
 
 
 def _loud(job: Measuring, frames: F32) -> NDArray[np.bool_]:
@@ -280,30 +293,6 @@ def _loud(job: Measuring, frames: F32) -> NDArray[np.bool_]:
     usual = max(usual_variance(variance, len(frames) - 1), job.quantum**2 / 4)
     unknown = np.full(variance.shape, np.nan)
     return noisy(variance, dof, np.full(variance.shape, usual), unknown, 0 * dof, job.limits.noisy)
-
-
-def _pair_sums(job: Measuring, frames: F32, levels: F32, lamp: bool) -> F64:
-    """Photon transfer of frames 0 and 1, 2 and 3, …, each made as bright as the other."""
-    sums = np.zeros((N_BINS, COLUMNS))
-    for n in range(0, len(frames) - 1, 2):
-        (a, b), (first, second) = levels[n : n + 2], frames[n : n + 2]
-        if not np.isfinite(a + b):
-            continue
-        gain = job.gain
-        if not lamp:
-            first, second, gain = first - a, second - b, np.inf
-        elif abs(a - b) > _PAIR_LAMP_CHANGE * (a + b) / 2:
-            continue
-        else:
-            first, second = first * ((a + b) / (2 * a)), second * ((a + b) / (2 * b))
-            # Full pixels beside those of an overscan would pass for half-full ones without noise.
-            first[~lit(first + second)] = np.nan
-        sums += bin_pairs(
-            pair_statistics(
-                first, second, gain=gain, read_noise=job.read_noise, quantum=job.quantum
-            )
-        )
-    return sums
 
 
 def _usable(job: Measuring, samples: NDArray[Any], lamp: bool) -> F32:

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from pixcal.estimators.detector.emva import Measure
-from pixcal.kernels.photon_transfer import BLOCK, LAGS
+from pixcal.estimators.detector.pair_noise import lost_in_blocks
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.kernels.rounding import SHEPPARD, noise_before_rounding
 from pixcal.model.arrays import F64
@@ -14,35 +14,10 @@ from pixcal.stages.reduce.flat_survey import middle_rows
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.storage.place import Place
 
-_SHARED = 5.0  # errors of the noise that a row shares from which it is there
 # Error of the variance of noise that is cut off at code zero, whose samples are taken for those of
 # normals: relative; in square steps below so many steps, where few codes are left to tell.
 _CUT_OFF, _COARSE_CUT_OFF, _FEW_STEPS = 0.02, 0.2, 0.75
 _LEAST = 0.05  # steps of noise that are told from none
-
-
-def shared_by_lines(dark: F64) -> dict[str, Measure]:
-    """Variance in time that all pixels of a row, or of a column, share, with its error (ADU²).
-
-    Zero where it is not significant.
-
-    Parameters
-    ----------
-    dark : (N_BINS, COLUMNS) float64
-        Sums over pairs of frames without light, as `bin_pairs` gives them.
-    """
-    total = dark.sum(axis=0)
-    if not total[0]:
-        return {}
-    error = total[2] / total[0] / math.sqrt(total[0])
-    found = {}
-    for name, lags in (("row", ((0, 1), (0, 2))), ("column", ((1, 0), (2, 0)))):
-        at = [3 + LAGS.tolist().index(list(lag)) for lag in lags]
-        # A coupling reaches the next pixel, and a row that repeats the row after it; not both.
-        # The mean of its block was taken off.
-        shared = float(total[at].min() / total[0]) * (BLOCK + 1) / BLOCK
-        found[name] = (shared if shared > _SHARED * error else 0.0, error)
-    return found
 
 
 def _read_variance(dark: F64) -> tuple[float, float] | None:
@@ -50,9 +25,7 @@ def _read_variance(dark: F64) -> tuple[float, float] | None:
     dof, _, square = dark[:, :3].sum(axis=0)
     if not dof > 0:
         return None
-    # What lines share was lost in part with the means of blocks.
-    lost = sum(shared for shared, _ in shared_by_lines(dark).values()) / (BLOCK + 1)
-    return square / dof + lost, square / dof * math.sqrt(2 / dof)
+    return square / dof + lost_in_blocks(dark), square / dof * math.sqrt(2 / dof)
 
 
 def dark_charge(folder: Place, job: Measuring) -> float:

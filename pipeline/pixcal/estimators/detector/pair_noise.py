@@ -1,0 +1,170 @@
+"""Noise of pairs of frames, and what of it all pixels of a row, or of a column, have in common.
+
+A few rows hold few independent values of their noise: it would hide the photon noise of flats. So
+it is taken off flats, line by line, and its covariances are put back as frames without light have
+them, where there are many more of it.
+"""
+
+import math
+
+import numpy as np
+
+from pixcal.estimators.detector.emva import Measure
+from pixcal.kernels.photon_transfer import (
+    BLOCK,
+    COLUMNS,
+    LAGS,
+    N_BINS,
+    bin_pairs,
+    pair_statistics,
+)
+from pixcal.kernels.robust import lit, median_of_columns
+from pixcal.model.arrays import F32, F64
+
+LINES = {"row": ((0, 1), (0, 2)), "column": ((1, 0), (2, 0))}  # lags along a line
+
+_SHARED = 5.0  # errors of the noise that a row shares from which it is there
+_PAIR_LAMP_CHANGE = 0.05
+# Of n normal numbers less their median, n times by how much the variance is less, and by how much
+# each two are anticorrelated: 2 / n by the mean, of which the scatter of the median takes π/2.
+_MEDIAN_TAKES = 2 - math.pi / 2
+
+
+def shared_by_lines(dark: F64) -> dict[str, Measure]:
+    """Variance in time that all pixels of a row, or of a column, share, with its error (ADU²).
+
+    Zero where it is not significant.
+
+    Parameters
+    ----------
+    dark : (N_BINS, COLUMNS) float64
+        Sums over pairs of frames without light, as `bin_pairs` gives them.
+    """
+    total = dark.sum(axis=0)
+    if not total[0]:
+        return {}
+    error = total[2] / total[0] / math.sqrt(total[0])
+    found = {}
+    for name, lags in LINES.items():
+        at = [3 + LAGS.tolist().index(list(lag)) for lag in lags]
+        # A coupling reaches the next pixel, and a row that repeats the row after it; not both.
+        # The mean of its block was taken off.
+        shared = float(total[at].min() / total[0]) * (BLOCK + 1) / BLOCK
+        found[name] = (shared if shared > _SHARED * error else 0.0, error)
+    return found
+
+
+def lost_in_blocks(dark: F64) -> float:
+    """Variance (ADU²) of what lines share that is lost with the means of the blocks."""
+    return sum(shared for shared, _ in shared_by_lines(dark).values()) / (BLOCK + 1)
+
+
+def lines_with_noise(dark: F64) -> tuple[str, ...]:
+    """Kinds of lines whose pixels share noise, by sums over pairs of frames without light."""
+    return tuple(name for name, (shared, _) in shared_by_lines(dark).items() if shared)
+
+
+def dark_pair_sums(
+    frames: F32, read_noise: float, quantum: float, without: tuple[str, ...] = ()
+) -> F64:
+    """Sums (N_BINS, COLUMNS) over frames 0 and 1, 2 and 3, … without light.
+
+    Parameters
+    ----------
+    frames : (t, y, x) float32
+        Less their common level (ADU); NaN where a sample is not to be used.
+    read_noise, quantum : float
+        As of `pair_statistics`.
+    without : tuple of str
+        Lines whose common noise is taken off.
+    """
+    sums = np.zeros((N_BINS, COLUMNS))
+    for first, second in zip(frames[::2], frames[1::2], strict=False):
+        sums += _sums(first, second, np.inf, read_noise, quantum, without)
+    return sums
+
+
+def flat_pair_sums(
+    frames: F32,
+    levels: F32,
+    gain: float,
+    read_noise: float,
+    quantum: float,
+    line_noise: "LineNoise",
+) -> F64:
+    """The same of flats, each made as bright as the other of its pair.
+
+    Parameters
+    ----------
+    frames : (t, y, x) float32
+        ADU above bias and dark.
+    levels : (t,) float32
+        Their common levels, in any unit; pairs that differ too much are not used.
+    gain, read_noise, quantum : float
+        As of `pair_statistics`.
+    line_noise : LineNoise
+        Of these pixels.
+    """
+    sums = np.zeros((N_BINS, COLUMNS))
+    for n in range(0, len(frames) - 1, 2):
+        (a, b), (first, second) = levels[n : n + 2], frames[n : n + 2]
+        if not np.isfinite(a + b) or abs(a - b) > _PAIR_LAMP_CHANGE * (a + b) / 2:
+            continue
+        first, second = first * ((a + b) / (2 * a)), second * ((a + b) / (2 * b))
+        # Full pixels beside those of an overscan would pass for half-full ones without noise.
+        first[~lit(first + second)] = np.nan
+        sums += _sums(first, second, gain, read_noise, quantum, line_noise.lines or ())
+    return line_noise.put_back(sums)
+
+
+def _sums(
+    first: F32,
+    second: F32,
+    gain: float,
+    read_noise: float,
+    quantum: float,
+    without: tuple[str, ...],
+) -> F64:
+    if not np.isfinite(first + second).any():
+        return np.zeros((N_BINS, COLUMNS))
+    for name in without:
+        second = second + _common(first - second, name)
+    blocks = pair_statistics(first, second, gain=gain, read_noise=read_noise, quantum=quantum)
+    for name in without:
+        taken = _MEDIAN_TAKES / first.shape[1 if name == "row" else 0] * blocks[:, 2]
+        across = 0 if name == "row" else 1
+        blocks[:, 2] += taken
+        blocks[:, 3:] += np.outer(taken, LAGS[:, across] == 0)
+    return bin_pairs(blocks)
+
+
+def _common(difference: F32, line: str) -> F32:
+    """Median of each line, to be broadcast; zero where a line has no sample."""
+    rows = np.array(difference.T if line == "row" else difference, order="C")
+    median = np.empty(rows.shape[1], np.float32)
+    median_of_columns(rows, median)
+    median = np.nan_to_num(median)
+    return median[:, None] if line == "row" else median[None]
+
+
+class LineNoise:
+    """Noise that pixels of lines share, with all its covariances, from frames without light."""
+
+    def __init__(self) -> None:
+        self.lines: tuple[str, ...] | None = None
+        self._whole, self._rest = np.zeros((2, COLUMNS))
+
+    def add(self, frames: F32, sums: F64, read_noise: float, quantum: float) -> None:
+        """Take frames as `dark_pair_sums` does, and its ``sums``; the first tell which lines."""
+        if self.lines is None:
+            self.lines = lines_with_noise(sums)
+        if self.lines:
+            self._whole += sums.sum(axis=0)
+            self._rest += dark_pair_sums(frames, read_noise, quantum, self.lines).sum(axis=0)
+
+    def put_back(self, sums: F64) -> F64:
+        """Sums without the noise of lines, with it as it is without light."""
+        if self.lines:
+            shared = self._whole[2:] / self._whole[0] - self._rest[2:] / self._rest[0]
+            sums[:, 2:] += sums[:, :1] * shared
+        return sums
