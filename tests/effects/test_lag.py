@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from pixcal.effects.lag import Lag
-from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.detector.frame_lag import lag_of_flats
+from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.model.bench import Bench
 from pixcal.simulation.exposure import Camera, frames_of
 from pixcal.simulation.recording import Recording, recordings
@@ -177,6 +178,43 @@ def test_flats_tell_where_there_are_no_fringes(acquired: Callable[..., Evidence]
     assert nothing is not None
     assert nothing.significance < 4
     assert Lag.estimate(replace(acquired(), fringes={}, stacks=())) is None
+
+
+def test_what_the_frame_before_left_comes_out_in_the_first(
+    make_effect_bench: Callable[..., Bench],
+) -> None:
+    two = [{"exptime_s": 0.02, "count": 3}, {"exptime_s": 0.04, "count": 3}]
+    bench = quiet(make_effect_bench({**FLATS, "frames.flats": two, "detector.dark_e_s": 0.0}))
+    dim, bright = (r for r in recordings(bench) if r.kind == "flat")
+    plain = [frames_of(bench, r)[0].astype(float) - 500 for r in (dim, bright)]
+    for carried in (0.0, 0.6, 1.0):
+        lag = Lag(0.05, 0.0, 0.0, carried=carried)
+        made = frames_of(bench, replace(bright, before=dim), [lag])[0].astype(float) - 500
+        expected = 0.95 * plain[1] + 0.05 * carried * plain[0]
+        np.testing.assert_allclose(made, expected, atol=1.6)
+
+
+@pytest.mark.parametrize("carried", [0.0, 1.0])
+def test_flats_of_rising_levels_tell_whether_the_detector_was_cleared(carried: float) -> None:
+    rng, share, flicker, shape = np.random.default_rng(5), 0.01, 1e-3, (24, 24)
+    stacks = [Stack("bias", 0.0, np.arange(20.0), rng.normal(100, 5, (20, *shape)), 0.0)]
+    before = 0.0
+    for n, level in enumerate(np.linspace(1000, 20_000, 12)):
+        light = level * (1 + flicker * rng.standard_normal(2))
+        light[0] -= share * (level - carried * before)
+        adu = rng.normal(100 + light[:, None, None], np.sqrt(level), (2, *shape))
+        stacks.append(Stack("flat", 0.1 * (n + 1), np.arange(2.0), adu, 100.0 + 10 * n))
+        before = level
+    maps = {"bias": np.full(shape, 100.0), "dark_rate": np.zeros(shape), "flat": np.ones(shape)}
+    found = lag_of_flats(
+        Evidence(
+            {}, tuple(stacks), 1.0, 5.0, 5.0, **maps, good=np.ones(shape, np.bool_),
+            saturation_adu=65535, pitch_um=5.0, wavelength_nm=600.0, distance_mm=400.0,
+        )
+    )  # fmt: skip
+    assert found is not None
+    assert found.carried == carried
+    assert abs(found.share - share) < 4 * found.error < 0.5 * share
 
 
 def test_equal_steps_of_the_phase_tell_nothing(acquired: Callable[..., Evidence]) -> None:

@@ -175,8 +175,6 @@ def _stacks(ingested: Ingested, part: Part) -> tuple[Stack, ...]:
 
 def _start(ingested: Ingested, name: str) -> float:
     """Time of an array's first frame after the first one of all, s; nan when unknown."""
-    stamps = [np.array(table["mjd"], float) for table in ingested.tables.values()]
-    if not len(stamps) or any(np.isnan(s).any() for s in stamps):
-        return np.nan
-    first = min(float(s.min()) for s in stamps)
-    return float(ingested.tables[name]["mjd"][0] - first) * 86400.0
+    # Later planes of a cube without exposure time have none.
+    stamps = {key: np.array(table["mjd"][:1], float) for key, table in ingested.tables.items()}
+    return float(stamps[name][0] - min(float(s[0]) for s in stamps.values())) * 86400.0

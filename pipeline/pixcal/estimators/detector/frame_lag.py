@@ -9,12 +9,13 @@ from scipy.optimize import minimize_scalar
 from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker
 from pixcal.estimators.detector.pixel_lag import CLIP, MIN_FRAMES
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
-from pixcal.model.arrays import F32, F64
+from pixcal.model.arrays import F32, F64, Mask
 
 LAGS = 6  # frames back that are looked at
 ROUNDS = 2  # of the fit, each about the lag of the one before
 MAX_DECAY = 3.0
 _SERIES = 8
+_MANY_FLATS = 5  # series that tell the flicker of the lamp beside the lag
 _STEADIEST = 1e-4
 CLEAR = 4.0
 _NOT_EXPONENTIAL = 40.0  # chi-square from which releases are taken as they come
@@ -183,16 +184,30 @@ def lag_of_flats(evidence: Evidence) -> LagOfFlats | None:
     if np.ptp(level) < 10 * error.min():
         return None
     before = np.array([_level_before(s, evidence) for s, _ in found])
-    fits = []
-    for carried in (0.0, 1.0) if before.any() else (0.0,):
-        design = np.stack([carried * before - level, np.ones_like(level)]) / error
-        covariance = np.linalg.inv(design @ design.T)
-        share, offset = covariance @ (design @ (step / error))
-        chi2 = float(((step / error - np.array([share, offset]) @ design) ** 2).sum())
-        scatter = max(chi2 / (len(level) - 2), 1.0)
-        error_of = float(np.sqrt(covariance[0, 0] * scatter))
-        fits.append((chi2, LagOfFlats(float(share), error_of, carried)))
-    return min(fits, key=lambda one: one[0])[1]
+    flat = np.array([s.kind == "flat" for s, _ in found])
+    known = 1.0 if before.any() else 0.0
+    fits = [_fit_steps(level - c * before, step, error, flat) for c in (0.0, known)]
+    carried, (share, of_share, _) = min(
+        zip((0.0, known), fits, strict=True), key=lambda one: one[1][2]
+    )
+    return LagOfFlats(share, of_share, carried)
+
+
+def _fit_steps(lacking: F64, step: F64, error: F64, flat: Mask) -> tuple[float, float, float]:
+    """Share of what first frames lack, its error, and the chi-square of the steps.
+
+    The lamp's flicker is that which the fit leaves: before it, lag passes for flicker too.
+    """
+    design = np.stack([-lacking, np.ones_like(step)])
+    scale = np.ones_like(step)
+    for _ in range(ROUNDS):
+        weighted = design / (error * scale)
+        covariance = np.linalg.inv(weighted @ weighted.T)
+        found = covariance @ (weighted @ (step / (error * scale)))
+        squares = ((step - found @ design) / error) ** 2
+        if flat.sum() >= _MANY_FLATS:
+            scale = np.where(flat, np.sqrt(squares[flat].sum() / (flat.sum() - 1)), 1.0)
+    return float(found[0]), float(np.sqrt(covariance[0, 0])), float(squares.sum())
 
 
 def _level_before(stack: Stack, evidence: Evidence) -> float:

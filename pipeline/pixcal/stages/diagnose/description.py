@@ -138,10 +138,8 @@ def _in_sequence(
     places: Sequence[tuple[str, Indices]],
     tables: Mapping[str, Table],
 ) -> list[Recording]:
-    """Each recording with the one before it, where all frames have time stamps."""
+    """Each recording with the one before it, where time stamps tell which it is."""
     stamps = [np.array(tables[name]["mjd"], float)[numbers] for name, numbers in places]
-    if not all(np.isfinite(own).all() for own in stamps):
-        return list(recordings)
     found = []
     for recording, own in zip(recordings, stamps, strict=True):
         earlier = [
