@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
-from pixcal.estimators.frame_series.row_ramp import RowRamp, enough_for_rows, enough_frames
+from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.frame_series.row_ramp import RowRamp
 from pixcal.estimators.frame_series.row_settling import find_settling, profile, steps_of
+from pixcal.estimators.frame_series.row_sums import RowSums, enough_frames
 from pixcal.estimators.maps.imprint import imprint, left_in_samples
 from pixcal.kernels.synthesis import illuminate
 from pixcal.model.arrays import F32, F64
@@ -194,10 +195,10 @@ class RollingShutter(Effect):
         free; lag, which is of the last frame and of no row, does not look alike. Phases in equal
         steps tell nothing: there the next frame is what the fit takes for the pixel's own phase.
         """
-        sets = [f for f in evidence.fringes.values() if enough_for_rows(f)]
-        many = [f for f in evidence.fringes.values() if enough_frames(f)]
+        many = [RowSums.of(f) for f in evidence.fringes.values() if enough_frames(f)]
         if not many:
             return None
+        sets = [sums for sums in many if sums.found.exptime_s > 0]  # not so where unknown (nan)
         settled = find_settling(many)
         which = "from the last" if settled.way < 0 else "to the next"
         law = "phase error of the rows in proportion to the phase step, with any profile"
@@ -215,11 +216,11 @@ class RollingShutter(Effect):
         return max(mixed, settling, key=lambda e: e.significance)
 
     @classmethod
-    def _mixed(cls, sets: list[FringeEvidence]) -> Estimate:
+    def _mixed(cls, sets: list[RowSums]) -> Estimate:
         """Light of two frames in the exposure of a row."""
         sums = [RowRamp.of(sets, way) for way in (1, -1)]
         following, last = (s.slope / s.error for s in sums)
-        ramp, found = sums[int(last > max(following, 4.0))], sets[0]
+        ramp, found = sums[int(last > max(following, 4.0))], sets[0].found
         per_row = found.exptime_s * 1e6
         period = float(np.median(np.diff(found.time_s)))
         late = max(period - found.exptime_s, 0.0) * 1e6 if ramp.way < 0 else 0.0

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
-from pixcal.estimators.frame_series.row_ramp import INSIDE, rows_of
+from pixcal.estimators.frame_series.row_sums import INSIDE, RowSums
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F64
 
@@ -19,10 +19,6 @@ KNOTS = 13  # rows at equal distances at which the profile is given
 ORIGINS = 8  # phases tried as the one where the modulator's range begins
 # standard deviations from which that phase is sought more finely, and how finely, rad
 CLEAR, FINEST = 4.0, 0.01
-# columns of the window that are enough to tell the steps' way and origin; of wide ones one in
-# `MAX_APART` at most
-COLUMNS = 24
-MAX_APART = 4
 OWN_ORDERS = 4  # harmonics of a frame's own phase that a step must not be taken for
 
 
@@ -59,39 +55,35 @@ def profile(share: Sequence[float] | F64, rows: F64) -> F64:
     return np.asarray(make_interp_spline(at, np.array(share), k=min(3, len(share) - 1))(rows))
 
 
-def find_settling(sets: Sequence[FringeEvidence]) -> Settling:
+def find_settling(sets: Sequence[RowSums]) -> Settling:
     """The likeliest profile, of the last step or the next, along either way around the turn."""
     origins = [None, *(2 * np.pi * n / ORIGINS for n in range(ORIGINS))]
     ways = [(way, origin) for way in (-1, 1) for origin in origins]
-    every = int(np.clip(min(f.good.shape[1] for f in sets) // COLUMNS, 1, MAX_APART))
-    found = {one: _fit(sets, *one, every)[0] for one in ways}
-    way, origin = max(found, key=lambda one: found[one])
-    gain = found[way, origin]
-    chance = sigmas_of_chi2(max(gain - 2 * np.log(len(ways)), 1e-9), KNOTS - 1)
+    found = {one: _fit(sets, *one) for one in ways}
     width = np.pi / ORIGINS
-    while origin is not None and chance > CLEAR / np.sqrt(every) and width > FINEST:
+    while True:
+        way, origin = max(found, key=lambda one: found[one][0])
+        gain, share, error = found[way, origin]
+        chance = sigmas_of_chi2(max(gain - 2 * np.log(len(ways)), 1e-9), KNOTS - 1)
+        if origin is None or chance < CLEAR or width < FINEST:
+            return Settling(way, origin, share, error, chance)
         # A frame whose step is taken around the wrong way is off by the share of a turn.
         for near in (origin - width / 2, origin + width / 2):
-            found[way, near] = _fit(sets, way, near, every)[0]
-        way, origin = max(found, key=lambda one: found[one])
+            found[way, near] = _fit(sets, way, near)
         width /= 2
-    gain, share, error = _fit(sets, way, origin)
-    chance = sigmas_of_chi2(max(gain - 2 * np.log(len(ways)), 1e-9), KNOTS - 1)
-    return Settling(way, origin, share, error, chance)
 
 
-def _fit(
-    sets: Sequence[FringeEvidence], way: int, origin: float | None, every: int = 1
-) -> tuple[float, F64, F64]:
-    """Gain in chi-square, profile and its error, from one column of so many."""
+def _fit(sets: Sequence[RowSums], way: int, origin: float | None) -> tuple[float, F64, F64]:
+    """Gain in chi-square, profile and its error."""
     normal, right = np.zeros((KNOTS, KNOTS)), np.zeros(KNOTS)
     slopes = []
-    for f in sets:
+    for sums in sets:
+        f = sums.found
         _, cosine, sine = f.g.T
         step = beside_own_phase(steps_of(f.phi, way, origin), f.phi)
         # Of B, A cos phi and A sin phi, what a turn of the phase does, times the step.
         other = (step[:, None] * np.stack([np.zeros(len(step)), -sine, cosine], axis=1))[INSIDE]
-        _, own, vector = rows_of(f, other, every=every)
+        own, vector = sums.share(other)
         at = np.linspace(0, 1, len(vector))
         terms = np.stack([profile(unit, at) for unit in np.eye(KNOTS)], axis=1)
         terms -= terms.mean(axis=0)
