@@ -1,4 +1,4 @@
-"""The options of the blind examination, as `pixcal.model.options` has those of the others."""
+"""The commands of the blind examination and their options, as in `pixcal.model.options`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,7 +9,7 @@ from pixcal.model.config import quantity
 
 @dataclass(frozen=True)
 class MakeConfig:
-    """Options of ``blind make``."""
+    """Simulate cases with no, one or several effects, and seal the truth."""
 
     cases: int = quantity(low=1, high=9999, metavar="N", doc="Number of cases.")
     seed: int | None = quantity(
@@ -33,7 +33,7 @@ class MakeConfig:
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Options of ``blind run``."""
+    """Diagnose every case of DIR that is not done yet."""
 
     again: bool = quantity(False, doc="Repeat cases that are done.")
     keep: bool = quantity(False, doc="Keep the whole runs, not only their products.")
@@ -42,7 +42,7 @@ class RunConfig:
 
 @dataclass(frozen=True)
 class ScoreConfig:
-    """Options of ``blind score``."""
+    """Compare every diagnosis with its truth."""
 
     oracle: int = quantity(
         0,

@@ -8,8 +8,9 @@ import click
 
 from pixcal.model.options import Astrometry
 from pixcal.storage.artefact import read_json
-from pixcal_cli import printing, results
+from pixcal_cli import printing
 from pixcal_cli.click_options import command
+from pixcal_cli.results import perform
 
 if TYPE_CHECKING:
     from pixcal.engine.run import Runtime
@@ -21,17 +22,12 @@ if TYPE_CHECKING:
     "pixcal astrometry demo --diameter 2.4 --focal-length 57.6 --electrons 1e6",
 )
 def astrometry(run: Path, config: Astrometry, runtime: "Runtime") -> None:
-    """Estimate how much the maps improve star centroids.
-
-    Simulated stars are fitted twice: on a perfect grid and with the measured maps. The default
-    telescope is that of the habitable worlds mission, 7 m and 130 m.
-    """
-    from pixcal.stages import astrometry as stage  # here: for a fast `pixcal --help`
-
-    with results.announce("astrometry", run / "astrometry"):
-        stage.run(run, config, runtime)
+    """Star centroids with the maps of RUN."""
+    perform("astrometry", run / "astrometry", run, config, runtime)
     result = read_json(run / "astrometry" / "astrometry.json")
-    _show(result, stage.table(result))
+    from pixcal.stages.astrometry import table  # here: for a fast `pixcal --help`
+
+    _show(result, table(result))
     click.echo(f"  {run / 'products' / 'astrometry.png'}")
 
 

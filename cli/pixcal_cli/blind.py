@@ -40,7 +40,7 @@ def blind() -> None:
     argument=lambda body: out_option(sealed_option(body)),
 )
 def make(folder: Path, sealed: Path, config: MakeConfig, runtime: "Runtime") -> None:
-    """Simulate cases with no, one or several effects, and seal the truth."""
+    """The cases."""
     from blind_examination import examination as stage  # here: for a fast `pixcal --help`
 
     examination = stage.make(folder, sealed, config, runtime)
@@ -52,7 +52,7 @@ def make(folder: Path, sealed: Path, config: MakeConfig, runtime: "Runtime") -> 
     RunConfig, "pixcal blind run exam", "pixcal blind run exam --limit 20", argument=cases_argument
 )
 def run(folder: Path, config: RunConfig, runtime: "Runtime") -> None:
-    """Diagnose every case of DIR that is not done yet."""
+    """The diagnoses."""
     from blind_examination import examination as stage  # here: for a fast `pixcal --help`
 
     done, failed = stage.run(folder, config, runtime)
@@ -68,7 +68,7 @@ def run(folder: Path, config: RunConfig, runtime: "Runtime") -> None:
     argument=lambda body: cases_argument(sealed_option(body)),
 )
 def score(folder: Path, sealed: Path, config: ScoreConfig, runtime: "Runtime") -> None:
-    """Compare every diagnosis with its truth."""
+    """The scores."""
     from blind_examination import examination as stage  # here: for a fast `pixcal --help`
 
     result = stage.score(folder, sealed, config, runtime)

@@ -1,7 +1,9 @@
 """``pixcal budget``."""
 
+import inspect
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,7 @@ import click
 
 from pixcal.model.options import Budget
 from pixcal_cli.click_options import PATH, bench_argument, config_options, examples
-from pixcal_cli.printing import show_notes, show_table
+from pixcal_cli.printing import Columns, show_notes, show_records
 
 LIMITS = {
     "photons": "photons",
@@ -21,10 +23,11 @@ LIMITS = {
 
 
 @click.command(
+    help=inspect.getdoc(Budget),
     epilog=examples(
         "pixcal budget configs/demo.yaml",
         "pixcal budget configs/paper.yaml --precision 5e-4 --frames 10000 --out budget",
-    )
+    ),
 )
 @bench_argument
 @config_options(Budget)
@@ -33,11 +36,7 @@ LIMITS = {
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the contents of budget.json.")
 def budget(bench: Path, config: Budget, out: Path | None, as_json: bool) -> None:
-    """Plan an exposure: frames and hours needed for a given precision.
-
-    BENCH.yaml describes a bench as for `pixcal simulate`. The numbers are the Cramér-Rao bound: no
-    unbiased estimate needs fewer frames. The fit comes within a few percent of it.
-    """
+    """The bound for the bench BENCH.yaml."""
     from pixcal.stages import budget as stage  # here: for a fast `pixcal --help`
 
     plan = stage.run(bench, config, out)
@@ -66,98 +65,87 @@ def _show(plan: Mapping[str, Any]) -> None:
 
 def _show_sets(plan: Mapping[str, Any]) -> None:
     click.echo("\nfringe sets as planned")
-    rows = [
-        (
-            name,
-            f"{s['interfringe_px']:.4g}",
-            f"{s['mean_e']:.4g}",
-            f"{s['visibility']:.3g}",
-            f"{s['frame_px']['median']:.3g}",
-            f"{s['frame_px']['worst']:.3g}",
-            s["planned"]["frames"],
-            f"{s['planned']['median_px']:.3g}",
-            f"{s['planned']['worst_px']:.3g}",
-        )
-        for name, s in plan["sets"].items()
-    ]
-    header = (
-        "set", "fringe period px", "mean e-", "visibility", "one frame px", "worst px", "frames",
-        "reach px", "worst px",
-    )  # fmt: skip
-    show_table(header, rows)
+    columns: Columns = {
+        "fringe period px": lambda s: f"{s['interfringe_px']:.4g}",
+        "mean e-": lambda s: f"{s['mean_e']:.4g}",
+        "visibility": lambda s: f"{s['visibility']:.3g}",
+        "one frame px": lambda s: f"{s['frame_px']['median']:.3g}",
+        "one frame, worst px": lambda s: f"{s['frame_px']['worst']:.3g}",
+        "frames": lambda s: s["planned"]["frames"],
+        "reach px": lambda s: f"{s['planned']['median_px']:.3g}",
+        "reach, worst px": lambda s: f"{s['planned']['worst_px']:.3g}",
+    }
+    show_records("set", plan["sets"], columns)
+
+
+def _alone_and_joined(plan: Mapping[str, Any], key: str) -> dict[str, Any]:
+    """What each set gives alone and, for more than one, each axis with all of them."""
+    entries = {f"{name} alone": s[key] for name, s in plan["sets"].items()}
+    joined = plan["joined"]["components"] if len(plan["sets"]) > 1 else {}
+    return entries | {f"{name}, all sets": c[key] for name, c in joined.items()}
 
 
 def _show_wanted(plan: Mapping[str, Any]) -> None:
     click.echo(f"\nfor {plan['precision_px']:g} px on each axis")
-    joint = plan["joined"]
-    entries = [(f"{name} alone", s["wanted"]) for name, s in plan["sets"].items()]
-    if len(plan["sets"]) > 1:
-        entries += [(f"{name}, all sets", c["wanted"]) for name, c in joint["components"].items()]
-    rows = [
-        (name, w["frames"], _hours(w["hours"]), _size(w["bytes"]), w["frames_worst"])
-        for name, w in entries
-    ]
-    show_table(("", "frames", "time", "data", "frames, worst px"), rows)
+    columns: Columns = {
+        "frames": itemgetter("frames"),
+        "time": lambda w: _hours(w["hours"]),
+        "data": lambda w: _size(w["bytes"]),
+        "frames, worst px": itemgetter("frames_worst"),
+    }
+    show_records("", _alone_and_joined(plan, "wanted"), columns)
 
 
 def _show_given(plan: Mapping[str, Any]) -> None:
     click.echo(f"\nwith {plan['frames']} frames of each set")
-    parts = [(f"{name} alone", s["given"]) for name, s in plan["sets"].items()]
-    if len(plan["sets"]) > 1:
-        parts += [
-            (f"{name}, all sets", c["given"]) for name, c in plan["joined"]["components"].items()
-        ]
-    rows = [(name, f"{g['median_px']:.3g}", f"{g['worst_px']:.3g}") for name, g in parts]
-    show_table(("", "median px", "worst px"), rows)
+    columns: Columns = {
+        "median px": lambda g: f"{g['median_px']:.3g}",
+        "worst px": lambda g: f"{g['worst_px']:.3g}",
+    }
+    show_records("", _alone_and_joined(plan, "given"), columns)
 
 
 def _show_shares(plan: Mapping[str, Any]) -> None:
     click.echo("\nframes for photon noise alone, and the factors that increase them")
-    rows = [
-        (
-            name,
-            s["shares"].get("photons_frames", "-"),
-            *(f"× {s['shares'][key]:.3g}" for key in list(LIMITS)[1:]),
-            LIMITS[s["limited_by"]],
-        )
-        for name, s in plan["sets"].items()
-    ]
-    header = (
-        "set", "photons", "uneven light", "visibility", "read noise", "phases", "limited by",
-    )  # fmt: skip
-    show_table(header, rows)
+
+    def factor(key: str) -> Callable[[Any], str]:
+        return lambda s: f"× {s['shares'][key]:.3g}"
+
+    factors = {LIMITS[key]: factor(key) for key in list(LIMITS)[1:]}
+    columns: Columns = {
+        "photons": lambda s: s["shares"].get("photons_frames", "-"),
+        **factors,
+        "limited by": lambda s: LIMITS[s["limited_by"]],
+    }
+    show_records("set", plan["sets"], columns)
 
 
 def _show_calibration(plan: Mapping[str, Any]) -> None:
     click.echo(
         "\ncalibration frames for which their noise costs less than 0.1 % more fringe frames"
     )
-    rows = []
-    for name, s in plan["sets"].items():
-        c = s["calibration"]
-        flat = "-" if c["flat_error"] is None else f"{100 * c['flat_error']:.2g} %"
-        rows.append(
-            (
-                name,
-                f"{c['bias_frames_needed']} of {c['bias_frames']} planned",
-                f"{c['flats_needed']} of {c['flats']} planned",
-                flat,
-                _percent(100 * c["flat_cost"]),
-            )
-        )
-    show_table(("set", "bias", "flat", "noise of the flats", "which costs"), rows)
+    columns: Columns = {
+        "bias": lambda c: f"{c['bias_frames_needed']} of {c['bias_frames']} planned",
+        "flat": lambda c: f"{c['flats_needed']} of {c['flats']} planned",
+        "noise of the flats": lambda c: (
+            "-" if c["flat_error"] is None else f"{100 * c['flat_error']:.2g} %"
+        ),
+        "which costs": lambda c: _percent(100 * c["flat_cost"]),
+    }
+    show_records("set", {n: s["calibration"] for n, s in plan["sets"].items()}, columns)
 
 
 def _show_levers(plan: Mapping[str, Any]) -> None:
     click.echo("\nalternatives (all sets, the worse axis)")
-    planned = next(v for v in plan["levers"] if v["name"] == "as planned")
-    rows = []
-    for lever in plan["levers"]:
-        ratio = planned["variance"] * planned["period_s"] / (lever["variance"] * lever["period_s"])
-        frames = "-" if lever["frames"] is None else lever["frames"]
-        time = "-" if lever["hours"] is None else _hours(lever["hours"])
-        rows.append((lever["name"], frames, time, f"{ratio:.3g}", lever["note"]))
-    show_table(("change", "frames", "time", "times faster", ""), rows)
+    levers = {v["name"]: v for v in plan["levers"]}
+    cost = {name: v["variance"] * v["period_s"] for name, v in levers.items()}
+    columns: Columns = {
+        "frames": itemgetter("frames"),
+        "time": lambda v: None if v["hours"] is None else _hours(v["hours"]),
+        "times faster": lambda v: f"{cost['as planned'] / cost[v['name']]:.3g}",
+        "": itemgetter("note"),
+    }
+    show_records("change", levers, columns)
 
 
 def _percent(value: float) -> str:

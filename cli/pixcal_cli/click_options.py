@@ -1,6 +1,7 @@
 """Click options made from the dataclasses of `pixcal.model.options`; arguments they share."""
 
 import functools
+import inspect
 import math
 import re
 from collections.abc import Callable, Mapping
@@ -162,7 +163,8 @@ def command(
     Parameters
     ----------
     kind : type
-        The body receives an instance as ``config``, and a `Runtime` as ``runtime``.
+        The body receives an instance as ``config``, and a `Runtime` as ``runtime``. Its docstring
+        is the help text.
     *lines : str
         Examples for its help.
     argument : callable
@@ -171,6 +173,7 @@ def command(
 
     def decorate(body: Command) -> click.Command:
         body = argument(config_options(kind)(runtime_options(body)))
-        return click.command(epilog=examples(*lines))(body)
+        name = kind.__name__.removesuffix("Config").lower()
+        return click.command(name, help=inspect.getdoc(kind), epilog=examples(*lines))(body)
 
     return decorate

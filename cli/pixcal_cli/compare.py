@@ -1,6 +1,7 @@
 """``pixcal compare``."""
 
 from collections.abc import Mapping
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -8,8 +9,9 @@ import click
 
 from pixcal.model.options import Compare
 from pixcal.storage.artefact import read_json
-from pixcal_cli import printing, results
 from pixcal_cli.click_options import PATH, Command, command
+from pixcal_cli.printing import Columns, show_notes, show_records, show_table, with_error
+from pixcal_cli.results import perform
 
 if TYPE_CHECKING:
     from pixcal.engine.run import Runtime
@@ -36,14 +38,8 @@ def runs_and_out(body: Command) -> Command:
     argument=runs_and_out,
 )
 def compare(runs: tuple[Path, ...], out: Path, config: Compare, runtime: "Runtime") -> None:
-    """Compare maps of the same pixels, scale by scale.
-
-    Give two or more fitted runs of the same window, or one run to compare with itself.
-    """
-    from pixcal.stages import compare as stage  # here: for a fast `pixcal --help`
-
-    with results.announce("compare", out):
-        stage.run(runs, out, config, runtime)
+    """Runs of the same window."""
+    perform("compare", out, runs, out, config, runtime)
     _show(read_json(out / "compare.json"))
     for file in sorted(out.glob("compare*.*")):
         click.echo(f"  {file}")
@@ -55,44 +51,24 @@ def _show(result: Mapping[str, Any]) -> None:
         first, second = pair["sides"]
         components = pair["components"]
         click.echo(f"\n{labels[first]} | {labels[second]}")
-        rows = [
-            (
-                name,
-                facts["pixels"],
-                printing.with_error(facts["correlation"], facts["correlation_error"]),
-                printing.with_error(facts["slope"], facts["slope_error"]),
-                *_sizes(facts),
-            )
-            for name, facts in components.items()
-        ]
-        printing.show_table(("", "pixels", "correlation", "slope", *SIZES), rows)
+        columns: Columns = {
+            "pixels": itemgetter("pixels"),
+            "correlation": lambda c: with_error(c["correlation"], c["correlation_error"]),
+            "slope": lambda c: with_error(c["slope"], c["slope_error"]),
+        }
+        show_records("", components, {**columns, **SIZES})
         for name, facts in components.items():
             click.echo(f"\n  {name} by scale")
             *smaller, last = [f"{scale['side_px']} px" for scale in facts["scales"]]
             sides = [*smaller, f"{last} and larger"]
-            sizes = zip(sides, map(_sizes, facts["scales"]), strict=True)
-            printing.show_table(("scale", *SIZES), [(side, *row) for side, row in sizes])
-        printing.show_notes(_sentences(components))
+            show_records("scale", dict(zip(sides, facts["scales"], strict=True)), SIZES)
+        show_notes(_sentences(components))
     if result["summary"] is not None:
         click.echo("\nerrors of each map beyond noise, from the differences of all pairs, px")
-        columns = [map(_amount, facts["own"]) for facts in result["summary"].values()]
-        rows = list(zip(labels, *columns, strict=True))
-        printing.show_table(("", *result["summary"]), rows)
-    printing.show_notes(result["warnings"])
-
-
-SIZES = ("common px", "difference px", "noise px", "ratio", "beyond noise px")
-
-
-def _sizes(facts: Mapping[str, Any]) -> tuple[str, ...]:
-    """Cells of `SIZES`."""
-    return (
-        _amount(facts["common"]),
-        f"{facts['difference_px']:.3g}",
-        f"{facts['expected_px']:.3g}",
-        printing.with_error(facts["ratio"], facts["ratio_error"]),
-        _amount(facts["beyond_noise"]),
-    )
+        own = [map(_amount, facts["own"]) for facts in result["summary"].values()]
+        rows = list(zip(labels, *own, strict=True))
+        show_table(("", *result["summary"]), rows)
+    show_notes(result["warnings"])
 
 
 def _sentences(components: Mapping[str, Any]) -> list[str]:
@@ -112,3 +88,12 @@ def _amount(estimate: Mapping[str, float]) -> str:
     if estimate["variance_px2"] < 2 * estimate["variance_error_px2"]:
         return f"< {estimate['upper_px']:.2g}"
     return f"{estimate['px']:.3g} ± {estimate['error_px']:.1g}"
+
+
+SIZES: Columns = {
+    "common px": lambda facts: _amount(facts["common"]),
+    "difference px": lambda facts: f"{facts['difference_px']:.3g}",
+    "noise px": lambda facts: f"{facts['expected_px']:.3g}",
+    "ratio": lambda facts: with_error(facts["ratio"], facts["ratio_error"]),
+    "beyond noise px": lambda facts: _amount(facts["beyond_noise"]),
+}

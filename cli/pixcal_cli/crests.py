@@ -7,8 +7,8 @@ import click
 
 from pixcal.model.options import Crests
 from pixcal.storage.artefact import read_json
-from pixcal_cli import results
 from pixcal_cli.click_options import command
+from pixcal_cli.results import perform
 
 if TYPE_CHECKING:
     from pixcal.engine.run import Runtime
@@ -16,11 +16,8 @@ if TYPE_CHECKING:
 
 @command(Crests, "pixcal crests demo", "pixcal crests demo --frames 1 --paths 4")
 def crests(run: Path, config: Crests, runtime: "Runtime") -> None:
-    """Locate the fibres from the paths of crests and valleys, to check the fit."""
-    from pixcal.stages import crests as stage  # here: for a fast `pixcal --help`
-
-    with results.announce("crests", run / "crests"):
-        stage.run(run, config, runtime)
+    """The fibres of each set."""
+    perform("crests", run / "crests", run, config, runtime)
     for name, facts in read_json(run / "crests" / "crests.json")["sets"].items():
         _show(name, facts)
         click.echo(f"  {run / 'products' / f'crests-{name}.png'}")

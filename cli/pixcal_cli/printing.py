@@ -1,10 +1,12 @@
 """Numbers, tables and notes on stdout."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import click
+
+Columns = Mapping[str, Callable[[Any], Any]]  # by title, the cell made of a record
 
 
 def number(value: float | None, digits: int = 4) -> str:
@@ -27,6 +29,12 @@ def show_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     for row in cells:
         line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
         click.echo(f"  {line.rstrip()}")
+
+
+def show_records(first: str, records: Mapping[str, Any], columns: Columns) -> None:
+    """Print a row for each record: its name, then what each column makes of it."""
+    rows = [(name, *(cell(facts) for cell in columns.values())) for name, facts in records.items()]
+    show_table((first, *columns), rows)
 
 
 def show_notes(sentences: Sequence[str]) -> None:

@@ -2,8 +2,10 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib import import_module
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import click
 
 from pixcal.storage.artefact import MANIFEST, read_json
 from pixcal.storage.cube_place import cubes_of
-from pixcal_cli.printing import number, show_notes, show_table, with_error
+from pixcal_cli.printing import Columns, number, show_notes, show_records, show_table, with_error
 
 
 @contextmanager
@@ -23,6 +25,12 @@ def announce(stage: str, folder: Path) -> Iterator[None]:
     click.echo(f"{stage}: {folder} ({state})")
     if (place := cubes_of(folder)) != folder:
         click.echo(f"  cubes: {place}")
+
+
+def perform(stage: str, folder: Path, *arguments: Any, label: str = "") -> None:
+    """Run a stage inside `announce`; it is imported here, for a fast ``pixcal --help``."""
+    with announce(label or stage, folder):
+        import_module(f"pixcal.stages.{stage}").run(*arguments)
 
 
 def _made_at(folder: Path) -> int | None:
@@ -43,37 +51,29 @@ def show_simulate(acquisition: Path) -> None:
 def show_ingest(run: Path) -> None:
     """Print one row for each array of frames, and the warnings."""
     summary = read_json(run / "ingest" / MANIFEST)["summary"]
-    rows = [
-        (
-            name,
-            array["shape"][0],
-            f"{array['shape'][2]} × {array['shape'][1]}",
-            array["dtype"],
-            "copied" if array["copied"] else "in their files",
-        )
-        for name, array in summary["arrays"].items()
-    ]
-    show_table(("array", "frames", "x × y", "type", "samples"), rows)
+    columns: Columns = {
+        "frames": lambda array: array["shape"][0],
+        "x × y": lambda array: f"{array['shape'][2]} × {array['shape'][1]}",
+        "type": itemgetter("dtype"),
+        "samples": lambda array: "copied" if array["copied"] else "in their files",
+    }
+    show_records("array", summary["arrays"], columns)
     show_notes(summary["warnings"])
 
 
 def show_reduce(run: Path) -> None:
     """Print gain and read noise, declared and measured, and how many pixels have each flag."""
     facts = read_json(run / "reduce" / "reduce.json")
-    rows = [
-        (
-            label,
-            number(facts[key]["declared"]),
-            with_error(facts[key]["measured"], facts[key]["error"]),
-            number(facts[key]["used"]),
-        )
-        for label, key in (("gain e-/ADU", "gain_e_per_adu"), ("read noise e-", "read_noise_e"))
-    ]
-    show_table(("quantity", "declared", "measured", "used"), rows)
-    figures = facts.get("figures_of_merit", {})
+    columns: Columns = {
+        "declared": lambda of: number(of["declared"]),
+        "measured": lambda of: with_error(of["measured"], of["error"]),
+        "used": lambda of: number(of["used"]),
+    }
+    quantities = {"gain e-/ADU": facts["gain_e_per_adu"], "read noise e-": facts["read_noise_e"]}
+    show_records("quantity", quantities, columns)
     shown = [
         (f["title"], f"{_figure(f['value'], f['error'])} {f['unit']}".rstrip(), f["note"])
-        for key, f in figures.items()
+        for key, f in facts.get("figures_of_merit", {}).items()
         if not key.endswith(_PARTS)
     ]
     if shown:
@@ -90,33 +90,18 @@ _PARTS = ("_row", "_column", "_pixel")
 def show_fit(run: Path) -> None:
     """Print one row for each fringe set: how good its map of offsets is, and the bound."""
     sets = read_json(run / "fit" / "fit.json")["sets"]
-    rows = [
-        (
-            name,
-            fitted["model"],
-            fitted["frames"],
-            number(fitted["interfringe_px"], 5),
-            number(fitted["sigma_median_px"], 3),
-            number(fitted["crb_median_px"], 3),
-            number(_ratio(fitted["sigma_median_px"], fitted["crb_median_px"]), 3),
-            number(fitted["chi2_reduced"], 4),
-        )
-        for name, fitted in sets.items()
-    ]
-    header = [
-        "set",
-        "model",
-        "frames",
-        "fringe period px",
-        "sigma px",
-        "bound px",
-        "sigma/bound",
-        "chi2",
-    ]
-    show_table(header, rows)
+    columns: Columns = {
+        "model": itemgetter("model"),
+        "frames": itemgetter("frames"),
+        "fringe period px": lambda s: number(s["interfringe_px"], 5),
+        "sigma px": lambda s: number(s["sigma_median_px"], 3),
+        "bound px": lambda s: number(s["crb_median_px"], 3),
+        "sigma/bound": lambda s: number(_ratio(s["sigma_median_px"], s["crb_median_px"]), 3),
+        "chi2": lambda s: number(s["chi2_reduced"]),
+    }
+    show_records("set", sets, columns)
     # Fits of earlier versions have no such note.
-    notes = {name: fitted.get("period_note") for name, fitted in sets.items()}
-    show_notes([f"{name}: {note}" for name, note in notes.items() if note])
+    show_notes([f"{n}: {s['period_note']}" for n, s in sets.items() if s.get("period_note")])
 
 
 def show_correction(run: Path) -> None:
@@ -132,45 +117,38 @@ def show_correction(run: Path) -> None:
     if not correction["outputs"]:
         click.echo("  nothing to correct: use the maps of the fit")
         return
-    header = (
-        "set",
-        "change px rms",
-        "maximum",
-        "residual px",
-        "sigma px",
-        "chi2",
-        "4-row period px",
-    )
-    show_table(header, [_gain_row(name, facts) for name, facts in correction["sets"].items()])
+    columns: Columns = {
+        "change px rms": lambda s: number(s["change"]["rms_px"], 3),
+        "maximum": lambda s: number(s["change"]["max_px"], 3),
+        "residual px": lambda s: _quadratic_sum(s["parameter_error_px"]),
+        "sigma px": lambda s: _before_after(s["sigma_median_px"]),
+        "chi2": lambda s: _before_after(s["chi2_reduced"], 4),
+        "4-row period px": lambda s: _before_after(
+            s["rows"] and {"before": s["rows"]["before_px"], "after": s["rows"]["after_px"]}
+        ),
+    }
+    show_records("set", correction["sets"], columns)
     show_notes(
         ["residual px: error of the offsets from the uncertainty of the effects' parameters"]
     )
     for pair in correction["pairs"]:
         expected = number(pair["after_expected_px"], 3)
-        apart = _before_after(pair["before_px"], pair["after_px"])
+        apart = _before_after({"before": pair["before_px"], "after": pair["after_px"]})
         sets = " and ".join(pair["sets"])
         click.echo(f"  difference between {sets}: {apart} px ({expected} px expected from noise)")
     if not correction["pairs"]:
         show_notes(["one set along each axis: a second baseline would verify the correction"])
 
 
-def _gain_row(name: str, facts: Mapping[str, Any]) -> tuple[str, ...]:
-    """Change of the offsets of a set, and its figures before and after."""
-    left = [error for error in facts["parameter_error_px"].values() if error is not None]
-    rows = facts["rows"]
-    return (
-        name,
-        number(facts["change"]["rms_px"], 3),
-        number(facts["change"]["max_px"], 3),
-        number(math.hypot(*left) if left else None, 3),
-        _before_after(facts["sigma_median_px"]["before"], facts["sigma_median_px"]["after"]),
-        _before_after(facts["chi2_reduced"]["before"], facts["chi2_reduced"]["after"], 4),
-        "-" if rows is None else _before_after(rows["before_px"], rows["after_px"]),
-    )
+def _quadratic_sum(errors: Mapping[str, float | None]) -> str:
+    known = [error for error in errors.values() if error is not None]
+    return number(math.hypot(*known) if known else None, 3)
 
 
-def _before_after(before: float | None, after: float | None, digits: int = 3) -> str:
-    return f"{number(before, digits)} → {number(after, digits)}"
+def _before_after(change: Mapping[str, float | None] | None, digits: int = 3) -> str:
+    if change is None:
+        return "-"
+    return f"{number(change['before'], digits)} → {number(change['after'], digits)}"
 
 
 def show_allan(run: Path) -> None:
@@ -207,37 +185,29 @@ def show_diagnosis(run: Path) -> None:
         f"  {diagnosis['verdict']}; residual gap: {100 * gap['after']:.0f} % "
         f"(90 % interval {low:.0f} to {high:.0f} %)"
     )
-    causes = [
-        (
-            cause["effect"],
-            "{:.1f} % ({:.1f} to {:.1f} %)".format(
-                *(100 * v for v in (cause["gap_closed"], *cause["gap_closed_interval"]))
-            ),
-            f"{100 * cause['gain_over_rest']:.1f} %",
-            _chance(cause["p_value"]),
-            ", ".join(cause["not_told_apart_from"]) or "-",
-        )
-        for cause in diagnosis["causes"]
-    ]
-    if causes:
-        header = ("cause", "gap closed", "unique share", "p-value", "indistinguishable from")
-        show_table(header, causes)
+    columns: Columns = {
+        "gap closed": lambda c: _closed(c["gap_closed"], c["gap_closed_interval"]),
+        "unique share": lambda c: f"{100 * c['gain_over_rest']:.1f} %",
+        "p-value": lambda c: _chance(c["p_value"]),
+        "indistinguishable from": lambda c: ", ".join(c["not_told_apart_from"]) or "-",
+    }
+    if diagnosis["causes"]:
+        show_records("cause", {c["effect"]: c for c in diagnosis["causes"]}, columns)
     for cause in diagnosis["causes"]:
         _show_cause(cause)
+    columns = {
+        "where": itemgetter("place"),
+        "measured": lambda e: f"{number(e['measured'], 3)} {e['unit']}".strip(),
+        "nominal": lambda e: number(e["simulated"], 3),
+        "with causes": lambda e: number(e["after"], 3),
+        "significance σ": lambda e: f"{e['significance']:.1f}",
+    }
     rows = [
-        (
-            f"{entry['domain']}: {entry['title']}",
-            entry["place"],
-            f"{number(entry['measured'], 3)} {entry['unit']}".strip(),
-            number(entry["simulated"], 3),
-            number(entry["after"], 3),
-            f"{entry['significance']:.1f}",
-        )
-        for entry in gap["where"][:MAX_ROWS]
+        (f"{e['domain']}: {e['title']}", *(cell(e) for cell in columns.values()))
+        for e in gap["where"][:MAX_ROWS]
     ]
     if rows:
-        columns = ("statistic", "where", "measured", "nominal", "with causes", "significance σ")
-        show_table(columns, rows)
+        show_table(("statistic", *columns), rows)
         if len(gap["where"]) > MAX_ROWS:
             click.echo(f"  and {len(gap['where']) - MAX_ROWS} more in diagnosis.json")
     if diagnosis["more_would_tell"]:
@@ -263,6 +233,11 @@ MAX_ROWS = 8
 """Largest number of differences that are printed."""
 MIN_P_VALUE = 1e-12
 """Smallest p-value that is printed as a number."""
+
+
+def _closed(share: float, interval: Sequence[float]) -> str:
+    low, high = (100 * end for end in interval)
+    return f"{100 * share:.1f} % ({low:.1f} to {high:.1f} %)"
 
 
 def _chance(p: float) -> str:

@@ -278,7 +278,7 @@ def test_what_is_wrong_is_named(changes: dict[str, Any], message: str, tmp_path:
         (lambda run: pixcal.allan(run, region=(0, 9)), "pixcal.allan: region: expected 4 values"),
         (
             lambda run: pixcal.fit(run, own=["mine.py"]),
-            "own: has an effect only with with_diagnosis",
+            "--own: only used with --with-diagnosis",
         ),
         (lambda run: pixcal.fit(run, with_diagnosis=True), "diagnose: not there yet; run 'pixcal"),
         (lambda run: run.diagnosis, "diagnose: not there yet; run 'pixcal diagnose"),

@@ -1,31 +1,39 @@
-"""A function whose options are one dataclass, called with the dataclass's fields as keywords."""
+"""A function whose keywords are the fields of a dataclass of options."""
 
 import functools
 import inspect
 import operator
 from collections.abc import Callable, Sequence
-from dataclasses import Field, fields
+from dataclasses import fields
+from inspect import Parameter
 from os import PathLike
 from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
+from pixcal.engine.run import Runtime
 from pixcal.model.config import StrPath, parse
 
 T = TypeVar("T")
 
-_ARGUMENTS = {
-    "acquisition": "str or path\n    Directory with ``acquisition.yaml``.",
-    "bench": "str or path\n    Bench file (schema ``pixcal/bench/1``).",
-    "run": "Run, str or path\n    A run directory.",
-    "runs": "sequence of Run, str or path\n    Fitted runs; one alone is compared with itself.",
-    "out": "str or path\n    Where the result goes; made if it is not there.",
-    "runtime": "Runtime, optional\n    Where and with how much memory tasks run.",
+# type and meaning of the arguments that are not options
+_ARGUMENTS: dict[str, tuple[Any, str]] = {
+    "acquisition": (StrPath, "str or path\n    Directory with ``acquisition.yaml``."),
+    "bench": (StrPath, "str or path\n    Bench file (schema ``pixcal/bench/1``)."),
+    "run": (StrPath, "Run, str or path\n    A run directory."),
+    "runs": (
+        Sequence[StrPath],
+        "sequence of Run, str or path\n    Fitted runs; one alone is compared with itself.",
+    ),
+    "out": (StrPath, "str or path\n    Directory of the results; created if missing."),
+    "runtime": (Runtime, "Runtime, optional\n    Where and with how much memory tasks run."),
 }
 
 
-def function_of(kind: type) -> Callable[[Callable[..., T]], Callable[..., T]]:
-    """A function that takes the fields of a dataclass as keywords, for one that takes it whole.
+def function_of(
+    kind: type, name: str, body: Callable[..., T], fails: str, returns: str = ""
+) -> Callable[..., T]:
+    """The function of a command, which takes the fields of its options as keywords.
 
     What is given is checked as a file's keys are. Signature and docstring list every option;
     type checkers find them in ``pixcal/__init__.pyi``, which ``make doc-pages`` writes.
@@ -33,37 +41,47 @@ def function_of(kind: type) -> Callable[[Callable[..., T]], Callable[..., T]]:
     Parameters
     ----------
     kind : type
-        Of the parameter ``options``.
+        Of the options; its docstring says what the command does.
+    name : str
+        Of the function.
+    body : callable
+        Called by keywords, ``options`` and ``runtime`` among them. Parameters after ``options``
+        can only be given by name.
+    fails : str
+        When the function raises InputError.
+    returns : str
+        What it returns, where that is not simply the run.
     """
+    declared, hints = inspect.signature(body), get_type_hints(kind)
+    options, names = {f.name: f for f in fields(kind)}, list(declared.parameters)
+    before, after = names[: names.index("options")], names[names.index("options") + 1 :]
 
-    def decorate(body: Callable[..., T]) -> Callable[..., T]:
-        declared = inspect.signature(body)
-        hints = get_type_hints(kind)
-        given = [p for p in declared.parameters.values() if p.name != "options"]
-        keywords = [
-            inspect.Parameter(
-                field.name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=field.default,
-                annotation=accepted(hints[field.name]),
-            )
-            for field in fields(kind)
-        ]
-        before = [p for p in given if p.kind is not inspect.Parameter.KEYWORD_ONLY]
-        signature = declared.replace(parameters=[*before, *keywords, *given[len(before) :]])
+    def keyword(name: str, hint: Any, default: Any = None) -> Parameter:
+        return Parameter(name, Parameter.KEYWORD_ONLY, default=default, annotation=hint)
 
-        @functools.wraps(body)
-        def function(*args: Any, **values: Any) -> T:
-            bound = signature.bind(*args, **values).arguments
-            chosen = {p.name: bound.pop(p.name) for p in keywords if p.name in bound}
-            options: Any = parse(kind, chosen, f"pixcal.{body.__name__}")
-            return body(**bound, options=options)
+    parameters = [declared.parameters[n].replace(annotation=_ARGUMENTS[n][0]) for n in before]
+    parameters += [keyword(n, accepted(hints[n]), f.default) for n, f in options.items()]
+    parameters += [keyword(n, _ARGUMENTS[n][0] | None) for n in after]
+    signature = declared.replace(parameters=parameters)
 
-        function.__signature__ = signature  # type: ignore[attr-defined]
-        function.__doc__ = _with_parameters(body.__doc__ or "", fields(kind), signature)
-        return function
+    def function(*args: Any, **values: Any) -> T:
+        bound = signature.bind(*args, **values).arguments
+        chosen = {n: bound.pop(n) for n in options if n in bound}
+        bound["options"] = parse(kind, chosen, f"pixcal.{name}")
+        if "runtime" in after:
+            bound["runtime"] = bound.get("runtime") or Runtime()
+        return body(**{n: bound.get(n) for n in names})
 
-    return decorate
+    lines = [inspect.getdoc(kind) or "", "", "Parameters", "----------"]
+    for n, parameter in signature.parameters.items():
+        told = f"{_words(parameter)}\n    {options[n].metadata['doc']}" if n in options else ""
+        lines.append(f"{n} : {told or _ARGUMENTS[n][1]}")
+    lines += ["", "Returns", "-------", returns] if returns else []
+    lines += ["", "Raises", "------", "InputError", f"    If {fails}."]
+    function.__name__ = function.__qualname__ = name
+    function.__doc__ = "\n".join(lines)
+    function.__signature__ = signature  # type: ignore[attr-defined]
+    return function
 
 
 def accepted(hint: Any) -> Any:
@@ -78,21 +96,7 @@ def accepted(hint: Any) -> Any:
     return hint
 
 
-def _with_parameters(text: str, options: Sequence[Field[Any]], signature: inspect.Signature) -> str:
-    """A docstring with its parameters, before what it says of results and errors."""
-    fields_by_name = {field.name: field for field in options}
-    lines = ["Parameters", "----------"]
-    for parameter in signature.parameters.values():
-        name = parameter.name
-        if name not in fields_by_name:
-            lines.append(f"{name} : {_ARGUMENTS[name]}")
-            continue
-        lines += [f"{name} : {_words(parameter)}", f"    {fields_by_name[name].metadata['doc']}"]
-    summary, _, rest = inspect.cleandoc(text).partition("\n\n")
-    return "\n".join([summary, "", *lines, "", rest])
-
-
-def _words(parameter: inspect.Parameter) -> str:
+def _words(parameter: Parameter) -> str:
     """Type of a parameter as docstrings write it."""
     hint, optional = parameter.annotation, ""
     hints = [kind for kind in get_args(hint) if kind is not type(None)]

@@ -1,8 +1,9 @@
-"""The options of every command, each said once: type, range, default, unit and meaning.
+"""Every command and its options, each said once: type, range, default, unit and meaning.
 
-The command line, the functions of `pixcal.api` and the stages take them from here. An option is
-called as its field; the command line leaves out the unit (``--diameter`` is ``diameter_m``).
-Beside those of `pixcal.model.config.quantity`, a field may say
+The command line, the functions of `pixcal.api` and the stages take them from here. The docstring of
+a class is the help text of its command. An option is called as its field; the command line leaves
+out the unit (``--diameter`` is ``diameter_m``). Beside those of `pixcal.model.config.quantity`, a
+field may say
 
 - ``in_key``: false where the result does not depend on it;
 - ``python_only``: true where the command line does not offer it;
@@ -59,7 +60,11 @@ class Running:
 
 @dataclass(frozen=True)
 class Ingest:
-    """Options of ``ingest``."""
+    """Check and catalogue every frame of an acquisition.
+
+    An acquisition is a directory ACQ with acquisition.yaml and its frames. Later steps read these
+    files where they are; only compressed ones are copied into cubes.
+    """
 
     overwrite: bool = quantity(
         False, in_key=False, doc="Replace the ingested frames of another acquisition."
@@ -78,7 +83,11 @@ class Ingest:
 
 @dataclass(frozen=True)
 class Reduce:
-    """Options of ``reduce``."""
+    """Measure the detector and write the fringes in electrons.
+
+    Bias, dark, flat, gain, read noise and bad pixels come from the detector frames; the fringe
+    frames become cubes in electrons.
+    """
 
     gain: Literal["declared", "measured"] = quantity(
         "declared", doc="Gain to use: declared in acquisition.yaml or measured from the flats."
@@ -133,7 +142,7 @@ class Sweep:
 
 @dataclass(frozen=True)
 class Fit(Sweep):
-    """Options of ``fit``."""
+    """Fit the fringes and write the maps of pixel offsets."""
 
     model: str = quantity(
         "auto",
@@ -149,10 +158,14 @@ class Fit(Sweep):
         "Python file of your own effect that the diagnosis found", in_key=False
     )
 
+    def __post_init__(self) -> None:
+        if self.own and not self.with_diagnosis:
+            raise InputError("--own: only used with --with-diagnosis; give both")
+
 
 @dataclass(frozen=True)
 class Allan:
-    """Options of ``allan``."""
+    """Measure how the error falls with the number of frames (Allan deviation)."""
 
     region: Region | None = _python(
         None, unit="px", low=0, doc="Limits (y0, y1, x0, x1) of the main curve, ends excluded."
@@ -169,7 +182,7 @@ class Allan:
 
 @dataclass(frozen=True)
 class Crests:
-    """Options of ``crests``."""
+    """Locate the fibres from the paths of crests and valleys, to check the fit."""
 
     frames: int = quantity(
         8, low=1, metavar="N", doc="Number of frames to use, spread over the run."
@@ -188,7 +201,7 @@ class Crests:
 
 @dataclass(frozen=True)
 class Diagnose:
-    """Options of ``diagnose``."""
+    """Find where data and simulation differ, which effect causes it, and the residual gap."""
 
     only: tuple[str, ...] = _python((), doc="The only candidates.")
     without: tuple[str, ...] = _python((), doc="Effects to leave out.")
@@ -200,7 +213,11 @@ class Diagnose:
 
 @dataclass(frozen=True)
 class Astrometry:
-    """Options of ``astrometry``; the telescope is by default that of the paper, section 2."""
+    """Estimate how much the maps improve star centroids.
+
+    Simulated stars are fitted twice: on a perfect grid and with the measured maps. The default
+    telescope is that of the habitable worlds mission, 7 m and 130 m.
+    """
 
     truth: Path | None = quantity(
         None,
@@ -262,7 +279,10 @@ class Astrometry:
 
 @dataclass(frozen=True)
 class Compare:
-    """Options of ``compare``."""
+    """Compare maps of the same pixels, scale by scale.
+
+    Give two or more fitted runs of the same window, or one run to compare with itself.
+    """
 
     split: Literal["halves", "odd-even"] = quantity(
         "halves", doc="How to split a single run: first and second half, or alternating batches."
@@ -274,7 +294,11 @@ class Compare:
 
 @dataclass(frozen=True)
 class Budget:
-    """Options of ``budget``; without either it is for 5e-5 px, as the paper asks (section 1)."""
+    """Plan an exposure: frames and hours needed for a given precision.
+
+    BENCH.yaml describes a bench as for `pixcal simulate`. The numbers are the Cramér-Rao bound: no
+    unbiased estimate needs fewer frames. The fit comes within a few percent of it.
+    """
 
     precision_px: float | None = quantity(
         None,
@@ -294,7 +318,11 @@ class Budget:
 
 @dataclass(frozen=True)
 class Simulate:
-    """Options of ``simulate``."""
+    """Simulate a bench and write an acquisition.
+
+    BENCH.yaml describes detector, optics and frames. The acquisition holds the FITS files that the
+    camera of the bench would have written; its truth goes to a separate directory.
+    """
 
     truth: Path | None = quantity(
         None, metavar="DIR", shown="ACQ-truth", doc="Directory of the truth."
@@ -304,7 +332,7 @@ class Simulate:
 
 @dataclass(frozen=True)
 class Run:
-    """Options of ``run`` and of its steps."""
+    """Run all steps, from an acquisition to corrected maps and the report."""
 
     overwrite: bool = _as_in(Ingest, "overwrite")
     copy: bool = _as_in(Ingest, "copy")
@@ -320,4 +348,4 @@ class Run:
 
 @dataclass(frozen=True)
 class Report:
-    """``report`` has no options."""
+    """Write the report of a run, one self-contained HTML page."""
