@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip --quiet install --no-compile
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: study-diagnose help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-run bench-full cluster fuzz torture effect-pictures reproduce reproduce-full blind blind-second blind-full clean
+.PHONY: help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-run bench-full cluster fuzz torture effect-pictures reproduce reproduce-full blind blind-second blind-full clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 17
@@ -86,9 +86,6 @@ fuzz: $(INSTALLED) ## bad input in thousands of cases, for docs/appendix/fuzz.md
 
 torture: $(TOOLS) ## faults of all kinds done on purpose, for docs/appendix/torture.md (12 minutes)
 	$(BIN)/python benchmarks/torture.py
-
-study-diagnose: $(INSTALLED) ## what the diagnosis claims by chance, and from which strength on it finds each effect (hours)
-	$(BIN)/python benchmarks/study_diagnose.py
 
 effect-pictures: $(INSTALLED) ## what every effect does to the offsets, for docs/reference/effects (two minutes)
 	$(BIN)/python benchmarks/effect_pictures.py

@@ -92,7 +92,7 @@ def _target(count: Plain) -> tuple[str, str]:
 def _medians(medians: Mapping[str, float | None]) -> str:
     names = {"closed": "share of the gap closed", "oracle": "by the true effects"}
     known = [f"{names[n]} {v:.3g}" for n, v in medians.items() if v is not None]
-    return f"Medians of the cases of one effect: {', '.join(known)}." if known else ""
+    return f"Medians over the cases of one effect: {', '.join(known)}." if known else ""
 
 
 def _maps(maps: Plain) -> str:

@@ -58,7 +58,7 @@ def allan(
     regions: collections.abc.Sequence[tuple[int, int, int, int]] = (),
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> pixcal.api.opened.Run:
-    """Measure how the error falls with the number of frames (paper, section 4.3).
+    """Measure how the error falls with the number of frames (Allan deviation).
 
     Parameters
     ----------
@@ -94,7 +94,10 @@ def astrometry(
     seed: int = 0,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> dict[str, typing.Any]:
-    """Estimate how much the maps improve star centroids (paper, section 2).
+    """Estimate how much the maps improve star centroids.
+
+    Simulated stars are fitted twice: on a perfect grid and with the measured maps. The default
+    telescope is that of the habitable worlds mission, 7 m and 130 m.
 
     Parameters
     ----------
@@ -145,7 +148,10 @@ def budget(
     frames: int | None = None,
     out: str | os.PathLike[str] | None = None,
 ) -> dict[str, typing.Any]:
-    """Plan an exposure: frames and hours for a given precision (Cramér-Rao bound).
+    """Plan an exposure: frames and hours needed for a given precision.
+
+    BENCH.yaml describes a bench as for `pixcal simulate`. The numbers are the Cramér-Rao bound: no
+    unbiased estimate needs fewer frames. The fit comes within a few percent of it.
 
     Parameters
     ----------
@@ -156,12 +162,12 @@ def budget(
     frames : int, optional
         Frames of each fringe set; prints the precision that they reach.
     out : str or path
-        Where the result goes; made if it is not there.
+        Directory of the results; created if missing.
 
     Returns
     -------
     dict
-        Contents of ``budget.json``, which goes into ``out`` (if given) with ``budget.png``.
+        Contents of ``budget.json``; with ``out`` it goes there, with ``budget.png``.
 
     Raises
     ------
@@ -179,12 +185,14 @@ def compare(
 ) -> dict[str, typing.Any]:
     """Compare maps of the same pixels, scale by scale.
 
+    Give two or more fitted runs of the same window, or one run to compare with itself.
+
     Parameters
     ----------
     runs : sequence of Run, str or path
         Fitted runs; one alone is compared with itself.
     out : str or path
-        Where the result goes; made if it is not there.
+        Directory of the results; created if missing.
     split : {"halves", "odd-even"}
         How to split a single run: first and second half, or alternating batches.
     sigma_accuracy : float
@@ -195,7 +203,7 @@ def compare(
     Returns
     -------
     dict
-        Contents of ``compare.json``; beside it in ``out`` lie pictures.
+        Contents of ``compare.json``; pictures are beside it in ``out``.
 
     Raises
     ------
@@ -211,7 +219,7 @@ def crests(
     segment: int | None = None,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> dict[str, typing.Any]:
-    """Locate the fibres from the paths of crests and valleys (paper, equation 7).
+    """Locate the fibres from the paths of crests and valleys, to check the fit.
 
     Parameters
     ----------
@@ -284,7 +292,7 @@ def fit(
     own: collections.abc.Sequence[str | os.PathLike[str]] = (),
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> pixcal.api.opened.Run:
-    """Fit the fringes and write the maps of the offsets.
+    """Fit the fringes and write the maps of pixel offsets.
 
     Parameters
     ----------
@@ -306,8 +314,7 @@ def fit(
     Raises
     ------
     InputError
-        If the run was not reduced, or holds no fringes that can be fitted; with a diagnosis, if
-        there is none.
+        If the run was not reduced, or holds no fringes that can be fitted; with a diagnosis, if there is none.
     """
 
 def ingest(
@@ -321,12 +328,15 @@ def ingest(
 ) -> pixcal.api.opened.Run:
     """Check and catalogue every frame of an acquisition.
 
+    An acquisition is a directory ACQ with acquisition.yaml and its frames. Later steps read these
+    files where they are; only compressed ones are copied into cubes.
+
     Parameters
     ----------
     acquisition : str or path
         Directory with ``acquisition.yaml``.
     out : str or path
-        Where the result goes; made if it is not there.
+        Directory of the results; created if missing.
     overwrite : bool
         Replace the ingested frames of another acquisition.
     copy : bool
@@ -357,6 +367,9 @@ def reduce(
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> pixcal.api.opened.Run:
     """Measure the detector and write the fringes in electrons.
+
+    Bias, dark, flat, gain, read noise and bad pixels come from the detector frames; the fringe
+    frames become cubes in electrons.
 
     Parameters
     ----------
@@ -401,14 +414,14 @@ def run(
     diagnosed: bool = True,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> pixcal.api.opened.Run:
-    """Run all steps, from an acquisition to corrected maps and the report, as ``pixcal run``.
+    """Run all steps, from an acquisition to corrected maps and the report.
 
     Parameters
     ----------
     acquisition : str or path
         Directory with ``acquisition.yaml``.
     out : str or path
-        Where the result goes; made if it is not there.
+        Directory of the results; created if missing.
     overwrite : bool
         Replace the ingested frames of another acquisition.
     copy : bool
@@ -427,13 +440,12 @@ def run(
     Returns
     -------
     Run
-        Without fringes in the acquisition, only the detector's side of it is there.
+        Without fringes in the acquisition it holds only what was measured of the detector.
 
     Raises
     ------
     InputError
-        In one line, with the file, key or option that is wrong. A diagnosis or correction
-        that is not possible is a warning.
+        If a file, key or option is wrong. A diagnosis or correction that is not possible is a warning.
     """
 
 def simulate(
@@ -444,14 +456,17 @@ def simulate(
     own: collections.abc.Sequence[str | os.PathLike[str]] = (),
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> pathlib.Path:
-    """Simulate a bench; write an acquisition and, in a separate directory, its truth.
+    """Simulate a bench and write an acquisition.
+
+    BENCH.yaml describes detector, optics and frames. The acquisition holds the FITS files that the
+    camera of the bench would have written; its truth goes to a separate directory.
 
     Parameters
     ----------
     bench : str or path
         Bench file (schema ``pixcal/bench/1``).
     out : str or path
-        Where the result goes; made if it is not there.
+        Directory of the results; created if missing.
     truth : str or path, optional
         Directory of the truth.
     own : Sequence[str | os.PathLike[str]]
@@ -475,7 +490,7 @@ def write_report(
     *,
     runtime: pixcal.engine.run.Runtime | None = None,
 ) -> pixcal.api.opened.Run:
-    """Write the report of a run, one self-contained HTML page, as ``pixcal report``.
+    """Write the report of a run, one self-contained HTML page.
 
     Parameters
     ----------

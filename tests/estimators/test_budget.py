@@ -173,7 +173,7 @@ def test_finer_fringes_lose_contrast_in_the_pixel(bench):
     assert pixel_contrast(2 * np.pi / 5, 0.0) == pytest.approx(averaged(5.0), rel=1e-5)
     both = pixel_contrast(2 * np.pi / 5, 2 * np.pi / 7)
     assert both == pytest.approx(averaged(5.0) * averaged(7.0), rel=1e-5)
-    finer = next(v for v in levers(bench, joined(bench)) if v.name.startswith("interfringe 5 px"))
+    finer = next(v for v in levers(bench, joined(bench)) if v.name.startswith("fringe period 5 px"))
     contrast = averaged(5.0) / averaged(9.588)
     s = SetBound.of(bench, 0, contrast)
     assert s.visibility == pytest.approx(contrast * SetBound.of(bench, 0).visibility)

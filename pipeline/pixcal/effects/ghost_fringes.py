@@ -71,7 +71,7 @@ class GhostFringes(Effect):
     strengths = ("share", "waves")
     frames_needed = ("baseline", "axis")
     sources = (
-        "a ghost of 0.5 % shifts by up to 0.005 / |K|: 4e-3 px at 5 px interfringe",
+        "a ghost of 0.5 % shifts by up to 0.005 / |K|: 4e-3 px at a fringe period of 5 px",
         "Born & Wolf, Principles of Optics, sections 1.5 and 7.6: a surface of n = 1.5 reflects "
         "4 % of the light, a coated one some 0.5 %; after two, an amplitude of 4 % or 0.5 %; a "
         "wedge of angle w makes fringes of lambda / (2 n w)",

@@ -6,11 +6,31 @@ from enum import IntFlag
 class PixelFlag(IntFlag):
     """Why a pixel's offset is not given. Zero is a good pixel."""
 
-    HOT = 1  # dark signal far above that of the other pixels
-    DEAD = 2  # response far below (or above) that of the neighbours
-    NOISY = 4  # noise in bias or dark frames far above the read noise; telegraph noise included
-    # saturated in more than two, and a thousandth, of its samples (which have no weight)
+    HOT = 1
+    DEAD = 2
+    NOISY = 4
     SATURATED = 8
-    NONLINEAR = 16  # departs from the straight line over a ladder of flats
-    NO_DATA = 32  # samples are missing or not finite
-    BAD_FIT = 64  # the fringe model does not describe the pixel (chi-square, or no contrast)
+    NONLINEAR = 16
+    NO_DATA = 32
+    BAD_FIT = 64
+
+    @property
+    def words(self) -> str:
+        """The name as words."""
+        return (self.name or "").lower().replace("_", " ")
+
+    @property
+    def meaning(self) -> str:
+        """What a pixel with this flag is."""
+        return _MEANINGS[self.value]
+
+
+_MEANINGS = {
+    1: "dark signal far above that of the other pixels",
+    2: "response far below (or above) that of the neighbours",
+    4: "noise in bias or dark frames far above the read noise; telegraph noise included",
+    8: "saturated in more than two, and a thousandth, of its samples, which carry no weight",
+    16: "deviates from a straight line over the exposure-time steps",
+    32: "samples are missing or not finite",
+    64: "the fringe model does not describe the pixel (chi-square, or no contrast)",
+}

@@ -263,7 +263,7 @@ class Astrometry:
         unit="px",
         low=0,
         high=512,
-        doc="Largest distance of a position from the first, along x and y.",
+        doc="Largest dither from the first position, along x and y.",
     )
     seed: int = quantity(0, low=0, doc="Random seed.")
 

@@ -114,15 +114,14 @@ def _precision(axes: Axes, result: Mapping[str, Any]) -> None:
             xycoords=("data", "axes fraction"), color=RED, fontsize=10,
         )  # fmt: skip
     axes.set(xscale="log", yscale="log", xlim=(frames[0], frames[-1]))
-    axes.set(xlabel="frames", ylabel="1σ bound of a pixel's offset (px)")
     plain_ticks(axes.xaxis, *axes.get_xlim(), most=9)
     plain_ticks(axes.yaxis, *axes.get_ylim(), most=9)
     _clock(axes, _as_planned(result)["period_s"])
-    finish(axes)
     axes.plot([], [], "o", color=GREY, label="planned")
     if any(line.spread for line in sets):
         axes.fill_between([], [], [], color=GREY, alpha=0.25, label="median to worst pixel")
-    axes.legend(fontsize=9, framealpha=0.9, loc="upper right")
+    label = "1σ bound of a pixel's offset (px)"
+    finish(axes, legend="upper right", xlabel="frames", ylabel=label)
 
 
 def _clock(axes: Axes, period: float) -> None:
@@ -149,6 +148,6 @@ def _levers(axes: Axes, result: Mapping[str, Any]) -> None:
         time = f"   {duration(share * planned / precision**2)}" if precision else ""
         note(axes, f"{100 * share:.3g} %{time}", (share, y), (4, 0), fontsize=9, va="center")
     axes.set(yticks=[], xlim=(0, 1.45 * max(shares.values())), ylim=(-0.6, len(shares) - 0.1))
-    axes.set(xlabel="time for the same precision / as planned", title="What if")
-    finish(axes, grid=False)
+    label = "time for the same precision / as planned"
+    finish(axes, grid=False, xlabel=label, title="Alternatives")
     axes.spines["left"].set_visible(False)

@@ -128,8 +128,7 @@ def _scales(axes: Axes, view: ComponentView) -> None:
     names = [str(s["side_px"]) for s in scales]
     axes.set_xticks(at, [*names[:-1], f"≥{names[-1]}"])
     axes.set(xlabel="scale (px)", ylabel=f"rms at this scale ({unit.label})", title="by scale")
-    finish(axes)
-    axes.legend(fontsize=8, framealpha=0.9, loc="upper right")
+    finish(axes, legend="upper right")
 
 
 def _round_off(axes: Axes, values: F64) -> None:
@@ -174,8 +173,6 @@ def _profile(axes: Axes, profile: tuple[F64, F64], label: str, view: ComponentVi
     width = 1.0 if len(at) <= LINES else 0.5
     axes.plot(at, mean * unit.factor, color=BLUE, linewidth=width, label="2 − 1")
     low, high = limits([mean * unit.factor, band, -band], 0.0)
-    axes.set_ylim(low, high + 0.25 * (high - low))
-    axes.set_xlim(-0.5, len(at) - 0.5)
-    axes.set(xlabel=label, ylabel=f"mean Δ{SYMBOLS[view.name]}\n({unit.label})")
-    finish(axes)
+    axes.set(xlim=(-0.5, len(at) - 0.5), ylim=(low, high + 0.25 * (high - low)))
+    finish(axes, xlabel=label, ylabel=f"mean Δ{SYMBOLS[view.name]}\n({unit.label})")
     axes.legend(fontsize=8, framealpha=0.9, loc="upper right", ncols=2)

@@ -115,30 +115,17 @@ class StageRecord:
 
 
 @dataclass(frozen=True)
-class ArrayRecord:
-    """Frames of one kind, as ingested; unknown facts are None."""
-
-    name: str
-    files: int
-    frames: int
-    shape: tuple[int, int] | None
-    first_mjd: float | None
-    duration_s: float | None
-    exptimes_s: tuple[float, ...]
-    temperature_c: tuple[float, float] | None
-    time_source: str | None
-
-
-@dataclass(frozen=True)
 class Contents:
     """A whole run."""
 
     acquisition: dict[str, Any]  # as in `acquisition.json`
     stages: tuple[StageRecord, ...]
-    arrays: tuple[ArrayRecord, ...] = ()
+    # by array, its ``frames.json`` and the shape (y, x) of its frames; empty where not ingested
+    arrays: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     detector: DetectorContents = field(default_factory=DetectorContents)
     fit: dict[str, Any] | None = None  # `fit.json`
     offsets: tuple[MapContents, ...] = ()
+    corrected: tuple[MapContents, ...] = ()  # freed of the causes, where there is one to correct
     sets: tuple[SetContents, ...] = ()
     flags: FlagSummary | None = None  # of the products
     diagnosis: DiagnosisContents | None = None  # where the run was diagnosed

@@ -138,8 +138,9 @@ def _whole(axes: Axes, view: CrestView, paths: I64) -> None:
         axes.plot(x, y, "+", color=INK, markersize=9)
         note(axes, f"$s_{label}$", (x, y), (4, 4), color=INK)
     title = f"{view.name}: outermost paths, fibres"
-    axes.set(xlabel="x (px)", ylabel="y (px)", aspect="equal", title=title, anchor="C")
-    finish(axes, grid=False)
+    finish(
+        axes, grid=False, xlabel="x (px)", ylabel="y (px)", aspect="equal", title=title, anchor="C"
+    )
 
 
 def _extract(axes: Axes, view: CrestView, extract: Extract, title: str) -> None:
@@ -168,12 +169,9 @@ def _pulls(axes: Axes, view: CrestView) -> None:
     axes.hist(pull, edges.tolist(), density=True, color=BLUE, alpha=0.35)
     at = np.linspace(-5, 5, 201)
     axes.plot(at, np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi), color=INK, linewidth=1)
-    axes.set(
-        xlabel="residual / error", ylabel="density",
-        title=f"{view.used.sum()} points, good to {np.median(view.sigma_px):.1e} px",
-    )  # fmt: skip
     axes.title.set_fontsize(LONG_TITLE)
-    finish(axes)
+    title = f"{view.used.sum()} points, median error {np.median(view.sigma_px):.1e} px"
+    finish(axes, xlabel="residual / error", ylabel="density", title=title)
 
 
 def _map(figure: SubFigure, axes: Axes, view: CrestView, *, by_ratio: bool) -> None:
@@ -208,9 +206,6 @@ def _valley(axes: Axes, view: CrestView) -> None:
     error = view.distance_sigma
     decimals = max(0, 1 - int(np.floor(np.log10(error)))) if error > 0 else 3
     origin = ", nominal" if view.distance_from_prior else ""
-    axes.set(
-        xlabel="D (mm)", ylabel="cost above its least",
-        title=f"{view.best[0]:.{decimals}f} ± {error:.{decimals}f} mm{origin}",
-    )  # fmt: skip
     axes.title.set_fontsize(LONG_TITLE)
-    finish(axes)
+    title = f"{view.best[0]:.{decimals}f} ± {error:.{decimals}f} mm{origin}"
+    finish(axes, xlabel="D (mm)", ylabel="cost above minimum", title=title)

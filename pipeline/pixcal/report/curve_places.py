@@ -21,7 +21,7 @@ class _Axis:
 _SIDES = ("x−1", "x+1", "y−1", "y+1")
 _ROWS_OF_FOUR = tuple(f"{step} r{row}" for step in ("y+1", "x+1") for row in range(4))
 _LINES = tuple(f"{n} {of}{'s' * (n > 1)}" for of in ("row", "column") for n in range(1, 5))
-_BANDS = ("8 px and more", "4 to 8 px", "2.7 to 4 px", "2 to 2.7 px", "2 rows", "2 columns")
+_BANDS = ("≥ 8 px", "4 to 8 px", "2.7 to 4 px", "2 to 2.7 px", "2 rows", "2 columns")
 _HALF_WAVES = ("1 to 3", "4 to 9", "10 on")
 _CELLS = tuple(f"{row},{column}" for row in range(1, 5) for column in range(1, 5))
 _TERMS = tuple(f"{of} {f} {n}φ" for of in "VB" for n in ("", 2, 3) for f in ("cos", "sin"))
@@ -55,7 +55,7 @@ _AXES = {
 def axis_label(curve: Mapping[str, Any]) -> str:
     """What the places of a curve are."""
     label = str(curve["x_label"])
-    return _AXES[label].label if label in _AXES else label
+    return _AXES[label].label if label in _AXES else label.replace(" a ", " per ")
 
 
 def places(curve: Mapping[str, Any]) -> list[str]:

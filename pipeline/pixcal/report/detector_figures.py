@@ -40,18 +40,18 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
     )  # fmt: skip
     if curve["read_variance"] > 0:
         left.axhline(curve["read_variance"], color=GREY, ls=":", label="read noise")
-    left.set(xscale="log", yscale="log", xlabel="level (ADU)", ylabel="variance (ADU²)")
+    left.set(xscale="log", yscale="log", ylabel="variance (ADU²)")
     low, high = left.get_xlim()
     plain_ticks(left.xaxis, low, high, most=5)
     right.errorbar(level, variance / line, error / line, **style)
     right.axhline(1, color=INK, linewidth=1.2)
-    right.set(xlabel="level (ADU)", ylabel="variance over the line")
+    right.set_ylabel("variance over the line")
     right.margins(y=0.15)
     right.locator_params(axis="x", nbins=6)
     for axes in (left, right):
         if saturation is not None:
             axes.axvline(saturation, color=RED, ls="--", linewidth=1, label="saturation")
-        finish(axes)
+        finish(axes, xlabel="level (ADU)")
     # Empty room above the rising points, for the legend.
     left.set_ylim(top=4 * left.get_ylim()[1])
     left.legend(fontsize=9, frameon=False, loc="upper left")
@@ -80,10 +80,9 @@ def nonuniformity(patterns: Mapping[str, Curves]) -> Figure:
             part = curves[along]
             axes.plot(part["at"], part["profile"], color=colour, linewidth=0.8)
             axes.axhline(0, color=INK, linewidth=0.8)
-            axes.set(xlabel=f"{axis} (px)", ylabel=f"mean of {along} ({unit})")
             axes.margins(x=0.01)
             axes.locator_params(nbins=5)
-            finish(axes)
+            finish(axes, xlabel=f"{axis} (px)", ylabel=f"mean of {along} ({unit})")
     return figure
 
 
@@ -110,12 +109,12 @@ def _spectra(axes: Axes, curves: Curves) -> None:
 
 
 def linearity(levels: Sequence[Mapping[str, Any]]) -> Figure:
-    """Departure from the straight line over the ladder of flats.
+    """Deviation from a straight line over the exposure-time steps of the flats.
 
     Parameters
     ----------
     levels : sequence of mapping
-        With ``level_e`` (e-) and ``deviation_percent`` (None where the rung was not used).
+        With ``level_e`` (e-) and ``deviation_percent`` (None where the step was not used).
     """
     used = [v for v in levels if v.get("deviation_percent") is not None]
     left_out = [v for v in levels if v.get("deviation_percent") is None]
@@ -128,7 +127,6 @@ def linearity(levels: Sequence[Mapping[str, Any]]) -> Figure:
     )  # fmt: skip
     for level in left_out:
         axes.axvline(level["level_e"] / 1e3, color=INK, ls=":", linewidth=1)
-    axes.set(xlabel="level (10³ e⁻)", ylabel="departure (%)")
     axes.margins(y=0.25)
-    finish(axes)
+    finish(axes, xlabel="level (10³ e⁻)", ylabel="deviation (%)")
     return figure

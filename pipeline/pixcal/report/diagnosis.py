@@ -12,12 +12,11 @@ from pixcal.report.diagnosis_words import (
     effect_title,
     listed,
     percent,
-    unit,
     with_interval,
     worst,
 )
 from pixcal.report.tables import Table, is_table
-from pixcal.report.text import exact, number, with_error
+from pixcal.report.text import exact, number, unit, with_error
 
 Facts = Mapping[str, Any]
 
@@ -78,7 +77,7 @@ def parameters(cause: Facts) -> Iterator[tuple[str, Table]]:
     errors, values = cause["uncertainty"], cause["parameters"]
     rows = []
     for name, value in values.items():
-        if not is_table(value):
+        if not is_table(value) and value not in (None, []):
             its_unit = unit(cause["units"].get(name, "")) or "–"
             meaning = cause["meanings"].get(name, "")
             rows.append([name, _fitted(name, value, errors), its_unit, meaning])
@@ -131,6 +130,8 @@ def _is_long(value: Any) -> bool:
 
 def _in_short(value: Any) -> str:
     """A value in full; of a long list of numbers how many there are, their range and rms."""
+    if isinstance(value, list) and not _is_long(value):
+        return ", ".join(number(one) if isinstance(one, float) else exact(one) for one in value)
     if not _is_long(value):
         return exact(value)
     ends = f"{len(value)} values, {number(min(value))} to {number(max(value))}"

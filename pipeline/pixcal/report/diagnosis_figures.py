@@ -13,8 +13,9 @@ from pixcal.model.arrays import F64
 from pixcal.report.colours import BAND, BLUE, GREY, INK, RED
 from pixcal.report.contents import DiagnosisContents
 from pixcal.report.curve_places import axis_label, places
-from pixcal.report.diagnosis_words import DETECTOR, effect_title, percent, unit
+from pixcal.report.diagnosis_words import DETECTOR, effect_title, percent
 from pixcal.report.drawing import TITLE, WIDE, Unit, axes_grid, finish, note, plain_ticks, unit_for
+from pixcal.report.text import unit
 
 ROOM = 50  # letters that fit below a panel; where names of places have more, they are turned
 SPAN = 12.0  # ratio of values from which an axis is logarithmic
@@ -105,8 +106,7 @@ def _share(axes: Axes, end: float, y: float, value: float) -> None:
 
 
 def _share_axes(axes: Axes, rows: int) -> None:
-    axes.set(xlabel="share of the gap (%)", ylim=(rows - 0.4, -0.6))
-    finish(axes)
+    finish(axes, xlabel="share of the gap (%)", ylim=(rows - 0.4, -0.6))
     axes.grid(visible=False, axis="y")
 
 
@@ -156,11 +156,15 @@ def curves_figure(curves: Sequence[Mapping[str, Any]], *, with_effects: bool = T
     with_effects : bool
         False where no effect was found: then that curve is the nominal one.
     """
-    turned = any(_is_named(c) and _turned(places(c)) for c in curves)
+    named = [places(c) for c in curves if _is_named(c)]
+    # room for the longest of the names that are written upwards, inches
+    turned = max(
+        [0.075 * min(len(n), 12) for names in named if _turned(names) for n in names] or [0]
+    )
     lines = max(_title(c).count("\n") + 1 for c in curves)
     figure, axes = axes_grid(
-        (WIDE * (1 + len(curves)) / 4, 5.0 + 0.5 * turned), 2, len(curves), left=0.9, right=0.35,
-        bottom=1.3 if turned else 0.6, top=0.45 + 0.2 * lines, beside=0.9, between=0.2,
+        (WIDE * (1 + len(curves)) / 4, 5.0 + turned), 2, len(curves), left=0.9, right=0.35,
+        bottom=0.6 + turned, top=0.45 + 0.2 * lines, beside=0.9, between=0.2,
         sharex="col", height_ratios=[2.1, 1],
     )  # fmt: skip
     for n, (top, below, curve) in enumerate(zip(axes[0], axes[1], curves, strict=True)):
@@ -242,9 +246,8 @@ def _value_axis(axes: Axes, curve: Mapping[str, Any], values: F64, scale: Unit) 
         axes.axhline(0, color=GREY, linewidth=0.8)
     quantity = str(curve["quantity"])
     label = f"{quantity} ({scale.label})" if scale.label else quantity
-    axes.set_ylabel(_plain(label, 40))
     axes.margins(x=0.06)
-    finish(axes)
+    finish(axes, ylabel=_plain(label, 40))
 
 
 def _sigma_axis(axes: Axes, sigmas: Sequence[F64]) -> None:
@@ -252,8 +255,7 @@ def _sigma_axis(axes: Axes, sigmas: Sequence[F64]) -> None:
     top = 1.15 * max(QUIET, float(np.max(np.abs(finite[np.isfinite(finite)]), initial=0.0)))
     axes.axhspan(-2, 2, color=BAND, linewidth=0, zorder=0)
     axes.axhline(0, color=GREY, linewidth=0.8)
-    axes.set_ylim(-top, top)
-    finish(axes)
+    finish(axes, ylim=(-top, top))
 
 
 def _place_axis(axes: Axes, curve: Mapping[str, Any], x: F64, named: bool) -> None:

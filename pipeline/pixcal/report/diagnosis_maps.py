@@ -107,9 +107,9 @@ def where_figure(
             if not after:
                 ax.set_title(panel.title.replace("$", r"\$"), **TITLE)
             if number == 0:
-                ax.set_ylabel(f"{words}\nrow (px)")
+                ax.set_ylabel(f"{words}\ny (px)")
     for ax in axes[-1]:
-        ax.set_xlabel("column (px)")
+        ax.set_xlabel("x (px)")
     return figure
 
 
@@ -119,20 +119,18 @@ def _draw(
     ny, nx = shape
     axes.add_patch(Rectangle((0, 0), nx, ny, fill=False, edgecolor=GREY, linewidth=1))
     for spot in panel.spots:
-        (top, left), (high, wide) = _shown(spot, shape)
+        (low, left), (high, wide) = _shown(spot, shape)
         sigma = spot.sigmas[after]
         colour = DIVERGING(scale(sigma))
         axes.add_patch(
-            Rectangle((left, top), wide, high, facecolor=colour, edgecolor="white", linewidth=1)
+            Rectangle((left, low), wide, high, facecolor=colour, edgecolor="white", linewidth=1)
         )
         dark = abs(scale(sigma) - 0.5) > 0.33
         axes.text(
-            left + wide / 2, top + high / 2, f"{sigma:.1f}".replace("-", "−"), ha="center",
+            left + wide / 2, low + high / 2, f"{sigma:.1f}".replace("-", "−"), ha="center",
             va="center", fontsize=9, color="white" if dark else INK,
         )  # fmt: skip
-    axes.set_xlim(-0.02 * nx, 1.02 * nx)
-    axes.set_ylim(1.02 * ny, -0.02 * ny)
-    axes.set_aspect("equal")
+    axes.set(xlim=(-0.02 * nx, 1.02 * nx), ylim=(-0.02 * ny, 1.02 * ny), aspect="equal")
 
 
 def _shown(spot: Spot, shape: tuple[int, int]) -> tuple[tuple[float, float], tuple[float, float]]:

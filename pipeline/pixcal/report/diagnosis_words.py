@@ -10,16 +10,6 @@ from pixcal.report.text import number
 DETECTOR = "detector"
 
 
-def unit(name: str) -> str:
-    """A unit in its usual notation."""
-    return (
-        name.replace("h^-0.5", "1/√h")
-        .replace("h^0.5", "√h")
-        .replace("e-", "e⁻")
-        .replace("um", "µm")
-    )
-
-
 def percent(value: float) -> str:
     """A share in per cent, to two digits or a hundredth of a per cent."""
     return f"{number(round(100 * float(value), 2), 2)}\u00a0%"

@@ -207,8 +207,11 @@ def fit_box(shape: tuple[int, int], width: float, height: float, least: float = 
     return max(nx * scale, least), max(ny * scale, least)
 
 
-def finish(axes: Axes, *, grid: bool = True) -> None:
-    """Style of axes with lines or points."""
+def finish(axes: Axes, *, grid: bool = True, legend: str = "", **settings: Any) -> None:
+    """Style of axes with lines or points, where the legend is, and settings of ``Axes.set``."""
+    axes.set(**settings)
+    if legend:
+        axes.legend(fontsize=9, framealpha=0.9, loc=legend)
     axes.spines[["top", "right"]].set_visible(False)
     if grid:
         axes.grid(True, color="#d9dee5", linewidth=0.7)

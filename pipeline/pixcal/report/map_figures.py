@@ -140,10 +140,8 @@ def histogram(maps: Sequence[MapContents]) -> Figure:
         _histogram(axes, offset, unit, colour)
     axes.set_yscale("log")
     axes.set_ylim(bottom=0.5)
-    axes.set(xlabel=f"offset ({unit.label})", ylabel="pixels per bin")
-    finish(axes)
-    if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=9, loc="upper right", framealpha=0.9)
+    legend = "upper right" if axes.get_legend_handles_labels()[0] else ""
+    finish(axes, legend=legend, xlabel=f"offset ({unit.label})", ylabel="pixels per bin")
     return figure
 
 

@@ -20,7 +20,7 @@ from pixcal.report.colours import FLAGS, LEVELS, MARKS, MASKED, SEQUENTIAL, SEVE
 from pixcal.report.contents import MapContents, SetContents
 from pixcal.report.drawing import block_note, covered, fit_box, span_scale, unit_for
 from pixcal.report.summary import FlagSummary, MapSummary, Spectrum
-from pixcal.report.text import SYMBOLS, exact, flag_name
+from pixcal.report.text import SYMBOLS, exact
 
 Ticks = list[tuple[float, str]]  # places (page px) and their numbers
 Legend = list[tuple[str, str]]  # colours and what they mean
@@ -228,7 +228,7 @@ def flags(masks: Mapping[str, FlagSummary]) -> tuple[list[Panel], Legend]:
     panels = [_flags(", ".join(titles), summary, most) for titles, summary in merged.values()]
     if next(iter(masks.values())).block > 1:
         return panels, []
-    legend = [(FLAGS[f.value], flag_name(f)) for f in PixelFlag]
+    legend = [(FLAGS[f.value], f.words) for f in PixelFlag]
     return panels, [*legend, (SEVERAL, "several")]
 
 

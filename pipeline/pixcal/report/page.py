@@ -119,7 +119,7 @@ def _subtitle(contents: Contents) -> str:
     if contents.has_fringes and optics:
         parts.append(f"{text.number(optics['wavelength_nm'], 4)} nm")
         parts.append(f"{text.number(optics['distance_mm'], 4)} mm from the fibres")
-    starts = [a.first_mjd for a in contents.arrays if a.first_mjd is not None]
+    starts = [t for a in contents.arrays.values() for t in a.get("mjd", ()) if t is not None]
     if starts:
         parts.append(f"first frame {text.date_of_mjd(min(starts))} UTC")
     return " · ".join(parts)

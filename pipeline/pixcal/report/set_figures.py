@@ -29,6 +29,7 @@ Facts = Mapping[str, Any]
 
 ALLAN_COLUMNS = ("frames", "seconds", "adev_px", "adev_lo_px", "adev_hi_px", "white_expected_px")
 PHASE_BINS = 24
+TURN = ("0", "π", "2π")  # labels of a phase axis
 POINTS = 6000  # most frames that are drawn one by one; of longer runs, every n-th
 
 
@@ -47,14 +48,11 @@ def temporal(sets: Sequence[SetContents]) -> Figure:
             size = float(np.clip(70 / np.sqrt(max(len(time), 1)), 1.2, 4.5))
             drawing: Any = {"markersize": size, "markeredgewidth": 0}
             axes.plot(time, values[::step], "o", color=BLUE, **drawing)
-            axes.set_ylabel(label)
-            axes.set_ylim(*limits([values], 0.0))
-            finish(axes)
+            finish(axes, ylabel=label, ylim=limits([values], 0.0))
         for axes in column[: rows - 1]:
             axes.tick_params(labelbottom=False)
         column[0].set_title(f"set {fringes.name}", **TITLE)
-        column[2].set_ylim(0, 2 * np.pi)
-        column[2].set_yticks([0, np.pi, 2 * np.pi], ["0", "π", "2π"])
+        column[2].set(ylim=(0, 2 * np.pi), yticks=[0, np.pi, 2 * np.pi], yticklabels=TURN)
         column[rows - 1].set_xlabel(
             f"time ({clock})" + (f", every {step}th frame" if step > 1 else "")
         )
@@ -88,10 +86,8 @@ def _phases(axes: Axes, phi: F64) -> None:
     axes.axhspan(mean - chance, mean + chance, color=GREY, alpha=0.25, linewidth=0)
     axes.stairs(count, edges, fill=True, color=BAR, edgecolor=BLUE)
     axes.axhline(mean, color=INK, linewidth=1, ls="--")
-    axes.set_xlim(0, 2 * np.pi)
-    axes.set_xticks([0, np.pi, 2 * np.pi], ["0", "π", "2π"])
-    axes.set(xlabel="φ (rad)", ylabel="frames\nper bin")
-    finish(axes)
+    axes.set(xlim=(0, 2 * np.pi), xticks=[0, np.pi, 2 * np.pi], xticklabels=TURN)
+    finish(axes, xlabel="φ (rad)", ylabel="frames\nper bin")
 
 
 def _clock(time: F64) -> tuple[F64, str]:
@@ -109,11 +105,8 @@ def chi2(sets: Sequence[SetContents]) -> Figure:
     ends = np.array(
         [_histogram(axes, s, LINES[n % len(LINES)]) for n, s in enumerate(sets)]
     )  # (set, 3): lowest, highest, tallest
-    axes.set_xlim(ends[:, 0].min(), ends[:, 1].max())
-    axes.set_ylim(0, 1.45 * ends[:, 2].max())
-    axes.set(xlabel="reduced χ² of a pixel", ylabel="pixels per bin")
-    finish(axes)
-    axes.legend(fontsize=9, loc="upper right", framealpha=0.9)
+    axes.set(xlim=(ends[:, 0].min(), ends[:, 1].max()), ylim=(0, 1.45 * ends[:, 2].max()))
+    finish(axes, legend="upper right", xlabel="reduced χ² of a pixel", ylabel="pixels per bin")
     return figure
 
 
@@ -169,16 +162,13 @@ def allan_figure(sets: Mapping[str, tuple[Facts, Facts]]) -> Figure:
     axes.set(xscale="log", yscale="log")
     axes.xaxis.set_minor_locator(NullLocator())
     plain_ticks(axes.yaxis, *axes.get_ylim())
-    finish(axes)
-    finish(below)
     frames = np.unique(np.concatenate([c["frames"] for c in curves.values()]))
     shown = frames[:: -(-len(frames) // 9)]
     below.set_xticks(shown, [f"{v:.0f}" for v in shown])
-    axes.set_ylabel(f"Allan deviation of δ ({unit.label})")
-    below.set(xlabel="averaging length (frames)", ylabel="measured / law")
+    finish(axes, legend="upper right", ylabel=f"Allan deviation of δ ({unit.label})")
+    finish(below, xlabel="averaging length (frames)", ylabel="measured / law")
     first = next(iter(curves.values()))
     _add_clock(axes, first["frames"], first["seconds"])
-    axes.legend(fontsize=10, framealpha=0.9)
     return figure
 
 

@@ -77,11 +77,6 @@ class Profile:
     scatter: F64  # (n,) standard deviation of the pixels that were averaged
     count: I64  # (n,) how many they were
 
-    @property
-    def error(self) -> F64:
-        """Error of the mean if the pixels are independent."""
-        return self.scatter / np.sqrt(np.maximum(self.count, 1))
-
 
 @dataclass(frozen=True)
 class MapSummary:
@@ -94,7 +89,6 @@ class MapSummary:
     columns: Profile
     rows: Profile
     sample: F32  # (n,) finite pixels at regular steps: all of them up to `SAMPLE`
-    good: int  # finite pixels
     mean: float  # mean, std: of all finite pixels
     std: float
 
@@ -192,7 +186,6 @@ def summarise(source: Source, most: int = SHOWN_PIXELS) -> MapSummary:
         columns=_profile(columns, origin or 0.0),
         rows=_profile(rows, origin or 0.0),
         sample=np.concatenate(samples),
-        good=int(count),
         mean=float(mean + (origin or 0.0)),
         std=float(np.sqrt(np.maximum(variance, 0.0))),
     )

@@ -5,29 +5,18 @@ from dataclasses import dataclass
 from typing import Any
 
 from pixcal.model.flags import PixelFlag
-from pixcal.report.contents import ArrayRecord, Contents, SetContents, StageRecord
+from pixcal.report.contents import Contents, SetContents, StageRecord
 from pixcal.report.summary import FlagSummary, MapSummary
 from pixcal.report.text import (
     date_of_mjd,
     duration,
     exact,
-    flag_name,
     mode_in_words,
     number,
     share,
+    unit,
     with_error,
 )
-
-FLAG_WORDS = {
-    PixelFlag.HOT: "dark signal far above that of the other pixels",
-    PixelFlag.DEAD: "response far from that of the neighbours",
-    PixelFlag.NOISY: "noise far above the read noise, telegraph noise included",
-    PixelFlag.SATURATED: "some fringe samples are saturated and carry no weight",
-    PixelFlag.NONLINEAR: "departs from linearity over the exposure-time steps",
-    PixelFlag.NO_DATA: "samples are missing or not finite",
-    PixelFlag.BAD_FIT: "the fringe model does not describe the pixel",
-}
-
 
 _GAIN_COLUMNS = ("declared", "measured", "error", "used")
 _REDUCTION_SHOWN = (
@@ -63,7 +52,7 @@ def flags(masks: Mapping[str, FlagSummary]) -> Table:
     rows = []
     for flag in PixelFlag:
         counts = [_count(s.counts[flag.value], s) for s in masks.values()]
-        rows.append([flag_name(flag), FLAG_WORDS[flag], *counts])
+        rows.append([flag.words, flag.meaning, *counts])
     rows.append(["any", "masked", *(_count(s.masked, s) for s in masks.values())])
     return Table("Pixels flagged", ["flag", "meaning", *masks], rows)
 
@@ -74,7 +63,7 @@ def _count(pixels: int, summary: FlagSummary) -> str:
 
 
 def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
-    """Gain and read noise side by side, the ladder of flats, then what each set was made of."""
+    """Gain and read noise side by side, the steps of the flats, then what each set was made of."""
     rows = []
     for key, label in (("gain_e_per_adu", "gain (e⁻/ADU)"), ("read_noise_e", "read noise (e⁻)")):
         entry = facts.get(key)
@@ -87,7 +76,8 @@ def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
         yield Table("Gain and read noise", ["", "declared", "measured", "used", ""], rows)
     straight = facts.get("linearity") or {}
     if is_table(straight.get("levels")):
-        title = f"Ladder of flats, intercept {number(straight.get('intercept_adu'), 2)} ADU"
+        intercept = number(straight.get("intercept_adu"), 2)
+        title = f"Exposure-time steps of the flats, intercept {intercept} ADU"
         keys = list(dict.fromkeys(key for level in straight["levels"] for key in level))
         rows = [[_plain(level.get(key)) for key in keys] for level in straight["levels"]]
         yield Table(title, keys, rows)
@@ -98,9 +88,10 @@ def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
     }
     if sets:
         yield _columns_table("Fringe sets as reduced", sets)
-    rest = {k: v for k, v in facts.items() if k not in _REDUCTION_SHOWN}
-    if rest:
-        yield Table("Other numbers of the reduction", ["quantity", "value"], _flat_rows(rest))
+    rest = _flat({k: v for k, v in facts.items() if k not in _REDUCTION_SHOWN})
+    rows = [[key, _plain(value)] for key, value in rest if value is not None]
+    if rows:
+        yield Table("Other numbers of the reduction", ["quantity", "value"], rows)
 
 
 def _listed(facts: Mapping[str, Any]) -> str:
@@ -110,7 +101,7 @@ def _listed(facts: Mapping[str, Any]) -> str:
 def merit(facts: Mapping[str, Any]) -> Iterator[Table]:
     """Figures of merit, as in a data sheet of the detector."""
     rows = [
-        [f["title"], with_error(f["value"], f["error"]), f["unit"].replace("e-", "e⁻"), f["note"]]
+        [f["title"], with_error(f["value"], f["error"]), unit(f["unit"]), unit(f["note"])]
         for f in (facts.get("figures_of_merit") or {}).values()
     ]
     if rows:
@@ -205,17 +196,26 @@ def _fit(fit: Mapping[str, Any]) -> Iterator[Table]:
     yield Table("fit.json, all sets together", ["quantity", "value"], _flat_rows(rest))
 
 
-def _frames(arrays: Sequence[ArrayRecord]) -> Table:
+def _frames(arrays: Mapping[str, Mapping[str, Any]]) -> Table:
     """What was ingested."""
     rows = []
-    for a in arrays:
-        size = "–" if a.shape is None else f"{a.shape[1]}\u00a0×\u00a0{a.shape[0]}"
-        first = "–" if a.first_mjd is None else date_of_mjd(a.first_mjd)
-        length = "–" if a.duration_s is None else duration(a.duration_s)
-        exposures = ", ".join(exact(v) for v in a.exptimes_s[:8])
-        exposures += ", …" if len(a.exptimes_s) > 8 else ""
-        rows.append([a.name, number(a.files), number(a.frames), size, first, length])
-        rows[-1] += [exposures or "–", _span(a.temperature_c), a.time_source or "–"]
+    for name, a in arrays.items():
+        times, source = _known(a, "time_s"), (a.get("time_source") or ["–"])[0]
+        exposures = sorted(set(_known(a, "exptime_s")))
+        listed = ", ".join(exact(v) for v in exposures[:8]) + ", …" * (len(exposures) > 8)
+        rows.append(
+            [
+                name,
+                number(len(set(a["file"]))),
+                number(len(a["file"])),
+                f"{a['shape'][1]}\u00a0×\u00a0{a['shape'][0]}" if a.get("shape") else "–",
+                date_of_mjd(min(_known(a, "mjd"))) if _known(a, "mjd") else "–",
+                duration(max(times) - min(times)) if times and source != "number" else "–",
+                listed or "–",
+                _span(_known(a, "temperature_c")),
+                {"number": "frame numbers"}.get(source, source),
+            ]
+        )
     header = [
         "array", "files", "frames", "x × y", "first frame (UTC)", "duration", "exposures (s)", "°C",
         "times from",
@@ -223,10 +223,14 @@ def _frames(arrays: Sequence[ArrayRecord]) -> Table:
     return Table("Frames", header, rows)
 
 
-def _span(ends: tuple[float, float] | None) -> str:
-    if ends is None:
+def _known(array: Mapping[str, Any], column: str) -> list[float]:
+    return [value for value in array.get(column, ()) if value is not None]
+
+
+def _span(values: Sequence[float]) -> str:
+    if not values:
         return "–"
-    low, high = (f"{v:.1f}" for v in ends)
+    low, high = (f"{v:.1f}" for v in (min(values), max(values)))
     return low if low == high else f"{low} to {high}"
 
 
@@ -251,7 +255,7 @@ def _plain(value: Any) -> str:
     if isinstance(value, list):
         shown = ", ".join(_plain(v) for v in value[:12])
         return shown + (f", … ({len(value)} in all)" if len(value) > 12 else "") or "–"
-    if value == "":
+    if value in ("", {}):
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"

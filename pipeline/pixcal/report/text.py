@@ -1,10 +1,9 @@
 """Numbers and names as text."""
 
 import math
+import re
 from datetime import UTC, datetime, timedelta
 from typing import Any
-
-from pixcal.model.flags import PixelFlag
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -40,11 +39,6 @@ def mode_in_words(name: str) -> str:
         moved = name.removeprefix("d psi / d ")
         return f"how the fringes change with {_FIBRES.get(moved, moved)}"
     return _MODES.get(name, "a smooth mode of the fringe geometry")
-
-
-def flag_name(flag: PixelFlag) -> str:
-    """A flag as words."""
-    return (flag.name or "").lower().replace("_", " ")
 
 
 def number(value: Any, digits: int = 3) -> str:
@@ -102,6 +96,22 @@ def with_error(value: float | None, error: float | None) -> str:
     scale = 10.0**power
     text = f"({value / scale:.{decimals}f} ± {error / scale:.{decimals}f})".replace("-", "−")
     return f"{text} × 10{str(power).translate(_SUPERSCRIPT)}"
+
+
+def unit(name: str) -> str:
+    """A unit, or a note with units, in the usual notation."""
+    for pattern, usual in _NOTATION.items():
+        name = re.sub(pattern, usual, name)
+    return name
+
+
+# units as files write them, and in the usual notation
+_NOTATION = {
+    r"\bh\^-0\.5": "1/√h",
+    r"\bh\^0\.5": "√h",
+    r"\b(k?e)-(?!\w)": r"\1⁻",
+    r"\bu([ms])\b": r"µ\1",
+}
 
 
 def share(part: int, whole: int) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 
 from pixcal.report.contents import Contents, DiagnosisContents, SetContents
 from pixcal.report.diagnosis_words import level, listed, residual_gap
-from pixcal.report.text import NAMES, NO_OFFSETS, duration, number, share, with_error
+from pixcal.report.text import NAMES, NO_OFFSETS, duration, number, share, unit, with_error
 
 TARGET_PX = 5e-5  # target precision of a calibration (paper, section 4.2)
 
@@ -57,7 +57,7 @@ def detector_headline(facts: dict[str, Any]) -> str:
     """Gain, read noise and full well in a sentence, measured where they could be."""
     figures = facts.get("figures_of_merit") or {}
     parts = []
-    for key, entry, name, unit in (
+    for key, entry, name, of in (
         ("conversion_gain", "gain_e_per_adu", "gain", "e⁻/ADU"),
         ("read_noise", "read_noise_e", "read noise", "e⁻"),
         ("full_well", "", "full well", "e⁻"),
@@ -65,11 +65,11 @@ def detector_headline(facts: dict[str, Any]) -> str:
         known = facts.get(entry, {})
         if key in figures and not figures[key]["note"]:
             value, error = figures[key]["value"], figures[key]["error"]
-            parts.append(f"{name} {with_error(value, error)} {unit}")
+            parts.append(f"{name} {with_error(value, error)} {of}")
         elif known.get("measured") is not None:
-            parts.append(f"{name} {with_error(known['measured'], known.get('error'))} {unit}")
+            parts.append(f"{name} {with_error(known['measured'], known.get('error'))} {of}")
         elif known.get("used") is not None:
-            parts.append(f"{name} {number(known['used'], 4)} {unit} (declared)")
+            parts.append(f"{name} {number(known['used'], 4)} {of} (declared)")
     return f"The detector: {', '.join(parts)}." if parts else "The detector was not measured."
 
 
@@ -103,8 +103,8 @@ def _detector_cards(facts: dict[str, Any]) -> Iterator[Card]:
                 "dark_current"):  # fmt: skip
         if key in figures:
             f = figures[key]
-            unit = f["unit"].replace("e-", "e⁻")
-            yield Card(f["title"], f"{with_error(f['value'], f['error'])} {unit}", f["note"], GOOD)
+            value = f"{with_error(f['value'], f['error'])} {unit(f['unit'])}"
+            yield Card(f["title"], value, unit(f["note"]), GOOD)
 
 
 def _diagnosis_card(diagnosis: DiagnosisContents) -> Card:
@@ -204,8 +204,8 @@ def _of_set(facts: dict[str, Any], allan: dict[str, Any] | None) -> Said:
     if scale is not None and abs(scale - 1) > 0.02:
         yield (
             _level(abs(scale - 1), 0.02, 0.3),
-            "variance of the residuals over that of the declared noise: {}. All errors were "
-            "multiplied by its root, {}. Gain or read noise may be wrong, or the model "
+            "variance of the residuals relative to the declared noise: {}. All errors were "
+            "multiplied by its square root, {}. Gain or read noise may be wrong, or the model "
             "incomplete",
             number(scale**2, 4),
             number(scale, 4),

@@ -162,7 +162,7 @@ class Effect(ForwardModel):
     Attributes
     ----------
     absorbed_because : str
-        How the fit absorbs it; empty where it does not (docs/appendix/correction-study.md).
+        How the fit absorbs it; empty where it does not.
     left_because : str
         Why maps need no correction for it all the same: it is noise, or small.
     fit_model : str

@@ -1,6 +1,6 @@
 """Report: one HTML page on the whole run."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from operator import call
 from pathlib import Path
@@ -17,7 +17,6 @@ from pixcal.model.config import result_options
 from pixcal.model.options import Report
 from pixcal.report.contents import (
     DETECTOR_MAPS,
-    ArrayRecord,
     Contents,
     Detail,
     DetectorContents,
@@ -40,7 +39,7 @@ from pixcal.report.summary import (
     summarise,
     summarise_flags,
 )
-from pixcal.stages.advice import advice
+from pixcal.stages.advice import advice, maps_to_use
 from pixcal.storage.artefact import MANIFEST, Build, Manifest, read_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.folder import INDEX
@@ -89,7 +88,9 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
     facts = _optional_json(run_dir / "reduce" / "reduce.json")
     fit = read_json(run_dir / "fit" / "fit.json") if "fit" in manifests else None
     allan = read_json(run_dir / "allan" / "allan.json") if "allan" in manifests else {}
-    results = _summaries(_jobs(run_dir, fit), runtime)
+    used = maps_to_use(run_dir) if fit is not None else {}
+    corrected = [name for name, path in used.items() if path.stem != name]
+    results = _summaries(_jobs(run_dir, fit, corrected), runtime)
     summary = advice(run_dir)
     return Contents(
         acquisition=read_json(run_dir / "ingest" / "acquisition.json"),
@@ -105,7 +106,8 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
             results.get("flags/detector"),
         ),
         fit=fit,
-        offsets=tuple(_offset(name, results) for name in (fit["outputs"] if fit else ())),
+        offsets=tuple(_offset(name, name, results) for name in (fit["outputs"] if fit else ())),
+        corrected=tuple(_offset(name, f"corrected/{name}", results) for name in corrected),
         sets=tuple(
             _set(run_dir / "fit" / "fit.zarr", name, of_set, allan.get("sets", {}), results)
             for name, of_set in (fit["sets"].items() if fit else ())
@@ -125,9 +127,12 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
 # Maps
 
 
-def _jobs(run_dir: Path, fit: Mapping[str, Any] | None) -> dict[str, partial[Any]]:
+def _jobs(
+    run_dir: Path, fit: Mapping[str, Any] | None, corrected: Sequence[str]
+) -> dict[str, partial[Any]]:
     """Every summary of a map that the page shows, by name."""
     calibration, group = run_dir / "reduce" / "calibration.zarr", run_dir / "fit" / "fit.zarr"
+    undone = run_dir / "corrected" / "corrected.zarr"
     there = [name for name in (*DETECTOR_MAPS, "mask") if (calibration / name / INDEX).exists()]
     maps: dict[str, Source] = {f"detector/{n}": ArrayReader(calibration / n) for n in there}
     masks = {"detector": maps.pop("detector/mask")} if "mask" in there else {}
@@ -138,6 +143,12 @@ def _jobs(run_dir: Path, fit: Mapping[str, Any] | None) -> dict[str, partial[Any
             maps |= {f"{name}/delta": delta, f"{name}/sigma": sigma}
             jobs[f"{name}/spectrum"] = partial(spectrum, *both)
             jobs[f"{name}/detail"] = partial(_detail, *both)
+        for name in corrected:
+            both = (ArrayReader(undone / name), ArrayReader(undone / f"{name}_sigma"))
+            maps |= dict(
+                zip((f"corrected/{name}/delta", f"corrected/{name}/sigma"), both, strict=True)
+            )
+            jobs[f"corrected/{name}/detail"] = partial(_detail, *both)
         masks["products"] = ArrayReader(group / "mask")
         for name in fit["sets"]:
             columns = ("iota", "alpha", "chi2", "mask")
@@ -165,11 +176,11 @@ def _detail(delta: Source, sigma: Source) -> Detail:
     return Detail(start, summary, detail(sigma)[0])
 
 
-def _offset(name: str, results: Mapping[str, Any]) -> MapContents:
-    delta = results[f"{name}/delta"]
+def _offset(name: str, key: str, results: Mapping[str, Any]) -> MapContents:
+    delta = results[f"{key}/delta"]
     # Pixel by pixel is the whole map already where no blocks were averaged.
-    part = results[f"{name}/detail"] if delta.block > 1 and min(delta.shape) > DETAIL else None
-    return MapContents(name, delta, results[f"{name}/sigma"], results[f"{name}/spectrum"], part)
+    part = results[f"{key}/detail"] if delta.block > 1 and min(delta.shape) > DETAIL else None
+    return MapContents(name, delta, results[f"{key}/sigma"], results.get(f"{key}/spectrum"), part)
 
 
 def _set(
@@ -224,26 +235,8 @@ def _warnings(manifests: Mapping[str, Manifest], facts: Mapping[str, Any]) -> tu
     return tuple(sentences)
 
 
-def _arrays(run_dir: Path, manifests: Mapping[str, Manifest]) -> tuple[ArrayRecord, ...]:
+def _arrays(run_dir: Path, manifests: Mapping[str, Manifest]) -> dict[str, dict[str, Any]]:
     tables = _optional_json(run_dir / "ingest" / "frames.json")
-    shapes = manifests["ingest"].summary.get("arrays", {}) if "ingest" in manifests else {}
-    return tuple(_array(name, table, shapes.get(name)) for name, table in tables.items())
-
-
-def _array(name: str, table: Mapping[str, list[Any]], facts: Any) -> ArrayRecord:
-    def known(column: str) -> list[float]:
-        return [v for v in table.get(column, ()) if v is not None]
-
-    mjd, warm, times = known("mjd"), known("temperature_c"), known("time_s")
-    source = (table.get("time_source") or [None])[0]
-    return ArrayRecord(
-        name=name,
-        files=len(set(table["file"])),
-        frames=len(table["file"]),
-        shape=tuple(facts["shape"][1:]) if facts else None,
-        first_mjd=min(mjd) if mjd else None,
-        duration_s=max(times) - min(times) if times and source != "number" else None,
-        exptimes_s=tuple(sorted(set(known("exptime_s")))),
-        temperature_c=(min(warm), max(warm)) if warm else None,
-        time_source=source,
-    )
+    facts = manifests["ingest"].summary.get("arrays", {}) if "ingest" in manifests else {}
+    shapes = {name: {"shape": fact["shape"][1:]} for name, fact in facts.items()}
+    return {name: table | shapes.get(name, {}) for name, table in tables.items()}

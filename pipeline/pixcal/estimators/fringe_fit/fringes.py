@@ -114,8 +114,8 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
     if start is None:
         raise InputError(
             "no fringes found: the frames are constant in phase or without contrast, or the "
-            f"fringes are wider than the window of {shape[1]} x {shape[0]} px allows; look at the "
-            "frames, and at which files the set lists"
+            f"fringes are wider than the window of {shape[1]} x {shape[0]} px allows; check the "
+            "frames, and which files the set lists"
         )
     found = _refined(light, start)
     cosine = found @ np.array(nominal) / max(np.hypot(*found) * np.hypot(*nominal), 1e-300)

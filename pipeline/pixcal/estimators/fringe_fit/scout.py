@@ -161,7 +161,7 @@ class Scout:
         if sum(int(t.good.sum()) for t in self.tiles) < 30:
             raise InputError(
                 "fewer than 30 good pixels are left: the others are "
-                "masked, saturated too often, or do not fit the fringes; look at the mask, the "
+                "masked, saturated too often, or do not fit the fringes; check the mask, the "
                 "bias frames and the level of the light"
             )
 
@@ -254,8 +254,8 @@ class Scout:
         turned = np.hypot((kx - self.k[0]) * nx, (ky - self.k[1]) * ny)
         if not np.median(away) < FOLLOWS_RAD or turned > np.pi:
             raise InputError(
-                "no fringes found in the pixels; check the frames, at the bias frames, "
-                "and at which files the set lists"
+                "no fringes found in the pixels; check the frames, the bias frames, and which "
+                "files the set lists"
             )
         across = float(np.hypot(kx * nx, ky * ny)) / (2 * np.pi)
         if across < HONEST_FRINGES:

@@ -231,8 +231,8 @@ def _measure_region(
     curve = fit_curve(chosen, median, np.log(high / low) / 2, pixels, shared, white)
     warnings = []
     if curve.knee is not None and curve.knee > batches.n / 2:
-        warnings = [f"not quite white: the fitted knee at {curve.knee * batches.frames:.2g} "
-                    "frames is longer than the run can show"]  # fmt: skip
+        at = f"{curve.knee * batches.frames:.0f} frames"
+        warnings = [f"the noise is not quite white: fitted knee at {at}, beyond half of the run"]
         curve = replace(curve, knee=None)
     expected = float(np.median(noise)) / np.sqrt(chosen)
     facts = _as_json(batches, chosen, curve, expected.tolist(), warnings)

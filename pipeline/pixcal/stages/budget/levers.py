@@ -50,7 +50,7 @@ def levers(bench: Bench, now: JoinedBound) -> list[Lever]:
         ratio = float(np.median(unweighted * information))
         plain.append(replace(s, loss=(s.loss[0] * ratio, s.loss[1] * ratio)))
     equal = _worse(JoinedBound(tuple(plain)), split)
-    candidates.append(Lever("equal weights", equal, period, "a loss: do not"))
+    candidates.append(Lever("equal weights", equal, period, "needs more frames: not recommended"))
     return sorted(candidates, key=lambda lever: lever.variance * lever.period_s)
 
 
@@ -111,4 +111,4 @@ def _finer_fringes(bench: Bench, now: JoinedBound) -> list[Change]:
     changed = replace(bench, frames=replace(bench.frames, fringes=tuple(longer)))
     loss = 100 * (1 - min(contrast))
     note = f"contrast {loss:.2g} % lower: a pixel averages over its area"
-    return [(f"interfringe {wanted:g} px (baseline {length:.3g} mm)", changed, contrast, note)]
+    return [(f"fringe period {wanted:g} px (baseline {length:.3g} mm)", changed, contrast, note)]

@@ -272,8 +272,8 @@ def _warnings(bench: Bench, bound: JoinedBound) -> list[str]:
             )
         if s.interfringe < 2:
             sentences.append(
-                f"{scan.name}: interfringe {s.interfringe:.3g} px is below two pixels: the fringes "
-                "are aliased"
+                f"{scan.name}: fringe period {s.interfringe:.3g} px is below two pixels: the "
+                "fringes are aliased"
             )
         across = float(np.hypot(np.median(s.kx) * nx, np.median(s.ky) * ny) / (2 * np.pi))
         if across < HONEST_FRINGES:

@@ -61,9 +61,9 @@ def _of_gain(fit: GainFit, declared: float, used: float) -> list[str]:
         )
     if fit.uneven:
         found.append(
-            "parts of the flats brighten and fade by themselves from frame to frame, as rows do "
-            "under a rolling shutter and a lamp that flickers (mains, dimmed LED): gain and "
-            "diagnosis suffer; take flats with a steady (DC) lamp, or exposures of many periods"
+            "parts of the flats vary in brightness from frame to frame, as rows of a rolling "
+            "shutter do under a flickering lamp (mains, dimmed LED). This biases gain and "
+            "diagnosis; take flats with a steady (DC) lamp, or exposures of many periods"
         )
     if fit.curved:
         found.append(

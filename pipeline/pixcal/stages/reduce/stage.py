@@ -275,8 +275,8 @@ def _cut_off(source: Ingested) -> dict[str, float]:
 def _of_cut_off(shares: Mapping[str, float]) -> list[str]:
     return [
         f"{name} frames are cut off at code 0, where {100 * share:.2g} % of their samples lie: "
-        "level and noise are those of normal noise that would look so; raise the black level "
-        "(offset) of the camera"
+        "level and noise are estimated from a normal distribution cut off there; raise the black "
+        "level (offset) of the camera"
         for name, share in shares.items()
     ]
 
