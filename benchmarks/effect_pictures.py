@@ -11,10 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("agg")
-import matplotlib.pyplot as plt
 import numpy as np
 import yaml
 from numpy.typing import NDArray
@@ -22,6 +18,9 @@ from numpy.typing import NDArray
 from pixcal.effects import effects
 from pixcal.engine.run import Runtime
 from pixcal.model.config import to_plain
+from pixcal.report.colours import BLUE, DIVERGING, RED
+from pixcal.report.drawing import axes_grid, draw_blocks, finish, png, unit_for
+from pixcal.report.text import SYMBOLS, number
 from pixcal.stages import fit, ingest, reduce, simulate
 from pixcal.storage.products import read_map
 
@@ -60,32 +59,34 @@ def fitted(folder: Path, on: dict[str, Any], detector: dict[str, Any] | None = N
 
 
 def draw(title: str, change: F64, sigma: F64, file: Path) -> None:
-    """Maps of the change and their profiles, in 1e-3 px."""
-    milli = 1e3 * change
-    limit = max(float(np.nanpercentile(np.abs(milli), 99)), 1e-3)
-    figure, axes = plt.subplots(2, 2, figsize=(7.6, 6.4), height_ratios=(3, 1.3), dpi=110)
+    """Maps of the change and the means of their columns and rows."""
+    limit = max(float(np.nanpercentile(np.abs(change), 99)), 1e-6)
+    unit = unit_for([limit], "px")
+    scale: Any = {"cmap": DIVERGING, "vmin": -unit.factor * limit, "vmax": unit.factor * limit}
+    figure, axes = axes_grid(
+        (7.6, 6.0), 2, 2, right=1.0, bottom=0.9, top=0.9, beside=0.65, between=0.65,
+        height_ratios=(3, 1.3),
+    )  # fmt: skip
     for n, name in enumerate(AXES):
-        picture = axes[0, n].imshow(
-            milli[n], cmap="RdBu_r", vmin=-limit, vmax=limit, origin="lower"
-        )
-        rms = float(np.nanstd(milli[n]))
-        error = 1e3 * float(np.nanmedian(sigma[n]))
-        axes[0, n].set_title(f"change of {name}\n{rms:.2g}e-3 px rms", fontsize=10)
-        axes[0, n].set_xlabel(f"x, px\nnoise of the map: {error:.2g}e-3 px", fontsize=9)
-        # In the unit of the profiles below.
-        figure.colorbar(picture, ax=axes[0, n], shrink=0.85)
-        for axis, label in ((0, "mean of columns, along x"), (1, "mean of rows, along y")):
-            axes[1, n].plot(np.nanmean(milli[n], axis=axis), lw=1, label=label)
-        axes[1, n].set_xlabel("px", fontsize=9)
-        axes[1, n].grid(alpha=0.3)
-    axes[0, 0].set_ylabel("y, px")
-    axes[1, 0].set_ylabel("change, 1e-3 px")
+        drawn = draw_blocks(axes[0, n], unit.factor * change[n], aspect="auto", **scale)
+        rms = number(float(np.nanstd(change[n])), 2)
+        axes[0, n].set_title(f"change of {SYMBOLS[name]}: {rms} px rms", fontsize=10)
+        axes[0, n].set_xlabel("x (px)")
+        for axis, label, colour in ((0, "columns (along x)", BLUE), (1, "rows (along y)", RED)):
+            means = unit.factor * np.nanmean(change[n], axis=axis)
+            axes[1, n].plot(means, color=colour, lw=1, label=f"mean of {label}")
+        finish(axes[1, n], xlabel="x or y (px)")
+    axes[0, 0].set_ylabel("y (px)")
+    axes[1, 0].set_ylabel(f"mean ({unit.label})")
+    ends = axes[0, 1].get_position()
+    bar = figure.add_axes((ends.x1 + 0.02, ends.y0, 0.02, ends.height))
+    figure.colorbar(drawn, cax=bar).set_label(f"change ({unit.label})")
+    errors = ", ".join(number(float(np.nanmedian(s)), 2) for s in sigma)
+    figure.suptitle(title, fontsize=12, y=0.985)
+    figure.text(0.5, 0.915, f"errors of the maps: {errors} px", ha="center", fontsize=9.5)
     handles, labels = axes[1, 0].get_legend_handles_labels()
-    figure.suptitle(title)
-    figure.tight_layout(rect=(0.01, 0.03, 1, 1))
-    figure.legend(handles, labels, loc="lower center", ncols=2, fontsize=8, frameon=False)
-    figure.savefig(file, metadata={"Software": None})
-    plt.close(figure)
+    figure.legend(handles, labels, loc="lower center", ncols=2, fontsize=9, frameon=False)
+    file.write_bytes(png(figure))
 
 
 def main() -> None:
@@ -99,7 +100,7 @@ def main() -> None:
             effect = effects()[name]().scaled(STRONGER.get(name, 1.0))
             maps = fitted(Path(scratch) / name, {name: to_plain(effect)})
             change = maps.delta - plain.delta
-            times = f", {STRONGER[name]:.0e} times the default" if name in STRONGER else ""
+            times = f", {number(STRONGER[name])} times the default" if name in STRONGER else ""
             draw(f"{name}: {effect.title}{times}", change, plain.sigma, PAGES / f"{name}.png")
             rms = [float(np.nanstd(c)) for c in change]
             print(f"{name:22} changes delta_x by {rms[0]:.1e}, delta_y by {rms[1]:.1e} px rms")
