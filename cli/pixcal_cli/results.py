@@ -254,7 +254,8 @@ def show_advice(run: Path) -> None:
     from pixcal.stages.advice import advice  # here: for a fast `pixcal --help`
 
     summary = advice(run)
-    click.echo()
+    if summary.sentences:
+        click.echo()
     for sentence in summary.sentences:
         click.echo(sentence)
     if summary.rows:

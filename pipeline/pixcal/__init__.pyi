@@ -124,7 +124,7 @@ def astrometry(
     positions : int
         Positions of each star to average.
     dither_px : float
-        Largest distance of a position from the first, along x and y.
+        Largest dither from the first position, along x and y.
     seed : int
         Random seed.
     runtime : Runtime, optional

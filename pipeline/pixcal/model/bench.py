@@ -44,21 +44,14 @@ class SimulatedDetector:
         unit="px",
         low=0,
         high=65536,
-        doc="window's first pixel; default: window in the middle",
+        doc="first pixel of the window; default: window in the centre",
     )
     bits: int = quantity(16, low=1, high=16, doc="of the analogue-to-digital converter")
     step_adu: int = quantity(
-        1,
-        unit="ADU",
-        low=1,
-        high=4096,
-        doc="step of the samples: 16 for a 12-bit camera that writes 16 bits",
+        1, unit="ADU", low=1, high=4096, doc="step of the samples (16: 12 bits written as 16)"
     )
     saturation_adu: float | None = quantity(
-        None,
-        unit="ADU",
-        above=0,
-        doc="samples are clipped here; default: largest code of the converter",
+        None, unit="ADU", above=0, doc="samples are clipped here; default: highest code"
     )
     full_well_e: float | None = quantity(
         None, unit="e-", low=1, high=1e7, doc="charge is clipped here; default: never"
@@ -153,11 +146,7 @@ class SimulatedOptics:
         unit="mm", low=1e-3, high=1e7, doc="1/e² radius of each fibre's light on the detector"
     )
     nominal_distance_mm: float | None = quantity(
-        None,
-        unit="mm",
-        low=0.1,
-        high=1e7,
-        doc="distance that acquisition.yaml declares; default: the true one",
+        None, unit="mm", low=0.1, high=1e7, doc="declared distance; default: the true one"
     )
     offset_mm: tuple[float, float] = quantity(
         (0.0, 0.0), unit="mm", low=-1e5, high=1e5, doc="projected centre of the fibres: [x, y]"

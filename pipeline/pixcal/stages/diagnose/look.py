@@ -199,7 +199,7 @@ def _enough(half: Half) -> None:
         if "/" in name and len(frames) < FEWEST_FRAMES:
             raise InputError(
                 f"{name}: half of its frames are {len(frames)}; diagnose needs {FEWEST_FRAMES} in "
-                "each half, because it fits effects on one half and tests them on the other"
+                "each half: it fits effects on one and tests them on the other"
             )
 
 
