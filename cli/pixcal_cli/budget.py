@@ -1,6 +1,5 @@
 """``pixcal budget``."""
 
-import inspect
 import json
 from collections.abc import Callable, Mapping
 from operator import itemgetter
@@ -10,7 +9,7 @@ from typing import Any
 import click
 
 from pixcal.model.options import Budget
-from pixcal_cli.click_options import PATH, bench_argument, config_options, examples
+from pixcal_cli.click_options import PATH, Command, bench_argument, command
 from pixcal_cli.printing import Columns, show_notes, show_records
 
 LIMITS = {
@@ -22,19 +21,28 @@ LIMITS = {
 }
 
 
-@click.command(
-    help=inspect.getdoc(Budget),
-    epilog=examples(
-        "pixcal budget configs/demo.yaml",
-        "pixcal budget configs/paper.yaml --precision 5e-4 --frames 10000 --out budget",
-    ),
+def bench_and_output(body: Command) -> Command:
+    """BENCH.yaml, and where and how the plan is written."""
+    for option in (
+        click.option("--json", "as_json", is_flag=True, help="Print the contents of budget.json."),
+        click.option(
+            "--out",
+            type=PATH,
+            metavar="DIR",
+            help="Write budget.json and the picture budget.png there.",
+        ),
+    ):
+        body = option(body)
+    return bench_argument(body)
+
+
+@command(
+    Budget,
+    "pixcal budget configs/demo.yaml",
+    "pixcal budget configs/paper.yaml --precision 5e-4 --frames 10000 --out budget",
+    argument=bench_and_output,
+    tasks=False,
 )
-@bench_argument
-@config_options(Budget)
-@click.option(
-    "--out", type=PATH, metavar="DIR", help="Write budget.json and the picture budget.png there."
-)
-@click.option("--json", "as_json", is_flag=True, help="Print the contents of budget.json.")
 def budget(bench: Path, config: Budget, out: Path | None, as_json: bool) -> None:
     """The bound for the bench BENCH.yaml."""
     from pixcal.stages import budget as stage  # here: for a fast `pixcal --help`

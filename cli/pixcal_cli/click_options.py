@@ -156,7 +156,10 @@ def runtime_options(command: Command) -> Command:
 
 
 def command(
-    kind: type, *lines: str, argument: Callable[[Command], Command] = run_argument
+    kind: type,
+    *lines: str,
+    argument: Callable[[Command], Command] = run_argument,
+    tasks: bool = True,
 ) -> Callable[[Command], click.Command]:
     """A command of RUN (or another argument) with the options of a dataclass and of how to run.
 
@@ -169,10 +172,12 @@ def command(
         Examples for its help.
     argument : callable
         What stands before the options.
+    tasks : bool
+        Whether it runs tasks, and so has options on how to run.
     """
 
     def decorate(body: Command) -> click.Command:
-        body = argument(config_options(kind)(runtime_options(body)))
+        body = argument(config_options(kind)(runtime_options(body) if tasks else body))
         name = kind.__name__.removesuffix("Config").lower()
         return click.command(name, help=inspect.getdoc(kind), epilog=examples(*lines))(body)
 

@@ -114,8 +114,8 @@ def test_maps_are_ccddata(run: pixcal.Run) -> None:
     [
         ({"table": "nowhere.csv"}, "nowhere.csv: cannot be read as a table (no such file)"),
         ({"--x": "xx"}, "--x: "),
-        ({"--fwhm": "0.1"}, "--fwhm: 0.1 px; give a width from 0.5 to 50 px"),
-        ({"--electrons": "-1"}, "--electrons: -1"),
+        ({"--fwhm": "0.1"}, "'--fwhm': 0.1 is not in the range 0.5<=x<=50"),
+        ({"--electrons": "-1"}, "'--electrons': -1.0 is not in the range x>0"),
         ({"--x": "name"}, "--x: column 'name'"),
         ({"--out": "out.doc"}, "write a name that ends in"),
     ],

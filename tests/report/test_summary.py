@@ -99,7 +99,7 @@ def test_the_sample_of_a_large_map_is_bounded_and_visits_all_columns() -> None:
 
 def test_a_map_without_good_pixels_is_no_error() -> None:
     made = summarise(ArraySource(np.full((9, 11), np.nan, np.float32)))
-    assert made.good == 0
+    assert len(made.sample) == 0
     assert np.isnan([made.mean, made.std, made.median, made.robust_std]).all()
     assert np.isnan(made.image).all()
 

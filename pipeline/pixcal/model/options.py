@@ -21,6 +21,7 @@ from pixcal.model.errors import InputError
 Region = tuple[int, int, int, int]
 
 MAX_ELECTRONS = 1e15  # the Poisson generator counts so far
+FWHMS = (0.5, 50.0)  # widths of stars, px
 
 
 def _as_in(kind: type, name: str) -> Any:
@@ -275,6 +276,53 @@ class Astrometry:
                 f"--electrons, --background: more than {MAX_ELECTRONS:g} e- cannot be counted; "
                 "give less"
             )
+
+
+@dataclass(frozen=True)
+class Centroids:
+    """Correct a table of centroids with the maps of RUN.
+
+    TABLE holds centroids measured on a perfect grid. Columns are added for the corrected positions
+    and their errors from the maps.
+    """
+
+    out: Path = quantity(metavar="FILE", doc="Table to write: CSV, ECSV, FITS or VOTable.")
+    fwhm_px: float = quantity(
+        unit="px", low=FWHMS[0], high=FWHMS[1], doc="Full width of the stars at half maximum, px."
+    )
+    x: str = quantity("x", metavar="NAME", doc="Column of x, px.")
+    y: str = quantity("y", metavar="NAME", doc="Column of y, px.")
+    origin: Literal["0", "1"] = quantity(
+        "0", doc="Coordinate of the centre of the first pixel (1 for SExtractor and FITS)."
+    )
+    electrons: float | None = quantity(
+        None,
+        above=0,
+        metavar="N",
+        shown="equal weights",
+        doc="Electrons per star, if the centroids were fitted with photon-noise weights.",
+    )
+    overwrite: bool = quantity(False, doc="Replace FILE.")
+
+
+@dataclass(frozen=True)
+class Wcs:
+    """Write the maps of RUN as a WCS distortion.
+
+    astropy and others apply these lookup tables (D2IMARR) to pixel coordinates before the rest of a
+    WCS.
+    """
+
+    out: Path = quantity(metavar="FILE", doc="FITS file to write.")
+    fwhm_px: float | None = quantity(
+        None,
+        unit="px",
+        low=FWHMS[0],
+        high=FWHMS[1],
+        shown="no star: the pixel offsets",
+        doc="Distortion for stars of this width, centred on pixels.",
+    )
+    overwrite: bool = quantity(False, doc="Replace FILE.")
 
 
 @dataclass(frozen=True)

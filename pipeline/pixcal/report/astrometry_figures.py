@@ -152,7 +152,7 @@ def _against_positions(axes: Axes, view: AstrometryView) -> None:
 
 def _finish_with_sky(axes: Axes, view: AstrometryView) -> None:
     finish(axes)
-    second_axis(axes, "right", view.uas_per_px).set_ylabel("µas", labelpad=-2)
+    second_axis(axes, "right", view.uas_per_px).set_ylabel("µas", labelpad=1)
 
 
 def _weights(figure: SubFigure, axes: Axes, view: AstrometryView) -> None:

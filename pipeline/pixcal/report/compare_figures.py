@@ -104,7 +104,7 @@ def _scales(axes: Axes, view: ComponentView) -> None:
     spread = expected * 2 * np.array([s["ratio_error"] for s in scales])
     low, high = np.maximum(expected - spread, 0), expected + spread
     axes.fill_between(at, low, high, color=BAND, linewidth=0)
-    axes.plot(at, expected, color=GREEN, linewidth=1.5, label="difference that noise gives, ±2σ")
+    axes.plot(at, expected, color=GREEN, linewidth=1.5, label="difference expected from noise, ±2σ")
     axes.plot(at, difference, "o-", color=BLUE, markersize=6, linewidth=1.2, label="difference")
     common = line("px", "common")
     seen = np.array(

@@ -169,9 +169,9 @@ def _pulls(axes: Axes, view: CrestView) -> None:
     axes.hist(pull, edges.tolist(), density=True, color=BLUE, alpha=0.35)
     at = np.linspace(-5, 5, 201)
     axes.plot(at, np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi), color=INK, linewidth=1)
-    axes.title.set_fontsize(LONG_TITLE)
-    title = f"{view.used.sum()} points, median error {np.median(view.sigma_px):.1e} px"
+    title = f"{view.used.sum()} points, error {np.median(view.sigma_px):.1e} px"
     finish(axes, xlabel="residual / error", ylabel="density", title=title)
+    axes.title.set_fontsize(LONG_TITLE)
 
 
 def _map(figure: SubFigure, axes: Axes, view: CrestView, *, by_ratio: bool) -> None:
@@ -206,6 +206,6 @@ def _valley(axes: Axes, view: CrestView) -> None:
     error = view.distance_sigma
     decimals = max(0, 1 - int(np.floor(np.log10(error)))) if error > 0 else 3
     origin = ", nominal" if view.distance_from_prior else ""
-    axes.title.set_fontsize(LONG_TITLE)
     title = f"{view.best[0]:.{decimals}f} ± {error:.{decimals}f} mm{origin}"
     finish(axes, xlabel="D (mm)", ylabel="cost above minimum", title=title)
+    axes.title.set_fontsize(LONG_TITLE)

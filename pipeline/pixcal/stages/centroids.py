@@ -15,12 +15,11 @@ from pixcal.estimators.star_centroids.correction import (
 )
 from pixcal.model.arrays import F32, F64
 from pixcal.model.errors import InputError
+from pixcal.model.options import FWHMS, Centroids, Wcs
 from pixcal.stages.advice import maps_to_use
 from pixcal.storage.artefact import read_json
 from pixcal.storage.products import read_map
 from pixcal.storage.star_files import column, distortion, read_table, write_distortion, write_table
-
-FWHMS = (0.5, 50.0)
 
 
 @dataclass(frozen=True)
@@ -72,32 +71,18 @@ def correct(run_dir: Path, place: F64, *, fwhm_px: float, electrons: float | Non
     return correct_centroids(place, offsets.delta, offsets.sigma, star)
 
 
-@dataclass(frozen=True)
-class TableJob:
-    """Which columns of which table to correct."""
-
-    table: Path
-    out: Path
-    x: str = "x"  # x, y: names of the columns
-    y: str = "y"
-    origin: int = 0  # coordinate of the centre of the first pixel: 0 or 1
-    overwrite: bool = False  # whether `out` may be replaced
-
-
-def correct_table(
-    run_dir: Path, job: TableJob, *, fwhm_px: float, electrons: float | None
-) -> Corrected:
+def correct_table(run_dir: Path, file: Path, config: Centroids) -> Corrected:
     """Write a table with columns added: ``<x>_corrected``, ``<x>_map_error``; the same of y."""
-    table = read_table(job.table)
-    names = (job.x, job.y)
-    measured = np.stack(
-        [column(table, n, job.table, f"--{o}") for n, o in zip(names, "xy", strict=True)], axis=1
+    table, first = read_table(file), int(config.origin)
+    names = {"--x": config.x, "--y": config.y}
+    measured = np.stack([column(table, n, file, option) for option, n in names.items()], axis=1)
+    corrected = correct(
+        run_dir, measured - first, fwhm_px=config.fwhm_px, electrons=config.electrons
     )
-    corrected = correct(run_dir, measured - job.origin, fwhm_px=fwhm_px, electrons=electrons)
-    for n, name in enumerate(names):
-        table[f"{name}_corrected"] = corrected.place[:, n] + job.origin
+    for n, name in enumerate(names.values()):
+        table[f"{name}_corrected"] = corrected.place[:, n] + first
         table[f"{name}_map_error"] = corrected.error[:, n]
-    write_table(table, job.out, overwrite=job.overwrite)
+    write_table(table, config.out, overwrite=config.overwrite)
     return corrected
 
 
@@ -108,8 +93,11 @@ def wcs_of(run_dir: Path, *, fwhm_px: float | None) -> WCS:
     return distortion(correction_map(offsets.delta, star))
 
 
-def write_wcs(run_dir: Path, out: Path, *, fwhm_px: float | None) -> None:
+def write_wcs(run_dir: Path, config: Wcs) -> None:
     """Write `wcs_of` to a FITS file."""
+    out, fwhm_px = config.out, config.fwhm_px
+    if out.exists() and not config.overwrite:
+        raise InputError(f"{out}: exists; choose another --out or add --overwrite")
     names = " and ".join(path.name for path in maps_to_use(run_dir).values())
     of = "pixels" if fwhm_px is None else f"stars of FWHM {fwhm_px:g} px"
     write_distortion(wcs_of(run_dir, fwhm_px=fwhm_px), out, f"offsets of {of}, from {names}")
