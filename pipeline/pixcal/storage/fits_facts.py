@@ -5,7 +5,9 @@ be read without (`integer`) is an error.
 """
 
 import math
+from collections.abc import Iterable
 from datetime import UTC, datetime, timedelta
+from functools import lru_cache
 from typing import Any
 
 from astropy.io import fits
@@ -17,7 +19,49 @@ _MJD_EPOCH = datetime(1858, 11, 17, tzinfo=UTC)
 _SECONDS_A_DAY = 86400.0
 
 
-def integer(header: fits.Header, key: str, default: int | None = None) -> int:
+_CARD = 80  # characters
+
+
+class Header:
+    """Values and comments of a header by keyword; of a keyword that is repeated, the first."""
+
+    def __init__(self, cards: Iterable[tuple[str, Any, str]]) -> None:
+        self._cards: dict[str, tuple[Any, str]] = {}
+        for keyword, found, comment in cards:
+            self._cards.setdefault(keyword, (found, comment))
+
+    @classmethod
+    def of_text(cls, text: str) -> "Header":
+        """From the cards of a file."""
+        return cls(_card(text[n : n + _CARD]) for n in range(0, len(text), _CARD))
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._cards
+
+    def get(self, key: str, default: Any = None) -> Any:
+        """Value of a key; VerifyError when its card does not parse."""
+        found = self._cards.get(key, (default, ""))[0]
+        if isinstance(found, fits.VerifyError):
+            raise fits.VerifyError(*found.args)
+        return found
+
+    def comment(self, key: str) -> str:
+        """Comment of a key."""
+        return self._cards[key][1]
+
+
+# Kept: most cards are the same in all files, and astropy takes a millisecond for a header.
+@lru_cache(maxsize=4096)
+def _card(text: str) -> tuple[str, Any, str]:
+    card = fits.Card.fromstring(text)
+    try:
+        found = card.value
+        return card.keyword, None if isinstance(found, fits.card.Undefined) else found, card.comment
+    except fits.VerifyError as error:
+        return card.keyword, error, ""
+
+
+def integer(header: Header, key: str, default: int | None = None) -> int:
     """Whole number of a key; ValueError when it is something else."""
     found = header.get(key, default)
     if isinstance(found, bool) or not isinstance(found, int):
@@ -27,7 +71,7 @@ def integer(header: fits.Header, key: str, default: int | None = None) -> int:
     return found
 
 
-def value(header: fits.Header, key: str, default: Any = None) -> Any:
+def value(header: Header, key: str, default: Any = None) -> Any:
     """Value of a key; None when its card does not parse."""
     try:
         return header.get(key, default)
@@ -35,7 +79,7 @@ def value(header: fits.Header, key: str, default: Any = None) -> Any:
         return None
 
 
-def number(header: fits.Header, key: str, default: float | None = None) -> float | None:
+def number(header: Header, key: str, default: float | None = None) -> float | None:
     """Finite number of a key; None when it is something else."""
     found = value(header, key, default)
     try:
@@ -45,7 +89,7 @@ def number(header: fits.Header, key: str, default: float | None = None) -> float
     return result if math.isfinite(result) else None
 
 
-def exposure_s(headers: tuple[fits.Header, ...]) -> float | None:
+def exposure_s(headers: tuple[Header, ...]) -> float | None:
     """Exposure time (s) from EXPTIME, else EXPOSURE."""
     for key in _EXPOSURE_KEYS:
         for header in headers:
@@ -55,19 +99,19 @@ def exposure_s(headers: tuple[fits.Header, ...]) -> float | None:
     return None
 
 
-def temperature_c(headers: tuple[fits.Header, ...]) -> float | None:
+def temperature_c(headers: tuple[Header, ...]) -> float | None:
     """Temperature in degrees Celsius; in kelvin in the header where its comment says so."""
     for key in _TEMPERATURE_KEYS:
         for header in headers:
             degrees = number(header, key)
             if degrees is not None:
-                comment = header.comments[key].lower()
+                comment = header.comment(key).lower()
                 kelvin = "[k]" in comment or "kelvin" in comment
                 return degrees + _ABSOLUTE_ZERO_C if kelvin else degrees
     return None
 
 
-def time_stamp_mjd(headers: tuple[fits.Header, ...]) -> float | None:
+def time_stamp_mjd(headers: tuple[Header, ...]) -> float | None:
     """Time stamp from MJD-OBS, else from DATE-OBS when it holds the time of day."""
     for header in headers:
         mjd = number(header, "MJD-OBS")

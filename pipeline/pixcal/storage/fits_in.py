@@ -18,7 +18,14 @@ import numpy as np
 from astropy.io import fits
 
 from pixcal.model.errors import InputError
-from pixcal.storage.fits_facts import exposure_s, integer, number, temperature_c, time_stamp_mjd
+from pixcal.storage.fits_facts import (
+    Header,
+    exposure_s,
+    integer,
+    number,
+    temperature_c,
+    time_stamp_mjd,
+)
 from pixcal.storage.sources import SourceFile, unreadable
 
 Container = Literal["plain", "gzip", "tiles", "picture"]
@@ -179,7 +186,7 @@ def _check_rest(stream: _Stream, end: int) -> None:
         )
 
 
-def _first_image(source: SourceFile, stream: _Stream) -> tuple[fits.Header, fits.Header, int]:
+def _first_image(source: SourceFile, stream: _Stream) -> tuple[Header, Header, int]:
     """Header of the first image with data, primary header, and number of the former.
 
     The stream is left where the image's data begin.
@@ -200,7 +207,7 @@ def _first_image(source: SourceFile, stream: _Stream) -> tuple[fits.Header, fits
     raise ValueError("holds no image; remove it, or narrow the glob that lists it")
 
 
-def _read_header(stream: _Stream, first: bytes) -> fits.Header | None:
+def _read_header(stream: _Stream, first: bytes) -> Header | None:
     """Next header, or None where none begins with the keyword ``first``."""
     text = bytearray()
     while True:
@@ -211,20 +218,20 @@ def _read_header(stream: _Stream, first: bytes) -> fits.Header | None:
             raise ValueError("header cut short or damaged; copy it again, or remove it")
         text += block
         if any(block[n : n + 80].rstrip(b" \0") == b"END" for n in range(0, _BLOCK, 80)):
-            return fits.Header.fromstring(text.decode("latin-1"))
+            return Header.of_text(text.decode("latin-1"))
 
 
-def _is_tiled(header: fits.Header) -> bool:
+def _is_tiled(header: Header) -> bool:
     return header.get("XTENSION") == "BINTABLE" and header.get("ZIMAGE") is True
 
 
-def _is_image(header: fits.Header) -> bool:
+def _is_image(header: Header) -> bool:
     kind = "SIMPLE" in header or header.get("XTENSION") == "IMAGE"
     axes = _axes(header)
     return kind and len(axes) > 0 and 0 not in axes
 
 
-def _axes(header: fits.Header, prefix: str = "") -> list[int]:
+def _axes(header: Header, prefix: str = "") -> list[int]:
     """Lengths of the axes, fastest first."""
     count = integer(header, f"{prefix}NAXIS")
     axes = [integer(header, f"{prefix}NAXIS{n + 1}") for n in range(count)]
@@ -233,7 +240,7 @@ def _axes(header: fits.Header, prefix: str = "") -> list[int]:
     return axes
 
 
-def _data_bytes(header: fits.Header) -> int:
+def _data_bytes(header: Header) -> int:
     axes = _axes(header)
     samples = math.prod(axes) if axes else 0
     groups, extra = integer(header, "GCOUNT", 1), integer(header, "PCOUNT", 0)
@@ -256,7 +263,7 @@ def _frames_shape(axes: list[int]) -> tuple[int, int, int]:
     return (later[0] if later else 1, axes[1], axes[0])
 
 
-def _tile(header: fits.Header) -> tuple[int, int]:
+def _tile(header: Header) -> tuple[int, int]:
     """(planes, rows) of a compressed tile; a row where nothing is said (FITS 4.0, 10.1.1)."""
     lengths = [
         min(integer(header, f"ZTILE{n + 1}", 1), length)
@@ -265,7 +272,7 @@ def _tile(header: fits.Header) -> tuple[int, int]:
     return max(1, math.prod(lengths[2:])), max(1, lengths[1])
 
 
-def _coding(header: fits.Header, prefix: str) -> SampleFormat:
+def _coding(header: Header, prefix: str) -> SampleFormat:
     bitpix = integer(header, f"{prefix}BITPIX")
     if bitpix not in _STORED:
         raise ValueError(

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
-from astropy.io import fits
 from PIL import ExifTags, Image
 
 from pixcal.model.errors import InputError
-from pixcal.storage.fits_facts import exposure_s, temperature_c, time_stamp_mjd
+from pixcal.storage.fits_facts import Header, exposure_s, temperature_c, time_stamp_mjd
 from pixcal.storage.fits_in import FrameFile, SampleFormat
 from pixcal.storage.sources import SourceFile
 
@@ -62,7 +61,7 @@ def inspect_picture(source: SourceFile) -> FrameFile:
                 f"{source.path}: samples of Pillow's mode {mode}; frames are greyscale of 8, 16 or "
                 "32 bits: record raw frames, without colour or palette"
             )
-        header = fits.Header(dict(source.header))
+        header = Header((key, found, "") for key, found in source.header)
         exif = _exposure_s(picture)
     told = exposure_s((header,))
     return FrameFile(

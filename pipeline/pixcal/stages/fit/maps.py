@@ -19,7 +19,7 @@ from pixcal.estimators.fringe_fit.tile_sums import local_modes
 from pixcal.model.arrays import F32, F64, U8
 from pixcal.stages.fit.fringe_set import FittedSet
 from pixcal.stages.fit.scouting import read_frames
-from pixcal.stages.fit.sweep import BATCH_MAPS, rounded
+from pixcal.stages.fit.sweep import BATCH_MAPS, DIGITS, rounded
 from pixcal.stages.reduced_set import STRIP
 from pixcal.storage.cube import (
     ArrayReader,
@@ -157,25 +157,32 @@ def _write_strip(
             # Those that are linked too: damage would be there for good.
             reader.keep_block((y0, y1), (x0, x1))
         swept.append(held)
-    found = [_maps_of_tile(fitted, swept, both, job) for job in strip]
+    shape = (y1 - y0, x1 - x0)
+    made = {n: np.empty((*w.shape[:-2], *shape), w.dtype) for n, w in writers.items()}
+    told = []
+    for job in strip:
+        _, (a, b) = fitted[0].source.ranges(job[0])
+        part = {name: data[..., a - x0 : b - x0] for name, data in made.items()}
+        told.append(_maps_of_tile(fitted, swept, both, job, part))
     for name, writer in writers.items():
-        data = np.concatenate([maps.pop(name) for maps, _ in found], axis=-1)
-        writer.write((*(0,) * (data.ndim - 2), y0, x0), data)
-    return [told for _, told in found]
+        writer.write((*(0,) * (made[name].ndim - 2), y0, x0), made[name])
+    return told
 
 
 def _maps_of_tile(
-    fitted: list[FittedSet], readers: list[Swept], both: bool, job: Job
-) -> tuple[dict[tuple[str, str], NDArray[Any]], _Told]:
-    """Maps of a tile by the keys of their writers, and what there is to tell of it."""
+    fitted: list[FittedSet],
+    readers: list[Swept],
+    both: bool,
+    job: Job,
+    made: dict[tuple[str, str], NDArray[Any]],
+) -> _Told:
+    """Fill the maps of a tile, by the keys of their writers; what there is to tell of it."""
     at, removed = job
     y, x = fitted[0].source.ranges(at)
-    made: dict[tuple[str, str], NDArray[Any]] = {}
-    found = []
-    for f, swept in zip(fitted, readers, strict=True):
-        offset, maps = _maps_of_set(f, swept, at, removed[f.name])
-        found.append(offset)
-        made |= {(f.name, name): values for name, values in maps.items()}
+    found = [
+        _maps_of_set(f, swept, at, removed[f.name], made)
+        for f, swept in zip(fitted, readers, strict=True)
+    ]
     delta, sigma = (
         np.stack([getattr(m, name) for m in found]).astype(float) for name in ("delta", "sigma")
     )
@@ -188,13 +195,13 @@ def _maps_of_tile(
     # A flag counts where it costs the pixel its value; a set that others replace does not.
     flags = np.where(missing, np.bitwise_or.reduce(masks, axis=0), 0).astype(np.uint8)
     for name, own_value, own_error in zip(outputs_of(both), values, errors, strict=True):
-        made |= {("", name): own_value, ("", f"{name}_sigma"): own_error}
-    made["", "mask"] = flags
+        made["", name][...], made["", f"{name}_sigma"][...] = own_value, own_error
+    made["", "mask"][...] = flags
     freedom = np.isfinite(delta).sum(axis=0) - len(values)
     goods = [np.isfinite(s) for s in sigma]
     number = max(1, min(TOLD, TOLD_IN_ALL // len(fitted[0].planes)))
     some = [_some(s[good].astype(np.float32), number) for s, good in zip(sigma, goods, strict=True)]
-    return made, _Told(
+    return _Told(
         [int(good.sum()) for good in goods],
         some,
         float(chi2[~missing].sum()),
@@ -233,26 +240,30 @@ def offsets(fitted: FittedSet, swept: Swept, at: tuple[int, int], removed: F64) 
 
 
 def _maps_of_set(
-    fitted: FittedSet, swept: Swept, at: tuple[int, int], removed: F64
-) -> tuple[SetOffsets, dict[str, F32]]:
-    """A set's own maps of a tile."""
+    fitted: FittedSet,
+    swept: Swept,
+    at: tuple[int, int],
+    removed: F64,
+    made: dict[tuple[str, str], NDArray[Any]],
+) -> SetOffsets:
+    """Fill a set's own maps of a tile."""
     y, x = fitted.source.ranges(at)
     found = offsets(fitted, swept, at, removed)
-    made = {"delta": found.delta, "sigma": found.sigma}
-    if fitted.n_batches:
-        everything = (0, fitted.n_batches)
-        for name, array in (("batch_delta", "batch_phase"), ("batch_sigma", "batch_sigma")):
-            maps = swept[array].read(everything, y, x)
-            if name == "batch_delta":
-                surfaces = removed[:, 1:].T.astype(np.float32) @ found.modes.astype(np.float32)
-                maps -= surfaces.reshape(maps.shape)
-                maps *= np.float32(1 / found.k)
-                maps += found.delta
-            else:
-                maps *= found.scale
-            maps[:, found.flags != 0] = np.nan
-            made[name] = rounded(maps)
-    return found, made
+    made[fitted.name, "delta"][...], made[fitted.name, "sigma"][...] = found.delta, found.sigma
+    for name, array in (
+        (("batch_delta", "batch_phase"), ("batch_sigma", "batch_sigma")) if fitted.n_batches else ()
+    ):
+        maps = swept[array].read((0, fitted.n_batches), y, x, out=made[fitted.name, name])
+        if name == "batch_delta":
+            surfaces = removed[:, 1:].T.astype(np.float32) @ found.modes.astype(np.float32)
+            maps -= surfaces.reshape(maps.shape)
+            maps *= np.float32(1 / found.k)
+            maps += found.delta
+        else:
+            maps *= found.scale
+        maps[:, found.flags != 0] = np.nan
+        rounded(maps, DIGITS[name])
+    return found
 
 
 def _create_set(folder: Path, fitted: FittedSet) -> Writers:

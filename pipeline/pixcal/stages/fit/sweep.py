@@ -50,7 +50,7 @@ MAPS = ("iota", "alpha", "phase", "sigma", "chi2")
 BATCH_MAPS = ("batch_phase", "batch_sigma")
 # binary digits kept of the batches' maps: the others, far below their noise, would take as much
 # disk again
-MANTISSA = 12
+DIGITS = {"batch_phase": 10, "batch_sigma": 8, "batch_delta": 12}
 TABLES = ("tiles", "sums")  # of a row of numbers for each tile
 
 
@@ -265,13 +265,13 @@ def _sweep_tile(job: _Job, at: tuple[int, int]) -> dict[str, NDArray[Any]]:
     sums = _sums(job, tile, maps, flags == 0)[None, None]
     found = {name: getattr(maps, name) for name in MAPS}
     # In place, once the sums have been taken.
-    found |= {name: rounded(getattr(maps, name)) for name in BATCH_MAPS}
+    found |= {name: rounded(getattr(maps, name), DIGITS[name]) for name in BATCH_MAPS}
     return found | {"mask": flags, "tiles": facts, "sums": sums}
 
 
-def rounded(values: F32) -> F32:
-    """Rounded to `MANTISSA` digits, in place; what is no number stays none."""
-    bits, dropped = values.view(np.uint32), 23 - MANTISSA
+def rounded(values: F32, digits: int) -> F32:
+    """Rounded to some binary digits, in place; what is no number stays none."""
+    bits, dropped = values.view(np.uint32), 23 - digits
     bits += np.uint32(1 << (dropped - 1))
     bits &= np.uint32(0xFFFFFFFF ^ ((1 << dropped) - 1))
     return values
