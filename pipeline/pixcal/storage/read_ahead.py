@@ -22,8 +22,7 @@ class ReadAhead:
 
     Parameters
     ----------
-    path : UrlPath
-        The folder.
+    path : UrlPath, the folder
     """
 
     def __init__(self, path: UrlPath) -> None:
@@ -43,10 +42,8 @@ class ReadAhead:
 
         Parameters
         ----------
-        file : File
-            The one.
-        following : sequence of File
-            Those that will be read next, if this is not the only one.
+        file : File, the one
+        following : sequence of File, those that will be read next, if this is not the only one
 
         Raises
         ------

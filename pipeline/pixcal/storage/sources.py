@@ -32,10 +32,8 @@ def read_headers(folder: Path, names: Iterable[str]) -> dict[str, Header]:
 
     Parameters
     ----------
-    folder : Path
-        Of the acquisition.
-    names : iterable of str
-        All files of the acquisition, relative to it.
+    folder : Path, of the acquisition
+    names : iterable of str, all files of the acquisition, relative to it
 
     Raises
     ------
@@ -154,10 +152,8 @@ def find_sources(frames: Frames, description: Path) -> dict[str, tuple[SourceFil
 
     Parameters
     ----------
-    frames : Frames
-        Globs of each kind.
-    description : Path
-        The ``acquisition.yaml`` that they are relative to.
+    frames : Frames, globs of each kind
+    description : Path, the ``acquisition.yaml`` that they are relative to
 
     Returns
     -------

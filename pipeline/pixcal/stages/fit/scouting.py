@@ -58,14 +58,9 @@ def scout_set(
 
     Parameters
     ----------
-    source : ReducedSet
-    nominal : (float, float)
-        Nominal fringe vector (kx, ky), rad/px.
-    folder : Path or MemoryPath
-        ``sweep.zarr/<set name>``.
-    runtime : Runtime
-    name : str
-        Of the set.
+    nominal : (float, float), nominal fringe vector (kx, ky), rad/px
+    folder : Path or MemoryPath, ``sweep.zarr/<set name>``
+    name : str, of the set
 
     Raises
     ------

@@ -76,14 +76,10 @@ def on_grid(
 
     Parameters
     ----------
-    folder : Place
-        Where the maps are.
-    shape : (int, int)
-        Of the detector's window (y, x).
-    names : sequence of str
-        Of `STATISTICS`.
-    light : float64 array, optional
-        Of each tile, which its response is multiplied by.
+    folder : Place, where the maps are
+    shape : (int, int), of the detector's window (y, x)
+    names : sequence of str, of `STATISTICS`
+    light : float64 array, optional, of each tile, which its response is multiplied by
     """
     reader = ArrayReader(folder / "maps")
     stride = int(np.ceil(np.sqrt(shape[0] * shape[1] / _SAMPLES)))
@@ -108,10 +104,8 @@ def usual(folder: Place, shape: tuple[int, int], gain: float, light: F64) -> Usu
     ----------
     folder, shape
         As of `on_grid`.
-    gain : float
-        Rough guess (e-/ADU).
-    light : float64 array
-        Of each tile over that of the detector.
+    gain : float, rough guess (e-/ADU)
+    light : float64 array, of each tile over that of the detector
     """
     names = (
         "response", "response_error", "dark_rate", "dark_variance", "dark_charge", "dark_dof",

@@ -47,14 +47,11 @@ def characterise(
 
     Parameters
     ----------
-    made : Build
-        With ``calibration.zarr`` and the statistics of the frames.
+    made : Build, with ``calibration.zarr`` and the statistics of the frames
     source : Ingested
     job : Measuring
     summary : Summary
-    facts : dict
-        What ``reduce.json`` says so far.
-    runtime : Runtime
+    facts : dict, what ``reduce.json`` says so far
 
     Returns
     -------
