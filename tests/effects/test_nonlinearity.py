@@ -158,6 +158,19 @@ def test_a_knee_is_measured_to_a_hundredth_of_its_size(acquired: Callable[..., E
     assert rest.std() < 12.0
 
 
+def test_a_response_that_one_set_denies_is_refused(acquired: Callable[..., Evidence]) -> None:
+    on, off = acquired(None, {"nonlinearity": {}}), acquired()
+    found = Nonlinearity.estimate(on)
+    assert found is not None
+    assert not found.refused
+    name = next(iter(on.fringes))
+    mixed = {**on.fringes, name: off.fringes[name]}
+    found = Nonlinearity.estimate(replace(on, fringes=mixed))
+    assert found is not None
+    assert found.significance > 4
+    assert "sets disagree" in found.refused
+
+
 def test_bad_samples_do_not_matter(acquired: Callable[..., Evidence]) -> None:
     evidence = acquired(None, {"nonlinearity": {}})
     fringes = {}

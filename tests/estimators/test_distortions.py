@@ -102,17 +102,33 @@ def test_the_size_of_a_distortion_is_found_with_its_error(fringes: FringeEvidenc
 
     for _ in range(12):
         noise = RNG.standard_normal((T, NY, NX))
-        sizes, covariance = fit_distortions(
+        sizes, covariance, agreement = fit_distortions(
             [bent(fringes, distortion, truth, noise)], distortion, 2
         )
+        assert not agreement.refused
         pulls.append((sizes - truth) / np.sqrt(np.diag(covariance)))
     assert np.abs(pulls).max() < 4
     assert 0.5 < np.std(pulls) < 1.6
     known = np.array([-0.02, 0.0]), np.array([1e12, 0.0])
     quiet = bent(fringes, distortion, truth, np.zeros(()))
-    sizes, covariance = fit_distortions([quiet], distortion, 2, prior=known)
+    sizes, covariance, _ = fit_distortions([quiet], distortion, 2, prior=known)
     assert covariance[0, 0] == pytest.approx(1e-12, rel=0.01)
     assert sizes[1] == pytest.approx(0.01, rel=0.02)
+
+
+def test_sets_of_which_one_denies_the_size_disagree(fringes: FringeEvidence) -> None:
+    def distortion(
+        _: FringeEvidence, signal: F32, sizes: NDArray[np.float64]
+    ) -> tuple[F32, Sequence[F32]]:
+        slope = signal * signal / np.float32(5e4)
+        return np.float32(sizes[0]) * slope, [slope]
+
+    for second, refused in ((-0.02, False), (0.0, True), (-0.015, False)):
+        sets = [
+            bent(fringes, distortion, np.array([size]), RNG.standard_normal((T, NY, NX)))
+            for size in (-0.02, second)
+        ]
+        assert fit_distortions(sets, distortion, 1)[2].refused == refused
 
 
 def bent(

@@ -11,6 +11,7 @@ from pixcal.estimators.detector.neighbours import shared_charge
 from pixcal.estimators.detector.response import departure, fit_curve, fit_response
 from pixcal.estimators.detector.transfer_curve import transfer_curve
 from pixcal.estimators.diagnosis.central_crop import central_crop
+from pixcal.estimators.diagnosis.distortions import Agreement
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.boundaries import boundary_shifts
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
@@ -18,7 +19,7 @@ from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench
 from pixcal.model.config import quantity
 from pixcal.model.errors import InputError
-from pixcal.simulation.effect import Effect, Estimate, Stage
+from pixcal.simulation.effect import SETS_DISAGREE, Effect, Estimate, Stage
 from pixcal.simulation.shot import Shot
 
 FALLOFF_PX = 0.5  # of the shift of boundaries by the brighter-fatter effect beside the response
@@ -178,34 +179,38 @@ class Nonlinearity(Effect):
         quadratic, cubic = (float(np.clip(v, -0.3, 0.3)) for v in sizes[:2])
         errors = np.sqrt(np.diag(covariance))
         effect, significance = cls(quadratic, cubic, level), sigmas_of_chi2(float(found), 2)
-        more = None
+        more, refused = None, ""
         if evidence.fringes and significance > SIGNIFICANT:
-            more = _bends(part, effect.response, float(found))
+            more, agreement = _bends(part, effect.response, float(found))
+            refused = SETS_DISAGREE if agreement.refused else ""
         named = {"quadratic": float(errors[0]), "cubic": float(errors[1])}
         if more is None:
-            return Estimate(effect, named, significance, why, details)
+            return Estimate(effect, named, significance, why, details, refused=refused)
         named |= {f"bends[{n}].change_e": error for n, error in enumerate(more[1])}
         return Estimate(
             replace(effect, bends=more[0]), named, significance, why, details,
-            law="response curve of second and third order", by_law=effect,
+            law="response curve of second and third order", by_law=effect, refused=refused,
         )  # fmt: skip
 
 
 def _bends(
     evidence: Evidence, response: Callable[[F32], F32], chi2_of_polynomial: float
-) -> tuple[tuple[Bend, ...], list[float]] | None:
-    """Points of the response beside a polynomial, and their errors; None where it has none."""
+) -> tuple[tuple[tuple[Bend, ...], list[float]] | None, Agreement]:
+    """Points of the response beside a polynomial, and their errors; None where it has none.
+
+    Then how far the sets agree on the response.
+    """
     ends = [np.nanquantile(f.electrons[::7], [TAIL, 1 - TAIL]) for f in evidence.fringes.values()]
     low, top = max(min(float(a) for a, _ in ends), 0.0), max(float(b) for _, b in ends)
     seen = low + KNOTS * (top - low)
     knots = np.array([0.0, *seen[seen >= KNOTS[1] * top]])
-    change, covariance = fit_curve(evidence, response, knots)
+    change, covariance, agreement = fit_curve(evidence, response, knots)
     chi2 = float(change @ np.linalg.pinv(covariance, rcond=1e-9, hermitian=True) @ change)
     told = sigmas_of_chi2(chi2, len(change) - 2) > SIGNIFICANT
     if not told or chi2 < BESIDE * chi2_of_polynomial:
-        return None
+        return None, agreement
     bends = tuple(Bend(float(k), float(c)) for k, c in zip(knots, [0.0, *change], strict=True))
-    return bends, [0.0, *map(float, np.sqrt(np.diag(covariance)))]
+    return (bends, [0.0, *map(float, np.sqrt(np.diag(covariance)))]), agreement
 
 
 def _full_scale(evidence: Evidence, usual: float) -> float:

@@ -24,8 +24,9 @@ from pixcal.simulation.light_fit import LightFit, LightStart, fit_light
 from pixcal.simulation.numbers import numbers, with_numbers
 from pixcal.simulation.score import score, score_again
 
-__all__ = ["DOMAINS", "Effect", "Estimate", "FringeMaps", "LightStart", "Stage"]
+__all__ = ["DOMAINS", "SETS_DISAGREE", "Effect", "Estimate", "FringeMaps", "LightStart", "Stage"]
 
+SETS_DISAGREE = "fringe sets disagree: an effect of the detector acts on all of them alike"
 NONZERO = 3.0  # errors from which a strength of an effect counts as different from zero
 
 
@@ -105,6 +106,8 @@ class Estimate:
     in_full : Effect, optional
         The effect with everything that was measured of it, significant or not; None where that is
         the effect itself.
+    refused : str
+        Why it cannot be a cause, however significant.
     """
 
     effect: "Effect"
@@ -117,6 +120,7 @@ class Estimate:
     by_law: "Effect | None" = None
     again: "Again | None" = None
     in_full: "Effect | None" = None
+    refused: str = ""
 
     @property
     def sure(self) -> "Effect":

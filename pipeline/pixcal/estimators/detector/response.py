@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from pixcal.estimators.diagnosis.distortions import distortion_sums, fit_distortions
+from pixcal.estimators.diagnosis.distortions import Agreement, distortion_sums, fit_distortions
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.boundaries import REACH, boundary_shifts, moved_charge
 from pixcal.kernels.normal_matrix import inverse_normal
@@ -84,7 +84,7 @@ def fit_response(
         value, information = np.zeros(powers + 1), np.zeros(powers + 1)
         value[-1], information[-1] = known_shift[0] / UNIT, UNIT**2 / known_shift[1]
         prior = value, information
-    sizes, covariance = fit_distortions(
+    sizes, covariance, _ = fit_distortions(
         tuple(evidence.fringes.values()), distortion, powers + 1, margin=REACH, prior=prior
     )
     scale = np.ones(powers + 1)
@@ -98,7 +98,9 @@ def departure(level: F32, knots_e: F64, change_e: F64) -> F32:
     return np.asarray(spline(np.clip(level, knots_e[0], knots_e[-1])), np.float32)
 
 
-def fit_curve(evidence: Evidence, response: Callable[[F32], F32], knots_e: F64) -> tuple[F64, F64]:
+def fit_curve(
+    evidence: Evidence, response: Callable[[F32], F32], knots_e: F64
+) -> tuple[F64, F64, Agreement]:
     """What the signal departs from a response at some levels, from all fringe sets.
 
     Parameters
@@ -116,6 +118,8 @@ def fit_curve(evidence: Evidence, response: Callable[[F32], F32], knots_e: F64) 
         At the other knots, e-. Fringes tell neither an offset nor a factor: the departure has
         none, from the third knot on.
     covariance : (n - 1, n - 1) float64
+    agreement : Agreement
+        Of the sets, on the whole curve.
     """
     unit = np.eye(len(knots_e))[1:-1]
 
@@ -127,7 +131,7 @@ def fit_curve(evidence: Evidence, response: Callable[[F32], F32], knots_e: F64) 
         return np.asarray(change / flat, np.float32), slopes
 
     prior = np.zeros(len(unit)), np.full(len(unit), (LOOSE * knots_e[-1]) ** -2)
-    sizes, covariance = fit_distortions(
+    sizes, covariance, agreement = fit_distortions(
         tuple(evidence.fringes.values()), distortion, len(unit), prior=prior
     )
     straight = np.stack([np.ones(len(unit) + 1), knots_e[1:]], axis=1)
@@ -135,7 +139,7 @@ def fit_curve(evidence: Evidence, response: Callable[[F32], F32], knots_e: F64) 
     taken = straight @ np.linalg.pinv(straight[1:])
     rest = np.eye(len(unit) + 1) - np.pad(taken, ((0, 0), (1, 0)))
     rest = rest[:, :-1]  # nothing at the last knot
-    return rest @ sizes, rest @ covariance @ rest.T
+    return rest @ sizes, rest @ covariance @ rest.T, agreement
 
 
 @dataclass(frozen=True)

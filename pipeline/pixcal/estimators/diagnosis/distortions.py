@@ -8,6 +8,7 @@ least-squares fit of one to the other (Gauss-Newton, since the fitted signal is 
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +16,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
+from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
 from pixcal.model.arrays import F32, F64, Mask
 
 Distortion = Callable[[FringeEvidence, F32, F64], tuple[F32, Iterable[F32]]]
@@ -30,6 +32,8 @@ _NEGLIGIBLE = 1e-6
 # all sizes together move by less than this many standard errors
 _ROUNDS = 8
 _STILL = 0.1
+
+DENIED = 0.25  # share of what sets show by themselves from which common sizes are refused
 
 
 class TwoWay:
@@ -161,6 +165,22 @@ class Freedom(TwoWay):
         return np.take(samples.reshape(len(samples), -1), np.flatnonzero(self.good), axis=1)
 
 
+@dataclass(frozen=True)
+class Agreement:
+    """Whether sets have sizes in common."""
+
+    common: float  # common, own: chi-square that common sizes explain, and each set's own
+    own: float
+    more: int  # sizes that are each set's own, less the common ones
+
+    @property
+    def refused(self) -> bool:
+        """Whether sets deny much of what others show, beyond chance."""
+        apart = self.own - self.common
+        chance = sigmas_of_chi2(apart, self.more) < SIGNIFICANT if self.more else True
+        return apart > DENIED * self.own and not chance
+
+
 def fit_distortions(
     sets: Sequence[FringeEvidence],
     distortion: Distortion,
@@ -168,10 +188,10 @@ def fit_distortions(
     *,
     margin: int = 0,
     prior: tuple[F64, F64] | None = None,
-) -> tuple[F64, F64]:
+) -> tuple[F64, F64, Agreement]:
     """Sizes (count,) of distortions that all sets have in common, and their covariance.
 
-    That is from the noise of the samples.
+    That is from the noise of the samples. Last, how far the sets agree on them.
 
     Parameters
     ----------
@@ -188,13 +208,16 @@ def fit_distortions(
     known, information = (np.zeros(count), np.zeros(count)) if prior is None else prior
     covariance = inverse_normal(sum(fit.normal for fit in fits) + np.diag(information), 1e-7)
     sizes = np.zeros(count)
+    rights = [fit.right(sizes) for fit in fits]
+    agreement = _agreement(fits, rights)
     for _ in range(_ROUNDS):
-        right = sum(fit.right(sizes) for fit in fits) + information * (known - sizes)
+        right = sum(rights) + information * (known - sizes)
         step = covariance @ right
         sizes = sizes + step
         if right @ step < _STILL**2:
             break
-    return sizes, covariance
+        rights = [fit.right(sizes) for fit in fits]
+    return sizes, covariance, agreement
 
 
 def distortion_sums(
@@ -209,6 +232,17 @@ def distortion_sums(
         fit = _SetFit(fringes, distortion, count, margin)
         normal, right = normal + fit.normal, right + fit.right(np.zeros(count))
     return normal, right
+
+
+def _agreement(fits: Sequence["_SetFit"], rights: Sequence[F64]) -> Agreement:
+    """From the normal equations of each set about no distortion."""
+
+    def explained(normal: F64, right: F64) -> float:
+        return float(right @ inverse_normal(normal, 1e-7) @ right)
+
+    own = [explained(fit.normal, right) for fit, right in zip(fits, rights, strict=True)]
+    common = explained(np.sum([fit.normal for fit in fits], axis=0), np.sum(rights, axis=0))
+    return Agreement(common, sum(own), len(rights[0]) * (len(fits) - 1))
 
 
 class _SetFit:

@@ -176,7 +176,7 @@ def _candidates(
     candidates = {}
     for name, one in found.items():
         if isinstance(one, Estimate):
-            candidates[name] = Candidate(name, one)
+            candidates[name] = Candidate(name, one, one.refused)
         else:
             candidates[name] = Candidate(name, None, one or "")
     return candidates
@@ -198,7 +198,7 @@ def _replayed(candidate: Candidate, unseen: Evidence) -> Effect | None:
     In full, or as the unseen frames have it one by one.
     """
     found = candidate.estimate
-    if found is None or found.significance < SIGNIFICANT:
+    if found is None or found.refused or found.significance < SIGNIFICANT:
         return None
     if found.in_full is not None:
         return found.in_full
