@@ -19,7 +19,7 @@ from second_bench.model import (
 VARIATIONS = (
     "aim", "centred", "radii", "powers", "read_noise", "dust", "phases", "amplifiers",
     "bad_pixels", "gain", "period", "rotated", "ambient",
-    "declared_gain",
+    "declared_gain", "stitches", "noisy_pixels", "lamp",
 )  # fmt: skip
 """What differs from bench to bench."""
 CHANCE = {
@@ -30,6 +30,9 @@ CHANCE = {
     "rotated": 0.25,
     "ambient": 0.3,
     "declared_gain": 0.3,
+    "stitches": 0.3,
+    "noisy_pixels": 0.3,
+    "lamp": 0.5,
 }
 """With which probability, where that is not one."""
 PITCH_UM, WAVELENGTH_NM, DISTANCE_MM, PERIOD_S = 4.4, 632.8, 400.0, 0.14
@@ -96,7 +99,7 @@ def draw_bench(layout: Layout, seed: int, varied: set[str]) -> Bench:
     bench.notes = {"gain_e_per_adu": gain, "read_noise_e": read, "peak_e": peak}
     _vary_detector(bench, varied)
     bench.sets = _draw_sets(bench, varied)
-    bench.flat_response = bench.response.copy()
+    bench.flat_response = bench.response * (_lamp(bench) if "lamp" in varied else 1.0)
     bench.runs = _draw_runs(bench, layout, varied)
     return bench
 
@@ -119,6 +122,13 @@ def _vary_detector(bench: Bench, varied: set[str]) -> None:
         bench.notes["dust_specks"] = specks
     if "amplifiers" in varied:
         _amplifiers(bench, rng)
+    if "stitches" in varied:
+        _stitch(bench)
+    if "noisy_pixels" in varied:
+        rng = stream(bench.seed, "noisy pixels")
+        noisy = rng.random(shape) < rng.uniform(0.002, 0.02)
+        bench.read_noise_e[noisy] *= rng.uniform(2, 8, noisy.sum())
+        bench.notes["noisy_pixels"] = int(noisy.sum())
     if "declared_gain" in varied:
         # Flats tell better than the data sheet.
         wrong = float(rng.choice([-1, 1])) * rng.uniform(0.01, 0.1)
@@ -138,6 +148,32 @@ def _dust(bench: Bench, specks: int, rng: np.random.Generator) -> F64:
             1 / (1 + (r / radius) ** 6) - 0.2 * np.exp(-((r / radius - 1.5) ** 2) * 8)
         )
     return left
+
+
+def _stitch(bench: Bench) -> None:
+    """Masks of the foundry that were laid side by side, each off by a little."""
+    rng = stream(bench.seed, "stitches")
+    size, first = rng.integers(20, 70, 2), rng.integers(0, 60, 2)
+    rms = rng.uniform(1e-3, 4e-3)
+    rows, columns = (
+        (np.arange(n) + start) // side
+        for n, start, side in zip(bench.shape, first, size, strict=True)
+    )
+    for offsets in (bench.delta_x, bench.delta_y):
+        steps = rng.normal(0, rms, (rows[-1] + 1, columns[-1] + 1))
+        offsets += steps[rows][:, columns]
+    bench.notes["stitches"] = {"size_px": size.tolist(), "rms_px": rms}
+
+
+def _lamp(bench: Bench) -> F64:
+    """Light of the flats, which falls off to one side."""
+    rng = stream(bench.seed, "lamp")
+    x, y = bench.grid()
+    u, v = x / bench.shape[1], y / bench.shape[0]
+    slopes = rng.uniform(-0.1, 0.1, 5)
+    bench.notes["lamp"] = slopes.tolist()
+    terms = (u, v, u**2, v**2, u * v)
+    return np.asarray(1 + sum(a * term for a, term in zip(slopes, terms, strict=True)))
 
 
 def _amplifiers(bench: Bench, rng: np.random.Generator) -> None:

@@ -200,6 +200,21 @@ def test_ordinary_benches_come_in_all_their_variety() -> None:
     assert max(gains) > 3
 
 
+def test_stitches_shift_blocks_and_a_lamp_falls_off() -> None:
+    plain, _ = make_case("ordinary/dust", 4, SMALL)
+    stitched, _ = make_case("ordinary/stitches", 4, SMALL)
+    shift = stitched.delta_x - plain.delta_x
+    levels = np.unique(shift.round(9))
+    assert 1 < len(levels) < 20
+    assert 1e-4 < np.abs(levels).max() < 0.02
+    lit, _ = make_case("ordinary/lamp", 4, SMALL)
+    ratio = lit.flat_response / lit.response
+    assert 0.005 < np.ptp(ratio) < 0.3
+    assert np.abs(np.diff(ratio, 2, axis=1)).max() < 1e-3
+    noisy, _ = make_case("ordinary/noisy_pixels", 4, SMALL)
+    assert 0 < np.mean(noisy.read_noise_e > 1.9 * np.median(noisy.read_noise_e)) < 0.03
+
+
 @pytest.mark.parametrize("name", VARIATIONS)
 def test_one_variation_alone_is_no_effect(name: str) -> None:
     bench, truth = make_case(f"ordinary/{name}", 4, SMALL)
