@@ -1,7 +1,8 @@
 """Terms fitted to the maps of several fringe sets at once, with errors that the maps show.
 
 The noise of a map is what the fit leaves, true offsets included: its scatter gives the errors, and
-where what is left is alike in neighbouring pixels, blocks of pixels give larger ones.
+where what is left is alike in neighbouring pixels, blocks of pixels give larger ones. Blocks of
+several sizes are tried: the foundry's stitching moves whole fields of pixels alike.
 """
 
 from collections.abc import Sequence
@@ -12,9 +13,9 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid, polynomial_basis
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
+from pixcal.estimators.maps.structure import CELLS
 from pixcal.model.arrays import F64, Indices, Mask
 
-BLOCK = 8  # pixels along the side of a block
 _CLIP = 5.0
 _MIN_VARIANCE = 1e-30  # variance of a map that its signals fit exactly
 
@@ -25,7 +26,7 @@ class MapPart:
 
     signals: F64  # (pixel, n) what one unit of each parameter does to the map
     data: F64  # (pixel,)
-    block: Indices  # (pixel,) number of the block that a pixel lies in
+    blocks: Indices  # (size, pixel) number of the block that a pixel lies in
     dof: int  # pixels less the terms that were taken off
 
     @classmethod
@@ -45,10 +46,10 @@ class MapPart:
         columns = np.concatenate([signals[:, use], data[None, use]]).T
         rest = without(columns, free[:, use].T)
         y, x = np.nonzero(use)
-        width = -(-use.shape[1] // BLOCK)
-        block = (y // BLOCK) * width + x // BLOCK
+        sides = [*CELLS, max(min(use.shape) // 4, 1)]
+        blocks = np.stack([(y // n) * (use.shape[1] // n + 1) + x // n for n in sides])
         return cls(
-            np.ascontiguousarray(rest[:, :-1]), rest[:, -1].copy(), block, len(y) - len(free)
+            np.ascontiguousarray(rest[:, :-1]), rest[:, -1].copy(), blocks, len(y) - len(free)
         )
 
 
@@ -76,14 +77,15 @@ def fit_maps(parts: Sequence[MapPart]) -> MapFit:
         squares = np.array([r @ r / max(p.dof - n, 1) for p, r in zip(parts, left, strict=True)])
         variances = np.maximum(squares, _MIN_VARIANCE)
     covariance = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-    meat = np.zeros((n, n))
+    meat = np.zeros((len(parts[0].blocks), n, n))
     for part, rest, variance in zip(parts, left, variances, strict=True):
-        scores = np.zeros((part.block.max(initial=0) + 1, n))
-        np.add.at(scores, part.block, part.signals * (rest / variance)[:, None])
-        meat += scores.T @ scores
-    inside = covariance @ meat @ covariance
-    more = float(np.mean(np.diag(inside) / np.diag(covariance)))
-    more = max(1.0, more)
+        pulls = part.signals * (rest / variance)[:, None]
+        for own, block in zip(meat, part.blocks, strict=True):
+            scores = np.zeros((block.max(initial=0) + 1, n))
+            np.add.at(scores, block, pulls)
+            own += scores.T @ scores
+    inside = np.einsum("ij,sjk,ki->si", covariance, meat, covariance)
+    more = max(1.0, *map(float, np.mean(inside / np.diag(covariance), axis=1)))
     return MapFit(values, np.asarray(covariance * more), float(values @ normal @ values) / more)
 
 
