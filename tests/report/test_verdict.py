@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pixcal.report.contents import Contents, FrameHistory, MapContents, SetContents
+from pixcal.report.page import section
 from pixcal.report.summary import ArraySource, summarise, summarise_flags
 from pixcal.report.verdict import cards, findings, headline
 
@@ -150,3 +151,11 @@ def test_a_finding_on_several_sets_is_one_sentence() -> None:
     (bound,) = (text for text in texts if "Cramér–Rao" in text)
     assert bound.endswith("1.300 for s and 1.400 for other.")
     assert len(texts) == len(findings(one))
+
+
+def test_corrected_maps_are_shown_beside_those_of_the_fit() -> None:
+    run = contents()
+    assert "corrected" not in section("maps", run)
+    shown = section("maps", replace(run, corrected=run.offsets))
+    assert shown.index("Map of δx.") < shown.index("Map of δx, corrected.")
+    assert shown.count("this is the map to use") == 1

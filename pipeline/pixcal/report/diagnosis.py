@@ -94,7 +94,9 @@ def parameters(cause: Facts) -> Iterator[tuple[str, Table]]:
 
 def _fitted(name: str, value: Any, errors: Facts) -> str:
     if isinstance(value, list) and not _is_long(value):
-        return ", ".join(_fitted(f"{name}[{n}]", v, errors) for n, v in enumerate(value)) or "–"
+        if all(isinstance(v, float) and f"{name}[{n}]" not in errors for n, v in enumerate(value)):
+            return f"{_in_short(value)} (not fitted)"
+        return ", ".join(_fitted(f"{name}[{n}]", v, errors) for n, v in enumerate(value))
     if name in errors and isinstance(value, (int, float)):
         return with_error(float(value), errors[name])
     if isinstance(value, bool):

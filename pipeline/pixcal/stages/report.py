@@ -106,8 +106,8 @@ def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime)
             results.get("flags/detector"),
         ),
         fit=fit,
-        offsets=tuple(_offset(name, name, results) for name in (fit["outputs"] if fit else ())),
-        corrected=tuple(_offset(name, f"corrected/{name}", results) for name in corrected),
+        offsets=tuple(_offset(name, results) for name in (fit["outputs"] if fit else ())),
+        corrected=tuple(_offset(f"corrected/{name}", results) for name in corrected),
         sets=tuple(
             _set(run_dir / "fit" / "fit.zarr", name, of_set, allan.get("sets", {}), results)
             for name, of_set in (fit["sets"].items() if fit else ())
@@ -138,17 +138,14 @@ def _jobs(
     masks = {"detector": maps.pop("detector/mask")} if "mask" in there else {}
     jobs: dict[str, partial[Any]] = {}
     if fit is not None:
-        for name in fit["outputs"]:
-            both = delta, sigma = ArrayReader(group / name), ArrayReader(group / f"{name}_sigma")
-            maps |= {f"{name}/delta": delta, f"{name}/sigma": sigma}
-            jobs[f"{name}/spectrum"] = partial(spectrum, *both)
-            jobs[f"{name}/detail"] = partial(_detail, *both)
-        for name in corrected:
-            both = (ArrayReader(undone / name), ArrayReader(undone / f"{name}_sigma"))
-            maps |= dict(
-                zip((f"corrected/{name}/delta", f"corrected/{name}/sigma"), both, strict=True)
-            )
-            jobs[f"corrected/{name}/detail"] = partial(_detail, *both)
+        outputs = {name: group / name for name in fit["outputs"]}
+        outputs |= {f"corrected/{name}": undone / name for name in corrected}
+        for key, path in outputs.items():
+            both = ArrayReader(path), ArrayReader(path.with_name(f"{path.name}_sigma"))
+            maps |= {f"{key}/delta": both[0], f"{key}/sigma": both[1]}
+            jobs[f"{key}/detail"] = partial(_detail, *both)
+            if path.parent == group:
+                jobs[f"{key}/spectrum"] = partial(spectrum, *both)
         masks["products"] = ArrayReader(group / "mask")
         for name in fit["sets"]:
             columns = ("iota", "alpha", "chi2", "mask")
@@ -176,8 +173,8 @@ def _detail(delta: Source, sigma: Source) -> Detail:
     return Detail(start, summary, detail(sigma)[0])
 
 
-def _offset(name: str, key: str, results: Mapping[str, Any]) -> MapContents:
-    delta = results[f"{key}/delta"]
+def _offset(key: str, results: Mapping[str, Any]) -> MapContents:
+    name, delta = key.rpartition("/")[2], results[f"{key}/delta"]
     # Pixel by pixel is the whole map already where no blocks were averaged.
     part = results[f"{key}/detail"] if delta.block > 1 and min(delta.shape) > DETAIL else None
     return MapContents(name, delta, results[f"{key}/sigma"], results.get(f"{key}/spectrum"), part)
