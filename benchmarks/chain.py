@@ -71,7 +71,9 @@ def limits(work: Workload, threads: int) -> dict[str, float]:
 
 def every_stage(work: Workload, threads: int) -> dict[str, float]:
     """Seconds of each stage from the start."""
-    shutil.rmtree(work.run, ignore_errors=True)
+    if work.run.exists():
+        # Not removed: the kernel would be busy with that for as long as the next stages run.
+        work.run.rename(tempfile.mkdtemp(dir=work.folder))
     os.sync()
     here, acquisition = Runtime(workers=threads), work.folder / "acq"
     found = {
