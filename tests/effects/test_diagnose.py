@@ -19,6 +19,7 @@ from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.effects.straylight import Straylight
 from pixcal.engine.run import Runtime
 from pixcal.estimators.diagnosis.test_statistics import DETECTOR, measure
+from pixcal.kernels.frame_order import runs
 from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
@@ -390,10 +391,22 @@ def test_halves_share_no_frame() -> None:
     assert len(learn["fringes/a"]) + len(test["fringes/a"]) == 101
     # Three frames of an exposure time cannot be parted.
     assert set(learn["flat"]) & set(test["flat"]) == {5, 6, 7}
-    long = split({"fringes/a": {"exptime_s": [0.1] * 9000, "time_s": list(range(9000))}}, 128 * 128)
-    assert len(long.test.frames["fringes/a"]) == 366
-    assert long.test.frames["fringes/a"][-1] == 8999
-    assert long.learn.frames["fringes/a"][0] == 0
+
+
+@pytest.mark.parametrize("count", [32, 200, 600, 732, 9000])
+def test_both_halves_see_the_whole_of_time(count: int) -> None:
+    table: dict[str, list[Any]] = {"exptime_s": [0.1] * count, "time_s": list(range(count))}
+    parts = split({"fringes/a": table}, 128 * 128)
+    learn, test = parts.learn.frames["fringes/a"], parts.test.frames["fringes/a"]
+    assert not set(learn) & set(test)
+    assert abs(len(learn) - len(test)) <= 2
+    assert len(learn) == min(count // 2, 366 // 8 * 8)
+    # A steady drift is the same in both, and both begin and end near the ends.
+    assert learn.mean() == pytest.approx(test.mean(), abs=0.02 * count)
+    assert max(learn[0], test[0]) <= 0.26 * count
+    assert min(learn[-1], test[-1]) >= 0.73 * count
+    # Few frames lack the one before.
+    assert max(len(runs(learn)), len(runs(test))) <= max(count // 40, 2)
 
 
 def test_windows_of_a_large_detector_lie_apart_on_its_chunks() -> None:

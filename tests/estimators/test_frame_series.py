@@ -15,11 +15,12 @@ from pixcal.estimators.frame_series.series import (
     without,
 )
 from pixcal.estimators.frame_series.spectral_line import cleared_of_line, find_line
-from pixcal.estimators.frame_series.variance_components import walk_power
+from pixcal.estimators.frame_series.walk_modes import walk_modes
 from pixcal.estimators.fringe_fit.tile_fit import Coding
 
 T = 297
 SHAPE = (61, 67)
+INSIDE, EVEN = np.arange(1, T + 1), walk_modes(np.arange(float(T)))
 
 
 def phases(seed: int) -> np.ndarray:
@@ -33,9 +34,9 @@ def test_what_follows_the_phase_goes_and_white_noise_keeps_its_size() -> None:
     sizes = []
     for _ in range(20):
         noise = rng.standard_normal((T, 2))
-        rest = without(noise + bent[:, None], _follows_phase(phase))
+        rest = without(noise + bent[:, None], _follows_phase(phase, INSIDE, EVEN), EVEN)
         # Weights see the whole series, so that the two differ by a little of the noise.
-        assert np.std(rest - without(noise, _follows_phase(phase))) < 0.4
+        assert np.std(rest - without(noise, _follows_phase(phase, INSIDE, EVEN), EVEN)) < 0.4
         sizes.append(rest.var(axis=0))
     assert np.mean(sizes) == pytest.approx(1.0, abs=0.05)
 
@@ -50,14 +51,14 @@ def test_drifts_and_lines_are_not_taken_for_what_follows_the_phase(kind: str) ->
         "line": 30 * np.sin(1.1 * time),
     }[kind]
     noise = 0.1 * rng.standard_normal(T)
-    rest = without((slow + noise)[:, None], _follows_phase(phase))[:, 0]
+    rest = without((slow + noise)[:, None], _follows_phase(phase, INSIDE, EVEN), EVEN)[:, 0]
     # A walk is white at its upper end: there its steps are noise as well.
     assert np.std(rest - slow + slow.mean()) < (6 if kind == "walk" else 0.05 * np.std(slow))
 
 
 def test_a_scan_so_slow_that_its_phase_is_a_drift_takes_nothing() -> None:
-    assert _follows_phase(0.004 * np.arange(T + 2)).shape[1] == 0
-    assert _follows_phase(phases(3)).shape[1] > 50
+    assert _follows_phase(0.004 * np.arange(T + 2), INSIDE, EVEN).shape[1] == 0
+    assert _follows_phase(phases(3), INSIDE, EVEN).shape[1] > 50
 
 
 def test_halves_are_halves_without_a_period() -> None:
@@ -83,7 +84,8 @@ def fringes(seed: int, frames: int = 80) -> FringeEvidence:
     free, covariance = free_frames(electrons, coding, g, dk, theta, read, shot, good)
     return FringeEvidence(
         name="a", baseline_mm=(6.0, 0.0), k=(1.21, 0.02), origin=(0, 0), window=shape,
-        time_s=0.14 * np.arange(frames), exptime_s=0.02, electrons=electrons,
+        frame=np.arange(frames), time_s=0.14 * np.arange(frames), exptime_s=0.02,
+        electrons=electrons,
         adu=electrons.astype(np.uint16), g=g, dk=dk, free=free, free_covariance=covariance,
         theta=theta, sigma=np.ones(shape), delta=np.zeros(shape), good=good, read_variance=read,
         shot_factor=shot,
@@ -131,25 +133,45 @@ def test_dark_frames_and_short_sets_tell_nothing() -> None:
     free[10:20, :3] = 0.0
     series = motion_series(replace(found, free=free))
     assert series is not None
-    assert len(series) == len(free) - 12
+    # Without the dark ones, those beside them, and both ends.
+    assert len(series) == len(free) - 14
     assert motion_series(fringes(11, frames=20)) is None
 
 
-def series_of(values: np.ndarray) -> FrameSeries:
+def series_of(values: np.ndarray, frame: np.ndarray | None = None) -> FrameSeries:
     unit = np.eye(2)
-    time = 0.14 * np.arange(len(values))
+    frame = np.arange(len(values)) if frame is None else frame
     nothing = np.zeros((len(values), 0))
-    return FrameSeries("a", (1.0, 0.0), time, 0.14, 0.02, values, 0 * values, nothing, unit, unit)
+    return FrameSeries(
+        "a", (1.0, 0.0), frame, 0.14 * frame, 0.02, values, 0 * values, nothing, unit, unit
+    )
 
 
 def white(series: FrameSeries) -> np.ndarray:
     return np.ones((len(series) - 1, 2))
 
 
-def test_a_line_is_found_with_its_frequency_and_amplitude() -> None:
+def test_frames_beside_a_gap_are_left_out_and_times_are_kept() -> None:
+    found = fringes(12)
+    kept = np.r_[0:20, 55 : len(found.g)]
+    of_frames = ("frame", "time_s", "electrons", "adu", "g", "dk", "free", "free_covariance")
+    parted = replace(found, **{name: getattr(found, name)[kept] for name in of_frames})
+    series = light_series(parted)
+    assert series is not None
+    assert not set(series.frame) & {0, 19, 55, len(found.g) - 1}
+    assert len(series) == len(kept) - 4
+    np.testing.assert_allclose(series.time_s, 0.14 * series.frame)
+    assert series.step_s == pytest.approx(0.14)
+
+
+GAPS = np.concatenate([np.arange(n, n + T // 4) for n in (0, T // 2, 3 * T // 2, 2 * T)])
+
+
+@pytest.mark.parametrize("frame", [np.arange(T), GAPS], ids=["without gaps", "with gaps"])
+def test_a_line_is_found_with_its_frequency_and_amplitude(frame: np.ndarray) -> None:
     rng = np.random.default_rng(4)
-    swing = np.sin(2 * np.pi * 1.7 * 0.14 * np.arange(T))[:, None] * [0.8, 0.4]
-    every = [series_of(swing + rng.standard_normal((T, 2))) for _ in range(2)]
+    swing = np.sin(2 * np.pi * 1.7 * 0.14 * frame)[:, None] * [0.8, 0.4]
+    every = [series_of(swing + rng.standard_normal(swing.shape), frame) for _ in range(2)]
     line, cleared = cleared_of_line(every, white)
     assert line is not None
     assert line.sure
@@ -162,7 +184,7 @@ def test_a_line_is_found_with_its_frequency_and_amplitude() -> None:
 
 
 def test_no_line_is_found_in_noise_nor_in_a_walk_of_known_power() -> None:
-    rng, power = np.random.default_rng(5), 1 + 4 * walk_power(T)
+    rng, power = np.random.default_rng(5), 1 + 4 * EVEN.walk
     for _ in range(20):
         noise = rng.standard_normal((T, 2)) + 2 * np.cumsum(rng.standard_normal((T, 2)), axis=0)
         line = find_line([series_of(noise)], lambda s: np.stack([power, power], axis=1))

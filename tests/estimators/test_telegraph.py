@@ -23,7 +23,7 @@ def jumping(
         turns = np.where(anew & (rng.random((frames, n)) < 0.5), -1.0, 1.0)
         turns[0] = rng.choice([-1.0, 1.0], n)
         noise = rng.standard_normal((frames, n)) + np.cumprod(turns, axis=0) * jumps / 2
-        series.append(Series(noise, np.arange(n), 1.0, PERIOD_S))
+        series.append(Series(noise, np.arange(frames), np.arange(n), 1.0, PERIOD_S))
     return series
 
 

@@ -26,7 +26,9 @@ def evidence(seed: int = 1, quadratic: float = 0.0, read: float = READ) -> Evide
         charge *= 1 + quadratic * charge / 2e4
         charge += read * rng.standard_normal(charge.shape)
         adu = np.rint(BIAS + charge / GAIN).astype(np.float32)
-        return Stack(kind, seconds, np.arange(float(frames)), adu, step=int(light))
+        return Stack(
+            kind, seconds, np.arange(frames), np.arange(float(frames)), adu, step=int(light)
+        )
 
     levels = np.linspace(1500, 18000, 8)
     return Evidence(

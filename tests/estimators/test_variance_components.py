@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.fft import dct
 from scipy.stats import chi2, norm
 
 from pixcal.estimators.frame_series.profiled import best_shape
@@ -9,7 +10,6 @@ from pixcal.estimators.frame_series.variance_components import (
     Components,
     Modes,
     _State,
-    cosine_modes,
     estimate_components,
     joint_log_chance,
     log_chance,
@@ -17,20 +17,21 @@ from pixcal.estimators.frame_series.variance_components import (
     sigmas,
     signed_sigmas,
     trace_products,
-    walk_power,
 )
+from pixcal.estimators.frame_series.walk_modes import walk_modes
 from pixcal.kernels.processes import damped_walk
 
 T = 199
+EVEN = walk_modes(np.arange(float(T)))
 
 
 def modes_of(series: np.ndarray, *powers: np.ndarray, known: np.ndarray | None = None) -> Modes:
     """One channel of unit noise, and parts of some powers."""
-    n = len(series) - 1
+    n, basis = len(series) - 1, walk_modes(np.arange(float(len(series))))
     parts = np.stack([*powers])[..., None, None]
     return Modes(
-        values=cosine_modes(series)[:, None],
-        known=np.zeros((n, 1, 0)) if known is None else cosine_modes(known)[:, None, :],
+        values=basis.of(series)[:, None],
+        known=np.zeros((n, 1, 0)) if known is None else basis.of(known)[:, None, :],
         parts=parts,
         start=np.array([1.0] + [0.0] * (len(powers) - 1)),
         least=np.array([0.05] + [-0.1 / power.max() for power in powers[1:]]),
@@ -41,12 +42,29 @@ def white_and_walk(rng: np.random.Generator, step: float) -> np.ndarray:
     return rng.standard_normal(T) + step * np.cumsum(rng.standard_normal(T))
 
 
-def test_modes_of_white_noise_and_a_walk_are_independent_and_of_the_power_that_is_said() -> None:
-    # The covariance itself, by the transform of the identity and of a walk's steps.
-    white = cosine_modes(np.eye(31))
-    walk = cosine_modes(np.tril(np.ones((31, 31))))
-    np.testing.assert_allclose(white @ white.T, np.eye(30), atol=1e-12)
-    np.testing.assert_allclose(walk @ walk.T, np.diag(walk_power(31)), atol=1e-10)
+PAUSED = np.concatenate([np.arange(13.0), 40 + np.arange(9.0), 60.5 + 0.5 * np.arange(9)])
+
+
+@pytest.mark.parametrize("time_s", [np.arange(31.0), PAUSED], ids=["even", "with pauses"])
+def test_modes_of_white_noise_and_a_walk_are_independent_and_of_the_power_that_is_said(
+    time_s: np.ndarray,
+) -> None:
+    # The covariance itself, by the modes of the identity and of a walk's steps.
+    modes, n = walk_modes(time_s), len(time_s)
+    white = modes.of(np.eye(n))
+    walk = modes.of(np.tril(np.ones((n, n))) * np.sqrt(np.diff(time_s, prepend=time_s[0] - 1)))
+    np.testing.assert_allclose(white @ white.T, np.eye(n - 1), atol=1e-12)
+    np.testing.assert_allclose(walk @ walk.T, np.diag(modes.walk), atol=1e-8)
+    series = np.random.default_rng(1).standard_normal((n, 2))
+    np.testing.assert_allclose(modes.series(modes.of(series)), series - series.mean(axis=0))
+
+
+def test_modes_of_equal_steps_are_cosines_in_order_of_frequency() -> None:
+    series = np.random.default_rng(2).standard_normal(31)
+    cosines = dct(series, type=2, norm="ortho")[1:]
+    modes = walk_modes(0.14 * np.arange(31))
+    np.testing.assert_allclose(np.abs(modes.of(series)), np.abs(cosines), atol=1e-10)
+    assert np.all(np.diff(modes.walk) < 0)
 
 
 def damped_power(frames: int, keep: float) -> np.ndarray:
@@ -56,9 +74,9 @@ def damped_power(frames: int, keep: float) -> np.ndarray:
 
 
 def test_a_damped_walk_has_the_power_that_is_said() -> None:
-    rng = np.random.default_rng(3)
+    rng, modes = np.random.default_rng(3), walk_modes(np.arange(400.0))
     power = np.mean(
-        [cosine_modes(damped_walk(rng.standard_normal(400), 0.9)) ** 2 for _ in range(400)], axis=0
+        [modes.of(damped_walk(rng.standard_normal(400), 0.9)) ** 2 for _ in range(400)], axis=0
     )
     ratio = power / damped_power(400, 0.9)
     blocks = ratio[: 19 * 21].reshape(19, 21).mean(axis=1)
@@ -69,7 +87,7 @@ def test_the_slope_of_the_likelihood_is_its_derivative() -> None:
     rng = np.random.default_rng(4)
     time = np.linspace(-1, 1, T)
     modes = modes_of(
-        white_and_walk(rng, 0.3) + 5 * time, np.ones(T - 1), walk_power(T), known=time[:, None]
+        white_and_walk(rng, 0.3) + 5 * time, np.ones(T - 1), EVEN.walk, known=time[:, None]
     )
     size = np.array([1.3, 0.05])
     score = _State(modes, size).score()
@@ -94,7 +112,7 @@ def test_sizes_and_errors_are_honest() -> None:
     time = np.linspace(-1, 1, T)
     for _ in range(100):
         series = white_and_walk(rng, step) + 2.0 * time
-        modes = modes_of(series, np.ones(T - 1), walk_power(T), known=time[:, None])
+        modes = modes_of(series, np.ones(T - 1), EVEN.walk, known=time[:, None])
         found = estimate_components(modes)
         rms, error = found.root(1)
         pulls.append((rms - step) / error)
@@ -123,7 +141,7 @@ def test_what_is_not_there_comes_out_normal() -> None:
     rng = np.random.default_rng(7)
     found = []
     for _ in range(150):
-        modes = modes_of(white_and_walk(rng, 0.0), np.ones(T - 1), walk_power(T))
+        modes = modes_of(white_and_walk(rng, 0.0), np.ones(T - 1), EVEN.walk)
         full, less = estimate_components(modes), estimate_components(modes, absent=[1])
         found.append(signed_sigmas(full.likelihood - less.likelihood, full.size[1]))
         assert less.size[1] == 0
@@ -143,7 +161,7 @@ def test_two_parts_together_are_as_rare_as_they_should_be() -> None:
         half = np.zeros_like(x)
         # Noise is seen alone in a second series.
         modes = Modes(
-            values=cosine_modes(np.hstack([series, rng.standard_normal((T, 2))])).reshape(-1, 2),
+            values=EVEN.of(np.hstack([series, rng.standard_normal((T, 2))])).reshape(-1, 2),
             known=np.zeros((2 * (T - 1), 2, 0)),
             parts=np.stack(
                 [

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
-from scipy.fft import idct
 
 from pixcal.estimators.detector.noiseless_charge import noiseless_level
 from pixcal.estimators.diagnosis.evidence import Evidence
@@ -314,7 +313,7 @@ def _tracks(light: FrameLight) -> tuple[Track, ...]:
         with_offset = level * drift[:, :, 0]
         weight = np.linalg.solve(parts.sum(axis=0), with_offset[..., None])[..., 0]
         smooth = np.einsum("nc,nc->n", weight, modes.values[:n])
-        offset = idct(np.concatenate([[0.0], smooth]), type=2, norm="ortho")
+        offset = series.walk_modes.series(smooth)
         some = np.unique(np.linspace(0, n, min(KNOTS, n + 1)).astype(int))
         found.append(Track.of(series.name, series.time_s[some], offset[some]))
     return tuple(found)

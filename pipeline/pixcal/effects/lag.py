@@ -253,7 +253,9 @@ class Lag(Effect):
                 {"share": found.share},
             )
         fringes = tuple(evidence.fringes.values())
-        common = common_lag([f.free[:, :3] for f in fringes], cls._undone)
+        common = common_lag(
+            [f.free[:, :3] for f in fringes], [f.frame for f in fringes], cls._undone
+        )
         if common is None:
             return None
         part = central_crop(evidence)

@@ -183,8 +183,9 @@ def _of_stack(stack: Stack, evidence: Evidence) -> Series | None:
         # Of noise below a step of the converter the shape is that of the steps.
         return None
     return Series(
-        rest / spread, np.flatnonzero(pixels), spread, max(_period(stack.time_s), seconds)
-    )
+        rest / spread, stack.frame, np.flatnonzero(pixels), spread,
+        max(_period(stack.time_s), seconds),
+    )  # fmt: skip
 
 
 def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Series:
@@ -196,7 +197,9 @@ def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Series:
     root = np.sqrt(freedom.weight)
     noise = np.where(root > 0, left * root, np.nan).astype(float)
     sigma = float(freedom.weight[freedom.weight > 0].mean() ** -0.5)
-    return Series(noise, np.flatnonzero(freedom.good), sigma, _period(fringes.time_s))
+    return Series(
+        noise, fringes.frame, np.flatnonzero(freedom.good), sigma, _period(fringes.time_s)
+    )
 
 
 def _period(time_s: F64) -> float:

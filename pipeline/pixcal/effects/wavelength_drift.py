@@ -110,15 +110,16 @@ def _hops(
     """
     size, error = np.array([abs(h.size) for h in jumps]), np.array([h.error for h in jumps])
     weight = 1 / error**2
-    seconds = sum(float(np.ptp(s.time_s)) + s.step_s for s in motion.raw)
+    seconds = sum(len(s) * s.step_s for s in motion.raw)
     hop, rate = float(size @ weight / weight.sum()), len(jumps) / seconds
     # They may scatter by more than the noise.
     excess = float(weight @ (size - hop) ** 2) / max(len(jumps) - 1, 1)
     own_error = float(np.sqrt(max(excess, 1.0) / weight.sum()))
     found = Hopping(hop, own_error, rate, float(np.sqrt(len(jumps))) / seconds)
     colours, bases = [colour_of(s) for s in motion.raw], [colour_of(s) for s in motion.series]
-    slopes = [float(np.polyfit(np.arange(len(b)), b, 1)[0]) for b in bases]
-    levels = find_hopping(colours, [s.step_s for s in motion.raw], slopes, hop, rate)
+    times = [s.time_s for s in motion.raw]
+    slopes = [float(np.polyfit(t - t[0], b, 1)[0]) for t, b in zip(times, bases, strict=True)]
+    levels = find_hopping(colours, times, slopes, hop, rate)
     alike = 0.5 < levels.size / hop < 2
     if alike and all(n < LEVEL * scatter_of(c) for n, c in zip(levels.noise, colours, strict=True)):
         found = replace(levels, size=hop, error=own_error) if walks else levels

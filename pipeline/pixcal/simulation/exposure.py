@@ -6,7 +6,7 @@ out the same however the work is cut, and an effect that needs the rows around a
 before it has them made again.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TypeVar
@@ -56,7 +56,7 @@ class Camera:
         for effect in self.effects:
             self.maps = effect.detector(self.maps, bench, self.rows)
 
-    def expose(self, recording: Recording, frames: range) -> Iterator[tuple[int, U16]]:
+    def expose(self, recording: Recording, frames: Iterable[int]) -> Iterator[tuple[int, U16]]:
         """Frames of these numbers as the camera reads them: the number and samples, uint16 (y, x).
 
         ADU; the array is used again.
@@ -65,7 +65,7 @@ class Camera:
         for frame in frames:
             yield frame, chain.samples(frame)[self._kept]
 
-    def analogue(self, recording: Recording, frames: range) -> Iterator[F32]:
+    def analogue(self, recording: Recording, frames: Iterable[int]) -> Iterator[F32]:
         """The same before the converter: float32 (y, x), ADU; a new array each."""
         chain = _Chain(self, recording)
         for frame in frames:

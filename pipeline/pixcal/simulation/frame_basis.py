@@ -14,7 +14,6 @@ from pixcal.estimators.frame_series.series import assemble
 from pixcal.estimators.frame_series.variance_components import (
     MAX_STEPS,
     Components,
-    cosine_modes,
     estimate_components,
 )
 from pixcal.model.arrays import F64
@@ -142,7 +141,7 @@ class FrameBasis:
             weight = np.linalg.inv(covariance[at : at + len(own)])
             weighed = weight @ own @ weight
             both = weighed @ own
-            modes = cosine_modes(w.changes(of.at(shape), DRAWS).transpose(1, 0, 2))
+            modes = w.series.walk_modes.of(w.changes(of.at(shape), DRAWS).transpose(1, 0, 2))
             seen += float(np.einsum("kra,kab,krb->r", modes, weighed, modes).var(ddof=1))
             normal += 2 * float(np.einsum("kab,kba->", both, both))
             square += float(np.einsum("kaa->", both))

@@ -2,7 +2,7 @@
 
 A model of whole frames needs no samples to be taken again: its `ForwardModel.states` are the change
 of the series, draw by draw. What is the same in all draws is a shape of known course; their scatter
-is a part of the covariance of the series' cosine modes.
+is a part of the covariance of the series' modes.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,6 @@ from pixcal.estimators.frame_series.fringe_motion import motion_of
 from pixcal.estimators.frame_series.light import light_of
 from pixcal.estimators.frame_series.series import FrameSeries
 from pixcal.estimators.frame_series.spectral_line import Line
-from pixcal.estimators.frame_series.variance_components import cosine_modes
 from pixcal.kernels.scene import FrameStates
 from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench
@@ -63,7 +62,7 @@ class Watched:
     @lru_cache(maxsize=KEPT)  # noqa: B019
     def part(self, model: ForwardModel) -> F64:
         """Covariance (t - 1, 2, 2) of the modes by a random model; the same for like frames."""
-        modes = cosine_modes(self.changes(model, DRAWS).transpose(1, 0, 2))
+        modes = self.series.walk_modes.of(self.changes(model, DRAWS).transpose(1, 0, 2))
         modes -= modes.mean(axis=1, keepdims=True)
         power = np.einsum("kra,krb->kab", modes, modes) / (DRAWS - 1)
         order = np.arange(1, len(power) + 1)
@@ -157,11 +156,9 @@ class FrameChanges:
         light, motion = light_of(evidence), motion_of(evidence)
 
         def watched(series: FrameSeries, channels: tuple[int, int]) -> Watched:
-            recording, first = recordings[series.name]
+            recording = recordings[series.name]
             recording = replace(recording, bench=_rounded(recording.bench))
-            time_s = evidence.fringes[series.name].time_s
-            places = np.searchsorted(time_s, series.time_s - 1e-9)
-            return Watched(series, channels, recording, tuple((first + places).tolist()))
+            return Watched(series, channels, recording, tuple(series.frame.tolist()))
 
         self.light, self.crossed = light, motion is not None and motion.crossed
         self._every = [[watched(s, MOTION) for s in motion.series]] if motion else []

@@ -178,7 +178,7 @@ def _bent(turn: C128) -> F64:
 def _lit(evidence: Evidence) -> list[_Lit]:
     recordings = set_recordings(evidence)
     return [
-        _Lit.of(found, recordings[name][0])
+        _Lit.of(found, recordings[name])
         for name, found in evidence.fringes.items()
         if np.count_nonzero(found.good) > MIN_PIXELS and min(found.good.shape) >= MIN_SIDE
     ]

@@ -13,7 +13,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.crosstalk import filled
 from pixcal.kernels.scene import DetectorMaps, FrameStates, LightMaps, Rows
-from pixcal.model.arrays import F32, F64
+from pixcal.model.arrays import F32, F64, Indices
 from pixcal.model.bench import (
     SCHEMA,
     Bench,
@@ -84,10 +84,11 @@ class Replica:
         self._fitted = _fitted(evidence, sets)
         self._bench = _bench(evidence, sets)
         starts = _starts(evidence, sets)
-        self._recordings: dict[str | int, tuple[Recording, int]] = {}
-        self._recordings.update(set_recordings(evidence).items())
+        self._recordings: dict[str | int, Recording] = dict(set_recordings(evidence).items())
+        self._frames: dict[str | int, Indices] = {s.name: s.frame for s in sets}
         for n, stack in enumerate(evidence.stacks):
             self._recordings[n] = _of_stack(self._bench, n, stack, evidence, starts[n])
+            self._frames[n] = stack.frame - stack.frame[0]
 
     def taken(
         self,
@@ -117,8 +118,7 @@ class Replica:
         bench = replace(self._bench, seed=seed, detector=detector)
         for model in models:
             model.check(bench)
-        recording, first = self._recordings[of]
-        frames = range(first, recording.count)[:most]
+        recording, frames = self._recordings[of], self._frames[of][:most].tolist()
         rows = (0, bench.detector.shape[0])
         camera = Camera(bench, rows, [self._fitted, *models], noise=noise)
         out = np.empty((len(frames), *bench.detector.shape), np.float32)
@@ -127,8 +127,8 @@ class Replica:
         return out
 
 
-def set_recordings(evidence: Evidence) -> dict[str, tuple[Recording, int]]:
-    """Of each fringe set: its recording, and the number of the first frame there is of it."""
+def set_recordings(evidence: Evidence) -> dict[str, Recording]:
+    """The recording of each fringe set, up to the last frame there is of it."""
     sets = list(evidence.fringes.values())
     bench, starts = _bench(evidence, sets), _starts(evidence, sets)
     return {s.name: _of_set(bench, n, s, starts[s.name]) for n, s in enumerate(sets)}
@@ -156,29 +156,25 @@ def _fitted(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Fitted:
 
 
 def _states(found: FringeEvidence) -> FrameStates:
-    """Of all frames of the recording; of those before the first they are nothing in particular."""
-    before = _first(found)
+    """Of all frames of the recording; of those left out they are nothing in particular."""
 
-    def padded(values: F64, value: float) -> F64:
-        return np.concatenate([np.full(before, value), values])
+    def every(values: F64, other: float) -> F64:
+        states = np.full(found.frame[-1] + 1, other)
+        states[found.frame] = values
+        return states
 
-    b, a_cos, a_sin = found.g.T
+    b, a = found.g[:, 0], np.hypot(found.g[:, 1], found.g[:, 2])
     return FrameStates(
-        phi=padded(np.arctan2(a_sin, a_cos), 0.0),
-        level=padded(b, float(b.mean())),
-        amplitude=padded(np.hypot(a_cos, a_sin), float(np.hypot(a_cos, a_sin).mean())),
-        dkx=padded(found.dk[:, 0], 0.0),
-        dky=padded(found.dk[:, 1], 0.0),
+        phi=every(found.phi, 0.0),
+        level=every(b, float(b.mean())),
+        amplitude=every(a, float(a.mean())),
+        dkx=every(found.dk[:, 0], 0.0),
+        dky=every(found.dk[:, 1], 0.0),
     )
 
 
 def _period(time_s: F64) -> float:
     return max(float(np.median(np.diff(time_s))), MIN_S) if len(time_s) > 1 else MIN_S
-
-
-def _first(found: FringeEvidence) -> int:
-    """Number of the first frame in its recording."""
-    return max(round(float(found.time_s[0]) / _period(found.time_s)), 0)
 
 
 def _starts(evidence: Evidence, sets: Sequence[FringeEvidence]) -> dict[str | int, float]:
@@ -191,26 +187,22 @@ def _starts(evidence: Evidence, sets: Sequence[FringeEvidence]) -> dict[str | in
         found[n] = clock if in_order else stack.start_s + float(stack.time_s[0])
         clock += len(stack.adu) * _period(stack.time_s)
     for s in sets:
-        found[s.name] = clock if in_order else s.start_s - float(s.time_s[0])
+        found[s.name] = clock if in_order else s.start_s
         clock += float(s.time_s[-1]) + _period(s.time_s)
     return found
 
 
-def _of_set(
-    bench: Bench, number: int, found: FringeEvidence, start_s: float
-) -> tuple[Recording, int]:
-    first, period = _first(found), _period(found.time_s)
+def _of_set(bench: Bench, number: int, found: FringeEvidence, start_s: float) -> Recording:
     exposure = found.exptime_s if np.isfinite(found.exptime_s) else 0.0
-    recording = Recording(
-        bench, "fringes", number, found.name, found.name, first + len(found.g), exposure, start_s,
-        period, 1.0,
+    return Recording(
+        bench, "fringes", number, found.name, found.name, int(found.frame[-1]) + 1, exposure,
+        start_s, _period(found.time_s), 1.0,
     )  # fmt: skip
-    return recording, first
 
 
 def _of_stack(
     bench: Bench, number: int, stack: Stack, evidence: Evidence, start_s: float
-) -> tuple[Recording, int]:
+) -> Recording:
     exposure = stack.exptime_s if np.isfinite(stack.exptime_s) else 0.0
     electrons = 0.0
     if stack.kind == "flat":
@@ -218,12 +210,11 @@ def _of_stack(
         light = (stack.adu.mean(axis=0) - evidence.bias) * evidence.gain
         light = (light - evidence.dark_rate * exposure)[good] / evidence.flat[good]
         electrons = float(np.median(light)) if light.size else 0.0
-    period, count = _period(stack.time_s), len(stack.adu)
-    recording = Recording(
-        bench, stack.kind, number, stack.kind, stack.kind, count, exposure, start_s, period,
-        electrons,
+    count = int(np.ptp(stack.frame)) + 1
+    return Recording(
+        bench, stack.kind, number, stack.kind, stack.kind, count, exposure, start_s,
+        _period(stack.time_s), electrons,
     )  # fmt: skip
-    return recording, 0
 
 
 def _bench(evidence: Evidence, sets: Sequence[FringeEvidence]) -> Bench:

@@ -1,5 +1,6 @@
 """A part of a run as evidence for effects: samples, maps, frames and calibration, in memory."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, free_frames
 from pixcal.estimators.fringe_fit.fringes import grid
-from pixcal.model.arrays import F64
+from pixcal.model.arrays import F64, Indices
 from pixcal.model.errors import InputError
 from pixcal.stages.fit.scouting import read_frames
 from pixcal.stages.reduce.ingested import Ingested
@@ -20,6 +21,7 @@ from pixcal.storage.stage import read_acquisition, require
 # rows and columns of the window: ((y0, y1), (x0, x1))
 Part = tuple[tuple[int, int], tuple[int, int]]
 
+DAY_S = 86400.0
 MAX_SAMPLES = 1 << 26  # samples of a set that are taken into memory (some ten bytes each)
 
 
@@ -115,6 +117,7 @@ def _fringes(
     shot = ArrayReader(source.folder / "shot_factor").read(y, x).astype(float)
     free, covariance = free_frames(codes, coding, g, dk, theta, read, shot, good)
     table = ingested.tables[f"fringes/{name}"]
+    numbers = frame_numbers(table)[frames]
     exposure = table["exptime_s"][0]
     return FringeEvidence(
         name=name,
@@ -122,6 +125,7 @@ def _fringes(
         k=(float(facts["kx"]), float(facts["ky"])),
         origin=(y[0], x[0]),
         window=source.shape,
+        frame=numbers,
         time_s=times,
         exptime_s=np.nan if exposure is None else float(exposure),
         electrons=electrons,
@@ -169,12 +173,27 @@ def _stacks(ingested: Ingested, part: Part) -> tuple[Stack, ...]:
             for step in np.unique(steps[same]):
                 own = same & (steps == step)
                 adu, start = frames[own].astype(np.float32), _start(ingested, kind)
-                found.append(Stack(kind, float(exposure), times[own], adu, start, int(step)))
+                numbers = frame_numbers(table)[own]
+                found.append(
+                    Stack(kind, float(exposure), numbers, times[own], adu, start, int(step))
+                )
     return tuple(found)
 
 
+def frame_numbers(table: Mapping[str, list[Any]]) -> Indices:
+    """Numbers (t,) of the frames of an array, some of which may be left out."""
+    return np.array(table["frame"] if "frame" in table else range(len(table["time_s"])), int)
+
+
 def _start(ingested: Ingested, name: str) -> float:
-    """Time of an array's first frame after the first one of all, s; nan when unknown."""
+    """Time of an array's frame 0 after the first frame of all, s; nan when unknown."""
+    begin = {key: _begin(table) for key, table in ingested.tables.items()}
+    return (begin[name] - min(begin.values())) * DAY_S
+
+
+def _begin(table: Mapping[str, list[Any]]) -> float:
+    """Time stamp of an array's frame 0, days; nan when unknown."""
+    stamps = np.array(table["mjd"], float) - np.array(table["time_s"], float) / DAY_S
     # Later planes of a cube without exposure time have none.
-    stamps = {key: np.array(table["mjd"][:1], float) for key, table in ingested.tables.items()}
-    return float(stamps[name][0] - min(float(s[0]) for s in stamps.values())) * 86400.0
+    known = stamps[np.isfinite(stamps)]
+    return float(known[0]) if len(known) else np.nan

@@ -9,7 +9,8 @@ from scipy.optimize import minimize_scalar
 from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker
 from pixcal.estimators.detector.pixel_lag import CLIP, MIN_FRAMES
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
-from pixcal.model.arrays import F32, F64, Mask
+from pixcal.kernels.frame_order import follows
+from pixcal.model.arrays import F32, F64, Indices, Mask
 
 LAGS = 6  # frames back that are looked at
 ROUNDS = 2  # of the fit, each about the lag of the one before
@@ -21,10 +22,11 @@ CLEAR = 4.0
 _NOT_EXPONENTIAL = 40.0  # chi-square from which releases are taken as they come
 
 
-def _contrast_steps(frames: F64) -> tuple[F64, F64] | None:
+def _contrast_steps(frames: F64, numbers: Indices) -> tuple[F64, F64] | None:
     """Shares (lag,) that come out 1, 2, ... frames later, and their information (lag, lag).
 
-    From (B, A cos phi, A sin phi) of the frames (t, 3); None where they do not tell.
+    From (B, A cos phi, A sin phi) of the frames (t, 3) of some numbers; None where they do not
+    tell.
     """
     b, a_cos, a_sin = frames.T
     count = len(b)
@@ -35,16 +37,17 @@ def _contrast_steps(frames: F64) -> tuple[F64, F64] | None:
     contrast = contrast / np.median(contrast)
     terms = np.zeros((LAGS, count))
     for back in range(1, LAGS + 1):
-        light = b[:-back] / b[back:]
-        terms[back - 1, back:] = light * (np.cos(phase[:-back] - phase[back:]) - 1)
-    time = np.linspace(-1, 1, count)
+        own = np.flatnonzero(follows(numbers, back))
+        light = b[own - back] / b[own]
+        terms[back - 1, own] = light * (np.cos(phase[own - back] - phase[own]) - 1)
+    time = numbers / numbers[-1]
     # What a wrong gauge of the fit and slow changes do to the contrast.
     other = [np.ones(count), time, time**2]
     for n in (1, 2):
         other += [np.cos(n * phase), np.sin(n * phase)]
     basis, size, _ = np.linalg.svd(np.stack(other).T, full_matrices=False)
     basis = basis[:, size > 1e-6 * size[0]]
-    used = np.ones(count, bool)
+    used = follows(numbers)
     for _ in range(2):
         inside = np.linalg.qr(basis[used])[0]
         rest = terms[:, used] - (terms[:, used] @ inside) @ inside.T
@@ -85,7 +88,9 @@ class CommonLag:
 
 
 def common_lag(
-    frames: Sequence[F64], undone: Callable[[float, float, F32], tuple[F32, F64]]
+    frames: Sequence[F64],
+    numbers: Sequence[Indices],
+    undone: Callable[[float, float, F32], tuple[F32, F64]],
 ) -> CommonLag | None:
     """Lag by the contrast of frames against the step of the phase since those before.
 
@@ -93,6 +98,8 @@ def common_lag(
     ----------
     frames : sequence of (t, 3) float64
         (B, A cos phi, A sin phi) of the frames of each fringe set.
+    numbers : sequence of (t,) int
+        Of these frames in their set.
     undone : callable
         Frames without a lag of a share and a decay, and the shares that come out later.
 
@@ -104,11 +111,11 @@ def common_lag(
     found = CommonLag(0.0, 0.0, 0.0, 0.0, 0.0)
     for _ in range(ROUNDS):
         steps = []
-        for own in frames:
+        for own, which in zip(frames, numbers, strict=True):
             # Linear about a lag that is known in part, which is taken out of the frames first.
             share = float(np.clip(found.share, 0, 0.5))
             rest, known = undone(share, found.decay_frames, own.astype(np.float32))
-            told = _contrast_steps(rest.astype(float))
+            told = _contrast_steps(rest.astype(float), which)
             if told is not None:
                 more = np.pad(known[:LAGS], (0, LAGS - len(known[:LAGS])))
                 steps.append((more + told[0], told[1]))

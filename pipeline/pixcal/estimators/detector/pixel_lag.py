@@ -7,6 +7,7 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
+from pixcal.kernels.frame_order import follows
 from pixcal.model.arrays import F32, F64
 
 # of the phase that pixels are free to have, so that a bent response is not taken for lag
@@ -81,7 +82,7 @@ def _squares_of_shares(
     others = np.zeros((len(steps), *fringes.g.T.shape), np.float32)
     for other, step in zip(others, steps, strict=True):
         other[:] = np.roll(fringes.g, step, axis=0).T
-        other[:, slice(0, step) if step > 0 else slice(step, None)] = 0
+        other[:, ~follows(fringes.frame, step)] = 0
     own, weight, theta = freedom.of_time, freedom.weight, fringes.theta[:, freedom.good]
     count = weight.shape[1]
     upper = np.triu_indices(3)

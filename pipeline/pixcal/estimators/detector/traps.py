@@ -14,13 +14,14 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.kernels.frame_order import since_gap
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64
 
 BANDS = (0.0, 0.125, 0.25, 0.5)  # where bands of the level begin, over the full scale
 STEP = 0.03  # relative step of a parameter for its derivative
 SLOW = (2, 1)  # powers of the time, and harmonics of the phase, that the contrast is free to have
-UNKNOWN = 6  # first frames, whose past is not known
+UNKNOWN = 6  # frames after a gap, whose past is not known
 CONVERGED = 1.0  # fall in chi-square that a step must bring
 # lengths of a step that are tried: where room is short, samples that fill it change with the step
 LENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25)
@@ -147,7 +148,7 @@ class LossFit:
     def weigh(self, lost: Loss, value: Sequence[float] | F64) -> None:
         """Take what a loss leaves of the contrast for its noise."""
         for one, rest in zip(self._sets, self._rests(lost, np.array(value)), strict=True):
-            one.contrast_error *= 1.4826 * float(np.median(np.abs(rest.contrast[UNKNOWN:])))
+            one.contrast_error *= 1.4826 * float(np.median(np.abs(rest.contrast[one.known])))
 
     def _rests(self, lost: Loss, value: F64) -> list["_Rest"]:
         return [one.rest(lost(value, one.level)) for one in self._sets]
@@ -201,6 +202,8 @@ class _Set:
         Charge of the good pixels, e-.
     contrast_error : float
         Of a frame's contrast, relative.
+    known : (t,) bool
+        Frames whose past is known.
     """
 
     def __init__(self, evidence: Evidence, fringes: FringeEvidence, level_e: float) -> None:
@@ -219,7 +222,8 @@ class _Set:
         self.contrast_error = 1.4826 * float(np.median(np.abs(self._contrast)))
         self._residual = freedom.left_over(freedom.of_good(fringes.residual))
         self._sigma = np.sqrt(freedom.weight)
-        self._sigma[:UNKNOWN] = 0
+        self.known = ~since_gap(fringes.frame, UNKNOWN)
+        self._sigma[~self.known] = 0
         self._bands = in_bands(self.level, level_e)[1:]
 
     @cached_property

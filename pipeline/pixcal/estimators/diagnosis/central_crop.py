@@ -37,7 +37,7 @@ def central_crop(evidence: Evidence, samples: int = MAX_SAMPLES) -> Evidence:
 
 
 def _part(fringes: FringeEvidence, frames: slice, rows: slice, columns: slice) -> FringeEvidence:
-    of_frames = ("time_s", "g", "dk", "free", "free_covariance")
+    of_frames = ("frame", "time_s", "g", "dk", "free", "free_covariance")
     of_pixels = ("theta", "sigma", "delta", "good", "read_variance", "shot_factor")
     return replace(
         fringes,

@@ -12,7 +12,7 @@ from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.estimators.fringe_fit.tile_fit import Coding
 from pixcal.kernels.bilinear import frame_sums
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
-from pixcal.model.arrays import F32, F64, Mask
+from pixcal.model.arrays import F32, F64, Indices, Mask
 
 T = TypeVar("T")
 
@@ -31,8 +31,9 @@ class FringeEvidence:
     k: tuple[float, float]  # fringe vector (kx, ky) at the window's centre, rad/px
     origin: tuple[int, int]  # row and column of the part's first pixel in the window
     window: tuple[int, int]  # rows and columns of the whole window
-    time_s: F64  # time_s, exptime_s: time of each frame, s; exposure time (nan when unknown)
-    exptime_s: float
+    frame: Indices  # (t,) number of each frame in the set, ascending; frames may be left out
+    time_s: F64  # (t,) time of each frame after the first of the set, s
+    exptime_s: float  # nan when unknown
     # (t, y, x) reduced samples (bias and dark taken off, divided by the flat); NaN without weight
     electrons: F32
     adu: NDArray[np.generic]  # (t, y, x) the same samples as the camera wrote them
@@ -50,7 +51,7 @@ class FringeEvidence:
     # read_variance`` (e-²)
     read_variance: F64
     shot_factor: F64
-    # time of the set's first frame after that of the acquisition; nan when unknown
+    # time of the set's frame 0 after the first frame of the acquisition; nan when unknown
     start_s: float = np.nan
 
     @cached_property
@@ -110,6 +111,7 @@ class Stack:
 
     kind: str  # ``bias``, ``dark`` or ``flat``
     exptime_s: float  # nan when unknown
+    frame: Indices  # (t,) number of each frame among those of its kind, ascending
     time_s: F64  # (t,) time of each frame, from the first of its kind
     adu: F32  # (t, y, x)
     # time of the first of its kind after the first frame of the acquisition; nan when unknown

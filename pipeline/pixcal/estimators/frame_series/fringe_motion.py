@@ -13,7 +13,6 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.series import MEDIAN, FrameSeries, mode_variance, motion_series
 from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
-from pixcal.estimators.frame_series.variance_components import cosine_modes, from_modes, walk_power
 from pixcal.model.arrays import F64
 
 CROSSED = 0.5  # sine of the angle between fringes from which they count as different
@@ -58,7 +57,7 @@ def _motion_of(evidence: Evidence) -> Motion | None:
     if not found:
         return None
     hops = {s.name: find_hops(s) for s in found}
-    # A hop is in all cosine modes: what follows the phase is sought where none is left.
+    # A hop is in all modes: what follows the phase is sought where none is left.
     still = [_with_hops(s, hops[s.name], -1.0).cleaned() for s in found]
     line, cleared = cleared_of_line(still, _level)
     angles = [np.arctan2(s.k[1], s.k[0]) for s in found]
@@ -74,7 +73,7 @@ def _motion_of(evidence: Evidence) -> Motion | None:
 def vector_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
     """Of every set: name, times (t,), slow and fast change (t, 2) of the fringe vector, rad/px.
 
-    Cosine modes, each smaller than it was seen by the share of noise in those of about its
+    Walk modes, each smaller than it was seen by the share of noise in those of about its
     frequency: a walk has many of them, a ramp few. What is fast keeps its power, what is slow is
     as near to the truth as can be (Wiener).
     """
@@ -83,18 +82,19 @@ def vector_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
         series = motion_series(fringes)
         if series is None:
             continue
-        modes = cosine_modes(series.values)
+        basis = series.walk_modes
+        modes = basis.of(series.values)
         level = np.median(modes[len(modes) // 2 :] ** 2, axis=0) / MEDIAN
         power, count = _around(modes, 1 / OCTAVE, OCTAVE)
         slow = power > level * (1 + SLOW_SIGMAS * np.sqrt(2 / count))
         slow = np.logical_and.accumulate(slow, axis=0)
         near, few = _around(modes, 1.0, 1.0, beside=BESIDE)
-        noise = np.diag(series.noise) * np.mean(cosine_modes(series.apart) ** 2, axis=0)
+        noise = np.diag(series.noise) * np.mean(basis.of(series.apart) ** 2, axis=0)
         noise /= np.diag(series.apart_noise)
         near = np.where(near > level * (1 + SLOW_SIGMAS * np.sqrt(2 / few)), near, level)
         of_slow = np.where(slow, 1 - level / power, 0)
         of_fast = np.where(slow, 0, np.sqrt(np.maximum(1 - noise / near, 0)))
-        courses = from_modes(modes * of_slow), from_modes(modes * of_fast)
+        courses = basis.series(modes * of_slow), basis.series(modes * of_fast)
         found.append((series.name, series.time_s, *courses))
     return found
 
@@ -145,7 +145,9 @@ def find_hops(series: FrameSeries) -> tuple[Hop, ...]:
         if len(along) < 6 * width:
             break
         aside, aside_scatter = _differences(across, width)
-        smooth = np.zeros(len(aside), bool)
+        # Across a gap a drift is a jump.
+        frames = 2 * width - 1
+        smooth = series.frame[frames:] - series.frame[:-frames] > frames
         for _ in range(MAX_HOPS):
             change, scatter = _differences(rest, width)
             at = int(np.argmax(np.where(smooth, 0.0, np.abs(change))))
@@ -208,14 +210,13 @@ def _with_hops(series: FrameSeries, hops: Sequence[Hop], times: float) -> FrameS
 def motion_part(name: str, series: FrameSeries) -> F64:
     """Covariance (t - 1, 2, 2) of the modes of a series for a unit of a kind of motion."""
     kind, _, axis = name.partition("_")
-    n = len(series)
-    power = np.ones(n - 1) if kind == "jitter" else walk_power(n) * series.step_s
+    power = np.ones(len(series) - 1) if kind == "jitter" else series.walk_modes.walk
     x, y = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
     direction = {"x": x, "y": y, "k": np.outer(series.k, series.k), "": x + y}
     return np.asarray(power[:, None, None] * direction[axis])
 
 
 def _level(series: FrameSeries) -> F64:
-    """Variance (t - 1, 2) of the cosine modes, of noise, jitter and walk."""
+    """Variance (t - 1, 2) of the modes, of noise, jitter and walk."""
     names = ("jitter_x", "jitter_y", "walk_x", "walk_y")
     return mode_variance(series, np.stack([motion_part(name, series) for name in names]))

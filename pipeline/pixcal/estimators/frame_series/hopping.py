@@ -38,7 +38,7 @@ class Hopping:
 @dataclass(frozen=True)
 class _Series:
     values: F64
-    step_s: float
+    time_s: F64
     base: F64
     noise: float
     second: F64
@@ -49,13 +49,13 @@ class _Series:
         """With the chances of its states, and the likelihood of all."""
         off = self.values - self.base
         odds = size * (off - size / 2) / self.noise**2
-        second, changes, growth = likely_states(odds, _change(rate, self.step_s))
+        second, changes, growth = likely_states(odds, _change(rate, self.time_s))
         first = -len(off) * np.log(self.noise) - float(off @ off) / (2 * self.noise**2)
         return replace(self, second=second, changes=changes, likelihood=first + growth)
 
 
 def find_hopping(
-    values: Sequence[F64], steps_s: Sequence[float], slopes: Sequence[float], size: float,
+    values: Sequence[F64], times_s: Sequence[F64], slopes: Sequence[float], size: float,
     rate: float,
 ) -> Hopping:  # fmt: skip
     """Hops of a common size and rate in several series.
@@ -63,16 +63,15 @@ def find_hopping(
     Parameters
     ----------
     values : sequence of (t,) float64
-    steps_s : sequence of float
-        From frame to frame.
+    times_s : sequence of (t,) float64
     slopes : sequence of float
-        Of the bases, for a frame; to begin with, like the others.
+        Of the bases, 1/s; to begin with, like the others.
     size, rate : float
         1/s.
     """
-    series = zip(values, steps_s, slopes, strict=True)
+    series = zip(values, times_s, slopes, strict=True)
     every = [_begun(*one, size, rate) for one in series]
-    seconds = sum(s.step_s * len(s.values) for s in every)
+    seconds = sum(float(np.ptp(s.time_s)) for s in every)
     last = -np.inf
     for _ in range(ROUNDS):
         every = [s.weighed(size, rate) for s in every]
@@ -82,12 +81,14 @@ def find_hopping(
         last = likelihood
         size = _size(every) or size
         every = [_settled(s, size) for s in every]
-        expected = sum(_change(rate, s.step_s) * (len(s.values) - 1) for s in every)
+        expected = sum(float(_change(rate, s.time_s).sum()) for s in every)
         rate = max(rate * sum(s.changes for s in every) / expected, FEWEST_HOPS / seconds)
 
     def of_size(step: float) -> float:
         # The bases go along.
-        moved = [replace(s, base=s.base - step * size * _ramp_of(s.second)) for s in every]
+        moved = [
+            replace(s, base=s.base - step * size * _ramp_of(s.second, s.time_s)) for s in every
+        ]
         return sum(s.weighed(size * (1 + step), rate).likelihood for s in moved)
 
     def of_rate(step: float) -> float:
@@ -111,27 +112,27 @@ def scatter_of(values: F64) -> float:
     return 1.4826 * float(np.median(np.abs(np.diff(values)))) / float(np.sqrt(2)) or 1e-300
 
 
-def _change(rate: float, step_s: float) -> float:
-    """Chance that the number of hops in a step is odd."""
-    return float(-np.expm1(-2 * rate * step_s) / 2)
+def _change(rate: float, time_s: F64) -> F64:
+    """Chance (t - 1,) that the number of hops from a frame to the next is odd."""
+    return np.asarray(-np.expm1(-2 * rate * np.diff(time_s)) / 2)
 
 
-def _begun(values: F64, step_s: float, slope: float, size: float, rate: float) -> _Series:
+def _begun(values: F64, time_s: F64, slope: float, size: float, rate: float) -> _Series:
     """With the likeliest base on a grid."""
-    ramp = slope * (np.arange(len(values)) - (len(values) - 1) / 2)
+    ramp = slope * (time_s - time_s.mean())
     noise = max(scatter_of(values), MIN_NOISE * abs(size))
     flat = values - ramp
     bases = np.linspace(flat.min() - size / 2, flat.max() - size / 2, BASES)
     nothing = np.zeros(len(values))
     tried = [
-        _Series(values, step_s, ramp + base, noise, nothing).weighed(size, rate) for base in bases
+        _Series(values, time_s, ramp + base, noise, nothing).weighed(size, rate) for base in bases
     ]
     return max(tried, key=lambda s: s.likelihood)
 
 
-def _ramp_of(values: F64) -> F64:
+def _ramp_of(values: F64, time_s: F64) -> F64:
     """The part of a series that is a ramp."""
-    time = np.linspace(-1, 1, len(values))
+    time = time_s - time_s.mean()
     return np.asarray(values.mean() + time * (time @ values) / (time @ time))
 
 
@@ -139,7 +140,7 @@ def _size(every: Sequence[_Series]) -> float:
     """Size of the hops, beside a ramp of each series; zero where all stay on one level."""
     seen = total = 0.0
     for s in every:
-        ramp = _ramp_of(s.second)
+        ramp = _ramp_of(s.second, s.time_s)
         total += float(s.second.sum() - s.second @ ramp) / s.noise**2
         seen += float((s.second - ramp) @ s.values) / s.noise**2
     return seen / total if total > 0 else 0.0
@@ -147,7 +148,7 @@ def _size(every: Sequence[_Series]) -> float:
 
 def _settled(s: _Series, size: float) -> _Series:
     """With the base and the noise that go with its states."""
-    base = _ramp_of(s.values - size * s.second)
+    base = _ramp_of(s.values - size * s.second, s.time_s)
     off = s.values - base
     square = off**2 - 2 * size * s.second * off + size**2 * s.second
     noise = max(float(np.sqrt(max(square.mean(), 0.0))), MIN_NOISE * abs(size))

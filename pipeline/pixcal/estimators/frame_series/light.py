@@ -14,7 +14,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack, stripes
 from pixcal.estimators.frame_series.series import FrameSeries, assemble, light_series, mode_variance
 from pixcal.estimators.frame_series.spectral_line import Line, cleared_of_line
-from pixcal.estimators.frame_series.variance_components import Modes, walk_power
+from pixcal.estimators.frame_series.variance_components import Modes
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 
@@ -39,7 +39,7 @@ class FrameLight:
     line: Line | None = None  # the strongest in B, sure or not
 
     def modes(self, parts: Sequence[str], ramp: bool = False) -> Modes:
-        """Cosine modes of all series, with the parts that kinds of change have in them.
+        """Walk modes of all series, with the parts that kinds of change have in them.
 
         ``power``, ``contrast`` or ``offset`` (white), with ``_walk`` (a random walk; 1/s) or
         ``_smooth`` (ramps and settlings: the square of a walk's spectrum); offsets in e-², the
@@ -61,11 +61,11 @@ class FrameLight:
     def part(self, name: str, series: FrameSeries) -> F64:
         """Covariance (t - 1, 2, 2) of the modes of a series for a unit of a kind of change."""
         kind, _, time = name.partition("_")
-        n, level = len(series), self.level.get(series.name)
+        n, level, walk = len(series), self.level.get(series.name), series.walk_modes.walk
         power = {
             "": np.ones(n - 1),
-            "walk": walk_power(n) * series.step_s,
-            "smooth": walk_power(n) ** 2 / n**2,
+            "walk": walk,
+            "smooth": (walk / series.step_s / n) ** 2,
         }[time]
         if level is None:
             pattern = PATTERNS["power"] * (kind == "offset")
@@ -173,12 +173,11 @@ def _dark_series(stack: Stack, number: int, evidence: Evidence) -> FrameSeries |
     whole, one, other = (signal[:, mask].mean(axis=1) for mask in masks)
     noise = evidence.read_noise**2 / np.array([mask.sum() for mask in masks])
     nothing = np.zeros(len(whole))
-    step = float(np.ptp(stack.time_s)) / (len(whole) - 1) or 1.0
     return FrameSeries(
         name=f"{stack.kind}:{number}",
         k=(0.0, 0.0),
+        frame=stack.frame,
         time_s=stack.time_s,
-        step_s=step,
         exptime_s=stack.exptime_s,
         values=np.stack([whole, nothing], axis=1).astype(float),
         apart=np.stack([(one - other) / 2, nothing], axis=1).astype(float),

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import STRIPE, FringeEvidence, Stack
-from pixcal.estimators.frame_series.variance_components import Modes, cosine_modes, walk_power
+from pixcal.estimators.frame_series.variance_components import Modes
+from pixcal.estimators.frame_series.walk_modes import walk_modes
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64, Mask
 
@@ -35,7 +36,7 @@ class OffsetSeries:
 
     name: str
     time_s: F64  # (t,) after the first frame of the acquisition where that is known
-    step_s: float  # mean time from frame to frame
+    step_s: float  # median time from frame to frame
     values: F64  # (t, 4) W, R, C, K, e-
     noise: F64  # (4,) variance that the noise of the pixels gives them, e-²
     nuisance: F64  # (t, p) shapes that are no offsets
@@ -99,17 +100,17 @@ def offset_modes(every: Sequence[OffsetSeries], shapes: Sequence[F64]) -> Modes:
     for i, s in enumerate(every):
         n = len(s) - 1
         design = np.zeros((n, 4, q + sum(widths)))
-        design[:, 0, :q] = cosine_modes(shapes[i])
-        design[:, 0, at : at + widths[i]] = cosine_modes(s.nuisance)
+        basis = walk_modes(s.time_s)
+        design[:, 0, :q] = basis.of(shapes[i])
+        design[:, 0, at : at + widths[i]] = basis.of(s.nuisance)
         at += widths[i]
         part = np.zeros((2 + 3 * len(every), n, 4, 4))
-        walk = walk_power(len(s)) * s.step_s
-        part[0, :, 0, 0], part[1, :, 0, 0] = 1.0, walk
+        part[0, :, 0, 0], part[1, :, 0, 0] = 1.0, basis.walk
         part[2 + 3 * i : 5 + 3 * i] = _diagonals(NOISES * s.noise)[:, None]
-        values.append(cosine_modes(s.values))
+        values.append(basis.of(s.values))
         designs.append(design)
         parts.append(part)
-        least = np.maximum(least, -BELOW * s.noise[0] / np.array([1.0, walk.max()]))
+        least = np.maximum(least, -BELOW * s.noise[0] / np.array([1.0, basis.walk.max()]))
     own = [MIN_NOISE, -BELOW * MIN_NOISE, -BELOW * MIN_NOISE]
     return Modes(
         values=np.concatenate(values),
@@ -152,7 +153,7 @@ def _series(
     name: str, time_s: F64, start_s: float, means: F64, noise: F64, nuisance: F64
 ) -> OffsetSeries:
     """From the means of all pixels and of the quarters (5, t), and their variances (5,)."""
-    step = float(np.ptp(time_s)) / (len(time_s) - 1) or 1.0
+    step = float(np.median(np.diff(time_s))) or 1.0
     return OffsetSeries(
         name=name,
         time_s=time_s + (start_s if np.isfinite(start_s) else 0.0),

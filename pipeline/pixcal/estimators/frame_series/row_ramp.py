@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pixcal.estimators.frame_series.row_sums import INSIDE, RowSums
+from pixcal.estimators.frame_series.row_sums import RowSums
 from pixcal.model.arrays import F64
 
 _KNEES = 24  # places of the row from which the next step is seen that are tried
@@ -99,4 +99,4 @@ def _rows(sums: RowSums, way: int, share: F64) -> tuple[F64, F64, F64]:
     g = _apart_in_time(sums.found.g, float(share.mean()), way)
     lost = 1 / (1 - (share - share.mean()))
     factors = np.stack([np.ones_like(lost), lost, lost], axis=1)
-    return sums.rows, *sums.share(g[1 + way : len(g) - 1 + way] - g[INSIDE], factors)
+    return sums.rows, *sums.share(g[sums.inside + way] - g[sums.inside], factors)

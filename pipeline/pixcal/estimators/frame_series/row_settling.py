@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
-from pixcal.estimators.frame_series.row_sums import INSIDE, RowSums
+from pixcal.estimators.frame_series.row_sums import RowSums
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import F64
 
@@ -82,15 +82,15 @@ def _fit(sets: Sequence[RowSums], way: int, origin: float | None) -> tuple[float
         _, cosine, sine = f.g.T
         step = beside_own_phase(steps_of(f.phi, way, origin), f.phi)
         # Of B, A cos phi and A sin phi, what a turn of the phase does, times the step.
-        other = (step[:, None] * np.stack([np.zeros(len(step)), -sine, cosine], axis=1))[INSIDE]
-        own, vector = sums.share(other)
+        other = step[:, None] * np.stack([np.zeros(len(step)), -sine, cosine], axis=1)
+        own, vector = sums.share(other[sums.inside])
         at = np.linspace(0, 1, len(vector))
         terms = np.stack([profile(unit, at) for unit in np.eye(KNOTS)], axis=1)
         terms -= terms.mean(axis=0)
         normal += terms.T @ own @ terms
         right += terms.T @ vector
         if np.any(f.dk):
-            slopes.append(_slope(f, step))
+            slopes.append(_slope(f, step[sums.inside], f.free[sums.inside, 4]))
     covariance = np.linalg.pinv(normal, rcond=1e-9, hermitian=True)
     share, variance = covariance @ right, np.diag(covariance)
     gain = float(right @ share)
@@ -117,10 +117,12 @@ def beside_own_phase(step: F64, phi: F64) -> F64:
     return np.asarray(step - own @ np.linalg.lstsq(own, step, rcond=1e-9)[0])
 
 
-def _slope(found: FringeEvidence, step: F64) -> tuple[float, float]:
-    """Change of the share from the first row to the last, by the fringe vectors; its weight."""
-    size = step[INSIDE] - step[INSIDE].mean()
-    moved = found.free[INSIDE, 4] - found.free[INSIDE, 4].mean()
+def _slope(found: FringeEvidence, step: F64, turn: F64) -> tuple[float, float]:
+    """Change of the share from the first row to the last, and its weight.
+
+    By the fringe vectors, of steps (t,) and of the vectors' parts along y (t,).
+    """
+    size, moved = step - step.mean(), turn - turn.mean()
     value = float(size @ moved / (size @ size))
     left = moved - value * size
     variance = float(left @ left) / max(len(left) - 2, 1) / float(size @ size)

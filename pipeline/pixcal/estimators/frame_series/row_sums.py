@@ -11,10 +11,10 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.maps.map_fit import centred
+from pixcal.kernels.frame_order import with_neighbours
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
-from pixcal.model.arrays import F64
+from pixcal.model.arrays import F64, Indices
 
-INSIDE = slice(1, -1)  # frames that have one before and one after
 _MIN_FRAMES, _MIN_PIXELS = 12, 80
 
 
@@ -30,6 +30,8 @@ class RowSums:
     Attributes
     ----------
     found : FringeEvidence
+    inside : (t,) int
+        Places of the frames in it.
     rows : (y,) float64
         Of the window.
     right : (t, y, 3) float64
@@ -39,6 +41,7 @@ class RowSums:
     """
 
     found: FringeEvidence
+    inside: Indices
     rows: F64
     right: F64
     normal: F64
@@ -47,7 +50,8 @@ class RowSums:
     def of(cls, found: FringeEvidence) -> "RowSums":
         """Of a fringe set."""
         theta = np.where(found.good, found.theta, 0).astype(np.float32).transpose(1, 2, 0)
-        rest, variance = found.residual[INSIDE], found.variance[INSIDE]
+        inside = with_neighbours(found.frame)
+        rest, variance = found.residual[inside], found.variance[inside]
         used = np.isfinite(rest) & found.good
         weight = np.divide(np.float32(1), variance, out=np.zeros_like(rest), where=used)
         weighted = weight * np.where(used, rest, np.float32(0))
@@ -55,6 +59,7 @@ class RowSums:
         by_row = weight.transpose(1, 0, 2) @ (theta[..., upper[0]] * theta[..., upper[1]])
         return cls(
             found,
+            inside,
             found.origin[0] + np.arange(len(theta), dtype=float),
             (weighted.transpose(1, 0, 2) @ theta).transpose(1, 0, 2).astype(float),
             symmetric(by_row.transpose(1, 0, 2)),
@@ -67,7 +72,7 @@ class RowSums:
         modes = np.broadcast_to(np.eye(3), (t, y, 3, 3))
         if not np.any(self.found.dk):
             return modes
-        _, c, s = self.found.g[INSIDE].T
+        _, c, s = self.found.g[self.inside].T
         turned = np.stack([np.zeros(t), -s, c], axis=1)
         turns = centred(self.found.good.shape)[0][None] * turned[:, None]
         return np.concatenate([modes, turns[:, :, None]], axis=2)
@@ -87,12 +92,11 @@ class RowSums:
         Parameters
         ----------
         other : (t, 3) float64
-            Parameters of the light in every frame but the first and the last, as in
-            `FringeEvidence.g`.
+            Parameters of the light in the frames inside, as in `FringeEvidence.g`.
         factors : (y, 3) float64, optional
             Of these parameters in each row.
         """
-        g = self.found.g[INSIDE]
+        g = self.found.g[self.inside]
         own = (other - g @ (np.linalg.pinv(g) @ other))[:, None]
         # Pixels take up what is best for their own weights: more of chance, by their freedom.
         left = 1 - g.shape[1] / len(g)

@@ -12,18 +12,15 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from pixcal.estimators.diagnosis.evidence import FringeEvidence
-from pixcal.estimators.frame_series.variance_components import (
-    Modes,
-    cosine_modes,
-    estimate_components,
-    from_modes,
-)
-from pixcal.model.arrays import F64, Mask
+from pixcal.estimators.frame_series.variance_components import Modes, estimate_components
+from pixcal.estimators.frame_series.walk_modes import WalkModes, walk_modes
+from pixcal.kernels.frame_order import with_neighbours
+from pixcal.model.arrays import F64, Indices, Mask
 
 FEWEST = 32  # frames of a set from which something is learnt
 HARMONICS = 10  # of the phase, that are no noise
 SPENT = 0.25  # share of the frames' freedom that shapes which follow the phase may take
-SLOW = 12  # cosine modes that are drift
+SLOW = 12  # walk modes that are drift
 # modes whose power is the level of the one in their middle; median of chi-square
 AROUND, MEDIAN = 15, 0.455
 OUTLIER = 9.0  # power over the level from which a mode counts less
@@ -38,8 +35,8 @@ class FrameSeries:
 
     name: str  # of the set
     k: tuple[float, float]  # fringe vector (kx, ky), rad/px
+    frame: Indices  # (t,) numbers of the frames in their set
     time_s: F64  # (t,)
-    step_s: float  # mean time from frame to frame
     exptime_s: float  # nan when unknown
     # values, apart: (t, 2) the quantities, and the half difference of theirs from two halves of
     # the pixels
@@ -54,11 +51,21 @@ class FrameSeries:
     def __len__(self) -> int:
         return len(self.values)
 
+    @property
+    def step_s(self) -> float:
+        """Mean time from a frame to the next one."""
+        return float(np.ptp(self.time_s)) / max(int(np.ptp(self.frame)), 1) or 1.0
+
+    @property
+    def walk_modes(self) -> WalkModes:
+        """In which noise and walks are independent."""
+        return walk_modes(self.time_s)
+
     def cleaned(self) -> "FrameSeries":
         """The series without its shapes."""
         if not self.shapes.size:
             return self
-        rest = without(np.hstack([self.values, self.apart]), self.shapes)
+        rest = without(np.hstack([self.values, self.apart]), self.shapes, self.walk_modes)
         return replace(
             self,
             values=rest[:, :2],
@@ -120,30 +127,34 @@ def _series(
     # A window of one row tells nothing of ky.
     if min(np.diag(noise).min() for noise in noises) <= 0:
         return None
-    # What neighbours leave in a frame is told from all but the end frames.
-    inside = slice(1, -1)
-    time = found.time_s[use][inside]
+    # What neighbours leave in a frame is told from those that have both.
+    frame, time = found.frame[use], found.time_s[use]
+    inside = with_neighbours(frame)
+    if len(inside) < FEWEST // 2:
+        return None
     return FrameSeries(
         name=found.name,
         k=found.k,
-        time_s=time,
-        step_s=float((time[-1] - time[0]) / (len(time) - 1)) or 1.0,
+        frame=frame[inside],
+        time_s=time[inside],
         exptime_s=found.exptime_s,
         values=taken[0][inside],
         apart=((taken[1] - taken[2]) / 2)[inside],
-        shapes=_follows_phase(np.arctan2(found.free[use, 2], found.free[use, 1])),
+        shapes=_follows_phase(
+            np.arctan2(found.free[use, 2], found.free[use, 1]), inside, walk_modes(time[inside])
+        ),
         noise=noises[0],
         apart_noise=(noises[1] + noises[2]) / 4,
     )
 
 
-def without(values: F64, shapes: F64) -> F64:
-    """Series (t, c) without shapes (t, p) and mean, by weighted least squares of the cosine modes.
+def without(values: F64, shapes: F64, basis: WalkModes) -> F64:
+    """Series (t, c) without shapes (t, p) and mean, by weighted least squares of their modes.
 
     A mode's weight is the inverse of the power around it, so that drifts and lines are not taken
     for the shapes; what noise and jitter lose to the shapes is given back to each mode.
     """
-    modes, design = cosine_modes(values), cosine_modes(shapes)
+    modes, design = basis.of(values), basis.of(shapes)
     rest = np.empty_like(modes)
     for channel, wanted in enumerate(modes.T):
         own = wanted
@@ -156,25 +167,26 @@ def without(values: F64, shapes: F64) -> F64:
             own = wanted - left @ (left.T @ (wanted * root)) / root
         kept = 1 - np.einsum("kp,kp->k", left, left)
         rest[:, channel] = own / np.sqrt(np.maximum(kept, 0.1))
-    return from_modes(rest)
+    return basis.series(rest)
 
 
-def _follows_phase(phase: F64) -> F64:
-    """Shapes (t - 2, p) of what is no noise but goes with the phases, of all but the end frames.
+def _follows_phase(phase: F64, inside: Indices, basis: WalkModes) -> F64:
+    """Shapes (n, p) of what is no noise but goes with the phases (t,), of the n frames inside.
 
     What a bent response, the window's edges and the maps' gauge leave goes with the frame's own
     phase and its harmonics, up to the one at which the samples of a fringe meet again; what other
     frames leave in it (lag, rolling shutter) with the steps from and to them, and with both. The
     likeliest come first. A scan so slow that such a shape is a drift does not count.
     """
-    own, steps = phase[1:-1], (phase[:-2] - phase[1:-1], phase[2:] - phase[1:-1])
+    own = phase[inside]
+    steps = phase[inside - 1] - own, phase[inside + 1] - own
     angles = [own, 2 * own, *steps, 3 * own, 4 * own]
     for order in range(1, HARMONICS + 1):
         angles += [(order + 4) * own] * (order + 4 <= HARMONICS)
         angles += [step + turns * own for step in steps for turns in (order, -order)]
     angles = angles[: max(1, int(len(own) * SPENT / 2))]
     shapes = np.stack([turn(angle) for angle in angles for turn in (np.cos, np.sin)], axis=1)
-    power = cosine_modes(shapes) ** 2
+    power = basis.of(shapes) ** 2
     fast = power[SLOW:].sum(axis=0) > np.maximum(power.sum(axis=0) / 2, 1e-9)
     return np.asarray(shapes[:, fast])
 
@@ -202,12 +214,13 @@ def assemble(
     for i, s in enumerate(every):
         n = len(s) - 1
         design = np.zeros((2 * n, 2, q))
-        design[:n] = cosine_modes(shapes[i])
+        basis = s.walk_modes
+        design[:n] = basis.of(shapes[i])
         covariance = np.zeros((m + 3 * len(every), 2 * n, 2, 2))
         covariance[:m, :n] = shared[i]
         for half, noise in ((slice(n), s.noise), (slice(n, 2 * n), s.apart_noise)):
             covariance[m + 3 * i : m + 3 * i + 3, half] = _noise_parts(noise)[:, None]
-        values.append(np.concatenate([cosine_modes(s.values), cosine_modes(s.apart)]))
+        values.append(np.concatenate([basis.of(s.values), basis.of(s.apart)]))
         designs.append(design)
         covariances.append(covariance)
         share = np.einsum("ab,inba->in", np.linalg.inv(s.noise), shared[i]).max(axis=1)

@@ -6,12 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixcal.estimators.frame_series.series import FrameSeries, without
-from pixcal.estimators.frame_series.variance_components import (
-    cosine_modes,
-    from_modes,
-    log_chance,
-    sigmas,
-)
+from pixcal.estimators.frame_series.variance_components import log_chance, sigmas
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 
@@ -50,14 +45,14 @@ def find_line(
     Parameters
     ----------
     level : callable
-        Of a series, the variance (t - 1, 2) of its cosine modes without a line.
+        Of a series, the variance (t - 1, 2) of its modes without a line.
     channels : sequence of int
         That may hold the line.
     """
-    longest = max(every, key=len)
+    lengths = [(np.ptp(s.frame) + 1) * s.step_s for s in every]
     top = min(0.5 / s.step_s for s in every)
-    low = max(SLOWEST / (len(s) * s.step_s) for s in every)
-    grid = np.arange(low, top, 1 / (FINER * len(longest) * longest.step_s))
+    low = SLOWEST / min(lengths)
+    grid = np.arange(low, top, 1 / (FINER * max(lengths)))
     if len(grid) < FINER:
         return None
     powers = [_spectrum(s, level(s), channels, grid) for s in every]
@@ -96,20 +91,21 @@ def _without_line(every: Sequence[FrameSeries], line: Line) -> tuple[FrameSeries
     for s in every:
         turn = 2 * np.pi * line.hz * s.time_s
         swing = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-        found.append(replace(s, values=without(s.values, swing)))
+        found.append(replace(s, values=without(s.values, swing, s.walk_modes)))
     return tuple(found)
 
 
 def _spectrum(s: FrameSeries, level: F64, channels: Sequence[int], grid: F64) -> tuple[F64, F64]:
     """Power (f, channel) in units of the level, and the level, both at frequencies ``grid``.
 
-    Made white by its cosine modes first: a walk or a ramp would leak all over the spectrum.
+    Made white by its modes first: a walk or a ramp would leak all over the spectrum.
     """
-    n = len(s)
+    n, basis = len(s), s.walk_modes
     level = level[:, list(channels)]
-    modes = cosine_modes(s.values[:, list(channels)]) / np.sqrt(level)
-    white = from_modes(modes)
-    size = 1 << int(np.ceil(np.log2(2 * FINER * n)))
+    place = s.frame - s.frame[0]
+    white = np.zeros((place[-1] + 1, len(channels)))
+    white[place] = basis.series(basis.of(s.values[:, list(channels)]) / np.sqrt(level))
+    size = 1 << int(np.ceil(np.log2(2 * FINER * len(white))))
     power = np.abs(np.fft.rfft(white, size, axis=0)) ** 2 / n
     own = np.arange(len(power)) / (size * s.step_s)
     at = np.arange(1, n) / (2 * n * s.step_s)

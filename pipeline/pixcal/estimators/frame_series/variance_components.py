@@ -1,10 +1,9 @@
 """How much of a series is white and how much wanders: components of its variance.
 
-Series of a run at equal steps are taken to their cosine transform (DCT-II) without the mean. Its
-modes are the eigenvectors of a random walk's covariance, so that white noise and a walk together
-are independent from mode to mode, exactly; other stationary noise is so but for the ends. Each mode
-is then a normal vector of covariance ``sum_i size_i part_i`` about ``known @ beta``. The
-sizes are those of restricted maximum likelihood (Patterson & Thompson 1971, Biometrika 58, 545), by
+Series are taken to their walk modes (`walk_modes`), in which white noise and a walk together are
+independent from mode to mode, exactly; other stationary noise is so but for ends and gaps. Each
+mode is then a normal vector of covariance ``sum_i size_i part_i`` about ``known @ beta``. The sizes
+are those of restricted maximum likelihood (Patterson & Thompson 1971, Biometrika 58, 545), by
 Fisher scoring.
 """
 
@@ -12,7 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.fft import dct, idct
 from scipy.optimize import brentq
 from scipy.special import ndtri_exp
 
@@ -30,26 +28,9 @@ def trace_products(weight: F64, parts: F64) -> F64:
     return np.asarray(products.reshape(len(parts), -1) @ turned.reshape(len(parts), -1).T)
 
 
-def cosine_modes(series: F64) -> F64:
-    """Orthonormal cosine transform of series (t, ...) without their mean: (t - 1, ...)."""
-    return np.asarray(dct(series, type=2, norm="ortho", axis=0)[1:])
-
-
-def from_modes(modes: F64) -> F64:
-    """Series (t, ...) of some cosine modes (t - 1, ...), without mean."""
-    whole = np.concatenate([np.zeros((1, *modes.shape[1:])), modes])
-    return np.asarray(idct(whole, type=2, norm="ortho", axis=0))
-
-
-def walk_power(frames: int) -> F64:
-    """Variance (t - 1) of the cosine modes of a random walk of unit steps."""
-    angle = np.pi * np.arange(1, frames) / (2 * frames)
-    return np.asarray(1 / (4 * np.sin(angle) ** 2))
-
-
 @dataclass(frozen=True)
 class Modes:
-    """Cosine modes of one or more series of ``c`` channels, and the parts of their covariance."""
+    """Walk modes of one or more series of ``c`` channels, and the parts of their covariance."""
 
     values: F64  # (n, c)
     known: F64  # (n, c, p) shapes that are fitted, each by a coefficient

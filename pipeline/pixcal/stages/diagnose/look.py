@@ -172,9 +172,9 @@ def _evidence(
         try:
             return evidence_of(raw, part, shape)
         except InputError as error:
-            raise InputError(f"{run_dir}: in the {which} half of the frames, {error}") from error
+            raise InputError(f"{run_dir}: in the {which} frames, {error}") from error
 
-    halves = list(zip(("first", "second"), raws, strict=True))
+    halves = list(zip(("fitted", "held-out"), raws, strict=True))
     return run_tasks(of_half, halves, runtime.here, label=f"window {number}")
 
 

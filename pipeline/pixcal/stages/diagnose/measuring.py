@@ -202,6 +202,7 @@ def _frames(
         [(f.g[:, 1] + 1j * f.g[:, 2]) * np.exp(1j * a) for f, a in zip(found, turns, strict=True)]
     )
     g = np.stack([np.concatenate([f.g[:, 0] for f in found]), wave.real, wave.imag], axis=1)
+    g = g[np.argsort(np.concatenate([f.frame for f in found]))]
     one = found[0]
     period = float(np.median(np.diff(one.time_s))) if len(one.time_s) > 1 else 0.0
     rows = first_row, one.good.shape[0]

@@ -195,10 +195,9 @@ class NominalBench:
             wanted = np.flatnonzero(np.isin(numbers, half.frames[name]))
             before = None if recording.before is None else taken[recording.before.key]
             own = replace(taken[recording.key], before=before)
-            for first, after in _runs(wanted):
-                for frame, samples in camera.expose(own, range(first, after)):
-                    at = int(np.searchsorted(half.frames[name], numbers[frame]))
-                    arrays[name][at] = samples - np.float32(self.pedestal)
+            for frame, samples in camera.expose(own, wanted.tolist()):
+                at = int(np.searchsorted(half.frames[name], numbers[frame]))
+                arrays[name][at] = samples - np.float32(self.pedestal)
         return Raw(self.acquisition, arrays, select(self.tables, half), self.reduction)
 
     def _of_measured_k(
@@ -280,11 +279,3 @@ class NominalBench:
                 )
             )
         return replace(self.measured, maps=maps, sets=tuple(sets))
-
-
-def _runs(numbers: Indices) -> list[tuple[int, int]]:
-    """Ranges (first, one after the last) of numbers that follow one another."""
-    if not len(numbers):
-        return []
-    cuts = np.flatnonzero(np.diff(numbers) > 1) + 1
-    return [(int(run[0]), int(run[-1]) + 1) for run in np.split(numbers, cuts)]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.kernels.frame_order import runs
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import Indices
 from pixcal.stages import evidence, reduce
@@ -68,15 +69,16 @@ def take(
     """Read a part of a run's frames."""
     arrays = {}
     for name, frames in half.frames.items():
-        read = ingested.arrays[name].read((int(frames[0]), int(frames[-1]) + 1), *part)
-        arrays[name] = read[frames - frames[0]]
+        array = ingested.arrays[name]
+        arrays[name] = np.concatenate([array.read(run, *part) for run in runs(frames)])
     return Raw(acquisition, arrays, select(ingested.tables, half), reduction)
 
 
 def select(tables: Mapping[str, Table], half: Half) -> dict[str, Table]:
-    """Rows of the tables that belong to a half."""
+    """Rows of the tables that belong to a half, with the numbers of the frames."""
     return {
         name: {key: [column[n] for n in frames] for key, column in tables[name].items()}
+        | {"frame": frames.tolist()}
         for name, frames in half.frames.items()
     }
 

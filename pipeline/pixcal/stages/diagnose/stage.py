@@ -1,7 +1,7 @@
 """``pixcal diagnose``: where data and simulation differ, which effect causes it, what remains.
 
-The frames are parted: on the first half effects are fitted, on the second they are tried. Both the
-data and every simulation of them are reduced and fitted by the same stages.
+The frames are parted in blocks: on half of them effects are fitted, on the others they are tried.
+Both the data and every simulation of them are reduced and fitted by the same stages.
 """
 
 import hashlib

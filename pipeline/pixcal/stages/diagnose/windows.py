@@ -1,5 +1,6 @@
 """Which pixels and frames are looked at: all of a small window, some windows of a large one."""
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,13 @@ LARGEST = 288  # rows or columns of a detector that are taken whole; of more, wi
 APART = 4  # sides of a window that a detector has at least where windows lie on chunks
 # samples of a fringe set that are looked at in each half of the frames and each window
 SAMPLES = 6_000_000
-FEWEST = 4  # calibration frames of an exposure time that can be halved; fewer serve both halves
+FEWEST = 4  # calibration frames of an exposure time that can be parted; fewer serve both halves
+# fringe frames in a half: the time that series of them take grows with the square
+MOST_FRAMES = 1500
+# blocks that frames are parted into, and the frames that this takes at least: long blocks leave few
+# frames without the one before, short ones show both halves the same drifts
+BLOCKS = ((16, 384), (8, 192), (4, 32), (2, FEWEST))
+TURN = (False, True, True, False)  # which blocks are held out: a steady drift is alike in both
 
 
 def chosen_windows(shape: tuple[int, int], frames: int = 0) -> tuple[Part, tuple[Part, ...]]:
@@ -75,10 +82,10 @@ class Split:
 
 
 def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = ()) -> Split:
-    """First and second half, in order of time, of every array and exposure time.
+    """Blocks in turn (`TURN`) of every array and exposure time.
 
-    Of long fringe sets the first and the last frames only, `SAMPLES` in each half; without fringes
-    as many of all frames together.
+    Of long fringe sets the blocks are parts, `SAMPLES` in each half; without fringes as many of all
+    frames together.
 
     Parameters
     ----------
@@ -92,16 +99,18 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
     learn, test = {}, {}
     every = {name: _groups(name, table, full_flats) for name, table in tables.items()}
     most = SAMPLES // pixels
-    if not any("/" in name for name in tables):
+    if any("/" in name for name in tables):
+        most = min(most, MOST_FRAMES)
+    else:
         most = _equal_share([len(own) for of_name in every.values() for own in of_name], most)
     for name, of_name in every.items():
-        early, late = [], []
+        fitted, held_out = [], []
         for own in of_name:
             one, other = _halves(own, most)
-            early.append(one)
-            late.append(other)
-        learn[name] = np.sort(np.concatenate(early))
-        test[name] = np.sort(np.concatenate(late))
+            fitted.append(one)
+            held_out.append(other)
+        learn[name] = np.sort(np.concatenate(fitted))
+        test[name] = np.sort(np.concatenate(held_out))
     return Split(Half(learn), Half(test))
 
 
@@ -144,5 +153,10 @@ def _equal_share(counts: Sequence[int], total: int) -> int:
 def _halves(frames: Indices, most: int) -> tuple[Indices, Indices]:
     if len(frames) < FEWEST:
         return frames, frames
-    middle = len(frames) // 2
-    return frames[: min(middle, most)], frames[max(middle, len(frames) - most) :]
+    count = next(blocks for blocks, fewest in BLOCKS if len(frames) >= fewest)
+    edges = [n * len(frames) // count for n in range(count + 1)]
+    halves: tuple[list[Indices], list[Indices]] = ([], [])
+    for n, (first, last) in enumerate(itertools.pairwise(edges)):
+        size = min(last - first, 2 * most // count)
+        halves[TURN[n % len(TURN)]].append(frames[first : first + size])
+    return np.concatenate(halves[0]), np.concatenate(halves[1])

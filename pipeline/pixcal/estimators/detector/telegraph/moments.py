@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
+from pixcal.kernels.frame_order import follows
 from pixcal.model.arrays import F64, Indices
 
 NOISY = 3.0  # excess of the variance, in its own sigmas, from which a pixel's noise is looked at
@@ -23,6 +24,7 @@ class Series:
     """Noise of pixels in frames that follow one another."""
 
     noise: F64  # (t, n) over the common noise, about the pixel's mean; NaN where there is none
+    frame: Indices  # (t,) numbers of the frames
     pixel: Indices  # (n,) which pixels
     sigma: float  # the common noise, e-
     period_s: float  # from frame to frame; nan when unknown
@@ -36,8 +38,9 @@ class Moments:
     count: F64  # samples
     variance: F64
     kurtosis: F64  # excess, unbiased
-    # sum of products of neighbouring frames, over the degrees of freedom of the variance
+    # mean product of neighbouring frames
     neighbours: F64
+    pairs: float  # neighbouring frames, over all but one
     dof: float  # of the variance: fewer than the samples have where pixels differ anyway
     sigma: float
     period_s: float
@@ -72,7 +75,9 @@ def moments_of(series: Series) -> Moments | None:
     variance = square / (n - 1)
     kurtosis = n * (x**4).sum(axis=0) / square**2 - 3
     kurtosis = (n - 1) / ((n - 2) * (n - 3)) * ((n + 1) * kurtosis + 6)
-    neighbours = (x[1:] * x[:-1]).sum(axis=0) / (n - 1)
+    paired = np.flatnonzero(follows(series.frame))
+    pairs = len(paired) / (len(x) - 1)
+    neighbours = (x[paired] * x[paired - 1]).sum(axis=0) / (n - 1) / pairs
     dof = float(np.median(n)) - 1
     centre = np.median(variance) * dof / chdtri(dof, 0.5)
     # Half the pixels lie between the quartiles, whatever the noisy ones do.
@@ -84,6 +89,7 @@ def moments_of(series: Series) -> Moments | None:
         variance / centre,
         kurtosis,
         neighbours / centre,
+        pairs,
         dof / max(float(wide), 1.0) ** 2,
         series.sigma * float(np.sqrt(centre)),
         series.period_s if np.isfinite(series.period_s) and series.period_s > 0 else 1.0,
@@ -102,7 +108,7 @@ def signs(parts: Sequence[Moments]) -> tuple[float, float, int]:
         flat_variance += float(part**4 @ of_kurtosis)
         # Mean and variance for white noise, exact (Moran 1948, Biometrika 35, 255).
         stay += float(part @ (m.neighbours / m.variance + 1 / n))
-        stay_variance += float(part**2 @ ((n - 2) ** 2 / (n**2 * (n - 1))))
+        stay_variance += float(part**2 @ ((n - 2) ** 2 / (n**2 * (n - 1)))) / m.pairs
         noisy.update(m.pixel[m.excess > 0].tolist())
     if not flat_variance:
         return 0.0, 0.0, 0

@@ -9,6 +9,7 @@ from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker, light
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
 from pixcal.estimators.diagnosis.test_statistics.look import Look
+from pixcal.kernels.frame_order import follows
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.model.arrays import F64
 
@@ -68,6 +69,7 @@ def frames_before(look: Look) -> Curve:
     for lag in LAGS:
         other = np.roll(g, lag, axis=0)
         other -= basis @ (basis.T @ other)
+        other[~follows(look.found.frame, lag)] = 0
         size = np.einsum("ti,ij,tj->", other, square, other)
         values.append(float(np.vdot(other, along) / size))
     return Curve(np.array(LAGS, float), np.array(values))
@@ -83,9 +85,9 @@ def contrast_by_step(look: Look) -> Curve:
     slow = np.stack([np.ones(len(phi)), np.linspace(-1, 1, len(phi))], axis=1)
     values = []
     for lag in LAGS[:3]:
-        step = np.cos(phi[lag:] - phi[:-lag])
-        terms = np.column_stack([slow[lag:], step])
-        values.append(float(np.linalg.lstsq(terms, contrast[lag:], rcond=DISTINCT)[0][-1]))
+        own = np.flatnonzero(follows(look.found.frame, lag))
+        terms = np.column_stack([slow[own], np.cos(phi[own] - phi[own - lag])])
+        values.append(float(np.linalg.lstsq(terms, contrast[own], rcond=DISTINCT)[0][-1]))
     return Curve(np.array(LAGS[:3], float), np.array(values))
 
 
@@ -183,5 +185,6 @@ def bias_trend(evidence: Evidence) -> Curve | None:
     for stack in (*evidence.of_kind("bias"), *evidence.of_kind("dark")):
         if len(stack.adu) >= MIN_FRAMES:
             means = frame_means(stack.adu, evidence.good) * evidence.gain
-            values.append(2 * float(np.polyfit(np.linspace(-1, 1, len(means)), means, 1)[0]))
+            time = stack.time_s - stack.time_s.mean()
+            values.append(float(np.polyfit(time / np.ptp(time), means, 1)[0]))
     return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None
