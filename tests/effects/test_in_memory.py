@@ -13,7 +13,7 @@ from pixcal.engine.run import Runtime
 from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
 from pixcal.stages import ingest, reduce, simulate
-from pixcal.stages.diagnose.parts import Half, Raw, take
+from pixcal.stages.diagnose.parts import Raw, take
 from pixcal.stages.diagnose.windows import whole_of
 from pixcal.stages.evidence import evidence_of
 from pixcal.stages.fit.sweep import Config as Sweep
@@ -40,7 +40,7 @@ def raw(tmp_path_factory: pytest.TempPathFactory, make_effect_bench: Callable[..
     run = folder / "run"
     ingest.run(folder / "acq", run, ingest.Config(), SYNC)
     ingested = Ingested(run / "ingest")
-    half = Half({name: np.arange(3, a.shape[0]) for name, a in ingested.arrays.items()})
+    half = {name: np.arange(3, a.shape[0]) for name, a in ingested.arrays.items()}
     part = whole_of(ingested.shape)
     return take(ingested, read_acquisition(run), half, part, reduce.Config())
 

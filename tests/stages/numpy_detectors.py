@@ -129,7 +129,7 @@ def held_against_nominal(
         look(
             Raw(
                 acquisition,
-                {name: array[half.frames[name]] for name, array in arrays.items()},
+                {name: array[half[name]] for name, array in arrays.items()},
                 select(tables, half),
                 reduce.Config(),
             )

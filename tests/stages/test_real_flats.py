@@ -168,10 +168,10 @@ def test_flats_with_full_wells_are_not_diagnosed() -> None:
         "flat": {"exptime_s": [1.0] * 4 + [2.0] * 4, "step": [0] * 8},
     }
     parted = split(tables, 100, full_flats=(4, 5, 6, 7))
-    both = np.concatenate([parted.learn.frames["flat"], parted.test.frames["flat"]])
+    both = np.concatenate([parted.learn["flat"], parted.test["flat"]])
     assert sorted(set(both.tolist())) == [0, 1, 2, 3]
     whole = split(tables, 100, full_flats=range(8))
-    assert len(whole.learn.frames["flat"]) > 0
+    assert len(whole.learn["flat"]) > 0
 
 
 def test_a_curve_that_all_pixels_share_is_no_defect(tmp_path: Path) -> None:

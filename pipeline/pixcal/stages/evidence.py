@@ -188,7 +188,7 @@ def frame_numbers(table: Mapping[str, list[Any]]) -> Indices:
 def _start(ingested: Ingested, name: str) -> float:
     """Time of an array's frame 0 after the first frame of all, s; nan when unknown."""
     begin = {key: _begin(table) for key, table in ingested.tables.items()}
-    return (begin[name] - min(begin.values())) * DAY_S
+    return float(begin[name] - np.min(list(begin.values()))) * DAY_S
 
 
 def _begin(table: Mapping[str, list[Any]]) -> float:

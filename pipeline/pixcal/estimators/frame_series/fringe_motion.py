@@ -79,7 +79,7 @@ def vector_courses(evidence: Evidence) -> list[tuple[str, F64, F64, F64]]:
     """
     found = []
     for fringes in evidence.fringes.values():
-        series = motion_series(fringes)
+        series = motion_series(fringes, every=True)
         if series is None:
             continue
         basis = series.walk_modes

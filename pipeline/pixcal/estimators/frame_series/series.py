@@ -75,11 +75,17 @@ class FrameSeries:
         )
 
 
-def motion_series(found: FringeEvidence) -> FrameSeries | None:
-    """Change of the fringe vector (x, y), rad/px; None where too few frames tell."""
+def motion_series(found: FringeEvidence, *, every: bool = False) -> FrameSeries | None:
+    """Change of the fringe vector (x, y), rad/px; None where too few frames tell.
+
+    Of ``every`` frame, also where it is not known what the frames before and after leave in it.
+    """
     slopes = np.eye(5)[3:]
     return _series(
-        found, lambda free: free[:, 3:5], lambda free: np.broadcast_to(slopes, (len(free), 2, 5))
+        found,
+        lambda free: free[:, 3:5],
+        lambda free: np.broadcast_to(slopes, (len(free), 2, 5)),
+        every=every,
     )
 
 
@@ -114,7 +120,11 @@ def _lit(found: FringeEvidence) -> Mask:
 
 
 def _series(
-    found: FringeEvidence, values: Callable[[F64], F64], slopes: Callable[[F64], F64]
+    found: FringeEvidence,
+    values: Callable[[F64], F64],
+    slopes: Callable[[F64], F64],
+    *,
+    every: bool = False,
 ) -> FrameSeries | None:
     use = _lit(found)
     if use.sum() < FEWEST:
@@ -127,11 +137,15 @@ def _series(
     # A window of one row tells nothing of ky.
     if min(np.diag(noise).min() for noise in noises) <= 0:
         return None
-    # What neighbours leave in a frame is told from those that have both.
     frame, time = found.frame[use], found.time_s[use]
-    inside = with_neighbours(frame)
+    phase = np.arctan2(found.free[use, 2], found.free[use, 1])
+    # What neighbours leave in a frame is told from those that have both.
+    inside = np.arange(len(frame)) if every else with_neighbours(frame)
     if len(inside) < FEWEST // 2:
         return None
+    shapes = np.zeros((len(inside), 0))
+    if not every:
+        shapes = _follows_phase(phase, inside, walk_modes(time[inside]))
     return FrameSeries(
         name=found.name,
         k=found.k,
@@ -140,9 +154,7 @@ def _series(
         exptime_s=found.exptime_s,
         values=taken[0][inside],
         apart=((taken[1] - taken[2]) / 2)[inside],
-        shapes=_follows_phase(
-            np.arctan2(found.free[use, 2], found.free[use, 1]), inside, walk_modes(time[inside])
-        ),
+        shapes=shapes,
         noise=noises[0],
         apart_noise=(noises[1] + noises[2]) / 4,
     )

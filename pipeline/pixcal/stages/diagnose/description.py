@@ -176,7 +176,7 @@ def _light(
     exposure, step = exposure_and_step
     light = np.full(len(numbers), np.nan)
     for one, half in zip(evidence, halves, strict=True):
-        own = np.flatnonzero(np.isin(numbers, half.frames[name]))
+        own = np.flatnonzero(np.isin(numbers, half[name]))
         for stack in one.of_kind("flat"):
             known = np.isfinite(stack.exptime_s)
             same = np.isclose(stack.exptime_s, exposure) if known else exposure == 0

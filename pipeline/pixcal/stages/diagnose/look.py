@@ -143,7 +143,7 @@ def _memory(half: Half, pixels: int, runtime: Runtime) -> tuple[Runtime, Runtime
     That is an estimate beside simulations, here.
     """
     largest, evidence = _samples(half, pixels)
-    frames = sum(len(frames) for name, frames in half.frames.items() if "/" not in name)
+    frames = sum(len(frames) for name, frames in half.items() if "/" not in name)
     held = EVIDENCE_BYTES * evidence + CALIBRATION_BYTES * pixels * frames
     need, estimates = held + LOOK_BYTES * largest, ESTIMATE_BYTES * largest
     for_estimates = make_plan("diagnose", estimates, held, runtime)
@@ -180,22 +180,20 @@ def _evidence(
 
 def _samples(half: Half, pixels: int) -> tuple[int, int]:
     """Samples of a window: of the largest fringe set, and of all; without fringes of all frames."""
-    counts = [len(frames) for name, frames in half.frames.items() if "/" in name]
-    counts = counts or [sum(map(len, half.frames.values()))]
+    counts = [len(frames) for name, frames in half.items() if "/" in name]
+    counts = counts or [sum(map(len, half.values()))]
     return pixels * max(counts), pixels * sum(counts)
 
 
 def shared(own: Split) -> list[str]:
     """Arrays too short to part: effects are fitted and tried on the same frames of them."""
     return [
-        name
-        for name, frames in own.learn.frames.items()
-        if np.intersect1d(frames, own.test.frames[name]).size
+        name for name, frames in own.learn.items() if np.intersect1d(frames, own.test[name]).size
     ]
 
 
 def _enough(half: Half) -> None:
-    for name, frames in half.frames.items():
+    for name, frames in half.items():
         if "/" in name and len(frames) < FEWEST_FRAMES:
             raise InputError(
                 f"{name}: half of its frames are {len(frames)}; diagnose needs {FEWEST_FRAMES} in "
@@ -209,9 +207,7 @@ def plain_part(part: Part) -> list[list[int]]:
 
 
 def _plain_half(half: Half) -> dict[str, list[int]]:
-    return {
-        name: [int(frames[0]), int(frames[-1]), len(frames)] for name, frames in half.frames.items()
-    }
+    return {name: [int(frames[0]), int(frames[-1]), len(frames)] for name, frames in half.items()}
 
 
 def _reduction(run_dir: Path) -> reduce.Config:

@@ -79,7 +79,7 @@ def nominal_bench(
     sets = tuple(
         _set_truth(
             [e.fringes[name] for e in evidence],
-            [half.frames[f"fringes/{name}"] for half in halves],
+            [half[f"fringes/{name}"] for half in halves],
             len(tables[f"fringes/{name}"]["time_s"]),
         )
         for name in names
@@ -129,7 +129,7 @@ def _pixel_noise(
 
 def parted(name: str, halves: Sequence[Half]) -> bool:
     """Whether the parts hold different frames of an array."""
-    first, *others = (set(h.frames.get(name, ())) for h in halves)
+    first, *others = (set(h.get(name, ())) for h in halves)
     return not any(first & other for other in others)
 
 

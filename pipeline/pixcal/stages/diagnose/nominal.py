@@ -181,7 +181,7 @@ class NominalBench:
         camera = Camera(bench, rows, [measured, *effects])
         arrays = {
             name: np.empty((len(frames), *bench.detector.shape), self.dtypes[name])
-            for name, frames in half.frames.items()
+            for name, frames in half.items()
         }
         levels = measured.lamp.levels(self.recordings, undone)
         taken = {
@@ -192,11 +192,11 @@ class NominalBench:
             for r in self.recordings
         }  # fmt: skip
         for recording, (name, numbers) in zip(self.recordings, self.places, strict=True):
-            wanted = np.flatnonzero(np.isin(numbers, half.frames[name]))
+            wanted = np.flatnonzero(np.isin(numbers, half[name]))
             before = None if recording.before is None else taken[recording.before.key]
             own = replace(taken[recording.key], before=before)
             for frame, samples in camera.expose(own, wanted.tolist()):
-                at = int(np.searchsorted(half.frames[name], numbers[frame]))
+                at = int(np.searchsorted(half[name], numbers[frame]))
                 arrays[name][at] = samples - np.float32(self.pedestal)
         return Raw(self.acquisition, arrays, select(self.tables, half), self.reduction)
 

@@ -23,14 +23,9 @@ from pixcal.stages.reduce.ingested import Ingested
 
 Frames = NDArray[Any]
 Table = Mapping[str, list[Any]]
-
-
-@dataclass(frozen=True)
-class Half:
-    """Some frames of every array of an acquisition."""
-
-    # numbers of the frames (ascending) by name of the array, e.g. ``bias``, ``fringes/vertical``.
-    frames: Mapping[str, Indices]
+# some frames of an acquisition: their numbers (t,), ascending, by the name of the array, such as
+# ``bias`` or ``fringes/vertical``
+Half = Mapping[str, Indices]
 
 
 @dataclass(frozen=True)
@@ -68,7 +63,7 @@ def take(
 ) -> Raw:
     """Read a part of a run's frames."""
     arrays = {}
-    for name, frames in half.frames.items():
+    for name, frames in half.items():
         array = ingested.arrays[name]
         arrays[name] = np.concatenate([array.read(run, *part) for run in runs(frames)])
     return Raw(acquisition, arrays, select(ingested.tables, half), reduction)
@@ -79,7 +74,7 @@ def select(tables: Mapping[str, Table], half: Half) -> dict[str, Table]:
     return {
         name: {key: [column[n] for n in frames] for key, column in tables[name].items()}
         | {"frame": frames.tolist()}
-        for name, frames in half.frames.items()
+        for name, frames in half.items()
     }
 
 

@@ -111,7 +111,7 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
             held_out.append(other)
         learn[name] = np.sort(np.concatenate(fitted))
         test[name] = np.sort(np.concatenate(held_out))
-    return Split(Half(learn), Half(test))
+    return Split(learn, test)
 
 
 def _groups(name: str, table: Table, full_flats: Sequence[int]) -> list[Indices]:
