@@ -159,6 +159,27 @@ def test_crosstalk_of_every_other_row_is_not_taken_for_it(
         assert found.significance < 4
 
 
+def test_ghosts_of_both_fibres_need_not_be_in_phase(acquired: Callable[..., Evidence]) -> None:
+    """Their static pattern is the sum of both, whatever is between them."""
+    of_one, of_other = 0.004, 0.004 * np.exp(2j)
+    static = of_one + of_other
+    wave = {
+        "beat_rad_px": [0.35, 0.2],
+        "static": [static.real, -static.imag],
+        "forward": [of_one, 0.0],
+        "backward": [of_other.real, -of_other.imag],
+    }
+    evidence = acquired(None, {"ghost_fringes": {"share": 0.0, "waves": [wave]}})
+    found = GhostFringes.estimate(evidence)
+    assert found is not None
+    assert found.significance > 20
+    assert found.law == "ghosts of both fibres"
+    assert not found.effect.in_flats
+    for one, other in zip(found.effect.waves, found.by_law.waves, strict=True):
+        np.testing.assert_allclose(one.static, other.static, atol=1e-3)
+        np.testing.assert_allclose(one.forward, other.forward, atol=1e-3)
+
+
 def test_a_pattern_of_mean_light_and_fringes_alike_in_all_sets_is_the_flats(
     acquired: Callable[..., Evidence],
 ) -> None:

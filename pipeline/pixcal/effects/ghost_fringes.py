@@ -15,7 +15,15 @@ from pixcal.simulation.effect import Effect, Estimate, FringeMaps, Stage
 from pixcal.simulation.recording import Recording
 
 PARENTS = ("modulated", "fixed", "both", "crossed")
+# static, forward and backward fringes by the ghost of one fibre, of one amplitude; laws of the
+# amplitudes
+SINGLE = {
+    "static fringes alone: a ghost crossed in polarisation with the other fibre": (1, 0, 0),
+    "ghost of the modulated fibre: static and moving fringes": (1, 1, 0),
+    "ghost of the fixed fibre: static and moving fringes": (1, 0, 1),
+}
 BOTH = "ghosts of both fibres"
+TWO_GHOSTS = 25.0  # chi-square of a wave that the second ghost must explain at least
 UNTIED = 0.5  # share of the chi-square of the waves that the law of a beam may leave
 # differences between sets, relative and in errors, of a pattern that is the flat's
 ALIKE, ALIKE_SIGMAS = 0.1, 5.0
@@ -209,35 +217,55 @@ def _law(
     waves: Sequence[WaveFit], middle: tuple[float, float]
 ) -> tuple[str, tuple[GhostWave, ...], float]:
     """Law of the amplitudes, the waves that follow it, and the share of chi-square it leaves."""
-    laws = {
-        "static fringes alone: a ghost crossed in polarisation with the other fibre": (1, 0, 0),
-        "ghost of the modulated fibre: static and moving fringes": (1, 1, 0),
-        "ghost of the fixed fibre: static and moving fringes": (1, 0, 1),
-        BOTH: (2, 1, 1),
-    }
-    best = None
-    for law, (s, f, b) in laws.items():
-        misfit, tied = 0.0, []
-        for w in waves:
-            # One complex amplitude: static s·a, forward f·a, backward b·conj(a).
-            weights = [s**2 / w.errors[0] ** 2, f**2 / w.errors[1] ** 2, b**2 / w.errors[2] ** 2]
-            parts = [w.static / s, w.forward, w.backward.conjugate()]
-            amplitude = complex(np.average(parts, weights=weights))
-            own = (s * amplitude, f * amplitude, b * amplitude.conjugate())
-            for value, wanted, error in zip(
-                (w.static, w.forward, w.backward), own, w.errors, strict=False
-            ):
-                misfit += abs(value - wanted) ** 2 / error**2
-            tied.append(_wave(replace(w, static=own[0], forward=own[1], backward=own[2]), middle))
-        if best is None or misfit < best[0]:
-            best = misfit, law, tuple(tied)
-    assert best is not None
-    total = sum(
-        abs(v) ** 2 / e**2
-        for w in waves
-        for v, e in zip((w.static, w.forward, w.backward), w.errors, strict=False)
+    laws = {law: [_tied(w, weights) for w in waves] for law, weights in SINGLE.items()}
+    both = [_tied_of_both(w) for w in waves]
+
+    def misfit(tied: Sequence[Tied]) -> float:
+        return sum(one.misfit for one in tied)
+
+    law = min(laws, key=lambda name: misfit(laws[name]))
+    best = laws[law]
+    # Two ghosts have more free numbers, and must explain much that one does not.
+    if misfit(best) > 2 * misfit(both) + TWO_GHOSTS * len(waves):
+        law, best = BOTH, both
+    left = misfit(best) / max(sum(one.unrelated for one in best), 1e-300)
+    return law, tuple(_wave(one.wave, middle) for one in best), left
+
+
+@dataclass(frozen=True)
+class Tied:
+    """A wave whose amplitudes follow a law."""
+
+    wave: WaveFit
+    misfit: float  # chi-square that the law leaves,
+    unrelated: float  # and that it leaves of unrelated amplitudes of these sizes
+
+
+def _tied(w: WaveFit, weights: tuple[int, int, int]) -> Tied:
+    """Of one complex amplitude: static s·a, forward f·a, backward b·conj(a)."""
+    amplitudes = np.array([w.static, w.forward, w.backward.conjugate()])
+    information = 1 / np.array(w.errors[:3]) ** 2
+    unit = np.array(weights)
+    a = complex((information * unit) @ amplitudes / ((information * unit) @ unit))
+    s, f, b = (complex(v) for v in a * unit)
+    misfit = float(information @ np.abs(amplitudes - a * unit) ** 2)
+    tied = replace(w, static=s, forward=f, backward=b.conjugate())
+    return Tied(tied, misfit, float(information @ np.abs(amplitudes) ** 2))
+
+
+def _tied_of_both(w: WaveFit) -> Tied:
+    """Of an amplitude for each fibre's ghost: the static fringes are those of both."""
+    variance = np.array(w.errors[:3]) ** 2
+    sizes = np.abs([w.static, w.forward, w.backward])
+    off = (w.static - w.forward - w.backward.conjugate()) / float(variance.sum())
+    tied = replace(
+        w,
+        static=w.static - off * variance[0],
+        forward=w.forward + off * variance[1],
+        backward=w.backward + off.conjugate() * variance[2],
     )
-    return best[1], best[2], best[0] / total
+    total = float(variance.sum())
+    return Tied(tied, abs(off) ** 2 * total, float(sizes @ sizes) / total)
 
 
 def _of_the_flat(waves: Sequence[WaveFit], evidence: Evidence) -> bool:

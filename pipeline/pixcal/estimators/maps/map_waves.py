@@ -108,7 +108,8 @@ def find_waves(evidence: Evidence) -> Waves | None:
         return None
     ways = {still: {f.name: _maps(f, evidence, still) for f in sets} for still in (False, True)}
     allowed = _allowed(sets)
-    in_flats = max(ways, key=lambda way: _second_best(ways[way], allowed))
+    light, flats = (_static_gain(ways[still], allowed) for still in (False, True))
+    in_flats = flats > light + APART
     best = _strongest(ways[in_flats], allowed, in_flats)
     waves = list(best.waves)
     if best.significance > SIGNIFICANT:
@@ -138,18 +139,13 @@ def _maps(fringes: FringeEvidence, evidence: Evidence, in_flats: bool) -> list[_
     ]
 
 
-def _second_best(maps: Maps, allowed: Mask) -> float:
-    """Chi-square of the wave that is strongest in all maps, in the map that shows it second best.
+def _static_gain(maps: Maps, allowed: Mask) -> float:
+    """Chi-square of the wave that is strongest in all maps, in light or flats.
 
     A pattern of the light that flats share is in flats and visibility, not in light over flat.
     """
-    common = sum((_power(own, allowed) for own in maps.values()), np.zeros(allowed.shape))
-    q = _vector(common)
-    gains: dict[str, float] = {}
-    for own in maps.values():
-        for m in own:
-            gains[m.kind] = gains.get(m.kind, 0.0) + _plain_gain(m, q)
-    return sorted(gains.values())[-2]
+    q = _vector(sum((_power(own, allowed) for own in maps.values()), np.zeros(allowed.shape)))
+    return sum(_plain_gain(own[0], q) for own in maps.values())
 
 
 def _strongest(maps: Maps, allowed: Mask, in_flats: bool) -> Waves:
