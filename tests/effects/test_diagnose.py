@@ -259,10 +259,10 @@ def test_a_corner_without_light_is_left_out(
     ingest.run(acquisition, other, ingest.Config(), SYNC)
     reduce.run(other, reduce.Config(), SYNC)
     look = look_at(other, SYNC)
-    (left,) = look.facts["left_out"]
-    assert left["window"] == [[9, 49], [9, 49]]
-    assert left["reason"]
-    assert len(look.facts["tried_on"]["windows"]) == len(look.windows) == 3
+    (left,) = look.facts.left_out
+    assert left.window == ((9, 49), (9, 49))
+    assert left.reason
+    assert len(look.facts.tried_on.windows) == len(look.windows) == 3
     # Nothing of the one that failed gets into those after it.
     levels = [w.bench.measured.sets[0].light.mean() for w in look.windows]
     assert min(levels) > 0.5 * max(levels) > 1000
@@ -270,7 +270,7 @@ def test_a_corner_without_light_is_left_out(
 
 def test_frames_too_few_to_part_are_named(reduced: Callable[..., Path]) -> None:
     changes = {"frames.bias": 3, "frames.fringes.0.count": 60, "frames.fringes.1.count": 60}
-    assert look_at(reduced(None, changes), SYNC).facts["shared"] == ["bias"]
+    assert look_at(reduced(None, changes), SYNC).facts.shared == ("bias",)
 
 
 OWN = '''

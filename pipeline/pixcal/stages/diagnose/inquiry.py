@@ -16,10 +16,12 @@ from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
+from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Again, Effect, Estimate
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
-from pixcal.stages.diagnose.look import DiagnosisInput, look_at, plain_part
+from pixcal.stages.diagnose.look import DiagnosisInput, look_at
+from pixcal.stages.diagnose.looked_at import LookedAt
 from pixcal.stages.diagnose.recommended_frames import MORE
 from pixcal.stages.diagnose.result import by_domain
 from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Search
@@ -160,7 +162,7 @@ def places(made: Inquiry) -> list[dict[str, Any]]:
         if made.found.accepted:
             bench = (*made.base, *made.found.final.effects)
             final = compare(data, expect_with(own, trials.of_window(number, bench, CONFIRM)))
-        places.append({"window": plain_part(window.part), "domains": by_domain(nominal, final)})
+        places.append({"window": to_plain(window.part), "domains": by_domain(nominal, final)})
     return places
 
 
@@ -182,13 +184,11 @@ def _candidates(
     return candidates
 
 
-def _needs(kind: type[Effect], facts: Mapping[str, Any]) -> str:
+def _needs(kind: type[Effect], facts: LookedAt) -> str:
     """Frames without which an effect cannot be estimated."""
-    frames = [
-        words for name, words in facts["missing_frames"].items() if name in kind.frames_needed
-    ]
+    frames = [words for name, words in facts.missing_frames.items() if name in kind.frames_needed]
     if not frames:
-        frames = [MORE if facts["sets"] else "fringes"]
+        frames = [MORE if facts.sets else "fringes"]
     return f"needs frames that this acquisition lacks: {' or '.join(frames)}"
 
 

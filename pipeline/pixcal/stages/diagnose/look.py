@@ -3,9 +3,6 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from pixcal.engine.plan import Plan, make_plan
 from pixcal.engine.run import Runtime, run_tasks
@@ -14,11 +11,12 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages import reduce
+from pixcal.stages.diagnose.looked_at import LeftOut, LookedAt
 from pixcal.stages.diagnose.measuring import nominal_bench
 from pixcal.stages.diagnose.parts import Half, Raw, evidence_of, take
 from pixcal.stages.diagnose.recommended_frames import missing_frames
 from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, looked_at
-from pixcal.stages.diagnose.windows import Split, chosen_windows, frames_of_half, split
+from pixcal.stages.diagnose.windows import chosen_windows, frames_of_half, split
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.storage.artefact import read_json
@@ -42,7 +40,7 @@ class DiagnosisInput:
     windows: tuple[Window, ...]  # that they are tried on
     each: tuple[Curves, ...]  # curves of the test frames of each window
     measured: Curves  # their mean
-    facts: dict[str, Any]  # what is told of it
+    facts: LookedAt
     # runtime, few: with as many workers as fit the memory: of simulations, and of estimates
     runtime: Runtime
     few: Runtime
@@ -82,7 +80,7 @@ def look_at(
     runtime, few, room = _memory(own.test, pixels, runtime)
     dtypes = {name: array.dtype for name, array in ingested.arrays.items()}
     windows: list[Window] = []
-    left_out: list[dict[str, Any]] = []
+    left_out: list[LeftOut] = []
     measured: list[Curves] = []
     signatures: tuple[Signature, ...] = ()
     seed: int | None = None
@@ -96,7 +94,7 @@ def look_at(
             # In a corner there may be no light; effects are fitted in the middle.
             if part == first or len(left_out) == len(parts) - 1:
                 raise
-            left_out.append({"window": plain_part(part), "reason": str(error)})
+            left_out.append(LeftOut(part, str(error)))
             continue
         finally:
             del raws
@@ -110,21 +108,15 @@ def look_at(
         if part in parts:
             measured.append(looked_at(halves[1], signatures))
     tried = tuple(w for w in windows if w.part in parts)
-    facts = {
-        "shape": list(shape),
-        "fitted_on": {"window": plain_part(first), "frames": _plain_half(own.learn)},
-        "tried_on": {
-            "windows": [plain_part(w.part) for w in tried],
-            "frames": _plain_half(own.test),
-        },
-        "left_out": left_out,
-        "shared": shared(own),
-        "kinds": [kind for kind in ("bias", "dark", "flat") if kind in ingested.tables],
-        "sets": {s.name: list(s.baseline_mm) for s in acquisition.frames.fringes},
-        "missing_frames": missing_frames(
-            acquisition, ingested.tables, [s.step for s in windows[0].bench.measured.sets]
-        ),
-    }
+    steps = [s.step for s in windows[0].bench.measured.sets]
+    facts = LookedAt.of(
+        shape,
+        (first, own.learn),
+        (tuple(w.part for w in tried), own.test),
+        tuple(left_out),
+        {s.name: s.baseline_mm for s in acquisition.frames.fringes},
+        missing_frames(acquisition, ingested.tables, steps),
+    )
     return DiagnosisInput(
         windows[0], tried, tuple(measured), averaged(measured), facts, runtime, few, room
     )
@@ -185,13 +177,6 @@ def _samples(half: Half, pixels: int) -> tuple[int, int]:
     return pixels * max(counts), pixels * sum(counts)
 
 
-def shared(own: Split) -> list[str]:
-    """Arrays too short to part: effects are fitted and tried on the same frames of them."""
-    return [
-        name for name, frames in own.learn.items() if np.intersect1d(frames, own.test[name]).size
-    ]
-
-
 def _enough(half: Half) -> None:
     for name, frames in half.items():
         if "/" in name and len(frames) < FEWEST_FRAMES:
@@ -199,15 +184,6 @@ def _enough(half: Half) -> None:
                 f"{name}: half of its frames are {len(frames)}; diagnose needs {FEWEST_FRAMES} in "
                 "each half: it fits effects on one and tests them on the other"
             )
-
-
-def plain_part(part: Part) -> list[list[int]]:
-    """Rows and columns of a part, as in the product."""
-    return [list(part[0]), list(part[1])]
-
-
-def _plain_half(half: Half) -> dict[str, list[int]]:
-    return {name: [int(frames[0]), int(frames[-1]), len(frames)] for name, frames in half.items()}
 
 
 def _reduction(run_dir: Path) -> reduce.Config:

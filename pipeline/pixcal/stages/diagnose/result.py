@@ -18,6 +18,7 @@ from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place
 from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
+from pixcal.stages.diagnose.looked_at import LookedAt
 from pixcal.stages.diagnose.recommended_frames import recommend_frames
 from pixcal.stages.diagnose.shrinkage import Shrinkage, Trial, differing, shrinkage
 
@@ -36,7 +37,7 @@ def describe(
     data: Mapping[Key, F64],
     measured: Mapping[Key, Curve],
     reference: Reference,
-    facts: Mapping[str, Any],
+    facts: LookedAt,
     places: Sequence[Mapping[str, Any]] = (),
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The product, and every curve as measured, nominal and with the effects found.
@@ -49,8 +50,7 @@ def describe(
     measured : mapping
         The same in their own units.
     reference : Reference
-    facts : mapping
-        What was looked at.
+    facts : LookedAt
     places : sequence of mapping
         How far windows are off by themselves, `by_domain`.
     """
@@ -78,12 +78,12 @@ def describe(
         },
         "candidates": [_candidate(c, found, data, where) for c in found.candidates.values()],
         "more_would_tell": (
-            recommend_frames(facts["missing_frames"])
+            recommend_frames(facts.missing_frames)
             if verdict in ("unexplained", "partly explained")
             else []
         ),
         "statistics": len(final.before),
-        "looked_at": dict(facts),
+        "looked_at": to_plain(facts),
     }
     return diagnosis, curves
 
@@ -118,22 +118,13 @@ def _verdict(found: SearchResult, final: Shrinkage) -> str:
     return "explained" if final.gap.total <= EXPLAINED and not still else "partly explained"
 
 
-def _on_the_same_pixels(facts: Mapping[str, Any]) -> bool:
-    """Whether effects are tried on pixels that they were fitted on."""
-    fitted = facts["fitted_on"]["window"]
-    return any(
-        all(a[0] < b[1] and b[0] < a[1] for a, b in zip(fitted, window, strict=True))
-        for window in facts["tried_on"]["windows"]
-    )
-
-
 def _cause(
     name: str,
     found: SearchResult,
     data: Mapping[Key, F64],
     where: set[Key],
     final: Shrinkage,
-    facts: Mapping[str, Any],
+    facts: LookedAt,
 ) -> dict[str, Any]:
     candidate = found.candidates[name]
     estimate = candidate.estimate
@@ -152,7 +143,7 @@ def _cause(
     own = estimate.significance * candidate.share
     log_both = max(float(log_ndtr(-own)) - max(gain, 0.0), -600.0)
     chance = np.exp(log_both) * (1 - log_both)
-    same_samples = facts["shared"] and not facts["sets"] and _on_the_same_pixels(facts)
+    same_samples = facts.shared and not facts.sets and facts.on_the_same_pixels
     if same_samples or candidate.in_maps_alone:
         # Both parts hold the same samples, or the same offsets: the second says nothing new.
         chance = float(ndtr(-own))
@@ -176,7 +167,7 @@ def _cause(
         "why": estimate.why,
         "given_away_by": _telling(found.without[name], found.final, data),
         "not_told_apart_from": list(alike),
-        "would_decide": recommend_frames(facts["missing_frames"], kinds) if alike else [],
+        "would_decide": recommend_frames(facts.missing_frames, kinds) if alike else [],
     }
 
 

@@ -1,0 +1,86 @@
+"""Frames and windows that a diagnosis looked at, as the product names them."""
+
+from dataclasses import dataclass
+from typing import Self
+
+from pixcal.stages.diagnose.parts import Half
+from pixcal.stages.evidence import Part
+
+# of an array: first and last frame, and how many
+Frames = dict[str, tuple[int, int, int]]
+
+
+def frames_of(half: Half) -> Frames:
+    """Frames of a half, by array."""
+    return {name: (int(own[0]), int(own[-1]), len(own)) for name, own in half.items()}
+
+
+@dataclass(frozen=True)
+class FittedOn:
+    """Where effects were fitted."""
+
+    window: Part
+    frames: Frames
+
+
+@dataclass(frozen=True)
+class TriedOn:
+    """Where effects were tried."""
+
+    windows: tuple[Part, ...]
+    frames: Frames
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A window that could not be fitted."""
+
+    window: Part
+    reason: str
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """What a diagnosis looked at."""
+
+    shape: tuple[int, int]  # rows and columns of the detector
+    fitted_on: FittedOn
+    tried_on: TriedOn
+    left_out: tuple[LeftOut, ...]
+    # arrays too short to part: effects are fitted and tried on the same frames of them
+    shared: tuple[str, ...]
+    kinds: tuple[str, ...]  # of calibration frames
+    sets: dict[str, tuple[float, float]]  # baseline of each fringe set, mm
+    missing_frames: dict[str, str]  # `recommended_frames.missing_frames`
+
+    @classmethod
+    def of(
+        cls,
+        shape: tuple[int, int],
+        fitted: tuple[Part, Half],
+        tried: tuple[tuple[Part, ...], Half],
+        left_out: tuple[LeftOut, ...],
+        sets: dict[str, tuple[float, float]],
+        missing_frames: dict[str, str],
+    ) -> Self:
+        """Of windows, and the frames of both halves."""
+        (window, learn), (windows, test) = fitted, tried
+        return cls(
+            shape,
+            FittedOn(window, frames_of(learn)),
+            TriedOn(windows, frames_of(test)),
+            left_out,
+            tuple(name for name, frames in learn.items() if set(frames) & set(test[name])),
+            tuple(kind for kind in ("bias", "dark", "flat") if kind in learn),
+            sets,
+            missing_frames,
+        )
+
+    @property
+    def on_the_same_pixels(self) -> bool:
+        """Whether effects were tried on pixels that they were fitted on."""
+        (y0, y1), (x0, x1) = self.fitted_on.window
+        return any(
+            y0 < b1 and b0 < y1 and x0 < a1 and a0 < x1
+            for (b0, b1), (a0, a1) in self.tried_on.windows
+        )
