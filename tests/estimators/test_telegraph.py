@@ -1,5 +1,7 @@
 """Telegraph noise by its moments: unbiased however faint and slow; likelihoods against SciPy."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from scipy.special import logsumexp
@@ -12,14 +14,20 @@ PERIOD_S = 0.14
 
 
 def jumping(
-    rng: np.random.Generator, share: float, amplitude: float, switching_s: float
+    rng: np.random.Generator,
+    share: float,
+    amplitude: float,
+    switching_s: float,
+    decades: float = 0.0,
+    frames_of_series: Sequence[int] = (30, 20),
 ) -> list[Series]:
-    """Two series of the same pixels, of noise one and jumps with amplitudes about ``amplitude``."""
+    """Series of the same pixels, of noise one and jumps with amplitudes about ``amplitude``."""
     n = 16_000
+    times = switching_s * 10 ** (decades * (rng.random(n) - 0.5)) if decades else switching_s
     jumps = np.where(rng.random(n) < share, amplitude * rng.standard_exponential(n), 0.0)
     series = []
-    for frames in (30, 20):
-        anew = rng.random((frames, n)) < 1 - np.exp(-2 * PERIOD_S / switching_s)
+    for frames in frames_of_series:
+        anew = rng.random((frames, n)) < 1 - np.exp(-2 * PERIOD_S / times)
         turns = np.where(anew & (rng.random((frames, n)) < 0.5), -1.0, 1.0)
         turns[0] = rng.choice([-1.0, 1.0], n)
         noise = rng.standard_normal((frames, n)) + np.cumprod(turns, axis=0) * jumps / 2
@@ -40,6 +48,7 @@ def test_pixels_that_hardly_stand_out_tell_share_amplitude_and_time(
     assert abs(found.amplitude - amplitude) < 4 * found.amplitude_error < amplitude
     assert abs(found.switching_s - switching_s) < 4 * found.switching_error < 2 * switching_s
     assert found.significance > 8
+    assert found.switching_decades == 0
 
 
 def test_of_stays_longer_than_the_frames_no_more_is_said() -> None:
@@ -63,3 +72,11 @@ def test_the_likelihood_is_that_of_all_classes_even_where_numbers_underflow() ->
     quiet = 1 - weight.sum()
     np.testing.assert_allclose(chance, np.exp(wanted - np.logaddexp(np.log(quiet), wanted)))
     np.testing.assert_allclose(of_class.sum(axis=1), 1)
+
+
+def test_times_that_differ_from_pixel_to_pixel_are_told() -> None:
+    found = find_telegraph(jumping(np.random.default_rng(9), 0.03, 8.0, 1.2, 1.5, (60, 60)))
+    assert found is not None
+    assert found.switching_decades > 1
+    assert abs(found.switching_s - 1.2) < 4 * found.switching_error
+    assert abs(found.share - 0.03) < 4 * found.share_error

@@ -6,6 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from pixcal.estimators.detector.telegraph.classes import Stays
 from pixcal.estimators.detector.telegraph.find import Telegraph, find_telegraph
 from pixcal.estimators.detector.telegraph.moments import Series
 from pixcal.estimators.diagnosis.distortions import Freedom
@@ -66,18 +67,25 @@ class TelegraphNoise(Effect):
         1.0, low=0.01, high=100, doc="shape of the gamma distribution of amplitudes; 1: "
         "exponential, large: equal amplitudes"
     )  # fmt: skip
+    switching_decades: float = quantity(
+        0.0, low=0, high=6, doc="range of the times from pixel to pixel, even in the logarithm; "
+        "switching_s is the geometric mean"
+    )  # fmt: skip
 
     def readout(self, adu: F32, shot: Shot) -> F32:
         found = adu.copy()
         detector, recording = shot.bench.detector, shot.recording
-        keep = float(np.exp(-2 * recording.period_s / self.switching_s)) if self.switching_s else 0
+        stays = Stays(self.switching_s, self.switching_decades)
         first, last = shot.rows
         for block in range(first // BLOCK_ROWS, -(-last // BLOCK_ROWS)):
-            rows, columns, amplitudes = _pixels(detector, block, self.share, self.amplitude_shape)
+            rows, columns, amplitudes, places = _pixels(
+                detector, block, self.share, self.amplitude_shape
+            )
             if not len(rows):
                 continue
             seed = int(recording.pixel_rng(self.name, block).integers(1 << 62))
-            states = _states(seed, recording.count, len(rows), keep)
+            keep = np.broadcast_to(stays.kept(recording.period_s, places), len(rows))
+            states = _states(seed, recording.count, keep.tobytes())
             up = np.unpackbits(states[shot.frame], count=len(rows))
             step = (up - np.float32(0.5)) * amplitudes * np.float32(self.amplitude_e)
             inside = (rows >= first) & (rows < last)
@@ -106,7 +114,7 @@ class TelegraphNoise(Effect):
 
 def _estimate(cls: type[TelegraphNoise], found: Telegraph) -> Estimate:
     return Estimate(
-        cls(found.share, found.amplitude, found.switching_s, found.shape),
+        cls(found.share, found.amplitude, found.switching_s, found.shape, found.switching_decades),
         {
             "share": found.share_error,
             "amplitude_e": found.amplitude_error,
@@ -122,8 +130,8 @@ def _estimate(cls: type[TelegraphNoise], found: Telegraph) -> Estimate:
 @lru_cache(maxsize=4)
 def _pixels(
     detector: SimulatedDetector, block: int, share: float, shape: float
-) -> tuple[Indices, Indices, F32]:
-    """Rows and columns of the pixels of a block that have it, and amplitudes of mean one."""
+) -> tuple[Indices, Indices, F32, F32]:
+    """Pixels of a block that have it: rows, columns, amplitudes of mean one, places among stays."""
     rows = block * BLOCK_ROWS, min((block + 1) * BLOCK_ROWS, detector.shape[0])
 
     def draw(rng: np.random.Generator) -> F64:
@@ -133,14 +141,19 @@ def _pixels(
         return np.where(chance < share, amplitude, 0)
 
     amplitudes = chip_map(detector, rows, TelegraphNoise.name, draw)
+    places = chip_map(detector, rows, f"{TelegraphNoise.name} stays", lambda rng: rng.random(TILE))
     y, x = np.nonzero(amplitudes)
-    return y + rows[0], x, amplitudes[y, x]
+    return y + rows[0], x, amplitudes[y, x], places[y, x]
 
 
 @lru_cache(maxsize=4)
-def _states(seed: int, frames: int, pixels: int, keep: float) -> U8:
-    """Whether each pixel is in its upper level, in bits: (frame, pixel / 8)."""
-    rng = np.random.default_rng(seed)
+def _states(seed: int, frames: int, kept: bytes) -> U8:
+    """Whether each pixel is in its upper level, in bits: (frame, pixel / 8).
+
+    Of each pixel, float64, the correlation from frame to frame.
+    """
+    rng, keep = np.random.default_rng(seed), np.frombuffer(kept)
+    pixels = len(keep)
     up = np.zeros(pixels, bool)
     packed = []
     for first in range(0, frames, _FRAMES_AT_ONCE):

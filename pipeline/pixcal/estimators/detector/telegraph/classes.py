@@ -11,11 +11,12 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import logsumexp, softmax
 
-from pixcal.estimators.detector.telegraph.moments import Moments
-from pixcal.model.arrays import F64, Indices
+from pixcal.estimators.detector.telegraph.moments import LAGS, Moments
+from pixcal.model.arrays import F32, F64, Indices
 
 AMPLITUDES = np.geomspace(0.1, 300, 90)  # amplitudes over the common noise that are looked at
 _DRAWN = 600
+PLACES = (np.arange(5) + 0.5) / 5  # of pixels in the range of their stays
 _UNDERFLOW = 1e-200
 
 
@@ -26,11 +27,11 @@ class AmplitudeClasses:
     likely: F64  # (n, class) likelihood of each pixel's variance over the largest of its own
     largest: F64  # (n, 1) the logarithm of that, over the likelihood of a quiet pixel
     added: F64  # (class,) variance that an amplitude adds, over the common one
-    chances: F64  # chances, products: (level, class) from `_levels`
+    chances: F64  # chances, products: (level, class) and (lag, level, class) from `_levels`
     products: F64
 
     @classmethod
-    def of(cls, m: Moments, unit: float, switching_s: float) -> "AmplitudeClasses":
+    def of(cls, m: Moments, unit: float, stays: "Stays") -> "AmplitudeClasses":
         """Likelihoods of the moments of each pixel."""
         added = (AMPLITUDES * unit / m.sigma / 2) ** 2
         levels = m.variance[:, None] * (added / (1 + added))
@@ -39,8 +40,7 @@ class AmplitudeClasses:
         largest = levels.max(axis=1, keepdims=True)
         levels -= largest
         np.exp(levels, out=levels)
-        keep = float(np.exp(-2 * m.period_s / switching_s)) if switching_s > 0 else 0.0
-        of_levels = _levels(keep, m.frames)
+        of_levels = _levels(tuple(stays.kept(m.period_s, PLACES).tolist()), m.frames)
         return cls(levels, largest, added, *of_levels)
 
     def mixed(self) -> F64:
@@ -55,13 +55,28 @@ class AmplitudeClasses:
         mixed += self.largest
         return mixed
 
-    def neighbours(self) -> F64:
-        """Products of neighbouring frames (n, class) to be expected, as in `Moments`."""
-        return np.asarray((self.likely @ self.products) * self.added / self.mixed())
+    def expected(self, lag: int) -> F64:
+        """Products of frames (n, class) to be expected, as in `Moments`, of one of its lags."""
+        return np.asarray((self.likely @ self.products[lag]) * self.added / self.mixed())
+
+
+@dataclass(frozen=True)
+class Stays:
+    """How long pixels stay in a level."""
+
+    mean_s: float  # geometric mean over the pixels; 0: no longer than a frame
+    decades: float = 0.0  # range of the pixels' times, even in the logarithm
+
+    def kept(self, period_s: float, places: F32 | F64) -> F64:
+        """Correlation from frame to frame of pixels at places in the range, 0 to 1."""
+        if not self.mean_s > 0:
+            return np.zeros(1)
+        times = self.mean_s * 10 ** (self.decades * (places.astype(float) - 0.5))
+        return np.asarray(np.exp(-2 * period_s / times))
 
 
 @lru_cache(maxsize=64)
-def _levels(keep: float, count: int) -> tuple[F64, F64]:
+def _levels(keeps: tuple[float, ...], count: int) -> tuple[F64, F64]:
     """What a pixel of an amplitude shows in a number of frames, by its stays.
 
     One that stays long shows more or less of its two levels, or only one: it looks as if it had
@@ -71,24 +86,29 @@ def _levels(keep: float, count: int) -> tuple[F64, F64]:
     -------
     chances : (level, class) float64
         That a pixel of a class has the variance that those of another have on average.
-    products : (level, class) float64
-        That chance, times the products of neighbouring frames it then has over its full variance.
+    products : (lag, level, class) float64
+        That chance, times the products of frames apart it then has over its full variance.
     """
     rng = np.random.default_rng(0)
+    keep = np.resize(keeps, _DRAWN)
     turns = np.where(rng.random((count, _DRAWN)) < (1 - keep) / 2, -1.0, 1.0)
     states = np.cumprod(turns, axis=0)
     states -= states.mean(axis=0)
     seen = (states**2).sum(axis=0) / (count - 1)
-    near = (states[1:] * states[:-1]).sum(axis=0) / (count - 1)
+    near = np.zeros((len(LAGS), _DRAWN))
+    for own, lag in zip(near, LAGS, strict=True):
+        if count > lag:
+            own[:] = (states[lag:] * states[:-lag]).sum(axis=0) / (count - lag)
     step = np.log(AMPLITUDES[1] / AMPLITUDES[0])
     moves = np.rint(np.log(np.maximum(seen, 1e-12)) / 2 / step).astype(int)
     classes = np.arange(len(AMPLITUDES))
-    chances, products = np.zeros((2, len(classes), len(classes)))
+    chances, *products = np.zeros((1 + len(LAGS), len(classes), len(classes)))
     for move in np.unique(moves):
         at = np.clip(classes + move, 0, classes[-1]), classes
         np.add.at(chances, at, np.mean(moves == move))
-        np.add.at(products, at, near[moves == move].sum() / _DRAWN)
-    return chances, products
+        for own, of_lag in zip(products, near, strict=True):
+            np.add.at(own, at, of_lag[moves == move].sum() / _DRAWN)
+    return chances, np.stack(products)
 
 
 def joined(pixels: Indices, parts: Sequence[Moments], classes: Iterable[AmplitudeClasses]) -> F64:

@@ -3,11 +3,20 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pixcal.estimators.detector.telegraph.moments import Series, moments_of, signs
-from pixcal.estimators.detector.telegraph.population import find_population, find_switching
+from pixcal.estimators.detector.telegraph.classes import Stays
+from pixcal.estimators.detector.telegraph.moments import Moments, Series, moments_of, signs
+from pixcal.estimators.detector.telegraph.population import (
+    Population,
+    find_population,
+    find_switching,
+    off_later,
+)
 from pixcal.kernels.significance import sigmas_of_best
 
 ROUNDS = 3  # most, in which population and time are found, each with the other known
+# decades over which stays differ where they do, and chi-square by which frames further apart must
+# say so
+SPREAD, DIFFER = 1.5, 4.0
 SETTLED = 0.5  # change of the time, over its error, after which no other round is needed
 
 
@@ -21,6 +30,7 @@ class Telegraph:
     amplitude: float
     shape: float
     switching_s: float
+    switching_decades: float  # range of the pixels' times, even in the logarithm
     share_error: float
     amplitude_error: float
     shape_error: float
@@ -37,20 +47,44 @@ def find_telegraph(series: Sequence[Series]) -> Telegraph | None:
     if not parts:
         return None
     flat_top, staying, noisy = signs(parts)
+    even = _of_stays(parts, 0.0)
+    found = even
+    if even.stays.mean_s > 0:
+        # Times of traps differ widely, where frames further apart say so.
+        spread = _of_stays(parts, SPREAD)
+        if even.later**2 - spread.later**2 > DIFFER:
+            found = spread
+    p = found.population
+    return Telegraph(
+        p.share, p.amplitude, p.shape, found.stays.mean_s, found.stays.decades,
+        p.share_error, p.amplitude_error, p.shape_error, found.error,
+        sigmas_of_best(flat_top, staying), flat_top, staying, noisy,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A population, and how long its pixels stay."""
+
+    population: Population
+    stays: Stays
+    error: float  # of the mean stay, s
+    later: float  # what frames further apart have in common beyond that, in errors
+
+
+def _of_stays(parts: Sequence[Moments], decades: float) -> _Found:
+    """The likeliest population with stays that differ by so many decades."""
     # A pixel's variance is high by telegraph noise or by chance: how much is which, the population
     # tells; how much of it a few frames hold, the time.
-    found = find_population(parts, 0.0)
-    switching, switching_error = find_switching(parts, found)
+    found = find_population(parts, Stays(0.0))
+    switching, error = find_switching(parts, found, decades)
     for _ in range(ROUNDS):
         before = switching
         if before == 0:
             break
-        found = find_population(parts, switching)
-        switching, switching_error = find_switching(parts, found)
-        if abs(switching - before) < SETTLED * switching_error:
+        found = find_population(parts, Stays(switching, decades))
+        switching, error = find_switching(parts, found, decades)
+        if abs(switching - before) < SETTLED * error:
             break
-    return Telegraph(
-        found.share, found.amplitude, found.shape, switching,
-        found.share_error, found.amplitude_error, found.shape_error, switching_error,
-        sigmas_of_best(flat_top, staying), flat_top, staying, noisy,
-    )  # fmt: skip
+    stays = Stays(switching, decades)
+    return _Found(found, stays, error, off_later(parts, found, stays))

@@ -15,6 +15,7 @@ from pixcal.kernels.frame_order import follows
 from pixcal.model.arrays import F64, Indices
 
 NOISY = 3.0  # excess of the variance, in its own sigmas, from which a pixel's noise is looked at
+LAGS = 1, 4  # frames apart whose products tell how long pixels stay, and how widely that differs
 _OUTLIER = 5.0
 _MIN_FRAMES = 8
 
@@ -38,8 +39,8 @@ class Moments:
     count: F64  # samples
     variance: F64
     kurtosis: F64  # excess, unbiased
-    # mean product of neighbouring frames
-    neighbours: F64
+    # (lag, n) mean product of frames `LAGS` apart; NaN where there are none
+    products: F64
     pairs: float  # neighbouring frames, over all but one
     dof: float  # of the variance: fewer than the samples have where pixels differ anyway
     sigma: float
@@ -49,8 +50,8 @@ class Moments:
     def of(self, pixels: Indices) -> "Moments":
         """Of some pixels (ascending) alone."""
         own = np.isin(self.pixel, pixels)
-        names = ("pixel", "count", "variance", "kurtosis", "neighbours")
-        return replace(self, **{name: getattr(self, name)[own] for name in names})
+        names = ("pixel", "count", "variance", "kurtosis", "products")
+        return replace(self, **{name: getattr(self, name)[..., own] for name in names})
 
     @property
     def excess(self) -> F64:
@@ -75,9 +76,12 @@ def moments_of(series: Series) -> Moments | None:
     variance = square / (n - 1)
     kurtosis = n * (x**4).sum(axis=0) / square**2 - 3
     kurtosis = (n - 1) / ((n - 2) * (n - 3)) * ((n + 1) * kurtosis + 6)
-    paired = np.flatnonzero(follows(series.frame))
-    pairs = len(paired) / (len(x) - 1)
-    neighbours = (x[paired] * x[paired - 1]).sum(axis=0) / (n - 1) / pairs
+    products, pairs = np.full((len(LAGS), x.shape[1]), np.nan), []
+    for own, lag in zip(products, LAGS, strict=True):
+        paired = np.flatnonzero(follows(series.frame, lag))
+        pairs.append(len(paired) / (len(x) - 1))
+        if len(paired):
+            own[:] = (x[paired] * x[paired - lag]).sum(axis=0) / (n - 1) / pairs[-1]
     dof = float(np.median(n)) - 1
     centre = np.median(variance) * dof / chdtri(dof, 0.5)
     # Half the pixels lie between the quartiles, whatever the noisy ones do.
@@ -88,8 +92,8 @@ def moments_of(series: Series) -> Moments | None:
         n,
         variance / centre,
         kurtosis,
-        neighbours / centre,
-        pairs,
+        products / centre,
+        pairs[0],
         dof / max(float(wide), 1.0) ** 2,
         series.sigma * float(np.sqrt(centre)),
         series.period_s if np.isfinite(series.period_s) and series.period_s > 0 else 1.0,
@@ -107,7 +111,7 @@ def signs(parts: Sequence[Moments]) -> tuple[float, float, int]:
         flat -= float(part**2 @ m.kurtosis)
         flat_variance += float(part**4 @ of_kurtosis)
         # Mean and variance for white noise, exact (Moran 1948, Biometrika 35, 255).
-        stay += float(part @ (m.neighbours / m.variance + 1 / n))
+        stay += float(part @ (m.products[0] / m.variance + 1 / n))
         stay_variance += float(part**2 @ ((n - 2) ** 2 / (n**2 * (n - 1)))) / m.pairs
         noisy.update(m.pixel[m.excess > 0].tolist())
     if not flat_variance:

@@ -17,6 +17,7 @@ from pixcal.estimators.detector.telegraph.classes import (
     AMPLITUDES,
     AmplitudeClasses,
     Mixture,
+    Stays,
     joined,
 )
 from pixcal.estimators.detector.telegraph.moments import Moments
@@ -47,12 +48,12 @@ class Population:
     chance: F64  # (n,) that each is one of them
 
 
-def find_population(parts: Sequence[Moments], switching_s: float) -> Population:
-    """Of how many pixels, and how strong, for a mean stay in a level."""
+def find_population(parts: Sequence[Moments], stays: Stays) -> Population:
+    """Of how many pixels, and how strong, for stays in a level."""
     pixels = np.unique(np.concatenate([m.pixel for m in parts]))
     unit = min(m.sigma for m in parts)
     # One after the other: each is large.
-    classes = (AmplitudeClasses.of(m, unit, switching_s) for m in parts)
+    classes = (AmplitudeClasses.of(m, unit, stays) for m in parts)
     mixture = Mixture.of(joined(pixels, parts, classes))
 
     def weights(p: F64) -> F64:
@@ -104,29 +105,18 @@ def _curvature(cost: Callable[[F64], float], at: F64, step: float = 0.05) -> F64
     return np.asarray(np.linalg.inv(second))
 
 
-def find_switching(parts: Sequence[Moments], population: "Population") -> tuple[float, float]:
+def find_switching(
+    parts: Sequence[Moments], population: Population, decades: float
+) -> tuple[float, float]:
     """Mean stay in a level and its error, s, from neighbouring frames."""
     period = min(m.period_s for m in parts)
     # The others say nothing of it.
     few = population.pixels[population.chance > LIKELY]
     if not len(few):
         return 0.0, period
-    own = [m.of(few) for m in parts]
 
     def rest(log_time: float) -> tuple[float, float]:
-        """Products of neighbours beyond those for a time, and their error."""
-        classes = [AmplitudeClasses.of(m, population.unit, float(np.exp(log_time))) for m in own]
-        mixture = Mixture.of(joined(few, own, classes))
-        chance = mixture.chance(population.weight)
-        of_class = mixture.shares(population.weight)
-        total = square = 0.0
-        for m, one in zip(own, classes, strict=True):
-            at = np.searchsorted(few, m.pixel)
-            expected = np.einsum("nk,nk->n", of_class[at], one.neighbours())
-            left = chance[at] * (m.neighbours + 1 / m.count - chance[at] * expected)
-            total += float(left.sum())
-            square += float(left @ left)
-        return total, square**0.5
+        return _rest(parts, population, Stays(float(np.exp(log_time)), decades), 0)
 
     # Of longer stays the frames do not tell how long.
     longest = max(m.period_s * m.frames for m in parts)
@@ -145,3 +135,31 @@ def find_switching(parts: Sequence[Moments], population: "Population") -> tuple[
     found = solved(0.0)
     slope = abs(rest(found + 0.05)[0] - rest(found - 0.05)[0]) / 0.1
     return float(np.exp(found)), float(np.exp(found) * rest(found)[1] / max(slope, 1e-12))
+
+
+def off_later(parts: Sequence[Moments], population: Population, stays: Stays) -> float:
+    """Products of frames further apart than neighbours beyond those for some stays, in errors."""
+    total, error = _rest(parts, population, stays, 1)
+    return total / error if error > 0 else 0.0
+
+
+def _rest(
+    parts: Sequence[Moments], population: Population, stays: Stays, lag: int
+) -> tuple[float, float]:
+    """Products of frames, of one of the lags, beyond those for some stays, and their error."""
+    few = population.pixels[population.chance > LIKELY]
+    own = [m.of(few) for m in parts]
+    classes = [AmplitudeClasses.of(m, population.unit, stays) for m in own]
+    mixture = Mixture.of(joined(few, own, classes))
+    chance = mixture.chance(population.weight)
+    of_class = mixture.shares(population.weight)
+    total = square = 0.0
+    for m, one in zip(own, classes, strict=True):
+        if not len(m.pixel) or np.isnan(m.products[lag]).any():
+            continue
+        at = np.searchsorted(few, m.pixel)
+        expected = np.einsum("nk,nk->n", of_class[at], one.expected(lag))
+        left = chance[at] * (m.products[lag] + 1 / m.count - chance[at] * expected)
+        total += float(left.sum())
+        square += float(left @ left)
+    return total, square**0.5
