@@ -11,7 +11,7 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages import reduce
-from pixcal.stages.diagnose.looked_at import LeftOut, LookedAt
+from pixcal.stages.diagnose.looked_at import FittedOn, LeftOut, LookedAt, TriedOn, frames_of
 from pixcal.stages.diagnose.measuring import nominal_bench
 from pixcal.stages.diagnose.parts import Half, Raw, evidence_of, take
 from pixcal.stages.diagnose.recommended_frames import missing_frames
@@ -109,11 +109,13 @@ def look_at(
             measured.append(looked_at(halves[1], signatures))
     tried = tuple(w for w in windows if w.part in parts)
     steps = [s.step for s in windows[0].bench.measured.sets]
-    facts = LookedAt.of(
+    facts = LookedAt(
         shape,
-        (first, own.learn),
-        (tuple(w.part for w in tried), own.test),
+        FittedOn(first, frames_of(own.learn)),
+        TriedOn(tuple(w.part for w in tried), frames_of(own.test)),
         tuple(left_out),
+        tuple(name for name, frames in own.learn.items() if set(frames) & set(own.test[name])),
+        tuple(kind for kind in ("bias", "dark", "flat") if kind in ingested.tables),
         {s.name: s.baseline_mm for s in acquisition.frames.fringes},
         missing_frames(acquisition, ingested.tables, steps),
     )

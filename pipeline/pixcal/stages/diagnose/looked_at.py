@@ -1,7 +1,6 @@
 """Frames and windows that a diagnosis looked at, as the product names them."""
 
 from dataclasses import dataclass
-from typing import Self
 
 from pixcal.stages.diagnose.parts import Half
 from pixcal.stages.evidence import Part
@@ -52,29 +51,6 @@ class LookedAt:
     kinds: tuple[str, ...]  # of calibration frames
     sets: dict[str, tuple[float, float]]  # baseline of each fringe set, mm
     missing_frames: dict[str, str]  # `recommended_frames.missing_frames`
-
-    @classmethod
-    def of(
-        cls,
-        shape: tuple[int, int],
-        fitted: tuple[Part, Half],
-        tried: tuple[tuple[Part, ...], Half],
-        left_out: tuple[LeftOut, ...],
-        sets: dict[str, tuple[float, float]],
-        missing_frames: dict[str, str],
-    ) -> Self:
-        """Of windows, and the frames of both halves."""
-        (window, learn), (windows, test) = fitted, tried
-        return cls(
-            shape,
-            FittedOn(window, frames_of(learn)),
-            TriedOn(windows, frames_of(test)),
-            left_out,
-            tuple(name for name, frames in learn.items() if set(frames) & set(test[name])),
-            tuple(kind for kind in ("bias", "dark", "flat") if kind in learn),
-            sets,
-            missing_frames,
-        )
 
     @property
     def on_the_same_pixels(self) -> bool:
