@@ -148,6 +148,8 @@ def _rest(
 ) -> tuple[float, float]:
     """Products of frames, of one of the lags, beyond those for some stays, and their error."""
     few = population.pixels[population.chance > LIKELY]
+    if not len(few):
+        return 0.0, 0.0
     own = [m.of(few) for m in parts]
     classes = [AmplitudeClasses.of(m, population.unit, stays) for m in own]
     mixture = Mixture.of(joined(few, own, classes))
