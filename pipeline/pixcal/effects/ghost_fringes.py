@@ -23,7 +23,8 @@ SINGLE = {
     "ghost of the fixed fibre: static and moving fringes": (1, 0, 1),
 }
 BOTH = "ghosts of both fibres"
-TWO_GHOSTS = 25.0  # chi-square of a wave that the second ghost must explain at least
+# chi-square of a wave that the second ghost must explain at least, and that static fringes have
+TWO_GHOSTS = 25.0
 UNTIED = 0.5  # share of the chi-square of the waves that the law of a beam may leave
 # differences between sets, relative and in errors, of a pattern that is the flat's
 ALIKE, ALIKE_SIGMAS = 0.1, 5.0
@@ -225,8 +226,10 @@ def _law(
 
     law = min(laws, key=lambda name: misfit(laws[name]))
     best = laws[law]
-    # Two ghosts have more free numbers, and must explain much that one does not.
-    if misfit(best) > 2 * misfit(both) + TWO_GHOSTS * len(waves):
+    static = sum(abs(w.static) ** 2 / w.errors[0] ** 2 for w in waves)
+    # Two ghosts have more free numbers, and must explain much that one does not. Coupled pixels
+    # leave no static fringes.
+    if misfit(best) > 2 * misfit(both) + TWO_GHOSTS * len(waves) < static:
         law, best = BOTH, both
     left = misfit(best) / max(sum(one.unrelated for one in best), 1e-300)
     return law, tuple(_wave(one.wave, middle) for one in best), left
