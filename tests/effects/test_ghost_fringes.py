@@ -165,9 +165,9 @@ def test_ghosts_of_both_fibres_need_not_be_in_phase(acquired: Callable[..., Evid
     static = of_one + of_other
     wave = {
         "beat_rad_px": [0.35, 0.2],
-        "static": [static.real, -static.imag],
+        "static": [float(static.real), -float(static.imag)],
         "forward": [of_one, 0.0],
-        "backward": [of_other.real, -of_other.imag],
+        "backward": [float(of_other.real), -float(of_other.imag)],
     }
     evidence = acquired(None, {"ghost_fringes": {"share": 0.0, "waves": [wave]}})
     found = GhostFringes.estimate(evidence)

@@ -108,8 +108,9 @@ def find_waves(evidence: Evidence) -> Waves | None:
         return None
     ways = {still: {f.name: _maps(f, evidence, still) for f in sets} for still in (False, True)}
     allowed = _allowed(sets)
-    light, flats = (_static_gain(ways[still], allowed) for still in (False, True))
-    in_flats = flats > light + APART
+    light, flats = (_gains(ways[still], allowed) for still in (False, True))
+    # A pattern of the light that flats share is in flats and visibility, not in light over flat.
+    in_flats = all(own > other + APART for own, other in zip(flats, light, strict=True))
     best = _strongest(ways[in_flats], allowed, in_flats)
     waves = list(best.waves)
     if best.significance > SIGNIFICANT:
@@ -139,13 +140,17 @@ def _maps(fringes: FringeEvidence, evidence: Evidence, in_flats: bool) -> list[_
     ]
 
 
-def _static_gain(maps: Maps, allowed: Mask) -> float:
-    """Chi-square of the wave that is strongest in all maps, in light or flats.
+def _gains(maps: Maps, allowed: Mask) -> tuple[float, float]:
+    """Chi-square of the wave that is strongest in all maps.
 
-    A pattern of the light that flats share is in flats and visibility, not in light over flat.
+    In light or flats, and in the map that shows it second best.
     """
     q = _vector(sum((_power(own, allowed) for own in maps.values()), np.zeros(allowed.shape)))
-    return sum(_plain_gain(own[0], q) for own in maps.values())
+    gains: dict[str, float] = {}
+    for own in maps.values():
+        for m in own:
+            gains[m.kind] = gains.get(m.kind, 0.0) + _plain_gain(m, q)
+    return next(iter(gains.values())), sorted(gains.values())[-2]
 
 
 def _strongest(maps: Maps, allowed: Mask, in_flats: bool) -> Waves:
