@@ -272,15 +272,23 @@ def _tied_of_both(w: WaveFit) -> Tied:
 
 
 def _of_the_flat(waves: Sequence[WaveFit], evidence: Evidence) -> bool:
-    """Whether the waves of all sets are one pattern, as an error of the flats makes."""
+    """Whether the waves of all sets are one pattern of the light, as an error of the flats makes.
+
+    It leaves the phase.
+    """
     first = waves[0]
     same = [w for w in waves if w.q == first.q]
+
+    def alike(one: complex, other: complex, of_one: float, of_other: float) -> bool:
+        apart = ALIKE * abs(first.static) + ALIKE_SIGMAS * float(np.hypot(of_one, of_other))
+        return abs(one - other) < apart
+
     return (
         any(evidence.of_kind("flat"))
         and len(same) == len(evidence.fringes)
         and all(
-            abs(w.static - first.static)
-            < ALIKE * abs(first.static) + ALIKE_SIGMAS * np.hypot(w.errors[0], first.errors[0])
+            alike(w.static, first.static, w.errors[0], first.errors[0])
+            and alike(w.forward, w.backward.conjugate(), w.errors[1], w.errors[2])
             for w in same
         )
     )
