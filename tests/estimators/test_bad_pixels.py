@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from pixcal.estimators.detector.bad_pixels import dead, hot, noisy, nonlinear
+from pixcal.estimators.detector.bad_pixels import dead, hot, noisy, noisy_factor, nonlinear
 from pixcal.estimators.detector.calibration import Rung, step_levels
 
 F64 = NDArray[np.float64]
@@ -143,3 +143,16 @@ def test_the_glow_of_an_amplifier_is_not_hot() -> None:
     )
     rate[40, 50] += 900
     assert np.argwhere(hot(rate, np.full(y.shape, 3.0), 3, 10)).tolist() == [[40, 50]]
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.25])
+def test_a_population_of_pixels_that_differ_is_not_noisy(spread: float) -> None:
+    rng, dof = np.random.default_rng(6), 49
+    noise = 3 * rng.lognormal(0, spread, (200, 300))
+    variance = noise**2 * rng.chisquare(dof, noise.shape) / dof
+    same = np.ones_like(variance)
+    factor = noisy_factor(1.5, variance, dof, 1.0)
+    expected = float(np.median(variance)) * same
+    found = noisy(variance, dof * same, expected, np.nan * same, 0 * same, factor)
+    assert found.mean() < 1e-3
+    assert factor == (1.5 if not spread else pytest.approx(np.exp(4 * spread), rel=0.1))

@@ -16,6 +16,7 @@ from pixcal.estimators.diagnosis.distortions import TwoWay
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.crosstalk import Coupling, filled, noise_shares, uncouple, uncouple_fringes
+from pixcal.kernels.line_means import without_line_means
 from pixcal.model.arrays import F32, F64, Indices
 
 UNIT = 1e4  # electrons that charge is counted in; variances are in 10⁴ e-²
@@ -77,7 +78,8 @@ def _of_stack(stack: Stack, evidence: Evidence, known: Sequence[Coupling], kept:
     signal = (stack.adu[at] - evidence.bias) * evidence.gain
     light = signal.mean(axis=0)
     used = evidence.good & (stack.adu.max(axis=0) < evidence.saturation_adu)
-    rest = np.where(used, (signal - light) / UNIT**0.5, np.nan).astype(np.float32)
+    noise = ((signal - light) / UNIT**0.5).astype(np.float32)
+    rest = np.where(used, without_line_means(noise, used), np.float32(np.nan))
     collected = np.maximum(uncouple(light, known, evidence.origin), 0)
     charge = np.broadcast_to((collected / UNIT).astype(np.float32), rest.shape)
     level = np.ones((1, len(at)), np.float32)

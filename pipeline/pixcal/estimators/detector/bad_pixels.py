@@ -7,7 +7,7 @@ the frames can do: on a perfect detector fewer than one pixel in 10⁵ is flagge
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.special import chdtri, polygamma
 
 from pixcal.estimators.detector.calibration import MIN_RUNGS, Rung
 from pixcal.kernels.robust import lit, median_and_sigma
@@ -27,6 +27,8 @@ _DEGREE = 3
 _FARTHEST = 4.0
 _CLIPPINGS = 4
 _CLIP = 4.0
+_POPULATION = 4.0  # spreads of the logarithm of the noise that a population of pixels reaches
+_SPREAD_DOF = 8
 _QUARTILE = 0.6745  # of a normal distribution, in standard deviations
 _FEWEST = 64
 _SAMPLE = 4096
@@ -131,6 +133,29 @@ def noisy(
     telegraph = significant & flat_top & (dof >= _KURTOSIS_SAMPLES)
     blinking = outliers >= np.maximum(_MIN_OUTLIERS, _OUTLIER_SHARE * dof)
     return np.asarray(loud | telegraph | blinking)
+
+
+def noisy_factor(least: float, variance: F64, dof: int, quantum: float) -> float:
+    """Factor of the usual standard deviation that makes a pixel noisy, where pixels differ.
+
+    Those of a log-normal population (sCMOS) are no defects as far as it reaches.
+
+    Parameters
+    ----------
+    least : float
+        The factor at least.
+    variance : float64 array
+        Temporal variance of pixels without light (ADU²).
+    dof : int
+        Its degrees of freedom; few do not tell how pixels differ.
+    quantum : float
+        Step of the samples (ADU): noise below it depends on the place between two codes.
+    """
+    known = variance[variance > 0]
+    if dof < _SPREAD_DOF or not known.size or np.median(known) < quantum**2:
+        return least
+    seen = median_and_sigma(np.log(known))[1] ** 2 - float(polygamma(1, dof / 2))
+    return max(least, float(np.exp(_POPULATION * np.sqrt(max(seen, 0.0)) / 2)))
 
 
 def nonlinear(rungs: Sequence[Rung], levels: F64, limit: float) -> Mask:

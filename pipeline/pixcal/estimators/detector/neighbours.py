@@ -21,6 +21,7 @@ from numba import njit
 from pixcal.estimators.diagnosis.distortions import Freedom, TwoWay
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.boundaries import REACH, boundary_pushes, shared_noise
+from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F32, F64, Mask
 
@@ -188,7 +189,8 @@ def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[_Noise]:
     weight = np.where(good, 1 / variance, np.float32(0)).reshape(len(frames), -1)
     level = np.ones((1, len(frames)), np.float32)
     freedom = TwoWay(weight, level, light.reshape(1, -1).astype(np.float32))
-    residual = freedom.left_over((frames - charge).reshape(weight.shape))
+    noise = without_line_means(frames - charge, good)
+    residual = freedom.left_over(noise.reshape(weight.shape))
     residual[np.abs(residual) * np.sqrt(weight) > _CLIP] = 0
 
     def taken(one: Mask, other: Mask) -> F32:

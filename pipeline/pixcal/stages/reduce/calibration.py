@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.detector.bad_pixels import dead, hot, noisy
+from pixcal.estimators.detector.bad_pixels import dead, hot, noisy, noisy_factor
 from pixcal.estimators.detector.calibration import usual_variance
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.model.arrays import F32, F64, U8
@@ -26,7 +26,7 @@ from pixcal.stages.reduce.columns import (
     span,
     strips,
 )
-from pixcal.stages.reduce.frame_statistics import STATISTICS, Limits
+from pixcal.stages.reduce.frame_statistics import STATISTICS, Limits, Measuring
 from pixcal.stages.reduced_set import STRIP
 from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group
 from pixcal.storage.place import Place
@@ -67,6 +67,7 @@ class Usual:
     dark_rate_sigma: float
     dark_variance: float  # variance of a sample without light and without dark signal (ADU²)
     bias: float  # median (ADU)
+    noisy: float  # factor of the usual noise from which a pixel is noisy
 
 
 def on_grid(
@@ -97,27 +98,25 @@ def on_grid(
     return np.concatenate(parts, axis=1)
 
 
-def usual(folder: Place, shape: tuple[int, int], gain: float, light: F64) -> Usual:
+def usual(job: Measuring, folder: Place, light: F64) -> Usual:
     """Medians of the maps that `measure` wrote.
 
     Parameters
     ----------
-    folder, shape
-        As of `on_grid`.
-    gain : float, rough guess (e-/ADU)
+    job : Measuring, what they were measured with
+    folder : Place, as of `on_grid`
     light : float64 array, of each tile over that of the detector
     """
-    names = (
-        "response", "response_error", "dark_rate", "dark_variance", "dark_charge", "dark_dof",
-        "bias",
-    )  # fmt: skip
-    response, error, rate, variance, charge, dof, bias = on_grid(folder, shape, names, light)
+    names = ("response", "response_error", "dark_rate", "dark_variance", "dark_dof", "bias")
+    response, error, rate, variance, dof, bias = on_grid(folder, job.shape, names, light)
+    freedom = int(np.median(dof))
     return Usual(
         median_and_sigma(response[response > 0])[0],
         median_and_sigma(error[error > 0])[0],
         *median_and_sigma(rate),
-        usual_variance((variance - charge / gain)[dof > 0], int(np.median(dof))),
+        usual_variance(variance[dof > 0], freedom),
         median_and_sigma(bias)[0],
+        noisy_factor(job.limits.noisy, variance[dof > 0], freedom, job.quantum),
     )
 
 
@@ -206,14 +205,15 @@ def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U
     limits, medians = job.limits, job.usual
     # A sample that lies on a change of code is one of two, however little noise it has.
     least = 3 * (job.floor / job.gain) ** 2
-    expected = np.maximum(medians.dark_variance + found["dark_charge"] / job.gain, least)
+    expected = np.full_like(flat, max(medians.dark_variance, least))
     if job.has_flat:
         mask[~np.isfinite(flat)] |= np.uint8(PixelFlag.NO_DATA)
         where = dead(flat, error, limits.dead, limits.bright, _FLAT_FLOOR)
         mask[where] |= np.uint8(PixelFlag.DEAD)
     if job.has_rate:
-        rate_error = found["dark_rate_error"] * np.sqrt(expected)
-        where = hot(found["dark_rate"], rate_error, medians.dark_rate_sigma, limits.hot)
+        where = hot(
+            found["dark_rate"], found["dark_rate_error"], medians.dark_rate_sigma, limits.hot
+        )
         mask[where] |= np.uint8(PixelFlag.HOT)
     if np.isfinite(medians.dark_variance):
         where = noisy(
@@ -222,7 +222,7 @@ def _flags(job: Finishing, found: Mapping[str, F64], flat: F64, error: F64) -> U
             expected,
             found["kurtosis"],
             found["outliers"],
-            limits.noisy,
+            medians.noisy,
         )
         mask[where] |= np.uint8(PixelFlag.NOISY)
     return mask

@@ -118,7 +118,7 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     full = usable & (levels > (well[0] if well else math.inf))
     usable &= ~full
     light = _light(tables, levels, usable, job)
-    medians = usual(folder, job.shape, job.gain, light)
+    medians = usual(job, folder, light)
     if job.flat and not medians.response > _LIT * medians.response_error:
         if not math.isfinite(medians.response):
             raise InputError(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pixcal.estimators.detector.bad_pixels import noisy, nonlinear
+from pixcal.estimators.detector.bad_pixels import noisy, noisy_factor, nonlinear
 from pixcal.estimators.detector.calibration import (
     DarkLine,
     Rung,
@@ -28,6 +28,7 @@ from pixcal.estimators.detector.cut_off import without_cut_off
 from pixcal.estimators.detector.pair_noise import LineNoise, dark_pair_sums, flat_pair_sums
 from pixcal.kernels.photon_transfer import COLUMNS, N_BINS
 from pixcal.kernels.robust import BATCH, Combination, Combined, lit, median_and_sigma
+from pixcal.kernels.rounding import SHEPPARD
 from pixcal.model.arrays import F32, F64
 from pixcal.model.flags import PixelFlag
 from pixcal.stages.reduce.columns import (
@@ -51,13 +52,12 @@ from pixcal.storage.place import Place
 STATISTICS = (
     "bias",  # ADU
     "dark_rate",  # ADU/s
-    "dark_rate_error",  # of a pixel of unit variance, 1/s
+    "dark_rate_error",  # ADU/s
     "response",  # over that of the tile
     "response_error",
     "read_variance",  # ADU², of the read noise series
-    "dark_variance",  # ADU², of all frames without light
+    "dark_variance",  # ADU², of all frames without light, as it would be without dark signal
     "dark_dof",
-    "dark_charge",  # ADU, mean dark signal of these frames
     "kurtosis",
     "outliers",
     "flags",
@@ -193,25 +193,33 @@ def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined])
     times = [group.exptime for group in job.dark]
     line = dark_line([c.mean for c in combined], [c.kept for c in combined], times)
     maps["bias"], maps["dark_rate"] = line.bias, line.rate
-    maps["dark_rate_error"] = np.sqrt(line.per_rate)
+    charges = [np.maximum(np.nan_to_num(line.rate) * time, 0) for time in times]
+    least = int(np.argmin(times))
+    read = usual_variance(
+        combined[least].variance - charges[least] / job.gain, len(job.dark[least].frames) - 1
+    )
+    read = max(read if read > 0 else job.read_noise**2, SHEPPARD * job.quantum**2)
+    pooled = np.zeros_like(line.bias)
     dofs = [np.where(np.isfinite(c.variance), c.kept - 1, 0.0) for c in combined]
     dof = np.sum(dofs, axis=0)
-    for group, found, weight in zip(job.dark, combined, dofs, strict=True):
+    for group, found, weight, charge in zip(job.dark, combined, dofs, charges, strict=True):
         share = weight / np.maximum(dof, 1)
-        maps["dark_variance"] += share * np.nan_to_num(found.variance)
-        maps["dark_charge"] += share * np.maximum(np.nan_to_num(line.rate) * group.exptime, 0)
+        variance = share * np.nan_to_num(found.variance)
+        pooled += variance
+        # Long exposures would outweigh the others by their shot noise.
+        maps["dark_variance"] += variance * read / (read + charge / job.gain)
         maps["kurtosis"] += share * np.nan_to_num(found.excess_kurtosis)
         maps["outliers"] += found.seen - found.kept
         if group == job.read_series:
-            charge = np.maximum(np.nan_to_num(line.rate) * group.exptime, 0)
             maps["read_variance"] = found.variance - charge / job.gain
     maps["dark_dof"] = dof
     missing = ~np.isfinite(line.bias) | ~np.isfinite(line.rate)
     maps["flags"][missing] += int(PixelFlag.NO_DATA)
     maps["flags"][line.bias >= job.full] += int(PixelFlag.HOT)
-    usual = usual_variance(maps["dark_variance"], int(np.median(dof)))
+    usual = usual_variance(pooled, int(np.median(dof)))
     usual = job.read_noise**2 if np.isnan(usual) else usual
-    column.line, column.noise = line, np.maximum(maps["dark_variance"], usual)
+    column.line, column.noise = line, np.maximum(pooled, usual)
+    maps["dark_rate_error"] = np.sqrt(line.per_rate * column.noise)
 
 
 def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined) -> None:
@@ -292,7 +300,8 @@ def _loud(job: Measuring, frames: F32) -> NDArray[np.bool_]:
     # A sample that lies on a change of code is one of two.
     usual = max(usual_variance(variance, len(frames) - 1), job.quantum**2 / 4)
     unknown = np.full(variance.shape, np.nan)
-    return noisy(variance, dof, np.full(variance.shape, usual), unknown, 0 * dof, job.limits.noisy)
+    factor = noisy_factor(job.limits.noisy, variance, len(frames) - 1, job.quantum)
+    return noisy(variance, dof, np.full(variance.shape, usual), unknown, 0 * dof, factor)
 
 
 def _usable(job: Measuring, samples: NDArray[Any], lamp: bool) -> F32:

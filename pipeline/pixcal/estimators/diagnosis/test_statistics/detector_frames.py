@@ -11,6 +11,7 @@ import numpy as np
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
 from pixcal.estimators.diagnosis.test_statistics.look import STEPS, neighbour_sums
+from pixcal.kernels.line_means import without_line_means
 from pixcal.model.arrays import F32, F64, Mask
 
 REPEATS = (1, 2, 3, 4)  # rows or columns between two that may share noise
@@ -42,10 +43,11 @@ def _stacks(evidence: Evidence, kind: str) -> tuple[Stack, ...]:
 
 
 def _neighbours(rest: Iterable[F32], good: Mask) -> F64:
-    """Correlation (step,) of pixels some rows and columns apart."""
+    """Correlation (step,) of pixels some rows and columns apart; lines have their own statistic."""
     total, pairs = np.zeros(len(STEPS)), np.zeros(len(STEPS))
     square = count = 0.0
     for steps in rest:
+        steps = without_line_means(steps, good)
         sums, number = neighbour_sums(steps, good, STEPS)
         total += sums.sum(axis=1)
         pairs += number.sum(axis=1)
