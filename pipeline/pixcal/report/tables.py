@@ -18,7 +18,20 @@ from pixcal.report.text import (
     with_error,
 )
 
-_GAIN_COLUMNS = ("declared", "measured", "error", "used")
+_GAIN_WORDS = {
+    "chi2_reduced": "reduced chi-square",
+    "neighbours": "neighbours (rows, columns) whose noise is included",
+    "used_from": "gain used:",
+    "with_rounding": "with rounding",
+}
+# of the flats: heading and significant digits
+_LADDER = {
+    "exptime_s": ("exposure (s)", 4),
+    "frames": ("frames", 4),
+    "level_adu": ("level (ADU)", 5),
+    "level_e": ("level (e⁻)", 5),
+    "deviation_percent": ("deviation (%)", 2),
+}
 _REDUCTION_SHOWN = (
     "schema", "warnings", "flags", "figures_of_merit", "gain_e_per_adu", "read_noise_e",
     "linearity", "sets", "quantisation",
@@ -70,7 +83,11 @@ def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
         if isinstance(entry, Mapping):
             declared, used = (number(entry.get(k), 4) for k in ("declared", "used"))
             measured = with_error(entry.get("measured"), entry.get("error"))
-            others = {k.replace("_", " "): v for k, v in entry.items() if k not in _GAIN_COLUMNS}
+            others = {
+                words: entry[k] if words.startswith("neighbours") else number(entry[k], 4)
+                for k, words in _GAIN_WORDS.items()
+                if entry.get(k)
+            }
             rows.append([label, declared, measured, used, _listed(others)])
     if rows:
         yield Table("Gain and read noise", ["", "declared", "measured", "used", ""], rows)
@@ -78,9 +95,11 @@ def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
     if is_table(straight.get("levels")):
         intercept = number(straight.get("intercept_adu"), 2)
         title = f"Exposure-time steps of the flats, intercept {intercept} ADU"
-        keys = list(dict.fromkeys(key for level in straight["levels"] for key in level))
-        rows = [[_plain(level.get(key)) for key in keys] for level in straight["levels"]]
-        yield Table(title, keys, rows)
+        rows = [
+            [number(level.get(key), digits) for key, (_, digits) in _LADDER.items()]
+            for level in straight["levels"]
+        ]
+        yield Table(title, [words for words, _ in _LADDER.values()], rows)
     sets = {
         name: dict(_flat({k: v for k, v in entry.items() if k != "flags"}))
         | {f"quantisation.{k}": v for k, v in facts.get("quantisation", {}).get(name, {}).items()}
@@ -88,10 +107,20 @@ def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
     }
     if sets:
         yield _columns_table("Fringe sets as reduced", sets)
-    rest = _flat({k: v for k, v in facts.items() if k not in _REDUCTION_SHOWN})
-    rows = [[key, _plain(value)] for key, value in rest if value is not None]
-    if rows:
-        yield Table("Other numbers of the reduction", ["quantity", "value"], rows)
+    rest = {k: v for k, v in facts.items() if k not in _REDUCTION_SHOWN}
+    end = rest.pop("saturation_adu", None)
+    if end:
+        rows = [
+            ["declared (ADU)", number(end["declared"], 5)],
+            ["found in the flats (ADU)", number(end["found"], 5)],
+            ["used (ADU)", number(end["used"], 5)],
+            ["levels of flats left out", number(end["levels_left_out"])],
+            ["flats with full wells", number(len(end["full_frames"]))],
+        ]
+        yield Table("Saturation of the samples", ["", ""], rows)
+    others = [[key, _plain(value)] for key, value in _flat(rest) if value is not None]
+    if others:
+        yield Table("Other numbers of the reduction", ["quantity", "value"], others)
 
 
 def _listed(facts: Mapping[str, Any]) -> str:
