@@ -77,7 +77,8 @@ def show_reduce(run: Path) -> None:
         if not key.endswith(_PARTS)
     ]
     if shown:
-        show_table(("figure of merit (measured gain)", "value", ""), shown)
+        gain = "declared" if facts["gain_e_per_adu"]["measured"] is None else "measured"
+        show_table((f"figure of merit ({gain} gain)", "value", ""), shown)
     counts = ", ".join(f"{count} {flag}" for flag, count in facts["flags"].items() if count)
     click.echo(f"  pixels: {counts}")
     show_notes(facts["warnings"])

@@ -134,7 +134,8 @@ def merit(facts: Mapping[str, Any]) -> Iterator[Table]:
         for f in (facts.get("figures_of_merit") or {}).values()
     ]
     if rows:
-        title = "Figures of merit (EMVA 1288), with the measured gain"
+        gain = "declared" if facts["gain_e_per_adu"]["measured"] is None else "measured"
+        title = f"Figures of merit (EMVA 1288), with the {gain} gain"
         yield Table(title, ["figure", "value", "unit", ""], rows)
 
 

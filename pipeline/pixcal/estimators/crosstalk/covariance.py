@@ -29,7 +29,9 @@ from pixcal.model.arrays import F32, F64
 
 Frames = tuple[F32, F32, F32]  # factor, charge over sigma, and one over sigma, all (t, y, x)
 
-MIN_CHARGE = 0.1  # charge (10⁴ e-) of the least light whose noise can tell
+# charge (10⁴ e-) of the least light whose noise can tell; less where the variance of that noise is
+# so many times that without light
+MIN_CHARGE, ABOVE_READ = 0.1, 4.0
 TINY = np.float32(1e-20)
 TERMS = 5  # D, D', 1, D D', D² + D'²
 # place of each normal sum; terms 2 and 3 meet in the same sum as 0 and 1
@@ -78,7 +80,7 @@ def products(
             _add_normal_sums(*_powers(piece, 4), steps, normal)
         # Not beside the next ones: they are large.
         del parts, part, noise, terms, piece
-    if brightest < MIN_CHARGE:
+    if brightest < min(MIN_CHARGE, ABOVE_READ * evidence.read_noise**2 / UNIT):
         return None
     covariance = np.linalg.pinv(line, rcond=1e-12, hermitian=True)
     shot, error = float((covariance @ line_right)[0]), float(np.sqrt(2 * covariance[0, 0]))
