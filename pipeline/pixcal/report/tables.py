@@ -118,9 +118,9 @@ def reduction(facts: Mapping[str, Any]) -> Iterator[Table]:
             ["flats with full wells", number(len(end["full_frames"]))],
         ]
         yield Table("Saturation of the samples", ["", ""], rows)
-    others = [[key, _plain(value)] for key, value in _flat(rest) if value is not None]
-    if others:
-        yield Table("Other numbers of the reduction", ["quantity", "value"], others)
+    rows = [[key, _plain(value)] for key, value in _flat(rest) if value is not None]
+    if rows:
+        yield Table("Other numbers of the reduction", ["quantity", "value"], rows)
 
 
 def _listed(facts: Mapping[str, Any]) -> str:
