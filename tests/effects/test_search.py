@@ -9,6 +9,7 @@ import pytest
 from pixcal.estimators.diagnosis.expectation import Reference
 from pixcal.estimators.diagnosis.gap import compare, flagged
 from pixcal.estimators.diagnosis.test_statistics import Curve, Key
+from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
@@ -129,6 +130,26 @@ def test_what_maps_may_have_by_chance_is_not_taken_for_an_effect() -> None:
         one = Candidate("unknown", Estimate(effect, {"size": size / 5}, 5.0, "told"))
         found, _ = search({"unknown": size}, [one])
         assert found.accepted == accepted
+
+
+@pytest.mark.parametrize(("sigmas", "counts"), [(2.8, False), (6.0, True)])
+def test_of_an_effect_in_maps_its_own_significance_must_differ(sigmas: float, counts: bool) -> None:
+    """Not as the worst of all statistics: those that share its pattern add nothing."""
+    own = signature_key("unknown", "space")
+    rng = np.random.default_rng(1)
+
+    def seen(size: float) -> dict[Key, Curve]:
+        every = {key: rng.standard_normal(1) for key in (own, *KEYS)}
+        every[own] += size
+        every[KEYS[0]] += min(size, 2.5)
+        return {key: Curve(np.zeros(1), value) for key, value in every.items()}
+
+    reference = Reference.of([seen(0.0) for _ in range(16)])
+    center = {key: Curve(np.zeros(1), v.mean(axis=0)) for key, v in reference.values.items()}
+    center[own] = Curve(np.zeros(1), center[own].value + sigmas * reference.values[own].std(ddof=1))
+    world = Comparison(reference, reference.on_scale(center))
+    trial = world.trial((), [seen(sigmas) for _ in range(3)])
+    assert (world.gain_where_differing(world.nominal, trial, own) > 2) == counts
 
 
 def test_two_effects_are_both_found_in_any_order() -> None:

@@ -11,7 +11,14 @@ from pixcal.estimators.diagnosis.expectation import (
     expect_nominal,
     expect_with,
 )
-from pixcal.estimators.diagnosis.gap import compare, flagged, likelier, log_likelihood, remaining
+from pixcal.estimators.diagnosis.gap import (
+    CHANCE,
+    compare,
+    flagged,
+    likelier,
+    log_likelihood,
+    remaining,
+)
 from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.model.arrays import F64
 from pixcal.stages.diagnose.shrinkage import Trial, differing
@@ -62,10 +69,18 @@ class Comparison:
             variance[key] = variance[key] + (LAW_ERROR * (mean - nominal[key])) ** 2
         return self._trial(trial.effects, replace(trial.expected, variance=variance))
 
-    def gain_where_differing(self, start: Trial, trial: Trial) -> float:
-        """Rise of the log-likelihood by the test statistics that differ from ``start``."""
+    def gain_where_differing(self, start: Trial, trial: Trial, own: Key) -> float:
+        """Rise of the log-likelihood by the test statistics that differ from ``start``.
+
+        ``own`` is the significance of the effect that is added: one statistic, not the worst of
+        all.
+        """
         gains = likelier(self.data, start.expected, trial.expected)
-        return sum(gains[key] for key in flagged(compare(self.data, start.expected)))
+        differences = compare(self.data, start.expected)
+        where = flagged(differences)
+        if own in differences and differences[own].log_chance < np.log(CHANCE):
+            where.add(own)
+        return sum(gains[key] for key in where)
 
     def differs(self, trial: Trial) -> bool:
         """Whether any test statistic of the data differs from a bench by more than chance."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from pixcal.estimators.diagnosis.expectation import Reference
 from pixcal.estimators.diagnosis.test_statistics import Key
+from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.model.arrays import F64
 from pixcal.simulation.effect import Effect
@@ -254,7 +255,8 @@ class Search:
             if remaining[name].in_maps_alone:
                 # Chance does the same to all statistics of a pattern, which are no more unlikely
                 # together than one of them.
-                gain = min(gain, self.comparison.gain_where_differing(start, trial))
+                own = signature_key(effect.name, effect.domains[0])
+                gain = min(gain, self.comparison.gain_where_differing(start, trial, own))
             made.append(Addition(name, effect, trial, gain))
         for name in refused.keys() - {one.name for one in made}:
             remaining.pop(name).reason = refused[name]
