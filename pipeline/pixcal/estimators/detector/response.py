@@ -5,13 +5,18 @@ the phase: a response the same for all fringes, moving boundaries (brighter-fatt
 on the fringes' spacing.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from pixcal.estimators.diagnosis.distortions import Agreement, distortion_sums, fit_distortions
+from pixcal.estimators.diagnosis.distortions import (
+    Agreement,
+    Distortion,
+    distortion_sums,
+    fit_distortions,
+)
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.boundaries import REACH, boundary_shifts, moved_charge
 from pixcal.kernels.normal_matrix import inverse_normal
@@ -53,43 +58,37 @@ def fit_response(
         c_1, c_2, ...; the shift by an electron, px.
     covariance : (powers + 1, powers + 1) float64
     """
-
-    def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> tuple[F32, Iterable[F32]]:
-        level = evidence.level(fringes, signal)
-        gained = np.stack([moved_charge(frame, UNIT * shifts) for frame in level])
-        charge = level + np.float32(sizes[-1]) * gained
-        flat = evidence.flat.astype(np.float32)
-        response = [np.float32(size) for size in sizes[:-1]]
-
-        def slopes() -> Iterator[F32]:
-            u = charge / np.float32(level_e)
-            power, steepness = charge / flat, np.float32(1) / flat
-            to_the_n = np.ones_like(u)
-            for n, size in enumerate(response, start=1):
-                power = power * u
-                yield np.asarray(power, np.float32)
-                to_the_n *= u
-                steepness = steepness + (size * np.float32(n + 1) / flat) * to_the_n
-            yield np.asarray(steepness * gained, np.float32)
-
-        # Horner's scheme of c_1 u + c_2 u² + ...
-        bend = np.zeros_like(charge)
-        for size in reversed(response):
-            bend += size
-            bend *= charge / np.float32(level_e)
-        return (charge * (1 + bend) - level) / flat, slopes()
-
     prior = None
     if known_shift is not None:
         value, information = np.zeros(powers + 1), np.zeros(powers + 1)
         value[-1], information[-1] = known_shift[0] / UNIT, UNIT**2 / known_shift[1]
         prior = value, information
     sizes, covariance, _ = fit_distortions(
-        tuple(evidence.fringes.values()), distortion, powers + 1, margin=REACH, prior=prior
-    )
+        tuple(evidence.fringes.values()), _signal_of(evidence, level_e, [UNIT * shifts]),
+        powers + 1, margin=REACH, prior=prior,
+    )  # fmt: skip
     scale = np.ones(powers + 1)
     scale[-1] = UNIT
     return sizes * scale, covariance * np.outer(scale, scale)
+
+
+def _signal_of(evidence: Evidence, level_e: float, every: Sequence[F64]) -> Distortion:
+    """What boundaries that move and then a bent response add to a signal.
+
+    Sizes are those of the powers, then of the shifts of boundaries.
+    """
+    flat = evidence.flat.astype(np.float32)
+
+    def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> F32:
+        powers, moves = sizes[: -len(every)], sizes[-len(every) :]
+        level = charge = evidence.level(fringes, signal)
+        for size, shifts in zip(moves, every, strict=True):
+            if size:
+                charge = charge + np.stack([moved_charge(frame, size * shifts) for frame in level])
+        factor = np.polyval(np.array([*powers[::-1], 1], np.float32), charge / np.float32(level_e))
+        return np.asarray((charge * factor - level) / flat)
+
+    return distortion
 
 
 def departure(level: F32, knots_e: F64, change_e: F64) -> F32:
@@ -121,16 +120,14 @@ def fit_curve(
     agreement : Agreement
         Of the sets, on the whole curve.
     """
-    unit = np.eye(len(knots_e))[1:-1]
+    unit = LOOSE * knots_e[-1] * np.eye(len(knots_e))[1:-1]
 
-    def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> tuple[F32, Iterable[F32]]:
+    def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> F32:
         level = evidence.level(fringes, signal)
-        flat = evidence.flat.astype(np.float32)
         change = response(level) - level + departure(level, knots_e, sizes @ unit)
-        slopes = (departure(level, knots_e, one) / flat for one in unit)
-        return np.asarray(change / flat, np.float32), slopes
+        return np.asarray(change / evidence.flat, np.float32)
 
-    prior = np.zeros(len(unit)), np.full(len(unit), (LOOSE * knots_e[-1]) ** -2)
+    prior = np.zeros(len(unit)), np.ones(len(unit))
     sizes, covariance, agreement = fit_distortions(
         tuple(evidence.fringes.values()), distortion, len(unit), prior=prior
     )
@@ -138,7 +135,7 @@ def fit_curve(
     straight /= np.abs(straight).max(axis=0)
     taken = straight @ np.linalg.pinv(straight[1:])
     rest = np.eye(len(unit) + 1) - np.pad(taken, ((0, 0), (1, 0)))
-    rest = rest[:, :-1]  # nothing at the last knot
+    rest = LOOSE * knots_e[-1] * rest[:, :-1]  # nothing at the last knot
     return rest @ sizes, rest @ covariance @ rest.T, agreement
 
 
@@ -190,29 +187,14 @@ def boundaries_alone(
 def _boundary_sums(evidence: Evidence, level_e: float, powers: int) -> list[tuple[F64, F64]]:
     """Sums of `distortion_sums` for powers and falloffs, of fringes across columns and rows."""
     every = [UNIT * boundary_shifts(falloff) for falloff in FALLOFFS_PX]
-
-    def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> tuple[F32, Iterable[F32]]:
-        level = evidence.level(fringes, signal)
-        flat = evidence.flat.astype(np.float32)
-
-        def slopes() -> Iterator[F32]:
-            u = level / np.float32(level_e)
-            power = level / flat
-            for _ in range(powers):
-                power = power * u
-                yield np.asarray(power, np.float32)
-            for shifts in every:
-                yield np.stack([moved_charge(frame, shifts) for frame in level]) / flat
-
-        return np.zeros_like(signal), slopes()
-
+    signal = _signal_of(evidence, level_e, every)
     sets = evidence.fringes.values()
     across = [
         tuple(f for f in sets if (abs(f.k[0]) >= abs(f.k[1])) == of_columns)
         for of_columns in (True, False)
     ]
     return [
-        distortion_sums(own, distortion, powers + len(every), margin=REACH) for own in across if own
+        distortion_sums(own, signal, powers + len(every), margin=REACH) for own in across if own
     ]
 
 

@@ -7,7 +7,7 @@ them blind to every error of the fit, a moving fringe vector included, and the s
 least-squares fit of one to the other (Gauss-Newton, since the fitted signal is itself distorted).
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -19,7 +19,7 @@ from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
 from pixcal.model.arrays import F32, F64, Mask
 
-Distortion = Callable[[FringeEvidence, F32, F64], tuple[F32, Iterable[F32]]]
+Distortion = Callable[[FringeEvidence, F32, F64], F32]
 
 # of the alternating projections: with the weights of fringes of full contrast 0.5 % of the rest
 # still lies in directions that are free, and half as much with each turn more
@@ -197,7 +197,7 @@ def fit_distortions(
     ----------
     distortion : callable
         From a set, its signal (t, y, x) without distortion and the sizes, what is added to the
-        signal (t, y, x), and its derivative by each size.
+        signal (t, y, x). Derivatives are the changes by sizes of one.
     margin : int
         Pixels along the edges that are not used.
     prior : (float64 array, float64 array), optional
@@ -261,7 +261,8 @@ class _SetFit:
         seen = np.isfinite(fringes.electrons) & ~fringes.good
         self._fitted = np.nan_to_num(np.where(seen, fringes.electrons, fringes.model))
         self._signal = self._fitted
-        _, slopes = distortion(fringes, self._signal, np.zeros(count))
+        plain = distortion(fringes, self._signal, np.zeros(count))
+        slopes = (distortion(fringes, self._signal, one) - plain for one in np.eye(count))
         self._left = [self._freedom.left_over(self._freedom.of_good(slope)) for slope in slopes]
         self.normal = np.array([self._weighted_dots(rest) for rest in self._left])
 
@@ -270,7 +271,7 @@ class _SetFit:
         residual = self._residual
         if np.any(sizes):
             freedom = self._freedom
-            change = freedom.of_good(self._distortion(self._fringes, self._signal, sizes)[0])
+            change = freedom.of_good(self._distortion(self._fringes, self._signal, sizes))
             left = freedom.left_over(change)
             self._signal = self._fitted.copy()
             self._signal[:, freedom.good] -= change - left
