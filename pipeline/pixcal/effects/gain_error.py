@@ -14,6 +14,7 @@ from pixcal.estimators.detector.transfer_curve import (
     sums_of_stacks,
     transfer_curve,
 )
+from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.scene import DetectorMaps, Rows
 from pixcal.model.arrays import F32, F64
@@ -143,24 +144,16 @@ def _of_fringes(found: FringeEvidence) -> F64 | None:
     pixels = np.count_nonzero(found.good)
     if len(found.g) < _MIN_FRAMES or pixels < MIN_PIXELS:
         return None
-    b, c, s = found.g.T.astype(np.float32)
-    of_time = np.stack([b * b, 2 * b * c, 2 * b * s, c * c, 2 * c * s, s * s], axis=1)
-    shape = found.good.shape
-    weight = (1 / found.variance).reshape(len(b), -1)
-    weight[~np.isfinite(found.electrons.reshape(len(b), -1))] = 0
-    sums = of_time.T @ weight / np.array([1, 2, 2, 1, 2, 1], np.float32)[:, None]
-    n00, n01, n02, n11, n12, n22 = sums.astype(float)
-    normal = np.stack([[n00, n01, n02], [n01, n11, n12], [n02, n12, n22]]).transpose(2, 0, 1)
-    normal[~(found.good.ravel() & (n00 > 0))] = 0
-    good = np.linalg.det(normal / np.where(n00 > 0, n00, 1)[:, None, None]) > 1e-6
-    normal[~good] = np.eye(3)
-    inverse = np.linalg.inv(normal)
-    of_pixels = inverse[:, (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)].T
+    freedom = Freedom(found)
+    i, j = np.triu_indices(len(freedom.of_time))
+    of_time = (freedom.of_time[i] * freedom.of_time[j]).T * np.where(i == j, 1, 2)
+    of_pixels = np.zeros((len(i), *found.good.shape))
+    of_pixels[:, found.good] = freedom.pixel_inverse[:, i, j].T
     # (B, A cos phi, A sin phi) of every frame, and the fringe vector where it is free: what they
     # take from the residuals is alike in neighbours as far as the pattern is.
     alike = np.cos(STEPS @ np.array([found.k[1], found.k[0]]))
     taken = (1 + (4 if np.any(found.dk) else 2) * alike) / pixels
     return residual_sums(
         found.residual, found.model, found.shot_factor, found.read_variance,
-        good.reshape(shape), of_time, of_pixels.reshape(6, *shape), taken,
+        found.good, of_time, of_pixels, taken,
     )  # fmt: skip

@@ -13,10 +13,8 @@ particle hits neighbours together.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numba import njit
 
 from pixcal.estimators.diagnosis.distortions import Freedom, TwoWay
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
@@ -110,38 +108,16 @@ def _sums(noise: _Noise, shared: F32, dy: int, dx: int) -> tuple[F64, F64]:
     m = REACH
     one[m + max(0, -dy) : ny - m - max(0, dy), m + max(0, -dx) : nx - m - max(0, dx)] = True
     one &= noise.good & np.roll(noise.good, (-dy, -dx), axis=(0, 1))
-    other = np.roll(one, (dy, dx), axis=(0, 1))
-    normal, right = np.zeros((4, 4)), np.zeros(4)
-    _add_products(
-        noise.residual, noise.variance, noise.charge, shared, noise.taken(one, other),
-        *np.nonzero(one), dy, dx, normal, right,
-    )  # fmt: skip
-    return noise.kept**2 * normal, noise.kept * right
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _add_products(
-    residual: Any, variance: Any, charge: Any, shared: Any, taken: Any,
-    rows: Any, columns: Any, dy: int, dx: int, normal: Any, right: Any,
-) -> None:  # fmt: skip
-    terms = np.ones(4)
-    for t in range(len(residual)):
-        for n in range(len(rows)):
-            y, x = rows[n], columns[n]
-            v, u = y + dy, x + dx
-            product = residual[t, y, x] * residual[t, v, u]
-            if product != 0:
-                w = 1 / (variance[t, y, x] * variance[t, v, u])
-                terms[1] = charge[t, y, x] + charge[t, v, u]
-                terms[2], terms[3] = shared[0, t, y, x], shared[1, t, y, x]
-                product = w * (product + taken[t, n])
-                for i in range(4):
-                    right[i] += product * terms[i]
-                    for j in range(i + 1):
-                        normal[i, j] += w * terms[i] * terms[j]
-    for i in range(4):
-        for j in range(i):
-            normal[j, i] = normal[i, j]
+    y, x = np.nonzero(one)
+    here, there = (slice(None), y, x), (slice(None), y + dy, x + dx)
+    product = noise.residual[here] * noise.residual[there]
+    both = noise.variance[here] * noise.variance[there]
+    weight = np.where(product != 0, 1 / both, np.float32(0)).ravel()
+    charge = noise.charge[here] + noise.charge[there]
+    terms = np.stack([np.ones_like(charge), charge, *(own[here] for own in shared)]).reshape(4, -1)
+    product += noise.taken(one, np.roll(one, (dy, dx), axis=(0, 1)))
+    normal, right = (terms * weight) @ terms.T, (terms * weight) @ product.ravel()
+    return noise.kept**2 * normal.astype(float), noise.kept * right.astype(float)
 
 
 def _noises(evidence: Evidence) -> Iterator[_Noise]:
