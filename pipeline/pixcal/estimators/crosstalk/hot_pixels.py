@@ -8,10 +8,8 @@ counts only where several hot pixels of a class agree.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numba import njit
 from scipy.ndimage import maximum_filter, median_filter
 
 from pixcal.estimators.crosstalk.links import REACH, PixelClasses, Place
@@ -71,11 +69,14 @@ class HotPixels:
         x = np.stack([np.broadcast_to(self.x[:, None], (len(self.x), len(step)))] * 2, -1)
         y[:, :, 1] -= step[:, 0]
         x[:, :, 1] -= step[:, 1]
-        found = np.zeros((6, len(links), classes.count, 2))
-        sigma = np.hypot(self.sigma, doubt * self.value)
         order = np.argsort(self.value, axis=0)
-        _by_class(self.value, sigma, self.charge, order, classes.of(y, x), found)
-        return ClassShares(*found)
+        every = (self.value, np.hypot(self.sigma, doubt * self.value), classes.of(y, x))
+        value, sigma, number = (np.take_along_axis(a, order, 0) for a in every)
+        found = [
+            _agreed(value, np.where(number == n, sigma, np.inf), self.charge[order])
+            for n in range(classes.count)
+        ]
+        return ClassShares(*np.stack(found, axis=2))
 
     def level_dependence(
         self, couplings: Sequence[Coupling], links: Sequence[Place], first: Place
@@ -241,64 +242,33 @@ def _surroundings(values: F64, y: Indices, x: Indices, size: int) -> F64:
     return np.asarray(padded[y[:, None, None] + step[:, None], x[:, None, None] + step])
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _by_class(value: Any, sigma: Any, charge: Any, order: Any, classes: Any, found: Any) -> None:
-    pixels, links, sides = value.shape
-    v, s, q = np.empty(pixels), np.empty(pixels), np.empty(pixels)
-    for link in range(links):
-        for side in range(sides):
-            for number in range(found.shape[2]):
-                n = 0
-                for place in range(pixels):
-                    h = order[place, link, side]
-                    if classes[h, link, side] == number and sigma[h, link, side] < np.inf:
-                        v[n], s[n], q[n] = value[h, link, side], sigma[h, link, side], charge[h]
-                        n += 1
-                if n:
-                    _agreed(v[:n], s[:n], q[:n], found[:, link, number, side])
+def _agreed(v: F64, s: F64, q: F64) -> F64:
+    """Sums (6, ...) of `ClassShares`, of values (h, ...) in rising order and charges.
 
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _agreed(v: Any, s: Any, q: Any, found: Any) -> None:
-    """Sums of values, in rising order: of less weight where they disagree by more than chance."""
-    # In loops: expressions of arrays take seconds to compile.
-    w = np.empty(v.size)
-    half = 0.0
-    for i in range(v.size):
-        w[i] = 1 / s[i] ** 2
-        half += 0.5 * w[i]
-    at, middle = 0.0, v[0]
-    for i in range(v.size):
-        middle = v[i]
-        at += w[i]
-        if at >= half:
-            break
-    near = 0
-    for i in range(v.size):
-        near += abs(v[i] - middle) < CLIP * s[i]
-    if near < 2 or 2 * near <= v.size:
-        near = v.size
-    else:
-        for i in range(v.size):
-            w[i] *= abs(v[i] - middle) < CLIP * s[i]
-    total = mean = charge = 0.0
-    for i in range(v.size):
-        total += w[i]
-        mean += w[i] * v[i]
-        charge += w[i] * q[i]
-    mean, charge = mean / total, charge / total
-    square = product = rest = 0.0
-    for i in range(v.size):
-        square += w[i] * (q[i] - charge) ** 2
-        product += w[i] * (q[i] - charge) * (v[i] - mean)
-        rest += w[i] * (v[i] - mean) ** 2
-    freedom, less = near - 1, 1.0
-    if freedom >= ENOUGH and square > 0:
-        # What rises with the charge is told apart later.
-        freedom, rest = freedom - 1, rest - product**2 / square
-    if freedom > 0:
-        # Reduced chi-square that chance passes once in a thousand (Wilson and Hilferty's cube).
-        usual = (1 - 2 / (9 * freedom) + 3.09 * np.sqrt(2 / (9 * freedom))) ** 3
-        less = freedom / rest if rest > usual * freedom else 1.0
-    found[0], found[1], found[2] = total * less, mean, charge
-    found[3], found[4], found[5] = square * less, product * less, v.size
+    Of less weight where they disagree by more than chance; errors are infinite of no value.
+    """
+    w = s**-2.0
+    used, half = w > 0, w.sum(axis=0) / 2
+    middle = np.take_along_axis(v, np.argmax(np.cumsum(w, axis=0) >= half, axis=0)[None], 0)
+    near = used & (np.abs(v - middle) < CLIP * s)
+    count, agree = used.sum(axis=0), near.sum(axis=0)
+    kept = np.where((agree < 2) | (2 * agree <= count), used, near)
+    w = w * kept
+    total = w.sum(axis=0)
+    per = np.where(total > 0, total, 1)
+    mean, charge = (w * v).sum(axis=0) / per, (w * q).sum(axis=0) / per
+    square, product, rest = (
+        (w * a * b).sum(axis=0)
+        for a, b in ((q - charge, q - charge), (q - charge, v - mean), (v - mean, v - mean))
+    )
+    freedom = kept.sum(axis=0) - 1
+    # What rises with the charge is told apart later.
+    rising = (freedom >= ENOUGH) & (square > 0)
+    rest = rest - np.where(rising, product**2 / np.where(rising, square, 1), 0)
+    freedom = np.maximum(freedom - rising, 0)
+    # Reduced chi-square that chance passes once in a thousand (Wilson and Hilferty's cube).
+    some = np.maximum(freedom, 1)
+    usual = (1 - 2 / (9 * some) + 3.09 * np.sqrt(2 / (9 * some))) ** 3
+    apart = (freedom > 0) & (rest > usual * freedom)
+    less = np.where(apart, freedom / np.where(apart, rest, 1), 1)
+    return np.stack([total * less, mean, charge, square * less, product * less, count])

@@ -1,12 +1,12 @@
 """Whether charge that an effect adds to the samples has shot noise of its own."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
 from pixcal.kernels.normal_matrix import inverse_normal
-from pixcal.model.arrays import F32
+from pixcal.model.arrays import F32, F64
 
 _CLIP = 25.0  # squares of residuals, over their variance, that are left to particles and the like
 
@@ -32,21 +32,13 @@ def missing_noise(
     part, error : float
         Zero where every added electron came by its own chance, one where none did.
     """
-    normal, right = np.zeros((3, 3)), np.zeros(3)
     flat = evidence.flat.astype(np.float32)
-    for fringes in evidence.fringes.values():
-        charge = added(fringes, fringes.model * flat)
-        square = (fringes.residual[:, fringes.good] * flat[fringes.good]) ** 2
-        variance = fringes.variance[:, fringes.good] * flat[fringes.good] ** 2
-        weight = np.where(square < _CLIP * variance, 0.5 / variance**2, 0)
-        terms = [variance, np.ones_like(variance), -charge[:, fringes.good]]
-        for i, one in enumerate(terms):
-            right[i] += float(np.vdot(weight * one, square))
-            for j in range(i, 3):
-                normal[i, j] += float(np.vdot(weight * one, terms[j]))
-    normal = np.triu(normal) + np.triu(normal, 1).T
-    covariance = inverse_normal(normal)
-    return float(covariance[2] @ right), float(np.sqrt(covariance[2, 2]))
+
+    def terms(fringes: FringeEvidence, variance: F32) -> list[F32]:
+        charge = added(fringes, fringes.model * flat)[:, fringes.good]
+        return [variance, np.ones_like(variance), -charge]
+
+    return _last_of(evidence, evidence.fringes.values(), terms)
 
 
 def noiseless_level(evidence: Evidence, fringes: FringeEvidence) -> tuple[float, float]:
@@ -65,12 +57,27 @@ def noiseless_level(evidence: Evidence, fringes: FringeEvidence) -> tuple[float,
     level, error : float
         e-, before the flat.
     """
-    flat = evidence.flat[fringes.good].astype(np.float32)
-    square = (fringes.residual[:, fringes.good] * flat) ** 2
-    variance = fringes.variance[:, fringes.good] * flat**2
-    weight = np.where(square < _CLIP * variance, 0.5 / variance**2, 0)
-    terms = [variance, -np.ones_like(variance)]
-    normal = np.array([[float(np.vdot(weight * a, b)) for b in terms] for a in terms])
-    right = np.array([float(np.vdot(weight * a, square)) for a in terms])
-    covariance = np.linalg.inv(normal)
-    return float(covariance[1] @ right), float(np.sqrt(covariance[1, 1]))
+    return _last_of(evidence, [fringes], lambda _, v: [v, -np.ones_like(v)])
+
+
+def _last_of(
+    evidence: Evidence,
+    sets: Iterable[FringeEvidence],
+    terms: Callable[[FringeEvidence, F32], list[F32]],
+) -> tuple[float, float]:
+    """The last of some terms of the squared residuals, and its error.
+
+    Terms (t, n) of the good pixels of a set and their variance, e-², before the flat.
+    """
+    normal: F64 | float = 0.0
+    right: F64 | float = 0.0
+    for fringes in sets:
+        flat = evidence.flat[fringes.good].astype(np.float32)
+        square = (fringes.residual[:, fringes.good] * flat) ** 2
+        variance = fringes.variance[:, fringes.good] * flat**2
+        weight = np.where(square < _CLIP * variance, 0.5 / variance**2, 0)
+        own = terms(fringes, variance)
+        normal = normal + np.array([[np.vdot(weight * a, b) for b in own] for a in own], float)
+        right = right + np.array([np.vdot(weight * a, square) for a in own], float)
+    covariance = inverse_normal(np.asarray(normal))
+    return float(covariance[-1] @ right), float(np.sqrt(covariance[-1, -1]))
