@@ -61,12 +61,6 @@ class CouplingFrames:
         """Rows and columns."""
         return self.evidence.good.shape[0], self.evidence.good.shape[1]
 
-    def of(self, links: Sequence[int]) -> "CouplingFrames":
-        """Some of the steps."""
-        every = MeasuredLinks(self.noise, self.hot, self.steps, self.shape, self.evidence.origin)
-        some = every.of(links)
-        return CouplingFrames(self.evidence, some.products, some.hot, some.links)
-
     def measured(self, known: Sequence[Coupling], per_ke: float = 0.0) -> MeasuredLinks:
         """The same to the first order of shares, those known giving the second."""
         large = [replace(c, per_ke=per_ke) for c in known if abs(c.share) > NEGLIGIBLE]
