@@ -257,7 +257,7 @@ def test_what_the_fit_takes_up_is_said(coupled, tmp_path):
 
 def test_effects_known_before_the_diagnosis_are_undone_too(tmp_path):
     found = treatments([], {"ipc": to_plain(Ipc())}, "auto", {"only": "paraxial"}, (), tmp_path)
-    assert found.on_maps == (Ipc(),)
+    assert [t.effect for t in found.on_maps] == [Ipc()]
     assert found.every[0].origin == "nominal"
 
 
@@ -273,7 +273,7 @@ def test_bent_fringes_are_for_the_shape_that_is_fitted(tmp_path, asked, taken, h
     causes = [{"effect": "hyperbolic_fringes", "parameters": {}}]
     found = treatments(causes, {}, asked, {"one": "hyperbolic", "two": taken}, (), tmp_path)
     assert found.every[0].how == how
-    assert found.changes == (how == "in the corrected fit")
+    assert found.bent == (how == "in the corrected fit")
     assert ("--model hyperbolic" in found.every[0].why) == (how == "not undone")
 
 

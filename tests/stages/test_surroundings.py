@@ -7,7 +7,8 @@ from pixcal.effects.ipc import Ipc
 from pixcal.kernels.crosstalk import couple_fringes, uncouple_fringes
 from pixcal.model.flags import PixelFlag
 from pixcal.simulation.effect import FringeMaps
-from pixcal.stages.correct.surroundings import border_misfit, decided, disturbed, usable
+from pixcal.stages.correct.surroundings import border_misfit, decided, disturbed
+from pixcal.stages.correct.swept import usable
 
 K = (2 * np.pi / 9, 0.02)
 KERNEL = Ipc.nearest(0.008).couplings
@@ -55,7 +56,9 @@ def test_errors_of_neighbours_add_up_in_squares():
     theta = np.stack([np.full(shape, 2e4), 2e4 * np.sin(psi), 2e4 * np.cos(psi)])
     unknown = np.zeros(shape, bool)
     unknown[4, 3] = unknown[3, 4] = True
-    moved = disturbed(FringeMaps(theta, K, (5, 7)), unknown, np.zeros_like(unknown), 0.0)
+    moved = disturbed(
+        FringeMaps(theta, K, (5, 7)), unknown, np.zeros_like(unknown), np.zeros(shape)
+    )
     z = np.array([m.theta[2] + 1j * m.theta[1] for m in moved]) - (theta[2] + 1j * theta[1])
     both = np.abs(z[:, 4, 3] + z[:, 3, 4]) ** 2
     apart = np.abs(z[:, 4, 3]) ** 2 + np.abs(z[:, 3, 4]) ** 2

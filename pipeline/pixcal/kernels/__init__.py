@@ -1,5 +1,23 @@
-"""Pure array mathematics: no files, no configuration, no scheduling."""
+"""Pure array mathematics: no files, no configuration, no scheduling.
 
-from pixcal.kernels.compiled import settle
+Numba keeps compiled kernels beside the code or with the user, and refuses to import a kernel where
+neither can be written: they are then kept as long as the process lives.
+"""
 
-settle()
+import atexit
+import shutil
+import tempfile
+
+import numba
+
+
+def _probe() -> None:
+    """Never called: only where it would be kept matters."""
+
+
+try:
+    numba.njit(cache=True)(_probe)
+except RuntimeError:
+    # Of this process alone: what others could write there would be run.
+    numba.config.CACHE_DIR = tempfile.mkdtemp(prefix="pixcal-")
+    atexit.register(shutil.rmtree, numba.config.CACHE_DIR, ignore_errors=True)

@@ -8,14 +8,11 @@ grows along the baseline: its paraxial gradient is ``K = 2 pi / lambda p b / D``
 """
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pixcal.model.arrays import F64
-
-Array = F64
 
 # parameters of `phase_jacobian`, in its order; all in mm
 PARAMETERS = ("centre_x", "centre_y", "distance", "baseline_x", "baseline_y", "baseline_z")
@@ -46,7 +43,7 @@ class Geometry:
         """2 pi / wavelength, in rad/mm."""
         return 2 * np.pi / self.wavelength
 
-    def vector(self) -> Array:
+    def vector(self) -> F64:
         """The parameters (mm) in the order of `PARAMETERS`."""
         return np.array([getattr(self, name) for name in PARAMETERS])
 
@@ -56,7 +53,7 @@ class Geometry:
         return replace(self, **dict(zip(PARAMETERS, numbers, strict=True)))
 
 
-def phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
+def phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
     """Exact fringe phase psi, rad, good to 1e-9 rad, at pixel coordinates.
 
     The difference of the two paths (paper, eq. 3) loses seven digits when taken as written; this
@@ -65,13 +62,13 @@ def phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
     cx, cy, d, bx, by, bz = geometry.vector()
     qx, qy = np.asarray(x, float) * geometry.pitch - cx, np.asarray(y, float) * geometry.pitch - cy
     # With x a row and y a column only their sides are computed.
-    paths: Array = np.sqrt((qx + 0.5 * bx) ** 2 + (qy + 0.5 * by) ** 2 + (0.5 * bz - d) ** 2)
+    paths: F64 = np.sqrt((qx + 0.5 * bx) ** 2 + (qy + 0.5 * by) ** 2 + (0.5 * bz - d) ** 2)
     paths += np.sqrt((qx - 0.5 * bx) ** 2 + (qy - 0.5 * by) ** 2 + (-0.5 * bz - d) ** 2)
-    result: Array = geometry.wavenumber * 2.0 * (bx * qx + by * qy - bz * d) / paths
+    result: F64 = geometry.wavenumber * 2.0 * (bx * qx + by * qy - bz * d) / paths
     return result
 
 
-def opd(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
+def opd(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
     """Exact optical path difference in mm; parameters as `phase`."""
     return phase(x, y, geometry) / geometry.wavenumber
 
@@ -82,14 +79,14 @@ def paraxial_vector(geometry: Geometry) -> tuple[float, float]:
     return scale * geometry.baseline_x, scale * geometry.baseline_y
 
 
-def paraxial_phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
+def paraxial_phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
     """Phase of straight fringes (paper, eq. 4), zero at the foot of the fibres' centre.
 
     As `phase`; the tilt of the baseline is left out, as in the paper.
     """
     kx, ky = paraxial_vector(geometry)
     xs, ys = np.asarray(x, float), np.asarray(y, float)
-    result: Array = kx * (xs - geometry.centre_x / geometry.pitch) + ky * (
+    result: F64 = kx * (xs - geometry.centre_x / geometry.pitch) + ky * (
         ys - geometry.centre_y / geometry.pitch
     )
     return result
@@ -100,54 +97,45 @@ def interfringe(geometry: Geometry) -> float:
     return float(2 * np.pi / np.hypot(*paraxial_vector(geometry)))
 
 
-def fringe_vector(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[Array, Array]:
+def fringe_vector(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> tuple[F64, F64]:
     """Local fringe vector: the exact gradient of `phase` with respect to x and y, in rad/px."""
     path = _Paths(x, y, geometry)
     scale = geometry.wavenumber * geometry.pitch
-    kx = scale * path.quotient(2 * geometry.baseline_x, path.ua[0] + path.ub[0])
-    ky = scale * path.quotient(2 * geometry.baseline_y, path.ua[1] + path.ub[1])
+    kx, ky = (scale * path.quotient(2 * path.b[n], path.ua[n] + path.ub[n]) for n in (0, 1))
     return kx, ky
 
 
-def phase_jacobian(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> Array:
+def phase_jacobian(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
     """Derivative (..., 6), rad/mm, of `phase` by the geometry's `PARAMETERS`, in their order."""
     path = _Paths(x, y, geometry)
-    baseline = (geometry.baseline_x, geometry.baseline_y, geometry.baseline_z)
-    both, apart = path.ua + path.ub, (path.ua - path.ub) / 2
-    of_centre = [path.quotient(-2 * b, -u) for b, u in zip(baseline, both, strict=True)]
-    of_baseline = [path.quotient(2 * q, u) for q, u in zip(path.q, apart, strict=True)]
-    return geometry.wavenumber * np.stack([*of_centre, *of_baseline], axis=-1)
+    of_centre = path.quotient(-2 * path.b, -(path.ua + path.ub))
+    of_baseline = path.quotient(2 * path.q, (path.ua - path.ub) / 2)
+    return np.moveaxis(geometry.wavenumber * np.concatenate([of_centre, of_baseline]), 0, -1)
 
 
 class _Paths:
     """Optical path difference and its derivatives, free of cancellation.
 
     The quotient ``2 b·q / (|q + b/2| + |q - b/2|)``, q from the fibres' centre, and the unit
-    vectors of both paths.
+    vectors of both paths; vectors (3, ...), b (3, 1, ...).
     """
 
     def __init__(self, x: ArrayLike, y: ArrayLike, geometry: Geometry) -> None:
         xs, ys = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
-        b = np.array([geometry.baseline_x, geometry.baseline_y, geometry.baseline_z])
-        across = xs * geometry.pitch - geometry.centre_x
-        along = ys * geometry.pitch - geometry.centre_y
-        q = np.stack([across, along, np.full(xs.shape, -geometry.distance)])
-        half = (b / 2).reshape((3,) + (1,) * xs.ndim)
-        to_a, to_b = q + half, q - half
+        cx, cy, distance, *baseline = geometry.vector()
+        self.b = np.reshape(baseline, (3,) + (1,) * xs.ndim)
+        self.q = np.stack([xs * geometry.pitch - cx, ys * geometry.pitch - cy, xs * 0 - distance])
+        to_a, to_b = self.q + self.b / 2, self.q - self.b / 2
         rho_a, rho_b = np.sqrt((to_a**2).sum(0)), np.sqrt((to_b**2).sum(0))
-        self.q: Array = q
-        self.ua: Array = to_a / rho_a
-        self.ub: Array = to_b / rho_b
-        self.sum: Array = rho_a + rho_b
-        self.opd: Array = 2 * np.tensordot(b, q, axes=1) / self.sum
+        self.ua, self.ub, self.sum = to_a / rho_a, to_b / rho_b, rho_a + rho_b
+        self.opd = 2 * (self.b * self.q).sum(axis=0) / self.sum
 
-    def quotient(self, numerator: Any, paths: Any) -> Array:
+    def quotient(self, numerator: F64, paths: F64) -> F64:
         """Derivative of the OPD from those of its numerator and of the sum of the paths."""
-        result: Array = (numerator - self.opd * paths) / self.sum
-        return result
+        return np.asarray((numerator - self.opd * paths) / self.sum)
 
 
-def gaussian_beam(x: ArrayLike, y: ArrayLike, centre: tuple[float, float], radius: float) -> Array:
+def gaussian_beam(x: ArrayLike, y: ArrayLike, centre: tuple[float, float], radius: float) -> F64:
     """Intensity of a Gaussian beam at x, y relative to its peak, all in px.
 
     At the radius it has fallen to 1/e².
@@ -155,5 +143,5 @@ def gaussian_beam(x: ArrayLike, y: ArrayLike, centre: tuple[float, float], radiu
     # A product of two exponentials: with x a row and y a column only their sides are computed.
     across = np.exp(-2 * ((np.asarray(x, float) - centre[0]) / radius) ** 2)
     along = np.exp(-2 * ((np.asarray(y, float) - centre[1]) / radius) ** 2)
-    result: Array = along * across
+    result: F64 = along * across
     return result

@@ -14,6 +14,7 @@ as a cubic B-spline, fine enough that the spline does not show (`KNOTS`).
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -91,40 +92,30 @@ def _jinc(z: F64) -> F64:
     return np.where(small, 1.0, 2 * j1(away) / away)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def share(coefficients: F64, step: float, x: float, y: float) -> tuple[float, float, float]:
-    """Share of the light and its derivatives at one place (px): see `Psf.at`."""
-    n = coefficients.shape[0]
-    u, v = x / step + n // 2, y / step + n // 2
-    u, v = min(max(u, 1.0), n - 2.000001), min(max(v, 1.0), n - 2.000001)
-    j, i = int(u), int(v)
-    # Weights of the four knots around, and their derivatives (cubic B-spline).
-    t = u - j
+@njit(inline="always")  # type: ignore[untyped-decorator]
+def _spline(t: float) -> tuple[Any, Any]:
+    """Weights of the four knots around a place, t beyond the second, and their derivatives."""
     s = 1.0 - t
-    x0, x1, x2, x3 = (
-        s**3 / 6,
-        (3 * t * t * (t - 2) + 4) / 6,
-        (3 * s * s * (s - 2) + 4) / 6,
-        t**3 / 6,
-    )
-    dx0, dx1, dx2, dx3 = -s * s / 2, t * (1.5 * t - 2), -s * (1.5 * s - 2), t * t / 2
-    t = v - i
-    s = 1.0 - t
-    y_weight = (s**3 / 6, (3 * t * t * (t - 2) + 4) / 6, (3 * s * s * (s - 2) + 4) / 6, t**3 / 6)
-    y_slope = (-s * s / 2, t * (1.5 * t - 2), -s * (1.5 * s - 2), t * t / 2)
-    value, along_x, along_y = 0.0, 0.0, 0.0
-    for k in range(4):
-        row = coefficients[i - 1 + k, j - 1 : j + 3]
-        here = x0 * row[0] + x1 * row[1] + x2 * row[2] + x3 * row[3]
-        value += y_weight[k] * here
-        along_y += y_slope[k] * here
-        along_x += y_weight[k] * (dx0 * row[0] + dx1 * row[1] + dx2 * row[2] + dx3 * row[3])
-    return value, along_x / step, along_y / step
+    weights = s**3 / 6, (3 * t * t * (t - 2) + 4) / 6, (3 * s * s * (s - 2) + 4) / 6, t**3 / 6
+    return weights, (-s * s / 2, t * (1.5 * t - 2), -s * (1.5 * s - 2), t * t / 2)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _shares(coefficients: F64, step: float, x: F64, y: F64) -> F64:
-    out = np.empty((3, x.size))
-    for n in range(x.size):
-        out[0, n], out[1, n], out[2, n] = share(coefficients, step, x[n], y[n])
+    n, out = coefficients.shape[0], np.zeros((3, x.size))
+    for place in range(x.size):
+        u = min(max(x[place] / step + n // 2, 1.0), n - 2.000001)
+        v = min(max(y[place] / step + n // 2, 1.0), n - 2.000001)
+        j, i = int(u), int(v)
+        of_x, slope_x = _spline(u - j)
+        of_y, slope_y = _spline(v - i)
+        for k in range(4):
+            value = along = 0.0
+            for m in range(4):
+                c = coefficients[i - 1 + k, j - 1 + m]
+                value += of_x[m] * c
+                along += slope_x[m] * c
+            out[0, place] += of_y[k] * value
+            out[1, place] += of_y[k] * along / step
+            out[2, place] += slope_y[k] * value / step
     return out

@@ -44,7 +44,7 @@ from pixcal.storage.artefact import MANIFEST, Build, Manifest, read_json
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.folder import INDEX
 from pixcal.storage.formats import STAGES
-from pixcal.storage.stage import copy_products, make, require, working
+from pixcal.storage.stage import make, require, working
 
 # stages whose artefacts are read
 SHOWN_STAGES = ("ingest", "reduce", "sweep", "fit", "allan", "diagnose", "corrected")
@@ -78,9 +78,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             (made.folder / "report.html").write_text(page, encoding="utf-8")
             made.summary = {"bytes": len(page.encode()), "sections": page.count("<section")}
 
-        options = result_options(config)
-        publish = partial(copy_products, run_dir, STAGE, "report.html")
-        return make(run_dir, STAGE, options, inputs, body, publish=publish)
+        return make(run_dir, STAGE, result_options(config), inputs, body)
 
 
 def _collect(run_dir: Path, manifests: Mapping[str, Manifest], runtime: Runtime) -> Contents:

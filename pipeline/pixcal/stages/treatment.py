@@ -66,25 +66,20 @@ class Treatments:
 
     every: tuple[Treatment, ...]  # in the order of the diagnosis
 
-    def _those(self, how: str) -> tuple[Effect, ...]:
-        """Effects of a treatment, the last that acted first."""
-        matching = [t.effect for t in self.every if t.how == how]
-        return tuple(sorted(matching, key=lambda e: e.turn, reverse=True))
+    def _those(self, how: str) -> tuple[Treatment, ...]:
+        """To undo in one way, the last that acted first."""
+        matching = [t for t in self.every if t.how == how]
+        return tuple(sorted(matching, key=lambda t: t.effect.turn, reverse=True))
 
     @property
     def on_samples(self) -> tuple[Effect, ...]:
         """To undo on samples, in that order."""
-        return self._those("undone on samples")
+        return tuple(t.effect for t in self._those("undone on samples"))
 
     @property
-    def on_maps(self) -> tuple[Effect, ...]:
+    def on_maps(self) -> tuple[Treatment, ...]:
         """To undo on maps, in that order."""
         return self._those("undone on maps")
-
-    @property
-    def changes(self) -> bool:
-        """Whether there are other maps to be made."""
-        return bool(self.undone) or self.bent
 
     @property
     def bent(self) -> bool:
@@ -92,19 +87,9 @@ class Treatments:
         return any(t.how == IN_CORRECTED for t in self.every)
 
     @property
-    def errors(self) -> dict[str, Mapping[str, float]]:
-        """Of the parameters of each effect."""
-        return {t.effect.name: t.errors for t in self.every}
-
-    @property
-    def covariances(self) -> dict[str, F64]:
-        """Of the parameters of effects that were measured together."""
-        return {t.effect.name: t.covariance for t in self.every if t.covariance is not None}
-
-    @property
-    def undone(self) -> tuple[Effect, ...]:
-        """All that are undone."""
-        return (*self.on_samples, *self.on_maps)
+    def undone(self) -> tuple[str, ...]:
+        """Names of all that are undone."""
+        return tuple(e.name for e in (*self.on_samples, *(t.effect for t in self.on_maps)))
 
 
 def treatments(
@@ -115,20 +100,14 @@ def treatments(
     own: Sequence[Path],
     where: Path,
 ) -> Treatments:
-    """What to do about the effects of a diagnosis.
+    """What to do about the effects of a diagnosis, by the ``causes`` of ``diagnosis.json``.
 
     Parameters
     ----------
-    causes : sequence of mapping
-        Of ``diagnosis.json``.
-    nominal : mapping
-        Parameters of the effects that the nominal bench had, by name.
-    model, models : str, mapping
-        Shape of the fringes that the fit was asked for, and those fitted, by fringe set.
-    own : sequence of Path
-        Files with effects of the user's own; one that is not known is refused.
-    where : Path
-        The diagnosis, for messages.
+    nominal : parameters of the effects that the nominal bench had, by name
+    model, models : shape of the fringes that the fit was asked for, and those fitted, by set
+    own : files with effects of the user's own; one that is not known is refused
+    where : the diagnosis, for messages
     """
     known = known_effects(own)
     entries: list[tuple[str, str, Any, Mapping[str, float]]]

@@ -16,6 +16,7 @@ class ArtefactKind:
     command: str  # what the user types to have it made, `RUN` standing for the run directory
     earlier: tuple[int, ...] = ()  # formats that are read as well
     of_fringes: bool = True  # whether there is none of an acquisition without fringes
+    products: str = ""  # pattern of the files that are copied to ``RUN/products``
 
     def typed(self, run: Path) -> str:
         """The command for a run."""
@@ -29,12 +30,12 @@ STAGES = {
         ArtefactKind("reduce", 2, "reduce RUN", earlier=(1,), of_fringes=False),
         ArtefactKind("sweep", 4, "fit RUN"),
         ArtefactKind("fit", 1, "fit RUN"),
-        ArtefactKind("allan", 1, "allan RUN"),
-        ArtefactKind("crests", 1, "crests RUN"),
-        ArtefactKind("diagnose", 6, "diagnose RUN", of_fringes=False),
+        ArtefactKind("allan", 1, "allan RUN", products="allan.json"),
+        ArtefactKind("crests", 1, "crests RUN", products="crests*.*"),
+        ArtefactKind("diagnose", 6, "diagnose RUN", of_fringes=False, products="diagnosis.json"),
         ArtefactKind("corrected", 2, "fit RUN --with-diagnosis"),
-        ArtefactKind("astrometry", 1, "astrometry RUN"),
-        ArtefactKind("report", 2, "report RUN", of_fringes=False),
+        ArtefactKind("astrometry", 1, "astrometry RUN", products="astrometry.*"),
+        ArtefactKind("report", 2, "report RUN", of_fringes=False, products="report.html"),
         # In directories of their own.
         ArtefactKind("compare", 1, "compare RUN --out DIR"),
         ArtefactKind("simulate", 1, "simulate BENCH.yaml --out ACQ"),

@@ -102,7 +102,7 @@ def make(
     body : callable, writes it, into the folder of a `Build`
     cubes : Path or UrlPath, optional, as of `pixcal.storage.artefact.build`
     keep : callable, whether an artefact that is up to date can stay as it is
-    publish : callable, writes the products, when the artefact is complete
+    publish : callable, writes products beside those of `ArtefactKind.products`, when it is complete
     published : callable, whether those of an artefact that stays are there
 
     Returns
@@ -122,12 +122,15 @@ def make(
                 gc.unfreeze()
         ready = require(run, stage.name)
     if not (stays and published()):
+        if stage.products:
+            _copy_products(run, stage)
         publish()
     return ready
 
 
-def copy_products(run: Path, stage: ArtefactKind, pattern: str) -> None:
+def _copy_products(run: Path, stage: ArtefactKind) -> None:
     """Copy files of an artefact to ``RUN/products``; others there that match the pattern go."""
+    pattern = stage.products
     folder, products = run / stage.name, run / "products"
     products.mkdir(exist_ok=True)
     files = [file for file in folder.glob(pattern) if file.is_file()]

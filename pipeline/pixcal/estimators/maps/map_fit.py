@@ -14,6 +14,7 @@ from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid, polynomial_basis
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.estimators.maps.structure import CELLS
+from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64, Indices, Mask
 
 _CLIP = 5.0
@@ -43,8 +44,7 @@ class MapPart:
             kept = use.copy()
             kept[use] = np.abs(left - centre) <= _CLIP * scatter
             use = kept
-        columns = np.concatenate([signals[:, use], data[None, use]]).T
-        rest = without(columns, free[:, use].T)
+        rest = without(np.concatenate([signals[:, use], data[None, use]]).T, free[:, use].T)
         y, x = np.nonzero(use)
         sides = [*CELLS, max(min(use.shape) // 4, 1)]
         blocks = np.stack([(y // n) * (use.shape[1] // n + 1) + x // n for n in sides])
@@ -124,10 +124,7 @@ def centred(shape: tuple[int, ...]) -> tuple[F64, F64]:
 
 def without(columns: F64, free: F64) -> F64:
     """Columns (pixel, n) less their least-squares fit by free terms (pixel, m)."""
-    size = np.sqrt((free**2).sum(axis=0))
-    unit = free / np.where(size > 0, size, 1.0)
-    inverse = np.linalg.pinv(unit.T @ unit, rcond=1e-10, hermitian=True)
-    return np.asarray(columns - unit @ (inverse @ (unit.T @ columns)))
+    return np.asarray(columns - free @ (inverse_normal(free.T @ free, 1e-10) @ (free.T @ columns)))
 
 
 def half_theta(fringes: FringeEvidence, half: int, good: Mask) -> F64:

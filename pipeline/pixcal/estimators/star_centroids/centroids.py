@@ -53,16 +53,8 @@ class Star:
     def fit(self, data: F64, offsets: F64, good: Good) -> F64:
         """Fit each star from the middle of its window: a, b (px), N, B (e-), (n, 4).
 
-        NaN where the fit does not end.
-
-        Parameters
-        ----------
-        data : (n, side, side) float64
-            Electrons.
-        offsets : (n, 2, side, side) float64
-            Where the fit takes the pixels to lie, (dx, dy), px.
-        good : (n, side, side) bool
-            Pixels to use.
+        Of electrons and pixels to use (n, side, side), and of where the fit takes the pixels to
+        lie, (dx, dy) (n, 2, side, side), px. NaN where the fit does not end.
         """
         # What pixels that are not used hold may be anything.
         data, offsets = np.where(good, data, 0.0), np.where(good[:, None], offsets, 0.0)
@@ -99,8 +91,7 @@ class Star:
         """
         if place is not None:
             return np.asarray(np.sqrt(np.diag(np.linalg.inv(self.information(place)))[:2]))
-        quarters = (np.arange(4) - 1.5) / 4
-        places = [np.array([x, y]) for y in quarters for x in quarters]
+        places = np.indices((4, 4)).reshape(2, -1).T / 4 - 0.375
         return np.asarray(np.sqrt(np.mean([self.bound(p) ** 2 for p in places], axis=0)))
 
     def weights(self, place: F64, good: Good | None = None) -> F64:

@@ -58,34 +58,23 @@ class Corrected:
 def correct_centroids(
     place: F64, offsets: NDArray[np.floating], sigma: NDArray[np.floating], star: Star
 ) -> Corrected:
-    """Correct each centroid for the offsets under the star.
+    """Correct each centroid (n, 2), (x, y) px on a perfect grid, for the offsets under the star.
 
-    Parameters
-    ----------
-    place : (n, 2) float64
-        (x, y) as measured on a perfect grid, px.
-    offsets, sigma : (2, y, x)
-        Offsets along x and y and their errors, px; NaN where unknown.
+    Offsets (2, y, x) along x and y and their errors are in px, NaN where unknown.
     """
     _, ny, nx = offsets.shape
-    corrected = np.full(place.shape, np.nan)
-    error = np.full(place.shape, np.nan)
+    corrected, error = np.full((2, *place.shape), np.nan)
+    around = np.arange(-star.half, star.half + 1)
     inside = np.isfinite(place).all(axis=1)
     # Far from the detector, and beyond what integers hold.
     inside &= (np.abs(np.nan_to_num(place)) < 2 * max(ny, nx)).all(axis=1)
     for n in np.flatnonzero(inside):
         middle = np.rint(place[n]).astype(int)
         weights = star.weights(place[n] - middle)
-        window = np.full((2, 2, star.side, star.side), np.nan)
-        (y0, x0), (h, w) = middle[::-1] - star.half, (star.side, star.side)
-        rows, columns = (max(0, y0), min(ny, y0 + h)), (max(0, x0), min(nx, x0 + w))
-        if rows[0] >= rows[1] or columns[0] >= columns[1]:
-            continue
-        source = (slice(*rows), slice(*columns))
-        target = tuple(slice(a - o, b - o) for (a, b), o in ((rows, y0), (columns, x0)))
-        window[0][:, *target] = offsets[:, *source]
-        window[1][:, *target] = sigma[:, *source]
+        x, y = middle[0] + around, (middle[1] + around)[:, None]
+        window = np.array([m[:, y.clip(0, ny - 1), x.clip(0, nx - 1)] for m in (offsets, sigma)])
         known = np.isfinite(window).all(axis=(0, 1))
+        known &= (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
         lost = np.abs(weights * ~known).sum() / np.abs(weights).sum()
         if lost > MAX_UNKNOWN:
             continue

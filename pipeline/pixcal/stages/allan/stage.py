@@ -46,7 +46,7 @@ from pixcal.stages.allan.batches import (
 from pixcal.storage.artefact import Build, Manifest, read_json, write_json
 from pixcal.storage.cube import ArrayWriter, create_array, create_group, write_array
 from pixcal.storage.formats import STAGES
-from pixcal.storage.stage import copy_products, make, working
+from pixcal.storage.stage import make, working
 
 STAGE = STAGES["allan"]
 SCHEMA = "pixcal/allan/1"
@@ -86,9 +86,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             whole = {"schema": SCHEMA, "pixcal": __version__, "sets": result}
             write_json(made.folder / "allan.json", whole)
 
-        options = result_options(config)
-        publish = partial(copy_products, run_dir, STAGE, "allan.json")
-        return make(run_dir, STAGE, options, inputs, body, publish=publish)
+        return make(run_dir, STAGE, result_options(config), inputs, body)
 
 
 def _check_region(region: Region | None, window: tuple[int, int]) -> None:

@@ -24,6 +24,7 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.fringe_fit.gauge import fringe_modes
 from pixcal.estimators.fringe_fit.models import FringeShape
 from pixcal.estimators.fringe_fit.models.paraxial import Paraxial
+from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64, Mask
 from pixcal.model.errors import InputError
 from pixcal.storage.products import FitsMap
@@ -166,22 +167,16 @@ class PixelPositions:
 
 
 def open_components(run_dir: Path, fit: dict[str, Any], truth: Path | None) -> list[Component]:
-    """The products of a run as components, with their truth where one is given.
-
-    Raises
-    ------
-    InputError
-        If a map is missing or damaged, or the truth is not one of this detector.
-    """
+    """The products of a run as components, with their truth where one is given."""
     true = {}
-    if truth is not None:
-        for name in AXES:
-            if not (truth / f"{name}.fits").exists():
-                raise InputError(
-                    f"--truth {truth}: no {name}.fits there; give what 'pixcal simulate' left "
-                    "beside the acquisition (ACQ-truth)"
-                )
-            true[name] = FitsMap.open(truth / f"{name}.fits")
+    files = {} if truth is None else {name: truth / f"{name}.fits" for name in AXES}
+    for name, file in files.items():
+        if not file.exists():
+            raise InputError(
+                f"--truth {truth}: no {file.name} there; give what 'pixcal simulate' left beside "
+                "the acquisition (ACQ-truth)"
+            )
+        true[name] = FitsMap.open(file)
     components = []
     for output in fit["outputs"]:
         file = run_dir / "products" / f"{output}.fits"
@@ -218,10 +213,8 @@ def free_from_modes(
     freed, removed = [], {}
     for component, sums in zip(components, zip(*parts, strict=True), strict=True):
         normal, right, count = (np.sum(part, axis=0) for part in zip(*sums, strict=True))
-        scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
         # Modes of two sets overlap: of all combinations that do, the least.
-        fit = np.linalg.lstsq(normal / np.outer(scale, scale), right / scale, rcond=1e-10)[0]
-        c = fit / scale
+        c = inverse_normal(normal, 1e-10) @ right
         freed.append(replace(component, removed=(modes, tuple(c.tolist()))))
         removed[component.name] = {
             group: float(np.sqrt(c[p] @ normal[p, p] @ c[p] / max(count, 1)))

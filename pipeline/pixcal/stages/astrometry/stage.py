@@ -17,7 +17,6 @@ Values below the maps' own errors are null. ``astrometry.zarr`` holds the maps o
 """
 
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +56,7 @@ from pixcal.stages.fitted_shape import fitted_shape
 from pixcal.storage.artefact import Build, Manifest, read_json, write_json
 from pixcal.storage.formats import STAGES
 from pixcal.storage.manifest import file_digest
-from pixcal.storage.stage import copy_products, make, read_acquisition, working
+from pixcal.storage.stage import make, read_acquisition, working
 
 SCHEMA = "pixcal/astrometry/1"
 
@@ -112,8 +111,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             _measure(made, components, modes, acquisition, telescope, config, runtime)
 
         options = result_options(config) | {"truth": None}
-        publish = partial(copy_products, run_dir, STAGE, "astrometry.*")
-        return make(run_dir, STAGE, options, inputs, body, publish=publish)
+        return make(run_dir, STAGE, options, inputs, body)
 
 
 def _measure(

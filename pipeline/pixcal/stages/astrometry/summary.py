@@ -93,16 +93,10 @@ def running_means(errors: F64, lengths: list[int]) -> list[F64]:
 def axis_facts(
     errors: F64, bound: float, uas_per_px: float, *, drawn: bool, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """Results along one axis.
+    """Results along one axis, of errors (star, position, kind) of `stars.observe`, px.
 
-    Parameters
-    ----------
-    errors : (star, position, kind) float64
-        As `pixcal.stages.astrometry.stars.observe` leaves them, px.
-    bound : float
-        Cramér-Rao bound of one position, px.
-    drawn : bool
-        Whether the detector is the the maps plus random errors of size SIGMA.
+    ``bound`` is the Cramér-Rao bound of one position, px; ``drawn`` says whether the detector is
+    the maps plus random errors of size SIGMA.
     """
     kinds = dict(zip(KINDS, np.moveaxis(errors, -1, 0), strict=True))
 
@@ -122,7 +116,6 @@ def axis_facts(
     last = {kind: values[-1] for kind, values in means.items()}
     pairs = {kind: v[1::2] - v[: len(v) // 2 * 2 : 2] for kind, v in last.items()}
     photons = compared(kinds, "_photons")
-    curve = {grid: np.array([getattr(c, grid) for c in averaged]) for grid in GRIDS}
     times = {grid: getattr(photons, grid).value / TARGET_PX for grid in GRIDS}
     positions_needed = {g: math.ceil(t**2) if math.isfinite(t) else None for g, t in times.items()}
     second = kinds["perfect"] - kinds["linear"]
@@ -135,7 +128,7 @@ def axis_facts(
         "separation": _facts(compared(pairs, "_photons"), uas_per_px),
         "averaging": {"positions": lengths}
         | {
-            f"{grid}{suffix}_px": [_finite(value) for value in curve[grid][:, n]]
+            f"{grid}{suffix}_px": [_finite(getattr(c, grid)[n]) for c in averaged]
             for grid in GRIDS
             for n, suffix in enumerate(("", "_err"))
         },

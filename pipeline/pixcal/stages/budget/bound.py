@@ -30,11 +30,6 @@ class FrameSpread:
     weight: F64  # (n,) sum 1
 
     @classmethod
-    def steady(cls) -> "FrameSpread":
-        """All frames alike."""
-        return cls(np.ones(1), np.ones(1), np.ones(1))
-
-    @classmethod
     def normal(cls, level_rms: float, contrast_rms: float, visibility: float) -> "FrameSpread":
         """Normal changes of light and contrast, relative, clipped as `pixcal.kernels.scene` does.
 
@@ -52,15 +47,17 @@ class FrameSpread:
         return np.asarray(values @ self.weight)
 
 
+STEADY = FrameSpread(np.ones(1), np.ones(1), np.ones(1))
+
+
 def phase_information(
-    iota: ArrayLike, alpha: ArrayLike, variance: float, frames: FrameSpread | None = None
+    iota: ArrayLike, alpha: ArrayLike, variance: float, spread: FrameSpread = STEADY
 ) -> F64:
     """Information of one frame on a pixel's phase, 1/rad², at any phases that are uniform.
 
     Of mean and amplitude ``iota``, ``alpha`` (e-, at B = A = 1) and the ``variance`` (e-²) of a
     sample without light, averaged over the frames' spread.
     """
-    spread = frames or FrameSpread.steady()
     total = np.asarray(iota, float)[..., None] * spread.level + variance
     swing = np.asarray(alpha, float)[..., None] * spread.amplitude
     # The difference of two nearly equal numbers at faint contrast, written as a quotient.
@@ -69,13 +66,12 @@ def phase_information(
 
 
 def unweighted_variance(
-    iota: ArrayLike, alpha: ArrayLike, variance: float, frames: FrameSpread | None = None
+    iota: ArrayLike, alpha: ArrayLike, variance: float, spread: FrameSpread = STEADY
 ) -> F64:
     """Variance (rad²) that one frame gives where all samples have the same weight.
 
     Parameters as `phase_information`. At full contrast without read noise twice the bound's.
     """
-    spread = frames or FrameSpread.steady()
     square = spread.amplitude**2
     noise = np.asarray(iota, float)[..., None] * spread.level + variance
     power = np.asarray(alpha, float) ** 2 * spread.mean(square) ** 2

@@ -4,7 +4,7 @@ The bound of `bound` on a grid of pixels spread over the window, for each fringe
 set and for the sets joined. What is systematic is not in it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil
@@ -74,13 +74,7 @@ class SetBound:
 
     @classmethod
     def of(cls, bench: Bench, number: int, contrast: float = 1.0) -> "SetBound":
-        """For a set of a bench, by its number, with ``contrast`` times the bench's visibility.
-
-        Raises
-        ------
-        InputError
-            If no light falls on the window.
-        """
+        """For a set of a bench, by its number, with ``contrast`` times the bench's visibility."""
         scan, optics = bench.frames.fringes[number], bench.optics
         x, y = grid(bench.detector.shape)
         a, b = (
@@ -102,10 +96,8 @@ class SetBound:
         if scan.phase_law == "random":
             return bare
         phases = scan.phase_step_rad * np.arange(min(scan.count, MAX_PHASES), dtype=float)
-        typical = bare.typical
-        return replace(
-            bare, loss=sampling_loss(iota[typical], alpha[typical], bare.variance, phases)
-        )
+        n = bare.typical
+        return replace(bare, loss=sampling_loss(iota[n], alpha[n], bare.variance, phases))
 
     @property
     def typical(self) -> int:
@@ -145,10 +137,10 @@ class SetBound:
         """Variance of the offset along the set's axis that one frame gives, px²."""
         return np.asarray(1 / (self.information * self.k**2))
 
-    @property
-    def worst(self) -> float:
-        """Of `per_frame`, at the least favourable fringe phase."""
-        return float(self.per_frame.max()) * self.loss[1] / self.loss[0]
+    def reach(self, frames: Shares) -> tuple[float, float]:
+        """Variance (px²) of the median pixel, and of the worst at the worst fringe phase."""
+        variance = self.per_frame / sum(frames)
+        return float(np.median(variance)), float(variance.max()) * self.loss[1] / self.loss[0]
 
     def shares(self) -> dict[str, float]:
         """Photon-limited variance, and the factors that increase it.
@@ -179,12 +171,11 @@ class SetBound:
         return WeightErrors.of(float(self.iota[n]), float(self.alpha[n]), self.variance)
 
 
-def grid(shape: tuple[int, int]) -> tuple[I64, I64]:
+def grid(shape: tuple[int, int]) -> list[I64]:
     """Columns and rows of a window at which its bound is taken, the outermost among them."""
-    rows, columns = (
-        np.unique(np.linspace(0, n - 1, min(n, SAMPLES)).round().astype(np.int64)) for n in shape
-    )
-    return columns, rows
+    return [
+        np.unique(np.linspace(0, n - 1, min(n, SAMPLES)).round().astype(int)) for n in shape[::-1]
+    ]
 
 
 @dataclass(frozen=True)
@@ -215,6 +206,13 @@ class JoinedBound:
     def median(self, frames: Shares) -> F64:
         """Variance (component,) of the median pixel, px²."""
         return np.asarray(np.median(self.variance(frames), axis=1))
+
+    def reach(self, n: int) -> Callable[[Shares], tuple[float, float]]:
+        """As `SetBound.reach`, of one component."""
+        return lambda frames: (
+            float(self.median(frames)[n]),
+            float(self.variance(frames, worst=True)[n].max()),
+        )
 
     def best_split(self) -> F64:
         """Share of each set's frames with which the worse component is best."""

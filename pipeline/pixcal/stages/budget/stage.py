@@ -11,7 +11,7 @@ its frames are those of all sets, in the planned proportions. ``levers`` are cha
 the most helpful first; ``left_out`` and ``warnings`` are sentences.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ import numpy as np
 
 from pixcal import __version__
 from pixcal.estimators.fringe_fit.fringes import HONEST_FRINGES
-from pixcal.model.arrays import F64
 from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
@@ -30,6 +29,7 @@ from pixcal.report.drawing import png
 from pixcal.stages.budget.expected import (
     JoinedBound,
     SetBound,
+    Shares,
     bias_frames_needed,
     brightest_allowed,
     flat_error,
@@ -51,7 +51,8 @@ MARGIN = 4.0  # standard deviations that the brightest fringe should keep below 
 DOMINANT = 1.5  # a factor of the frames below this does not limit a set: photons do
 
 Config = Budget
-Reached = tuple[int, float, float]  # frames, and the variances (px²) of the median and worst pixel
+# frames of each set -> variances (px²) of the median and of the worst pixel
+Reach = Callable[[Shares], tuple[float, float]]
 
 
 def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, Any]:
@@ -86,31 +87,68 @@ def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, 
     precision = config.precision_px
     if precision is None and config.frames is None:
         precision = PRECISION_PX
-    result = _budget(bench, bound, precision, config.frames)
     result = {
         "schema": SCHEMA,
         "pixcal": __version__,
         "bench": {"file": str(bench_file), "digest": digest(to_plain(bench))},
-    } | result
+    } | _budget(bench, bound, precision, config.frames)
     if out is not None:
-        _write(out, result)
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except (FileExistsError, NotADirectoryError) as error:
+            raise InputError(f"--out {out}: is a file; choose another directory") from error
+        write_whole(out / "budget.png", png(budget_figure(result)))
+        write_json(out / "budget.json", result)
     return result
-
-
-def _write(out: Path, result: dict[str, Any]) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise InputError(f"--out {out}: is a file; choose another directory") from error
-    write_whole(out / "budget.png", png(budget_figure(result)))
-    write_json(out / "budget.json", result)
 
 
 def _budget(
     bench: Bench, bound: JoinedBound, precision: float | None, frames: int | None
 ) -> dict[str, Any]:
-    d, f = bench.detector, bench.frames
-    split = planned_split(bench)
+    d, f, split = bench.detector, bench.frames, planned_split(bench)
+    counts = [s.count for s in f.fringes]
+    given = None if frames is None else np.full(len(counts), frames)
+
+    def cost(variance: float) -> dict[str, Any] | None:
+        """Frames for the precision, their time and their bytes."""
+        if precision is None:
+            return None
+        n = frames_needed(variance, precision)
+        size = n * d.shape[0] * d.shape[1] * SAMPLE_BYTES
+        return {"frames": n, "hours": n * f.period_s / 3600, "bytes": size}
+
+    def facts(reach: Reach, one: Shares, planned: Shares, given: Shares | None) -> dict[str, Any]:
+        """What one frame and others reach, and the cost of the wanted precision."""
+        (median, worst), wanted = reach(one), cost(reach(one)[0])
+        if wanted and precision is not None:
+            wanted["frames_worst"] = frames_needed(worst, precision)
+        return {
+            "frame_px": {"median": median**0.5, "worst": worst**0.5},
+            "planned": _reached(reach, planned),
+            "given": None if given is None else _reached(reach, given),
+            "wanted": wanted,
+        }
+
+    sets = {}
+    for n, (scan, s) in enumerate(zip(f.fringes, bound.sets, strict=True)):
+        alone = None if frames is None else [frames]
+        shares = s.shares()
+        factors = {name: value for name, value in shares.items() if name != "photons"}
+        largest = max(factors, key=lambda name: factors[name])
+        if precision is not None:
+            shares["photons_frames"] = frames_needed(shares["photons"], precision)
+        sets[scan.name] = {
+            "interfringe_px": s.interfringe,
+            "mean_e": float(np.median(s.iota)),
+            "visibility": s.visibility,
+            **facts(s.reach, [1], [counts[n]], alone),
+            "shares": shares,
+            "limited_by": largest if factors[largest] > DOMINANT else "photons",
+            "calibration": _calibration(bench, s),
+        }
+    components = {
+        name: facts(bound.reach(n), split, counts, given) for n, name in enumerate(bound.components)
+    }
     return {
         "precision_px": precision,
         "frames": frames,
@@ -120,11 +158,13 @@ def _budget(
             "quantisation": d.gain_e_per_adu**2 / 12,
             "dark": d.dark_e_s * f.exptime_s,
         },
-        "sets": {
-            scan.name: _set_facts(bench, s, scan.count, precision, frames)
-            for scan, s in zip(f.fringes, bound.sets, strict=True)
+        "sets": sets,
+        "joined": {
+            "components": components,
+            "wanted": cost(float(bound.median(split).max())),
+            "split": split.tolist(),
+            "best_split": bound.best_split().tolist(),
         },
-        "joined": _joined_facts(bench, bound, split, precision, frames),
         "levers": [
             asdict(lever) | _time(lever.variance, lever.period_s, precision)
             for lever in levers(bench, bound)
@@ -139,100 +179,23 @@ def _time(variance: float, period_s: float, precision: float | None) -> dict[str
     return {"frames": frames, "hours": None if frames is None else frames * period_s / 3600}
 
 
-def _cost(bench: Bench, frames: int) -> dict[str, Any]:
-    """Frames with their time and their bytes."""
-    ny, nx = bench.detector.shape
-    return {
-        "frames": frames,
-        "hours": frames * bench.frames.period_s / 3600,
-        "bytes": frames * ny * nx * SAMPLE_BYTES,
-    }
-
-
-def _set_facts(
-    bench: Bench, s: SetBound, planned: int, precision: float | None, frames: int | None
-) -> dict[str, Any]:
-    median, worst = float(np.median(s.per_frame)), s.worst
-    shares = s.shares()
-    factors = {name: value for name, value in shares.items() if name != "photons"}
-    largest = max(factors, key=lambda name: factors[name])
-    if precision is not None:
-        shares["photons_frames"] = frames_needed(shares["photons"], precision)
-
-    def reached(n: int) -> Reached:
-        return n, median / n, worst / n
-
-    given = None if frames is None else reached(frames)
-    return {
-        "interfringe_px": s.interfringe,
-        "mean_e": float(np.median(s.iota)),
-        "visibility": s.visibility,
-        **_precision_facts(bench, reached(1), reached(planned), given, precision),
-        "shares": shares,
-        "limited_by": largest if factors[largest] > DOMINANT else "photons",
-        "calibration": _calibration(bench, s),
-    }
-
-
-def _precision_facts(
-    bench: Bench, one: Reached, planned: Reached, given: Reached | None, precision: float | None
-) -> dict[str, Any]:
-    """What one frame and others reach, and the cost of the wanted precision."""
-    _, median, worst = one
-    wanted = None
-    if precision is not None:
-        wanted = _cost(bench, frames_needed(median, precision))
-        wanted["frames_worst"] = frames_needed(worst, precision)
-    return {
-        "frame_px": {"median": median**0.5, "worst": worst**0.5},
-        "planned": _reached(*planned),
-        "given": None if given is None else _reached(*given),
-        "wanted": wanted,
-    }
-
-
-def _reached(frames: int, median: float, worst: float) -> dict[str, Any]:
-    return {"frames": frames, "median_px": median**0.5, "worst_px": worst**0.5}
+def _reached(reach: Reach, frames: Shares) -> dict[str, Any]:
+    median, worst = reach(frames)
+    return {"frames": round(sum(frames)), "median_px": median**0.5, "worst_px": worst**0.5}
 
 
 def _calibration(bench: Bench, s: SetBound) -> dict[str, Any]:
     """Bias and flat frames that are needed, and the cost of those planned."""
     errors, f = s.calibration(), bench.frames
     level, flat = float(np.median(s.iota)), flat_error(bench)
-    bias_e = None if not f.bias else (sample_variance(bench) / f.bias) ** 0.5
     return {
         "bias_frames_needed": bias_frames_needed(errors, s.variance),
         "bias_frames": f.bias,
-        "bias_error_e": bias_e,
+        "bias_error_e": (sample_variance(bench) / f.bias) ** 0.5 if f.bias else None,
         "flats_needed": flats_needed(errors, level, s.variance),
         "flats": sum(rung.count for rung in f.flats),
         "flat_error": flat,
         "flat_cost": errors.scale * (flat**2 if flat is not None else bench.detector.prnu_rms**2),
-    }
-
-
-def _joined_facts(
-    bench: Bench, bound: JoinedBound, split: F64, precision: float | None, frames: int | None
-) -> dict[str, Any]:
-    """Of each component: its unit is a frame of all sets, shared as planned."""
-    counts = [s.count for s in bench.frames.fringes]
-
-    def reached(shares: Sequence[float] | F64, n: int) -> Reached:
-        median, worst = bound.median(shares)[n], bound.variance(shares, worst=True)[n].max()
-        return round(sum(shares)), float(median), float(worst)
-
-    facts = {}
-    for n, name in enumerate(bound.components):
-        given = None if frames is None else reached([frames] * len(counts), n)
-        facts[name] = _precision_facts(
-            bench, reached(split, n), reached(counts, n), given, precision
-        )
-    both = float(bound.median(split).max())
-    return {
-        "components": facts,
-        "wanted": None if precision is None else _cost(bench, frames_needed(both, precision)),
-        "split": split.tolist(),
-        "best_split": bound.best_split().tolist(),
     }
 
 

@@ -39,8 +39,7 @@ def halve(sums: F64) -> F64:
     return np.asarray(np.add.reduceat(rows, range(0, nx, 2), axis=-1))
 
 
-@dataclass(frozen=True)
-class Grouping:
+class Grouping(NamedTuple):
     """Sums of squares of the means of groups of pixels."""
 
     groups: int  # those with a good pixel
@@ -53,12 +52,6 @@ class Grouping:
         used = sums[:, sums[-1] > 0]
         means = used[:-3] / np.sqrt(used[-1])
         return cls(used.shape[1], means @ means.T, (used[-3:-1] / used[-1]).sum(axis=1))
-
-    def __add__(self, other: "Grouping") -> "Grouping":
-        """Together with the groups of another part of the window."""
-        return Grouping(
-            self.groups + other.groups, self.products + other.products, self.noise + other.noise
-        )
 
 
 def double(sums: F64, times: int) -> tuple[list[Grouping], F64]:
@@ -74,7 +67,7 @@ def double(sums: F64, times: int) -> tuple[list[Grouping], F64]:
 class Projection:
     """The modes removed from both maps, by least squares on all good pixels alike."""
 
-    coefficients: F64  # (mode, 2) of the modes in the maps
+    change: F64  # (2, 2 + mode) the maps without their modes, from maps and modes
     # (mode, mode) inverse of the modes' normal matrix; of modes that are alike, one counts
     inverse: F64
 
@@ -82,22 +75,20 @@ class Projection:
     def of(cls, pixels: Grouping) -> "Projection":
         """From blocks of one pixel; the first two values are the maps."""
         inverse = inverse_normal(pixels.products[2:, 2:], RCOND)
-        return cls(inverse @ pixels.products[2:, :2], inverse)
+        return cls(np.hstack([np.eye(2), -pixels.products[:2, 2:] @ inverse]), inverse)
 
     def difference(self, values: F64) -> tuple[F64, F64, F64]:
         """Both maps (k, ...) without their modes, and the second less the first."""
-        first, second = values[:2] - np.tensordot(self.coefficients.T, values[2:], 1)
+        first, second = np.tensordot(self.change, values, 1)
         return first, second, second - first
 
     def part(self, fine: Grouping, coarse: Grouping, pixels: int) -> "Part":
         """Part of the maps at the scale of ``fine``: its sums less those of ``coarse``."""
         between = fine.products - coarse.products
-        change = np.concatenate([np.eye(2), -self.coefficients])
-        squares = change.T @ between @ change
+        (first, both), (_, second) = self.change @ between @ self.change.T
         raw = fine.groups - coarse.groups
         freedom = max(raw - self.taken(between), 0.0)
         noise = (fine.noise - coarse.noise) * (freedom / raw if raw else 0.0)
-        first, both, second = squares[0, 0], squares[0, 1], squares[1, 1]
         return Part(pixels, freedom, float(first), float(second), float(both), (noise[0], noise[1]))
 
     def taken(self, products: F64) -> float:
@@ -162,27 +153,30 @@ class Part:
         """Of the two maps."""
         return float(self.both / np.sqrt(max(self.first * self.second, 1e-300)))
 
+    def _estimate(self, square: float, chance: float, noise: float = 0.0) -> VarianceEstimate:
+        """From a sum of squares, its variance by chance, and noise known with an error."""
+        error = math.sqrt(chance / self.freedom + noise**2)
+        return VarianceEstimate(square / self.pixels, error / self.pixels)
+
     def common(self) -> VarianceEstimate:
         """Common signal of both maps, from their covariance."""
-        error = np.sqrt((self.first * self.second + self.both**2) / self.freedom)
-        return VarianceEstimate(self.both / self.pixels, float(error) / self.pixels)
+        return self._estimate(self.both, self.first * self.second + self.both**2)
 
     def beyond_noise(self, accuracy: float = SIGMA_ACCURACY) -> VarianceEstimate:
         """Excess of the difference over noise, whose size is known to a relative accuracy."""
-        chance = 2 / self.freedom * max(self.difference, self.expected) ** 2
-        error = np.sqrt(chance + (2 * accuracy * self.expected) ** 2)
-        excess = self.difference - self.expected
-        return VarianceEstimate(excess / self.pixels, float(error) / self.pixels)
+        excess, chance = self.difference - self.expected, max(self.difference, self.expected)
+        return self._estimate(excess, 2 * chance**2, 2 * accuracy * self.expected)
 
     def own(self, accuracy: float = SIGMA_ACCURACY) -> list[VarianceEstimate]:
         """Signal of each map that is neither noise nor common."""
-        estimates = []
-        for square, noise in zip((self.first, self.second), self.noise, strict=True):
-            chance = (square * self.difference + (square - self.both) ** 2) / self.freedom
-            error = np.sqrt(chance + (2 * accuracy * noise) ** 2)
-            rest = square - self.both - noise
-            estimates.append(VarianceEstimate(rest / self.pixels, float(error) / self.pixels))
-        return estimates
+        return [
+            self._estimate(
+                square - self.both - noise,
+                square * self.difference + (square - self.both) ** 2,
+                2 * accuracy * noise,
+            )
+            for square, noise in zip((self.first, self.second), self.noise, strict=True)
+        ]
 
     def significance(self, accuracy: float = SIGMA_ACCURACY) -> float:
         """Of the difference beyond noise, sigma (Wilson and Hilferty's cube root)."""
@@ -240,11 +234,9 @@ def three_cornered_hat(
     A difference's variance beyond noise (`Part.beyond_noise`) is the sum of those of its maps (Gray
     and Allan 1974).
     """
-    design = np.zeros((len(pairs), 1 + max(map(max, pairs))))
-    np.put_along_axis(design, np.array(pairs), 1.0, axis=1)
     values, errors = np.array(excess).T
-    weight = 1 / np.maximum(errors, 1e-300) ** 2
-    covariance = np.linalg.inv(design.T @ (design * weight[:, None]))
-    own = covariance @ (design.T @ (weight * values))
-    errors = np.sqrt(covariance.diagonal())
+    design = np.zeros((len(pairs), 1 + max(map(max, pairs))))
+    np.put_along_axis(design, np.array(pairs), 1 / np.maximum(errors, 1e-300)[:, None], axis=1)
+    inverse = np.linalg.pinv(design)
+    own, errors = inverse @ (values * design.max(axis=1)), np.hypot.reduce(inverse, axis=1)
     return [VarianceEstimate(float(v), float(e)) for v, e in zip(own, errors, strict=True)]

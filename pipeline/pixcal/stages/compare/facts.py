@@ -61,10 +61,9 @@ def describe(
     evidence = _evidence(facts)
     facts |= {"verdict": "differ" if evidence else "agree", "evidence": evidence}
     facts |= {"suspicion": _suspicion(facts["scales"])}
-    view = ComponentView(
-        pair.name, pair.window, facts, pixels.picture, pixels.reach, shift, scatter,
-        profiles, [(y, x) for y, x, _, _ in pixels.far],
-    )  # fmt: skip
+    far = [(y, x) for y, x, _, _ in pixels.far]
+    picture = pixels.picture, pixels.reach
+    view = ComponentView(pair.name, pair.window, facts, *picture, shift, scatter, profiles, far)
     return facts, view
 
 

@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial, reduce
+from functools import cached_property, partial
 from itertools import pairwise, product
-from operator import add
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import ndtr
@@ -141,18 +141,20 @@ class PairSums:
         """Block side (px) and the maps at that scale; the last holds all larger scales."""
         further, _ = double(self.coarse, max(0, self.levels + 1 - len(self.fine)))
         groupings = [*self.fine, *further[1:]][: self.levels + 1]
-        return [
-            (1 << level, self.projection.part(fine, coarse, self.pixels))
-            for level, (fine, coarse) in enumerate(pairwise([*groupings, self.whole]))
-        ]
+        parts = [self.part(*both) for both in pairwise([*groupings, self.whole])]
+        return [(1 << level, part) for level, part in enumerate(parts)]
+
+    def part(self, fine: Grouping, coarse: Grouping) -> Part:
+        """The maps between two scales."""
+        return self.projection.part(fine, coarse, self.pixels)
 
     def total(self) -> Part:
         """The maps at all scales."""
-        return self.projection.part(self.fine[0], self.whole, self.pixels)
+        return self.part(self.fine[0], self.whole)
 
     def of_means(self, sums: F64) -> Part:
         """The maps of the means of columns or rows."""
-        return self.projection.part(Grouping.of(sums), self.whole, self.pixels)
+        return self.part(Grouping.of(sums), self.whole)
 
     def differences(self, sums: F64) -> tuple[F64, F64]:
         """Mean difference, second less first, of each block and its error, px; NaN where empty."""
@@ -172,7 +174,10 @@ def read_sums(
     task = partial(_sums_task, pair, keep)
     results = run_tasks(task, pair.tiles(), runtime, label=f"sums {pair.name}")
     groupings, *pieces = zip(*results, strict=True)
-    fine = [reduce(add, level) for level in zip(*groupings, strict=True)]
+    fine = [
+        Grouping(sum(groups), np.sum(products, axis=0), np.sum(noise, axis=0))
+        for groups, products, noise in (zip(*level) for level in zip(*groupings))  # noqa: B905
+    ]
     coarse, columns, rows = (pair.together(p) for p in pieces)
     profiles = {"columns": columns.sum(axis=1), "rows": rows.sum(axis=2)}
     return PairSums(fine, coarse, profiles, pair.levels)
@@ -189,8 +194,7 @@ def _sums_task(
     return *double(pixels, pair.coarse), columns, rows
 
 
-@dataclass(frozen=True)
-class Pixels:
+class Pixels(NamedTuple):
     """The pixels one by one."""
 
     pulls: I64  # (bin,) histogram of differences over their errors, `PULLS`
@@ -215,15 +219,10 @@ def read_pixels(pair: Pair, sums: PairSums, runtime: Runtime) -> Pixels:
     reach = REACH * (max(total.first, total.second) / max(total.pixels, 1)) ** 0.5 or 1.0
     task = partial(_pixels_task, pair, sums.projection, reach)
     pieces = run_tasks(task, pair.tiles(), runtime, label=f"pixels {pair.name}")
-    far = sorted((f for piece in pieces for f in piece.far), key=lambda f: -abs(f[2] / f[3]))
-    return Pixels(
-        np.sum([piece.pulls for piece in pieces], axis=0),
-        np.sum([piece.picture for piece in pieces], axis=0),
-        far,
-        sum(piece.beyond for piece in pieces),
-        pair.together([piece.squares for piece in pieces]),
-        reach,
-    )
+    histograms, pictures, listed, beyond, squares, _ = zip(*pieces, strict=True)
+    far = sorted((f for some in listed for f in some), key=lambda f: -abs(f[2] / f[3]))
+    together = pair.together(squares)
+    return Pixels(sum(histograms), sum(pictures), far, sum(beyond), together, reach)
 
 
 def _pixels_task(pair: Pair, projection: Projection, reach: float, tile: Tile) -> Pixels:

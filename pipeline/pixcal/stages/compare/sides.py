@@ -90,14 +90,9 @@ class Side:
     facts: dict[str, Any]  # what to say of it
 
     @property
-    def whole(self) -> Tile:
-        """The window as one tile."""
-        return (0, self.window[0]), (0, self.window[1])
-
-    @property
     def axes(self) -> list[Vector]:
         """Of the sets, at the middle of the window."""
-        return [s.axis(self.whole) for s in self.sets]
+        return [s.axis(((0, self.window[0]), (0, self.window[1]))) for s in self.sets]
 
     @property
     def both(self) -> bool:
@@ -123,11 +118,8 @@ class Side:
         value, variance = np.where(lacking, np.nan, parts.sum(axis=1))
         used = self.sets_along(direction)
         known = zip(np.nan_to_num(shares), self.sets, strict=True)
-        return (
-            value,
-            variance,
-            np.concatenate([share * s.modes(tile) for share, s in known if s in used]),
-        )
+        modes = np.concatenate([share * s.modes(tile) for share, s in known if s in used])
+        return value, variance, modes
 
     def _shares(self, axes: Sequence[Vector], sigma: F64, direction: Vector) -> F64:
         """Weight of each set along a direction (set, ...), as in the fit."""
@@ -163,13 +155,7 @@ def whole_run(run: Path, label: str | None = None) -> Side:
 
 
 def parts_of(run: Path, *, interleaved: bool) -> list[Side]:
-    """Two parts of a run: the first and the second half of its batches, or every other one.
-
-    Raises
-    ------
-    InputError
-        If the run has not been fitted, or a set has fewer than two batches.
-    """
+    """Two parts of a run: the first and the second half of its batches, or every other one."""
     side = whole_run(run)
     labels = ("odd batches", "even batches") if interleaved else ("first half", "second half")
     counts = {s.name: ArrayReader(s.folder / "batch_count").read() for s in side.sets}

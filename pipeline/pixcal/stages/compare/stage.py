@@ -66,42 +66,36 @@ def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Ma
         If a run has not been fitted, the windows differ, the runs have no component in common, or
         the directory is not one that a comparison may write to.
     """
-    _check_out(out)
+    if out.exists():
+        if not out.is_dir():
+            raise InputError(f"--out {out}: is a file; choose another directory")
+        made = read_manifest(out)
+        if (made is not None and made.stage != STAGE.name) or (out / "ingest").exists():
+            raise InputError(
+                f"--out {out}: holds other results of pixcal; choose another directory"
+            )
     with damage_noted(*runs):
-        return _run(_sides(runs, config), out, config, runtime)
-
-
-def _run(sides: Sequence[Side], out: Path, config: Config, runtime: Runtime) -> Manifest:
-    components = _components(sides)
-    inputs = {f"{n} {side.run}": side.key for n, side in enumerate(sides)}
-    plain = result_options(config)
-    key = artefact_key(STAGE.name, STAGE.format, plain, inputs)
-    with lock(out):
-        ready = read_manifest(out)
-        if ready is not None and ready.key == key and (out / RESULT).exists():
-            return ready
-        (out / MANIFEST).unlink(missing_ok=True)
-        result, views = _compare_all(sides, components, config, runtime)
-        for picture in out.glob("compare*.png"):
-            picture.unlink()
-        for view in views:
-            first, second = view.numbers
-            name = "compare.png" if len(views) == 1 else f"compare-{first}-{second}.png"
-            write_whole(out / name, png(compare_figure(view)))
-        write_json(out / RESULT, result)
-        manifest = Manifest(STAGE.name, STAGE.format, key, plain, inputs)
-        write_manifest(out, manifest)
-        return manifest
-
-
-def _check_out(out: Path) -> None:
-    if not out.exists():
-        return
-    if not out.is_dir():
-        raise InputError(f"--out {out}: is a file; choose another directory")
-    made = read_manifest(out)
-    if (made is not None and made.stage != STAGE.name) or (out / "ingest").exists():
-        raise InputError(f"--out {out}: holds other results of pixcal; choose another directory")
+        sides = _sides(runs, config)
+        components = _components(sides)
+        inputs = {f"{n} {side.run}": side.key for n, side in enumerate(sides)}
+        plain = result_options(config)
+        key = artefact_key(STAGE.name, STAGE.format, plain, inputs)
+        with lock(out):
+            ready = read_manifest(out)
+            if ready is not None and ready.key == key and (out / RESULT).exists():
+                return ready
+            (out / MANIFEST).unlink(missing_ok=True)
+            result, views = _compare_all(sides, components, config, runtime)
+            for picture in out.glob("compare*.png"):
+                picture.unlink()
+            for view in views:
+                first, second = view.numbers
+                name = "compare.png" if len(views) == 1 else f"compare-{first}-{second}.png"
+                write_whole(out / name, png(compare_figure(view)))
+            write_json(out / RESULT, result)
+            manifest = Manifest(STAGE.name, STAGE.format, key, plain, inputs)
+            write_manifest(out, manifest)
+            return manifest
 
 
 def _sides(runs: Sequence[Path], config: Config) -> list[Side]:

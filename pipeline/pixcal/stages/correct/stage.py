@@ -25,7 +25,7 @@ from pixcal.stages import fit
 from pixcal.stages.correct.again import measured_again
 from pixcal.stages.correct.gain import Maps, measure_gain, worsened
 from pixcal.stages.correct.restored_set import RestoredSet
-from pixcal.stages.correct.sides import sides_of
+from pixcal.stages.correct.surroundings import sides_of
 from pixcal.stages.correct.swept import Swept
 from pixcal.stages.correct.uncertainty import parameter_errors
 from pixcal.stages.correct.undoing import undo_on_maps
@@ -123,7 +123,7 @@ def _correct(
         "pairs": [],
         "sets_chi2_reduced": None,
     }
-    if plan.changes:
+    if plan.undone or plan.bent:
         result |= _corrected_maps(run_dir, made, plan, acquisition, runtime)
         if worse := worsened(result["sets"], result["pairs"]):
             raise InputError(
@@ -131,42 +131,34 @@ def _correct(
                 "second baseline along each axis to measure the effect better"
             )
     write_json(made.folder / "correction.json", result)
-    made.summary = {"outputs": result["outputs"], "undone": [e.name for e in plan.undone]}
+    made.summary = {"outputs": result["outputs"], "undone": list(plan.undone)}
 
 
 def _corrected_maps(
     run_dir: Path, made: Build, plan: Treatments, acquisition: Acquisition, runtime: Runtime
 ) -> Json:
     before = read_json(run_dir / "fit" / "fit.json")
-    names = tuple(before["sets"])
     for old in (made.scratch / "undone", made.folder / "corrected.zarr"):
         shutil.rmtree(old, ignore_errors=True)
     create_group(made.scratch / "undone")
     swept, facts = _sweep(run_dir, made, plan, acquisition, runtime)
     model = HYPERBOLIC if plan.bent else before["model"]
-    fitted, halves, left = [], {}, {}
-    closed_sets = {
+    fitted, left = [], {}
+    sets = {
         name: _swept_set(run_dir, swept / name, before["sets"][name], plan, acquisition, name)
-        for name in names
+        for name in before["sets"]
     }
-    sides = sides_of([*closed_sets.values()])
-    for name, closed in closed_sets.items():
-        opened = replace(closed, open_sides=sides)
+    sides = sides_of([*sets.values()])
+    sets = {name: replace(swept, open_sides=sides) for name, swept in sets.items()}
+    for name, opened in sets.items():
         left[name] = parameter_errors(opened, runtime)
         target = made.scratch / "undone" / name
         undo_on_maps(opened, target, runtime, name)
-        halves[name] = opened.has_halves
         fitted.append(fit_set(target, opened.source, facts[name], acquisition, name, model))
     group = made.folder / "corrected.zarr"
     totals = write_maps(group, fitted, runtime)
-    gain = measure_gain(
-        Maps(
-            run_dir / "fit" / "fit.zarr", group, fitted[0].source, names,
-            {name: tuple(before["sets"][name]["axis"]) for name in names}, halves,
-            len(plan.on_maps),
-        ),
-        runtime,
-    )  # fmt: skip
+    axes = {name: tuple(before["sets"][name]["axis"]) for name in sets}
+    gain = measure_gain(Maps(run_dir / "fit" / "fit.zarr", group, sets, axes), runtime)
     return {
         "outputs": list(totals.outputs),
         "model": model,
@@ -221,8 +213,6 @@ def _swept_set(
         float(used["read_noise_e"]["used"]),
         plan.on_samples,
         run_dir / "sweep" / "sweep.zarr" / name,
-        plan.errors,
-        plan.covariances,
         float(np.median(exposures)),
     )
 
@@ -230,7 +220,9 @@ def _swept_set(
 def _of_set(fitted: FittedSet, totals: Totals, gain: Json, before: Json, plan: Treatments) -> Json:
     """Entry of a set in ``correction.json``."""
     summary = totals.sets[fitted.name]
-    by_effect = dict(zip((e.name for e in plan.on_maps), gain.pop("change_by_effect"), strict=True))
+    by_effect = dict(
+        zip((t.effect.name for t in plan.on_maps), gain.pop("change_by_effect"), strict=True)
+    )
     on_samples = gain.pop("change_on_samples")
     if plan.on_samples:
         # They are undone at once: the sweep does not tell one from the other.

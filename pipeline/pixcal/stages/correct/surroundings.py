@@ -6,40 +6,34 @@ window may be a part of a larger detector, whose pixels give to those at its bor
 the chip, where nothing comes from beyond: the maps tell, side by side.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 
-from pixcal.model.arrays import F64, U8, Mask
-from pixcal.model.flags import PixelFlag
+from pixcal.model.arrays import F64, Mask
 from pixcal.simulation.effect import FringeMaps
+from pixcal.stages.correct.swept import Sides, Swept, free_of_samples, undone
 
-# top, bottom, left and right of the window, rows counted from the top
-Sides = tuple[bool, bool, bool, bool]
-
-CLOSED: Sides = (False, False, False, False)
-BEYOND = 8  # pixels beyond an open side that are taken to be there
-# flags of pixels whose fit tells nothing of their light
-UNKNOWN = int(PixelFlag.SATURATED | PixelFlag.NO_DATA)
 # lines of pixels that tell what the one at the border should be; those beside it do not count
 DEPTH, SKIPPED = 24, 4
+ALONG = 1024  # pixels along a side that tell whether it is open
 # difference of chi-square by which one side is told by itself; others go by all together
 CLEAR = 9.0
 # of neighbours, so that the errors of any two of them add up in squares on average
 SIGNS = ((0, 0), (0, 1), (1, 0), (1, 1))
 
 
-def scatter_of(phase: F64) -> float:
-    """Robust scatter (rad) of phases from pixel to pixel, from differences of neighbours."""
-    apart = np.abs(np.diff(phase, axis=1))
-    apart = apart[np.isfinite(apart)]
-    return float(1.4826 * np.median(apart) / np.sqrt(2)) if apart.size else 0.0
-
-
-def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, scatter: float) -> list[FringeMaps]:
+def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, phase: F64) -> list[FringeMaps]:
     """The maps with unknown pixels perturbed by their errors, in the patterns of `SIGNS`.
 
     Pixels (y, x) that are ``unknown`` may have any light from none to twice that around them; those
-    ``beyond`` the window have known light, and unknown offsets of a ``scatter`` in phase, rad.
+    ``beyond`` the window have known light, and unknown offsets that scatter as a ``phase`` (y, x)
+    does from pixel to pixel, rad.
     """
+    apart = np.abs(np.diff(phase, axis=1))
+    apart = apart[np.isfinite(apart)]
+    scatter = 1.4826 * float(np.median(apart)) / np.sqrt(2) if apart.size else 0.0
     y, x = np.indices(unknown.shape)
     y, x = y + maps.origin[0], x + maps.origin[1]
     variants = []
@@ -51,9 +45,35 @@ def disturbed(maps: FringeMaps, unknown: Mask, beyond: Mask, scatter: float) -> 
     return variants
 
 
-def usable(theta: F64, mask: U8) -> Mask:
-    """Pixels (y, x) whose fitted signal is usable, flagged or not."""
-    return np.asarray(np.isfinite(theta).all(axis=0) & (mask & UNKNOWN == 0))
+def sides_of(sets: Sequence[Swept]) -> Sides:
+    """Sides at which the detector extends beyond the window, from the maps of all sets."""
+    misfits = np.zeros((4, 2))
+    for swept in sets:
+        if swept.passes_borders and min(swept.source.shape) >= 2 * DEPTH:
+            for side in range(4):
+                misfits[side] += [_misfit(swept, side, is_open) for is_open in (False, True)]
+    return decided(misfits)
+
+
+def _misfit(swept: Swept, side: int, is_open: bool) -> float:
+    """Misfit of the pixels at one side, that being open or not."""
+    axis, last = divmod(side, 2)
+    shape, (kx, ky) = swept.source.shape, swept.k
+    length = shape[1 - axis]
+    middle = max(0, (length - ALONG) // 2)
+    along = (middle, min(length, middle + ALONG))
+    across = (shape[axis] - DEPTH, shape[axis]) if last else (0, DEPTH)
+    y, x = (along, across) if axis else (across, along)
+    top, bottom, left, right = (is_open and n == side for n in range(4))
+    one = replace(swept, open_sides=(top, bottom, left, right))
+    inside = one.inside(y, x)
+    maps, good = free_of_samples(one, one.around(y, x))
+    theta, good = undone(maps, swept.effects)[0].theta[(slice(None), *inside)], good[inside]
+    if axis:
+        theta, good, kx, ky = theta.swapaxes(1, 2), good.T, ky, kx
+    if last:
+        theta, good, ky = theta[:, ::-1], good[::-1], -ky
+    return border_misfit(theta, (kx, ky), good)
 
 
 def border_misfit(theta: F64, k: tuple[float, float], good: Mask) -> float:
@@ -88,6 +108,5 @@ def border_misfit(theta: F64, k: tuple[float, float], good: Mask) -> float:
 def decided(misfits: F64) -> Sides:
     """Which sides are open, from the chi-squares (side, closed or open)."""
     gain = misfits[:, 0] - misfits[:, 1]
-    together = bool(gain.sum() > 0)
-    top, bottom, left, right = (bool(g > 0) if abs(g) > CLEAR else together for g in gain.tolist())
+    top, bottom, left, right = np.where(np.abs(gain) > CLEAR, gain > 0, gain.sum() > 0).tolist()
     return top, bottom, left, right

@@ -1,7 +1,7 @@
 """A swept fringe set, and the effects to correct on its maps."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,17 +12,25 @@ from numpy.typing import NDArray
 from pixcal.estimators.fringe_fit.tile_sums import Carrier
 from pixcal.estimators.maps.corrected import phase_change
 from pixcal.kernels.crosstalk import FILL_REACH, filled
-from pixcal.model.arrays import F64, Mask
+from pixcal.model.arrays import F64, U8, Mask
 from pixcal.model.errors import InputError
+from pixcal.model.flags import PixelFlag
 from pixcal.simulation.effect import Effect, FittedFrames, FringeMaps
-from pixcal.stages.correct.surroundings import BEYOND, CLOSED, Sides, usable
 from pixcal.stages.diagnose.undone import undone_on_samples
 from pixcal.stages.evidence import Part, fitted_theta
 from pixcal.stages.reduced_set import ReducedSet
+from pixcal.stages.treatment import Treatment
 from pixcal.storage.artefact import read_json
 from pixcal.storage.cube import ArrayReader
 
 HALVES = 2  # parts of the frames that are corrected each for itself
+BEYOND = 8  # pixels beyond an open side that are taken to be there
+# flags of pixels whose fit tells nothing of their light
+UNKNOWN = int(PixelFlag.SATURATED | PixelFlag.NO_DATA)
+
+# top, bottom, left and right of the window, rows counted from the top
+Sides = tuple[bool, bool, bool, bool]
+CLOSED: Sides = (False, False, False, False)
 
 
 @dataclass(frozen=True)
@@ -31,30 +39,26 @@ class Swept:
 
     folder: Path  # `sweep.zarr/<set name>`
     source: ReducedSet  # for the tiles
-    effects: tuple[Effect, ...]  # in the order in which they are undone
+    treatments: tuple[Treatment, ...]  # in the order in which their effects are undone
     k: tuple[float, float]  # fringe vector at the centre, rad/px
     flat: Path | None  # map that samples were divided by
     read_noise: float  # e-
     # that were undone on samples, as if nothing were beyond the window
     samples: tuple[Effect, ...] = ()
     raw: Path | None = None  # the sweep before that
-    # of the parameters of each effect, 1-sigma: by effect, then by parameter
-    errors: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    # mapping: by effect: of all its parameters, where they were measured together
-    covariances: Mapping[str, F64] = field(default_factory=dict)
     exptime_s: float = 0.0
     # where the detector goes on beyond the window: top, bottom, left, right
     open_sides: Sides = CLOSED
 
     @property
+    def effects(self) -> tuple[Effect, ...]:
+        """To undo, in that order."""
+        return tuple(t.effect for t in self.treatments)
+
+    @property
     def n_batches(self) -> int:
         """Batches of the sweep."""
         return int(ArrayReader(self.folder / "batch_count").shape[0])
-
-    @property
-    def variants(self) -> int:
-        """Of the maps: the halves, where there are batches to make them of, and the effects."""
-        return HALVES * self.has_halves + len(self.effects)
 
     @property
     def has_halves(self) -> bool:
@@ -88,11 +92,6 @@ class Swept:
         """Whether a correction moves charge, so that pixels beyond the window matter."""
         return any(effect.undo_halo for effect in (*self.effects, *self.samples))
 
-    @property
-    def as_read(self) -> "Swept":
-        """The set with effects on samples still there."""
-        return self if self.raw is None else replace(self, folder=self.raw)
-
     def around(self, y: tuple[int, int], x: tuple[int, int]) -> Part:
         """A tile with its halo, as far as the detector goes: beyond the window at open sides."""
         ny, nx = self.source.shape
@@ -110,6 +109,11 @@ class Swept:
         """Where a tile lies in its surroundings."""
         rows, columns = self.around(y, x)
         return slice(y[0] - rows[0], y[1] - rows[0]), slice(x[0] - columns[0], x[1] - columns[0])
+
+
+def usable(theta: F64, mask: U8) -> Mask:
+    """Pixels (y, x) whose fitted signal is usable, flagged or not."""
+    return np.asarray(np.isfinite(theta).all(axis=0) & (mask & UNKNOWN == 0))
 
 
 def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
@@ -138,7 +142,7 @@ def free_of_samples(swept: Swept, part: Part) -> tuple[FringeMaps, Mask]:
 
     With them pixels (y, x) that have an offset.
     """
-    maps, good, _ = maps_of(swept.as_read, part)
+    maps, good, _ = maps_of(replace(swept, folder=swept.raw or swept.folder), part)
     for effect in swept.samples:
         maps = undone_on_samples(effect, maps) or maps
     return maps, good

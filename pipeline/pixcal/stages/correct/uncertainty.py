@@ -59,18 +59,17 @@ def parameter_errors(swept: Swept, runtime: Runtime) -> dict[str, float | None]:
     tiles = scout_tiles(swept.source.grid, TILES)
     runtime = within_memory("errors of the parameters", task_bytes(swept), 0, runtime)
     total = np.sum(run_tasks(partial(_tile, swept), tiles, runtime, label="parameters"), axis=0)
-    left: dict[str, float | None] = dict.fromkeys(effect.name for effect in swept.effects)
-    for name, (square, count) in zip(left, total, strict=True):
-        if swept.errors.get(name):
-            left[name] = float(np.sqrt(square / max(count, 1)))
-    return left
+    return {
+        t.effect.name: float(np.sqrt(square / max(count, 1))) if t.errors else None
+        for t, (square, count) in zip(swept.treatments, total, strict=True)
+    }
 
 
 def task_bytes(swept: Swept) -> int:
     """Peak of a tile's task that undoes its effects and takes the slopes of their parameters."""
-    slopes = max((len(c) for c in swept.covariances.values()), default=0)
+    slopes = [0 if t.covariance is None else len(t.covariance) for t in swept.treatments]
     cy, cx = swept.source.signal.chunks[1:]
-    pixel = PIXEL_BYTES + EFFECT_BYTES * len(swept.effects) + SLOPE_BYTES * slopes
+    pixel = PIXEL_BYTES + EFFECT_BYTES * len(slopes) + SLOPE_BYTES * max(slopes, default=0)
     return (cy + 2 * swept.halo) * (cx + 2 * swept.halo) * pixel
 
 
@@ -96,13 +95,13 @@ def left_over(swept: Swept, maps: FringeMaps, good: Mask, inside: tuple[slice, s
     surroundings.
     """
     variances = []
-    for effect in swept.effects:
+    for treatment in swept.treatments:
+        effect, covariance = treatment.effect, treatment.covariance
         after, _ = undone(maps, (effect,))
         theta = after.theta[(slice(None), *inside)]
-        covariance = swept.covariances.get(effect.name)
         slopes = None if covariance is None else effect.phase_slopes(after)
         if covariance is None or slopes is None:
-            perturbed = moved(effect, swept.errors.get(effect.name, {}))
+            perturbed = moved(effect, treatment.errors)
             steps = [o for other in perturbed if (o := other.undo(maps)) is not None]
             slopes = np.array([phase_change(after.theta, o.theta) for o in steps])
             covariance = np.eye(len(steps))

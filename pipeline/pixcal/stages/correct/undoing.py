@@ -23,7 +23,7 @@ from pixcal.estimators.fringe_fit.tile_sums import TileSums, sum_row
 from pixcal.estimators.maps.corrected import phase_change
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.simulation.effect import FringeMaps
-from pixcal.stages.correct.surroundings import disturbed, scatter_of
+from pixcal.stages.correct.surroundings import disturbed
 from pixcal.stages.correct.swept import HALVES, Swept, border_change, maps_of, padded, undone
 from pixcal.stages.correct.uncertainty import left_over, task_bytes
 from pixcal.stages.evidence import Part
@@ -57,8 +57,8 @@ def undo_on_maps(swept: Swept, target: Path, runtime: Runtime, name: str) -> Non
         run_tasks(task, tiles, fitting, label=f"halves {name}")
         _finish(halves)
     writers = _create(target, swept, ("iota", "alpha", "phase", "sigma"))
-    writers |= _create(target, swept, ("batch_phase", "batch_sigma"), swept.variants)
-    width = TileSums.width(swept.variants)
+    writers |= _create(target, swept, ("batch_phase", "batch_sigma"), len(variants))
+    width = TileSums.width(len(variants))
     writers["sums"] = create_array(
         target / "sums", (*swept.source.grid, width), "<f8", dims=("row", "column", "fact"),
         chunks=(1, 1, width), fill_value=np.nan,
@@ -159,7 +159,7 @@ def _of_neighbours(
         return np.zeros(known.shape)
     within = padded(np.ones([b - a for a, b in swept.within(part)], bool), swept, part, False)
     phase = ArrayReader(swept.folder / "phase").read(*swept.within(part)).astype(float)
-    disturbed_maps = disturbed(maps, within & ~known, ~within, scatter_of(phase))
+    disturbed_maps = disturbed(maps, within & ~known, ~within, phase)
     steps = [phase_change(after.theta, undone(o, swept.effects)[0].theta) for o in disturbed_maps]
     error = np.sqrt(np.mean(np.square(steps), axis=0))
     return np.asarray(np.where(known, error, 0.0))

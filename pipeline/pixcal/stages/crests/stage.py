@@ -46,7 +46,7 @@ from pixcal.stages.reduced_set import ReducedSet
 from pixcal.storage.artefact import MANIFEST, Build, Manifest, read_json, write_json
 from pixcal.storage.cube import ArrayReader, create_group, write_array
 from pixcal.storage.formats import STAGES
-from pixcal.storage.stage import copy_products, make, require, working
+from pixcal.storage.stage import make, require, working
 
 STAGE = STAGES["crests"]
 SCHEMA = "pixcal/crests/1"
@@ -105,8 +105,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
             whole = {"schema": SCHEMA, "pixcal": __version__, "sets": sets}
             write_json(made.folder / "crests.json", whole)
 
-        publish = partial(copy_products, run_dir, STAGE, "crests*.*")
-        return make(run_dir, STAGE, result_options(config), inputs, body, publish=publish)
+        return make(run_dir, STAGE, result_options(config), inputs, body)
 
 
 def _facts(paths: CrestPaths, fit: CrestFit, maps: Mapping[str, NDArray[Any]]) -> dict[str, Any]:

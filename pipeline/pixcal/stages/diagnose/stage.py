@@ -23,7 +23,7 @@ from pixcal.stages.diagnose.result import describe
 from pixcal.stages.diagnose.trial import Effects
 from pixcal.storage.artefact import Build, Manifest, write_json
 from pixcal.storage.formats import STAGES
-from pixcal.storage.stage import copy_products, make, require, working
+from pixcal.storage.stage import make, require, working
 
 STAGE = STAGES["diagnose"]
 Config = Diagnose
@@ -48,8 +48,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     }
     with working(run_dir, "reduce") as inputs:
         body = partial(_diagnose, run_dir, kinds, base, runtime)
-        publish = partial(copy_products, run_dir, STAGE, "diagnosis.json")
-        return make(run_dir, STAGE, plain, inputs, body, publish=publish)
+        return make(run_dir, STAGE, plain, inputs, body)
 
 
 def _diagnose(

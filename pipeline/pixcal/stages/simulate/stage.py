@@ -32,7 +32,7 @@ from pixcal.model.options import Simulate
 from pixcal.model.yaml_file import to_yaml
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import Recording, recordings
-from pixcal.stages.simulate.folders import put_in_place, resolved, up_to_date
+from pixcal.stages.simulate.folders import Target
 from pixcal.stages.simulate.truth import Effects, row_blocks, write_truth
 from pixcal.storage.artefact import Manifest, artefact_key
 from pixcal.storage.fits_out import COMPRESSED, FrameWriter
@@ -82,25 +82,31 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
         If the bench file is wrong, or a directory holds what simulate did not put there.
     """
     plan = load_bench(bench)
-    out = resolved(out, "--out")
-    truth = resolved(config.truth or out.with_name(f"{out.name}-truth"), "--truth")
-    if truth.is_relative_to(out) or out.is_relative_to(truth):
-        raise InputError(f"--truth {truth}: lies inside {out}, or around it; choose another")
+    there = Target.of(out, "--out", STAGE)
+    truth = there.final.with_name(f"{there.final.name}-truth")
+    apart = Target.of(config.truth or truth, "--truth", TRUTH)
+    if apart.final.is_relative_to(there.final) or there.final.is_relative_to(apart.final):
+        raise InputError(
+            f"--truth {apart.final}: lies inside {there.final}, or around it; choose another"
+        )
     effects = _checked_effects(plan, bench, config.own)
     own = {f"effect {file.name}": file_digest(file) for file in config.own}
     key = artefact_key(STAGE.name, STAGE.format, to_plain(plan), own)
-    before = up_to_date(out, STAGE, key, "--out")
+    before = there.up_to_date(key)
     # Both are looked at, so that nothing else is in the way of either.
-    if up_to_date(truth, TRUTH, key, "--truth") and before:
+    if apart.up_to_date(key) and before:
         return before
-    aside, truth_aside = (p.with_name(f".{p.name}.partial") for p in (out, truth))
-    with lock(aside):
-        try:
-            sources = (bench, *config.own)
-            return _build(plan, effects, sources, key, (aside, out), (truth_aside, truth), runtime)
-        finally:
-            for folder in (aside, truth_aside):
-                shutil.rmtree(folder, ignore_errors=True)
+    with lock(there.aside), there.building() as made, apart.building() as truth_made:
+        recorded = recordings(plan)
+        runtime = _fitting(plan, recorded, effects, runtime)
+        write_truth(plan, effects, recorded, truth_made, runtime)
+        shutil.copyfile(bench, truth_made / "bench.yaml")
+        for file in config.own:
+            shutil.copyfile(file, truth_made / file.name)
+        _write_frames(plan, effects, recorded, made, runtime, Camera)
+        _write_description(plan, made)
+        apart.put_in_place(key, to_plain(plan))
+        return there.put_in_place(key, {})
 
 
 def acquire(
@@ -114,34 +120,6 @@ def acquire(
     runtime = _fitting(bench, recorded, effects, runtime)
     _write_frames(bench, effects, recorded, folder, runtime, camera)
     _write_description(bench, folder)
-
-
-def _build(
-    plan: Bench,
-    effects: Effects,
-    sources: tuple[Path, ...],
-    key: str,
-    acquisition: tuple[Path, Path],
-    truth: tuple[Path, Path],
-    runtime: Runtime,
-) -> Manifest:
-    """Write acquisition and truth, each aside (first path), then in place (second path)."""
-    (aside, out), (truth_aside, truth_out) = acquisition, truth
-    made, truth_made = aside / "made", truth_aside / "made"
-    for folder in (made, truth_made):
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-    recorded = recordings(plan)
-    runtime = _fitting(plan, recorded, effects, runtime)
-    write_truth(plan, effects, recorded, truth_made, runtime)
-    bench, *own = sources
-    shutil.copyfile(bench, truth_made / "bench.yaml")
-    for file in own:
-        shutil.copyfile(file, truth_made / file.name)
-    _write_frames(plan, effects, recorded, made, runtime)
-    _write_description(plan, made)
-    put_in_place(truth_made, truth_out, TRUTH, key, to_plain(plan))
-    return put_in_place(made, out, STAGE, key, {})
 
 
 def _checked_effects(bench: Bench, where: Path, own: tuple[Path, ...]) -> Effects:
@@ -170,43 +148,25 @@ def _fitting(
 
 
 def _write_frames(
-    bench: Bench,
-    effects: Effects,
-    recorded: list[Recording],
-    folder: Path,
-    runtime: Runtime,
-    camera: Cameras = Camera,
-) -> None:
-    spans: list[Span] = []
+    bench: Bench, effects: Effects, recorded: list[Recording], folder: Path, runtime: Runtime,
+    camera: Cameras,
+) -> None:  # fmt: skip
+    batches: list[list[Span]] = [[]]
     ready: list[Callable[[], Path]] = []
     for recording in recorded:
         files = _create_files(bench, recording, folder)
         packed = recording.folder in bench.frames.compress
         ready += [file.finish_compressed if packed else file.finish for file in files]
-        spans += _spans(recording, files, bench.frames.per_file)
-    pieces = list(product(row_blocks(bench), _batches(spans)))
+        for first in range(0, recording.count, FRAMES_PER_TASK):
+            frames = range(first, min(first + FRAMES_PER_TASK, recording.count))
+            used = {n // bench.frames.per_file for n in frames}
+            # Short spans together, so that a task has about `FRAMES_PER_TASK` frames.
+            if sum(len(s[1]) for s in batches[-1]) + len(frames) > FRAMES_PER_TASK:
+                batches.append([])
+            batches[-1].append((recording, frames, {n: files[n] for n in used}))
+    pieces = list(product(row_blocks(bench), filter(None, batches)))
     run_tasks(partial(_write_piece, bench, effects, camera), pieces, runtime, label="frames")
     run_tasks(call, ready, runtime, label="files")
-
-
-def _spans(recording: Recording, files: list[FrameWriter], per_file: int) -> list[Span]:
-    """A recording in spans of `FRAMES_PER_TASK` frames."""
-    spans: list[Span] = []
-    for first in range(0, recording.count, FRAMES_PER_TASK):
-        frames = range(first, min(first + FRAMES_PER_TASK, recording.count))
-        used = range(frames[0] // per_file, frames[-1] // per_file + 1)
-        spans.append((recording, frames, {n: files[n] for n in used}))
-    return spans
-
-
-def _batches(spans: list[Span]) -> list[list[Span]]:
-    """Short spans together, so that a task has about `FRAMES_PER_TASK` frames."""
-    batches: list[list[Span]] = [[]]
-    for span in spans:
-        if sum(len(s[1]) for s in batches[-1]) + len(span[1]) > FRAMES_PER_TASK:
-            batches.append([])
-        batches[-1].append(span)
-    return [batch for batch in batches if batch]
 
 
 def _create_files(bench: Bench, recording: Recording, folder: Path) -> list[FrameWriter]:
@@ -217,8 +177,7 @@ def _create_files(bench: Bench, recording: Recording, folder: Path) -> list[Fram
         planes = min(per_file, recording.count - first)
         shape = bench.detector.shape if per_file == 1 else (planes, *bench.detector.shape)
         path = folder / recording.folder / f"{recording.stem}-{number:05d}.fits"
-        cards = _cards(bench, recording, first)
-        made.append(FrameWriter.create(path, shape, "uint16", cards))
+        made.append(FrameWriter.create(path, shape, "uint16", _cards(bench, recording, first)))
     return made
 
 
