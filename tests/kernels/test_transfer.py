@@ -12,11 +12,9 @@ def stays(charge: float, share: float, seed: int | None = 0) -> np.ndarray:
     normal = np.zeros(SHAPE)
     if seed is not None:
         normal = np.random.default_rng(seed).standard_normal(SHAPE)
-    out = np.full(SHAPE, np.nan, np.float32)
     full = (np.full(SHAPE, value, np.float32) for value in (charge, share))
     bands = np.zeros(1, np.float32), np.ones(1, np.float32)
-    left_behind(*full, *bands, normal.astype(np.float32), out)
-    return out
+    return left_behind(*full, *bands, normal.astype(np.float32))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.5])
@@ -41,6 +39,5 @@ def test_no_more_stays_than_there_is(charge: float) -> None:
 def test_bands_of_the_charge_have_their_own_shares() -> None:
     charge = np.array([[500.0, 1500.0, 5000.0]], np.float32)
     bands = np.array([0.0, 1000.0, 2000.0], np.float32), np.array([2.0, 1.0, 0.5], np.float32)
-    out = np.empty_like(charge)
-    left_behind(charge, np.full_like(charge, 0.1), *bands, np.zeros_like(charge), out)
+    out = left_behind(charge, np.full_like(charge, 0.1), *bands, np.zeros_like(charge))
     np.testing.assert_allclose(out, [[100.0, 250.0, 450.0]], rtol=1e-6)

@@ -170,12 +170,9 @@ class Lag(Effect):
             e-.
         """
         taken = self._left(charge)
-        released = np.zeros_like(taken)
         if self.capacity_e:
-            lost = np.empty_like(taken)
-            flat = [part.reshape(len(charge), -1) for part in (taken, lost, released)]
-            fill_traps(flat[0], self._keep, self.capacity_e, *flat[1:])
-            return lost, released
+            return fill_traps(taken, self._keep, self.capacity_e)
+        released = np.zeros_like(taken)
         for back, release in enumerate(self.releases, start=1):
             released[back:] += np.float32(release) * taken[:-back]
         return taken - released, released
@@ -183,13 +180,10 @@ class Lag(Effect):
     def _left_behind(self, charge: F32, shot: Shot, frame: int, noisy: float = 1.0) -> F32:
         """Electrons of a frame that stay: each by its own chance, so that noise stays white."""
         share = _shares(self, shot.bench.detector, shot.rows)
-        left = np.empty_like(charge)
         noise = np.zeros_like(charge)
         if shot.bench.shot_noise and noisy > 0:
             noise = shot.normals(self.name, frame) * np.float32(np.sqrt(noisy))
-        begins, weights = _bands(self)
-        left_behind(charge, share, begins, weights, noise, left)
-        return left
+        return left_behind(charge, share, *_bands(self), noise)
 
     def _left(self, charge: F32) -> F32:
         """Mean of what stays of a charge, e-."""

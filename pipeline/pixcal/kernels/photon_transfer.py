@@ -46,21 +46,6 @@ _SIGMA_OF_MAD = 1.482602218505602
 
 
 @njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
-def _fill_ratios(
-    first: F32, second: F32, per_level: float, read_variance: float, ratios: F32
-) -> None:
-    """Differences over their expected noise, by the pixel's place in its block and by block."""
-    slope, floor = np.float32(per_level), np.float32(read_variance)
-    columns = -(-first.shape[1] // BLOCK)
-    for y in range(first.shape[0]):
-        for x in range(first.shape[1]):
-            mean = np.float32(0.5) * (first[y, x] + second[y, x])
-            variance = max(mean, np.float32(0)) * slope + floor
-            place, block = y % BLOCK * BLOCK + x % BLOCK, y // BLOCK * columns + x // BLOCK
-            ratios[place, block] = (first[y, x] - second[y, x]) / np.sqrt(variance)
-
-
-@njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")  # type: ignore[untyped-decorator]
 def _add_blocks(
     first: F32, second: F32, per_level: float, read_variance: float, quantum: float,
     centre: F32, spread: F32, lags: Any, out: F64,
@@ -129,10 +114,16 @@ def pair_statistics(
         for the clipping, and covariance (ADU²) of pixels apart by each of `LAGS`. All zero for
         blocks of fewer than 32 pixels.
     """
-    blocks = math.prod(-(-n // BLOCK) for n in first.shape)
-    ratios = np.full((BLOCK * BLOCK, blocks), np.nan, np.float32)
+    rows, columns = (-(-n // BLOCK) for n in first.shape)
+    blocks = rows * columns
     pair = np.ascontiguousarray(first, np.float32), np.ascontiguousarray(second, np.float32)
-    _fill_ratios(*pair, 1 / gain, read_noise**2, ratios)
+    # Differences over their expected noise, by the pixel's place in its block and by block.
+    whole = np.full((rows * BLOCK, columns * BLOCK), np.nan, np.float32)
+    variance = np.maximum(np.float32(0.5) * (pair[0] + pair[1]), 0) * np.float32(1 / gain)
+    ratio = (pair[0] - pair[1]) / np.sqrt(variance + np.float32(read_noise**2))
+    whole[: first.shape[0], : first.shape[1]] = ratio
+    by_block = whole.reshape(rows, BLOCK, columns, BLOCK).transpose(1, 3, 0, 2)
+    ratios = np.ascontiguousarray(by_block.reshape(BLOCK * BLOCK, blocks))
     centre, spread = np.empty((2, blocks), np.float32)
     few = np.isfinite(ratios).sum(axis=0) < _MIN_PIXELS
     median_of_columns(ratios.copy(), centre)

@@ -26,13 +26,7 @@ MAX_SAMPLES = 1 << 26  # samples of a set that are taken into memory (some ten b
 
 
 def load_evidence(run_dir: Path, part: Part | None = None, frames: slice = slice(None)) -> Evidence:
-    """Evidence of some frames of a part of the window; without one, of the whole window.
-
-    Raises
-    ------
-    InputError
-        If a stage is missing, or the part holds more than `MAX_SAMPLES` samples.
-    """
+    """Evidence of some frames of a part of the window; without one, of the whole window."""
     require(run_dir, "reduce")
     if read_acquisition(run_dir).frames.fringes:
         require(run_dir, "fit")

@@ -32,14 +32,9 @@ def run_in_memory(
 ) -> MemoryPath:
     """A run of frames that are at hand, with straight fringes, as a run directory.
 
-    Its arrays are those of the stages; by default nothing is fitted to batches of frames.
-
-    Parameters
-    ----------
-    frames : mapping
-        (t, y, x) in ADU by name of the array, ``bias`` or ``fringes/vertical``.
-    tables : mapping
-        What is known of each frame, in columns, as in ``frames.json``.
+    Of ``frames`` (t, y, x), ADU, by name of the array (``bias``, ``fringes/vertical``), and of what
+    is known of each, as in ``frames.json``. Its arrays are those of the stages; by default nothing
+    is fitted to batches of frames.
     """
     run = MemoryPath()
     for name, samples in frames.items():

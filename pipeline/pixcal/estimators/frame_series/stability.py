@@ -63,13 +63,10 @@ def white_population(
 
     Parameters
     ----------
-    present : (batch,) bool
-        False in gaps.
-    lengths : sequence of int
-        Averaging lengths in batches that leave at least one difference.
-    noise : (n,) float, optional
-        Noise levels that occur, equally often (quantiles over the window). Without it, all pixels
-        are alike and the covariance is that of a single pixel instead of a median.
+    present : (batch,) bool, false in gaps
+    lengths : averaging lengths in batches that leave at least one difference
+    noise : (n,) noise levels that occur, equally often (quantiles over the window); without it all
+        pixels are alike and the covariance is that of a single pixel instead of a median
     """
     draws = _draws(np.asarray(present, dtype=bool).tobytes(), tuple(lengths))
     pixels = draws.shape[1]

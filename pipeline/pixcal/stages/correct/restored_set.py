@@ -25,14 +25,11 @@ class RestoredSet(ReducedSet):
 
     Parameters
     ----------
-    folder : Path
-        ``RUN/reduce/reduced.zarr/<set name>``.
-    effects : tuple of Effect
-        In the order in which they are undone.
-    calibration : Path
-        ``calibration.zarr``: samples were divided by its flat, after its dark signal was taken off.
-    exptime_s : (t,) float32
-        Of each frame.
+    folder : ``RUN/reduce/reduced.zarr/<set name>``
+    effects : in the order in which they are undone
+    calibration : ``calibration.zarr``: samples were divided by its flat, after its dark signal was
+        taken off
+    exptime_s : (t,) float32, of each frame
     """
 
     effects: tuple[Effect, ...]

@@ -141,15 +141,11 @@ def _corrected_maps(
     for old in (made.scratch / "undone", made.folder / "corrected.zarr"):
         shutil.rmtree(old, ignore_errors=True)
     create_group(made.scratch / "undone")
-    swept, facts = _sweep(run_dir, made, plan, acquisition, runtime)
+    swept, facts = _swept_sets(run_dir, made, plan, acquisition, runtime)
     model = HYPERBOLIC if plan.bent else before["model"]
     fitted, left = [], {}
-    sets = {
-        name: _swept_set(run_dir, swept / name, before["sets"][name], plan, acquisition, name)
-        for name in before["sets"]
-    }
-    sides = sides_of([*sets.values()])
-    sets = {name: replace(swept, open_sides=sides) for name, swept in sets.items()}
+    sides = sides_of([*swept.values()])
+    sets = {name: replace(closed, open_sides=sides) for name, closed in swept.items()}
     for name, opened in sets.items():
         left[name] = parameter_errors(opened, runtime)
         target = made.scratch / "undone" / name
@@ -173,48 +169,38 @@ def _corrected_maps(
     }
 
 
-def _sweep(
+def _swept_sets(
     run_dir: Path, made: Build, plan: Treatments, acquisition: Acquisition, runtime: Runtime
-) -> tuple[Path, Mapping[str, Json]]:
-    """Where the swept sets are, and their summaries: those of the fit, unless samples change."""
-    of_fit = require(run_dir, "sweep")
-    if not plan.on_samples:
-        return run_dir / "sweep" / "sweep.zarr", of_fit.summary["sets"]
-    again = replace(made, folder=made.scratch)
-    create_group(made.scratch / "sweep.zarr")
-    ingested = Ingested(run_dir / "ingest")
-    facts = {}
-    for listed in acquisition.frames.fringes:
-        source = RestoredSet(
-            run_dir / "reduce" / "reduced.zarr" / listed.name,
+) -> tuple[dict[str, Swept], Mapping[str, Json]]:
+    """The sweeps to correct and their summaries: those of the fit, unless samples change."""
+    of_fit, ingested = require(run_dir, "sweep"), Ingested(run_dir / "ingest")
+    reduced, calibration = (run_dir / "reduce" / f"{n}.zarr" for n in ("reduced", "calibration"))
+    noise = float(read_json(run_dir / "reduce" / "reduce.json")["read_noise_e"]["used"])
+    group = run_dir / "sweep" / "sweep.zarr"
+    flat = calibration / "flat" if acquisition.frames.flat else None
+    again, facts, sets = replace(made, folder=made.scratch), dict(of_fit.summary["sets"]), {}
+    if plan.on_samples:
+        create_group(made.scratch / "sweep.zarr")
+    for name, of_set in read_json(run_dir / "fit" / "fit.json")["sets"].items():
+        exptime_s = ingested.exposures.fringes[f"fringes/{name}"]
+        folder = group / name
+        if plan.on_samples:
+            source = RestoredSet(reduced / name, plan.on_samples, calibration, exptime_s)
+            nominal, config = nominal_vector(acquisition, name), SweepConfig(**of_fit.config)
+            facts[name] = sweep_set(again, source, name, nominal, config, runtime)
+            folder = made.scratch / "sweep.zarr" / name
+        sets[name] = Swept(
+            folder,
+            ReducedSet(reduced / name),
+            plan.on_maps,
+            (float(of_set["kx"]), float(of_set["ky"])),
+            flat,
+            noise,
             plan.on_samples,
-            run_dir / "reduce" / "calibration.zarr",
-            ingested.exposures.fringes[f"fringes/{listed.name}"],
+            group / name,
+            float(np.median(exptime_s)),
         )
-        facts[listed.name] = sweep_set(
-            again, source, listed.name, nominal_vector(acquisition, listed.name),
-            SweepConfig(**of_fit.config), runtime,
-        )  # fmt: skip
-    return made.scratch / "sweep.zarr", facts
-
-
-def _swept_set(
-    run_dir: Path, folder: Path, facts: Json, plan: Treatments, acquisition: Acquisition, name: str
-) -> Swept:
-    used = read_json(run_dir / "reduce" / "reduce.json")
-    flat = run_dir / "reduce" / "calibration.zarr" / "flat"
-    exposures = Ingested(run_dir / "ingest").exposures.fringes[f"fringes/{name}"]
-    return Swept(
-        folder,
-        ReducedSet(run_dir / "reduce" / "reduced.zarr" / name),
-        plan.on_maps,
-        (float(facts["kx"]), float(facts["ky"])),
-        flat if acquisition.frames.flat else None,
-        float(used["read_noise_e"]["used"]),
-        plan.on_samples,
-        run_dir / "sweep" / "sweep.zarr" / name,
-        float(np.median(exposures)),
-    )
+    return sets, facts
 
 
 def _of_set(fitted: FittedSet, totals: Totals, gain: Json, before: Json, plan: Treatments) -> Json:

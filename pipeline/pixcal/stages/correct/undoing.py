@@ -120,7 +120,7 @@ def _undo_tile(
     change = np.sum(steps, axis=0) if steps else np.zeros(maps.theta.shape[1:])
     moved = (change + border)[inside].astype(np.float32)
     phase = wrapped(ArrayReader(swept.folder / "phase").read(y, x) + moved)
-    factor = np.prod(_noise_factors(swept, maps), axis=0)[inside]
+    factor = _noise_factor(swept, maps)[inside]
     own_error = ArrayReader(swept.folder / "sigma").read(y, x) * factor
     beside = _of_neighbours(swept, maps, after, known, part)[inside]
     left = np.sum(left_over(swept, maps, good, inside), axis=0)
@@ -128,15 +128,13 @@ def _undo_tile(
     iota, alpha = after.theta[0][inside], np.hypot(after.theta[1], after.theta[2])[inside]
     variants: list[F64] = []
     errors: list[F64] = []
-    if swept.has_halves:
-        for n in range(HALVES):
-            half = ArrayReader(target / "half_phase").read((n, n + 1), *swept.within(part))[0]
-            half_phase = padded(half.astype(float), swept, part)
-            its = undone(maps.turned(half_phase), swept.effects)[1]
-            rest = np.sum(its, axis=0) - change if its else 0.0
-            variants.append((half_phase + rest)[inside])
-            error = ArrayReader(target / "half_sigma").read((n, n + 1), y, x)[0]
-            errors.append(error * factor)
+    for n in range(HALVES * swept.has_halves):
+        half = ArrayReader(target / "half_phase").read((n, n + 1), *swept.within(part))[0]
+        half_phase = padded(half.astype(float), swept, part)
+        its = undone(maps.turned(half_phase), swept.effects)[1]
+        rest = np.sum(its, axis=0) - change if its else 0.0
+        variants.append((half_phase + rest)[inside])
+        errors.append(ArrayReader(target / "half_sigma").read((n, n + 1), y, x)[0] * factor)
     variants += [-step[inside] for step in steps]
     errors += [sigma] * len(steps)
     start = (y[0], x[0])
@@ -165,13 +163,13 @@ def _of_neighbours(
     return np.asarray(np.where(known, error, 0.0))
 
 
-def _noise_factors(swept: Swept, maps: FringeMaps) -> F64:
-    """Of each effect (effect, y, x); of one that does nothing, where there is none."""
+def _noise_factor(swept: Swept, maps: FringeMaps) -> F64:
+    """Noise (y, x) after all effects are undone, over that before."""
     light = maps.theta[0] if maps.flat is None else maps.theta[0] * maps.flat
-    charge = float(light.mean())
-    factors = [np.ones(light.shape)]
-    factors += [e.noise_factor(charge, swept.read_noise, maps) for e in swept.effects]
-    return np.stack(factors)
+    factor = np.ones(light.shape)
+    for effect in swept.effects:
+        factor *= effect.noise_factor(float(light.mean()), swept.read_noise, maps)
+    return factor
 
 
 def _sums(
