@@ -1,6 +1,5 @@
 """Correction of centroids by the maps of a run: tables, and a WCS distortion."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,56 +18,42 @@ from pixcal.model.options import FWHMS, Centroids, Wcs
 from pixcal.stages.advice import maps_to_use
 from pixcal.storage.artefact import read_json
 from pixcal.storage.products import read_map
+from pixcal.storage.stage import read_acquisition
 from pixcal.storage.star_files import column, distortion, read_table, write_distortion, write_table
 
 
-@dataclass(frozen=True)
-class Offsets:
-    """Offsets of the pixels along x and y, and their errors, (2, y, x), px; NaN where unknown."""
+def read_offsets(run_dir: Path) -> tuple[F32, F32]:
+    """Offsets of the pixels along x and y, and their errors, (2, y, x), px; NaN where unknown.
 
-    delta: F32
-    sigma: F32
-    files: tuple[str, ...]  # the products that they come from
-    read_noise: float  # e-, as declared
-
-
-def read_offsets(run_dir: Path) -> Offsets:
-    """The maps of a run to use: corrected ones where there are any.
-
-    With a single fringe axis the offsets along it; those across it are taken as zero.
+    Corrected ones where there are any. With a single fringe axis they are those along it; those
+    across it are taken as zero.
     """
-    files = maps_to_use(run_dir)
-    maps = {name: read_map(path)[:2] for name, path in files.items()}
+    maps = {name: read_map(path)[:2] for name, path in maps_to_use(run_dir).items()}
     if not maps:
         raise InputError(f"{run_dir}: the fit left no map of offsets")
     if "delta_fringe" in maps:
         facts = read_json(run_dir / "fit" / "fit.json")["sets"]
         axis = np.array(next(iter(facts.values()))["axis"], np.float32)[:, None, None]
-        delta, sigma = (axis * values for values in maps["delta_fringe"])
-        sigma = np.abs(sigma)
-    else:
-        pairs = zip(*(maps[name] for name in ("delta_x", "delta_y")), strict=True)
-        delta, sigma = (np.stack(pair) for pair in pairs)
-    detector = read_json(run_dir / "ingest" / "acquisition.json")["detector"]
-    names = tuple(path.name for path in files.values())
-    return Offsets(delta, sigma, names, float(detector["read_noise_e"]))
+        delta, sigma = maps["delta_fringe"]
+        return axis * delta, np.abs(axis * sigma)
+    delta, sigma = (np.stack([maps[f"delta_{axis}"][n] for axis in "xy"]) for n in (0, 1))
+    return delta, sigma
 
 
-def star_of(offsets: Offsets, fwhm_px: float, electrons: float | None) -> Star:
+def star_of(run_dir: Path, fwhm_px: float, electrons: float | None) -> Star:
     """A star of some width; refused if that is out of range."""
     low, high = FWHMS
     if not low <= fwhm_px <= high:
         raise InputError(f"--fwhm: {fwhm_px:g} px; give a width from {low:g} to {high:g} px")
     if electrons is not None and not 0 < electrons < np.inf:
         raise InputError(f"--electrons: {electrons:g}; give a number above zero")
-    return gaussian_star(fwhm_px, electrons, offsets.read_noise)
+    return gaussian_star(fwhm_px, electrons, read_acquisition(run_dir).detector.read_noise_e)
 
 
 def correct(run_dir: Path, place: F64, *, fwhm_px: float, electrons: float | None) -> Corrected:
     """Correct centroids (n, 2), px from the centre of the first pixel."""
-    offsets = read_offsets(run_dir)
-    star = star_of(offsets, fwhm_px, electrons)
-    return correct_centroids(place, offsets.delta, offsets.sigma, star)
+    delta, sigma = read_offsets(run_dir)
+    return correct_centroids(place, delta, sigma, star_of(run_dir, fwhm_px, electrons))
 
 
 def correct_table(run_dir: Path, file: Path, config: Centroids) -> Corrected:
@@ -88,9 +73,9 @@ def correct_table(run_dir: Path, file: Path, config: Centroids) -> Corrected:
 
 def wcs_of(run_dir: Path, *, fwhm_px: float | None) -> WCS:
     """The maps as a distortion: of the pixels themselves, or of stars of some width."""
-    offsets = read_offsets(run_dir)
-    star = None if fwhm_px is None else star_of(offsets, fwhm_px, None)
-    return distortion(correction_map(offsets.delta, star))
+    delta, _ = read_offsets(run_dir)
+    star = None if fwhm_px is None else star_of(run_dir, fwhm_px, None)
+    return distortion(correction_map(delta, star))
 
 
 def write_wcs(run_dir: Path, config: Wcs) -> None:

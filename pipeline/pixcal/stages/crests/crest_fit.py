@@ -105,16 +105,8 @@ def relative_phase(paths: CrestPaths, geometry: Geometry) -> F64:
 def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -> CrestFit:
     """Weighted least squares of equation 7 over fibre positions and phase.
 
-    Parameters
-    ----------
-    start : where to begin; far starts converge (tested: 10 mm of distance, 18 mm of offset, 5 % of
-        the baseline)
-    prior : default `Prior.none`: only a large window determines all six parameters
-
-    Raises
-    ------
-    InputError
-        If there are fewer points than unknowns, or they lie on fewer than three paths.
+    Far starts converge (tested: 10 mm of distance, 18 mm of offset, 5 % of the baseline). Without a
+    prior nothing is known: only a large window determines all six parameters.
     """
     prior = Prior.none(start) if prior is None else prior
     unknown, number = 1 + int(np.isinf(prior.sigma).sum()), len(np.unique(paths.k))

@@ -25,7 +25,6 @@ from pixcal.model.errors import InputError
 from pixcal.stages.crests.windows import (
     FRINGES_A_WINDOW,
     CrestCarrier,
-    Smooth,
     Vector,
     Windows,
     solve_windows,
@@ -133,11 +132,11 @@ def find_crests(
     for _ in range(SETTLING):
         phase, sigma, light = _window_phases(accumulate(0, windows, carrier), windows)
         _check(np.isfinite(sigma))
-        carrier = CrestCarrier(
-            _follow(windows, phase, sigma, carrier.phase),
-            _brightened(windows, light, sigma, carrier.light),
+        followed = _follow(windows, phase, sigma, carrier)
+        carrier = replace(
+            carrier, phase=followed, light=_brightened(windows, light, sigma, carrier)
         )
-        kx, ky = (float(v) for v in carrier.phase.gradient(*np.array(carrier.phase.centre)))
+        kx, ky = (float(v) for v in carrier.vector(*np.array(carrier.centre)))
         windows = Windows.lay(frame, (kx, ky), segment)
 
     phi = np.full(n_frames, np.nan)
@@ -159,18 +158,18 @@ def find_crests(
     start = np.nan_to_num(phi[0])
     rest = np.where(use, total / np.where(use, weight, 1.0), 0.0) + start
     y, x = windows.centres
-    here = carrier.phase.on(y, x) + rest
+    here = carrier.at(y, x) + rest
     column = [np.median(p[u]) if u.any() else 0.0 for p, u in zip(here, use, strict=True)]
     number = np.broadcast_to(np.rint(np.array(column) / np.pi)[:, None], here.shape)
     near = np.abs(here - number * np.pi) < np.pi * FRINGES_A_WINDOW / 2
     number = np.where(near, number, np.rint(here / np.pi))[use]
     y, x, rest = y[use], x[use], rest[use]
     for _ in range(4):
-        gx, gy = carrier.phase.gradient(y, x)
-        step = (number * np.pi - carrier.phase.on(y, x) - rest) / (gx**2 + gy**2)
+        gx, gy = carrier.vector(y, x)
+        step = (number * np.pi - carrier.at(y, x) - rest) / (gx**2 + gy**2)
         y, x = y + step * gy, x + step * gx
     return CrestPaths(
-        x, y, number.astype(np.int64), weight[use] ** -0.5, np.hypot(*carrier.phase.gradient(y, x)),
+        x, y, number.astype(np.int64), weight[use] ** -0.5, np.hypot(*carrier.vector(y, x)),
         phi - start, (kx, ky), frame, windows.size[1],
     )  # fmt: skip
 
@@ -201,6 +200,15 @@ def _design(y: F64, x: F64, degree: int) -> tuple[F64, list[tuple[int, int]]]:
     return np.stack([y**i * x**j for i, j in powers], axis=1), powers
 
 
+def _plus(before: F64, powers: list[tuple[int, int]], values: NDArray[Any]) -> F64:
+    """A polynomial (n, n) with terms added to it."""
+    size = max(powers[-1][0] + 1, len(before))
+    total = np.zeros((size, size))
+    total[: len(before), : len(before)] = before
+    np.add.at(total, tuple(np.transpose(powers)), values)
+    return total
+
+
 def _highest_degree(windows: Windows, number: int) -> int:
     """Of a polynomial that the windows determine."""
     degree = min(MAX_DEGREE, max(1, min(windows.shape) - 1))
@@ -209,23 +217,23 @@ def _highest_degree(windows: Windows, number: int) -> int:
     return degree
 
 
-def _brightened(windows: Windows, light: F64, sigma: F64, before: Smooth) -> Smooth:
+def _brightened(windows: Windows, light: F64, sigma: F64, carrier: CrestCarrier) -> F64:
     """Logarithm of the illumination: what it was times the light of the windows with fringes."""
     use = np.isfinite(sigma) & (light > 0)
-    y, x = before.scaled(*(c[use] for c in windows.centres))
+    y, x = carrier.scaled(*(c[use] for c in windows.centres))
     basis, powers = _design(y, x, _highest_degree(windows, len(y)))
     fit = np.linalg.lstsq(basis, np.log(light[use]), rcond=1e-12)[0]
-    return before.plus(powers, fit)
+    return _plus(carrier.light, powers, fit)
 
 
-def _follow(windows: Windows, phase: F64, sigma: F64, before: Smooth) -> Smooth:
+def _follow(windows: Windows, phase: F64, sigma: F64, carrier: CrestCarrier) -> F64:
     """Polynomial through the phases of the windows, numbered outwards from the middle.
 
     Each time the known region grows by a third, the polynomial through it fixes the
     cycle of the phases beyond: gaps are bridged, and single bad windows have no effect.
     """
     use = np.isfinite(sigma)
-    y, x = before.scaled(*(c[use] for c in windows.centres))
+    y, x = carrier.scaled(*(c[use] for c in windows.centres))
     measured, precision = phase[use], 1 / sigma[use]
     distance = np.hypot(y, x)
     highest = _highest_degree(windows, len(measured))
@@ -245,5 +253,5 @@ def _follow(windows: Windows, phase: F64, sigma: F64, before: Smooth) -> Smooth:
             fit = np.linalg.lstsq(scaled, value, rcond=1e-12)[0]
             known = basis @ fit
         if near.all():
-            return before.plus(powers, fit)
+            return _plus(carrier.phase, powers, fit)
         reach *= 1.33

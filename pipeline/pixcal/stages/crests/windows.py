@@ -7,7 +7,7 @@ across and along the fringes and P a smooth carrier. The normal equations of thi
 windows may be cut by any tiling of the frame.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
 
@@ -91,55 +91,35 @@ class Windows:
 
 
 @dataclass(frozen=True)
-class Smooth:
-    """A polynomial ``sum c[i, j] Y^i X^j`` of scaled pixel coordinates."""
+class CrestCarrier:
+    """What a frame is demodulated with: polynomials ``sum c[i, j] Y^i X^j`` of scaled pixels."""
 
-    coefficients: F64  # (n, n)
+    phase: F64  # (n, n) of the phase, rad
+    light: F64  # (n, n) of the natural logarithm of the illumination
     centre: Vector  # (y, x) where X = Y = 0, px
     scale: float  # pixels to a unit of X and Y
 
     @classmethod
-    def plane(cls, slope: Vector, frame: tuple[int, int]) -> Self:
-        """A plane of slope (x, y) a pixel, zero at the frame's centre."""
+    def straight(cls, k: Vector, frame: tuple[int, int]) -> Self:
+        """Straight fringes of a vector (kx, ky), of phase zero at the centre, and even light."""
         scale = max(frame) / 2
-        c = np.array([[0.0, slope[0] * scale], [slope[1] * scale, 0.0]])
-        return cls(c, ((frame[0] - 1) / 2, (frame[1] - 1) / 2), scale)
+        slope = np.array([[0.0, k[0]], [k[1], 0.0]]) * scale
+        return cls(slope, np.zeros((2, 2)), ((frame[0] - 1) / 2, (frame[1] - 1) / 2), scale)
 
     def scaled(self, y: F64, x: F64) -> tuple[F64, F64]:
         """Y and X at pixel coordinates."""
         return (y - self.centre[0]) / self.scale, (x - self.centre[1]) / self.scale
 
-    def on(self, y: F64, x: F64) -> F64:
-        """Value at pixel coordinates."""
-        return np.asarray(polynomial.polyval2d(*self.scaled(y, x), self.coefficients))
+    def at(self, y: F64, x: F64) -> F64:
+        """Phase at pixel coordinates, rad."""
+        return np.asarray(polynomial.polyval2d(*self.scaled(y, x), self.phase))
 
-    def gradient(self, y: F64, x: F64) -> tuple[F64, F64]:
-        """Derivatives (by x, by y) at pixel coordinates, 1/px."""
+    def vector(self, y: F64, x: F64) -> tuple[F64, F64]:
+        """Fringe vector (kx, ky) at pixel coordinates, rad/px."""
         at = self.scaled(y, x)
-        by_y, by_x = (polynomial.polyder(self.coefficients / self.scale, axis=n) for n in (0, 1))
-        values = [np.asarray(polynomial.polyval2d(*at, c), float) for c in (by_x, by_y)]
-        return values[0], values[1]
-
-    def plus(self, powers: list[tuple[int, int]], values: NDArray[Any]) -> "Smooth":
-        """The polynomial with terms added to it."""
-        size = max(max(powers)[0] + 1, len(self.coefficients))
-        total = np.zeros((size, size))
-        total[: len(self.coefficients), : len(self.coefficients)] = self.coefficients
-        np.add.at(total, tuple(np.transpose(powers)), values)
-        return replace(self, coefficients=total)
-
-
-@dataclass(frozen=True)
-class CrestCarrier:
-    """What a frame is demodulated with."""
-
-    phase: Smooth  # rad
-    light: Smooth  # natural logarithm of the illumination; coordinates scaled as those of `phase`
-
-    @classmethod
-    def straight(cls, k: Vector, frame: tuple[int, int]) -> Self:
-        """Straight fringes of a vector (kx, ky) and even light."""
-        return cls(Smooth.plane(k, frame), Smooth.plane((0.0, 0.0), frame))
+        by_y, by_x = (polynomial.polyder(self.phase / self.scale, axis=n) for n in (0, 1))
+        kx, ky = (np.asarray(polynomial.polyval2d(*at, c), float) for c in (by_x, by_y))
+        return kx, ky
 
 
 def tile_sums(
@@ -156,10 +136,9 @@ def tile_sums(
     y, x = ((at, at + n) for at, n in zip(start, signal.shape, strict=True))
     (i0, i1), (j0, j1) = windows.touched(y, x)
     sums = np.zeros((i1 - i0, j1 - j0, N_SUMS))
-    phase, layout = carrier.phase, np.array([*windows.direction, *windows.edge, *windows.size])
-    frame = np.array([phase.centre[1], phase.centre[0], phase.scale])
-    polynomials = (phase.coefficients, carrier.light.coefficients)
-    _add(signal, good, start, layout, (i0, j0), polynomials, frame, sums)
+    layout = np.array([*windows.direction, *windows.edge, *windows.size])
+    frame = np.array([carrier.centre[1], carrier.centre[0], carrier.scale])
+    _add(signal, good, start, layout, (i0, j0), (carrier.phase, carrier.light), frame, sums)
     return (i0, j0), sums
 
 
