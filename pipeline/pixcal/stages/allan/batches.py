@@ -1,6 +1,6 @@
 """The batch maps of a fringe set, as the fit left them, and what their pixels share."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
@@ -10,14 +10,19 @@ from typing import Any
 import numpy as np
 
 from pixcal.engine.run import Runtime, run_tasks
+from pixcal.estimators.frame_series.stability import ONE_SIGMA
 from pixcal.kernels.allan import disjoint_differences
+from pixcal.kernels.quantiles import quantiles_of_parts
 from pixcal.model.arrays import F32, F64, I64
+from pixcal.model.errors import DamagedError
 from pixcal.model.options import Region
 from pixcal.storage.cube import ArrayReader
 
 # a task takes so many of the fit's chunks, one above the other: one file of each length
 TILES_HIGH = 4
 DIFFERENCES = 32  # differences in time whose products show what pixels share
+# levels of the quantiles that describe the noise over a region
+NOISE_LEVELS = (np.arange(64) + 0.5) / 64
 
 Range = tuple[int, int]
 Tile = tuple[Range, Range]
@@ -100,9 +105,34 @@ def _sums_task(
     return counts, grams
 
 
-def positive_values(path: Path, region: Region, length: int | None = None) -> F32:
-    """Finite values (n,) above zero of a map over a region; no noise gives zero."""
+def quantiles_of_region(
+    path: Path, region: Region, usable: Sequence[int]
+) -> tuple[dict[int, tuple[float, float, float]], int]:
+    """Central 68 % and median over a region for each length's number, and how many pixels."""
+    quantiles, pixels = {}, 0
+    for n in usable:
+        parts = partial(_positive, path, (n, n + 1), region)
+        found, count = quantiles_of_parts(parts, (ONE_SIGMA[0], 0.5, ONE_SIGMA[1]))
+        pixels = max(pixels, count)
+        if count:
+            low, median, high = found.tolist()
+            quantiles[n] = (low, median, high)
+    return quantiles, pixels
+
+
+def _positive(path: Path, lengths: Range | None, region: Region) -> Iterator[F32]:
+    """Finite values of a map over a region that are above zero, some rows at a time."""
+    reader = ArrayReader(path)
     y0, y1, x0, x1 = region
-    first = [] if length is None else [(length, length + 1)]
-    values = ArrayReader(path).read(*first, (y0, y1), (x0, x1))
-    return values[(values > 0) & (values < np.inf)]
+    for rows in _spans(y0, y1, reader.chunks[-2]):
+        values = reader.read(*([lengths] if lengths else []), rows, (x0, x1))
+        # No noise gives zero.
+        yield values[(values > 0) & (values < np.inf)]
+
+
+def noise_levels(path: Path, region: Region) -> F64:
+    """Quantiles of the expected deviation of one batch over a region, px."""
+    levels, count = quantiles_of_parts(partial(_positive, path, None, region), NOISE_LEVELS)
+    if not count:
+        raise DamagedError(f"{path}: no errors of batches", path)
+    return levels

@@ -24,7 +24,6 @@ from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.frame_series.stability import (
     MAX_DRAWS,
     NO_CURVE,
-    ONE_SIGMA,
     AllanCurve,
     fit_curve,
     shared_noise,
@@ -33,13 +32,14 @@ from pixcal.estimators.frame_series.stability import (
 from pixcal.kernels.allan import allan_deviation, averaging_lengths
 from pixcal.model.arrays import F32, F64
 from pixcal.model.config import result_options
-from pixcal.model.errors import DamagedError, InputError
+from pixcal.model.errors import InputError
 from pixcal.model.options import Allan, Region
 from pixcal.stages.allan.batches import (
     TILES_HIGH,
     Batches,
     Tile,
-    positive_values,
+    noise_levels,
+    quantiles_of_region,
     region_name,
     sums_of_region,
 )
@@ -51,8 +51,7 @@ from pixcal.storage.stage import make, working
 STAGE = STAGES["allan"]
 SCHEMA = "pixcal/allan/1"
 MIN_BATCHES = 3
-# levels of the quantiles that describe the noise over a region
-NOISE_LEVELS = (np.arange(64) + 0.5) / 64
+COUNT_BYTES = 64 << 20  # of the digits of all values of a map (`quantiles_of_parts`)
 
 Config = Allan
 
@@ -108,8 +107,9 @@ def _measure_set(
     lengths = averaging_lengths(batches.n)
     cy, cx = batches.chunks
     tile_bytes = 4 * cy * cx * (2 * batches.n + len(lengths) * (TILES_HIGH + 2))
-    # A map and two copies of its values; draws of the curve.
-    held = 16 * batches.window[0] * batches.window[1] + 40 * MAX_DRAWS * len(lengths)
+    # Some rows of a map in copies; counts of its values; draws of the curve.
+    rows = 16 * TILES_HIGH * cy * batches.window[1]
+    held = rows + COUNT_BYTES + 40 * MAX_DRAWS * len(lengths)
     runtime = within_memory(f"the Allan deviation of {name}", tile_bytes, held, runtime)
     if lengths:
         _write_maps(made, folder, name, batches, lengths, runtime)
@@ -207,23 +207,16 @@ def _measure_region(
     present = counts > counts.max(initial=0) / 2
     filled = int(present.sum())
     common = {"n_batches": batches.n, "gaps": batches.n - filled}
-    quantiles, pixels = {}, 0
-    for n, m in enumerate(lengths):
-        # Gaps may leave no two neighbouring means.
-        if np.isin(2 * m, np.convolve(present, np.ones(2 * m, int), "valid")):
-            values = positive_values(folder / "adev", region, n)
-            pixels = max(pixels, len(values))
-            if len(values):
-                quantiles[n] = np.quantile(values, (ONE_SIGMA[0], 0.5, ONE_SIGMA[1]))
+    # Gaps may leave no two neighbouring means.
+    runs = [np.convolve(present, np.ones(2 * m, int), "valid") for m in lengths]
+    usable = [n for n, m in enumerate(lengths) if np.isin(2 * m, runs[n])]
+    quantiles, pixels = quantiles_of_region(folder / "adev", region, usable)
     if filled < MIN_BATCHES or not quantiles:
         reason = f"{filled} of {batches.n} batches have data: too few for an Allan deviation"
         return _as_json(batches, [], NO_CURVE, [], [reason]) | common | {"pixels": 0}
     chosen = [lengths[n] for n in quantiles]
     low, median, high = np.array(list(quantiles.values()), float).T
-    errors = positive_values(folder / "expected", region)
-    if not len(errors):
-        raise DamagedError(f"{folder / 'expected'}: no errors of batches", folder / "expected")
-    noise = np.quantile(errors, NOISE_LEVELS).astype(float)
+    noise = noise_levels(folder / "expected", region)
     white = white_population(present, chosen, noise if pixels > 1 else None)
     shared = shared_noise([grams[n] for n in quantiles], pixels)
     curve = fit_curve(chosen, median, np.log(high / low) / 2, pixels, shared, white)
