@@ -327,7 +327,7 @@ def test_an_effect_of_the_users_own_is_asked_for(coupled, tmp_path):
     spoilt = GLOW + "\n    def undo(self, maps):\n        return None\n"
     file.write_text(spoilt)
     with pytest.raises(InputError, match="'glow': undo does not return finite maps"):
-        correct.run(again, correct.Config(own=(file,)), SYNC)
+        correct.run(again, correct.Config(with_diagnosis=True, own=(file,)), SYNC)
 
 
 def test_a_file_of_the_users_own_may_be_in_any_encoding_of_python(coupled, tmp_path):
@@ -340,7 +340,7 @@ def test_a_file_of_the_users_own_may_be_in_any_encoding_of_python(coupled, tmp_p
     for author in ("Andr\xe9", "Ren\xe9"):
         file.write_bytes(f"# coding: latin-1\n# by {author}\n{GLOW}".encode("latin-1"))
         diagnosed(again, {"effect": "glow", "parameters": {}})
-        keys.add(correct.run(again, correct.Config(own=(file,)), SYNC).key)
+        keys.add(correct.run(again, correct.Config(with_diagnosis=True, own=(file,)), SYNC).key)
     assert len(keys) == 2
 
 
