@@ -24,6 +24,7 @@ FLICKER_KNOWN = 2.0
 
 # information of a median of absolute deviations, over that of a standard deviation
 _OF_MEDIAN = 0.37
+_WITH_BEFORE = 4  # pairs beyond which those of other frames before them are told apart
 _WITH_OFFSET, _WITH_CUBIC = 5, 6  # fewest levels for these terms
 _TURNS = 30
 _SMALL = 1e-4
@@ -55,21 +56,41 @@ def light_of(evidence: Evidence, stack: Stack) -> F64:
     return np.asarray(stack.adu[:, good].mean(axis=1, dtype=float) * evidence.gain - dark)
 
 
+def level_before(stack: Stack, evidence: Evidence) -> float:
+    """Level (e-) of the frame before a series; zero where time stamps do not tell which it is."""
+    start = stack.start_s + stack.time_s[0]
+    earlier = [
+        (float(times[times < start].max()), n)
+        for n, times in enumerate(s.start_s + s.time_s for s in evidence.stacks)
+        if (times < start).any()
+    ]
+    if not earlier:
+        return 0.0
+    frame = evidence.stacks[max(earlier)[1]].adu[-1]
+    return max(float((frame - evidence.bias)[evidence.good].mean()) * evidence.gain, 0.0)
+
+
 def flicker(evidence: Evidence) -> tuple[float, float]:
     """Relative change of the lamp from frame to frame, rms, and the degrees of freedom it has.
 
-    The first frame of a series may lack what stayed behind of the frame before: of pairs, what
-    their steps have in common is left out.
+    The first frame of a series may lack a share of its charge, and have one of the frame before:
+    of pairs, what their steps have in common by the levels of both is left out.
     """
     steps: list[float] = []
     firsts: list[float] = []
+    before: list[float] = []
     for stack in evidence.ladder:
         light = light_of(evidence, stack)
         if len(light) > 1 and light.mean() > 0:
             own = np.diff(light) / light.mean()
             firsts.append(float(own[0]))
+            before.append(level_before(stack, evidence) / float(light.mean()))
             steps += own[1:].tolist()
     pairs = np.array(firsts) - (np.median(firsts) if firsts else 0.0)
+    if len(firsts) > _WITH_BEFORE and np.ptp(before) > 0:
+        design = np.stack([np.ones_like(pairs), before], axis=1)
+        rest = pairs - design @ np.linalg.lstsq(design, pairs)[0]
+        pairs = rest * np.sqrt(len(rest) / (len(rest) - 2))
     every = np.concatenate([steps, pairs if len(pairs) > 2 else []])
     if not len(every):
         return 0.0, 1.0

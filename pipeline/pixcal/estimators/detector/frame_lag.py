@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker
+from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker, level_before
 from pixcal.estimators.detector.pixel_lag import CLIP, MIN_FRAMES
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
 from pixcal.kernels.frame_order import follows
@@ -190,7 +190,7 @@ def lag_of_flats(evidence: Evidence) -> LagOfFlats | None:
     level, step, error = np.array([f for _, f in found]).T
     if np.ptp(level) < 10 * error.min():
         return None
-    before = np.array([_level_before(s, evidence) for s, _ in found])
+    before = np.array([level_before(s, evidence) for s, _ in found])
     flat = np.array([s.kind == "flat" for s, _ in found])
     known = 1.0 if before.any() else 0.0
     fits = [_fit_steps(level - c * before, step, error, flat) for c in (0.0, known)]
@@ -215,20 +215,6 @@ def _fit_steps(lacking: F64, step: F64, error: F64, flat: Mask) -> tuple[float, 
         if flat.sum() >= _MANY_FLATS:
             scale = np.where(flat, np.sqrt(squares[flat].sum() / (flat.sum() - 1)), 1.0)
     return float(found[0]), float(np.sqrt(covariance[0, 0])), float(squares.sum())
-
-
-def _level_before(stack: Stack, evidence: Evidence) -> float:
-    """Level (e-) of the frame before a series; zero where time stamps do not tell which it is."""
-    start = stack.start_s + stack.time_s[0]
-    earlier = [
-        (float(times[times < start].max()), n)
-        for n, times in enumerate(s.start_s + s.time_s for s in evidence.stacks)
-        if (times < start).any()
-    ]
-    if not earlier:
-        return 0.0
-    frame = evidence.stacks[max(earlier)[1]].adu[-1]
-    return max(float((frame - evidence.bias)[evidence.good].mean()) * evidence.gain, 0.0)
 
 
 def _first_frame(stack: Stack, evidence: Evidence) -> tuple[float, float, float] | None:
