@@ -197,13 +197,17 @@ def test_what_the_frame_before_left_comes_out_in_the_first(
 @pytest.mark.parametrize("carried", [0.0, 1.0])
 def test_flats_of_rising_levels_tell_whether_the_detector_was_cleared(carried: float) -> None:
     rng, share, flicker, shape = np.random.default_rng(5), 0.01, 1e-3, (24, 24)
-    stacks = [Stack("bias", 0.0, np.arange(20.0), rng.normal(100, 5, (20, *shape)), 0.0)]
+    stacks = [
+        Stack("bias", 0.0, np.arange(20), np.arange(20.0), rng.normal(100, 5, (20, *shape)), 0.0)
+    ]
     before = 0.0
     for n, level in enumerate(np.linspace(1000, 20_000, 12)):
         light = level * (1 + flicker * rng.standard_normal(2))
         light[0] -= share * (level - carried * before)
         adu = rng.normal(100 + light[:, None, None], np.sqrt(level), (2, *shape))
-        stacks.append(Stack("flat", 0.1 * (n + 1), np.arange(2.0), adu, 100.0 + 10 * n))
+        stacks.append(
+            Stack("flat", 0.1 * (n + 1), np.arange(2), np.arange(2.0), adu, 100.0 + 10 * n)
+        )
         before = level
     maps = {"bias": np.full(shape, 100.0), "dark_rate": np.zeros(shape), "flat": np.ones(shape)}
     found = lag_of_flats(
