@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip --quiet install --no-compile
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-run bench-full cluster fuzz torture effect-pictures reproduce reproduce-full blind blind-second blind-full clean
+.PHONY: help install demo test test-long lint smoke wheel-check docs doc-pages precision bench bench-run bench-full cluster fuzz torture power effect-pictures reproduce reproduce-full blind blind-second blind-full clean
 
 help: ## list these commands
 	@sed -n 's/^\([a-z-]*\):.*## /\1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 17
@@ -86,6 +86,9 @@ fuzz: $(INSTALLED) ## bad input in thousands of cases, for docs/appendix/fuzz.md
 
 torture: $(TOOLS) ## faults of all kinds done on purpose, for docs/appendix/torture.md (12 minutes)
 	$(BIN)/python benchmarks/torture.py
+
+power: $(INSTALLED) ## from which strength on the diagnosis names each effect, and false causes, into work/ (hours)
+	$(BIN)/python benchmarks/power.py
 
 effect-pictures: $(INSTALLED) ## what every effect does to the offsets, for docs/reference/effects (two minutes)
 	$(BIN)/python benchmarks/effect_pictures.py

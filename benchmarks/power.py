@@ -1,0 +1,146 @@
+"""Power of the diagnosis: how often each effect is named, by its strength, and false causes.
+
+Every acquisition is of another detector, with no effect or with one at 0.3 to 10 times its
+threshold: the strength that half of the frames show at about four sigma. All effects are
+candidates::
+
+    python benchmarks/power.py --draws 2 --nominal 40 --out power.jsonl [EFFECT ...]
+
+Each acquisition takes about a minute of processor time. ``--out`` keeps a line of JSON for each;
+an interrupted study goes on where it stopped.
+"""
+
+import argparse
+import json
+import tempfile
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import yaml
+from numpy.random import default_rng
+
+import pixcal
+from blind_examination.strengths import variants_of
+from pixcal.engine.run import Runtime, run_tasks
+from pixcal.model.bench import SCHEMA
+
+STRENGTHS = (0.3, 1.0, 3.0, 10.0)  # times the threshold
+Case = tuple[str, float, int]  # effect ("" for none), strength, number of the draw
+
+
+def bench(seed: int) -> dict[str, Any]:
+    """Two sets of 300 frames on 61 x 67 pixels, with bias, darks and three levels of flats."""
+    detector = {
+        "seed": seed + 1, "shape": [61, 67], "pitch_um": 4.4, "gain_e_per_adu": 1.0,
+        "read_noise_e": 16.0, "bias_adu": 500, "bias_pixel_rms_adu": 4.0, "dark_e_s": 24.0,
+        "prnu_rms": 0.01, "delta_rms_px": 2.0e-3, "hot_fraction": 0.004, "hot_rate_e_s": 3.0e4,
+    }  # fmt: skip
+    fringes = [
+        {"name": name, "baseline_mm": baseline, "count": 300, "peak_e": 45000}
+        for name, baseline in (("vertical", [11.5, 0.0]), ("horizontal", [0.0, 6.4]))
+    ]
+    frames = {
+        "exptime_s": 0.02, "period_s": 0.14, "per_file": 500, "bias": 60,
+        "darks": [{"exptime_s": 0.5, "count": 20}], "flat_rate_e_s": 1.25e6,
+        "flats": [{"exptime_s": 0.01 * n, "count": 20} for n in (1, 2, 3)], "fringes": fringes,
+    }  # fmt: skip
+    optics = {
+        "wavelength_nm": 632.8,
+        "distance_mm": 400.0,
+        "beam_radius_mm": 35.0,
+        "visibility": 0.95,
+    }
+    return {"schema": SCHEMA, "seed": seed, "detector": detector, "optics": optics,
+            "frames": frames}  # fmt: skip
+
+
+def examine(case: Case) -> dict[str, Any]:
+    """Simulate and diagnose one acquisition."""
+    name, strength, draw = case
+    seed = 5000 + 10 * draw
+    plain = bench(seed)
+    if name:
+        seed += 100_000
+        variants = variants_of()[name]
+        variant = variants[(draw + STRENGTHS.index(strength)) % len(variants)]
+        drawn = variant.make(strength * variant.threshold("small"), default_rng(seed))
+        plain = bench(seed) | {"effects": {name: drawn}}
+    with tempfile.TemporaryDirectory() as folder:
+        file, acquisition, run = (Path(folder, n) for n in ("bench.yaml", "acq", "run"))
+        file.write_text(yaml.safe_dump(plain), encoding="utf-8")
+        pixcal.simulate(file, acquisition)
+        for step in (partial(pixcal.ingest, acquisition), pixcal.reduce, pixcal.diagnose):
+            step(run)
+        diagnosis = json.loads((run / "products" / "diagnosis.json").read_text(encoding="utf-8"))
+    own = [c.get("sigmas") for c in diagnosis["candidates"] if c["effect"] == name]
+    return {
+        "effect": name,
+        "strength": strength,
+        "draw": draw,
+        "verdict": diagnosis["verdict"],
+        "causes": [cause["effect"] for cause in diagnosis["causes"]],
+        "sigmas": next(iter(own), None),
+    }
+
+
+def table(results: Sequence[dict[str, Any]]) -> str:
+    """Markdown: effects named of those drawn (median significance), and false causes."""
+    head = ("effect", *(f"{s:g} × threshold" for s in STRENGTHS), "false causes")
+    rows: list[tuple[str, ...]] = []
+    for name in sorted({r["effect"] for r in results} - {""}):
+        own = [r for r in results if r["effect"] == name]
+        cells = [_named([r for r in own if r["strength"] == s], name) for s in STRENGTHS]
+        false = sum(any(c != name for c in r["causes"]) for r in own)
+        rows.append((name, *cells, f"{false} of {len(own)}"))
+    nominal = [r for r in results if not r["effect"]]
+    if nominal:
+        gaps = sum(r["verdict"] != "no gap" for r in nominal)
+        false = sum(bool(r["causes"]) for r in nominal)
+        note = f"a gap in {gaps} of {len(nominal)}"
+        rows.append(("none", note, *("" for _ in STRENGTHS[1:]), f"{false} of {len(nominal)}"))
+    lines = ["| " + " | ".join(row) + " |" for row in (head, *rows)]
+    return "\n".join([lines[0], "|" + "---|" * len(head), *lines[1:]])
+
+
+def _named(results: Sequence[dict[str, Any]], name: str) -> str:
+    if not results:
+        return "–"
+    sigmas = sorted(r["sigmas"] or 0.0 for r in results)
+    named = sum(name in r["causes"] for r in results)
+    return f"{named} of {len(results)} ({sigmas[len(sigmas) // 2]:.1f} σ)"
+
+
+def main() -> None:
+    """Examine all cases, two at a time, and print the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("effects", nargs="*", help="all, if not said")
+    parser.add_argument("--draws", type=int, default=2, help="of each effect and strength")
+    parser.add_argument("--nominal", type=int, default=40, help="acquisitions without an effect")
+    parser.add_argument("--strengths", type=float, nargs="*", choices=STRENGTHS, default=STRENGTHS)
+    parser.add_argument("--out", type=Path, default=Path("work", "power.jsonl"))
+    options = parser.parse_args()
+    names = options.effects or sorted(variants_of())
+    cases: list[Case] = [("", 0.0, draw) for draw in range(options.nominal)]
+    cases += [(n, s, d) for d in range(options.draws) for s in options.strengths for n in names]
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    options.out.touch()
+    results = [json.loads(line) for line in options.out.read_text("utf-8").splitlines()]
+    known = {(r["effect"], r["strength"], r["draw"]) for r in results}
+    pending = [case for case in cases if case not in known]
+    with options.out.open("a", encoding="utf-8") as lines:
+
+        def keep(_: int, result: dict[str, Any]) -> None:
+            results.append(result)
+            print(json.dumps(result), file=lines, flush=True)
+
+        runtime = Runtime(cluster="processes", quiet=False)
+        run_tasks(examine, pending, runtime, label="acquisitions", done=keep)
+    print(table(results))
+
+
+if __name__ == "__main__":
+    main()
