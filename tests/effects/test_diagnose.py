@@ -292,10 +292,11 @@ class Flicker(Effect):
 
     @classmethod
     def estimate(cls, evidence):
-        found = [f.free[:, 0] / f.free[:, 0].mean() for f in evidence.fringes.values()]
-        # Frames of this half start with the run.
-        sizes = [b[1::2].mean() - b[::2].mean() for b in found]
-        error = np.std(np.concatenate([np.diff(b[::2]) for b in found])) / 5
+        sets = evidence.fringes.values()
+        light = [f.free[:, 0] / f.free[:, 0].mean() for f in sets]
+        odd = [f.frame % 2 == 1 for f in sets]
+        sizes = [b[o].mean() - b[~o].mean() for b, o in zip(light, odd)]
+        error = np.std(np.concatenate([np.diff(b[~o]) for b, o in zip(light, odd)])) / 5
         size, error = float(np.mean(sizes)), max(float(error), 1e-6)
         return Estimate(cls(size), {"size": error}, abs(size) / error, "odd frames")
 '''
