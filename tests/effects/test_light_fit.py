@@ -31,7 +31,7 @@ def drawn(evidence: Evidence, effect: Effect, seed: int) -> Evidence:
     for name, f in evidence.fringes.items():
         psi = f.k[0] * x + f.k[1] * y
         plain = LightMaps(2e4 * one, 1.8e4 * np.sin(psi), 1.8e4 * np.cos(psi))
-        recording, _ = set_recordings(evidence)[name]
+        recording = set_recordings(evidence)[name]
         seen = effect.light(plain, recording, (0, shape[0]), maps)
         theta = np.stack([seen.iota, seen.alpha_sin, seen.alpha_cos]).astype(float)
         theta += 2e4 * NOISE * rng.standard_normal(theta.shape)
