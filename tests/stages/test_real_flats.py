@@ -226,5 +226,5 @@ def test_row_noise_with_a_repeat_shows_at_its_distance(tmp_path: Path) -> None:
         assert np.abs(repeated[[0, 2, 4, 5, 6, 7]]).max() < 0.3 * repeated[1]
         correlation = after[f"{kind}_neighbours", DETECTOR].value
         # Noise of whole rows is no coupling of their pixels.
-        assert abs(correlation[STEPS.index((2, 0))]) < 0.01
-        assert correlation[STEPS.index((0, 1))] > 0.2
+        for step in ((2, 0), (0, 1)):
+            assert abs(correlation[STEPS.index(step)]) < 0.01
