@@ -62,7 +62,7 @@ def run_with(
 
 
 def within(found: dict[str, Any], errors: dict[str, float], truth: dict[str, Any]) -> bool:
-    """Strengths and shapes within 3.5 errors: one in 2000 lies beyond by chance."""
+    """Strengths and shapes within 3.5 errors, which are too small by a fifth to a third."""
     seen = each(found)
     return all(abs(seen[name] - value) < 3.5 * errors[name] for name, value in each(truth).items())
 

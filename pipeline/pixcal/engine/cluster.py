@@ -82,13 +82,18 @@ def run_on_cluster(
 
     Parameters
     ----------
-    address : str, of the scheduler, ``tcp://…`` or ``tls://…``
-    function, items : callable, sequence, called with each item; both are pickled
-    ended : callable, gets the number and the result of each task
-    label : str, what the dashboard calls the tasks
+    address : str
+        Of the scheduler, ``tcp://…`` or ``tls://…``.
+    function, items : callable, sequence
+        Called with each item; both are pickled.
+    ended : callable
+        Gets the number and the result of each task.
+    label : str
+        What the dashboard calls the tasks.
     at_once : int
         Tasks that one worker process may do at the same time; 0 for as many as it has threads.
-    quiet : bool, print nothing
+    quiet : bool
+        Print nothing.
 
     Raises
     ------

@@ -38,7 +38,8 @@ class Runtime(Running):
         that each of its workers does at the same time; 0 means as many as it has threads.
     memory : int
         Bytes that the whole stage may use on this machine. Dask workers have their own limits.
-    quiet : bool, no progress on stderr
+    quiet : bool
+        No progress on stderr.
     """
 
     def __post_init__(self) -> None:
@@ -88,7 +89,8 @@ def _libraries(modules: int) -> ThreadpoolController:
 
     Parameters
     ----------
-    modules : int, modules imported by now: more may have brought more libraries
+    modules : int
+        Modules imported by now: more may have brought more libraries.
     """
     return ThreadpoolController()
 
@@ -105,9 +107,12 @@ def run_tasks(
 
     Parameters
     ----------
-    function : callable, called with one item; must not depend on the order of the items
-    items : sequence, one for each task
-    label : str, what is being done, for the progress line
+    function : callable
+        Called with one item; must not depend on the order of the items.
+    items : sequence
+        One for each task.
+    label : str
+        What is being done, for the progress line.
     done : callable, optional
         Called in this process with (number of the item, result) as each task ends, e.g. to
         note it in a journal.

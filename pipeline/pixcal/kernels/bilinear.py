@@ -1,4 +1,4 @@
-"""Compiled sums of the bilinear fringe model.
+"""Compiled sums of the bilinear fringe model: one file, whose changes Numba's cache notices.
 
 The model (paper, equation 2; physics note, section 2) is linear in the pixel's parameters when the
 frame's are known, and the other way round::
@@ -149,16 +149,22 @@ def sweep_block(
 
     Parameters
     ----------
-    codes : (t, y, x) unsigned int, stored samples, of which ``fill`` has no weight; at most some
-        100 frames, so that the block's float32 sums keep their precision
+    codes : (t, y, x) unsigned int
+        Stored samples, of which ``fill`` has no weight; at most some
+        100 frames, so that the block's float32 sums keep their precision.
     scale, offset : electrons of a code
-    g : (t, 3) float32, frame parameters at the tile's centre
-    dk : (t, 2) float32, change of the fringe vector (x, y), rad/px; used to second order
+    g : (t, 3) float32
+        Frame parameters at the tile's centre.
+    dk : (t, 2) float32
+        Change of the fringe vector (x, y), rad/px; used to second order.
     y0, x0 : the tile's first pixel relative to its centre, px
-    theta : (3, y, x) float32, start model, e-
-    read, shot : (y, x) float32, variance of a sample: ``shot * model + read``, e-²
-    sums : (N_SUMS, y, x) float64, added to: normal sums 00, 01, 02, 11, 12, 22, right-hand sums 0
-        to 2 (of the residual to the start model), its weighted square, number of samples
+    theta : (3, y, x) float32
+        Start model, e-.
+    read, shot : (y, x) float32
+        Variance of a sample: ``shot * model + read``, e-².
+    sums : (N_SUMS, y, x) float64
+        Added to: normal sums 00, 01, 02, 11, 12, 22, right-hand sums 0
+        to 2 (of the residual to the start model), its weighted square, number of samples.
     """
     moving = np.any(dk != 0)
     p = np.zeros((N_SUMS, codes.shape[2]), np.float32)
@@ -193,12 +199,16 @@ def frame_sums(
 
     Parameters
     ----------
-    codes : (t, p) float32, stored samples of p pixels; of other types it would be compiled again
+    codes : (t, p) float32
+        Stored samples of p pixels; of other types it would be compiled again.
     g, dk : (t, 3), (t, 2) float32, current frame parameters; sums are of the residual to them
-    y, x : (p,) float32, pixel coordinates relative to the point where ``g`` holds, px
+    y, x : (p,) float32
+        Pixel coordinates relative to the point where ``g`` holds, px.
     theta, read, shot : (3, p), (p,), (p,) float32, as in `sweep_block`
-    normal : (t, 15) float64, added to: upper triangle, by row, for (g0, g1, g2, dkx, dky)
-    right : (t, 5) float64, added to: right-hand sides
+    normal : (t, 15) float64
+        Added to: upper triangle, by row, for (g0, g1, g2, dkx, dky).
+    right : (t, 5) float64
+        Added to: right-hand sides.
     """
     s, o, f = np.float32(scale), np.float32(offset), np.float32(fill)
     n = codes.shape[1]

@@ -101,8 +101,9 @@ def pair_statistics(
 
     Parameters
     ----------
-    first, second : (y, x) float32, frames of the same scene, made equally bright, ADU above bias
-        and dark; NaN is not used
+    first, second : (y, x) float32
+        Frames of the same scene, made equally bright, ADU above bias
+        and dark; NaN is not used.
     gain, read_noise : rough guess, e-/ADU and ADU, only to tell outliers from noise where the level
         changes within a block
     quantum : step of the samples, ADU

@@ -101,9 +101,11 @@ def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) 
     Parameters
     ----------
     values : (t, y, x) float32
-    pairs : (step, y, x) float32, weight of each pair, by the place of its first row and of its
-        column that is further left; those beyond the edges are not looked at
-    steps : (step, 2) int, rows down (not negative) and columns to the right
+    pairs : (step, y, x) float32
+        Weight of each pair, by the place of its first row and of its
+        column that is further left; those beyond the edges are not looked at.
+    steps : (step, 2) int
+        Rows down (not negative) and columns to the right.
     every : only every so many frames
 
     Returns

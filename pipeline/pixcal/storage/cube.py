@@ -61,8 +61,10 @@ def create_array(
     ----------
     path : Path or UrlPath
         Folder of the array, e.g. ``raw.zarr/fringes/vertical``.
-    shape, chunks : sequence of int, in the order of ``dims``
-    dtype : dtype, of fixed size; stored little-endian
+    shape, chunks : sequence of int
+        In the order of ``dims``.
+    dtype : dtype
+        Of fixed size; stored little-endian.
     fill_value : scalar
         Value outside the array in edge chunks, and CF ``_FillValue`` where ``attrs`` says so.
     """
@@ -299,7 +301,8 @@ class ArrayReader:
 
     Parameters
     ----------
-    path : Path or UrlPath, folder of the array
+    path : Path or UrlPath
+        Folder of the array.
 
     Raises
     ------
@@ -359,8 +362,10 @@ class ArrayReader:
 
         Parameters
         ----------
-        index : sequence of int, position in the grid of chunks
-        out : ndarray, optional, buffer of shape ``chunks`` to decode into
+        index : sequence of int
+            Position in the grid of chunks.
+        out : ndarray, optional
+            Buffer of shape ``chunks`` to decode into.
 
         Raises
         ------
@@ -417,7 +422,8 @@ class ArrayReader:
         ----------
         *ranges : tuple of int
             Start and stop along each axis; missing trailing axes are taken whole.
-        out : ndarray, optional, buffer of the block's shape
+        out : ndarray, optional
+            Buffer of the block's shape.
         """
         full = [(0, n) for n in self.shape]
         full[: len(ranges)] = [(max(0, a), min(b, n)) for (a, b), (_, n) in zip(ranges, full)]  # noqa: B905

@@ -48,10 +48,13 @@ def chosen_base(named: StrPath | None, run: Path, like: Path) -> Place | None:
 
     Parameters
     ----------
-    named : str or path or None, a path or URL; the run directory itself to keep cubes in the
-        artefacts; None for the same as another artefact
-    run : Path, the run directory
-    like : Path, that artefact
+    named : str or path or None
+        A path or URL; the run directory itself to keep cubes in the artefacts; None for the same
+        as another artefact.
+    run : Path
+        The run directory.
+    like : Path
+        That artefact.
 
     Returns
     -------

@@ -66,9 +66,12 @@ class FrameWriter:
 
         Parameters
         ----------
-        row : int, the first of them
-        data : ndarray, shape (rows, x), of the file's type
-        plane : int, frame of a cube
+        row : int
+            The first of them.
+        data : ndarray, shape (rows, x)
+            Of the file's type.
+        plane : int
+            Frame of a cube.
         """
         ny, nx = self.shape[-2:]
         if data.dtype != self.dtype or data.shape[1] != nx or row + data.shape[0] > ny:

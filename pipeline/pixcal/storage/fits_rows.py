@@ -47,12 +47,17 @@ def read_rows(
 
     Parameters
     ----------
-    file : FrameFile, a file in the container ``plain``
-    planes : sequence of int, numbers of the planes
-    rows : tuple of int, first row, which begins a band, and the one after the last
-    out : ndarray (plane, y, x), optional, filled with the values (ADU); each plane of it
-        contiguous, of the file's type or one that holds it
-    largest : bool, look for the largest samples, which takes half as long as reading them
+    file : FrameFile
+        A file in the container ``plain``.
+    planes : sequence of int
+        Numbers of the planes.
+    rows : tuple of int
+        First row, which begins a band, and the one after the last.
+    out : ndarray (plane, y, x), optional
+        Filled with the values (ADU); each plane of it contiguous, of the file's type or one
+        that holds it.
+    largest : bool
+        Look for the largest samples, which takes half as long as reading them.
 
     Returns
     -------
@@ -128,8 +133,10 @@ def unpack(file: FrameFile, target: Path) -> FrameFile:
 
     Parameters
     ----------
-    file : FrameFile, a file in any container but ``plain``
-    target : Path, scratch file to make
+    file : FrameFile
+        A file in any container but ``plain``.
+    target : Path
+        Scratch file to make.
 
     Returns
     -------

@@ -31,8 +31,10 @@ class Folder(Protocol):
 
         Parameters
         ----------
-        files : iterable of File, taken a few at a time
-        durable : bool, they are on the disk when this returns, not on their way to it
+        files : iterable of File
+            Taken a few at a time.
+        durable : bool
+            They are on the disk when this returns, not on their way to it.
         """
 
     def ends(self, names: Sequence[str]) -> Iterator[tuple[int, bytes]]:
@@ -116,7 +118,8 @@ def written_aside(path: Path, *, durable: bool = False) -> Iterator[Path]:
 
     Parameters
     ----------
-    durable : bool, it is on the disk then, not on its way to it
+    durable : bool
+        It is on the disk then, not on its way to it.
     """
     aside = aside_of(path)
     yield aside
@@ -152,8 +155,10 @@ def read_file(path: str, size: int, later: str | None = None) -> bytes:
 
     Parameters
     ----------
-    size : int, bytes expected
-    later : str, optional, a file that will be asked for soon: the disk fetches it meanwhile
+    size : int
+        Bytes expected.
+    later : str, optional
+        A file that will be asked for soon: the disk fetches it meanwhile.
 
     Raises
     ------

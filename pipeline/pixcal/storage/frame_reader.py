@@ -61,12 +61,16 @@ class FrameReader:
 
     Parameters
     ----------
-    folder : Path, of the acquisition
-    columns : mapping, what `describe` returned
-    table : mapping, columns ``file`` and ``plane`` of the frames, in their order
+    folder : Path
+        Of the acquisition.
+    columns : mapping
+        What `describe` returned.
+    table : mapping
+        Columns ``file`` and ``plane`` of the frames, in their order.
     shape, dtype
         Of the array.
-    checksums : (time, band) ndarray, of the bytes of each band
+    checksums : (time, band) ndarray
+        Of the bytes of each band.
     """
 
     def __init__(

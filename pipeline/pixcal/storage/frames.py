@@ -70,9 +70,12 @@ def tabulate(
 
     Parameters
     ----------
-    array : str, name of the array, for the warnings
-    files : sequence of FrameFile, at least one
-    frame_period_s : float or None, from one frame to the next (s)
+    array : str
+        Name of the array, for the warnings.
+    files : sequence of FrameFile
+        At least one.
+    frame_period_s : float or None
+        From one frame to the next (s).
 
     Returns
     -------

@@ -18,7 +18,8 @@ def link_files(source: Path, target: Path) -> None:
 
     Parameters
     ----------
-    source, target : Path, folders; the target is made
+    source, target : Path
+        Folders; the target is made.
     """
     for folder, _, names in os.walk(source):
         there = target / Path(folder).relative_to(source)

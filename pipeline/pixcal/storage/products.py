@@ -144,11 +144,16 @@ def write_map(
 
     Parameters
     ----------
-    path : Path, of the FITS file; what is there is replaced once the new file is whole
-    data, sigma : (y, x) float32, map and 1-sigma error, px; NaN where masked
-    mask : (y, x) uint8, bits of `pixcal.model.flags.PixelFlag`
-    cards : sequence of (key, value, comment), for the primary header
-    history : sequence of str, HISTORY lines of the primary header
+    path : Path
+        Of the FITS file; what is there is replaced once the new file is whole.
+    data, sigma : (y, x) float32
+        Map and 1-sigma error, px; NaN where masked.
+    mask : (y, x) uint8
+        Bits of `pixcal.model.flags.PixelFlag`.
+    cards : sequence of (key, value, comment)
+        For the primary header.
+    history : sequence of str
+        HISTORY lines of the primary header.
     """
     # Headers of images of this shape, which are nowhere in memory.
     maps, flags_ = (np.broadcast_to(np.zeros((), t), data.shape) for t in (">f4", "u1"))

@@ -22,7 +22,8 @@ class ReadAhead:
 
     Parameters
     ----------
-    path : UrlPath, the folder
+    path : UrlPath
+        The folder.
     """
 
     def __init__(self, path: UrlPath) -> None:
@@ -42,8 +43,10 @@ class ReadAhead:
 
         Parameters
         ----------
-        file : File, the one
-        following : sequence of File, those that will be read next, if this is not the only one
+        file : File
+            The one.
+        following : sequence of File
+            Those that will be read next, if this is not the only one.
 
         Raises
         ------

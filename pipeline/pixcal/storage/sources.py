@@ -32,8 +32,10 @@ def read_headers(folder: Path, names: Iterable[str]) -> dict[str, Header]:
 
     Parameters
     ----------
-    folder : Path, of the acquisition
-    names : iterable of str, all files of the acquisition, relative to it
+    folder : Path
+        Of the acquisition.
+    names : iterable of str
+        All files of the acquisition, relative to it.
 
     Raises
     ------
@@ -152,8 +154,10 @@ def find_sources(frames: Frames, description: Path) -> dict[str, tuple[SourceFil
 
     Parameters
     ----------
-    frames : Frames, globs of each kind
-    description : Path, the ``acquisition.yaml`` that they are relative to
+    frames : Frames
+        Globs of each kind.
+    description : Path
+        The ``acquisition.yaml`` that they are relative to.
 
     Returns
     -------

@@ -97,13 +97,20 @@ def make(
 
     Parameters
     ----------
-    config : dict, plain data of the options that the result depends on
-    inputs : mapping, keys of what it is made from
-    body : callable, writes it, into the folder of a `Build`
-    cubes : Path or UrlPath, optional, as of `pixcal.storage.artefact.build`
-    keep : callable, whether an artefact that is up to date can stay as it is
-    publish : callable, writes products beside those of `ArtefactKind.products`, when it is complete
-    published : callable, whether those of an artefact that stays are there
+    config : dict
+        Plain data of the options that the result depends on.
+    inputs : mapping
+        Keys of what it is made from.
+    body : callable
+        Writes it, into the folder of a `Build`.
+    cubes : Path or UrlPath, optional
+        As of `pixcal.storage.artefact.build`.
+    keep : callable
+        Whether an artefact that is up to date can stay as it is.
+    publish : callable
+        Writes products beside those of `ArtefactKind.products`, when it is complete.
+    published : callable
+        Whether those of an artefact that stays are there.
 
     Returns
     -------

@@ -22,15 +22,19 @@ def combine_sets(
 
     Parameters
     ----------
-    axes : sequence of (float, float), unit vector (x, y) of each set's fringe axis
+    axes : sequence of (float, float)
+        Unit vector (x, y) of each set's fringe axis.
     delta, sigma : (s, ...) float64
         Projections and their 1-sigma errors, px; a set that is NaN at a pixel does not count there.
 
     Returns
     -------
-    xy : (2, ...) float64, delta_x and delta_y, px; NaN where the sets left do not give both
-    sigma_xy : (2, ...) float64, their errors
-    chi2 : (...) float64, disagreement of the sets, for ``sets - 2`` degrees of freedom (0 with two)
+    xy : (2, ...) float64
+        delta_x and delta_y, px; NaN where the sets left do not give both.
+    sigma_xy : (2, ...) float64
+        Their errors.
+    chi2 : (...) float64
+        Disagreement of the sets, for ``sets - 2`` degrees of freedom (0 with two).
     """
     a = np.asarray(axes, float).reshape(len(delta), 2, *([1] * (delta.ndim - 1)))
     good = np.isfinite(delta) & np.isfinite(sigma) & (sigma > 0)

@@ -81,9 +81,12 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
 
     Parameters
     ----------
-    maps : (n, y, x) float64, maps without their mean light (ratios to the mean map)
-    good : (y, x) bool, pixels to use
-    nominal : (float, float), fringe vector of the bench's nominal geometry, rad/px
+    maps : (n, y, x) float64
+        Maps without their mean light (ratios to the mean map).
+    good : (y, x) bool
+        Pixels to use.
+    nominal : (float, float)
+        Fringe vector of the bench's nominal geometry, rad/px.
 
     Raises
     ------

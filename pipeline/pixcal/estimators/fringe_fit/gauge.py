@@ -29,8 +29,9 @@ def gauge_matrix(tiles: list[tuple[F64, Mask, C128]]) -> F64:
 
     Parameters
     ----------
-    tiles : list of (theta, good, smooth), for each tile: theta (3, y, x), the pixels to use (y, x),
-        and the smooth phasor alpha exp(i psi) / iota (y, x) about which the modes are taken
+    tiles : list of (theta, good, smooth)
+        For each tile: theta (3, y, x), the pixels to use (y, x), and the smooth phasor
+        alpha exp(i psi) / iota (y, x) about which the modes are taken.
     """
     rows, rights, light_rows, light_rights = [], [], [], []
     for theta, good, smooth in tiles:

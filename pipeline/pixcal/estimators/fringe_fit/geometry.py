@@ -44,7 +44,8 @@ def tile_plane(
         Phase relative to the carrier and its error, rad; iota / alpha.
     slope : (float, float)
         Of the phase along x and y, rad/px, so near that no turn is missed over the tile.
-    centre : (float, float), of the tile, (y, x) in pixels of the window
+    centre : (float, float)
+        Of the tile, (y, x) in pixels of the window.
     """
     picked = np.flatnonzero(good)
     if not len(picked):

@@ -65,10 +65,14 @@ class Scout:
 
     Parameters
     ----------
-    tiles : sequence of Tile, the first is the one whose fringe vector is sought
-    nominal : (float, float), nominal fringe vector (kx, ky), rad/px
-    reference : (float, float), point (y, x) at which the frame parameters hold
-    each : callable, does what is to be done for every tile: as `in_turn`, or several at a time
+    tiles : sequence of Tile
+        The first is the one whose fringe vector is sought.
+    nominal : (float, float)
+        Nominal fringe vector (kx, ky), rad/px.
+    reference : (float, float)
+        Point (y, x) at which the frame parameters hold.
+    each : callable
+        Does what is to be done for every tile: as `in_turn`, or several at a time.
     """
 
     tiles: Sequence[Tile]
@@ -89,7 +93,8 @@ class Scout:
 
         Parameters
         ----------
-        codes : sequence of (t, y, x) arrays, the same frames for each tile
+        codes : sequence of (t, y, x) arrays
+            The same frames for each tile.
 
         Raises
         ------

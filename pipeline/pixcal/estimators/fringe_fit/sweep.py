@@ -60,9 +60,12 @@ def sweep_tile(
     blocks : iterable of (t, y, x) arrays
         Stored codes in the order of time; together as many frames as ``frames`` holds. The first
         ``prime`` frames are held until the start model is made from them.
-    k : (float, float), carrier (kx, ky), rad/px
-    prime : int, from `frames_to_prime`
-    bound_pixels : int, pixels for which to work out the Cramér-Rao bound
+    k : (float, float)
+        Carrier (kx, ky), rad/px.
+    prime : int
+        From `frames_to_prime`.
+    bound_pixels : int
+        Pixels for which to work out the Cramér-Rao bound.
     """
     held: list[U16] = []
     sums: PixelSums | None = None

@@ -135,10 +135,12 @@ def sum_row(
 
     Parameters
     ----------
-    phase, sigma : (y, x) float32, phases relative to the carrier and their errors, rad
+    phase, sigma : (y, x) float32
+        Phases relative to the carrier and their errors, rad.
     batches : (batch, y, x) float32
         Phases of the batches relative to the whole run's, rad; NaN in gaps.
-    plane : TilePlane, smooth phase of the tile
+    plane : TilePlane
+        Smooth phase of the tile.
     """
     shape = (phase.shape[0], phase.shape[1])
     modes = local_modes(carrier, plane, shape)

@@ -91,9 +91,12 @@ def fit_sets(
 
     Parameters
     ----------
-    sweep : Path or MemoryPath, folder of ``sweep.zarr``
-    reduced : Path or MemoryPath, ``reduced.zarr``
-    facts : mapping, summaries of the sweep, by name of the set
+    sweep : Path or MemoryPath
+        Folder of ``sweep.zarr``.
+    reduced : Path or MemoryPath
+        ``reduced.zarr``.
+    facts : mapping
+        Summaries of the sweep, by name of the set.
     """
     return [
         fit_set(
@@ -116,10 +119,16 @@ def fit_set(
 
     Parameters
     ----------
-    swept : Path or MemoryPath, ``sweep.zarr/<set name>``
-    facts : dict, summary of the set's sweep
-    name : str, of the set
-    model : str, a shape's name, or ``auto``
+    swept : Path or MemoryPath
+        ``sweep.zarr/<set name>``.
+    source : ReducedSet
+    facts : dict
+        Summary of the set's sweep.
+    acquisition : Acquisition
+    name : str
+        Of the set.
+    model : str
+        A shape's name, or ``auto``.
 
     Raises
     ------
@@ -221,8 +230,11 @@ def describe(fitted: FittedSet, masked: int, sigma_px: float) -> dict[str, Any]:
 
     Parameters
     ----------
-    masked : int, pixels without a value
-    sigma_px : float, median error of the others
+    fitted : FittedSet
+    masked : int
+        Pixels without a value.
+    sigma_px : float
+        Median error of the others.
     """
     source, facts, shape, fit = fitted.source, fitted.facts, fitted.shape, fitted.fit
     ny, nx = source.shape

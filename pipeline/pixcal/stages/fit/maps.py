@@ -62,8 +62,11 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
 
     Parameters
     ----------
-    group : Path, ``fit.zarr``
-    fitted : list of FittedSet, all of the same window
+    group : Path
+        ``fit.zarr``.
+    fitted : list of FittedSet
+        All of the same window.
+    runtime : Runtime
     """
     source = fitted[0].source
     ny, nx = source.shape

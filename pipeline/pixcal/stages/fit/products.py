@@ -38,8 +38,11 @@ def header_of(run_dir: Path, result: dict[str, Any], key: str) -> tuple[list[Car
 
     Parameters
     ----------
-    result : dict, as in ``fit.json``
-    key : str, of the artefact that holds the maps
+    run_dir : Path
+    result : dict
+        As in ``fit.json``.
+    key : str
+        Of the artefact that holds the maps.
     """
     models = {facts["model"] for facts in result["sets"].values()}
     cards = [
@@ -105,10 +108,15 @@ def publish_maps(
 
     Parameters
     ----------
-    group : Path, ``fit.zarr``, or another that `pixcal.stages.fit.maps.write_maps` wrote
-    outputs : sequence of str, their names
-    cards, history : list, of their headers
-    suffix : str, of the names of the products
+    run_dir : Path
+    group : Path
+        ``fit.zarr``, or another that `pixcal.stages.fit.maps.write_maps` wrote.
+    outputs : sequence of str
+        Their names.
+    cards, history : list
+        Of their headers.
+    suffix : str
+        Of the names of the products.
     """
     for name in outputs:
         delta, sigma, mask = (

@@ -58,9 +58,14 @@ def scout_set(
 
     Parameters
     ----------
-    nominal : (float, float), nominal fringe vector (kx, ky), rad/px
-    folder : Path or MemoryPath, ``sweep.zarr/<set name>``
-    name : str, of the set
+    source : ReducedSet
+    nominal : (float, float)
+        Nominal fringe vector (kx, ky), rad/px.
+    folder : Path or MemoryPath
+        ``sweep.zarr/<set name>``.
+    runtime : Runtime
+    name : str
+        Of the set.
 
     Raises
     ------

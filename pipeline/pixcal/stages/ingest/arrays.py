@@ -120,11 +120,16 @@ def find_kept(
 
     Parameters
     ----------
-    folder : Path, the earlier artefact
-    earlier : Manifest, its manifest
-    same : mapping, name now to earlier name, of the arrays made from the same files
-    sources : mapping, files of each array now
-    copy : bool, only those whose samples were copied
+    folder : Path
+        The earlier artefact.
+    earlier : Manifest
+        Its manifest.
+    same : mapping
+        Name now to earlier name, of the arrays made from the same files.
+    sources : mapping
+        Files of each array now.
+    copy : bool
+        Only those whose samples were copied.
 
     Returns
     -------

@@ -63,8 +63,14 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
 
     Parameters
     ----------
-    acquisition : Path, directory with ``acquisition.yaml``, or that file
-    out : Path, the run directory
+    acquisition : Path
+        Directory with ``acquisition.yaml``, or that file.
+    out : Path
+        The run directory.
+    config : Config
+        Options.
+    runtime : Runtime
+        How to run.
 
     Returns
     -------

@@ -77,10 +77,14 @@ def on_grid(
 
     Parameters
     ----------
-    folder : Place, where the maps are
-    shape : (int, int), of the detector's window (y, x)
-    names : sequence of str, of `STATISTICS`
-    light : float64 array, optional, of each tile, which its response is multiplied by
+    folder : Place
+        Where the maps are.
+    shape : (int, int)
+        Of the detector's window (y, x).
+    names : sequence of str
+        Of `STATISTICS`.
+    light : float64 array, optional
+        Of each tile, which its response is multiplied by.
     """
     reader = ArrayReader(folder / "maps")
     stride = int(np.ceil(np.sqrt(shape[0] * shape[1] / _SAMPLES)))
@@ -103,9 +107,12 @@ def usual(job: Measuring, folder: Place, light: F64) -> Usual:
 
     Parameters
     ----------
-    job : Measuring, what they were measured with
-    folder : Place, as of `on_grid`
-    light : float64 array, of each tile over that of the detector
+    job : Measuring
+        What they were measured with.
+    folder : Place
+        As of `on_grid`.
+    light : float64 array
+        Of each tile over that of the detector.
     """
     names = ("response", "response_error", "dark_rate", "dark_variance", "dark_dof", "bias")
     response, error, rate, variance, dof, bias = on_grid(folder, job.shape, names, light)

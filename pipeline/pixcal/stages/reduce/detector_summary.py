@@ -100,9 +100,12 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
 
     Parameters
     ----------
-    job : Measuring, what they were measured with
-    folder : Place, where they are
-    declared : Detector, what its owner says
+    job : Measuring
+        What they were measured with.
+    folder : Place
+        Where they are.
+    declared : Detector
+        What its owner says.
 
     Raises
     ------

@@ -13,8 +13,10 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
     Parameters
     ----------
     summary : Summary
-    gain : float, that is used (e-/ADU)
-    saturation : float or None, where flats were found to saturate (ADU), if it was not declared
+    gain : float
+        That is used (e-/ADU).
+    saturation : float or None
+        Where flats were found to saturate (ADU), if it was not declared.
     """
     found = []
     if saturation is not None:

@@ -54,7 +54,8 @@ def group_exposures(tables: Mapping[str, Mapping[str, Sequence[Any]]]) -> Exposu
 
     Parameters
     ----------
-    tables : mapping, contents of ``RUN/ingest/frames.json``
+    tables : mapping
+        Contents of ``RUN/ingest/frames.json``.
     """
     times = {name: list(table["exptime_s"]) for name, table in tables.items()}
     lit = [name for name in times if name not in ("bias", "dark")]

@@ -47,11 +47,14 @@ def characterise(
 
     Parameters
     ----------
-    made : Build, with ``calibration.zarr`` and the statistics of the frames
+    made : Build
+        With ``calibration.zarr`` and the statistics of the frames.
     source : Ingested
     job : Measuring
     summary : Summary
-    facts : dict, what ``reduce.json`` says so far
+    facts : dict
+        What ``reduce.json`` says so far.
+    runtime : Runtime
 
     Returns
     -------

@@ -54,12 +54,20 @@ def write_set(
 
     Parameters
     ----------
-    made : Workspace, with ``calibration.zarr``, and scratch for the counts
-    source : Ingested, with the raw frames
-    name : str, of the array, ``fringes/<set>``
-    gain : float, to use (e-/ADU)
-    bounds : Bounds, extremes of the calibration
-    share : float, of the variance that the stored precision may cost
+    made : Workspace
+        With ``calibration.zarr``, and scratch for the counts.
+    source : Ingested
+        With the raw frames.
+    name : str
+        Of the array, ``fringes/<set>``.
+    gain : float
+        To use (e-/ADU).
+    bounds : Bounds
+        Extremes of the calibration.
+    share : float
+        Of the variance that the stored precision may cost.
+    runtime : Runtime
+        How to run.
 
     Returns
     -------
@@ -156,10 +164,14 @@ def set_warnings(name: str, found: dict[str, Any], declared: bool, share: float)
 
     Parameters
     ----------
-    name : str, of the set
-    found : dict, as `write_set` returns it
-    declared : bool, whether the saturation level is
-    share : float, of the variance that the stored precision may cost
+    name : str
+        Of the set.
+    found : dict
+        As `write_set` returns it.
+    declared : bool
+        Whether the saturation level is.
+    share : float
+        Of the variance that the stored precision may cost.
     """
     warnings = []
     cost = found["quantisation"]["share_of_variance_dark"]

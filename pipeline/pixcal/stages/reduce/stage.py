@@ -59,6 +59,15 @@ Config = Reduce
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Make ``RUN/reduce`` from ``RUN/ingest``, unless it is up to date.
 
+    Parameters
+    ----------
+    run_dir : Path
+        The run directory.
+    config : Config
+        Options.
+    runtime : Runtime
+        How to run.
+
     Returns
     -------
     Manifest
