@@ -12,6 +12,7 @@ import yaml
 from pixcal.effects import effect_of_file
 from pixcal.engine.run import Runtime
 from pixcal.estimators.diagnosis.evidence import Evidence
+from pixcal.estimators.diagnosis.map_deviations import common_precision
 from pixcal.estimators.diagnosis.pair_sums import pair_sums, pair_variance
 from pixcal.model.bench import Bench
 from pixcal.model.config import to_plain
@@ -62,9 +63,9 @@ def run_with(
 
 
 def within(found: dict[str, Any], errors: dict[str, float], truth: dict[str, Any]) -> bool:
-    """Strengths and shapes within 3.5 errors, which are too small by a fifth to a third."""
+    """Strengths and shapes within three errors."""
     seen = each(found)
-    return all(abs(seen[name] - value) < 3.5 * errors[name] for name, value in each(truth).items())
+    return all(abs(seen[name] - value) < 3 * errors[name] for name, value in each(truth).items())
 
 
 def each(plain: dict[str, Any]) -> dict[str, float]:
@@ -119,6 +120,17 @@ def test_pairs_of_independent_samples_have_the_variance_that_is_said() -> None:
     assert np.abs(z.mean(axis=0)).max() < 5 / np.sqrt(300)
     np.testing.assert_allclose((z**2).mean(axis=0), 1, atol=0.5)
     assert (z**2).mean() == pytest.approx(1, abs=0.02)
+
+
+def test_the_precision_of_maps_is_that_of_the_noise_they_share() -> None:
+    """Two maps share the noise of a flat; their difference is better known than either."""
+    rng = np.random.default_rng(5)
+    own, shared = rng.normal(0, [[[1.0]], [[2.0]]], (2, 120, 130)), rng.normal(0, 3, (120, 130))
+    maps = own + shared
+    maps[0, 4, 5], maps[1, 30:34, 7] = np.nan, 1e4
+    expected = np.linalg.inv(np.array([[10.0, 9.0], [9.0, 13.0]]))
+    np.testing.assert_allclose(common_precision(maps), expected, rtol=0.06)
+    np.testing.assert_allclose(common_precision(maps[:1]), [[0.1]], rtol=0.06)
 
 
 def test_strengths_that_are_no_numbers_need_an_estimate_of_their_own(

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.deviations import Change, SetDeviations, StackDeviations
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.map_deviations import Deviation, is_smooth
-from pixcal.model.arrays import F32
+from pixcal.estimators.diagnosis.map_deviations import Deviation, common_precision, is_smooth
+from pixcal.model.arrays import F32, F64, Mask
 from pixcal.simulation.forward import ForwardModel, Stage
 from pixcal.simulation.replica import Replica
 
@@ -79,6 +79,7 @@ class Changes:
         }
         self._looks |= {n: SetDeviations(evidence, s) for n, s in evidence.fringes.items()}
         self._plain: dict[str | int, F32] = {}
+        self._precisions: dict[tuple[Key, ...], tuple[F64, Mask]] = {}
         flat = np.where(evidence.flat > 0, evidence.flat, 1.0)
         self._flat = np.asarray(flat, float)
         self._per_adu = (evidence.gain / self._flat).astype(np.float32)
@@ -86,6 +87,29 @@ class Changes:
     def measured(self, key: Key) -> Deviation:
         """A deviation of the data."""
         return self._looks[key[0]].measured(key[1])
+
+    def product(
+        self, keys: Sequence[Key], a: Mapping[Key, NDArray[Any]], b: Mapping[Key, NDArray[Any]]
+    ) -> float:
+        """Sum of products of changes over their noise; that of maps is common to them in part."""
+        maps = tuple(k for k in keys if k[1] == "maps")
+        total = sum(dot(self.measured(k).weight, a[k], b[k]) for k in keys if k not in maps)
+        if maps:
+            precision, there = self._precision(maps)
+            one, other = (np.concatenate([v[k] for k in maps])[:, there] for v in (a, b))
+            total += float(np.einsum("ij,in,jn->", precision, one, other, optimize=True))
+        return total
+
+    def _precision(self, maps: tuple[Key, ...]) -> tuple[F64, Mask]:
+        """Inverse covariance of maps, and the pixels that all of them have."""
+        if maps not in self._precisions:
+            measured = [self.measured(key) for key in maps]
+            value, weight = (
+                np.concatenate([getattr(m, name) for m in measured]) for name in ("value", "weight")
+            )
+            precision = common_precision(np.where(weight > 0, value, np.nan))
+            self._precisions[maps] = precision, np.all(weight > 0, axis=0)
+        return self._precisions[maps]
 
     def fits(self, template: Template) -> bool:
         """Whether a template is of deviations as they are here."""
@@ -114,10 +138,8 @@ class Changes:
 
     def _repeats(self, one: Draw, other: Draw) -> bool:
         """Whether two draws of a change have most of it in common."""
-        weights = {key: self.measured(key).weight for key in one}
-        common = sum(dot(w, one[k], other[k]) for k, w in weights.items())
-        power = sum(dot(w, one[k], one[k]) for k, w in weights.items())
-        return bool(common > COMMON * power)
+        keys = tuple(one)
+        return self.product(keys, one, other) > COMMON * self.product(keys, one, one)
 
     def template(self, model: ForwardModel, way: Way) -> Template:
         """Change by a model that shows in some way."""

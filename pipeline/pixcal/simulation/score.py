@@ -23,7 +23,7 @@ from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.frame_series.variance_components import log_chance, log_chance_of_any, sigmas
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64
-from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way, dot
+from pixcal.simulation.changes import LINEAR, Changes, Key, Template, Way
 from pixcal.simulation.forward import ForwardModel
 from pixcal.simulation.numbers import field_of, numbers, with_numbers
 
@@ -114,18 +114,19 @@ class _Fit:
         """
         count = len(templates)
         right, normal, variance = np.zeros(count), np.zeros((count, count)), np.zeros((count,) * 2)
-        for key in self.way.keys:
-            own = self.changes.measured(key)
-            rest = own.value if at is None else own.value - at.mean[key]
-            for i, a in enumerate(templates):
-                right[i] += dot(own.weight, a.mean[key], rest)
-                if at is not None and key in a.half:
-                    right[i] += dot(own.weight, a.half[key], at.half[key])
-                for j, b in enumerate(templates[: i + 1]):
-                    size = dot(own.weight, a.mean[key], b.mean[key])
-                    chance = dot(own.weight, a.half[key], b.half[key]) if key in a.half else 0.0
-                    variance[i, j] = variance[j, i] = variance[i, j] + size
-                    normal[i, j] = normal[j, i] = normal[i, j] + size - chance
+        keys, product = self.way.keys, self.changes.product
+        rest = {k: self.changes.measured(k).value for k in keys}
+        if at is not None:
+            rest = {k: v - at.mean[k] for k, v in rest.items()}
+        for i, a in enumerate(templates):
+            drawn = [k for k in keys if k in a.half]
+            right[i] = product(keys, a.mean, rest)
+            if at is not None:
+                right[i] += product(drawn, a.half, at.half)
+            for j, b in enumerate(templates[: i + 1]):
+                size = product(keys, a.mean, b.mean)
+                variance[i, j] = variance[j, i] = size
+                normal[i, j] = normal[j, i] = size - product(drawn, a.half, b.half)
         return right, normal, variance
 
     def amplitudes(self, alone: Sequence[ForwardModel]) -> tuple[F64, F64, float]:
@@ -187,10 +188,15 @@ class _Fit:
     def telling(self, model: ForwardModel) -> tuple[tuple[Key, ...], Template | None]:
         """Deviations that hold most of the information, and their change if it holds elsewhere."""
         template = self.template(model)
-        mean = template.mean
-        sizes = {k: dot(self.changes.measured(k).weight, mean[k], mean[k]) for k in self.way.keys}
-        least = TELLING * sum(sizes.values())
-        keys = tuple(key for key, size in sizes.items() if size >= least)
+        mean, every = template.mean, self.way.keys
+        sizes = {k: self.changes.product((k,), mean, mean) for k in every}
+        least, whole = TELLING * sum(sizes.values()), self.changes.product(every, mean, mean)
+
+        def lost(key: Key) -> float:
+            """Without it: a map that an effect leaves alone tells the noise of others."""
+            return whole - self.changes.product([k for k in every if k != key], mean, mean)
+
+        keys = tuple(k for k in every if max(sizes[k], lost(k)) >= least)
         elsewhere = not any(name in LINEAR for _, name in keys)
         return keys, template.only(keys) if elsewhere else None
 
@@ -249,13 +255,10 @@ class _Fit:
 
     def _misfit(self, at: Template) -> float:
         """Weighted square of what a model leaves, but for that of the deviations themselves."""
-        total = 0.0
-        for key in self.way.keys:
-            own = self.changes.measured(key)
-            total += dot(own.weight, at.mean[key], at.mean[key] - 2 * own.value)
-            if key in at.half:
-                total -= dot(own.weight, at.half[key], at.half[key])
-        return total
+        keys, product = self.way.keys, self.changes.product
+        rest = {k: at.mean[k] - 2 * self.changes.measured(k).value for k in keys}
+        drawn = [k for k in keys if k in at.half]
+        return product(keys, at.mean, rest) - product(drawn, at.half, at.half)
 
 
 def _shapes(model: ForwardModel) -> list[str]:

@@ -13,6 +13,7 @@ from pixcal.model.arrays import F64
 # of the smooth surface that maps of the nominal bench may have
 DEGREES = {"offset": 3, "contrast": 2, "light": 3}
 MAPS = tuple(DEGREES)
+WILD_STEP = 5.0  # robust deviations from which a step between neighbours is an outlier
 AROUND = 5  # pixels along the side of a pixel's surroundings
 # share of the changes of pixels by which they may differ from those of their surroundings
 ALONE = 0.5
@@ -35,6 +36,22 @@ def weighed(maps: F64) -> Deviation:
             spread = 1.4826 * float(np.nanmedian(np.abs(steps))) / np.sqrt(2)
             out[np.isfinite(own)] = 1 / max(spread**2, 1e-30)
     return Deviation(flat, weight)
+
+
+def common_precision(maps: F64) -> F64:
+    """Inverse covariance (m, m) of the noise of maps (m, y, x) of the same pixels.
+
+    Maps share the noise of flats, bias and each other's light. The covariance is that of the steps
+    between neighbours, of both axes; steps beyond `WILD_STEP` robust deviations count for nothing.
+    """
+    steps = np.concatenate([np.diff(maps, axis=a).reshape(len(maps), -1) for a in (1, 2)], axis=1)
+    steps = steps[:, np.isfinite(steps).all(axis=0)]
+    usual = 1.4826 * np.median(np.abs(steps), axis=1, keepdims=True)
+    scaled = steps / np.maximum(usual, 1e-30)
+    scaled = scaled[:, (np.abs(scaled) < WILD_STEP).all(axis=0)]
+    size = np.sqrt(2) / np.maximum(usual[:, 0], 1e-30)
+    correlation = np.atleast_2d(np.corrcoef(scaled))
+    return np.asarray(np.linalg.pinv(correlation, hermitian=True) * np.outer(size, size))
 
 
 def is_smooth(maps: F64, weight: F64) -> bool:
