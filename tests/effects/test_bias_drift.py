@@ -274,7 +274,11 @@ def test_a_walk_of_the_fringe_runs_alone_is_found(acquired: Callable[..., Eviden
     assert found.effect.walk_e_h == 0
     again = found.effect.replayed(evidence)
     assert again is not None
-    assert {track.set for track in again.tracks} == set(evidence.fringes)
+    assert {track.set for track in again.tracks} == {
+        *evidence.fringes,
+        "bias frames",
+        "dark frames",
+    }
 
 
 def test_a_ramp_that_begins_anew_with_each_run_is_found(
@@ -325,6 +329,28 @@ def test_a_track_takes_the_place_of_the_laws_in_its_run_alone(
         else:
             np.testing.assert_array_equal(on, by_law)
             assert np.ptp((on - plain).mean(axis=(1, 2))) > 1
+
+
+def test_offsets_of_bias_and_dark_frames_are_replayed_as_they_were(
+    acquired: Callable[..., Evidence], make_effect_bench: Callable[..., Bench]
+) -> None:
+    """Frame by frame: those of bias frames may walk faster than those of other runs."""
+    rng = np.random.default_rng(3)
+    truth = {"bias": rng.normal(0, 9, 40).cumsum(), "dark": rng.normal(0, 2, 20)}
+    every = levelled(
+        acquired(), rng, lambda t: np.concatenate(list(truth.values())), bias=40, dark=20
+    )
+    again = BiasDrift(**RUN).replayed(every)
+    assert again is not None
+    bench = make_effect_bench({"frames.bias": 40})
+    for r in recordings(bench):
+        if r.kind not in truth:
+            continue
+        plain, on = (frames_of(bench, r, e).mean(axis=(1, 2)) for e in ((), (again,)))
+        wanted = truth[r.kind] - truth[r.kind].mean()
+        step = {"bias": 0.14, "dark": 0.5}[r.kind]
+        assert r.period_s == pytest.approx(step)
+        np.testing.assert_allclose(on - plain, wanted, atol=1.0)
 
 
 def test_the_level_of_an_offset_shows_in_the_shot_noise_it_lacks(

@@ -26,6 +26,7 @@ from pixcal.estimators.frame_series.variance_components import (
     log_chance_of_any,
     sigmas,
 )
+from pixcal.estimators.frame_series.walk_modes import walk_modes
 from pixcal.kernels.processes import brownian
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.kernels.synthesis import Stream, generator
@@ -41,6 +42,8 @@ SETTLINGS = 8  # time constants tried, from some steps to the length of the run
 # fringes count where their mean offset is as well known as this, of a sample's read noise
 WORTH = 0.3
 KNOTS = 32  # most points of a track
+# sets that tracks of frames without fringes are listed under
+_CALIBRATION = {kind: f"{kind} frames" for kind in ("bias", "dark", "flat")}
 _KEY, _RUN = 1000, 2000  # first keys of the walks' random numbers: no recording has them
 
 
@@ -95,7 +98,7 @@ class BiasDrift(Effect):
         0.0, unit="e-/h", low=-1e6, high=1e6, doc="linear drift that restarts with each fringe set"
     )
     tracks: tuple[Track, ...] = quantity(
-        (), unit="e-", doc="measured bias of each frame, by fringe set"
+        (), unit="e-", doc="measured bias of each frame, by fringe set, or of bias or dark frames"
     )
 
     def trend(self, time_s: F64) -> F64:
@@ -119,6 +122,9 @@ class BiasDrift(Effect):
     def readout(self, adu: F32, shot: Shot) -> F32:
         if shot.recording.kind == "fringes":
             offset = self._in_run(shot)
+        elif any(track.set == _CALIBRATION[shot.recording.kind] for track in self.tracks):
+            time = shot.frame * shot.recording.period_s
+            offset = float(at(self.tracks, _CALIBRATION[shot.recording.kind], time))
         else:
             offset = self.offset(shot.time_s, shot.bench.seed, shot.rng(self.name))
         return adu + np.float32(offset / shot.bench.detector.gain_e_per_adu)
@@ -142,12 +148,11 @@ class BiasDrift(Effect):
         return offset
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        """As in `Effect.replayed`: the slow offset of every frame of fringes, the law elsewhere."""
+        """As in `Effect.replayed`: slow offsets of fringes, all offsets of bias and dark frames."""
         light = light_of(evidence)
-        if light is None:
-            return None
-        tracks = tuple(_with_level(track, evidence) for track in _tracks(light))
-        return replace(self, tracks=tracks)
+        of_fringes = () if light is None else _tracks(light)
+        tracks = (*(_with_level(t, evidence) for t in of_fringes), *_dark_tracks(evidence))
+        return replace(self, tracks=tracks) if tracks else None
 
     def undo(self, maps: FringeMaps) -> FringeMaps | None:
         """As in `Effect.undo`: the mean offset of a replayed run is no light."""
@@ -252,6 +257,26 @@ class BiasDrift(Effect):
             {"noise_sigmas": sigmas(changes[0]), "settling_sigmas": sigmas(changes[1]),
              "ramp_sigmas": sigmas(changes[2]), "ramp_over_walk_sigmas": steady},
         )  # fmt: skip
+
+
+def _dark_tracks(evidence: Evidence) -> list[Track]:
+    """Offsets of bias and dark frames of one exposure time, less what is noise (Wiener)."""
+    found = []
+    for kind in ("bias", "dark"):
+        stacks = evidence.of_kind(kind)
+        if len(stacks) != 1:
+            continue
+        series = dark_offsets(stacks[0], evidence.good, evidence.gain, evidence.read_noise)
+        if series is None:
+            continue
+        modes = offset_modes([series], [np.zeros((len(series), 0))])
+        size = np.maximum(estimate_components(modes).size, 0.0)
+        parts = size[:, None, None, None] * modes.parts
+        offset = parts[:2].sum(axis=0)[:, :, :1]
+        weight = np.linalg.solve(parts.sum(axis=0), offset)[..., 0]
+        course = walk_modes(series.time_s).series(np.einsum("nc,nc->n", weight, modes.values))
+        found.append(Track.of(_CALIBRATION[kind], stacks[0].time_s, course))
+    return found
 
 
 def _all_series(evidence: Evidence) -> list[OffsetSeries]:
