@@ -9,13 +9,14 @@ import numpy as np
 
 from pixcal.estimators.detector.noiseless_charge import noiseless_level
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.frame_series.light import LIGHT_PARTS, FrameLight, light_of
+from pixcal.estimators.frame_series.light import LIGHT_PARTS, light_of
 from pixcal.estimators.frame_series.offset import (
     OffsetSeries,
     dark_offsets,
     fringe_offsets,
     offset_modes,
 )
+from pixcal.estimators.frame_series.offset_courses import dark_courses, fringe_courses
 from pixcal.estimators.frame_series.profiled import Profiled, best_shape
 from pixcal.estimators.frame_series.variance_components import (
     MAX_STEPS,
@@ -26,7 +27,6 @@ from pixcal.estimators.frame_series.variance_components import (
     log_chance_of_any,
     sigmas,
 )
-from pixcal.estimators.frame_series.walk_modes import walk_modes
 from pixcal.kernels.processes import brownian
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.kernels.synthesis import Stream, generator
@@ -41,9 +41,6 @@ STEADY = 3.0  # the same for a ramp and a walk; below, a walk explains the frame
 SETTLINGS = 8  # time constants tried, from some steps to the length of the run
 # fringes count where their mean offset is as well known as this, of a sample's read noise
 WORTH = 0.3
-KNOTS = 32  # most points of a track
-# sets that tracks of frames without fringes are listed under
-_CALIBRATION = {kind: f"{kind} frames" for kind in ("bias", "dark", "flat")}
 _KEY, _RUN = 1000, 2000  # first keys of the walks' random numbers: no recording has them
 
 
@@ -120,11 +117,11 @@ class BiasDrift(Effect):
         return offset
 
     def readout(self, adu: F32, shot: Shot) -> F32:
+        own = f"{shot.recording.kind} frames"
         if shot.recording.kind == "fringes":
             offset = self._in_run(shot)
-        elif any(track.set == _CALIBRATION[shot.recording.kind] for track in self.tracks):
-            time = shot.frame * shot.recording.period_s
-            offset = float(at(self.tracks, _CALIBRATION[shot.recording.kind], time))
+        elif any(track.set == own for track in self.tracks):
+            offset = float(at(self.tracks, own, shot.frame * shot.recording.period_s))
         else:
             offset = self.offset(shot.time_s, shot.bench.seed, shot.rng(self.name))
         return adu + np.float32(offset / shot.bench.detector.gain_e_per_adu)
@@ -150,9 +147,10 @@ class BiasDrift(Effect):
     def replayed(self, evidence: Evidence) -> Self | None:
         """As in `Effect.replayed`: slow offsets of fringes, all offsets of bias and dark frames."""
         light = light_of(evidence)
-        of_fringes = () if light is None else _tracks(light)
-        tracks = (*(_with_level(t, evidence) for t in of_fringes), *_dark_tracks(evidence))
-        return replace(self, tracks=tracks) if tracks else None
+        lit = [] if light is None else fringe_courses(light)
+        tracks = [_with_level(Track.of(name, time, e), evidence) for name, time, e in lit]
+        tracks += [Track.of(name, time, e) for name, time, e in dark_courses(evidence)]
+        return replace(self, tracks=tuple(tracks)) if tracks else None
 
     def undo(self, maps: FringeMaps) -> FringeMaps | None:
         """As in `Effect.undo`: the mean offset of a replayed run is no light."""
@@ -259,26 +257,6 @@ class BiasDrift(Effect):
         )  # fmt: skip
 
 
-def _dark_tracks(evidence: Evidence) -> list[Track]:
-    """Offsets of bias and dark frames of one exposure time, less what is noise (Wiener)."""
-    found = []
-    for kind in ("bias", "dark"):
-        stacks = evidence.of_kind(kind)
-        if len(stacks) != 1:
-            continue
-        series = dark_offsets(stacks[0], evidence.good, evidence.gain, evidence.read_noise)
-        if series is None:
-            continue
-        modes = offset_modes([series], [np.zeros((len(series), 0))])
-        size = np.maximum(estimate_components(modes).size, 0.0)
-        parts = size[:, None, None, None] * modes.parts
-        offset = parts[:2].sum(axis=0)[:, :, :1]
-        weight = np.linalg.solve(parts.sum(axis=0), offset)[..., 0]
-        course = walk_modes(series.time_s).series(np.einsum("nc,nc->n", weight, modes.values))
-        found.append(Track.of(_CALIBRATION[kind], stacks[0].time_s, course))
-    return found
-
-
 def _all_series(evidence: Evidence) -> list[OffsetSeries]:
     stacks = [s for s in evidence.stacks if s.kind in ("bias", "dark")]
     dark = [dark_offsets(s, evidence.good, evidence.gain, evidence.read_noise) for s in stacks]
@@ -319,26 +297,3 @@ def _with_level(track: Track, evidence: Evidence) -> Track:
     if abs(level) < SIGNIFICANT * error:
         return track
     return replace(track, value=tuple(v + level for v in track.value))
-
-
-def _tracks(light: FrameLight) -> tuple[Track, ...]:
-    """Offsets of every set: the part of (B, log A/B) that moves the first and not A (Wiener)."""
-    light = replace(light, dark=())
-    drifts, every = ("offset_walk", "offset_smooth"), (*LIGHT_PARTS, "offset_smooth")
-    found = []
-    for series in light.sets:
-        alone = replace(light, sets=(series,))
-        modes = alone.modes(every)
-        size = np.maximum(estimate_components(modes).size, 0.0)
-        n = len(series) - 1
-        parts = size[:, None, None, None] * modes.parts[:, :n]
-        level = light.level[series.name]
-        # In e-, what (B, log A/B) share with the drift.
-        drift = sum(parts[every.index(name)] for name in drifts)
-        with_offset = level * drift[:, :, 0]
-        weight = np.linalg.solve(parts.sum(axis=0), with_offset[..., None])[..., 0]
-        smooth = np.einsum("nc,nc->n", weight, modes.values[:n])
-        offset = series.walk_modes.series(smooth)
-        some = np.unique(np.linspace(0, n, min(KNOTS, n + 1)).astype(int))
-        found.append(Track.of(series.name, series.time_s[some], offset[some]))
-    return tuple(found)
