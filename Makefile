@@ -40,6 +40,9 @@ $(DOCS): $(INSTALLED)
 demo: $(INSTALLED) ## calibrate the sample acquisition into demo/
 	$(BIN)/pixcal run data_samples/demo --out demo
 
+# Several files at a time: threads of one's linear algebra would only wait for another's.
+test test-long: export OPENBLAS_NUM_THREADS = 1
+
 # Three files at a time on two cores: some tests wait for processes of their own.
 test: $(TOOLS) ## run the tests
 	$(BIN)/pytest -n 3 --dist loadfile -m "not long" --durations=15
