@@ -34,7 +34,6 @@ def as_markdown(score: Plain) -> str:
             _effects(score["effects"], BY_STRENGTH),
         ]
     blocks += [
-        "Named first, by what was in the data (alone in it, and a candidate):",
         _confusion(score["confusion"]),
         _failures(wrong) if wrong else "No case was answered wrong.",
         *(f"{note}." for note in score["notes"]),
@@ -67,6 +66,8 @@ def _parts(parts: Mapping[str, Plain]) -> str:
     for facts in parts.values():
         name = facts["title"].partition(": ")[2]
         for question, count in facts["questions"].items():
+            if not count["of"]:
+                continue
             right = f"{count['right']} of {count['of']}"
             rows.append((name, question, right, *_percent(count), *_target(count)))
     header = ("part", "question", "right", "share", "95 % interval", "target", "reached")
@@ -74,8 +75,6 @@ def _parts(parts: Mapping[str, Plain]) -> str:
 
 
 def _percent(count: Plain) -> tuple[str, str]:
-    if count["share"] is None:
-        return "", ""
     low, high = count["interval"]
     return f"{100 * count['share']:.0f} %", f"{100 * low:.0f} to {100 * high:.0f} %"
 
@@ -84,8 +83,6 @@ def _target(count: Plain) -> tuple[str, str]:
     if "target" not in count:
         return "", ""
     text = f"≥ {100 * count['target']:.0f} %"
-    if count["share"] is None:
-        return text, ""
     return text, "yes" if count["share"] >= count["target"] else "**no**"
 
 
@@ -143,11 +140,15 @@ def _before_after(medians: Mapping[str, float | None]) -> str:
 
 
 def _confusion(confusion: Mapping[str, Mapping[str, int]]) -> str:
+    """What was named first in place of the single effect that was in the data."""
     rows = []
     for true, named in confusion.items():
         others = [f"{n} {count}" for n, count in named.items() if n != true]
-        rows.append((true, sum(named.values()), named.get(true, 0), ", ".join(others)))
-    return _table(("in the data", "cases", "named first", "instead"), rows)
+        if others:
+            rows.append((true, sum(named.values()), named.get(true, 0), ", ".join(others)))
+    if not rows:
+        return ""
+    return _table(("in the data, alone", "cases", "named first", "named instead"), rows)
 
 
 def _failures(wrong: Sequence[Plain]) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 
 import click
 
+from pixcal.report.text import chance, share_by_law
 from pixcal.storage.artefact import MANIFEST, read_json
 from pixcal.storage.cube_place import cubes_of
 from pixcal_cli.printing import Columns, number, show_notes, show_records, show_table, with_error
@@ -189,7 +190,7 @@ def show_diagnosis(run: Path) -> None:
     columns: Columns = {
         "gap closed": lambda c: _closed(c["gap_closed"], c["gap_closed_interval"]),
         "unique share": lambda c: f"{100 * c['gain_over_rest']:.1f} %",
-        "p-value": lambda c: _chance(c["p_value"]),
+        "p-value": lambda c: chance(c["p_value"]),
         "indistinguishable from": lambda c: ", ".join(c["not_told_apart_from"]) or "-",
     }
     if diagnosis["causes"]:
@@ -217,9 +218,8 @@ def show_diagnosis(run: Path) -> None:
 
 def _show_cause(cause: Mapping[str, Any]) -> None:
     """Print the law of a cause, and the frames that would distinguish it from others."""
-    law, by_law = cause.get("law", ""), cause.get("gap_closed_by_law", cause["gap_closed"])
-    differs = abs(by_law - cause["gap_closed"]) > LAW_DIFFERS
-    alone = f"the law alone closes {100 * by_law:.1f} %" if differs else ""
+    law, by_law = cause.get("law", ""), share_by_law(cause)
+    alone = "" if by_law is None else f"the law alone closes {100 * by_law:.1f} %"
     if law or alone:
         click.echo(f"  {cause['effect']}: {'; '.join(filter(None, (law, alone)))}")
     if cause["would_decide"]:
@@ -228,21 +228,13 @@ def _show_cause(cause: Mapping[str, Any]) -> None:
         click.echo(f"  recommended frames to distinguish {cause['effect']} from {others}: {frames}")
 
 
-LAW_DIFFERS = 0.02
-"""Difference of the shares closed by a cause and by its law alone that is printed."""
 MAX_ROWS = 8
 """Largest number of differences that are printed."""
-MIN_P_VALUE = 1e-12
-"""Smallest p-value that is printed as a number."""
 
 
 def _closed(share: float, interval: Sequence[float]) -> str:
     low, high = (100 * end for end in interval)
     return f"{100 * share:.1f} % ({low:.1f} to {high:.1f} %)"
-
-
-def _chance(p: float) -> str:
-    return f"< {MIN_P_VALUE:.0e}" if p <= MIN_P_VALUE else f"{p:.1e}"
 
 
 def show_report(run: Path) -> None:

@@ -443,8 +443,8 @@ def test_a_diagnosis_names_frames_that_would_decide(
     results.show_diagnosis(tmp_path)
     verdict, _, lag, row_noise, *frames = (" ".join(row) for row in cells(capsys.readouterr().out))
     assert verdict == "partly explained; residual gap: 50 % (90 % interval 40 to 60 %)"
-    assert lag == "lag 90.0 % (80.0 to 95.0 %) 90.0 % < 1e-12 ipc, glow"
-    assert row_noise == "row_noise 90.0 % (80.0 to 95.0 %) 90.0 % 1.1e-12 -"
+    assert lag == "lag 90.0 % (80.0 to 95.0 %) 90.0 % < 10⁻¹² ipc, glow"
+    assert row_noise == "row_noise 90.0 % (80.0 to 95.0 %) 90.0 % 1.1 × 10⁻¹² -"
     assert frames == [
         "lag: charge of the last frame; the law alone closes 70.0 %",
         "recommended frames to distinguish lag from ipc or glow: "

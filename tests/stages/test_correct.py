@@ -22,7 +22,7 @@ from pixcal.simulation.effect import Effect, FringeMaps
 from pixcal.stages import correct, fit
 from pixcal.stages.correct.gain import repeating, worsened
 from pixcal.stages.correct.restored_set import RestoredSet
-from pixcal.stages.correct.swept import undone
+from pixcal.stages.correct.sweep_to_correct import corrected
 from pixcal.stages.correct.uncertainty import moved
 from pixcal.stages.reduced_set import ReducedSet
 from pixcal.stages.treatment import treatments
@@ -180,11 +180,11 @@ def test_a_piece_with_its_halo_is_undone_as_the_whole():
     theta = 2e4 * np.stack([np.ones(x.shape), 0.9 * np.sin(psi), 0.9 * np.cos(psi)])
     ghost, straylight = parse_effects({"ghost_fringes": None, "straylight": None}, "test")
     effects = (Ipc(), straylight, ghost)
-    whole = np.sum(undone(FringeMaps(theta, (1.2, 0.0)), effects)[1], axis=0)
+    whole = np.sum(corrected(FringeMaps(theta, (1.2, 0.0)), effects)[1], axis=0)
     halo = sum(effect.undo_halo for effect in effects)
     for first, last in ((0, 7), (31, 60), (87, 103)):
         a, b = max(0, first - halo), min(103, last + halo)
-        steps = undone(FringeMaps(theta[:, a:b], (1.2, 0.0), (a, 0)), effects)[1]
+        steps = corrected(FringeMaps(theta[:, a:b], (1.2, 0.0), (a, 0)), effects)[1]
         piece = np.sum(steps, axis=0)[first - a : last - a]
         np.testing.assert_allclose(piece, whole[first:last], rtol=0, atol=1e-9)
 
@@ -250,7 +250,7 @@ def test_what_the_fit_takes_up_is_said(coupled, tmp_path):
     correct.run(again, correct.Config(), SYNC)
     found = json.loads((again / "products" / "correction.json").read_text())
     assert [e["treatment"] for e in found["effects"]] == [
-        "absorbed by the fit", "not undone", "not undone"
+        "absorbed by the fit", "not corrected", "not corrected"
     ]  # fmt: skip
     assert found["outputs"] == []
 
@@ -266,15 +266,15 @@ def test_effects_known_before_the_diagnosis_are_undone_too(tmp_path):
     [
         ("auto", "hyperbolic", "in the fit"),
         ("auto", "paraxial", "in the corrected fit"),
-        ("paraxial", "paraxial", "not undone"),
+        ("paraxial", "paraxial", "not corrected"),
     ],
 )
 def test_bent_fringes_are_for_the_shape_that_is_fitted(tmp_path, asked, taken, how):
     causes = [{"effect": "hyperbolic_fringes", "parameters": {}}]
     found = treatments(causes, {}, asked, {"one": "hyperbolic", "two": taken}, (), tmp_path)
     assert found.every[0].how == how
-    assert found.bent == (how == "in the corrected fit")
-    assert ("--model hyperbolic" in found.every[0].why) == (how == "not undone")
+    assert found.curved == (how == "in the corrected fit")
+    assert ("--model hyperbolic" in found.every[0].why) == (how == "not corrected")
 
 
 def test_bent_fringes_that_the_fit_did_not_see_are_fitted(coupled, tmp_path):
@@ -320,7 +320,7 @@ def test_an_effect_of_the_users_own_is_asked_for(coupled, tmp_path):
     (glow,) = treatments(
         [{"effect": "glow", "parameters": {}}], {}, "auto", {}, (file,), run / "diagnose"
     ).every
-    assert glow.why == "its file does not say how to undo it"
+    assert glow.why == "its file has no method to correct it"
     diagnosed(again, glow.effect)
     with pytest.raises(InputError, match=r"'glow' is an effect of your own; .* --own FILE"):
         correct.run(again, correct.Config(), SYNC)
@@ -363,7 +363,7 @@ def bent(make_bench, write_reduced, reseal, tmp_path_factory):
 def test_what_acts_on_samples_is_undone_as_they_are_swept_again(bent):
     bench, run, found = bent
     (effect,) = found["effects"]
-    assert effect["treatment"] == "undone on samples"
+    assert effect["treatment"] == "corrected on samples"
     for name in ("low", "high"):
         own = found["sets"][name]
         assert own["chi2_reduced"]["before"] > 1.3
@@ -448,7 +448,7 @@ def test_the_command_prints_a_table_and_refuses_in_one_line(
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"fit: {again}/fit (up to date)"
     assert lines[1] == f"corrected: {again}/corrected (up to date)"
-    assert any(line.split()[:4] == ["ipc", "undone", "on", "maps"] for line in lines)
+    assert any(line.split()[:4] == ["ipc", "corrected", "on", "maps"] for line in lines)
     assert "second baseline" in lines[-1]
     diagnosed(again, verdict="no gap")
     assert invoke(command) == 0

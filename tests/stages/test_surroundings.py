@@ -8,7 +8,7 @@ from pixcal.kernels.crosstalk import couple_fringes, uncouple_fringes
 from pixcal.model.flags import PixelFlag
 from pixcal.simulation.effect import FringeMaps
 from pixcal.stages.correct.surroundings import border_misfit, decided, disturbed
-from pixcal.stages.correct.swept import usable
+from pixcal.stages.correct.sweep_to_correct import usable
 
 K = (2 * np.pi / 9, 0.02)
 KERNEL = Ipc.nearest(0.008).couplings

@@ -8,7 +8,6 @@ from pixcal.report.contents import DiagnosisContents
 from pixcal.report.curve_places import place
 from pixcal.report.diagnosis_words import (
     DETECTOR,
-    chance,
     effect_title,
     listed,
     percent,
@@ -16,14 +15,13 @@ from pixcal.report.diagnosis_words import (
     worst,
 )
 from pixcal.report.tables import Table, is_table
-from pixcal.report.text import exact, number, unit, with_error
+from pixcal.report.text import chance, exact, number, share_by_law, unit, with_error
 
 Facts = Mapping[str, Any]
 
 SHOWN = 12  # rows of a table that are not folded
 PLOTS = 3  # statistics that are drawn for each cause, and of what remains
 LISTED = 8  # numbers of a list that are shown one by one
-LAW_DIFFERS = 0.02  # difference of the shares closed by a cause and by its law alone that is shown
 
 
 # Causes
@@ -54,8 +52,7 @@ def about_cause(cause: Facts) -> str:
         sentences.append(f"Detection significance in the fitted frames: {number(size, 2)}σ.")
     if law := cause.get("law"):
         sentences.append(f"Law: {law}.")
-    by_law = cause.get("gap_closed_by_law", cause["gap_closed"])
-    if abs(by_law - cause["gap_closed"]) > LAW_DIFFERS:
+    if (by_law := share_by_law(cause)) is not None:
         sentences.append(f"The law alone closes {percent(by_law)} of the gap.")
     return " ".join(filter(None, sentences))
 

@@ -27,11 +27,6 @@ def residual_gap(gap: Mapping[str, Any]) -> str:
     return f"residual gap is {percent(gap['after'])} (90\u00a0% interval {low} to {high}\u00a0%)"
 
 
-def chance(p: float) -> str:
-    """A p-value, or its upper limit where it is very small."""
-    return "< 10⁻¹²" if p <= 1e-12 else number(float(p), 2)
-
-
 def listed(names: Iterable[str], last: str = "and") -> str:
     """Names as a list within a sentence."""
     *first, end = names

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -126,6 +127,21 @@ def duration(seconds: float) -> str:
         if seconds >= 2 * length:
             return f"{number(seconds / length)} {unit}"
     return f"{number(seconds)} s"
+
+
+def chance(p: float) -> str:
+    """A p-value, or its upper limit where it is very small."""
+    return "< 10⁻¹²" if p <= 1e-12 else number(float(p), 2)
+
+
+# difference of the shares of the gap closed by a cause and by its law alone that is shown
+LAW_DIFFERS = 0.02
+
+
+def share_by_law(cause: Mapping[str, Any]) -> float | None:
+    """Share of the gap closed by the law of a cause, where it differs from that of the cause."""
+    share: float = cause.get("gap_closed_by_law", cause["gap_closed"])
+    return share if abs(share - cause["gap_closed"]) > LAW_DIFFERS else None
 
 
 def date_of_mjd(mjd: float) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 
 from pixcal.effects import known_effects
 from pixcal.report.text import NO_OFFSETS, number, with_error
-from pixcal.stages.treatment import SUFFIX, fitted_shapes, treatment_of_kind
+from pixcal.stages.treatment import CORRECTED, SUFFIX, fitted_shapes, treatment_of_kind
 from pixcal.storage.artefact import MANIFEST, read_json
 from pixcal.storage.stage import require
 
@@ -105,7 +105,7 @@ def _as_what(diagnosis: Json | None, correction: Json | None, it_needs: str) -> 
     if diagnosis is None:
         return " as fitted. No diagnosis was made, so biases are unknown"
     if correction is not None and correction["outputs"]:
-        freed = [e["effect"] for e in correction["effects"] if _corrects(e["treatment"])]
+        freed = [e["effect"] for e in correction["effects"] if e["treatment"] in CORRECTED]
         return f", corrected for {' and '.join(freed)}"
     if any(_on_map(c)["action"] == "corrected" for c in diagnosis["causes"]):
         return " as fitted, NOT corrected for the effects below"
@@ -115,14 +115,10 @@ def _as_what(diagnosis: Json | None, correction: Json | None, it_needs: str) -> 
 
 
 def _unknown(diagnosis: Json | None) -> list[str]:
-    """Causes that are neither absorbed nor undone, so that nothing tells what they do to maps."""
+    """Causes that are neither absorbed nor corrected: their change of the maps is unknown."""
     causes = (diagnosis or {}).get("causes", ())
     left = [c for c in causes if _on_map(c)["action"] == "fix the bench"]
     return [c["effect"] for c in left if not _on_map(c)["rms_px"]]
-
-
-def _corrects(how: str) -> bool:
-    return how.startswith("undone") or how == "in the corrected fit"
 
 
 def limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json | None) -> str:
@@ -173,7 +169,7 @@ def _treated(cause: Json, correction: Json | None) -> Json | None:
 def _settled(cause: Json, correction: Json | None, with_maps: bool) -> bool:
     """Whether nothing remains to be done about an effect."""
     action, treated = _on_map(cause)["action"], _treated(cause, correction)
-    done = not with_maps or (treated is not None and _corrects(treated["treatment"]))
+    done = not with_maps or (treated is not None and treated["treatment"] in CORRECTED)
     return bool(action == "unaffected" or (action == "corrected" and done))
 
 

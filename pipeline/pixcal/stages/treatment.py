@@ -17,7 +17,7 @@ HYPERBOLIC = "hyperbolic"
 SUFFIX = "_corrected"  # of the names of the corrected products
 IN_CORRECTED = "in the corrected fit"
 # treatments after which the corrected maps are free of an effect
-CORRECTED = ("undone on maps", "undone on samples", IN_CORRECTED)
+CORRECTED = ("corrected on maps", "corrected on samples", IN_CORRECTED)
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,7 @@ class Treatment:
     effect: Effect
     origin: str  # `diagnosis`, or `nominal`: known to be there before the diagnosis
     errors: Mapping[str, float]  # of its parameters, 1-sigma, by name
-    # `undone on samples`, `undone on maps`, `in the fit`, `in the corrected fit`, `absorbed by
-    # the fit` or `not undone`
+    # one of `CORRECTED`, `in the fit`, `absorbed by the fit` or `not corrected`
     how: str
     why: str
     covariance: F64 | None = None  # (n, n) of the parameters, where they were measured together
@@ -67,28 +66,28 @@ class Treatments:
     every: tuple[Treatment, ...]  # in the order of the diagnosis
 
     def _those(self, how: str) -> tuple[Treatment, ...]:
-        """To undo in one way, the last that acted first."""
+        """To correct in one way, the last that acted first."""
         matching = [t for t in self.every if t.how == how]
         return tuple(sorted(matching, key=lambda t: t.effect.turn, reverse=True))
 
     @property
     def on_samples(self) -> tuple[Effect, ...]:
-        """To undo on samples, in that order."""
-        return tuple(t.effect for t in self._those("undone on samples"))
+        """To correct on samples, in that order."""
+        return tuple(t.effect for t in self._those("corrected on samples"))
 
     @property
     def on_maps(self) -> tuple[Treatment, ...]:
-        """To undo on maps, in that order."""
-        return self._those("undone on maps")
+        """To correct on maps, in that order."""
+        return self._those("corrected on maps")
 
     @property
-    def bent(self) -> bool:
+    def curved(self) -> bool:
         """Whether hyperbolic fringes are to be fitted where the fit took straight ones."""
         return any(t.how == IN_CORRECTED for t in self.every)
 
     @property
-    def undone(self) -> tuple[str, ...]:
-        """Names of all that are undone."""
+    def corrected(self) -> tuple[str, ...]:
+        """Names of all that are corrected."""
         return tuple(e.name for e in (*self.on_samples, *(t.effect for t in self.on_maps)))
 
 
@@ -147,21 +146,21 @@ def fitted_shapes(run_dir: Path) -> tuple[str, Mapping[str, str]]:
 def treatment_of_kind(kind: type[Effect], model: str, models: Mapping[str, str]) -> tuple[str, str]:
     """How a kind of effect is treated, and why; parameters as in `treatments`."""
     if kind.undo is not Effect.undo:
-        return "undone on maps", "its change of the maps is computed and removed"
+        return "corrected on maps", "its change of the maps is computed and removed"
     if kind.undo_samples is not Effect.undo_samples:
         return (
-            "undone on samples",
+            "corrected on samples",
             "it depends on the light of each frame: removed from the samples, which are fitted "
             "again",
         )
     if kind.fit_model == HYPERBOLIC:
-        return _of_bent_fringes(model, models)
+        return _of_curved_fringes(model, models)
     if kind.absorbed_because:
         return "absorbed by the fit", kind.absorbed_because
-    return "not undone", kind.left_because or "its file does not say how to undo it"
+    return "not corrected", kind.left_because or "its file has no method to correct it"
 
 
-def _of_bent_fringes(requested: str, models: Mapping[str, str]) -> tuple[str, str]:
+def _of_curved_fringes(requested: str, models: Mapping[str, str]) -> tuple[str, str]:
     straight = [name for name, model in models.items() if model != HYPERBOLIC]
     if not straight:
         return "in the fit", "hyperbolic fringes were fitted"
@@ -171,4 +170,4 @@ def _of_bent_fringes(requested: str, models: Mapping[str, str]) -> tuple[str, st
             f"straight fringes were fitted ({', '.join(straight)}); the corrected maps use "
             "hyperbolic ones",
         )
-    return "not undone", "--model paraxial was given: use --model hyperbolic"
+    return "not corrected", "--model paraxial was given: use --model hyperbolic"

@@ -15,8 +15,8 @@ import numpy as np
 from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.model.arrays import F64
-from pixcal.stages.correct.swept import HALVES, Swept
-from pixcal.stages.correct.undoing import mean_of
+from pixcal.stages.correct.correct_maps import mean_of
+from pixcal.stages.correct.sweep_to_correct import HALVES, Swept
 from pixcal.stages.evidence import Part
 from pixcal.storage.cube import ArrayReader
 

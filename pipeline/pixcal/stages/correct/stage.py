@@ -1,8 +1,8 @@
 """The fit with a diagnosis: identified effects are corrected where possible.
 
-The ordinary fit and its products stay as they are. What acts on samples is undone as the cube is
-swept again; what acts on maps, on the maps that the sweep left. Shapes of the fringes are fitted to
-what remains, and sets combined, by the code of the fit.
+The ordinary fit and its products stay as they are. Effects on samples are corrected in a
+second sweep of the cube; effects on maps, on the maps of the sweep. The code of the fit then fits
+the shapes of the fringes and combines the sets.
 """
 
 import hashlib
@@ -22,13 +22,13 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.errors import DamagedError, InputError
 from pixcal.model.options import Fit
 from pixcal.stages import fit
-from pixcal.stages.correct.again import measured_again
+from pixcal.stages.correct.correct_maps import correct_sweep
 from pixcal.stages.correct.gain import Maps, measure_gain, worsened
+from pixcal.stages.correct.remeasure import remeasured
 from pixcal.stages.correct.restored_set import RestoredSet
 from pixcal.stages.correct.surroundings import sides_of
-from pixcal.stages.correct.swept import Swept
+from pixcal.stages.correct.sweep_to_correct import Swept
 from pixcal.stages.correct.uncertainty import parameter_errors
-from pixcal.stages.correct.undoing import undo_on_maps
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
 from pixcal.stages.fit.maps import Totals, write_maps
 from pixcal.stages.fit.products import header_of, publish_maps
@@ -62,7 +62,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     InputError
         If the run was not diagnosed, or not as it is reduced now; if the correction makes a map
         worse, by its periodic patterns or the agreement of sets along one axis; if an effect that
-        was found is of the user's own and its file was not given, or undoes what it should not.
+        was found is of the user's own and its file was not given, or its correction fails.
     """
     diagnosed = require(run_dir, "diagnose")
     if diagnosed.inputs["reduce"] != require(run_dir, "reduce").key:
@@ -111,9 +111,9 @@ def _correct(
     run_dir: Path, plan: Treatments, acquisition: Acquisition, runtime: Runtime, made: Build
 ) -> None:
     before = read_json(run_dir / "fit" / "fit.json")
-    plan = measured_again(run_dir, plan, runtime)
+    plan = remeasured(run_dir, plan, runtime)
     result: Json = {
-        "schema": "pixcal/correction/1",
+        "schema": "pixcal/correction/2",
         "pixcal": __version__,
         "input": before["input"],
         "verdict": read_json(run_dir / "diagnose" / "diagnosis.json")["verdict"],
@@ -123,7 +123,7 @@ def _correct(
         "pairs": [],
         "sets_chi2_reduced": None,
     }
-    if plan.undone or plan.bent:
+    if plan.corrected or plan.curved:
         result |= _corrected_maps(run_dir, made, plan, acquisition, runtime)
         if worse := worsened(result["sets"], result["pairs"]):
             raise InputError(
@@ -131,25 +131,25 @@ def _correct(
                 "second baseline along each axis to measure the effect better"
             )
     write_json(made.folder / "correction.json", result)
-    made.summary = {"outputs": result["outputs"], "undone": list(plan.undone)}
+    made.summary = {"outputs": result["outputs"], "corrected": list(plan.corrected)}
 
 
 def _corrected_maps(
     run_dir: Path, made: Build, plan: Treatments, acquisition: Acquisition, runtime: Runtime
 ) -> Json:
     before = read_json(run_dir / "fit" / "fit.json")
-    for old in (made.scratch / "undone", made.folder / "corrected.zarr"):
+    for old in (made.scratch / "corrected", made.folder / "corrected.zarr"):
         shutil.rmtree(old, ignore_errors=True)
-    create_group(made.scratch / "undone")
+    create_group(made.scratch / "corrected")
     swept, facts = _swept_sets(run_dir, made, plan, acquisition, runtime)
-    model = HYPERBOLIC if plan.bent else before["model"]
+    model = HYPERBOLIC if plan.curved else before["model"]
     fitted, left = [], {}
     sides = sides_of([*swept.values()])
     sets = {name: replace(closed, open_sides=sides) for name, closed in swept.items()}
     for name, opened in sets.items():
         left[name] = parameter_errors(opened, runtime)
-        target = made.scratch / "undone" / name
-        undo_on_maps(opened, target, runtime, name)
+        target = made.scratch / "corrected" / name
+        correct_sweep(opened, target, runtime, name)
         fitted.append(fit_set(target, opened.source, facts[name], acquisition, name, model))
     group = made.folder / "corrected.zarr"
     totals = write_maps(group, fitted, runtime)
@@ -211,7 +211,7 @@ def _of_set(fitted: FittedSet, totals: Totals, gain: Json, before: Json, plan: T
     )
     on_samples = gain.pop("change_on_samples")
     if plan.on_samples:
-        # They are undone at once: the sweep does not tell one from the other.
+        # They are corrected together, in one sweep.
         by_effect[" and ".join(e.name for e in plan.on_samples)] = on_samples
     after = describe(fitted, summary.masked, summary.sigma_px)
     return gain | {
@@ -235,7 +235,7 @@ def _published(run_dir: Path) -> bool:
 
 
 def _publish(run_dir: Path) -> None:
-    """Write the products; without effects to undo, ``correction.json`` alone."""
+    """Write the products; with nothing to correct, ``correction.json`` alone."""
     folder = run_dir / "corrected"
     result = read_json(folder / "correction.json")
     cards: list[Card] = []
@@ -244,10 +244,10 @@ def _publish(run_dir: Path) -> None:
         fits = {name: facts["fit"] for name, facts in result["sets"].items()}
         key = read_json(folder / "manifest.json")["key"]
         cards, history = header_of(run_dir, result | {"sets": fits}, key)
-        undone = [e for e in result["effects"] if e["treatment"].startswith("undone")]
-        cards.append(("NEFFECT", len(undone), "effects undone"))
-        for n, effect in enumerate(undone, start=1):
-            cards.append((f"EFFECT{n}", effect["effect"], "effect undone"))
+        freed = [e for e in result["effects"] if e["treatment"].startswith("corrected on")]
+        cards.append(("NEFFECT", len(freed), "effects corrected"))
+        for n, effect in enumerate(freed, start=1):
+            cards.append((f"EFFECT{n}", effect["effect"], "effect corrected"))
             parameters = json.dumps(effect["parameters"])
             history.append(f"{effect['effect']}: {effect['treatment']}: {parameters}")
     publish_maps(run_dir, folder / "corrected.zarr", result["outputs"], cards, history, SUFFIX)

@@ -13,7 +13,7 @@ import numpy as np
 
 from pixcal.model.arrays import F64, Mask
 from pixcal.simulation.effect import FringeMaps
-from pixcal.stages.correct.swept import Sides, Swept, free_of_samples, undone
+from pixcal.stages.correct.sweep_to_correct import Sides, Swept, corrected, free_of_samples
 
 # lines of pixels that tell what the one at the border should be; those beside it do not count
 DEPTH, SKIPPED = 24, 4
@@ -68,7 +68,7 @@ def _misfit(swept: Swept, side: int, is_open: bool) -> float:
     one = replace(swept, open_sides=(top, bottom, left, right))
     inside = one.inside(y, x)
     maps, good = free_of_samples(one, one.around(y, x))
-    theta, good = undone(maps, swept.effects)[0].theta[(slice(None), *inside)], good[inside]
+    theta, good = corrected(maps, swept.effects)[0].theta[(slice(None), *inside)], good[inside]
     if axis:
         theta, good, kx, ky = theta.swapaxes(1, 2), good.T, ky, kx
     if last:

@@ -16,7 +16,7 @@ from pixcal.model.arrays import F64, Mask
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect, FringeMaps
-from pixcal.stages.correct.swept import Swept, maps_of, undone
+from pixcal.stages.correct.sweep_to_correct import Swept, corrected, maps_of
 from pixcal.stages.fit.scouting import scout_tiles
 
 # peak of a tile's task for each of its pixels, those around it included (measured),
@@ -97,7 +97,7 @@ def left_over(swept: Swept, maps: FringeMaps, good: Mask, inside: tuple[slice, s
     variances = []
     for treatment in swept.treatments:
         effect, covariance = treatment.effect, treatment.covariance
-        after, _ = undone(maps, (effect,))
+        after, _ = corrected(maps, (effect,))
         theta = after.theta[(slice(None), *inside)]
         slopes = None if covariance is None else effect.phase_slopes(after)
         if covariance is None or slopes is None:

@@ -22,20 +22,20 @@ SAMPLES = 5_000_000  # of each fringe set that are in memory at a time
 MAX_PARTS = 4  # times that many at most
 
 
-def measured_again(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatments:
+def remeasured(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatments:
     """The same treatments, with effects on maps remeasured on all frames where possible.
 
     Where the memory does not suffice, effects stay as the diagnosis found them.
     """
-    remeasured = [
+    chosen = [
         t for t in plan.every
-        if t.how == "undone on maps" and t.origin == "diagnosis"
+        if t.how == "corrected on maps" and t.origin == "diagnosis"
         and type(t.effect).measured_again is not Effect.measured_again
     ]  # fmt: skip
-    if not remeasured:
+    if not chosen:
         return plan
     try:
-        refined = {t.effect.name: _again(t, _parts(run_dir, runtime)) for t in remeasured}
+        refined = {t.effect.name: _again(t, _parts(run_dir, runtime)) for t in chosen}
     except (InputError, FileNotFoundError, np.linalg.LinAlgError):
         # Frames are missing, or too large: what the diagnosis found is good, only less precise.
         return plan
@@ -68,7 +68,7 @@ def _parts(run_dir: Path, runtime: Runtime) -> Iterator[Evidence]:
     number = min(MAX_PARTS, -(-min(counts) // frames))
     samples = min(frames, min(counts)) * pixels
     held = EVIDENCE_BYTES * samples * len(counts)
-    make_plan("measuring effects again", ESTIMATE_BYTES * samples, held, runtime)
+    make_plan("remeasuring effects", ESTIMATE_BYTES * samples, held, runtime)
     ends = np.linspace(0, min(min(counts), number * frames), number + 1).astype(int)
     for first, last in pairwise(ends.tolist()):
         evidence = load_evidence(run_dir, part, slice(first, last))

@@ -39,11 +39,11 @@ class Swept:
 
     folder: Path  # `sweep.zarr/<set name>`
     source: ReducedSet  # for the tiles
-    treatments: tuple[Treatment, ...]  # in the order in which their effects are undone
+    treatments: tuple[Treatment, ...]  # in the order of the corrections
     k: tuple[float, float]  # fringe vector at the centre, rad/px
     flat: Path | None  # map that samples were divided by
     read_noise: float  # e-
-    # that were undone on samples, as if nothing were beyond the window
+    # corrected on samples, as if nothing were beyond the window
     samples: tuple[Effect, ...] = ()
     raw: Path | None = None  # the sweep before that
     exptime_s: float = 0.0
@@ -52,7 +52,7 @@ class Swept:
 
     @property
     def effects(self) -> tuple[Effect, ...]:
-        """To undo, in that order."""
+        """To correct, in that order."""
         return tuple(t.effect for t in self.treatments)
 
     @property
@@ -167,10 +167,10 @@ def padded(values: NDArray[Any], swept: Swept, part: Part, fill: float = np.nan)
     return np.pad(values, pads, constant_values=fill)
 
 
-def undone(maps: FringeMaps, effects: Sequence[Effect]) -> tuple[FringeMaps, list[F64]]:
-    """Maps without effects, and by how much each has moved the phase (y, x), rad.
+def corrected(maps: FringeMaps, effects: Sequence[Effect]) -> tuple[FringeMaps, list[F64]]:
+    """Maps corrected for effects, and the change (y, x) of the phase by each, rad.
 
-    An effect that gives back what is no map of the same pixels is refused.
+    An effect that does not return finite maps of the same pixels is refused.
     """
     steps = []
     for effect in effects:

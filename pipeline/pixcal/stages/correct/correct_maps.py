@@ -1,10 +1,10 @@
-"""A sweep's maps without effects: the phase of every pixel moved, and the sums of tiles taken anew.
+"""The maps of a sweep, corrected for effects: new phases of the pixels and new sums of the tiles.
 
-What is left is a sweep as that of the cube, which the shapes of the fringes are fitted to. In the
-place of its batches are variants: the two halves of the frames, corrected each for itself, and the
-map with each of the effects left in.
+The result is a sweep like that of the cube, to which the shapes of the fringes are fitted. Its
+batches are variants: each half of the frames, corrected by itself, and the map with each of the
+effects left in.
 
-A tile is undone with the pixels around it that the effects reach over. Tiles are the columns of
+A tile is corrected with the pixels around it that the effects reach over. Tiles are the columns of
 chunks of the cube, so results depend neither on memory nor on workers.
 """
 
@@ -24,7 +24,14 @@ from pixcal.estimators.maps.corrected import phase_change
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.simulation.effect import FringeMaps
 from pixcal.stages.correct.surroundings import disturbed
-from pixcal.stages.correct.swept import HALVES, Swept, border_change, maps_of, padded, undone
+from pixcal.stages.correct.sweep_to_correct import (
+    HALVES,
+    Swept,
+    border_change,
+    corrected,
+    maps_of,
+    padded,
+)
 from pixcal.stages.correct.uncertainty import left_over, task_bytes
 from pixcal.stages.evidence import Part
 from pixcal.stages.fit.sweep import BATCH_MAPS
@@ -35,8 +42,8 @@ from pixcal.storage.links import link_files
 SAME = ("chi2", "mask", "g", "dk", "time")  # arrays of a sweep that stay
 
 
-def undo_on_maps(swept: Swept, target: Path, runtime: Runtime, name: str) -> None:
-    """Write a set's sweep without effects to a new folder."""
+def correct_sweep(swept: Swept, target: Path, runtime: Runtime, name: str) -> None:
+    """Write the corrected sweep of a set to a new folder."""
     create_group(target)
     for array in SAME:
         link_files(swept.folder / array, target / array)
@@ -63,8 +70,9 @@ def undo_on_maps(swept: Swept, target: Path, runtime: Runtime, name: str) -> Non
         target / "sums", (*swept.source.grid, width), "<f8", dims=("row", "column", "fact"),
         chunks=(1, 1, width), fill_value=np.nan,
     )  # fmt: skip
-    fitting = within_memory(f"undoing effects of {name}", task_bytes(swept), 0, runtime)
-    run_tasks(partial(_undo_tile, swept, target, writers), tiles, fitting, label=f"undo {name}")
+    fitting = within_memory(f"correction of {name}", task_bytes(swept), 0, runtime)
+    task = partial(_correct_tile, swept, target, writers)
+    run_tasks(task, tiles, fitting, label=f"correct {name}")
     _finish(writers)
 
 
@@ -107,7 +115,7 @@ def mean_of(maps: F32, sigma: F32) -> tuple[F32, F32]:
     return mean.astype(np.float32), error.astype(np.float32)
 
 
-def _undo_tile(
+def _correct_tile(
     swept: Swept, target: Path, writers: dict[str, ArrayWriter], at: tuple[int, int]
 ) -> None:
     y, x = swept.source.ranges(at)
@@ -116,7 +124,7 @@ def _undo_tile(
     maps, good, known = maps_of(swept, part)
     border = border_change(swept, part)
     maps = maps.turned(border)
-    after, steps = undone(maps, swept.effects)
+    after, steps = corrected(maps, swept.effects)
     change = np.sum(steps, axis=0) if steps else np.zeros(maps.theta.shape[1:])
     moved = (change + border)[inside].astype(np.float32)
     phase = wrapped(ArrayReader(swept.folder / "phase").read(y, x) + moved)
@@ -131,7 +139,7 @@ def _undo_tile(
     for n in range(HALVES * swept.has_halves):
         half = ArrayReader(target / "half_phase").read((n, n + 1), *swept.within(part))[0]
         half_phase = padded(half.astype(float), swept, part)
-        its = undone(maps.turned(half_phase), swept.effects)[1]
+        its = corrected(maps.turned(half_phase), swept.effects)[1]
         rest = np.sum(its, axis=0) - change if its else 0.0
         variants.append((half_phase + rest)[inside])
         errors.append(ArrayReader(target / "half_sigma").read((n, n + 1), y, x)[0] * factor)
@@ -157,14 +165,14 @@ def _of_neighbours(
         return np.zeros(known.shape)
     within = padded(np.ones([b - a for a, b in swept.within(part)], bool), swept, part, False)
     phase = ArrayReader(swept.folder / "phase").read(*swept.within(part)).astype(float)
-    disturbed_maps = disturbed(maps, within & ~known, ~within, phase)
-    steps = [phase_change(after.theta, undone(o, swept.effects)[0].theta) for o in disturbed_maps]
+    others = disturbed(maps, within & ~known, ~within, phase)
+    steps = [phase_change(after.theta, corrected(o, swept.effects)[0].theta) for o in others]
     error = np.sqrt(np.mean(np.square(steps), axis=0))
     return np.asarray(np.where(known, error, 0.0))
 
 
 def _noise_factor(swept: Swept, maps: FringeMaps) -> F64:
-    """Noise (y, x) after all effects are undone, over that before."""
+    """Noise (y, x) after the correction over that before."""
     light = maps.theta[0] if maps.flat is None else maps.theta[0] * maps.flat
     factor = np.ones(light.shape)
     for effect in swept.effects:
