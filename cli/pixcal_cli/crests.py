@@ -42,7 +42,7 @@ def _show(name: str, facts: dict[str, Any]) -> None:
         click.echo(f"    not compared: {facts['agreement_note']}")
     else:
         click.echo(
-            f"    phases of both: {agreement['phase_rms_px']:.2g} px rms apart, "
+            f"    phase difference: {agreement['phase_rms_px']:.2g} px rms, "
             f"{agreement['phase_sigma_px']:.2g} px expected"
         )
     for sentence in facts["warnings"]:

@@ -173,7 +173,7 @@ def test_couplings_that_make_no_sense_are_refused(coupling: object, reason: str)
 
 def test_a_kernel_that_leaves_a_pixel_too_little_is_refused() -> None:
     many = tuple(Coupling(dy, dx, 0.1) for dy in (-1, 0, 1) for dx in (-1, 1))
-    with pytest.raises(InputError, match=r"give away 0\.60 of their signal"):
+    with pytest.raises(InputError, match=r"lose 0\.60 of their signal"):
         Ipc(many)
     with pytest.raises(InputError, match="odd numbers of rows and columns, not 2 x 3"):
         Ipc.of_kernel(np.ones((2, 3)))

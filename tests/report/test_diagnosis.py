@@ -23,6 +23,7 @@ from pixcal.report.diagnosis_figures import Bar, Closed, curves_figure, gap_figu
 from pixcal.report.diagnosis_words import percent, with_interval
 from pixcal.report.drawing import png
 from pixcal.report.page import render, section
+from pixcal.report.tables import provenance
 from pixcal.report.verdict import cards
 
 NOTICED = 3.7
@@ -271,6 +272,25 @@ def test_parameters_of_any_shape_are_listed() -> None:
 
 
 @pytest.mark.usefixtures("without_figures")
+def test_a_replay_is_not_shown_as_a_strength_of_zero() -> None:
+    tracks = [{"set": name, "value": [-0.02, 0.02]} for name in ("vertical", "horizontal")]
+    cause = a_cause(
+        parameters={"rms": 0.0, "line_hz": 100.0, "rate": 0.5, "tracks": tracks},
+        uncertainty={"rms": 0.0012, "rate": 0.1},
+    )
+    shown = diagnosis(contents(a_diagnosis(causes=(cause,))))
+    assert [row[0] for row in table(shown, "Parameters").rows] == ["rate"]
+    assert [row[0] for row in table(shown, "tracks").rows] == ["vertical", "horizontal"]
+
+
+def test_options_with_parameters_are_named_in_the_provenance() -> None:
+    effects = [{"effect": "ipc", "parameters": {"share": 0.1}}, {"effect": "lag"}]
+    stage = StageRecord("corrected", "k", 2, "0", {"effects": effects, "own": []}, {})
+    stages, _ = provenance(Contents({"detector": {}}, (stage,)))
+    assert stages.rows[0][-1] == "effects ipc, lag; own –"
+
+
+@pytest.mark.usefixtures("without_figures")
 def test_every_difference_is_listed_once_the_worst_of_each_domain_first() -> None:
     domains = {"space": 20, "noise": 9, "time": 2, "intensity": 1}
     curves = tuple(
@@ -298,7 +318,7 @@ def test_values_that_hardly_differ_are_shown_with_the_digits_that_tell() -> None
     curve = a_curve(unit="px", measured=[1.0, 1.0012], nominal=nominal)
     shown = diagnosis(contents(a_diagnosis(curves=(curve,))))
     (row,) = table(shown, "Statistics that differ").rows
-    assert row[3:5] == ["1.00120 px", "1.00070"]
+    assert row[3:5] == ["1.0012 px", "1.0007"]
     assert row[5] == "9.0"
 
 

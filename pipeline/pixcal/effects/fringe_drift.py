@@ -35,7 +35,7 @@ class FringeDrift(Effect):
     order = 3
     domains = ("time", "space")
     strengths = ("ramp", "settle", "walk", *TRACKS)
-    absorbed_because = "the fit has a free fringe vector in each frame where it moves"
+    absorbed_because = "the fit has a free fringe vector in each frame if the vector moves"
     frames_needed = ()
     sources = (
         "Rousset et al., sections 4.2, 4.3 and 5.2: thermal deformations move Kx, Ky; one of two "

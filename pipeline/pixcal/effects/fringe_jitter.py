@@ -32,7 +32,7 @@ class FringeJitter(Effect):
     order = 4
     domains = ("time", "space")
     strengths = ("rms", "vibration", "along_x", "along_y")
-    absorbed_because = "the fit has a free fringe vector in each frame where it moves"
+    absorbed_because = "the fit has a free fringe vector in each frame if the vector moves"
     frames_needed = ()
     sources = (
         "Rousset et al., sections 4.2 and 5.2: fringe residuals come from changing Kx, Ky, and "

@@ -84,7 +84,7 @@ class Ipc(Effect):
         most = largest_outflow(self.couplings)
         if most >= 0.5:
             raise InputError(
-                f"couplings: some pixels give away {most:.2f} of their signal; it must be below 0.5"
+                f"couplings: some pixels lose {most:.2f} of their signal; the limit is 0.5"
             )
 
     @classmethod

@@ -72,9 +72,12 @@ def evidence(result: DiagnosisContents, cause: Facts) -> list[Facts]:
 def parameters(cause: Facts) -> Iterator[tuple[str, Table]]:
     """Parameters with their errors; lists of like mappings have tables of their own."""
     errors, values = cause["uncertainty"], cause["parameters"]
+    # What was measured frame by frame replaces the law, whose strengths are zero then.
+    replayed = any(is_table(value) and "value" in value[0] for value in values.values())
     rows = []
     for name, value in values.items():
-        if not is_table(value) and value not in (None, []):
+        shown = name in errors and value if replayed else value not in (None, [])
+        if shown and not is_table(value):
             its_unit = unit(cause["units"].get(name, "")) or "–"
             meaning = cause["meanings"].get(name, "")
             rows.append([name, _fitted(name, value, errors), its_unit, meaning])
@@ -199,7 +202,7 @@ def _digits(one: float, other: float) -> int:
     size, apart = max(abs(one), abs(other)), abs(one - other)
     if not (math.isfinite(size) and apart > 0):
         return 3
-    return min(max(3, 2 + math.ceil(math.log10(size / apart))), 6)
+    return min(max(3, 1 + math.ceil(math.log10(size / apart))), 6)
 
 
 def _sigma(value: float) -> str:

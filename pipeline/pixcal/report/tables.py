@@ -285,7 +285,9 @@ def _plain(value: Any) -> str:
     if isinstance(value, list):
         shown = ", ".join(_plain(v) for v in value[:12])
         return shown + (f", … ({len(value)} in all)" if len(value) > 12 else "") or "–"
-    if value in ("", {}):
+    if isinstance(value, Mapping):  # such as an effect and its parameters: the first value names it
+        return _plain(next(iter(value.values()), ""))
+    if value == "":
         return "–"
     if isinstance(value, bool):
         return "yes" if value else "no"

@@ -160,7 +160,7 @@ class Scout:
     def _require_pixels(self) -> None:
         if sum(int(t.good.sum()) for t in self.tiles) < 30:
             raise InputError(
-                "fewer than 30 good pixels are left: the others are "
+                "fewer than 30 good pixels: the others are "
                 "masked, saturated too often, or do not fit the fringes; check the mask, the "
                 "bias frames and the level of the light"
             )

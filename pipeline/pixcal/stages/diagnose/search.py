@@ -180,7 +180,7 @@ class Search:
             estimate = remaining[name].estimate
             assert estimate is not None
             if size < least or estimate.effect.is_null:
-                remaining[name].reason = f"not significant ({size:.1f} sigma{beside})"
+                remaining[name].reason = f"not significant ({size:z.1f} sigma{beside})"
                 del remaining[name]
 
     def _tried(
