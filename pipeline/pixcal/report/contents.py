@@ -72,7 +72,7 @@ DETECTOR_MAPS = {
 
 @dataclass(frozen=True)
 class DetectorContents:
-    """What the reduction measured."""
+    """Results of ``pixcal reduce``."""
 
     facts: dict[str, Any] = field(default_factory=dict)  # `reduce.json`; empty where there is none
     # `bias` (ADU), `dark_rate` (e-/s), `flat`, `read_noise` (e-), those that exist
@@ -90,7 +90,7 @@ class DetectorContents:
 
 @dataclass(frozen=True)
 class DiagnosisContents:
-    """What ``pixcal diagnose`` found."""
+    """Results of ``pixcal diagnose``."""
 
     facts: dict[str, Any]  # `diagnosis.json`
     # of `curves.json`: each statistic as measured, as simulated, and with the effects
@@ -104,7 +104,7 @@ class DiagnosisContents:
 
 @dataclass(frozen=True)
 class StageRecord:
-    """What a stage's manifest says."""
+    """Facts from the manifest of a stage."""
 
     name: str
     key: str
@@ -136,7 +136,7 @@ class Contents:
 
     @property
     def has_fringes(self) -> bool:
-        """Whether the acquisition lists any."""
+        """Whether the acquisition lists fringes."""
         return bool(self.acquisition.get("frames", {}).get("fringes"))
 
     @property
@@ -151,7 +151,7 @@ class Contents:
 
     @property
     def nominal_effects(self) -> list[str]:
-        """Effects that the diagnosis took for granted."""
+        """Effects of the nominal simulation (``--nominal``)."""
         given = [s.config.get("nominal") for s in self.stages if s.name == "diagnose"]
         return list(given[0] or ()) if given else []
 

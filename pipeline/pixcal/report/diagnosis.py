@@ -63,7 +63,7 @@ def titles(result: DiagnosisContents, names: Sequence[str]) -> list[str]:
 
 
 def evidence(result: DiagnosisContents, cause: Facts) -> list[Facts]:
-    """Curves of the statistics that gave a cause away."""
+    """Curves of the statistics that are the evidence for a cause."""
     curves = {(c["statistic"], c["set"]): c for c in result.curves}
     keys = [(n["statistic"], n["set"]) for n in cause.get("given_away_by", ())[:PLOTS]]
     return [curves[key] for key in keys if key in curves]
@@ -239,7 +239,7 @@ def by_domain(gap: Facts) -> str:
 
 
 def rejected(result: DiagnosisContents) -> Table:
-    """Candidates that are no causes, the likeliest first."""
+    """Rejected candidates, the most likely first."""
     causes = {c["effect"] for c in result.facts["causes"]}
     tried = [c for c in result.facts["candidates"] if c["effect"] not in causes]
     rows = []

@@ -65,7 +65,7 @@ class ColourScale:
 
 
 def symmetric_scale(image: NDArray[Any], middle: float = 0.0) -> ColourScale:
-    """Three robust standard deviations on both sides of the middle."""
+    """Colours for three robust standard deviations on both sides of the middle."""
     reach = 3 * median_and_sigma(image)[1]
     if not reach > 0:
         finite = image[np.isfinite(image)]
@@ -74,7 +74,7 @@ def symmetric_scale(image: NDArray[Any], middle: float = 0.0) -> ColourScale:
 
 
 def span_scale(image: NDArray[Any]) -> ColourScale:
-    """From the 0.5th to the 99.5th percentile, a little wider."""
+    """Colours from the 0.5th to the 99.5th percentile, a little wider."""
     finite = image[np.isfinite(image)]
     low, high = np.percentile(finite, [0.5, 99.5]) if len(finite) else (0.0, 1.0)
     # A constant map still gets a scale with readable numbers.
@@ -174,7 +174,7 @@ def draw_blocks(
 def note(
     axes: Axes, text: str, at: tuple[float, float], aside: tuple[float, float], **style: Any
 ) -> None:
-    """A text some points (right, up) aside of a place."""
+    """A text beside a place, at a distance (right, up) in points."""
     axes.annotate(text, at, aside, textcoords="offset points", **style)
 
 

@@ -32,7 +32,7 @@ from pixcal.stages.correct.sweep_to_correct import (
     maps_of,
     padded,
 )
-from pixcal.stages.correct.uncertainty import left_over, task_bytes
+from pixcal.stages.correct.uncertainty import parameter_variance, task_bytes
 from pixcal.stages.evidence import Part
 from pixcal.stages.fit.sweep import BATCH_MAPS
 from pixcal.storage.artefact import read_json, write_json
@@ -131,7 +131,7 @@ def _correct_tile(
     factor = _noise_factor(swept, maps)[inside]
     own_error = ArrayReader(swept.folder / "sigma").read(y, x) * factor
     beside = _of_neighbours(swept, maps, after, known, part)[inside]
-    left = np.sum(left_over(swept, maps, good, inside), axis=0)
+    left = np.sum(parameter_variance(swept, maps, good, inside), axis=0)
     sigma = np.sqrt(own_error**2 + beside**2 + left).astype(np.float32)
     iota, alpha = after.theta[0][inside], np.hypot(after.theta[1], after.theta[2])[inside]
     variants: list[F64] = []

@@ -31,7 +31,7 @@ class Maps:
 
     before: Path  # before, after: `fit.zarr` and `corrected.zarr`
     after: Path
-    sets: Mapping[str, Swept]  # by name, as they were undone
+    sets: Mapping[str, Swept]  # by name, as they were corrected
     axes: Mapping[str, tuple[float, float]]  # unit vector (x, y) that each measures along
 
     @property
@@ -88,7 +88,8 @@ def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
 def worsened(sets: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> str:
     """Where the corrected maps are worse than those before; empty where they are not.
 
-    A wrong correction leaves a periodic pattern in a map, or sets apart that see the same offsets.
+    A wrong correction leaves a periodic pattern in a map, or makes sets disagree that measure the
+    same offsets.
     """
     for name, facts in sets.items():
         for lines in ("rows", "columns"):

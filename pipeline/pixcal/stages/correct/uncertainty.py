@@ -1,4 +1,4 @@
-"""What the errors of an effect's parameters leave in the corrected offsets."""
+"""Errors of the corrected offsets from the errors of an effect's parameters."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ from pixcal.stages.fit.scouting import scout_tiles
 PIXEL_BYTES = 500
 EFFECT_BYTES = 40  # for each effect,
 SLOPE_BYTES = 24  # and for each parameter whose slope is taken
-TILES = 9  # tiles, spread over the window, that tell for all: errors of parameters repeat over it
+TILES = 9  # tiles, spread over the window, that represent all of it
 
 
 def moved(effect: Effect, errors: Mapping[str, float]) -> list[Effect]:
@@ -52,7 +52,7 @@ def _add(plain: Any, path: Sequence[str], step: float) -> None:
 
 
 def parameter_errors(swept: Swept, runtime: Runtime) -> dict[str, float | None]:
-    """Rms (px) of what the errors of each effect's parameters leave in the offsets of a set.
+    """Rms error (px) of the offsets of a set from the errors of each effect's parameters.
 
     None where no errors are given.
     """
@@ -66,7 +66,7 @@ def parameter_errors(swept: Swept, runtime: Runtime) -> dict[str, float | None]:
 
 
 def task_bytes(swept: Swept) -> int:
-    """Peak of a tile's task that undoes its effects and takes the slopes of their parameters."""
+    """Peak memory of a task that corrects a tile and computes the slopes of the parameters."""
     slopes = [0 if t.covariance is None else len(t.covariance) for t in swept.treatments]
     cy, cx = swept.source.signal.chunks[1:]
     pixel = PIXEL_BYTES + EFFECT_BYTES * len(slopes) + SLOPE_BYTES * max(slopes, default=0)
@@ -82,17 +82,18 @@ def _tile(swept: Swept, at: tuple[int, int]) -> list[tuple[float, int]]:
     some = good[inside]
     return [
         (float(variance[some].sum()) / size**2, int(some.sum()))
-        for variance in left_over(swept, maps, good, inside)
+        for variance in parameter_variance(swept, maps, good, inside)
     ]
 
 
-def left_over(swept: Swept, maps: FringeMaps, good: Mask, inside: tuple[slice, slice]) -> list[F64]:
-    """Variance of the phase (y, x), rad², that the errors of each effect's parameters leave.
+def parameter_variance(
+    swept: Swept, maps: FringeMaps, good: Mask, inside: tuple[slice, slice]
+) -> list[F64]:
+    """Variance of the phase (y, x), rad², from the errors of each effect's parameters.
 
-    Where their covariance is known and the effect tells what each does (`Effect.phase_slopes`), all
-    together; else parameters are moved one by one, and what each does is added in squares. Modes
-    that the fit removes are taken off, tile by tile: ``inside`` the maps of a tile and its
-    surroundings.
+    If their covariance and `Effect.phase_slopes` are known, all parameters are taken together.
+    Otherwise they are moved one by one and their squared changes added. Modes that the fit removes
+    are subtracted tile by tile: ``inside`` is the tile within maps that include its surroundings.
     """
     variances = []
     for treatment in swept.treatments:
