@@ -32,6 +32,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--bias", type=int, default=40)
     parser.add_argument("--flats", type=int, default=40)
     parser.add_argument("--darks", type=int, default=0, help="of one second")
+    parser.add_argument("--sets", type=int, choices=(1, 2), default=2, help="of fringes")
     parser.add_argument("--list", action="store_true", help="list the cases")
     parser.add_argument("--json", action="store_true", help="list them for programs")
     return parser
@@ -63,7 +64,7 @@ def main(arguments: list[str] | None = None) -> int:
     if asked.out and asked.truth.resolve().is_relative_to(asked.out.resolve()):
         parser.error(f"--truth {asked.truth}: inside {asked.out}; keep the truth apart")
     shape = asked.size[0] + 2 * MARGIN, asked.size[1] + 2 * MARGIN
-    layout = Layout(shape, asked.frames, asked.bias, asked.darks, asked.flats)
+    layout = Layout(shape, asked.frames, asked.bias, asked.darks, asked.flats, asked.sets)
     plain = asked.bench == "plain"
     try:
         bench, truth = make_case(asked.case, asked.seed, layout, asked.strength, plain)

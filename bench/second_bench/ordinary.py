@@ -4,6 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from second_bench.less_common import (
+    LESS_COMMON,
+    SHARE,
+    vary_camera,
+    vary_light,
+    vary_runs,
+    without_dropped,
+)
 from second_bench.model import (
     EXPTIME_S,
     F64,
@@ -19,7 +27,7 @@ from second_bench.model import (
 VARIATIONS = (
     "aim", "centred", "radii", "powers", "read_noise", "dust", "phases", "amplifiers",
     "bad_pixels", "gain", "period", "rotated", "ambient",
-    "declared_gain", "stitches", "noisy_pixels", "lamp",
+    "declared_gain", "stitches", "noisy_pixels", "lamp", *LESS_COMMON,
 )  # fmt: skip
 """What differs from bench to bench."""
 CHANCE = {
@@ -33,6 +41,7 @@ CHANCE = {
     "stitches": 0.3,
     "noisy_pixels": 0.3,
     "lamp": 0.5,
+    **SHARE,
 }
 """With which probability, where that is not one."""
 PITCH_UM, WAVELENGTH_NM, DISTANCE_MM, PERIOD_S = 4.4, 632.8, 400.0, 0.14
@@ -52,6 +61,8 @@ class Layout:
         Of each fringe set.
     bias, dark, flat : int
         Frames; darks last 1 s.
+    sets : int
+        Fringe sets: 2, or 1 with the first direction alone.
     """
 
     shape: tuple[int, int] = (128, 128)
@@ -59,6 +70,7 @@ class Layout:
     bias: int = 40
     dark: int = 0
     flat: int = 40
+    sets: int = 2
 
 
 def draw_variations(seed: int) -> set[str]:
@@ -98,9 +110,12 @@ def draw_bench(layout: Layout, seed: int, varied: set[str]) -> Bench:
     )  # fmt: skip
     bench.notes = {"gain_e_per_adu": gain, "read_noise_e": read, "peak_e": peak}
     _vary_detector(bench, varied)
-    bench.sets = _draw_sets(bench, varied)
+    vary_camera(bench, varied)
+    bench.sets = _draw_sets(bench, varied)[: layout.sets]
+    vary_light(bench, varied)
     bench.flat_response = bench.response * (_lamp(bench) if "lamp" in varied else 1.0)
     bench.runs = _draw_runs(bench, layout, varied)
+    vary_runs(bench, varied)
     return bench
 
 
@@ -197,6 +212,8 @@ def _draw_sets(bench: Bench, varied: set[str]) -> list[FringeSet]:
     found = []
     for n, name in enumerate(("vertical", "horizontal")):
         period = np.exp(rng.uniform(np.log(5), np.log(20))) if "period" in varied else 9.0
+        if "long_period" in varied:
+            period = stream(bench.seed, "long period", name).uniform(20, 32)
         angle = turn + n * np.pi / 2
         length = WAVELENGTH_NM * 1e-6 * DISTANCE_MM / (period * PITCH_UM * 1e-3)
         declared = np.round(length * np.array([np.cos(angle), np.sin(angle)]), 3)
@@ -263,7 +280,9 @@ def _draw_runs(bench: Bench, layout: Layout, varied: set[str]) -> list[Run]:
         run = new_run(one.name, "fringes", layout.frames, layout.shape[0], EXPTIME_S, start, n)
         start += run.frames * PERIOD_S + PAUSE_S
         law = str(rng.choice(PHASE_LAWS)) if "phases" in varied else "random"
-        run.phase = draw_phases(law, run.frames, rng)
+        lost = 3 if "dropped_frames" in varied else 0
+        phases = draw_phases(law, run.frames + lost, rng)
+        run.phase = without_dropped(phases, lost, stream(bench.seed, "dropped", one.name))
         bench.notes[one.name]["phases"] = law
         runs.append(run)
     return runs

@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from second_bench.__main__ import main
 from second_bench.camera import record
 from second_bench.cases import CaseError, make_case
 from second_bench.effects import LAWS, Law
-from second_bench.model import Bench, Frame, stream
+from second_bench.model import WARM_UP, Bench, Frame, stream
 from second_bench.optics import expose, gaussian, light_of
 from second_bench.ordinary import VARIATIONS, Layout
 
@@ -219,7 +220,46 @@ def test_stitches_shift_blocks_and_a_lamp_falls_off() -> None:
 def test_one_variation_alone_is_no_effect(name: str) -> None:
     bench, truth = make_case(f"ordinary/{name}", 4, SMALL)
     assert truth["effects"] == []
-    assert not [*bench.charge, *bench.signal, *bench.offset, *bench.samples]
+    assert not [*bench.charge, *bench.signal, *bench.offset]
+    assert bool(bench.samples) == (name == "bad_frames")
+
+
+def test_less_common_variations_change_what_they_say() -> None:
+    plain = make_case("ordinary/centred", 4, SMALL)[0]
+
+    def with_one(name: str) -> Bench:
+        return make_case(f"ordinary/{name}", 4, SMALL)[0]
+
+    noise = with_one("noise_tail").read_noise_e / plain.read_noise_e
+    assert noise.max() > 1.8 * np.median(noise)
+    assert 10 <= with_one("coarse_gain").gain_e_per_adu <= 16
+    hot = with_one("hot_clusters").dark_e > plain.dark_e + 299
+    beside = hot[:, 1:] & hot[:, :-1]
+    assert hot.sum() > 3
+    assert beside.any()
+    for one in with_one("dim_fringes").sets:
+        assert 0.25 <= one.coherence <= 0.45
+    for one in with_one("far_aims").sets:
+        assert np.hypot(*(one.beams[0].aim_mm - one.beams[1].aim_mm)) == pytest.approx(10)
+    sets = zip(with_one("levels").sets, plain.sets, strict=True)
+    assert all(one.peak_e < other.peak_e for one, other in sets)
+    phases = [b.fringe_runs()[0].phase for b in (with_one("phase_errors"), plain)]
+    assert 0.01 < np.std(phases[0] - phases[1]) < 0.2
+
+
+def test_a_cut_frame_is_zero_from_some_row_on() -> None:
+    bench = make_case("ordinary/bad_frames", 4, SMALL)[0]
+    cubes = frames(bench)
+    for name, index, row in bench.notes["bad_frames"]:
+        frame = cubes[name][index - WARM_UP]
+        assert not frame[row:].any()
+        assert frame[:row].all()
+
+
+def test_one_set_may_be_all_there_is() -> None:
+    bench, _ = make_case("ordinary", 4, replace(SMALL, sets=1))
+    assert [one.name for one in bench.sets] == ["vertical"]
+    assert [run.name for run in bench.fringe_runs()] == ["vertical"]
 
 
 def test_the_command_writes_an_acquisition_and_its_truth_apart(tmp_path: Path) -> None:
