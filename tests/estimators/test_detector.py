@@ -124,6 +124,14 @@ def test_the_usual_variance_is_unbiased_and_robust(dof: int) -> None:
     assert np.isnan(usual_variance(variance, 0))
 
 
+@pytest.mark.parametrize("noise", [5.3, 9.7, 15.0])
+def test_the_usual_variance_of_pairs_of_whole_numbers_lies_between_theirs(noise: float) -> None:
+    pairs = np.rint(noise * np.random.default_rng(5).standard_normal((2, 20_000)))
+    assert usual_variance(pairs.var(axis=0, ddof=1), 1) == pytest.approx(
+        noise**2 + 1 / 12, rel=0.05
+    )
+
+
 def test_median_and_sigma_of_a_gaussian_with_outliers() -> None:
     values = np.random.default_rng(2).normal(5, 3, 100_000)
     values[:100], values[100:200] = np.nan, 1e9

@@ -52,3 +52,13 @@ def test_of_pixels_that_are_just_not_full_all_is_kept() -> None:
 def test_without_an_end_nothing_is_left_out(read: float, bend: float) -> None:
     rungs, _ = ladder(1e9, read_e=read, bend=bend)
     assert all(np.isfinite(rung.signal).all() for rung in unsaturated(rungs))
+
+
+def test_dim_levels_whose_noise_is_high_by_chance_are_no_slope() -> None:
+    noise = (280.0, 290.0, 310.0, 340.0, 390.0)
+    levels = (52.0, 340.0, 620.0, 910.0, 1200.0)
+    rungs = [
+        Rung(1.0 + n, 2, np.full(SHAPE, level), np.full(SHAPE, variance / 2))
+        for n, (level, variance) in enumerate(zip(levels, noise, strict=True))
+    ]
+    assert all(np.isfinite(rung.signal).all() for rung in unsaturated(rungs, 235.0))

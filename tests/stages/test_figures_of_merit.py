@@ -149,6 +149,30 @@ def test_the_step_of_the_codes_is_found(tmp_path: Path) -> None:
     assert "steps of 4 ADU" in found["read_noise_with_rounding"]["note"]
 
 
+def test_what_frames_without_exposure_times_do_not_tell_is_said(tmp_path: Path) -> None:
+    rng, shape = np.random.default_rng(6), (64, 64)
+    lights = {"bias": [0.0] * 8, "dark": [3.0] * 6 + [90.0] * 6, "flat": [400, 900, 2000, 5000]}
+    for kind, levels in lights.items():
+        mean = np.repeat(levels, 2 if kind == "flat" else 1)[:, None, None]
+        signal = rng.poisson(np.broadcast_to(mean, (len(mean), *shape))) + READ * (
+            rng.standard_normal((len(mean), *shape))
+        )
+        samples = 16 * np.rint(100 + signal / GAIN)
+        fits.writeto(tmp_path / f"{kind}.fits", samples.astype(np.uint16))
+    listed = {
+        "schema": "pixcal/acquisition/1",
+        "detector": {"name": "CAM", "pitch_um": 5.5, "gain_e_per_adu": GAIN, "read_noise_e": READ},
+        "frames": {kind: [f"{kind}.fits"] for kind in lights},
+    }
+    (tmp_path / "acquisition.yaml").write_text(yaml.safe_dump(listed))
+    found = pixcal.reduce(pixcal.ingest(tmp_path, tmp_path / "run")).reduction
+    gain = found["gain_e_per_adu"]
+    assert abs(gain["measured"] - GAIN / 16) < 4 * gain["error"]
+    for sentence in ("of several levels", "linearity is not measured", "divided by 16"):
+        assert any(sentence in warning for warning in found["warnings"]), sentence
+    assert "dark_current" not in found["figures_of_merit"]
+
+
 def test_noise_of_rows_is_told_from_that_of_pixels(tmp_path: Path) -> None:
     noise = camera_run(tmp_path, {"bias": (0, 40, 1, 2.0), "flat": (30000, 8, 1, 2.0)})["row_noise"]
     assert abs(noise["value"] - 2.0) < 4 * noise["error"] < 0.4

@@ -12,6 +12,7 @@ from pixcal.effects.gain_error import GainError
 from pixcal.effects.lag import Lag
 from pixcal.effects.nonlinearity import Nonlinearity
 from pixcal.estimators.detector.flat_ladder import ladder as ladder_of
+from pixcal.estimators.detector.flat_ladder import level_before
 from pixcal.estimators.diagnosis.test_statistics import DETECTOR, measure
 from pixcal.estimators.diagnosis.test_statistics.look import STEPS
 from pixcal.stages import reduce
@@ -93,8 +94,10 @@ def test_exposures_that_all_last_longer_are_no_response(tmp_path: Path) -> None:
     assert found.significance < 3
 
 
-@pytest.mark.parametrize("share", [0.0, 0.01])
-def test_pairs_of_flats_tell_of_charge_that_stays_behind(share: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("share", "carried"), [(0.0, False), (0.01, False), (0.01, True)])
+def test_pairs_of_flats_tell_of_charge_that_stays_behind(
+    share: float, carried: bool, tmp_path: Path
+) -> None:
     flats = ladder(list(zip(LEVELS, 1 + 0.001 * np.arange(12), strict=True)))
     evidence, _ = reduced(Detector(**CAMERA, flats=flats), 15, tmp_path)
     rng, stacks = np.random.default_rng(3), []
@@ -102,14 +105,17 @@ def test_pairs_of_flats_tell_of_charge_that_stays_behind(share: float, tmp_path:
         adu = stack.adu - evidence.bias
         if stack.kind == "flat":
             adu *= 1 + 0.001 * rng.standard_normal((2, 1, 1))
-            adu[0] *= 1 - share
+            before = level_before(stack, evidence) / (2.3 * adu.mean()) if carried else 0.0
+            adu[0] *= 1 - share * (1 - before)
         stacks.append(replace(stack, adu=(adu + evidence.bias).astype(np.float32)))
     found = Lag.estimate(replace(evidence, stacks=tuple(stacks)))
     assert found is not None
     assert isinstance(found.effect, Lag)
     assert found.effect.share == pytest.approx(share, abs=4 * found.errors["share"])
-    assert found.errors["share"] < 0.001
+    assert found.errors["share"] < (0.002 if carried else 0.001)
     assert (found.significance > 5) == (share > 0)
+    first = measure(replace(evidence, stacks=tuple(stacks)))["first_flats", DETECTOR]
+    assert first.value[int(carried)] == pytest.approx(-share, abs=0.002)
 
 
 def test_noise_that_is_cut_off_at_code_zero_is_told_of(tmp_path: Path) -> None:
@@ -160,6 +166,19 @@ def test_full_wells_below_the_highest_code_are_no_response(tmp_path: Path) -> No
     assert report["flags"]["nonlinear"] <= 0.001 * 96**2
     assert report["gain_e_per_adu"]["measured"] == pytest.approx(2.3, rel=0.02)
     assert np.std(evidence.flat[evidence.good]) == pytest.approx(0.03, rel=0.05)
+
+
+def test_wells_that_end_just_below_the_highest_code_are_not_the_converters_end(
+    tmp_path: Path,
+) -> None:
+    well = 0.98 * 2.3 * (4095 - 200.4)
+    flats = ladder([(1.4 * t, 1) for t in LEVELS], 4)
+    camera = Detector(**CAMERA, flats=flats, response=lambda e: np.minimum(e, well))
+    _, report = reduced(camera, 6, tmp_path)
+    assert report["saturation_adu"]["found"] is None
+    found = report["figures_of_merit"]["saturation"]
+    assert 0 < well / 2.3 - found["value"] < 3 * found["error"]
+    assert any("fill the wells" in warning for warning in report["warnings"])
 
 
 def test_flats_with_full_wells_are_not_diagnosed() -> None:

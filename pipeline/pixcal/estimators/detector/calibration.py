@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
+from scipy.special import chdtr, chdtri
 
 from pixcal.kernels.robust import lit, median_and_sigma
 from pixcal.model.arrays import F64, Mask
@@ -16,6 +16,7 @@ MIN_RUNGS = 3  # fewest exposure times that tell a straight line from a bent one
 # response that bends by a fifth lessens it to 0.64.
 COLLAPSED = 0.25
 SHOT = 0.1  # shot noise over the noise without light, in variance, from which a level tells a slope
+_OUTLYING, _CLIPPINGS = 0.01, 3  # chance of a variance that is left out of the mean; times
 NEARLY = 0.02  # relative distance from a pixel's own full well within which its signal is not used
 
 
@@ -90,7 +91,14 @@ def usual_variance(variance: NDArray[Any], dof: int) -> float:
     if dof < 1:
         return np.nan
     # The median of a variance of few samples is below its mean.
-    return median_and_sigma(variance)[0] * dof / float(chdtri(dof, 0.5))
+    usual = median_and_sigma(variance)[0] * dof / float(chdtri(dof, 0.5))
+    # Variances of few whole numbers come in steps: a mean without outliers lies between them.
+    limit = float(chdtri(dof, _OUTLYING))
+    kept = float(chdtr(dof + 2, limit) / chdtr(dof, limit))
+    for _ in range(_CLIPPINGS):
+        inside = variance[variance * dof <= limit * usual]
+        usual = float(inside.mean(dtype=float)) / kept if inside.size else usual
+    return usual
 
 
 def step_levels(rungs: Sequence[Rung]) -> F64:
@@ -151,13 +159,14 @@ def unsaturated(rungs: Sequence[Rung], dark_variance: float = 0.0) -> list[Rung]
     """
     levels = step_levels(rungs)
     seen = lit(np.fmax.reduce([rung.signal for rung in rungs]))
-    full, least = np.zeros(len(rungs), np.bool_), np.inf
+    full, least, most = np.zeros(len(rungs), np.bool_), np.inf, 0.0
     for n in np.argsort(levels):
         if not levels[n] > 0:
             continue
         noise = median_and_sigma(rungs[n].variance[seen] * rungs[n].frames)[0]
         slope = (noise - dark_variance) / levels[n]
-        full[n] = np.isfinite(least) and slope < COLLAPSED * least
+        full[n] = slope < COLLAPSED * least < np.inf and noise < most
+        most = max(most, noise)
         if not full[n] and noise > (1 + SHOT) * dark_variance:
             least = min(least, slope)
     if not full.any():

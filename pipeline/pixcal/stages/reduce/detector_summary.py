@@ -118,7 +118,7 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     # Pixels that are full saturate the flats though no sample of the converter does.
     points = transfer_points(sums[1])
     well = saturation(points)
-    full = usable & (levels > (well[0] if well else math.inf))
+    full = usable & (levels > (sum(well) if well else math.inf))
     usable &= ~full
     light = _light(tables, levels, usable, job)
     medians = usual(job, folder, light)

@@ -5,6 +5,7 @@ from pixcal.stages.reduce.detector_summary import Summary
 
 _NO_LINE = 10.0  # reduced chi-square of a photon-transfer curve that is no line
 _LINEARITY = 0.02
+_OF_STEP = 0.1  # relative distance of a gain declared for a step of the converter
 
 
 def detector_warnings(summary: Summary, gain: float, saturation: float | None) -> list[str]:
@@ -26,7 +27,13 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
             "linearity; declare detector.saturation_adu if it is another level"
         )
     if summary.gain is not None:
-        found += _of_gain(summary.gain, summary.declared.gain_e_per_adu, gain)
+        found += _of_gain(summary.gain, summary, gain)
+    if summary.full.any():
+        levels = summary.levels[summary.full]
+        found.append(
+            f"flats from {levels.min():.0f} ADU above bias on fill the wells: {len(levels)} of "
+            f"{len(summary.levels)} levels are left out of gain and linearity"
+        )
     if summary.linearity is not None and summary.linearity.max_deviation > _LINEARITY:
         found.append(
             f"the levels of the flats are up to {100 * summary.linearity.max_deviation:.2g} % off "
@@ -44,8 +51,8 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
     return found
 
 
-def _of_gain(fit: GainFit, declared: float, used: float) -> list[str]:
-    found = []
+def _of_gain(fit: GainFit, summary: Summary, used: float) -> list[str]:
+    found, declared, step = [], summary.declared.gain_e_per_adu, summary.step
     if fit.chi2_reduced > _NO_LINE:
         found.append(
             "the photon-transfer curve is not a straight line (reduced chi-square "
@@ -77,6 +84,12 @@ def _of_gain(fit: GainFit, declared: float, used: float) -> list[str]:
         found.append(
             f"photon transfer gives a gain of {value:.4g} ± {error:.2g} e-/ADU, not the "
             f"{declared:g} of detector.gain_e_per_adu: "
+            + (
+                f"samples are multiples of {step:g} ADU, so the gain of one step of the converter "
+                f"must be divided by {step:g}; "
+                if step > 1 and abs(value * step - declared) < _OF_STEP * declared
+                else ""
+            )
             + (
                 "correct it, or use '--gain measured'; the declared value is used now"
                 if used == declared

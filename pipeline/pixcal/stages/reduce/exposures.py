@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from pixcal.estimators.detector.calibration import MIN_RUNGS
 from pixcal.model.arrays import F32
 
 # exposure times are the same within this relative distance: cameras write what they measured
@@ -131,9 +132,14 @@ def _group_flats(found: Exposures, times: list[float | None], steps: Sequence[in
     if not found.flat:
         found.known = False
         found.flat = _groups("flat", [1.0] * len(times), steps)
-        if found.has_rate:
+        lost = ["linearity is not measured"] if len(found.flat) >= MIN_RUNGS else []
+        lost += ["their dark signal is not removed"] if found.has_rate else []
+        if lost:
             lacking = "an EXPTIME of 0" if unexposed else "no EXPTIME"
-            found.warnings.append(f"flat frames have {lacking}: their dark signal is not removed")
+            found.warnings.append(
+                f"flat frames have {lacking}: {' and '.join(lost)}; write exposure times into the "
+                "headers (for TIFF and PNG into headers.csv)"
+            )
     elif unknown:
         found.warnings.append(f"{unknown} of {len(times)} flat frames have no EXPTIME: not used")
     elif unexposed:

@@ -64,7 +64,8 @@ def characterise(
     gain = _gain(facts)
     dark, lit = pair_sums(made.scratch / "statistics", job)
     points = transfer_points(add_neighbours(lit, dark)[0])
-    top, reached = _top(points, summary, job)
+    clipped = (source.detector.saturation_adu or source.saturation_found) is not None
+    top, reached = _top(points, summary, job, clipped)
     top = top if job.dark else None  # levels above an unknown bias say nothing
     middle = middle_of(source.shape)
     halves = read_halves(made, source, summary, top, middle, runtime)
@@ -153,15 +154,20 @@ def _lamp_error(source: Ingested) -> float | None:
     return 100 * math.sqrt(float(np.mean(ratios))) if ratios else None
 
 
-def _top(points: F64, summary: Summary, job: Measuring) -> tuple[Measure | None, bool]:
-    """Saturation above bias (ADU) with its error, or the highest level, and whether it is one."""
+def _top(
+    points: F64, summary: Summary, job: Measuring, clipped: bool
+) -> tuple[Measure | None, bool]:
+    """Saturation above bias (ADU) with its error, or the highest level, and whether it is one.
+
+    ``clipped`` tells whether samples end at a code, and not the wells.
+    """
     peak, end = saturation(points), job.saturation - summary.usual.bias
-    if peak is not None and peak[0] + 2 * peak[1] < _WELL * end:
+    if peak is not None and (not clipped or peak[0] + 2 * peak[1] < _WELL * end):
         return peak, True
     if not len(summary.levels) or not summary.usable.any():
         return None, False
-    if (peak is not None or not summary.usable.all()) and math.isfinite(end):
-        return (end, 0.5), True
+    if clipped and (peak is not None or not summary.usable.all()):
+        return (end, job.quantum / 2), True
     return (float(summary.levels[summary.usable].max()), 0.0), False
 
 

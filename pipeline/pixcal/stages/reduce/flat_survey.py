@@ -1,4 +1,4 @@
-"""What flats show at first sight: how bright each frame is, and where samples saturate.
+"""What frames show at first sight: how bright each one is, and where samples saturate.
 
 Frames of one exposure time may be of several levels, where the lamp was changed. Where a converter
 or a well ends, samples pile up at their highest code.
@@ -22,6 +22,9 @@ APART = 0.05  # relative distance of two levels that are not one lamp's flicker
 MIN_SHARE = 1e-3  # of the samples of a frame that lie at the highest code at least
 MIN_SAMPLES = 50
 NEIGHBOURS = 16  # codes below the highest that are held against it
+# least step between levels of darks: over the median step, and over the noise of a sample
+MIN_DARKS = 5  # fewest steps that tell
+JUMP, NOTABLE = 20.0, 0.1
 PILED = 4  # how many times as many samples as at any of these are a pile
 
 
@@ -63,6 +66,16 @@ class FlatSurvey:
             levels = self.levels[order]
             found[order[1:]] = np.cumsum(np.diff(levels) > APART * np.maximum(levels[1:], 1.0))
         return [int(step) for step in found]
+
+
+def of_several_levels(frames: Reader) -> bool:
+    """Whether frames without light fall into groups of levels far apart: of exposure times."""
+    some = [middle_rows(frames, n, n + 1)[0].astype(float) for n in range(frames.shape[0])]
+    steps = np.diff(np.sort([np.nanmean(one) for one in some]))
+    if len(steps) < MIN_DARKS:
+        return False
+    noise = float(np.nanstd(some[1] - some[0])) / math.sqrt(2)
+    return bool(steps[1:-1].max() > max(JUMP * float(np.median(steps)), NOTABLE * noise))
 
 
 def share_at_zero(frames: Reader) -> float:

@@ -12,7 +12,7 @@ import numpy as np
 from pixcal.model.acquisition import Detector
 from pixcal.model.errors import InputError
 from pixcal.stages.reduce.exposures import Exposures, group_exposures
-from pixcal.stages.reduce.flat_survey import FlatSurvey, code_step
+from pixcal.stages.reduce.flat_survey import FlatSurvey, code_step, of_several_levels
 from pixcal.storage.artefact import read_json, read_manifest
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
@@ -46,11 +46,26 @@ class Ingested:
 
     @cached_property
     def tables(self) -> dict[str, dict[str, list[Any]]]:
-        """Columns of facts on the frames of each array; of flats also the ``step`` of the lamp."""
-        flat = self._listed.get("flat")
+        """Columns of facts on the frames of each array; of flats also the ``step`` of the lamp.
+
+        Without darks that are of several exposure times which nobody knows.
+        """
+        listed = {k: v for k, v in self._listed.items() if k != "dark" or not self._mixed_darks}
+        flat = listed.get("flat")
         if self.survey is None or flat is None or "step" in flat:
-            return self._listed
-        return self._listed | {"flat": flat | {"step": self.survey.steps(flat["exptime_s"])}}
+            return listed
+        return listed | {"flat": flat | {"step": self.survey.steps(flat["exptime_s"])}}
+
+    @cached_property
+    def _mixed_darks(self) -> bool:
+        """Whether darks of unknown exposure times are of several, beside bias frames."""
+        dark = self._listed.get("dark")
+        return (
+            dark is not None
+            and "bias" in self._listed
+            and all(t is None for t in dark["exptime_s"])
+            and of_several_levels(self.arrays["dark"])
+        )
 
     @cached_property
     def survey(self) -> FlatSurvey | None:
@@ -60,7 +75,13 @@ class Ingested:
     @cached_property
     def exposures(self) -> Exposures:
         """Groups of the calibration frames, exposure times of the others."""
-        return group_exposures(self.tables)
+        found = group_exposures(self.tables)
+        if self._mixed_darks:
+            found.warnings.append(
+                "dark frames have no EXPTIME and are of several levels: not used; write exposure "
+                "times into the headers (for TIFF and PNG into headers.csv)"
+            )
+        return found
 
     @cached_property
     def arrays(self) -> Mapping[str, Reader]:

@@ -5,7 +5,12 @@ from itertools import pairwise
 import numpy as np
 from scipy.fft import dct
 
-from pixcal.estimators.detector.flat_ladder import FLICKER_KNOWN, flicker, light_of
+from pixcal.estimators.detector.flat_ladder import (
+    FLICKER_KNOWN,
+    flicker,
+    level_before,
+    light_of,
+)
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
 from pixcal.estimators.diagnosis.test_statistics.look import Look
@@ -165,12 +170,19 @@ def _of_stacks(kind: str) -> Statistic:
     "time", "first flat of each level against the next ones", "relative intensity", sets=False
 )
 def first_flats(evidence: Evidence) -> Curve | None:
-    """Mean over the levels of the relative change; a lamp that flickers changes each by itself."""
-    every = [light_of(evidence, s) for s in evidence.ladder if len(s.adu) > 1]
+    """Relative change: mean over the levels, and slope against the rise from the frame before.
+
+    A lamp that flickers changes each level by itself. Lag changes the first frame by a share of the
+    rise, which is large only where the ladder begins.
+    """
+    stacks = [s for s in evidence.ladder if len(s.adu) > 1]
+    every = [light_of(evidence, s) for s in stacks]
     if flicker(evidence)[1] < FLICKER_KNOWN or min(light.mean() for light in every) <= 0:
         return None
-    steps = [float(light[0] / light[1:].mean()) - 1 for light in every]
-    return Curve(np.zeros(1), np.array([np.mean(steps)]))
+    steps = np.array([float(light[0] / light[1:].mean()) - 1 for light in every])
+    before = np.array([level_before(s, evidence) for s in stacks])
+    lacking = 1 - before / [light.mean() for light in every]
+    return Curve(np.arange(2.0), np.array([steps.mean(), steps @ lacking / (lacking @ lacking)]))
 
 
 MIN_FRAMES = 8
