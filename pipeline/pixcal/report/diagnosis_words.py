@@ -60,7 +60,7 @@ def answer(diagnosis: DiagnosisContents) -> str:
             f"No gap: on held-out frames, none of {tested} statistics differs significantly from "
             "the nominal simulation."
         )
-    where = main_domains(gap)
+    where = _main_domain(gap, residual=False)
     if verdict == "unexplained":
         return (
             f"Unexplained: the data differ from the nominal simulation in {count} of {tested} "
@@ -79,7 +79,7 @@ def answer(diagnosis: DiagnosisContents) -> str:
     return (
         f"{verdict[:1].upper()}{verdict[1:]}: {causes} close{'s' if one else ''} "
         f"{percent(1 - gap['after'])} of the gap between the data and the nominal simulation. The "
-        f"{left}{where_left(gap)}, measured on held-out frames."
+        f"{left}{_main_domain(gap, residual=True)}, measured on held-out frames."
     )
 
 
@@ -88,17 +88,9 @@ def differing(diagnosis: DiagnosisContents) -> int:
     return sum(bool(c["in_gap"]) for c in diagnosis.curves)
 
 
-def main_domains(gap: Mapping[str, Any]) -> str:
+def _main_domain(gap: Mapping[str, Any], *, residual: bool) -> str:
     """', mostly in noise', or an empty text where no domain dominates."""
-    return _mostly({d: v[0] for d, v in gap.get("domains", {}).items()})
-
-
-def where_left(gap: Mapping[str, Any]) -> str:
-    """The same for the residual gap."""
-    return _mostly({d: v[1] for d, v in gap.get("domains", {}).items()})
-
-
-def _mostly(shares: Mapping[str, float]) -> str:
+    shares = {domain: ends[residual] for domain, ends in gap.get("domains", {}).items()}
     whole = sum(shares.values())
     most = max(shares, key=lambda d: shares[d], default="")
     return f", mostly in {most}" if whole > 0 and shares[most] > 0.5 * whole else ""

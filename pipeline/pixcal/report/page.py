@@ -44,14 +44,7 @@ FIGURES = (
     | vars(diagnosis_figures) | vars(diagnosis_maps)
 )  # fmt: skip
 DATA = vars(tables) | vars(diagnosis) | vars(diagnosis_maps)
-FILTERS = {
-    **{f.__name__: f for f in (verdict.headline, verdict.cards, verdict.findings)},
-    **{f.__name__: f for f in (diagnosis_words.answer, diagnosis_words.level)},
-    **{f.__name__: f for f in (diagnosis_words.listed, diagnosis_words.residual_gap)},
-    **{f.__name__: f for f in (tables.is_table, tables.patterns, tables.saturation)},
-    "effect_title": diagnosis_words.effect_title,
-    "number": text.number,
-}
+FILTERS = vars(verdict) | vars(diagnosis_words) | vars(tables)
 
 
 def render(contents: Contents) -> str:

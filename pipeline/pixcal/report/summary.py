@@ -64,9 +64,7 @@ class RatioSource:
 
     def read(self, *ranges: tuple[int, int]) -> F32:
         """A block."""
-        above, below = self.above.read(*ranges), self.below.read(*ranges)
-        empty = np.full(above.shape, np.nan, np.float32)
-        return np.asarray(np.divide(above, below, out=empty, where=below > 0))
+        return _ratio(self.above.read(*ranges), self.below.read(*ranges))
 
 
 @dataclass(frozen=True)
@@ -134,8 +132,8 @@ def _block_sums(values: NDArray[Any], good: Mask, side: int) -> tuple[F64, F64]:
     return sums(np.where(good, values, 0)), sums(good)
 
 
-def _ratio(above: F64, below: NDArray[Any]) -> F64:
-    empty = np.full(above.shape, np.nan)
+def _ratio(above: NDArray[Any], below: NDArray[Any]) -> Any:
+    empty = np.full(above.shape, np.nan, above.dtype)
     return np.asarray(np.divide(above, below, out=empty, where=below > 0))
 
 
