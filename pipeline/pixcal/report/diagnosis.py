@@ -36,10 +36,7 @@ def causes(result: DiagnosisContents) -> Table:
         alike = listed(cause["not_told_apart_from"] or ["–"], "or")
         unique = percent(cause["gain_over_rest"])
         rows.append([title, alone, unique, chance(cause["p_value"]), alike])
-    header = [
-        "cause", "gap closed alone", "gap reopened when removed", "p-value",
-        "indistinguishable from",
-    ]  # fmt: skip
+    header = ["cause", "gap closed", "unique share", "p-value", "indistinguishable from"]
     return Table("Causes", header, rows)
 
 
@@ -247,7 +244,7 @@ def rejected(result: DiagnosisContents) -> Table:
         size = _sigma(c["sigmas"]) if "sigmas" in c else "–"
         closed = percent(c["gap_closed"]) if c.get("tried_on_unseen_frames") else "–"
         rows.append([effect_title(result, c["effect"]), size, closed, c["rejected_because"]])
-    header = ["effect", "significance (σ)", "gap closed alone", "reason"]
+    header = ["effect", "significance (σ)", "gap closed", "reason"]
     return Table("Rejected effects", header, rows)
 
 

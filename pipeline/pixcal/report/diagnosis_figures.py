@@ -117,11 +117,11 @@ def _causes(axes: Axes, causes: Sequence[Closed]) -> None:
     rows = range(len(causes))
     axes.plot(
         [100 * c.alone for c in causes], rows, "o", color=BLUE, markersize=8,
-        label="closed by the cause alone",
+        label="gap closed",
     )  # fmt: skip
     axes.plot(
         [100 * c.over_rest for c in causes], rows, "D", color=INK, markersize=7, fillstyle="none",
-        label="reopened when removed",
+        label="unique share",
     )  # fmt: skip
     axes.set_yticks(rows, _cause_names(causes))
     ends = [100 * v for c in causes for v in (*c.interval, c.over_rest, c.alone)]
