@@ -64,7 +64,7 @@ class RatioSource:
 
     def read(self, *ranges: tuple[int, int]) -> F32:
         """A block."""
-        return _ratio(self.above.read(*ranges), self.below.read(*ranges))
+        return _ratio(self.above.read(*ranges), self.below.read(*ranges)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -132,8 +132,8 @@ def _block_sums(values: NDArray[Any], good: Mask, side: int) -> tuple[F64, F64]:
     return sums(np.where(good, values, 0)), sums(good)
 
 
-def _ratio(above: NDArray[Any], below: NDArray[Any]) -> Any:
-    empty = np.full(above.shape, np.nan, above.dtype)
+def _ratio(above: NDArray[Any], below: NDArray[Any]) -> F64:
+    empty = np.full(above.shape, np.nan)
     return np.asarray(np.divide(above, below, out=empty, where=below > 0))
 
 
