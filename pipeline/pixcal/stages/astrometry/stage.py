@@ -253,7 +253,7 @@ def _warnings(result: Mapping[str, Any]) -> list[str]:
         )
     if result["detector"]["modes_removed_px"] is None:
         sentences.append(
-            "without --truth, the errors of the maps are SIGMA, without systematic errors"
+            "without --truth, SIGMA is taken as the error of the maps: no systematic errors"
         )
     return sentences
 
