@@ -1,4 +1,4 @@
-"""The page: every figure with its picture, beside what the paper states."""
+"""The pages: every figure with its picture, beside what the paper states."""
 
 import json
 import os
@@ -13,7 +13,7 @@ from reproduction.paper import STATEMENTS, Statement
 LEAD = """\
 Figures of Rousset et al., "Pixel-Level Calibration for Space-Based High Precision Astrometry Using
 Young's Fringes", simulated and analysed with the benches in [`configs/paper`]({configs}).
-`{command}` ({version}) writes this page. Numbers in the column "here" are measured in that run;
+`{command}` ({version}) writes these pages. Numbers in the column "here" are measured in that run;
 [numbers.json](numbers.json) holds all of them. {size}
 """
 QUICK = "Windows and frames are smaller than the paper's; `make reproduce-full` takes the paper's."
@@ -21,7 +21,7 @@ FULL = "Windows and frames are the paper's."
 
 
 def write(folder: Path, outcomes: Sequence[Outcome], *, full: bool) -> Path:
-    """Write ``README.md``, ``numbers.json`` and the pictures; returns the page."""
+    """Write a page and a picture of each figure, ``numbers.json``, and ``README.md``, returned."""
     folder.mkdir(parents=True, exist_ok=True)
     lead = LEAD.format(
         configs=Path(os.path.relpath(CONFIGS, folder)).as_posix(),
@@ -29,13 +29,13 @@ def write(folder: Path, outcomes: Sequence[Outcome], *, full: bool) -> Path:
         version=f"pixcal {__version__}",
         size=FULL if full else QUICK,
     )
-    parts = ["# The paper's figures\n", lead, _contents(outcomes)]
+    links = [f"- [{_heading(o)}](figure-{o.figure}.md)\n" for o in outcomes]
     for outcome in outcomes:
-        name = f"figure-{outcome.figure}.png"
-        (folder / name).write_bytes(outcome.picture)
-        parts.append(_section(outcome, name))
+        file = folder / f"figure-{outcome.figure}.png"
+        file.write_bytes(outcome.picture)
+        file.with_suffix(".md").write_text(_figure(outcome, file.name), encoding="utf-8")
     page = folder / "README.md"
-    page.write_text("\n".join(parts), encoding="utf-8")
+    page.write_text(f"# The paper's figures\n\n{lead}\n{''.join(links)}", encoding="utf-8")
     numbers = {outcome.figure: outcome.numbers for outcome in outcomes}
     (folder / "numbers.json").write_text(
         json.dumps({"pixcal": __version__, "full": full, "figures": numbers}, indent=1),
@@ -44,27 +44,17 @@ def write(folder: Path, outcomes: Sequence[Outcome], *, full: bool) -> Path:
     return page
 
 
-def _contents(outcomes: Sequence[Outcome]) -> str:
-    lines = [f"- [{_heading(o)}](#{_anchor(o)})" for o in outcomes]
-    return "\n".join(lines) + "\n"
-
-
 def _heading(outcome: Outcome) -> str:
     plural = "s" if "-" in outcome.figure else ""
     return f"Figure{plural} {outcome.figure}: {outcome.title}"
 
 
-def _anchor(outcome: Outcome) -> str:
-    kept = (c for c in _heading(outcome).lower() if c.isalnum() or c in " -")
-    return "".join(kept).replace(" ", "-")
-
-
-def _section(outcome: Outcome, picture: str) -> str:
+def _figure(outcome: Outcome, picture: str) -> str:
     table = ["| | the paper | where | here |", "|---|---|---|---|"]
     table += [_line(row) for row in outcome.rows]
     return "\n".join(
         [
-            f"## {_heading(outcome)}\n",
+            f"# {_heading(outcome)}\n",
             f"{outcome.run}\n",
             f"![{_heading(outcome)}]({picture})\n",
             f"{outcome.caption}\n",

@@ -22,13 +22,15 @@ def outcome(figure: str, *rows: Row) -> Outcome:
 def test_a_page_holds_pictures_statements_and_numbers(tmp_path: Path) -> None:
     rows = (Row("slope", "−0.5", "slope"), Row("other | thing", "2 px"))
     written = page.write(tmp_path, [outcome("11", *rows), outcome("16-17")], full=False)
-    text = written.read_text()
+    text = (tmp_path / "figure-11.md").read_text()
     said = STATEMENTS["slope"]
     assert f"| slope | {said.text} | {said.place} | −0.5 |" in text
     assert "| other \\| thing | – | – | 2 px |" in text
-    assert "## Figures 16-17: A title" in text
-    assert "[Figures 16-17: A title](#figures-16-17-a-title)" in text
-    assert "`make reproduce`" in text
+    assert (tmp_path / "figure-16-17.md").read_text().startswith("# Figures 16-17: A title\n")
+    lead = written.read_text()
+    assert "- [Figure 11: A title](figure-11.md)\n" in lead
+    assert "[Figures 16-17: A title](figure-16-17.md)" in lead
+    assert "`make reproduce`" in lead
     assert (tmp_path / "figure-16-17.png").read_bytes() == b"png"
     numbers = json.loads((tmp_path / "numbers.json").read_text())
     assert numbers["figures"]["11"] == {"value": 1.5}
