@@ -20,8 +20,8 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Again, Effect, Estimate
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
+from pixcal.stages.diagnose.frames_used import FramesUsed
 from pixcal.stages.diagnose.look import DiagnosisInput, look_at
-from pixcal.stages.diagnose.looked_at import LookedAt
 from pixcal.stages.diagnose.recommended_frames import MORE
 from pixcal.stages.diagnose.result import by_domain
 from pixcal.stages.diagnose.search import CONFIRM, SCREEN, Search
@@ -184,7 +184,7 @@ def _candidates(
     return candidates
 
 
-def _needs(kind: type[Effect], facts: LookedAt) -> str:
+def _needs(kind: type[Effect], facts: FramesUsed) -> str:
     """Frames without which an effect cannot be estimated."""
     frames = [words for name, words in facts.missing_frames.items() if name in kind.frames_needed]
     if not frames:

@@ -11,11 +11,11 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import parse
 from pixcal.model.errors import InputError
 from pixcal.stages import reduce
-from pixcal.stages.diagnose.looked_at import FittedOn, LeftOut, LookedAt, TriedOn, frames_of
+from pixcal.stages.diagnose.frames_used import FittedOn, FramesUsed, HeldOut, LeftOut, frames_of
 from pixcal.stages.diagnose.measuring import nominal_bench
 from pixcal.stages.diagnose.parts import Half, Raw, evidence_of, take
 from pixcal.stages.diagnose.recommended_frames import missing_frames
-from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, looked_at
+from pixcal.stages.diagnose.trial import Curves, Signature, Window, averaged, measured_curves
 from pixcal.stages.diagnose.windows import chosen_windows, frames_of_half, split
 from pixcal.stages.evidence import Part
 from pixcal.stages.reduce.ingested import Ingested
@@ -40,7 +40,7 @@ class DiagnosisInput:
     windows: tuple[Window, ...]  # that they are tried on
     each: tuple[Curves, ...]  # curves of the test frames of each window
     measured: Curves  # their mean
-    facts: LookedAt
+    facts: FramesUsed
     # runtime, few: with as many workers as fit the memory: of simulations, and of estimates
     runtime: Runtime
     few: Runtime
@@ -106,13 +106,13 @@ def look_at(
         assert seed is not None
         windows.append(Window(part, bench, own.learn, own.test, shape, seed))
         if part in parts:
-            measured.append(looked_at(halves[1], signatures))
+            measured.append(measured_curves(halves[1], signatures))
     tried = tuple(w for w in windows if w.part in parts)
     steps = [s.step for s in windows[0].bench.measured.sets]
-    facts = LookedAt(
+    facts = FramesUsed(
         shape,
         FittedOn(first, frames_of(own.learn)),
-        TriedOn(tuple(w.part for w in tried), frames_of(own.test)),
+        HeldOut(tuple(w.part for w in tried), frames_of(own.test)),
         tuple(left_out),
         tuple(name for name, frames in own.learn.items() if set(frames) & set(own.test[name])),
         tuple(kind for kind in ("bias", "dark", "flat") if kind in ingested.tables),

@@ -18,7 +18,7 @@ from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place
 from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
-from pixcal.stages.diagnose.looked_at import LookedAt
+from pixcal.stages.diagnose.frames_used import FramesUsed
 from pixcal.stages.diagnose.recommended_frames import recommend_frames
 from pixcal.stages.diagnose.shrinkage import Shrinkage, Trial, differing, shrinkage
 
@@ -37,7 +37,7 @@ def describe(
     data: Mapping[Key, F64],
     measured: Mapping[Key, Curve],
     reference: Reference,
-    facts: LookedAt,
+    facts: FramesUsed,
     places: Sequence[Mapping[str, Any]] = (),
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The product, and every curve as measured, nominal and with the effects found.
@@ -50,7 +50,7 @@ def describe(
     measured : mapping
         The same in their own units.
     reference : Reference
-    facts : LookedAt
+    facts : FramesUsed
     places : sequence of mapping
         How far windows are off by themselves, `by_domain`.
     """
@@ -124,7 +124,7 @@ def _cause(
     data: Mapping[Key, F64],
     where: set[Key],
     final: Shrinkage,
-    facts: LookedAt,
+    facts: FramesUsed,
 ) -> dict[str, Any]:
     candidate = found.candidates[name]
     estimate = candidate.estimate

@@ -201,12 +201,12 @@ def _made(
     window = windows[number]
     try:
         evidence = window.evidence(window.test, effects, seed, number=number)
-        return looked_at(evidence, signatures)
+        return measured_curves(evidence, signatures)
     except InputError as error:
         return str(error)
 
 
-def looked_at(evidence: Evidence, signatures: Sequence[Signature]) -> Curves:
+def measured_curves(evidence: Evidence, signatures: Sequence[Signature]) -> Curves:
     """The test statistics, and the detection significance of some effects."""
     curves = measure(evidence)
     for kind in signatures:

@@ -1,4 +1,4 @@
-"""Frames and windows that a diagnosis looked at, as the product names them."""
+"""Frames and windows that a diagnosis used; the fields are keys of ``diagnosis.json``."""
 
 from dataclasses import dataclass
 
@@ -16,15 +16,15 @@ def frames_of(half: Half) -> Frames:
 
 @dataclass(frozen=True)
 class FittedOn:
-    """Where effects were fitted."""
+    """Window and frames to which effects were fitted."""
 
     window: Part
     frames: Frames
 
 
 @dataclass(frozen=True)
-class TriedOn:
-    """Where effects were tried."""
+class HeldOut:
+    """Windows and frames on which effects were tested."""
 
     windows: tuple[Part, ...]
     frames: Frames
@@ -39,14 +39,14 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class LookedAt:
-    """What a diagnosis looked at."""
+class FramesUsed:
+    """Entry ``looked_at`` of ``diagnosis.json``."""
 
     shape: tuple[int, int]  # rows and columns of the detector
     fitted_on: FittedOn
-    tried_on: TriedOn
+    tried_on: HeldOut
     left_out: tuple[LeftOut, ...]
-    # arrays too short to part: effects are fitted and tried on the same frames of them
+    # arrays too short to split: effects are fitted and tested on the same frames
     shared: tuple[str, ...]
     kinds: tuple[str, ...]  # of calibration frames
     sets: dict[str, tuple[float, float]]  # baseline of each fringe set, mm
@@ -54,7 +54,7 @@ class LookedAt:
 
     @property
     def on_the_same_pixels(self) -> bool:
-        """Whether effects were tried on pixels that they were fitted on."""
+        """Whether effects were tested on pixels to which they were fitted."""
         (y0, y1), (x0, x1) = self.fitted_on.window
         return any(
             y0 < b1 and b0 < y1 and x0 < a1 and a0 < x1
