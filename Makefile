@@ -25,15 +25,16 @@ $(INSTALLED): pyproject.toml
 	  echo "pixcal needs Python 3.11 or newer, $(PYTHON) is not; try: make PYTHON=python3.12" >&2; \
 	  exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(PIP) --upgrade 'pip>=25.1'
 	$(PIP) --editable .
 	@touch $@
 
 $(TOOLS): $(INSTALLED)
+	$(PIP) --upgrade 'pip>=25.1'
 	$(PIP) --group dev
 	@touch $@
 
 $(DOCS): $(INSTALLED)
+	$(PIP) --upgrade 'pip>=25.1'
 	$(PIP) --group docs
 	@touch $@
 

@@ -178,6 +178,7 @@ def test_what_a_walk_explains_as_well_is_no_ramp(
     assert steady.effect.ramp_e_h == pytest.approx(7200, abs=4 * steady.errors["ramp_e_h"])
 
 
+@pytest.mark.long
 def test_few_frames_count_and_nothing_in_them_is_nothing(
     acquired: Callable[..., Evidence],
 ) -> None:

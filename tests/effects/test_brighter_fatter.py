@@ -170,6 +170,7 @@ def test_its_size_is_found(acquired: Callable[..., Evidence], size: float) -> No
     assert abs(found.details["of_noise"] - size) < 4 * found.details["of_noise_error"]
 
 
+@pytest.mark.long
 def test_noise_alone_tells_it_when_it_is_large(acquired: Callable[..., Evidence]) -> None:
     evidence = acquired(None, {"brighter_fatter": {"shift_px_per_e": 1e-6}})
     found = BrighterFatter.estimate(evidence)
@@ -212,6 +213,7 @@ def test_by_itself_its_falloff_is_found_with_its_size(
     )
 
 
+@pytest.mark.long
 def test_beside_a_bent_response_it_is_not_taken_to_be_alone(
     acquired: Callable[..., Evidence],
 ) -> None:

@@ -84,6 +84,7 @@ def test_a_slow_change_is_found_beside_a_vibration(acquired: Acquired) -> None:
     assert found.errors["polarisation"] < 0.002
 
 
+@pytest.mark.long
 def test_it_is_found_beside_a_laser_that_changes(acquired: Acquired) -> None:
     found = ContrastNoise.estimate(
         acquired(None, contrast(vibration_rad=0.1) | {"intensity_noise": {"rms": 0.02}})

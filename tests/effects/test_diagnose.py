@@ -209,6 +209,7 @@ def test_without_fringes_noise_and_intensity_are_looked_at(reduced: Callable[...
     assert {entry["domain"] for entry in found["gap"]["where"]} <= {"noise", "intensity", "time"}
 
 
+@pytest.mark.long
 def test_a_bent_ladder_of_flats_is_a_gap_and_its_response_closes_it(
     reduced: Callable[..., Path],
 ) -> None:
@@ -320,6 +321,7 @@ def test_an_effect_of_the_users_own_is_found(reduced: Callable[..., Path], tmp_p
     assert found["causes"][0]["parameters"]["size"] == pytest.approx(0.01, rel=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("few_references")
 def test_an_effect_of_the_users_own_may_be_in_the_nominal_bench(
     with_lag: Path,

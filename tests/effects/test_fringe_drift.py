@@ -80,6 +80,7 @@ def test_its_parameters_are_found(acquired: Acquired, parameters: dict[str, Any]
     assert (found.effect.settle != (0.0, 0.0)) == ("settle" in parameters)
 
 
+@pytest.mark.long
 def test_errors_mean_something(acquired: Acquired) -> None:
     found = FringeDrift.estimate(acquired(None, {"fringe_drift": OFF | {"ramp": [1e-2, -5e-3]}}))
     assert found is not None

@@ -111,6 +111,7 @@ def test_what_looks_like_it_is_not_taken_for_it(acquired: Acquired, alike: dict[
     assert found.significance < 4
 
 
+@pytest.mark.long
 def test_it_is_found_beside_a_drift(acquired: Acquired) -> None:
     found = FringeJitter.estimate(
         acquired(

@@ -87,6 +87,7 @@ def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: s
     assert found.significance < 4
 
 
+@pytest.mark.long
 def test_crosstalk_does_not_hide_it(acquired: Callable[..., Evidence]) -> None:
     evidence = acquired(None, {"ipc": {}, "gain_error": {"relative": 0.05}})
     found = GainError.estimate(evidence)

@@ -147,6 +147,7 @@ def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: s
     assert found.significance < 4
 
 
+@pytest.mark.long
 def test_crosstalk_of_every_other_row_is_not_taken_for_it(
     acquired: Callable[..., Evidence], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,6 +181,7 @@ def test_ghosts_of_both_fibres_need_not_be_in_phase(acquired: Callable[..., Evid
         np.testing.assert_allclose(one.forward, other.forward, atol=1e-3)
 
 
+@pytest.mark.long
 def test_a_pattern_of_mean_light_and_fringes_alike_in_all_sets_is_the_flats(
     acquired: Callable[..., Evidence],
 ) -> None:

@@ -94,6 +94,7 @@ def test_the_foot_is_found(acquired: Callable[..., Evidence], foot: tuple[float,
     assert found.significance > 10
 
 
+@pytest.mark.long
 def test_a_foot_far_aside_is_found_from_the_fringes_that_are_wider_there(
     acquired: Callable[..., Evidence],
 ) -> None:
@@ -103,6 +104,7 @@ def test_a_foot_far_aside_is_found_from_the_fringes_that_are_wider_there(
     found_near(foot, evidence, 8.0)
 
 
+@pytest.mark.long
 def test_positions_of_their_own_are_found(acquired: Callable[..., Evidence]) -> None:
     """The arms of a mount do not move together."""
     feet = {"vertical": (20.0, 14.0), "horizontal": (-16.0, 22.0)}

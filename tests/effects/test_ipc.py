@@ -309,6 +309,7 @@ def test_products_of_neighbours_are_the_same_in_pieces_of_any_length(
     assert pieces.shot == pytest.approx(usual.shot, rel=1e-6)
 
 
+@pytest.mark.long
 def test_noise_alone_tells_the_kernel_where_there_are_no_darks(acquired: Acquired) -> None:
     found = Ipc.estimate(acquired(NO_DARKS, {"ipc": to_plain(Ipc())}))
     assert found is not None
