@@ -11,6 +11,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,11 @@ import numpy as np
 from pixcal.engine.run import Runtime
 from pixcal.stages import allan, fit, ingest, reduce, report
 from pixcal.storage.cube import ArrayReader, create_array
+from pixcal.storage.lock import flushed_last
 from workload import Workload, seconds
 
 THREADS = 2
-STAGES = ("ingest", "reduce", "fit", "allan", "report")
+STAGES = ("ingest", "reduce", "fit", "allan", "flush", "report")
 COPIED = np.ones(32 << 20, np.uint8)  # larger than what the processor keeps
 
 
@@ -76,11 +78,15 @@ def every_stage(work: Workload, threads: int) -> dict[str, float]:
         work.run.rename(tempfile.mkdtemp(dir=work.folder))
     os.sync()
     here, acquisition = Runtime(workers=threads), work.folder / "acq"
-    found = {
-        "ingest": seconds(lambda: ingest.run(acquisition, work.run, ingest.Config(), here)),
-    }
-    for name, module in (("reduce", reduce), ("fit", fit), ("allan", allan), ("report", report)):
-        found[name] = seconds(lambda module=module: module.run(work.run, module.Config(), here))  # type: ignore[misc]
+    found = {}
+    with ExitStack() as stack:
+        # As `pixcal run` does.
+        stack.enter_context(flushed_last(work.run))
+        found["ingest"] = seconds(lambda: ingest.run(acquisition, work.run, ingest.Config(), here))
+        for name, module in (("reduce", reduce), ("fit", fit), ("allan", allan)):
+            found[name] = seconds(lambda module=module: module.run(work.run, module.Config(), here))  # type: ignore[misc]
+        found["flush"] = seconds(stack.close)
+    found["report"] = seconds(lambda: report.run(work.run, report.Config(), here))
     return found
 
 

@@ -1,6 +1,8 @@
 """Damaged artefacts: seen before they are used, and made again by their own command."""
 
+import errno
 import math
+import os
 import shutil
 import tracemalloc
 from contextlib import suppress
@@ -12,18 +14,20 @@ import pytest
 from numpy.typing import NDArray
 
 from pixcal.model.errors import DamagedError
-from pixcal.storage import artefact
+from pixcal.storage import artefact, writeback
 from pixcal.storage.artefact import (
     MANIFEST,
+    UNFLUSHED,
     build,
     read_json,
     read_manifest,
+    unflushed,
     up_to_date,
     write_json,
 )
 from pixcal.storage.cube import ArrayReader, create_array, create_group, write_array
 from pixcal.storage.formats import STAGES
-from pixcal.storage.lock import damage_noted, lock
+from pixcal.storage.lock import damage_noted, flushed_last, lock
 from pixcal.storage.products import is_whole, read_map, write_map
 from pixcal.storage.stage import require
 
@@ -169,6 +173,61 @@ def test_a_kill_before_the_last_steps_leaves_nothing_behind(tmp_path: Path) -> N
     with lock(tmp_path):
         assert sorted(f.name for f in final.iterdir()) == ["facts.json", MANIFEST, "maps.zarr"]
         assert not old.exists()
+
+
+# On the way to the disk
+
+
+def test_artefacts_are_marked_until_they_are_on_the_disk(tmp_path: Path) -> None:
+    mark = tmp_path / "fit" / UNFLUSHED
+    with flushed_last(tmp_path):
+        key = complete(tmp_path)
+        assert mark.exists()
+        assert up_to_date(tmp_path, "fit", key) is not None
+        with lock(tmp_path):
+            assert mark.exists()
+    assert not mark.exists()
+    assert up_to_date(tmp_path, "fit", key) is not None
+
+
+def test_a_kill_leaves_the_flush_to_the_next_command(tmp_path: Path) -> None:
+    with unflushed():
+        complete(tmp_path)
+    with lock(tmp_path):
+        assert not (tmp_path / "fit" / UNFLUSHED).exists()
+
+
+@pytest.mark.parametrize("left", ["of another boot", ""])
+def test_after_a_power_failure_what_was_not_on_the_disk_is_made_again(
+    tmp_path: Path, left: str
+) -> None:
+    with unflushed():
+        key = complete(tmp_path, "sweep")
+    (tmp_path / "sweep" / UNFLUSHED).write_text(left)
+    with lock(tmp_path):
+        assert up_to_date(tmp_path, "sweep", key) is None
+    with pytest.raises(DamagedError, match="machine stopped"):
+        require(tmp_path, "sweep")
+    complete(tmp_path, "sweep")
+    assert up_to_date(tmp_path, "sweep", key) is not None
+
+
+def test_what_the_disk_refuses_is_no_complete_artefact(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_handle: int) -> None:
+        raise OSError(errno.EIO, "input/output error")
+
+    def fail() -> None:
+        with build(tmp_path, "fit", 1, {}, {}) as made:
+            # The thread that flushes it meets the error first.
+            write_array(made.folder / "delta", large, dims=("x",), chunks=large.shape)
+
+    large = np.random.default_rng(1).integers(0, 2**32, 2 * writeback.LARGE, np.uint32)
+    monkeypatch.setattr(os, "fsync", refuse)
+    with lock(tmp_path), pytest.raises(OSError, match="input/output"):
+        fail()
+    assert not (tmp_path / "fit").exists()
 
 
 # Products

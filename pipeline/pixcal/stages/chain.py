@@ -10,6 +10,7 @@ from pixcal.model import options
 from pixcal.model.acquisition import load_acquisition
 from pixcal.model.errors import InputError
 from pixcal.stages import allan, correct, diagnose, fit, ingest, reduce, report
+from pixcal.storage.lock import flushed_last
 
 Config = options.Run
 # called with a step's name and its folder; the step runs inside the context
@@ -38,17 +39,18 @@ def run(
     not possible.
     """
     of_fit = fit.Config(model=config.model)
-    with step("ingest", out / "ingest"):
-        of_ingest = ingest.Config(config.overwrite, config.copy, config.cubes)
-        ingest.run(acquisition, out, of_ingest, runtime)
-    with step("reduce", out / "reduce"):
-        reduce.run(out, reduce.Config(gain=config.gain, cubes=config.cubes), runtime)
-    fringes = bool(load_acquisition(acquisition).frames.fringes)
-    if fringes:
-        with step("fit", out / "fit"):
-            fit.run(out, of_fit, runtime)
-        with step("allan", out / "allan"):
-            allan.run(out, allan.Config(), runtime)
+    with flushed_last(out):
+        with step("ingest", out / "ingest"):
+            of_ingest = ingest.Config(config.overwrite, config.copy, config.cubes)
+            ingest.run(acquisition, out, of_ingest, runtime)
+        with step("reduce", out / "reduce"):
+            reduce.run(out, reduce.Config(gain=config.gain, cubes=config.cubes), runtime)
+        fringes = bool(load_acquisition(acquisition).frames.fringes)
+        if fringes:
+            with step("fit", out / "fit"):
+                fit.run(out, of_fit, runtime)
+            with step("allan", out / "allan"):
+                allan.run(out, allan.Config(), runtime)
     diagnosed = config.diagnosed
     if diagnosed:
         try:

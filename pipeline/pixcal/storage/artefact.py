@@ -6,18 +6,20 @@ The key is a digest of everything the result depends on: options, inputs, format
 pixcal. A build with the same key that was killed is found again and resumed, if it was begun by the
 same code to the letter. Unfinished builds with other keys are removed when one completes.
 
+An artefact may be complete before it is on the disk (`unflushed`). Until then it holds a mark with
+the boot of the machine; after another boot, as after a power failure, it is damaged.
+
 The manifest is sealed, and holds a digest of every other file but the chunks of arrays, which have
 checksums of their own. What turns out to be damaged is noted in the artefact
 (`pixcal.storage.lock`): it is not up to date from then on, and its stage makes it again.
 """
 
 import json
-import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -31,7 +33,9 @@ from pixcal.storage.manifest import (
     JOURNAL,
     MANIFEST,
     SCRATCH,
+    UNFLUSHED,
     Manifest,
+    boot,
     check_intact,
     damaged_files,
     digest,
@@ -44,12 +48,14 @@ from pixcal.storage.manifest import (
     write_whole,
 )
 from pixcal.storage.place import Local, Place
+from pixcal.storage.writeback import flush_file
 
 __all__ = [
     "DAMAGE",
     "JOURNAL",
     "MANIFEST",
     "SCRATCH",
+    "UNFLUSHED",
     "Build",
     "Manifest",
     "Workspace",
@@ -125,7 +131,7 @@ class Build:
             # The last line may have been cut by a kill: what does not parse was not done.
             try:
                 step = json.loads(line)
-                if step["boot"] == _boot():
+                if step["boot"] == boot():
                     done.add(step["done"])
             except (ValueError, KeyError, TypeError):
                 continue
@@ -134,16 +140,7 @@ class Build:
     def note(self, step: str) -> None:
         """Note a step as done. Call it when all that the step wrote is in place."""
         with (self.folder / JOURNAL).open("a", encoding="utf-8") as file:
-            file.write("\n" + json.dumps({"done": step, "boot": _boot()}) + "\n")
-
-
-@cache
-def _boot() -> str:
-    """Name of this run of the machine; of this process where the system gives none."""
-    try:
-        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
-    except OSError:
-        return f"process {os.getpid()}"
+            file.write("\n" + json.dumps({"done": step, "boot": boot()}) + "\n")
 
 
 def artefact_key(stage: str, format: int, config: dict[str, Any], inputs: dict[str, str]) -> str:
@@ -201,9 +198,11 @@ def build(
     made = Build(folder, cubes_of(folder), key, resumed)
     yield made
     # What is called complete must be on the disk, not on its way to it.
-    flush(folder)
-    if isinstance(made.cubes, Path) and made.cubes != folder:
-        flush(made.cubes)
+    if _later.get():
+        write_whole(folder / UNFLUSHED, boot().encode())
+        flush_file(folder)
+    else:
+        _flush(folder)
     manifest = Manifest(
         stage, format, key, config, inputs, summary=made.summary, files=list_files(folder)
     )
@@ -219,6 +218,38 @@ def build(
     tidy(final)
     for left in [old, *folder.parent.glob(f"{stage}-{'[0-9a-f]' * _KEY_IN_NAME}")]:
         discard(left, run)
+
+
+# whether artefacts are completed before they are on the disk
+_later: ContextVar[bool] = ContextVar("_later", default=False)
+
+
+@contextmanager
+def unflushed() -> Iterator[None]:
+    """Complete artefacts before they are on the disk; `settle_flush` ends that for each.
+
+    The disk goes on with one while the next is being made.
+    """
+    token = _later.set(True)
+    try:
+        yield
+    finally:
+        _later.reset(token)
+
+
+def _flush(folder: Path) -> None:
+    flush(folder)
+    cubes = cubes_of(folder)
+    if isinstance(cubes, Path) and cubes != folder:
+        flush(cubes)
+
+
+def settle_flush(run: Path) -> None:
+    """See to it that the artefacts of a run are on the disk, unless inside `unflushed`."""
+    for mark in run.glob(f"*/{UNFLUSHED}"):
+        if not _later.get() and mark.read_bytes() == boot().encode():
+            _flush(mark.parent)
+            mark.unlink()
 
 
 def _whole(folder: Path) -> bool:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from pixcal.storage import writeback
 from pixcal.storage.memory import MemoryPath
 from pixcal.storage.place import Place, UrlPath, explained
 
@@ -83,13 +84,15 @@ class LocalFolder:
                 out = aside.open("wb")
             with out:
                 out.writelines(content)
-            written.append((aside, file))
+            written.append((aside, file, sum(map(len, content))))
         # Flushed once all are written: the disk works meanwhile (twice as fast as one by one).
-        for aside, file in written:
+        for aside, file, size in written:
             if durable:
                 with aside.open("rb") as handle:
                     os.fdatasync(handle.fileno())
             aside.replace(file)
+            if not durable and size >= writeback.LARGE:
+                writeback.begin(file)
 
     def ends(self, names: Sequence[str]) -> Iterator[tuple[int, bytes]]:
         for name in names:
@@ -136,18 +139,14 @@ def aside_of(path: Path) -> Path:
 
 def flush(folder: Path) -> None:
     """See to it that all files below a folder are on the disk, and the folders that name them."""
+    writeback.wait()
     files = [(at, names) for at, _, names in os.walk(folder)]
     if sum(len(names) for _, names in files) > MANY_FILES:
         os.sync()  # One by one they would take longer than all that other programs write.
         return
     for at, names in files:
         for path in (*(f"{at}/{name}" for name in names), at):
-            with suppress(FileNotFoundError):
-                handle = os.open(path, os.O_RDONLY)
-                try:
-                    os.fsync(handle)
-                finally:
-                    os.close(handle)
+            writeback.flush_file(path)
 
 
 def read_file(path: str, size: int, later: str | None = None) -> bytes:

@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pixcal.model.errors import DamagedError, InputError
-from pixcal.storage.artefact import discard, tidy
+from pixcal.storage.artefact import discard, settle_flush, tidy, unflushed
 from pixcal.storage.cube_place import POINTER, cubes_of
 from pixcal.storage.folder import DISK_FULL
 from pixcal.storage.formats import STAGES
@@ -102,8 +102,27 @@ def lock(run: Path) -> Iterator[None]:
         except OSError as error:
             raise InputError(f"{run}: another pixcal is working there; wait for it") from error
         _settle_killed(run)
+        settle_flush(run)
         try:
             yield
         except DamagedError as error:
             _note_damage(run, error)
             raise
+
+
+@contextmanager
+def flushed_last(run: Path) -> Iterator[None]:
+    """Complete artefacts of a run as they are made; all are on the disk when the block ends.
+
+    Raises
+    ------
+    OSError
+        If something could not be written to the disk.
+    """
+    try:
+        with unflushed():
+            yield
+    finally:
+        # Another process that works there sees to it by itself.
+        with suppress(InputError), lock(run):
+            pass

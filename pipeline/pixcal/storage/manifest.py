@@ -9,6 +9,7 @@ import json
 import os
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,18 @@ JOURNAL = "journal.jsonl"
 SCRATCH = "scratch"
 # names of the files of an artefact that turned out to be damaged, found when they were read
 DAMAGE = "damage.json"
-_NOT_LISTED = (MANIFEST, JOURNAL, DAMAGE)
+# in an artefact that is complete but not yet on the disk: the run of the machine that made it
+UNFLUSHED = "unflushed"
+_NOT_LISTED = (MANIFEST, JOURNAL, DAMAGE, UNFLUSHED)
+
+
+@cache
+def boot() -> str:
+    """Name of this run of the machine; of this process where the system gives none."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except OSError:
+        return f"process {os.getpid()}"
 
 
 @dataclass(frozen=True)
@@ -155,6 +167,9 @@ def check_intact(folder: Path, manifest: Manifest) -> None:
     DamagedError
         Naming the first file that is missing or altered, or was found to be so earlier.
     """
+    mark = folder / UNFLUSHED
+    if mark.exists() and mark.read_bytes() != boot().encode():
+        raise DamagedError(f"{folder}: the machine stopped before all of it was on the disk", mark)
     for name in damaged_files(folder):
         raise DamagedError(f"{folder / name}: damaged", folder / name)
     for name, expected in manifest.files.items():

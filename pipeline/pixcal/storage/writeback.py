@@ -1,0 +1,77 @@
+"""Files on their way to the disk while others are still being made.
+
+The kernel keeps what was written for half a minute, and whoever completes an artefact would wait
+for all of it at once.
+"""
+
+import os
+import threading
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from queue import SimpleQueue
+
+LARGE = 1 << 18  # bytes of a file from which it is worth a request of its own
+
+
+class _Writeback:
+    """A thread that flushes files one after the other."""
+
+    def __init__(self) -> None:
+        self._files: SimpleQueue[Path | threading.Event] = SimpleQueue()
+        self._failed: OSError | None = None
+        threading.Thread(target=self._flush_all, daemon=True).start()
+
+    def begin(self, file: Path) -> None:
+        self._files.put(file)
+
+    def wait(self) -> None:
+        reached = threading.Event()
+        self._files.put(reached)
+        reached.wait()
+        failed, self._failed = self._failed, None
+        if failed is not None:
+            raise failed
+
+    def _flush_all(self) -> None:
+        while True:
+            item = self._files.get()
+            if isinstance(item, threading.Event):
+                item.set()
+                continue
+            try:
+                flush_file(item)
+            except OSError as error:
+                self._failed = self._failed or error
+
+
+@cache
+def _writeback() -> _Writeback:
+    """Of this process."""
+    return _Writeback()
+
+
+def begin(file: Path) -> None:
+    """Start to flush a file to the disk; returns at once."""
+    _writeback().begin(file)
+
+
+def wait() -> None:
+    """Wait for all files that were begun.
+
+    Raises
+    ------
+    OSError
+        If one of them could not be written.
+    """
+    _writeback().wait()
+
+
+def flush_file(path: str | Path) -> None:
+    """See to it that a file, or the names in a folder, are on the disk; one that is gone is not."""
+    with suppress(FileNotFoundError):
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
