@@ -4,6 +4,8 @@ import errno
 import math
 import os
 import shutil
+import signal
+import time
 import tracemalloc
 from contextlib import suppress
 from pathlib import Path
@@ -228,6 +230,25 @@ def test_what_the_disk_refuses_is_no_complete_artefact(
     with lock(tmp_path), pytest.raises(OSError, match="input/output"):
         fail()
     assert not (tmp_path / "fit").exists()
+
+
+def test_a_forked_process_flushes_by_itself(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    writeback.begin(file)
+    writeback.wait()
+    child = os.fork()
+    if not child:
+        writeback.begin(file)
+        writeback.wait()
+        os._exit(0)
+    deadline = time.monotonic() + 20
+    while not (ended := os.waitpid(child, os.WNOHANG))[0] and time.monotonic() < deadline:
+        time.sleep(0.01)
+    if not ended[0]:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    assert ended == (child, 0)
 
 
 # Products

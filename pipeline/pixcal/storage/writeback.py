@@ -51,6 +51,10 @@ def _writeback() -> _Writeback:
     return _Writeback()
 
 
+# A process that is forked has no such thread.
+os.register_at_fork(after_in_child=_writeback.cache_clear)
+
+
 def begin(file: Path) -> None:
     """Start to flush a file to the disk; returns at once."""
     _writeback().begin(file)
