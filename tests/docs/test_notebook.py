@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 FILE = ROOT / "docs" / "tutorials" / "first-light.ipynb"
 NOTEBOOK: dict[str, Any] = json.loads(FILE.read_text(encoding="utf-8"))
@@ -24,6 +26,7 @@ def test_it_is_a_notebook_without_outputs() -> None:
     assert FILE.stat().st_size < 20_000
 
 
+@pytest.mark.long
 def test_its_cells_run_one_after_the_other(tmp_path: Path) -> None:
     """Each as a notebook does it: the value of its last line is shown."""
     program = (
