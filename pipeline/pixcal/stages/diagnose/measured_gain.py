@@ -13,9 +13,7 @@ from pixcal.simulation.effect import Effect, Stage
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import Recording
 
-DECLARED_ERROR = 0.01  # relative error that a declared gain may well have
-# errors between a declared gain and that of the flats beyond which only the latter counts
-DISAGREE = 3.0
+DECLARED_ERROR = 0.01  # least relative error of a declared gain
 FRAMES = 8  # flats that are simulated with and without effects, from the same random numbers
 # shot noise over read noise, as variances, of a flat that tells what effects do to the former
 LIT = 4.0
@@ -43,12 +41,12 @@ class MeasuredGain:
             What effects do to the variance of flats over their mean: by as much the photon
             transfer is wrong.
         """
-        values = np.array([1.0, *(value * change for value, _ in self.transfer)])
-        weights = np.array([DECLARED_ERROR, *(error for _, error in self.transfer)]) ** -2.0
-        if self.transfer:
-            measured, error = np.average(values[1:], weights=weights[1:]), weights[1:].sum() ** -0.5
-            if abs(measured - 1) > DISAGREE * np.hypot(DECLARED_ERROR, error):
-                values, weights = values[1:], weights[1:]
+        measured = np.array([value * change for value, _ in self.transfer])
+        errors = np.array([error for _, error in self.transfer])
+        # The declared gain is as wrong as the flats show it to be.
+        apart = abs(np.average(measured, weights=errors**-2.0) - 1) if self.transfer else 0.0
+        values = np.array([1.0, *measured])
+        weights = np.array([max(DECLARED_ERROR, apart), *errors]) ** -2.0
         common = np.average(values, weights=weights) + weights.sum() ** -0.5 * rng.standard_normal()
         return np.asarray(max(common, 0.1) * self.amplifiers, np.float32)
 
