@@ -214,6 +214,8 @@ def _draw_sets(bench: Bench, varied: set[str]) -> list[FringeSet]:
         period = np.exp(rng.uniform(np.log(5), np.log(20))) if "period" in varied else 9.0
         if "long_period" in varied:
             period = stream(bench.seed, "long period", name).uniform(20, 32)
+        # Fewer than two fringes in the window, which is without the border, cannot be fitted.
+        period = min(period, min(bench.shape) / 3)
         angle = turn + n * np.pi / 2
         length = WAVELENGTH_NM * 1e-6 * DISTANCE_MM / (period * PITCH_UM * 1e-3)
         declared = np.round(length * np.array([np.cos(angle), np.sin(angle)]), 3)
