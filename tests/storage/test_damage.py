@@ -192,6 +192,12 @@ def test_artefacts_are_marked_until_they_are_on_the_disk(tmp_path: Path) -> None
     assert up_to_date(tmp_path, "fit", key) is not None
 
 
+def test_where_nothing_was_made_no_run_directory_is_left(tmp_path: Path) -> None:
+    with flushed_last(tmp_path / "run"):
+        pass
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_kill_leaves_the_flush_to_the_next_command(tmp_path: Path) -> None:
     with unflushed():
         complete(tmp_path)

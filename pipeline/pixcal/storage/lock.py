@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pixcal.model.errors import DamagedError, InputError
-from pixcal.storage.artefact import discard, settle_flush, tidy, unflushed
+from pixcal.storage.artefact import UNFLUSHED, discard, settle_flush, tidy, unflushed
 from pixcal.storage.cube_place import POINTER, cubes_of
 from pixcal.storage.folder import DISK_FULL
 from pixcal.storage.formats import STAGES
@@ -123,6 +123,7 @@ def flushed_last(run: Path) -> Iterator[None]:
         with unflushed():
             yield
     finally:
-        # Another process that works there sees to it by itself.
-        with suppress(InputError), lock(run):
-            pass
+        if any(run.glob(f"*/{UNFLUSHED}")):
+            # Another process that works there sees to it by itself.
+            with suppress(InputError), lock(run):
+                pass

@@ -22,8 +22,8 @@ APART = 0.05  # relative distance of two levels that are not one lamp's flicker
 MIN_SHARE = 1e-3  # of the samples of a frame that lie at the highest code at least
 MIN_SAMPLES = 50
 NEIGHBOURS = 16  # codes below the highest that are held against it
-# least step between levels of darks: over the median step, and over the noise of a sample
-MIN_DARKS = 5  # fewest steps that tell
+MIN_DARKS = 5  # fewest steps between levels of darks that tell groups apart
+# least step between two groups: over the median step, and over the noise of a sample
 JUMP, NOTABLE = 20.0, 0.1
 PILED = 4  # how many times as many samples as at any of these are a pile
 
