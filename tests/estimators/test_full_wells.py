@@ -34,7 +34,7 @@ def ladder(
 def test_full_pixels_neither_flatten_the_response_nor_are_nonlinear(spread: float) -> None:
     rungs, response = ladder(30_500.0, well_spread=spread)
     assert nonlinear(rungs, step_levels(rungs), 0.03).mean() > 0.05
-    kept = unsaturated(rungs)
+    kept, _ = unsaturated(rungs, step_levels(rungs))
     assert not nonlinear(kept, step_levels(kept), 0.03).any()
     rate, error = relative_response(kept, step_levels(kept))
     off = rate / np.median(rate) - response / np.median(response)
@@ -43,7 +43,8 @@ def test_full_pixels_neither_flatten_the_response_nor_are_nonlinear(spread: floa
 
 def test_of_pixels_that_are_just_not_full_all_is_kept() -> None:
     rungs, _ = ladder(28_100.0)
-    lost = [float(np.isnan(rung.signal).mean()) for rung in unsaturated(rungs)][::-1]
+    kept, _ = unsaturated(rungs, step_levels(rungs))
+    lost = [float(np.isnan(rung.signal).mean()) for rung in kept][::-1]
     assert lost[:6] == [0.0] * 6
     assert lost[7:] == [1.0] * 3
 
@@ -51,7 +52,8 @@ def test_of_pixels_that_are_just_not_full_all_is_kept() -> None:
 @pytest.mark.parametrize(("read", "bend"), [(1.0, 0.0), (60.0, 0.0), (1.0, 0.15)])
 def test_without_an_end_nothing_is_left_out(read: float, bend: float) -> None:
     rungs, _ = ladder(1e9, read_e=read, bend=bend)
-    assert all(np.isfinite(rung.signal).all() for rung in unsaturated(rungs))
+    kept, _ = unsaturated(rungs, step_levels(rungs))
+    assert all(np.isfinite(rung.signal).all() for rung in kept)
 
 
 def test_dim_levels_whose_noise_is_high_by_chance_are_no_slope() -> None:
@@ -61,4 +63,5 @@ def test_dim_levels_whose_noise_is_high_by_chance_are_no_slope() -> None:
         Rung(1.0 + n, 2, np.full(SHAPE, level), np.full(SHAPE, variance / 2))
         for n, (level, variance) in enumerate(zip(levels, noise, strict=True))
     ]
-    assert all(np.isfinite(rung.signal).all() for rung in unsaturated(rungs, 235.0))
+    kept, _ = unsaturated(rungs, step_levels(rungs), 235.0)
+    assert all(np.isfinite(rung.signal).all() for rung in kept)

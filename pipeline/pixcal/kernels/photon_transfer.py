@@ -94,6 +94,20 @@ def _add_blocks(
                 out[block, 3 + lag] = np.float32(0.5) * product / pairs + variance / n
 
 
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _ratios(first: F32, second: F32, per_level: float, read_variance: float, out: F32) -> None:
+    # Differences over their expected noise, by the pixel's place in its block and by block.
+    slope, floor = np.float32(per_level), np.float32(read_variance)
+    half, zero = np.float32(0.5), np.float32(0)
+    columns = -(-first.shape[1] // BLOCK)
+    for y in range(first.shape[0]):
+        for x in range(first.shape[1]):
+            a, b = first[y, x], second[y, x]
+            noise = np.sqrt(max(half * (a + b), zero) * slope + floor)
+            at, block = y % BLOCK * BLOCK + x % BLOCK, y // BLOCK * columns + x // BLOCK
+            out[at, block] = (a - b) / noise
+
+
 def pair_statistics(
     first: F32, second: F32, *, gain: float, read_noise: float, quantum: float
 ) -> F64:
@@ -118,13 +132,8 @@ def pair_statistics(
     rows, columns = (-(-n // BLOCK) for n in first.shape)
     blocks = rows * columns
     pair = np.ascontiguousarray(first, np.float32), np.ascontiguousarray(second, np.float32)
-    # Differences over their expected noise, by the pixel's place in its block and by block.
-    whole = np.full((rows * BLOCK, columns * BLOCK), np.nan, np.float32)
-    variance = np.maximum(np.float32(0.5) * (pair[0] + pair[1]), 0) * np.float32(1 / gain)
-    ratio = (pair[0] - pair[1]) / np.sqrt(variance + np.float32(read_noise**2))
-    whole[: first.shape[0], : first.shape[1]] = ratio
-    by_block = whole.reshape(rows, BLOCK, columns, BLOCK).transpose(1, 3, 0, 2)
-    ratios = np.ascontiguousarray(by_block.reshape(BLOCK * BLOCK, blocks))
+    ratios = np.full((BLOCK * BLOCK, blocks), np.nan, np.float32)
+    _ratios(*pair, 1 / gain, read_noise**2, ratios)
     centre, spread = np.empty((2, blocks), np.float32)
     few = np.isfinite(ratios).sum(axis=0) < _MIN_PIXELS
     median_of_columns(ratios.copy(), centre)

@@ -28,7 +28,7 @@ BATCH = 64  # frames that are looked at together
 _LEVEL_PIXELS = 4096
 _ROUNDING = np.float32(1e-6)
 _SIGMA_OF_MAD = 1.482602218505602
-_BRIGHT, _LIT = 90, 0.1  # percentile of a tile that sees the lamp if any does; share of its signal
+_BRIGHT, _LIT = 0.9, 0.1  # quantile of a tile that sees the lamp if any does; share of its signal
 
 
 def clipped_variance_factor(clip: float) -> float:
@@ -179,7 +179,8 @@ class Combination:
         """
         if self._reference is None:
             self._start(frames)
-        levels = self._common(frames)
+        assert self._reference is not None
+        levels = self._common(_some(frames), _some(self._reference[None])[0])
         self._levels.append(levels)
         zeros, ones = np.zeros_like(levels), np.ones_like(levels)
         offsets, factors = (zeros, ones / levels) if self._lamp else (levels, ones)
@@ -210,16 +211,18 @@ class Combination:
         return Combined(mean, variance, kurtosis, seen, n)
 
     def _start(self, frames: F32) -> None:
-        # Twice: the frames' common part is taken out before the limits are measured for good.
-        self._reference, deviation = median_and_deviation(frames)
+        # Twice: the frames' common part, which some pixels tell, is taken out before the limits are
+        # measured for good.
+        reference, deviation = median_and_deviation(_some(frames)[:, None])
         scale = _SIGMA_OF_MAD * len(frames) / max(len(frames) - 0.8, 0.2)
-        seen = lit(self._reference) if self._lamp else np.ones(self._reference.shape, np.bool_)
-        self._sigma = scale * _finite_median(deviation[seen])
-        levels = self._common(frames)[:, None, None]
+        seen = lit(reference) if self._lamp else np.ones(reference.shape, np.bool_)
+        self._sigma = scale * finite_median(deviation[seen])
+        levels = self._common(_some(frames), reference[0])[:, None, None]
         level = frames / levels if self._lamp else frames - levels
         self._reference, deviation = median_and_deviation(level)
         sigma = scale * deviation
-        self._sigma = _finite_median(sigma[seen])
+        seen = lit(self._reference) if self._lamp else np.ones(sigma.shape, np.bool_)
+        self._sigma = finite_median(sigma[seen])
         if len(frames) == 2:
             # Two samples cannot tell which is wrong, nor their own noise: the tile's noise decides,
             # and of two that disagree the lower one is right, since particles only add charge.
@@ -233,34 +236,37 @@ class Combination:
         self._limit = np.float32(self._clip) * np.hypot(sigma, np.float32(self._quantum)) + rounding
         self._sums = np.zeros((6, *frames.shape[1:]))
 
-    def _common(self, frames: F32) -> F32:
-        """Factor or offset of each frame to the reference, from the median of some pixels."""
-        assert self._reference is not None
-        # An odd stride meets all columns, whatever pattern they have.
-        stride = (frames[0].size // _LEVEL_PIXELS) | 1
-        samples = frames.reshape(len(frames), -1)[:, ::stride]
-        reference = self._reference.reshape(-1)[::stride]
+    def _common(self, samples: F32, reference: F32) -> F32:
+        """Factor or offset of each frame (t, n) to the reference (n,), by the median."""
         if not self._lamp:
-            return np.array([_finite_median(s - reference) for s in samples], np.float32)
-        level = _finite_median(reference[lit(reference)])
+            return np.array([finite_median(s - reference) for s in samples], np.float32)
+        level = finite_median(reference[lit(reference)])
         if not level > 3 * self._sigma or level <= 0:
             # Too dark here to see the lamp.
-            return np.ones(len(frames), np.float32)
+            return np.ones(len(samples), np.float32)
         bright = reference >= level
-        ratios = (_finite_median(s[bright] / reference[bright]) for s in samples)
+        ratios = (finite_median(s[bright] / reference[bright]) for s in samples)
         return np.array([r if r > 0 else np.nan for r in ratios], np.float32)
 
 
 def lit(signal: NDArray[Any]) -> Mask:
     """Pixels of a tile that see the lamp; those of an overscan do not."""
-    # An odd stride meets all columns, whatever pattern they have.
-    some = signal.ravel()[:: (signal.size // _LEVEL_PIXELS) | 1]
+    some = _some(signal[None])[0]
     finite = some[np.isfinite(some)]
-    bright = float(np.percentile(finite, _BRIGHT)) if finite.size else np.inf
+    rank = int(_BRIGHT * finite.size)
+    bright = float(np.partition(finite, rank)[rank]) if finite.size else np.inf
     return np.asarray(signal > _LIT * bright)
 
 
-def _finite_median(values: F32) -> float:
+def _some(frames: NDArray[Any]) -> NDArray[Any]:
+    """Samples (t, n) of some pixels of frames (t, ...), the same in each."""
+    # An odd stride meets all columns, whatever pattern they have.
+    stride = (frames[0].size // _LEVEL_PIXELS) | 1
+    return np.ascontiguousarray(frames.reshape(len(frames), -1)[:, ::stride])
+
+
+def finite_median(values: NDArray[Any]) -> float:
+    """Median of the finite values (n,); NaN if there are none."""
     finite = values[np.isfinite(values)]
     return median(finite) if finite.size else math.nan
 

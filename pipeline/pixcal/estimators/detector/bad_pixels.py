@@ -203,23 +203,39 @@ def _common(off: F64, brightness: F64, used: Mask) -> F64:
     """What pixels of one brightness (y, x) have in common of their departures (rung, y, x)."""
     seen = lit(brightness)
     usual, scale = median_and_sigma(brightness[seen])
-    x = (
-        np.clip((brightness - usual) / scale, -_FARTHEST, _FARTHEST)
-        if scale > 0
-        else 0 * brightness
-    )
-    x = np.nan_to_num(x)
-    some = np.zeros(x.shape, np.bool_)
-    some.flat[:: max(x.size // _SAMPLE, 1) | 1] = True
-    some &= seen
-    found = np.zeros_like(off)
-    for rest, out, own in zip(off, found, used & np.isfinite(off), strict=True):
-        kept = own & some
-        for _ in range(_CLIPPINGS):
-            if kept.sum() < _FEWEST:
-                break
-            terms = np.polynomial.polynomial.polyfit(x[kept], rest[kept], _DEGREE)
-            out[:] = np.polynomial.polynomial.polyval(x, terms)
-            left = rest - out
-            kept = own & some & (np.abs(left) < _CLIP * max(median_and_sigma(left[kept])[1], 1e-12))
-    return np.nan_to_num(found)
+    x = (brightness - usual) / scale if scale > 0 else 0 * brightness
+    powers = np.vander(np.nan_to_num(np.clip(x, -_FARTHEST, _FARTHEST)).ravel(), _DEGREE + 1)
+    some = np.arange(0, x.size, max(x.size // _SAMPLE, 1) | 1)
+    some = some[seen.ravel()[some]]
+    picked = powers[some]
+    products = (picked[:, :, None] * picked[:, None]).reshape(len(some), -1)
+    rests = off.reshape(len(off), -1)[:, some]
+    usable = used.reshape(len(off), -1)[:, some] & np.isfinite(rests)
+    curves = [_curve(picked, products, *one) for one in zip(rests, usable, strict=True)]
+    found = (np.array(curves) @ powers.T).reshape(off.shape)
+    return np.where(used & np.isfinite(off), found, 0.0)
+
+
+def _curve(powers: F64, products: F64, values: F64, usable: Mask) -> F64:
+    """Polynomial through values (n,) without outliers; all zero through too few.
+
+    Parameters
+    ----------
+    powers, products : (n, power), (n, power * power) float64
+        Of the places, and products of each two.
+    values : (n,) float64
+    usable : (n,) bool
+    """
+    terms = np.zeros(powers.shape[1])
+    kept = usable
+    for _ in range(_CLIPPINGS):
+        if np.count_nonzero(kept) < _FEWEST:
+            break
+        normal = (kept @ products).reshape(len(terms), -1)
+        terms[:] = np.linalg.lstsq(normal, np.where(kept, values, 0.0) @ powers)[0]
+        left = values - powers @ terms
+        limit = _CLIP * max(median_and_sigma(left[kept])[1], 1e-12)
+        before, kept = kept, usable & (np.abs(left) < limit)
+        if np.array_equal(kept, before):
+            break
+    return terms

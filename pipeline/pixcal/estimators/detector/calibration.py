@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtr, chdtri
 
-from pixcal.kernels.robust import lit, median_and_sigma
+from pixcal.kernels.robust import finite_median, lit, median
 from pixcal.model.arrays import F64, Mask
 
 MIN_RUNGS = 3  # fewest exposure times that tell a straight line from a bent one
@@ -91,7 +91,7 @@ def usual_variance(variance: NDArray[Any], dof: int) -> float:
     if dof < 1:
         return np.nan
     # The median of a variance of few samples is below its mean.
-    usual = median_and_sigma(variance)[0] * dof / float(chdtri(dof, 0.5))
+    usual = finite_median(variance) * dof / float(chdtri(dof, 0.5))
     # Variances of few whole numbers come in steps: a mean without outliers lies between them.
     limit = float(chdtri(dof, _OUTLYING))
     kept = float(chdtr(dof + 2, limit) / chdtr(dof, limit))
@@ -111,7 +111,7 @@ def step_levels(rungs: Sequence[Rung]) -> F64:
     if not seen.any():
         return np.full(len(rungs), np.nan)
     whole = (np.nan_to_num(rung.signal[seen], nan=np.inf) for rung in rungs)
-    levels = np.array([np.median(signal) for signal in whole])
+    levels = np.array([median(signal) for signal in whole])
     return np.where(np.isfinite(levels), levels, np.nan)
 
 
@@ -143,8 +143,10 @@ def relative_response(rungs: Sequence[Rung], levels: F64) -> tuple[F64, F64]:
         return charge / light, np.sqrt(variance) / np.abs(light)
 
 
-def unsaturated(rungs: Sequence[Rung], dark_variance: float = 0.0) -> list[Rung]:
-    """Flats without the signal of full pixels, which becomes NaN.
+def unsaturated(
+    rungs: Sequence[Rung], levels: F64, dark_variance: float = 0.0
+) -> tuple[Sequence[Rung], F64]:
+    """Flats without the signal of full pixels, which becomes NaN, and their levels.
 
     A full well has no photon noise. It may be full far below the highest code, and read noise then
     spreads the samples: no code piles up. Such samples would flatten the response and outweigh all
@@ -154,29 +156,31 @@ def unsaturated(rungs: Sequence[Rung], dark_variance: float = 0.0) -> list[Rung]
     ----------
     rungs : sequence of Rung
         Of the same pixels, in any order.
+    levels : (rung,) float64
+        As `step_levels` gives them.
     dark_variance : float
         Of a usual sample without light (ADU²): the dimmest levels may show little else.
     """
-    levels = step_levels(rungs)
     seen = lit(np.fmax.reduce([rung.signal for rung in rungs]))
     full, least, most = np.zeros(len(rungs), np.bool_), np.inf, 0.0
     for n in np.argsort(levels):
         if not levels[n] > 0:
             continue
-        noise = median_and_sigma(rungs[n].variance[seen] * rungs[n].frames)[0]
+        noise = finite_median(rungs[n].variance[seen] * rungs[n].frames)
         slope = (noise - dark_variance) / levels[n]
         full[n] = slope < COLLAPSED * least < np.inf and noise < most
         most = max(most, noise)
         if not full[n] and noise > (1 + SHOT) * dark_variance:
             least = min(least, slope)
     if not full.any():
-        return list(rungs)
+        return rungs, levels
     well = np.mean([rung.signal for rung, ended in zip(rungs, full, strict=True) if ended], axis=0)
     limit = np.where(np.isfinite(well), (1 - NEARLY) * well, np.inf)
-    return [
+    left = [
         replace(rung, signal=np.where(ended | (rung.signal > limit), np.nan, rung.signal))
         for rung, ended in zip(rungs, full, strict=True)
     ]
+    return left, step_levels(left)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,6 @@ from pixcal.kernels.photon_transfer import (
     BLOCK,
     COLUMNS,
     LAGS,
-    N_BINS,
     bin_pairs,
     pair_statistics,
 )
@@ -28,6 +27,7 @@ _PAIR_LAMP_CHANGE = 0.05
 # Of n normal numbers less their median, n times by how much the variance is less, and by how much
 # each two are anticorrelated: 2 / n by the mean, of which the scatter of the median takes π/2.
 _MEDIAN_TAKES = 2 - math.pi / 2
+_NO_BLOCKS = np.zeros((0, COLUMNS))
 
 
 def shared_by_lines(dark: F64) -> dict[str, Measure]:
@@ -78,10 +78,9 @@ def dark_pair_sums(
     without : tuple of str
         Lines whose common noise is taken off.
     """
-    sums = np.zeros((N_BINS, COLUMNS))
-    for first, second in zip(frames[::2], frames[1::2], strict=False):
-        sums += _sums(first, second, np.inf, read_noise, quantum, without)
-    return sums
+    pairs = zip(frames[::2], frames[1::2], strict=False)
+    blocks = [_blocks(*pair, np.inf, read_noise, quantum, without) for pair in pairs]
+    return bin_pairs(np.concatenate([_NO_BLOCKS, *blocks]))
 
 
 def flat_pair_sums(
@@ -105,7 +104,7 @@ def flat_pair_sums(
     line_noise : LineNoise
         Of these pixels.
     """
-    sums = np.zeros((N_BINS, COLUMNS))
+    blocks = [_NO_BLOCKS]
     for n in range(0, len(frames) - 1, 2):
         (a, b), (first, second) = levels[n : n + 2], frames[n : n + 2]
         if not np.isfinite(a + b) or abs(a - b) > _PAIR_LAMP_CHANGE * (a + b) / 2:
@@ -113,11 +112,11 @@ def flat_pair_sums(
         first, second = first * ((a + b) / (2 * a)), second * ((a + b) / (2 * b))
         # Full pixels beside those of an overscan would pass for half-full ones without noise.
         first[~lit(first + second)] = np.nan
-        sums += _sums(first, second, gain, read_noise, quantum, line_noise.lines or ())
-    return line_noise.put_back(sums)
+        blocks.append(_blocks(first, second, gain, read_noise, quantum, line_noise.lines or ()))
+    return line_noise.put_back(bin_pairs(np.concatenate(blocks)))
 
 
-def _sums(
+def _blocks(
     first: F32,
     second: F32,
     gain: float,
@@ -126,7 +125,7 @@ def _sums(
     without: tuple[str, ...],
 ) -> F64:
     if not np.isfinite(first + second).any():
-        return np.zeros((N_BINS, COLUMNS))
+        return _NO_BLOCKS
     for name in without:
         second = second + _common(first - second, name)
     blocks = pair_statistics(first, second, gain=gain, read_noise=read_noise, quantum=quantum)
@@ -135,7 +134,7 @@ def _sums(
         across = 0 if name == "row" else 1
         blocks[:, 2] += taken
         blocks[:, 3:] += np.outer(taken, LAGS[:, across] == 0)
-    return bin_pairs(blocks)
+    return blocks
 
 
 def _common(difference: F32, line: str) -> F32:

@@ -27,7 +27,7 @@ from pixcal.estimators.detector.calibration import (
 from pixcal.estimators.detector.cut_off import without_cut_off
 from pixcal.estimators.detector.pair_noise import LineNoise, dark_pair_sums, flat_pair_sums
 from pixcal.kernels.photon_transfer import COLUMNS, N_BINS
-from pixcal.kernels.robust import BATCH, Combination, Combined, lit, median_and_sigma
+from pixcal.kernels.robust import BATCH, Combination, Combined, finite_median, lit
 from pixcal.kernels.rounding import SHEPPARD
 from pixcal.model.arrays import F32, F64
 from pixcal.model.flags import PixelFlag
@@ -231,7 +231,7 @@ def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined)
     column.levels[number, 1:] = signal.size, (frames - found.seen).sum()
     # Few frames say little of one pixel's noise, and most pixels are like the others.
     seen = lit(signal)
-    level = median_and_sigma(signal[seen])[0]
+    level = finite_median(signal[seen])
     usual = usual_variance(found.variance[seen], frames - 1)
     if usual < (_COARSE * job.quantum) ** 2:
         usual = float(np.nanmean(found.variance[seen]))
@@ -245,9 +245,9 @@ def _measure_rung(job: Measuring, column: _Column, number: int, found: Combined)
 
 def _measure_response(job: Measuring, column: _Column) -> None:
     """Response and levels of the tile, and pixels that do not follow the others."""
-    maps, rungs = column.maps, unsaturated(column.rungs, float(np.median(column.noise)))
-    column.levels[:, 0] = step_levels(column.rungs)
-    levels = step_levels(rungs)
+    maps, levels = column.maps, step_levels(column.rungs)
+    column.levels[:, 0] = levels
+    rungs, levels = unsaturated(column.rungs, levels, float(np.median(column.noise)))
     maps["response"], maps["response_error"] = relative_response(rungs, levels)
     maps["flags"][nonlinear(rungs, levels, job.limits.nonlinear)] += int(PixelFlag.NONLINEAR)
 
