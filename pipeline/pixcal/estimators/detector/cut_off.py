@@ -2,23 +2,26 @@
 
 A sample is a normal number, rounded to a code; what is negative is read as zero. Mean and variance
 of such samples tell level and noise of the normal (a censored one: Cohen 1959, *Technometrics* 1,
-217), those of most pixels the noise and that of each pixel its level.
+217). Each pixel has a level of its own; most pixels have the same noise, which explains the mean of
+their variances. No likelihood of each pixel is maximised: with a level for each the noise would be
+too low, as much as by one frame of them all (Neyman and Scott 1948, *Econometrica* 16, 1).
 """
 
 import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from pixcal.kernels.robust import Combined, median_and_sigma
 from pixcal.kernels.rounding import SHEPPARD
 from pixcal.model.arrays import F64
 
-_LEVELS = np.linspace(-2, 8, 401)  # over the noise
+_LEVELS = np.linspace(-4, 8, 481)  # over the noise
 _CUT = 4.0  # mean over noise below which samples are cut off
 _FINEST = 20.0  # steps of the noise in which codes are summed up at most
-_ROUNDS = 12
+_RANGE = 0.3, 5.0  # least and largest noise over that of the samples as they are
 _HOT, _NOISY = 6.0, 10.0
 
 
@@ -46,26 +49,44 @@ def without_cut_off(found: Combined, frames: int, step: float) -> tuple[Combined
         return found, 1.0
     # Means, for medians are those of no normal; without hot and noisy pixels.
     centre, spread = median_and_sigma(found.mean[known])
+    spread = max(spread, math.sqrt(float(found.variance[known].mean()) / frames))
     most = (1 + _NOISY * math.sqrt(2 / (frames - 1))) * float(np.median(found.variance[known]))
     usual = known & (abs(found.mean - centre) <= _HOT * spread) & (found.variance <= most)
-    level, variance = float(found.mean[usual].mean()), float(found.variance[usual].mean())
-    if not variance > 0 or not level < _CUT * math.sqrt(variance):
+    mean, variance = found.mean[usual], found.variance[usual]
+    sample = math.sqrt(float(variance.mean())) if usual.any() else 0.0
+    if not 0 < float(mean.mean()) < _CUT * sample:
         return found, 1.0
-    noise = math.sqrt(variance)
-    for _ in range(_ROUNDS):
-        means, variances = _of_cut_off(_LEVELS * noise, noise, step)
-        at = np.interp(level / math.sqrt(variance), means / np.sqrt(variances), _LEVELS)
-        noise *= math.sqrt(variance / float(np.interp(at, _LEVELS, variances)))
-    levels = np.interp(found.mean, means, _LEVELS * noise)
-    seen = np.interp(levels, _LEVELS * noise, variances)
-    whole = noise**2 + SHEPPARD * step**2
+
+    def excess(noise: float) -> float:
+        table = _of_cut_off(_LEVELS * noise, noise, step)
+        return float(np.mean(_variance_at(mean, variance / frames, *table)) - sample**2)
+
+    low, high = (end * sample for end in _RANGE)
+    if not excess(low) < 0 < excess(high):
+        return found, 1.0
+    noise = float(brentq(excess, low, high, rtol=1e-4))
+    means, variances = _of_cut_off(_LEVELS * noise, noise, step)
     above = found.mean > means[-1]
+    seen = np.interp(found.mean, means, variances)
+    whole = noise**2 + SHEPPARD * step**2
+    # A usual pixel of few frames is more like the others than like its own chance: of one that is
+    # zero in all of them nothing else is known.
+    true = max(1 - sample**2 / frames / float(mean.var()), 0.0) if mean.var() > 0 else 0.0
+    likely = np.where(usual, mean.mean() + true * (found.mean - mean.mean()), found.mean)
     corrected = replace(
         found,
-        mean=np.where(above, found.mean, levels),
+        mean=np.where(above, found.mean, np.interp(likely, means, _LEVELS * noise)),
         variance=np.where(above, 1.0, whole / seen) * found.variance,
     )
-    return corrected, whole / float(np.nanmean(np.where(above, whole, seen)))
+    expected = _variance_at(found.mean, found.variance / frames, means, variances)
+    return corrected, whole / float(np.nanmean(np.where(above, whole, expected)))
+
+
+def _variance_at(mean: F64, error: F64, means: F64, variances: F64) -> F64:
+    """Variances of samples of some means with errors (variances), free of a bias by these."""
+    bend = np.gradient(np.gradient(variances, means), means)
+    at = np.interp(mean, means, variances)
+    return np.asarray(at - np.interp(mean, means, bend) * error / 2)
 
 
 def _of_cut_off(levels: F64, noise: float, step: float) -> tuple[F64, F64]:

@@ -14,9 +14,9 @@ from pixcal.stages.reduce.flat_survey import middle_rows
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.storage.place import Place
 
-# Error of the variance of noise that is cut off at code zero, whose samples are taken for those of
-# normals: relative; in square steps below so many steps, where few codes are left to tell.
-_CUT_OFF, _COARSE_CUT_OFF, _FEW_STEPS = 0.02, 0.2, 0.75
+# Error of noise that is cut off at code zero, relative: itself, and times the cube of the step over
+# the noise. So far off it is at most where pixels differ by 10 % rms and are taken for alike.
+_CUT_OFF, _COARSE_CUT_OFF = 0.006, 0.004
 _LEAST = 0.05  # steps of noise that are told from none
 
 
@@ -51,10 +51,9 @@ def read_noise(
         return None, None
     variance = max(whole[0] - shot, SHEPPARD * job.quantum**2), whole[1]
     if is_cut_off(job):
-        own = variance[0] - SHEPPARD * job.quantum**2
-        coarse = own < (_FEW_STEPS * job.quantum) ** 2
-        unsure = _COARSE_CUT_OFF * job.quantum**2 if coarse else _CUT_OFF * own
-        return of_variance((variance[0], math.hypot(variance[1], unsure)), job.quantum)
+        own = max(variance[0] - SHEPPARD * job.quantum**2, (_LEAST * job.quantum) ** 2)
+        off = _CUT_OFF + _COARSE_CUT_OFF * (job.quantum / math.sqrt(own)) ** 3
+        return of_variance((variance[0], math.hypot(variance[1], 2 * off * own)), job.quantum)
     noise = math.sqrt(variance[0])
     measured = noise, variance[1] / (2 * noise) if noise else 0.0
     return measured, _before_rounding(variance, folder, job) if job.quantum else measured
