@@ -50,10 +50,7 @@ class DaskWorker:
 def workers_of(address: str, *, quiet: bool) -> list[DaskWorker]:
     """The workers that a cluster has now, at least one: it is waited for.
 
-    Raises
-    ------
-    InputError
-        If no scheduler answers at the address.
+    Raises InputError if no scheduler answers at the address.
     """
     with _connect(address, quiet=quiet) as client:
         workers = client.scheduler_info(n_workers=-1)["workers"]
@@ -80,27 +77,18 @@ def run_on_cluster(
 ) -> None:
     """Do tasks on a cluster.
 
+    Raises InputError if no scheduler answers there, or workers lack files or versions; or as a task
+    raised it. Raises ClusterError if the scheduler is lost, or workers die again and again at the
+    same task.
+
     Parameters
     ----------
-    address : str
-        Of the scheduler, ``tcp://…`` or ``tls://…``.
-    function, items : callable, sequence
-        Called with each item; both are pickled.
-    ended : callable
-        Gets the number and the result of each task.
-    label : str
-        What the dashboard calls the tasks.
-    at_once : int
-        Tasks that one worker process may do at the same time; 0 for as many as it has threads.
-    quiet : bool
-        Print nothing.
-
-    Raises
-    ------
-    InputError
-        If no scheduler answers there, or workers lack files or versions; or as a task raised it.
-    ClusterError
-        If the scheduler is lost, or workers die again and again at the same task.
+    address : of the scheduler, ``tcp://…`` or ``tls://…``
+    function, items : called with each item; both are pickled
+    ended : gets the number and the result of each task
+    label : what the dashboard calls the tasks
+    at_once : tasks that one worker process may do at the same time; 0 for as many as it has threads
+    quiet : print nothing
     """
     if not items:
         return

@@ -43,10 +43,7 @@ def run_in_processes(
 ) -> None:
     """Do the tasks in processes; those that a killed one had in hand are done again.
 
-    Raises
-    ------
-    ClusterError
-        If processes die again and again at the same tasks.
+    Raises ClusterError if processes die again and again at the same tasks.
     """
     packed = pack(function)
     job = Job(packed.data, packed.paths)

@@ -113,10 +113,8 @@ _abandoned: set[str] = set()
 def call(job: Job, item: PickledArguments) -> Any:
     """Do one task of a job, in the process that was chosen for it.
 
-    Raises
-    ------
-    InputError
-        If other versions are installed where this runs, or files of the task cannot be seen there.
+    Raises InputError if other versions are installed where this runs, or files of the task cannot
+    be seen there.
     """
     with _counting:
         if job.name in _abandoned:

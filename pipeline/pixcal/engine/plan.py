@@ -33,12 +33,8 @@ def make_plan(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtim
     """Choose the number of workers so that the work fits the memory allowed.
 
     Fewer than asked for are told on stderr. On a Dask cluster the tasks must fit the memory limits
-    of its workers; ``--memory`` holds for this process alone.
-
-    Raises
-    ------
-    PlanError
-        If not even one worker fits; the message holds both numbers.
+    of its workers; ``--memory`` holds for this process alone. Raises PlanError if not even one
+    worker fits; the message holds both numbers.
     """
     if runtime.remote:
         return _plan_on_cluster(what, bytes_per_task, shared_bytes, runtime)

@@ -87,10 +87,7 @@ def one_blas_thread() -> AbstractContextManager[Any]:
 def _libraries(modules: int) -> ThreadpoolController:
     """Libraries with threads that are loaded; to look for them takes milliseconds.
 
-    Parameters
-    ----------
-    modules : int
-        Modules imported by now: more may have brought more libraries.
+    ``modules``: modules imported by now: more may have brought more libraries.
     """
     return ThreadpoolController()
 
@@ -105,22 +102,15 @@ def run_tasks(
 ) -> list[R]:
     """Apply a function to every item, in parallel, with progress.
 
+    Returns results in the order of the items.
+
     Parameters
     ----------
-    function : callable
-        Called with one item; must not depend on the order of the items.
-    items : sequence
-        One for each task.
-    label : str
-        What is being done, for the progress line.
-    done : callable, optional
-        Called in this process with (number of the item, result) as each task ends, e.g. to
-        note it in a journal.
-
-    Returns
-    -------
-    list
-        Results in the order of the items.
+    function : called with one item; must not depend on the order of the items
+    items : one for each task
+    label : what is being done, for the progress line
+    done : called in this process with (number of the item, result) as each task ends, e.g. to note
+        it in a journal.
     """
     results: dict[int, R] = {}
     times = (TimeElapsedColumn(), "left", TimeRemainingColumn())

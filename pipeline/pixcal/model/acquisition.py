@@ -126,15 +126,8 @@ class Acquisition:
 def load_acquisition(path: Path) -> Acquisition:
     """Read an acquisition description.
 
-    Parameters
-    ----------
-    path : Path
-        The directory, or the YAML file itself.
-
-    Raises
-    ------
-    InputError
-        If it is missing or any key is unknown, missing or out of range.
+    ``path``: the directory, or the YAML file itself. Raises InputError if it is missing or any key
+    is unknown, missing or out of range.
     """
     file = path / "acquisition.yaml" if path.is_dir() else path
     if not file.exists():

@@ -37,20 +37,13 @@ def quantity(
 
     Parameters
     ----------
-    default : optional
-        Value used when the key is absent; without it the key is required.
-    unit : str
-        Unit, for messages and the documentation.
-    low, high : float, optional
-        Inclusive limits of a number (of each number of a tuple).
-    above : float, optional
-        Exclusive lower limit.
-    choices : tuple of str, optional
-        The only words allowed.
-    doc : str
-        One line on the meaning.
-    **more
-        Of options, as `pixcal.model.options` says.
+    default : value used when the key is absent; without it the key is required
+    unit : unit, for messages and the documentation
+    low, high : inclusive limits of a number (of each number of a tuple)
+    above : exclusive lower limit
+    choices : the only words allowed
+    doc : one line on the meaning
+    **more : of options, as `pixcal.model.options` says
     """
     meta = dict(more, unit=unit, low=low, high=high, above=above, choices=choices, doc=doc)
     if isinstance(default, (list, dict)):
@@ -79,21 +72,15 @@ class _Place:
 def parse(cls: type[T], data: Any, where: str, *, key: str = "") -> T:
     """Build the dataclass ``cls`` from plain data.
 
+    Raises InputError naming the first key that is unknown, missing, of the wrong type or out of
+    range.
+
     Parameters
     ----------
-    cls : type
-        A frozen dataclass with type-annotated fields.
-    data : object
-        Mapping as read from YAML (mistakes then have their line) or JSON.
-    where : str
-        Name of the file, for messages.
-    key : str
-        Dotted path of ``data`` inside the file, for messages.
-
-    Raises
-    ------
-    InputError
-        Naming the first key that is unknown, missing, of the wrong type or out of range.
+    cls : a frozen dataclass with type-annotated fields
+    data : mapping as read from YAML (mistakes then have their line) or JSON
+    where : name of the file, for messages
+    key : dotted path of ``data`` inside the file, for messages
     """
     return _section(cls, data, _Place(where, key))
 
@@ -142,11 +129,7 @@ def to_plain(config: Any) -> Any:
 def result_options(config: Any, kind: type | None = None) -> dict[str, Any]:
     """Plain data of the options that a result depends on.
 
-    Parameters
-    ----------
-    config : dataclass
-    kind : type, optional
-        A dataclass that the configuration inherits from, to look at its options alone.
+    ``kind``: a dataclass that the configuration inherits from, to look at its options alone.
     """
     return {
         f.name: to_plain(getattr(config, f.name))

@@ -72,10 +72,7 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:map", _StrictLoader.construct_s
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read a YAML mapping, refusing tags, aliases, duplicate keys and oversized files.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, too large, not UTF-8, not YAML, or not a mapping.
+    Raises InputError if the file is missing, too large, not UTF-8, not YAML, or not a mapping.
     """
     try:
         if path.stat().st_size > MAX_CONFIG_BYTES:

@@ -40,10 +40,7 @@ class PrecisionLine:
 def budget_figure(result: Mapping[str, Any]) -> Figure:
     """Precision against frames on the left, time with each change of the bench on the right.
 
-    Parameters
-    ----------
-    result : mapping
-        Contents of ``budget.json``.
+    ``result``: contents of ``budget.json``.
     """
     figure = new_figure(WIDE, 4.9)
     left, right = figure.subplots(1, 2, width_ratios=[1.25, 1])

@@ -20,11 +20,9 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
 
     Parameters
     ----------
-    curve : mapping
-        ``level`` (ADU), ``variance`` and ``error`` (ADU²) of the points; ``gain`` (e-/ADU) and
-        ``read_variance`` (ADU²) of the line.
-    saturation : float, optional
-        Level (ADU) where the detector saturates.
+    curve : ``level`` (ADU), ``variance`` and ``error`` (ADU²) of the points; ``gain`` (e-/ADU) and
+        ``read_variance`` (ADU²) of the line
+    saturation : level (ADU) where the detector saturates
     """
     level, variance, error = (np.array(curve[k]) for k in ("level", "variance", "error"))
     shown = (level > 0) & (variance > 0)
@@ -61,12 +59,9 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
 def nonuniformity(patterns: Mapping[str, Curves]) -> Figure:
     """Spectra along rows and columns over the noise, and the means of rows and columns.
 
-    Parameters
-    ----------
-    patterns : mapping
-        For ``DSNU`` and ``PRNU``: ``unit``; ``rows`` and ``columns`` with ``frequency``
-        (cycles/px), ``amplitude`` and ``noise`` of the spectrum, ``at`` (px) and ``profile`` of
-        the means.
+    ``patterns``: for ``DSNU`` and ``PRNU``: ``unit``; ``rows`` and ``columns`` with ``frequency``
+    (cycles/px), ``amplitude`` and ``noise`` of the spectrum, ``at`` (px) and ``profile`` of the
+    means.
     """
     figure, grid = axes_grid(
         (WIDE, 2.6 * len(patterns) + 0.3), len(patterns), 3, right=0.1, beside=0.85,
@@ -111,10 +106,7 @@ def _spectra(axes: Axes, curves: Curves) -> None:
 def linearity(levels: Sequence[Mapping[str, Any]]) -> Figure:
     """Deviation from a straight line over the exposure-time steps of the flats.
 
-    Parameters
-    ----------
-    levels : sequence of mapping
-        With ``level_e`` (e-) and ``deviation_percent`` (None where the step was not used).
+    ``levels``: with ``level_e`` (e-) and ``deviation_percent`` (None where the step was not used).
     """
     used = [v for v in levels if v.get("deviation_percent") is not None]
     left_out = [v for v in levels if v.get("deviation_percent") is None]

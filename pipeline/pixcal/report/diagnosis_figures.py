@@ -151,10 +151,8 @@ def curves_figure(curves: Sequence[Mapping[str, Any]], *, with_effects: bool = T
 
     Parameters
     ----------
-    curves : sequence of mapping
-        Up to three entries of ``curves.json``.
-    with_effects : bool
-        False where no effect was found: then that curve is the nominal one.
+    curves : up to three entries of ``curves.json``
+    with_effects : False where no effect was found: then that curve is the nominal one
     """
     named = [places(c) for c in curves if _is_named(c)]
     # room for the longest of the names that are written upwards, inches

@@ -50,12 +50,9 @@ def panels(
 
     Parameters
     ----------
-    shape : (int, int)
-        Rows and columns of the detector's window.
-    places : sequence of mapping
-        Windows with ``domains``, of ``diagnosis.json``; of a small detector none.
-    curves : sequence of mapping
-        Of ``curves.json``; those by cells are maps.
+    shape : rows and columns of the detector's window
+    places : windows with ``domains``, of ``diagnosis.json``; of a small detector none
+    curves : of ``curves.json``; those by cells are maps
     """
     maps = _of_windows(places) if places else _of_cells(shape, curves)
     maps = [panel for panel in maps if panel.largest > ASIDE]

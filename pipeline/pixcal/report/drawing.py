@@ -110,20 +110,15 @@ def axes_grid(
 ) -> tuple[Figure, NDArray[Any]]:
     """A figure and its grid of axes at fixed places: a computed layout takes half of the drawing.
 
+    Returns the figure and its axes (rows, columns).
+
     Parameters
     ----------
-    size : (float, float)
-        Width and height, inches.
-    rows, columns : int
-        Of the grid.
-    left, right, bottom, top, beside, between : float
-        Margins, and gaps of columns and of rows, inches; labels have to fit.
-    **drawing
-        For ``Figure.subplots``.
-
-    Returns
-    -------
-    Figure, ndarray of Axes (rows, columns)
+    size : width and height, inches
+    rows, columns : of the grid
+    left, right, bottom, top, beside, between : margins, and gaps of columns and of rows, inches;
+        labels have to fit
+    **drawing : for ``Figure.subplots``
     """
     figure, (width, height) = Figure(figsize=size, dpi=DPI), size
     # Gaps are shares of the mean width and height of the axes.

@@ -38,12 +38,9 @@ def offsets(
 
     Parameters
     ----------
-    name : str
-        ``delta_x`` and so on.
-    delta, sigma : MapSummary
-        Offsets and their errors, px.
-    start : (int, int)
-        First row and column, where it is a part of the map.
+    name : ``delta_x`` and so on
+    delta, sigma : offsets and their errors, px
+    start : first row and column, where it is a part of the map
     """
     width, height = fit_box(delta.shape, 5.7, 5.4)
     total = height + 3.45
@@ -175,10 +172,8 @@ def power(maps: Sequence[MapContents], vectors: Mapping[str, tuple[float, float]
 
     Parameters
     ----------
-    maps : sequence of MapContents
-        With spectra.
-    vectors : mapping
-        Fringe vector (kx, ky), rad/px, of each set.
+    maps : with spectra
+    vectors : fringe vector (kx, ky), rad/px, of each set
     """
     figure, ((axes,),) = axes_grid((WIDE, 4.0), left=1.0)
     for offset, colour in zip(maps, LINES, strict=False):

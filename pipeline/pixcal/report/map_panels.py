@@ -101,12 +101,9 @@ def map_panel(title: str, label: str, summary: MapSummary, factor: float = 1.0) 
 
     Parameters
     ----------
-    title, label : str
-        What it is; quantity and unit of the colours.
-    summary : MapSummary
-        The map.
-    factor : float
-        What values are multiplied by to be in the unit of ``label``.
+    title, label : what it is; quantity and unit of the colours
+    summary : the map
+    factor : what values are multiplied by to be in the unit of ``label``
     """
     image = summary.image * factor
     scale = span_scale(image)
@@ -170,10 +167,8 @@ def spectra(
 
     Parameters
     ----------
-    maps : sequence of MapContents
-        With spectra.
-    vectors : mapping
-        Fringe vector (kx, ky), rad/px, of each set.
+    maps : with spectra
+    vectors : fringe vector (kx, ky), rad/px, of each set
     """
     panels = [_spectrum(SYMBOLS[m.name], m.spectrum, vectors) for m in maps if m.spectrum]
     return panels, [(MARKS[n % len(MARKS)], f"set {name}") for n, name in enumerate(vectors)]

@@ -50,15 +50,8 @@ FILTERS = vars(verdict) | vars(diagnosis_words) | vars(tables)
 def render(contents: Contents) -> str:
     """Draw all figures and write the page.
 
-    Parameters
-    ----------
-    contents : Contents
-        What there is; sections say what is missing.
-
-    Returns
-    -------
-    str
-        HTML without any reference to something outside it.
+    ``contents``: what there is; sections say what is missing. Returns HTML without any reference to
+    something outside it.
     """
     what = "pixel offsets" if contents.has_fringes else "detector"
     name = contents.acquisition["detector"].get("name")

@@ -109,14 +109,7 @@ def block_side(shape: tuple[int, ...], most: int = SHOWN_PIXELS) -> int:
 def block_mean(values: NDArray[Any], side: int) -> F32:
     """Means of side × side pixels, NaN left out; blocks at the far edges may be smaller.
 
-    Parameters
-    ----------
-    values : (y, x)
-
-    Returns
-    -------
-    (ceil(y / side), ceil(x / side)) float32
-        NaN where a block has no finite pixel.
+    Of values (y, x): (ceil(y / side), ceil(x / side)) float32, NaN where a block has none.
     """
     total, count = _block_sums(values, np.isfinite(values), side)
     return _ratio(total, count).astype(np.float32)
@@ -150,10 +143,8 @@ def summarise(source: Source, most: int = SHOWN_PIXELS) -> MapSummary:
 
     Parameters
     ----------
-    source : Source
-        Values that are not finite count as masked.
-    most : int
-        Blocks along the longer side of the image.
+    source : values that are not finite count as masked
+    most : blocks along the longer side of the image
     """
     ny, nx = source.shape
     side = block_side((ny, nx), most)
@@ -238,12 +229,8 @@ def spectrum(delta: Source, sigma: Source) -> Spectrum | None:
     """Mean power spectrum of windows spread over a map; None where no pixel is good.
 
     Each window is tapered (sine squared) and masked pixels count as zero, both of which the
-    normalisation takes into account; spectra of independent errors stay flat.
-
-    Parameters
-    ----------
-    delta, sigma : Source
-        Map and 1-sigma errors (px); NaN where masked.
+    normalisation takes into account; spectra of independent errors stay flat. ``delta, sigma``: map
+    and 1-sigma errors (px); NaN where masked.
     """
     my, mx = (min(SEGMENT, n) for n in delta.shape)
     taper = _taper(my)[:, None] * _taper(mx)[None, :]

@@ -58,11 +58,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Write ``RUN/report/report.html`` and ``RUN/products/report.html``.
 
     Only ``RUN/reduce`` must be there; what the later stages would add is marked as not measured.
-
-    Raises
-    ------
-    InputError
-        If reduce has not been run, or an artefact cannot be read.
+    Raises InputError if reduce has not been run, or an artefact cannot be read.
     """
     with working(run_dir, "reduce"):
         manifests = {

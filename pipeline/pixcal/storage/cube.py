@@ -59,14 +59,11 @@ def create_array(
 
     Parameters
     ----------
-    path : Path or UrlPath
-        Folder of the array, e.g. ``raw.zarr/fringes/vertical``.
-    shape, chunks : sequence of int
-        In the order of ``dims``.
-    dtype : dtype
-        Of fixed size; stored little-endian.
-    fill_value : scalar
-        Value outside the array in edge chunks, and CF ``_FillValue`` where ``attrs`` says so.
+    path : folder of the array, e.g. ``raw.zarr/fringes/vertical``.
+    shape, chunks : in the order of ``dims``
+    dtype : of fixed size; stored little-endian
+    fill_value : value outside the array in edge chunks, and CF ``_FillValue`` where ``attrs`` says
+        so
     """
     shape, chunks = tuple(map(int, shape)), tuple(map(int, chunks))
     dtype = np.dtype(dtype).newbyteorder("<")
@@ -179,11 +176,7 @@ class ArrayWriter:
         """Write a block that begins and ends on chunk borders (or at the array's end).
 
         A chunk that exists is whole. Blocks that share no chunk may be written at the same time.
-
-        Raises
-        ------
-        RemoteError
-            If the array is at a URL that does not take it.
+        Raises RemoteError if the array is at a URL that does not take it.
         """
         first = []
         for s, n, c, size in zip(start, data.shape, self.chunks, self.shape, strict=True):
@@ -227,15 +220,8 @@ class ArrayWriter:
     def finish(self) -> NDArray[Any]:
         """Check that every chunk is there and write the index of sizes and checksums.
 
-        Returns
-        -------
-        ndarray
-            The index: ``size`` (bytes) and ``crc`` of each chunk, in the shape of their grid.
-
-        Raises
-        ------
-        DamagedError
-            Naming the first chunk that is missing or cut.
+        Returns the index: ``size`` (bytes) and ``crc`` of each chunk, in the shape of their grid.
+        Raises DamagedError naming the first chunk that is missing or cut.
         """
         grid = _grid(self.shape, self.chunks)
         index = np.zeros(grid, _INDEX_DTYPE)
@@ -299,17 +285,8 @@ def remove_arrays(path: Place) -> None:
 class ArrayReader:
     """Reads blocks of an array written by `ArrayWriter`, checking every chunk.
 
-    Parameters
-    ----------
-    path : Path or UrlPath
-        Folder of the array.
-
-    Raises
-    ------
-    DamagedError
-        If the metadata or the chunk index is missing, cut or altered.
-    RemoteError
-        If the array is at a URL that does not answer.
+    ``path``: folder of the array. Raises DamagedError if the metadata or the chunk index is
+    missing, cut or altered. Raises RemoteError if the array is at a URL that does not answer.
     """
 
     def __init__(self, path: Place) -> None:
@@ -360,17 +337,12 @@ class ArrayReader:
     def read_chunk(self, index: Sequence[int], out: NDArray[Any] | None = None) -> NDArray[Any]:
         """One whole chunk (edge chunks too, padded with the fill value).
 
+        Raises DamagedError naming the chunk's file when it is missing, cut or altered.
+
         Parameters
         ----------
-        index : sequence of int
-            Position in the grid of chunks.
-        out : ndarray, optional
-            Buffer of shape ``chunks`` to decode into.
-
-        Raises
-        ------
-        DamagedError
-            Naming the chunk's file when it is missing, cut or altered.
+        index : position in the grid of chunks
+        out : buffer of shape ``chunks`` to decode into
         """
         if self._memory is not None:
             return self._memory.chunk(index)
@@ -420,10 +392,8 @@ class ArrayReader:
 
         Parameters
         ----------
-        *ranges : tuple of int
-            Start and stop along each axis; missing trailing axes are taken whole.
-        out : ndarray, optional
-            Buffer of the block's shape.
+        *ranges : start and stop along each axis; missing trailing axes are taken whole
+        out : buffer of the block's shape
         """
         full = [(0, n) for n in self.shape]
         full[: len(ranges)] = [(max(0, a), min(b, n)) for (a, b), (_, n) in zip(ranges, full)]  # noqa: B905

@@ -28,10 +28,7 @@ log = logging.getLogger(__name__)
 def cubes_of(artefact: Local) -> Place:
     """The folder in which an artefact keeps its cubes (``raw.zarr``, ``reduced.zarr``).
 
-    Raises
-    ------
-    DamagedError
-        If the artefact's ``cubes.json`` cannot be understood.
+    Raises DamagedError if the artefact's ``cubes.json`` cannot be understood.
     """
     pointer = _read(artefact)
     return artefact if pointer is None else parse_place(pointer["place"])
@@ -46,20 +43,13 @@ def base_of(artefact: Path) -> Place | None:
 def chosen_base(named: StrPath | None, run: Path, like: Path) -> Place | None:
     """The folder for all cubes that the user wants.
 
+    None: cubes stay in the artefacts.
+
     Parameters
     ----------
-    named : str or path or None
-        A path or URL; the run directory itself to keep cubes in the artefacts; None for the same
-        as another artefact.
-    run : Path
-        The run directory.
-    like : Path
-        That artefact.
-
-    Returns
-    -------
-    Path or UrlPath or None
-        None to keep cubes in the artefacts.
+    named : a path or URL; the run directory itself to keep cubes in the artefacts; None for the
+        same as another artefact
+    like : that artefact
     """
     if named is None:
         return base_of(like)
@@ -78,10 +68,7 @@ def settled(artefact: Path, run: Path, base: Place | None) -> bool:
 def settle(artefact: Path, run: Path, base: Place | None) -> None:
     """Make the folder for the cubes of an artefact in the making, unless it has one already.
 
-    Raises
-    ------
-    InputError
-        If nothing can be written there.
+    Raises InputError if nothing can be written there.
     """
     if base is None or _read(artefact) is not None:
         return

@@ -38,10 +38,7 @@ class FrameWriter:
     ) -> "FrameWriter":
         """Write the header and take the room on the disk.
 
-        Raises
-        ------
-        OSError
-            If the folder cannot be written, or the disk has no room for the file.
+        Raises OSError if the folder cannot be written, or the disk has no room for the file.
         """
         header = _header(shape, dtype, cards or {}).tostring(padding=True).encode("ascii")
         writer = cls(path, shape, dtype, len(header))
@@ -66,12 +63,9 @@ class FrameWriter:
 
         Parameters
         ----------
-        row : int
-            The first of them.
-        data : ndarray, shape (rows, x)
-            Of the file's type.
-        plane : int
-            Frame of a cube.
+        row : the first of them
+        data : (rows, x) of the file's type
+        plane : frame of a cube
         """
         ny, nx = self.shape[-2:]
         if data.dtype != self.dtype or data.shape[1] != nx or row + data.shape[0] > ny:

@@ -45,30 +45,18 @@ def read_rows(
 ) -> F64:
     """Read rows of some planes of a plain file, each byte once.
 
+    Returns (plane, band, 2) float64: of each `BAND` rows: CRC-32C of the bytes in the file, and the
+    largest sample (ADU), NaN where that was not looked for. Raises InputError if the file was
+    changed, or ends too early.
+
     Parameters
     ----------
-    file : FrameFile
-        A file in the container ``plain``.
-    planes : sequence of int
-        Numbers of the planes.
-    rows : tuple of int
-        First row, which begins a band, and the one after the last.
-    out : ndarray (plane, y, x), optional
-        Filled with the values (ADU); each plane of it contiguous, of the file's type or one
-        that holds it.
-    largest : bool
-        Look for the largest samples, which takes half as long as reading them.
-
-    Returns
-    -------
-    (plane, band, 2) float64
-        Of each `BAND` rows: CRC-32C of the bytes in the file, and the largest sample (ADU), NaN
-        where that was not looked for.
-
-    Raises
-    ------
-    InputError
-        If the file was changed, or ends too early.
+    file : a file in the container ``plain``
+    planes : numbers of the planes
+    rows : first row, which begins a band, and the one after the last
+    out : (plane, y, x) filled with the values (ADU); each plane of it contiguous, of the file's
+        type or one that holds it
+    largest : look for the largest samples, which takes half as long as reading them
     """
     _, ny, nx = file.shape
     coding, within = file.coding, bands(rows)
@@ -131,22 +119,13 @@ def _scale(raw: NDArray[Any], coding: SampleFormat) -> F32:
 def unpack(file: FrameFile, target: Path) -> FrameFile:
     """Write the image of a compressed file as bare big-endian samples, reading the file once.
 
+    Returns the same image in the scratch file, in the container ``plain``. Raises InputError naming
+    the compressed file when it is damaged, cut short, or was changed.
+
     Parameters
     ----------
-    file : FrameFile
-        A file in any container but ``plain``.
-    target : Path
-        Scratch file to make.
-
-    Returns
-    -------
-    FrameFile
-        The same image in the scratch file, in the container ``plain``.
-
-    Raises
-    ------
-    InputError
-        Naming the compressed file when it is damaged, cut short, or was changed.
+    file : a file in any container but ``plain``
+    target : scratch file to make
     """
     with file.source.open() as handle, target.open("wb") as out:
         if file.container == "picture":

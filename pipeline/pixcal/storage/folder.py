@@ -32,19 +32,14 @@ class Folder(Protocol):
 
         Parameters
         ----------
-        files : iterable of File
-            Taken a few at a time.
-        durable : bool
-            They are on the disk when this returns, not on their way to it.
+        files : taken a few at a time
+        durable : they are on the disk when this returns, not on their way to it
         """
 
     def ends(self, names: Sequence[str]) -> Iterator[tuple[int, bytes]]:
         """Size and last four bytes (fewer, if there are no more) of each file.
 
-        Raises
-        ------
-        OSError
-            With the ``filename``, if one is not there.
+        Raises OSError with the ``filename``, if one is not there.
         """
 
     def children(self) -> list[str]:
@@ -119,10 +114,7 @@ class LocalFolder:
 def written_aside(path: Path, *, durable: bool = False) -> Iterator[Path]:
     """Another name to write a file under; it takes its own when the block ends.
 
-    Parameters
-    ----------
-    durable : bool
-        It is on the disk then, not on its way to it.
+    ``durable``: it is on the disk then, not on its way to it.
     """
     aside = aside_of(path)
     yield aside
@@ -152,17 +144,12 @@ def flush(folder: Path) -> None:
 def read_file(path: str, size: int, later: str | None = None) -> bytes:
     """Content of a file of this machine, but no more than a byte above its expected size.
 
+    Raises OSError if it is not there.
+
     Parameters
     ----------
-    size : int
-        Bytes expected.
-    later : str, optional
-        A file that will be asked for soon: the disk fetches it meanwhile.
-
-    Raises
-    ------
-    OSError
-        If it is not there.
+    size : bytes expected
+    later : a file that will be asked for soon: the disk fetches it meanwhile
     """
     if later is not None:
         with suppress(OSError):
@@ -230,13 +217,7 @@ class UrlFolder:
                 system.rm([f"{root}/{name}" for name in there])
 
     def copy(self, source: UrlPath, names: Sequence[str]) -> bool:
-        """Copy files from another folder inside the store, if it is one store.
-
-        Returns
-        -------
-        bool
-            Whether it is.
-        """
+        """Copy files from another folder inside the store; false if it is another store."""
         (system, root), (other, there) = self.path.filesystem(), source.filesystem()
         if system is not other:
             return False

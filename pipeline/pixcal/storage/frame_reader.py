@@ -61,16 +61,11 @@ class FrameReader:
 
     Parameters
     ----------
-    folder : Path
-        Of the acquisition.
-    columns : mapping
-        What `describe` returned.
-    table : mapping
-        Columns ``file`` and ``plane`` of the frames, in their order.
-    shape, dtype
-        Of the array.
-    checksums : (time, band) ndarray
-        Of the bytes of each band.
+    folder : of the acquisition
+    columns : what `describe` returned
+    table : columns ``file`` and ``plane`` of the frames, in their order
+    shape, dtype : of the array
+    checksums : (time, band) of the bytes of each band
     """
 
     def __init__(
@@ -102,10 +97,7 @@ class FrameReader:
     def read(self, *ranges: tuple[int, int], out: NDArray[Any] | None = None) -> NDArray[Any]:
         """A block, as `ArrayReader.read` gives it; fastest in bands of 128 rows of all columns.
 
-        Raises
-        ------
-        InputError
-            Naming the file that is gone, or is not as it was ingested.
+        Raises InputError naming the file that is gone, or is not as it was ingested.
         """
         full = [(0, n) for n in self.shape]
         full[: len(ranges)] = [(max(0, a), min(b, n)) for (a, b), n in zip(ranges, self.shape)]  # noqa: B905

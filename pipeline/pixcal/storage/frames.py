@@ -16,10 +16,8 @@ from pixcal.storage.sources import HEADERS, SourceFile
 def inspect(source: SourceFile) -> FrameFile:
     """Read what a file says of its frames, and hold it against the file's length.
 
-    Raises
-    ------
-    InputError
-        Naming the file: of no format that is known, damaged, or of frames that cannot be used.
+    Raises InputError naming the file: of no format that is known, damaged, or of frames that cannot
+    be used.
     """
     with source.open() as handle:
         start = handle.read(8)
@@ -70,12 +68,9 @@ def tabulate(
 
     Parameters
     ----------
-    array : str
-        Name of the array, for the warnings.
-    files : sequence of FrameFile
-        At least one.
-    frame_period_s : float or None
-        From one frame to the next (s).
+    array : name of the array, for the warnings
+    files : at least one
+    frame_period_s : from one frame to the next (s)
 
     Returns
     -------

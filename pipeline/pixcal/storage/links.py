@@ -15,11 +15,6 @@ def link_files(source: Path, target: Path) -> None:
     What is in the target already stays, so that a call that was cut short can be repeated; hidden
     files (those half written) are left out. Linked files share their bytes: replace them, as
     `pixcal.storage.cube` does, and never write into them.
-
-    Parameters
-    ----------
-    source, target : Path
-        Folders; the target is made.
     """
     for folder, _, names in os.walk(source):
         there = target / Path(folder).relative_to(source)
@@ -42,11 +37,7 @@ def copy_files(source: Place, target: Place, names: Sequence[str]) -> None:
     """Copy files of a folder to another, either of which may be at a URL.
 
     Inside one store the store copies, and what is there already stays; else all come by here.
-
-    Raises
-    ------
-    OSError
-        If a file is not there.
+    Raises OSError if a file is not there.
     """
     if isinstance(source, UrlPath) and isinstance(target, UrlPath):
         inside = UrlFolder(target).copy(source, names)

@@ -76,12 +76,8 @@ def lock(run: Path) -> Iterator[None]:
     """Hold a run directory: a second process on it is refused, not mixed in.
 
     When something of the run that the block reads turns out to be damaged, that is noted: the
-    artefact is not up to date any more, an unfinished build is removed.
-
-    Raises
-    ------
-    InputError
-        If another process holds it, or the directory cannot be written.
+    artefact is not up to date any more, an unfinished build is removed. Raises InputError if
+    another process holds it, or the directory cannot be written.
     """
     try:
         run.mkdir(parents=True, exist_ok=True)
@@ -114,10 +110,7 @@ def lock(run: Path) -> Iterator[None]:
 def flushed_last(run: Path) -> Iterator[None]:
     """Complete artefacts of a run as they are made; all are on the disk when the block ends.
 
-    Raises
-    ------
-    OSError
-        If something could not be written to the disk.
+    Raises OSError if something could not be written to the disk.
     """
     try:
         with unflushed():

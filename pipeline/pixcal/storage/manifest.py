@@ -62,10 +62,7 @@ def digest(*parts: Any) -> str:
 def file_digest(path: Local) -> str:
     """SHA-256 (hex, 32 characters) of a file.
 
-    Raises
-    ------
-    DamagedError
-        If it cannot be read.
+    Raises DamagedError if it cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -96,10 +93,7 @@ def write_whole(path: Path, content: bytes) -> None:
 def read_json(path: Local) -> Any:
     """Read JSON that pixcal wrote.
 
-    Raises
-    ------
-    DamagedError
-        If the file is missing or does not parse.
+    Raises DamagedError if the file is missing or does not parse.
     """
     return _read(path)[1]
 
@@ -125,10 +119,8 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 def read_manifest(folder: Local) -> Manifest | None:
     """Manifest of an artefact, or None when there is no artefact.
 
-    Raises
-    ------
-    DamagedError
-        If it does not parse, or was altered (those of earlier versions have no seal).
+    Raises DamagedError if it does not parse, or was altered (those of earlier versions have no
+    seal).
     """
     path = folder / MANIFEST
     if not path.exists():
@@ -162,10 +154,8 @@ def _listed(folder: Path) -> Iterator[str]:
 def check_intact(folder: Path, manifest: Manifest) -> None:
     """Hold the files of an artefact against its manifest; chunks are checked when they are read.
 
-    Raises
-    ------
-    DamagedError
-        Naming the first file that is missing or altered, or was found to be so earlier.
+    Raises DamagedError naming the first file that is missing or altered, or was found to be so
+    earlier.
     """
     mark = folder / UNFLUSHED
     if mark.exists() and mark.read_bytes() != boot().encode():

@@ -56,10 +56,7 @@ class MemoryPath:
     def read_bytes(self) -> bytes:
         """Content of a file.
 
-        Raises
-        ------
-        FileNotFoundError
-            If it is not there.
+        Raises FileNotFoundError if it is not there.
         """
         found = self._kept.get(self.at)
         if not isinstance(found, bytes):

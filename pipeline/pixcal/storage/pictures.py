@@ -39,10 +39,7 @@ def is_picture(start: bytes) -> bool:
 def inspect_picture(source: SourceFile) -> FrameFile:
     """Frames of a TIFF or PNG file: a page each, all of one size.
 
-    Raises
-    ------
-    InputError
-        Naming the file: damaged, in colour, or of pages that differ.
+    Raises InputError naming the file: damaged, in colour, or of pages that differ.
     """
     with _opened(source.path) as picture:
         pages = getattr(picture, "n_frames", 1)
@@ -80,10 +77,7 @@ def inspect_picture(source: SourceFile) -> FrameFile:
 def unpack_picture(file: FrameFile, out: BinaryIO) -> None:
     """Write the pages of a file as the big-endian samples of a FITS cube.
 
-    Raises
-    ------
-    InputError
-        Naming the file when it is damaged or cut short.
+    Raises InputError naming the file when it is damaged or cut short.
     """
     with _opened(file.source.path) as picture:
         for page in range(file.shape[0]):

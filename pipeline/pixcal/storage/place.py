@@ -57,17 +57,9 @@ class UrlPath:
     def read_bytes(self, most: int | None = None) -> bytes:
         """Content of a file.
 
-        Parameters
-        ----------
-        most : int, optional
-            Bytes to read at most. Some file systems ask for the size first when they are not told.
-
-        Raises
-        ------
-        FileNotFoundError
-            If it is not there.
-        RemoteError
-            If that cannot be known.
+        ``most``: bytes to read at most. Some file systems ask for the size first when they are not
+        told. Raises FileNotFoundError if it is not there. Raises RemoteError if that cannot be
+        known.
         """
         system, path = self.filesystem()
         with explained(self.url):
@@ -91,12 +83,8 @@ Place = Local | UrlPath  # a file or folder, here or at a URL
 def explained(url: str) -> Iterator[None]:
     """Turn what the driver of a file system raises into one line that names the URL.
 
-    Raises
-    ------
-    FileNotFoundError
-        With ``strerror`` and ``filename`` (the URL), if the file or the bucket is not there.
-    RemoteError
-        In all other cases.
+    Raises FileNotFoundError with ``strerror`` and ``filename`` (the URL), if the file or the bucket
+    is not there. Raises RemoteError in all other cases.
     """
     try:
         yield
@@ -124,10 +112,8 @@ def explained(url: str) -> Iterator[None]:
 def parse_place(text: str) -> Place:
     """The folder that a user means: a path, absolute from now on, or a URL.
 
-    Raises
-    ------
-    InputError
-        If it is neither; or holds a password, which would end up in files and messages.
+    Raises InputError if it is neither; or holds a password, which would end up in files and
+    messages.
     """
     scheme, is_url, rest = text.partition("://")
     if not is_url:

@@ -40,10 +40,8 @@ class FitsMap:
     def open(cls, path: Path, extension: str | int = 0) -> "FitsMap":
         """Read where the image is, and check that all of it is there and unaltered.
 
-        Raises
-        ------
-        DamagedError
-            If the file is missing, cut, altered (where it has a checksum), or holds no such image.
+        Raises DamagedError if the file is missing, cut, altered (where it has a checksum), or holds
+        no such image.
         """
         try:
             with fits.open(path, memmap=True) as hdus:
@@ -144,16 +142,11 @@ def write_map(
 
     Parameters
     ----------
-    path : Path
-        Of the FITS file; what is there is replaced once the new file is whole.
-    data, sigma : (y, x) float32
-        Map and 1-sigma error, px; NaN where masked.
-    mask : (y, x) uint8
-        Bits of `pixcal.model.flags.PixelFlag`.
-    cards : sequence of (key, value, comment)
-        For the primary header.
-    history : sequence of str
-        HISTORY lines of the primary header.
+    path : of the FITS file; what is there is replaced once the new file is whole
+    data, sigma : (y, x) float32 map and 1-sigma error, px; NaN where masked
+    mask : (y, x) uint8 bits of `pixcal.model.flags.PixelFlag`
+    cards : (key, value, comment) for the primary header
+    history : HISTORY lines of the primary header
     """
     # Headers of images of this shape, which are nowhere in memory.
     maps, flags_ = (np.broadcast_to(np.zeros((), t), data.shape) for t in (">f4", "u1"))
@@ -224,10 +217,7 @@ def _checked(path: Path) -> Iterator[fits.HDUList]:
 def read_map(path: Path) -> tuple[F32, F32, U8, dict[str, Any]]:
     """Read a map written by `write_map`: data, sigma, mask, primary header.
 
-    Raises
-    ------
-    DamagedError
-        If the file is missing, cut or altered.
+    Raises DamagedError if the file is missing, cut or altered.
     """
     try:
         with _checked(path) as hdus:

@@ -19,11 +19,6 @@ class ReadAhead:
     """Reads files below a URL; those that follow are fetched meanwhile, once two came in order.
 
     Threads may share it, each with an order of its own.
-
-    Parameters
-    ----------
-    path : UrlPath
-        The folder.
     """
 
     def __init__(self, path: UrlPath) -> None:
@@ -41,19 +36,8 @@ class ReadAhead:
     def read(self, file: File, following: Sequence[File]) -> bytes:
         """Content of a file, but not much more of it than its size should be.
 
-        Parameters
-        ----------
-        file : File
-            The one.
-        following : sequence of File
-            Those that will be read next, if this is not the only one.
-
-        Raises
-        ------
-        FileNotFoundError
-            If it is not there.
-        RemoteError
-            If that cannot be known.
+        Raises FileNotFoundError if it is not there, RemoteError if that cannot be known. Those
+        ``following`` will be read next, if this is not the only one.
         """
         expected = self.expected()
         in_order = file in expected

@@ -30,17 +30,13 @@ Header = tuple[tuple[str, str | float], ...]  # keywords and values
 def read_headers(folder: Path, names: Iterable[str]) -> dict[str, Header]:
     """Headers of files by their names; empty where there is no ``headers.csv``.
 
+    Raises InputError naming the line that has no such file, no value that can be used, or names a
+    file again.
+
     Parameters
     ----------
-    folder : Path
-        Of the acquisition.
-    names : iterable of str
-        All files of the acquisition, relative to it.
-
-    Raises
-    ------
-    InputError
-        Naming the line that has no such file, no value that can be used, or names a file again.
+    folder : of the acquisition
+    names : all files of the acquisition, relative to it
     """
     path = folder / HEADERS
     if not path.exists():
@@ -106,10 +102,7 @@ class SourceFile:
     def open(self) -> io.FileIO:
         """Open the file for unbuffered reading, if it is still the one that was found.
 
-        Raises
-        ------
-        InputError
-            If it is gone, cannot be read, or was changed.
+        Raises InputError if it is gone, cannot be read, or was changed.
         """
         try:
             handle = io.FileIO(self.path)
@@ -152,23 +145,14 @@ def fingerprint(sources: Sequence[SourceFile]) -> str:
 def find_sources(frames: Frames, description: Path) -> dict[str, tuple[SourceFile, ...]]:
     """Files of each array of an acquisition, by the array's name (``fringes/<set>`` for a set).
 
+    Returns sorted by name; kinds without globs are absent. Raises InputError if a glob leaves the
+    folder or matches nothing, a file is empty or unreadable, or one file is listed twice under two
+    names or for two kinds.
+
     Parameters
     ----------
-    frames : Frames
-        Globs of each kind.
-    description : Path
-        The ``acquisition.yaml`` that they are relative to.
-
-    Returns
-    -------
-    dict
-        Sorted by name; kinds without globs are absent.
-
-    Raises
-    ------
-    InputError
-        If a glob leaves the folder or matches nothing, a file is empty or unreadable, or one file
-        is listed twice under two names or for two kinds.
+    frames : globs of each kind
+    description : the ``acquisition.yaml`` that they are relative to
     """
     found: dict[str, tuple[SourceFile, ...]] = {}
     seen: dict[tuple[int, int], tuple[str, str]] = {}

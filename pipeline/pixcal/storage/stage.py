@@ -21,12 +21,8 @@ from pixcal.storage.place import Local, Place
 def require(run: Path, name: str) -> Manifest:
     """Manifest of a stage that must have been run.
 
-    Raises
-    ------
-    InputError
-        If the stage has not been run, or its format is another one.
-    DamagedError
-        If the artefact is damaged.
+    Raises InputError if the stage has not been run, or its format is another one. Raises
+    DamagedError if the artefact is damaged.
     """
     if not run.is_dir():
         raise InputError(f"{run}: no such run directory; make one with 'pixcal ingest'")
@@ -69,10 +65,7 @@ def _without_fringes(run: Path) -> bool:
 def working(run: Path, *needed: str) -> Iterator[dict[str, str]]:
     """Hold a run in which some stages must have been run; gives the keys of their artefacts.
 
-    Raises
-    ------
-    InputError
-        As of `require` and `pixcal.storage.lock.lock`.
+    Raises InputError as of `require` and `pixcal.storage.lock.lock`.
     """
     for name in needed:
         require(run, name)
@@ -97,24 +90,13 @@ def make(
 
     Parameters
     ----------
-    config : dict
-        Plain data of the options that the result depends on.
-    inputs : mapping
-        Keys of what it is made from.
-    body : callable
-        Writes it, into the folder of a `Build`.
-    cubes : Path or UrlPath, optional
-        As of `pixcal.storage.artefact.build`.
-    keep : callable
-        Whether an artefact that is up to date can stay as it is.
-    publish : callable
-        Writes products beside those of `ArtefactKind.products`, when it is complete.
-    published : callable
-        Whether those of an artefact that stays are there.
-
-    Returns
-    -------
-    Manifest
+    config : plain data of the options that the result depends on
+    inputs : keys of what it is made from
+    body : writes it, into the folder of a `Build`
+    cubes : as of `pixcal.storage.artefact.build`
+    keep : whether an artefact that is up to date can stay as it is
+    publish : writes products beside those of `ArtefactKind.products`, when it is complete
+    published : whether those of an artefact that stays are there
     """
     key = artefact_key(stage.name, stage.format, config, dict(inputs))
     ready = up_to_date(run, stage.name, key)

@@ -21,10 +21,8 @@ from pixcal.storage.folder import written_aside
 def read_table(path: Path) -> Table:
     """Read a table.
 
-    Raises
-    ------
-    InputError
-        If the file is not there or holds no table that astropy knows by its name or contents.
+    Raises InputError if the file is not there or holds no table that astropy knows by its name or
+    contents.
     """
     try:
         if path.suffix.lower() in (".csv", ".ecsv", ".txt", ".dat"):
@@ -43,10 +41,7 @@ def read_table(path: Path) -> Table:
 def column(table: Table, name: str, path: Path, option: str) -> F64:
     """Numbers of a column; NaN where it is masked.
 
-    Raises
-    ------
-    InputError
-        If there is no such column, or it holds no numbers.
+    Raises InputError if there is no such column, or it holds no numbers.
     """
     if name not in table.colnames:
         raise InputError(
@@ -62,10 +57,7 @@ def column(table: Table, name: str, path: Path, option: str) -> F64:
 def write_table(table: Table, path: Path, *, overwrite: bool) -> None:
     """Write a table in the format that the file's name ends in.
 
-    Raises
-    ------
-    InputError
-        If the file is there and not to be replaced, or its name says no format.
+    Raises InputError if the file is there and not to be replaced, or its name says no format.
     """
     if path.exists() and not overwrite:
         raise InputError(f"{path}: exists; choose another --out, or add --overwrite")
@@ -78,10 +70,8 @@ def write_table(table: Table, path: Path, *, overwrite: bool) -> None:
 def distortion(correction: F32) -> WCS:
     """A WCS whose step from detector to image adds a correction to pixel coordinates.
 
-    Parameters
-    ----------
-    correction : (2, y, x) float32
-        What to add to x and y, px, in the middle of each pixel; linear between them.
+    ``correction``: (2, y, x) float32 what to add to x and y, px, in the middle of each pixel;
+    linear between them.
     """
     _, ny, nx = correction.shape
     wcs = WCS(naxis=2)

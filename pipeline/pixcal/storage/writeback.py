@@ -63,10 +63,7 @@ def begin(file: Path) -> None:
 def wait() -> None:
     """Wait for all files that were begun.
 
-    Raises
-    ------
-    OSError
-        If one of them could not be written.
+    Raises OSError if one of them could not be written.
     """
     _writeback().wait()
 

@@ -59,12 +59,8 @@ Config = Allan
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Measure how the error of the offset maps falls with the number of frames.
 
-    Reads ``RUN/fit``; makes ``RUN/allan`` and the product ``allan.json``.
-
-    Raises
-    ------
-    InputError
-        If the fit has not been run, or a region is not inside the window.
+    Reads ``RUN/fit``; makes ``RUN/allan`` and the product ``allan.json``. Raises InputError if the
+    fit has not been run, or a region is not inside the window.
     """
     with working(run_dir, "fit") as inputs:
         facts = read_json(run_dir / "fit" / "fit.json")["sets"]

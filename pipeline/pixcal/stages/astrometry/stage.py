@@ -78,13 +78,8 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Compare centroids on a perfect grid with centroids on the measured maps.
 
     Reads the maps in ``RUN/products``; makes ``RUN/astrometry`` and the products
-    ``astrometry.json`` and ``astrometry.png``.
-
-    Raises
-    ------
-    InputError
-        If fit has not been run, the maps are too small for a star, or the truth is not that of
-        this detector.
+    ``astrometry.json`` and ``astrometry.png``. Raises InputError if fit has not been run, the maps
+    are too small for a star, or the truth is not that of this detector.
     """
     with working(run_dir, "fit") as inputs:
         acquisition = read_acquisition(run_dir)

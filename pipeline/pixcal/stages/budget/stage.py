@@ -58,17 +58,12 @@ Reach = Callable[[Shares], tuple[float, float]]
 def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, Any]:
     """Work out the budget of a bench: the contents of ``budget.json``.
 
+    Raises InputError if the bench cannot be read, has no fringes, or its phases determine nothing.
+
     Parameters
     ----------
-    bench_file : Path
-        As ``pixcal simulate`` takes it.
-    out : Path, optional
-        Directory for ``budget.json`` and ``budget.png``.
-
-    Raises
-    ------
-    InputError
-        If the bench cannot be read, has no fringes, or its phases determine nothing.
+    bench_file : as ``pixcal simulate`` takes it
+    out : directory for ``budget.json`` and ``budget.png``
     """
     bench = load_bench(bench_file)
     own_effects(bench, str(bench_file))

@@ -53,18 +53,13 @@ Config = Compare
 def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Manifest:
     """Compare the maps of two runs or more, or of two parts of one.
 
+    Raises InputError if a run has not been fitted, the windows differ, the runs have no component
+    in common, or the directory is not one that a comparison may write to.
+
     Parameters
     ----------
-    runs : sequence of Path
-        Fitted runs of windows of the same shape, whose pixels are taken to be the same.
-    out : Path
-        Directory for ``compare.json`` and the pictures.
-
-    Raises
-    ------
-    InputError
-        If a run has not been fitted, the windows differ, the runs have no component in common, or
-        the directory is not one that a comparison may write to.
+    runs : fitted runs of windows of the same shape, whose pixels are taken to be the same
+    out : directory for ``compare.json`` and the pictures
     """
     if out.exists():
         if not out.is_dir():

@@ -55,14 +55,10 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
     Makes ``RUN/fit`` where it is not up to date, ``RUN/corrected``, and the products
     ``delta_x_corrected.fits``, ``delta_y_corrected.fits`` (or ``delta_fringe_corrected.fits``) and
-    ``correction.json``.
-
-    Raises
-    ------
-    InputError
-        If the run was not diagnosed, or not as it is reduced now; if the correction makes a map
-        worse, by its periodic patterns or the agreement of sets along one axis; if an effect that
-        was found is of the user's own and its file was not given, or its correction fails.
+    ``correction.json``. Raises InputError if the run was not diagnosed, or not as it is reduced
+    now; if the correction makes a map worse, by its periodic patterns or the agreement of sets
+    along one axis; if an effect that was found is of the user's own and its file was not given, or
+    its correction fails.
     """
     diagnosed = require(run_dir, "diagnose")
     if diagnosed.inputs["reduce"] != require(run_dir, "reduce").key:

@@ -63,12 +63,8 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Locate the fibres from crests and valleys, and compare them with the fit.
 
     Reads ``RUN/reduce`` and, where it is there, ``RUN/fit``; makes ``RUN/crests`` and the products
-    ``crests.json`` and ``crests-<set>.png``.
-
-    Raises
-    ------
-    InputError
-        If reduce has not been run, or a set has no fringes or too few; the set is named.
+    ``crests.json`` and ``crests-<set>.png``. Raises InputError if reduce has not been run, or a set
+    has no fringes or too few; the set is named.
     """
     acquisition = load_run(run_dir)
     if not acquisition.frames.fringes:

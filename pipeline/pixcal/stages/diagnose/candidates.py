@@ -44,10 +44,7 @@ class Candidate:
     def variants(self, share: float) -> list[Effect]:
         """Effects to simulate: as estimated, with sure parameters alone, scaled down, replayed.
 
-        Parameters
-        ----------
-        share : float
-            Fraction of its significance that the causes before it do not produce.
+        ``share``: fraction of its significance that the causes before it do not produce.
         """
         assert self.estimate is not None
         whole, sure = self.estimate.effect, self.estimate.sure

@@ -34,10 +34,8 @@ class Comparison:
 
     Parameters
     ----------
-    reference : Reference
-        Of the nominal bench.
-    data : mapping
-        Test statistics of the held-out frames, on the scales of the reference.
+    reference : of the nominal bench
+    data : test statistics of the held-out frames, on the scales of the reference
     """
 
     def __init__(self, reference: Reference, data: Mapping[Key, F64]) -> None:
@@ -51,11 +49,8 @@ class Comparison:
 
         Parameters
         ----------
-        effects : tuple of Effect
-        curves : sequence of Curves
-            Of the simulations.
-        significance : float
-            Of the added effect, sigma: its strength has a relative error of one over it.
+        curves : of the simulations
+        significance : of the added effect, sigma: its strength has a relative error of one over it
         """
         error = 1 / max(significance, 1.0)
         return self._trial(effects, expect_with(self.reference, curves, error))
@@ -89,11 +84,7 @@ class Comparison:
     def residual(self, trial: Trial, where: set[Key]) -> float:
         """Fraction of the gap that a bench leaves.
 
-        Parameters
-        ----------
-        trial : Trial
-        where : set of Key
-            Test statistics that make up the gap.
+        ``where``: test statistics that make up the gap.
         """
         before = compare(self.data, self.nominal.expected)
         return remaining(before, compare(self.data, trial.expected), where).total

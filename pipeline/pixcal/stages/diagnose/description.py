@@ -32,10 +32,7 @@ def bench_of(
 ) -> Bench:
     """What effects ask a bench for; its own pixels and light are replaced by `Measured`.
 
-    Raises
-    ------
-    InputError
-        If the light goes beyond what a converter of 16 bits can give.
+    Raises InputError if the light goes beyond what a converter of 16 bits can give.
     """
     d = acquisition.detector
     listed = [f"fringes/{s.name}" for s in acquisition.frames.fringes]
@@ -75,10 +72,7 @@ def pedestal_of(
 ) -> int:
     """Steps (ADU) that lift the noise without light above zero, where samples may be negative.
 
-    Raises
-    ------
-    InputError
-        If samples are real numbers with less noise than whole numbers can show.
+    Raises InputError if samples are real numbers with less noise than whole numbers can show.
     """
     low = min(float(np.min(e.bias[e.good], initial=0.0)) for e in evidence)
     noise = max(e.read_noise / e.gain for e in evidence)

@@ -55,21 +55,13 @@ def inquire(
 ) -> Inquiry:
     """Look at a reduced run, simulate its nominal bench, and search for causes.
 
+    Raises InputError if the frames cannot be fitted or the nominal bench not be simulated.
+
     Parameters
     ----------
-    run_dir : Path
-    kinds : mapping
-        The candidates by name.
-    base : tuple of Effect
-        That the nominal bench has from the start.
-    scratch : Path
-        Keeps simulations: an inquiry that was stopped goes on with them.
-    runtime : Runtime
-
-    Raises
-    ------
-    InputError
-        If the frames cannot be fitted or the nominal bench not be simulated.
+    kinds : the candidates by name
+    base : that the nominal bench has from the start
+    scratch : keeps simulations: an inquiry that was stopped goes on with them
     """
     candidates: dict[str, Candidate] = {}
     signatures: tuple[Signature, ...] = ()

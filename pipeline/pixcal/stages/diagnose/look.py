@@ -55,18 +55,9 @@ def look_at(
 ) -> DiagnosisInput:
     """Take the parts of a reduced run that are looked at, and measure their nominal bench.
 
-    Parameters
-    ----------
-    run_dir : Path
-    runtime : Runtime
-    learnt : callable
-        Is given the evidence that effects are fitted on and that they are tried on, and how to run
-        estimates in the memory that there is; tells whose estimates are statistics too.
-
-    Raises
-    ------
-    InputError
-        If there are too few frames, or a part cannot be fitted.
+    ``learnt``: is given the evidence that effects are fitted on and that they are tried on, and how
+    to run estimates in the memory that there is; tells whose estimates are statistics too. Raises
+    InputError if there are too few frames, or a part cannot be fitted.
     """
     ingested = Ingested(run_dir / "ingest")
     acquisition, reduction = _acquisition(run_dir, ingested), _reduction(run_dir)

@@ -34,12 +34,8 @@ class MeasuredGain:
     def drawn(self, rng: np.random.Generator, change: float = 1.0) -> F32:
         """Gain (y, x) over the one used, as it may be within its error.
 
-        Parameters
-        ----------
-        rng : numpy.random.Generator
-        change : float
-            What effects do to the variance of flats over their mean: by as much the photon
-            transfer is wrong.
+        ``change``: what effects do to the variance of flats over their mean: by as much the photon
+        transfer is wrong.
         """
         measured = np.array([value * change for value, _ in self.transfer])
         errors = np.array([error for _, error in self.transfer])

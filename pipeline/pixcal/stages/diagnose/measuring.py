@@ -51,25 +51,15 @@ def nominal_bench(
 ) -> NominalBench:
     """The nominal bench that was measured by several parts of an acquisition.
 
+    Raises InputError if the light goes beyond what a converter of 16 bits can give.
+
     Parameters
     ----------
-    acquisition : Acquisition
-    tables : mapping
-        Of all frames.
-    evidence : sequence of Evidence
-        Of the same pixels, e.g. two halves of the frames.
-    halves : sequence of Half
-        The frames of each.
-    whole : (int, int)
-        Rows and columns of the detector's window.
-    reduction : reduce.Config
-    dtypes : mapping
-        Of the samples of each array.
-
-    Raises
-    ------
-    InputError
-        If the light goes beyond what a converter of 16 bits can give.
+    tables : of all frames
+    evidence : of the same pixels, e.g. two halves of the frames.
+    halves : the frames of each
+    whole : rows and columns of the detector's window
+    dtypes : of the samples of each array
     """
     one = evidence[0]
     good = np.all([e.good for e in evidence], axis=0)

@@ -144,22 +144,14 @@ class NominalBench:
     ) -> Raw:
         """Frames of a half of the acquisition, from this bench with some effects.
 
+        Raises InputError if an effect and the bench do not go together.
+
         Parameters
         ----------
-        half : Half
-        effects : sequence of Effect
-        seed : int
-            Of everything random; the same seed gives the same noise with other effects.
-        fitted : bool
-            The measured maps have the effects in them, which are undone before they act anew.
-        window : int
-            Which of the detector's, for noise of its own; what happens to a frame is the same in
-            all of them.
-
-        Raises
-        ------
-        InputError
-            If an effect and the bench do not go together.
+        seed : of everything random; the same seed gives the same noise with other effects
+        fitted : the measured maps have the effects in them, which are undone before they act anew
+        window : which of the detector's, for noise of its own; what happens to a frame is the same
+            in all of them
         """
         own_seed = seed + SEEDS_APART * window
         undone = IntensityBeforeEffects(effects if fitted else (), self.bench.detector)

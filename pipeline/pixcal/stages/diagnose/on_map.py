@@ -22,11 +22,8 @@ def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str
 
     Parameters
     ----------
-    effect : Effect
-    fits : iterable of FittedSet
-        Maps of every fringe set and window.
-    run_dir : Path
-        Whose fit tells the shape of the fringes that was fitted.
+    fits : maps of every fringe set and window
+    run_dir : whose fit tells the shape of the fringes that was fitted
     """
     action = treatment_of(effect, *fitted_shapes(run_dir)).action
     square, count, most = 0.0, 0, 0.0

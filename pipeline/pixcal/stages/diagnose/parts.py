@@ -81,18 +81,12 @@ def select(tables: Mapping[str, Table], half: Half) -> dict[str, Table]:
 def evidence_of(raw: Raw, part: Part, window: tuple[int, int]) -> Evidence:
     """Reduce and fit a part, with straight fringes: what it tells.
 
+    Raises InputError if the part cannot be reduced or fitted.
+
     Parameters
     ----------
-    raw : Raw
-    part : ((int, int), (int, int))
-        Rows and columns of the window that the frames hold.
-    window : (int, int)
-        Rows and columns of the whole window.
-
-    Raises
-    ------
-    InputError
-        If the part cannot be reduced or fitted.
+    part : rows and columns of the window that the frames hold
+    window : rows and columns of the whole window
     """
     run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction)
     found = evidence.evidence_of(run)

@@ -19,18 +19,12 @@ def missing_frames(
 ) -> dict[str, str]:
     """Kinds of frames that are of use and that an acquisition does not have, each in words.
 
+    By kind, as in `Effect.frames_needed`.
+
     Parameters
     ----------
-    acquisition : Acquisition
-    tables : mapping
-        As in ``frames.json``.
-    steps : sequence of float
-        Step of each set's phase, rad; zero where the phases are random.
-
-    Returns
-    -------
-    dict
-        By kind, as in `Effect.frames_needed`.
+    tables : as in ``frames.json``
+    steps : step of each set's phase, rad; zero where the phases are random
     """
     axes = _axes([s.baseline_mm for s in acquisition.frames.fringes])
     missing = {}

@@ -45,11 +45,8 @@ def redundant(
 
     Parameters
     ----------
-    comparison : Comparison
-    current : Trial
-        The bench with all causes.
-    without : mapping
-        The bench with all causes but one, by its name.
+    current : the bench with all causes
+    without : the bench with all causes but one, by its name
     """
     gains = {
         name: comparison.allowing_for_laws(current, trial).log_likelihood
@@ -76,10 +73,8 @@ def doubtful(
 
     Parameters
     ----------
-    comparison, current, without
-        As for `redundant`.
-    candidates : mapping
-        By name.
+    comparison, current, without : as for `redundant`
+    candidates : by name
     """
     where = comparison.gap_of(current)
     open_still = comparison.residual(current, where)

@@ -44,15 +44,9 @@ def describe(
 
     Parameters
     ----------
-    found : SearchResult
-    data : mapping
-        Curves of the unseen frames, on the reference's scales.
-    measured : mapping
-        The same in their own units.
-    reference : Reference
-    facts : FramesUsed
-    places : sequence of mapping
-        How far windows are off by themselves, `by_domain`.
+    data : curves of the unseen frames, on the reference's scales
+    measured : the same in their own units
+    places : how far windows are off by themselves, `by_domain`
     """
     where = differing(found.nominal, found.final, data)
     final = shrinkage(data, found.nominal, found.final, where)

@@ -56,15 +56,12 @@ class Search:
 
     Parameters
     ----------
-    reference : Reference
-    data : mapping
-        Test statistics of the held-out frames, on the scales of the reference.
-    simulate : callable
-        ``simulate(benches, seeds, label, asked)`` gives the test statistics of several benches. The
-        candidates ``asked`` are those that `estimates` will be called with for the first bench.
-    estimates : callable
-        ``estimates(effects, names)`` gives the significance of candidates on a simulation of the
-        fitted frames with some effects.
+    data : test statistics of the held-out frames, on the scales of the reference
+    simulate : ``simulate(benches, seeds, label, asked)`` gives the test statistics of several
+        benches. The candidates ``asked`` are those that `estimates` will be called with for the
+        first bench.
+    estimates : ``estimates(effects, names)`` gives the significance of candidates on a simulation
+        of the fitted frames with some effects
     """
 
     def __init__(

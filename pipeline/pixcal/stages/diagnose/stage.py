@@ -32,10 +32,8 @@ Config = Diagnose
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Diagnose a reduced run: make ``RUN/diagnose`` and the product ``diagnosis.json``.
 
-    Raises
-    ------
-    InputError
-        If the run was not reduced, a name of an effect is unknown, or the frames cannot be fitted.
+    Raises InputError if the run was not reduced, a name of an effect is unknown, or the frames
+    cannot be fitted.
     """
     require(run_dir, "reduce")
     known = known_effects(config.own)

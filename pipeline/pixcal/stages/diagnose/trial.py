@@ -83,19 +83,14 @@ class Trials:
     ) -> list[list[Curves] | str]:
         """Statistics of several benches.
 
+        Returns for each bench its simulations (means over the windows), or why it cannot be
+        simulated.
+
         Parameters
         ----------
-        benches : sequence of tuple of Effect
-            Effects of each.
-        seeds : int
-            Simulations of each, seeds 0, 1, ...
-        beside : callable, optional
-            Done along with them in this process, if any is to be made.
-
-        Returns
-        -------
-        list
-            For each bench its simulations (means over the windows), or why it cannot be simulated.
+        benches : effects of each
+        seeds : number of simulations of each
+        beside : done along with them in this process, if any is to be made
         """
         wanted = [(frozenset(bench), seed) for bench in benches for seed in range(seeds)]
         missing = [one for one in dict.fromkeys(wanted) if one not in self._made]

@@ -62,12 +62,8 @@ def undone_on_samples(
 ) -> FringeMaps | None:
     """Maps that a fit finds in frames without noise that an effect was undone on.
 
-    None where the effect is not one of samples.
-
-    Parameters
-    ----------
-    fit : FitOfFrames, optional
-        Of the frames that the maps were fitted to; by default their phases are spread evenly.
+    None where the effect is not one of samples. ``fit``: of the frames that the maps were fitted
+    to; by default their phases are spread evenly.
     """
     flat = np.ones(maps.theta.shape[1:]) if maps.flat is None else maps.flat
     charge = np.einsum("tm,myx->tyx", _EVEN, maps.theta * flat)

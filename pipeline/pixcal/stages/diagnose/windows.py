@@ -89,12 +89,9 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
 
     Parameters
     ----------
-    tables : mapping
-        As in ``frames.json``.
-    pixels : int
-        Of a window.
-    full_flats : sequence of int
-        Flats whose pixels are full; left out unless all are.
+    tables : as in ``frames.json``
+    pixels : of a window
+    full_flats : flats whose pixels are full; left out unless all are
     """
     learn, test = {}, {}
     every = {name: _groups(name, table, full_flats) for name, table in tables.items()}

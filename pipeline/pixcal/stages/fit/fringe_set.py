@@ -91,12 +91,9 @@ def fit_sets(
 
     Parameters
     ----------
-    sweep : Path or MemoryPath
-        Folder of ``sweep.zarr``.
-    reduced : Path or MemoryPath
-        ``reduced.zarr``.
-    facts : mapping
-        Summaries of the sweep, by name of the set.
+    sweep : folder of ``sweep.zarr``
+    reduced : ``reduced.zarr``
+    facts : summaries of the sweep, by name of the set
     """
     return [
         fit_set(
@@ -117,23 +114,14 @@ def fit_set(
 ) -> FittedSet:
     """Fit the shape of a set's fringes.
 
+    Raises InputError if no pixel of the set can be fitted.
+
     Parameters
     ----------
-    swept : Path or MemoryPath
-        ``sweep.zarr/<set name>``.
-    source : ReducedSet
-    facts : dict
-        Summary of the set's sweep.
-    acquisition : Acquisition
-    name : str
-        Of the set.
-    model : str
-        A shape's name, or ``auto``.
-
-    Raises
-    ------
-    InputError
-        If no pixel of the set can be fitted.
+    swept : ``sweep.zarr/<set name>``
+    facts : summary of the set's sweep
+    name : of the set
+    model : a shape's name, or ``auto``
     """
     rows = ArrayReader(swept / "sums").read()
     tiles = TileSums.of_rows(rows.reshape(-1, rows.shape[-1]))
@@ -230,11 +218,8 @@ def describe(fitted: FittedSet, masked: int, sigma_px: float) -> dict[str, Any]:
 
     Parameters
     ----------
-    fitted : FittedSet
-    masked : int
-        Pixels without a value.
-    sigma_px : float
-        Median error of the others.
+    masked : pixels without a value
+    sigma_px : median error of the others
     """
     source, facts, shape, fit = fitted.source, fitted.facts, fitted.shape, fitted.fit
     ny, nx = source.shape

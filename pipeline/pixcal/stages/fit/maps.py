@@ -62,11 +62,8 @@ def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals
 
     Parameters
     ----------
-    group : Path
-        ``fit.zarr``.
-    fitted : list of FittedSet
-        All of the same window.
-    runtime : Runtime
+    group : ``fit.zarr``
+    fitted : all of the same window
     """
     source = fitted[0].source
     ny, nx = source.shape

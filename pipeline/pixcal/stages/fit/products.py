@@ -38,11 +38,8 @@ def header_of(run_dir: Path, result: dict[str, Any], key: str) -> tuple[list[Car
 
     Parameters
     ----------
-    run_dir : Path
-    result : dict
-        As in ``fit.json``.
-    key : str
-        Of the artefact that holds the maps.
+    result : as in ``fit.json``
+    key : of the artefact that holds the maps
     """
     models = {facts["model"] for facts in result["sets"].values()}
     cards = [
@@ -108,15 +105,10 @@ def publish_maps(
 
     Parameters
     ----------
-    run_dir : Path
-    group : Path
-        ``fit.zarr``, or another that `pixcal.stages.fit.maps.write_maps` wrote.
-    outputs : sequence of str
-        Their names.
-    cards, history : list
-        Of their headers.
-    suffix : str
-        Of the names of the products.
+    group : ``fit.zarr``, or another that `pixcal.stages.fit.maps.write_maps` wrote
+    outputs : their names
+    cards, history : of their headers
+    suffix : of the names of the products
     """
     for name in outputs:
         delta, sigma, mask = (

@@ -56,21 +56,14 @@ def scout_set(
 ) -> None:
     """Find the frame parameters of a set and write them, and ``scout.json`` last.
 
+    Raises InputError if the set has too few frames or good pixels, or no fringes that can be
+    fitted.
+
     Parameters
     ----------
-    source : ReducedSet
-    nominal : (float, float)
-        Nominal fringe vector (kx, ky), rad/px.
-    folder : Path or MemoryPath
-        ``sweep.zarr/<set name>``.
-    runtime : Runtime
-    name : str
-        Of the set.
-
-    Raises
-    ------
-    InputError
-        If the set has too few frames or good pixels, or no fringes that can be fitted.
+    nominal : nominal fringe vector (kx, ky), rad/px
+    folder : ``sweep.zarr/<set name>``
+    name : of the set
     """
     n_tiles = source.grid[0] * source.grid[1]
     chunk_bytes = int(np.prod(source.signal.chunks)) * source.signal.dtype.itemsize

@@ -24,12 +24,8 @@ def run(run_dir: Path, config: Config, runtime: Runtime, *, products: bool = Tru
 
     Reads ``RUN/reduce``; makes ``RUN/sweep`` (when it is not up to date) and ``RUN/fit``, and
     writes the products ``delta_x.fits``, ``delta_y.fits`` (with one fringe axis:
-    ``delta_fringe.fits``) and ``fit.json``, unless ``products`` is false.
-
-    Raises
-    ------
-    InputError
-        If reduce has not been run, or the frames hold no fringes that can be fitted.
+    ``delta_fringe.fits``) and ``fit.json``, unless ``products`` is false. Raises InputError if
+    reduce has not been run, or the frames hold no fringes that can be fitted.
     """
     with working(run_dir, "reduce"):
         swept = sweep.run(run_dir, config, runtime)

@@ -66,10 +66,7 @@ def load_run(run_dir: Path) -> Acquisition:
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Sweep every fringe set of a run (the caller holds the run's lock).
 
-    Raises
-    ------
-    InputError
-        If there are no fringe sets, or a set has no fringes to fit; the set is named.
+    Raises InputError if there are no fringe sets, or a set has no fringes to fit; the set is named.
     """
     acquisition = load_run(run_dir)
     if not acquisition.frames.fringes:
@@ -95,10 +92,7 @@ def sweep_sets(
 ) -> dict[str, dict[str, Any]]:
     """Sweep every set of ``reduced.zarr`` into ``sweep.zarr``; their summaries by name.
 
-    Raises
-    ------
-    InputError
-        If a set has no fringes that can be fitted; it is named.
+    Raises InputError if a set has no fringes that can be fitted; it is named.
     """
     create_group(made.folder / "sweep.zarr")
     sets = {}
@@ -137,10 +131,7 @@ def sweep_set(
 ) -> dict[str, Any]:
     """Sweep one set into ``sweep.zarr/<set name>`` of a build; returns its summary.
 
-    Raises
-    ------
-    InputError
-        If the set has no fringes that can be fitted.
+    Raises InputError if the set has no fringes that can be fitted.
     """
     folder = made.folder / "sweep.zarr" / name
     create_group(folder)

@@ -44,10 +44,7 @@ def _create_groups(store: Place, array: str) -> None:
 def finish(writer: ArrayWriter) -> dict[str, Any]:
     """Close an array: its shape, type, and the digest of its content.
 
-    Raises
-    ------
-    DamagedError
-        Naming a chunk that is missing or cut.
+    Raises DamagedError naming a chunk that is missing or cut.
     """
     index = writer.finish()
     content = hashlib.sha256(repr((writer.shape, writer.dtype.str)).encode())
@@ -118,24 +115,14 @@ def find_kept(
 ) -> list[Kept]:
     """Arrays of an earlier ingest that can be taken over, if their chunks are whole.
 
+    Those that its tables do not describe, or that are damaged, must be read again.
+
     Parameters
     ----------
-    folder : Path
-        The earlier artefact.
-    earlier : Manifest
-        Its manifest.
-    same : mapping
-        Name now to earlier name, of the arrays made from the same files.
-    sources : mapping
-        Files of each array now.
-    copy : bool
-        Only those whose samples were copied.
-
-    Returns
-    -------
-    list of Kept
-        Without those that its tables do not describe, or that are damaged: they must be read
-        again.
+    folder, earlier : the earlier artefact and its manifest
+    same : name now to earlier name, of the arrays made from the same files
+    sources : files of each array now
+    copy : only those whose samples were copied
     """
     try:
         tables, places = (_intact(folder, earlier, name) for name in ("frames.json", "files.json"))
@@ -197,13 +184,8 @@ def _order(files: Sequence[FrameFile]) -> list[tuple[str, int]]:
 def take_over(made: Build, kept: Sequence[Kept], runtime: Runtime) -> dict[str, dict[str, Any]]:
     """Link the chunks of earlier arrays into a build, and verify their digests.
 
-    From one place to another they are copied.
-
-    Returns
-    -------
-    dict
-        What `Writers.finish` returns, by array, of those that are whole; the others must be read
-        again.
+    From one place to another they are copied. Returns what `Writers.finish` returns, by array, of
+    those that are whole; the others must be read again.
     """
     # Made here, one by one: they share groups, which two tasks must not make at once.
     writers = [

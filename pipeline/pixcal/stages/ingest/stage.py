@@ -56,32 +56,12 @@ Config = Ingest
 
 
 def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Make ``RUN/ingest`` from an acquisition, unless it is up to date.
+    """Make ``RUN/ingest`` from an acquisition (directory or its YAML file), unless up to date.
 
     Of an earlier ingest, arrays made from the same files are taken over; when there are none, it
-    was of another acquisition and is only replaced with `Config.overwrite`.
-
-    Parameters
-    ----------
-    acquisition : Path
-        Directory with ``acquisition.yaml``, or that file.
-    out : Path
-        The run directory.
-    config : Config
-        Options.
-    runtime : Runtime
-        How to run.
-
-    Returns
-    -------
-    Manifest
-        Its ``inputs`` hold the fingerprint of the files of each array; its ``summary`` the shape,
-        type and content digest of each array, and ``warnings``.
-
-    Raises
-    ------
-    InputError
-        Naming the file, key or option that is wrong.
+    was of another acquisition and is only replaced with `Config.overwrite`. In the manifest,
+    ``inputs`` holds the fingerprint of the files of each array; ``summary`` holds the shape, type
+    and content digest of each array, and ``warnings``.
     """
     described = load_acquisition(acquisition)
     description = acquisition / "acquisition.yaml" if acquisition.is_dir() else acquisition

@@ -40,10 +40,7 @@ class Target:
     def up_to_date(self, key: str) -> Manifest | None:
         """Manifest of what was made with this key and is whole, if it is.
 
-        Raises
-        ------
-        InputError
-            If something else is in the way.
+        Raises InputError if something else is in the way.
         """
         folder, place = self.final, f"{self.option} {self.final}"
         if not folder.exists():

@@ -74,12 +74,8 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
     """Simulate a bench (schema ``pixcal/bench/1``).
 
     The directory appears when it is complete. The key of its manifest is a digest, so that it tells
-    nothing of the truth.
-
-    Raises
-    ------
-    InputError
-        If the bench file is wrong, or a directory holds what simulate did not put there.
+    nothing of the truth. Raises InputError if the bench file is wrong, or a directory holds what
+    simulate did not put there.
     """
     plan = load_bench(bench)
     there = Target.of(out, "--out", STAGE)
