@@ -6,9 +6,9 @@ import numpy as np
 
 from pixcal.estimators.detector.flat_ladder import ladder_response
 from pixcal.estimators.detector.transfer_curve import (
+    CLIP,
     MIN_PIXELS,
     STEPS,
-    residual_sums,
     shared_steps,
     shot_share,
     sums_of_stacks,
@@ -16,6 +16,7 @@ from pixcal.estimators.detector.transfer_curve import (
 )
 from pixcal.estimators.diagnosis.distortions import Freedom
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.kernels.residual_sums import residual_sums
 from pixcal.kernels.scene import DetectorMaps, Rows
 from pixcal.model.arrays import F32, F64
 from pixcal.model.bench import Bench
@@ -155,5 +156,5 @@ def _of_fringes(found: FringeEvidence) -> F64 | None:
     taken = (1 + (4 if np.any(found.dk) else 2) * alike) / pixels
     return residual_sums(
         found.residual, found.model, found.shot_factor, found.read_variance,
-        found.good, of_time, of_pixels, taken,
+        found.good, of_time, of_pixels, taken, STEPS, CLIP,
     )  # fmt: skip

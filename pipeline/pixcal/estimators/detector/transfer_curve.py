@@ -8,10 +8,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
-from pixcal.model.arrays import F32, F64, Indices, Mask
+from pixcal.kernels.residual_sums import residual_sums
+from pixcal.model.arrays import F64, Mask
 
 # rows and columns from a pixel to itself and to those that it may share its noise with
 STEPS = np.array([(0, 0), (0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)])
@@ -19,8 +19,8 @@ STEPS = np.array([(0, 0), (0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0)])
 # gain of a detector better than this, and amplifiers differ by as much
 FLOOR = 5e-3
 MIN_PIXELS = 200  # fewest pixels that tell a noise
+CLIP = 6.0  # standard deviations beyond which a residual does not count
 
-_CLIP = 6.0
 _MIN_LEVELS = 3
 _ALIKE = 1e4
 _READ_KNOWN = 0.3  # relative error of the read noise's variance as it was used
@@ -141,52 +141,5 @@ def _of_stack(stack: Stack, evidence: Evidence) -> F64 | None:
     return residual_sums(
         frames - level - brighter, usual + brighter, ones, evidence.read_noise**2 * ones, good,
         np.ones((len(frames), 1)), (noise / len(frames))[None], np.full(len(STEPS), 1 / pixels),
+        STEPS, CLIP,
     )  # fmt: skip
-
-
-def residual_sums(
-    rest: F32, model: F32, shot_factor: F64, read: F64,
-    good: Mask, of_time: NDArray[np.floating], of_pixels: NDArray[np.floating],
-    taken: F64, steps: Indices = STEPS, limit: float = _CLIP,
-) -> F64:  # fmt: skip
-    """Sums (step, 7) for ``product = a shot + b read`` of residuals, by steps between pixels.
-
-    ``shot`` and ``read`` are means of the two pixels' variances; all is divided by the root of the
-    product of their variances, so that every product has the same weight. Summed are the number,
-    the normal matrix (11, 12, 22), the right-hand side (1, 2) and the squared products.
-
-    Parameters
-    ----------
-    rest, model : (t, y, x) residuals (NaN without weight) and their model, e-
-    shot_factor, read : (y, x) variance of a sample: ``shot_factor * model + read``, e-²
-    of_time, of_pixels : (t, k), (k, y, x); their product over the variance is the share of a
-        sample's variance that its pixel's own fit took up
-    taken : (step,) covariance that the frames' fits took off, as a share of the variance
-    steps : (step, 2) rows (not negative) and columns
-    limit : standard deviations beyond which a residual has no weight
-    """
-    of_time, of_pixels = of_time.astype(np.float32), of_pixels.astype(np.float32)
-    factor, still_variance = shot_factor.astype(np.float32), read.astype(np.float32)
-    sums = np.zeros((len(steps), 7))
-    ny, nx = good.shape
-    for residual, level, share in zip(rest, model, of_time, strict=True):
-        signal = np.maximum(level, np.float32(0)) * factor
-        weight = 1 / (signal + still_variance)
-        root = np.sqrt(weight)
-        value = residual * root
-        # False of NaN.
-        root[~(good & (np.abs(value) <= limit))] = 0
-        left = np.sqrt(1 - np.tensordot(share, of_pixels, 1) * weight)
-        size = np.where(root > 0, value / left, np.float32(0))
-        shot, still = signal * root, still_variance * root
-        for n, (dy, dx) in enumerate(steps):
-            one = np.s_[: ny - dy, max(0, -dx) : nx - max(0, dx)]
-            two = np.s_[dy:, max(0, dx) : nx - max(0, -dx)]
-            first = (shot[one] * root[two] + root[one] * shot[two]) / 2
-            second = (still[one] * root[two] + root[one] * still[two]) / 2
-            there = second > 0
-            product = size[one] * size[two] + np.float32(taken[n]) * there
-            columns = np.stack([first, second, product]).reshape(3, -1)
-            (s11, s12, p1), (_, s22, p2), (_, _, square) = columns @ columns.T
-            sums[n] += there.sum(), s11, s12, s22, p1, p2, square
-    return sums

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pixcal.estimators.detector.transfer_curve import residual_sums
+from pixcal.kernels.residual_sums import residual_sums
 
 STEPS = np.array([(0, 0), (0, 1), (1, 0), (1, -1), (2, 0)])
 TAKEN = np.array([0.01, 0.02, 0.0, -0.01, 0.03])
