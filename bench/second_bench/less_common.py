@@ -8,8 +8,8 @@ LESS_COMMON = (
     "noise_tail", "coarse_gain", "hot_clusters", "bad_frames", "dropped_frames", "phase_errors",
     "dim_fringes", "far_aims", "long_period", "levels",
 )  # fmt: skip
-SHARE = dict.fromkeys(LESS_COMMON, 0.15) | {"bad_frames": 0.0}
-"""Probability of each; frames that were cut off come only where they are asked for."""
+SHARE = dict.fromkeys(LESS_COMMON, 0.15)
+"""Probability of each."""
 
 
 def vary_camera(bench: Bench, varied: set[str]) -> None:

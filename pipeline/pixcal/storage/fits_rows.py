@@ -26,6 +26,20 @@ from pixcal.storage.sources import SourceFile, unreadable
 
 BAND = CHUNK[1]  # rows that have a checksum in common: those of a chunk
 
+FACTS = {
+    "crc": "CRC-32C of the bytes",
+    "largest": "largest sample, adu",
+    "last": "last sample, adu",
+    "share": "share of the last row that equals the last sample",
+    "constant": "rows at the end that hold nothing but the last sample",
+}  # what is found of every `BAND` rows of a frame
+
+
+def by_fact(catalogue: F64) -> dict[str, F64]:
+    """Facts (time, band) by their names, of a catalogue (time, band, fact)."""
+    return dict(zip(FACTS, np.moveaxis(catalogue, -1, 0), strict=True))
+
+
 _PIECE = 1 << 20
 _TILE_PIECE = 8 << 20
 
@@ -41,13 +55,12 @@ def read_rows(
     rows: tuple[int, int],
     out: NDArray[Any] | None = None,
     *,
-    largest: bool = True,
+    crc_alone: bool = False,
 ) -> F64:
     """Read rows of some planes of a plain file, each byte once.
 
-    Returns (plane, band, 2) float64: of each `BAND` rows: CRC-32C of the bytes in the file, and the
-    largest sample (ADU), NaN where that was not looked for. Raises InputError if the file was
-    changed, or ends too early.
+    Returns (plane, band, fact) float64: `FACTS` of each `BAND` rows, NaN where they were not looked
+    for. Raises InputError if the file was changed, or ends too early.
 
     Parameters
     ----------
@@ -56,12 +69,12 @@ def read_rows(
     rows : first row, which begins a band, and the one after the last
     out : (plane, y, x) filled with the values (ADU); each plane of it contiguous, of the file's
         type or one that holds it
-    largest : look for the largest samples, which takes half as long as reading them
+    crc_alone : leave out the other facts: the largest samples take half as long as reading them
     """
     _, ny, nx = file.shape
     coding, within = file.coding, bands(rows)
     stored = coding.stored
-    found = np.empty((len(planes), len(within), 2))
+    found = np.full((len(planes), len(within), len(FACTS)), np.nan)
     scratch, spare = np.empty((2, min(BAND, rows[1] - rows[0]), nx), stored)
     direct = out is not None and coding.exact and out.dtype == coding.dtype
     with file.source.open() as handle:
@@ -75,12 +88,23 @@ def read_rows(
             found[n, b, 0] = google_crc32c.value(raw)
             _make_native(raw, coding, native)
             values = native.view(coding.dtype) if coding.exact else _scale(native, coding)
-            found[n, b, 1] = np.fmax.reduce(values, axis=None) if largest else np.nan
+            if not crc_alone:
+                found[n, b, 1:] = np.fmax.reduce(values, axis=None), *_ending(values)
             if target is not None and not direct:
                 target[...] = values
         # Written to since it was opened, it is partly another file.
         file.source.check_read(handle)
     return found
+
+
+def _ending(values: NDArray[Any]) -> tuple[float, float, int]:
+    """Last sample, share of the last row that equals it, and rows at the end of nothing else."""
+    bits = values.view(f"u{values.itemsize}")  # NaN equals itself
+    share = float((bits[-1] == bits[-1, -1]).mean())
+    if share < 1:
+        return float(values[-1, -1]), share, 0
+    same = (bits == bits[-1, -1]).all(axis=1)
+    return float(values[-1, -1]), share, len(same) if same.all() else int(same[::-1].argmin())
 
 
 def _make_native(raw: NDArray[Any], coding: SampleFormat, native: NDArray[Any]) -> None:

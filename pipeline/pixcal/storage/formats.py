@@ -26,7 +26,7 @@ class ArtefactKind:
 STAGES = {
     stage.name: stage
     for stage in (
-        ArtefactKind("ingest", 2, "ingest ACQ --out RUN", earlier=(1,), of_fringes=False),
+        ArtefactKind("ingest", 3, "ingest ACQ --out RUN", earlier=(1, 2), of_fringes=False),
         ArtefactKind("reduce", 2, "reduce RUN", earlier=(1,), of_fringes=False),
         ArtefactKind("sweep", 4, "fit RUN"),
         ArtefactKind("fit", 1, "fit RUN"),

@@ -118,7 +118,7 @@ class FrameReader:
 
     def _read_frame(self, t: int, rows: tuple[int, int], out: NDArray[Any]) -> None:
         file = self._files[t]
-        found = read_rows(file, [self._planes[t]], rows, out, largest=False)[0, :, 0]
+        found = read_rows(file, [self._planes[t]], rows, out, crc_alone=True)[0, :, 0]
         first = rows[0] // BAND
         if (found != self._checksums[t, first : first + len(found)]).any():
             raise InputError(
@@ -127,4 +127,37 @@ class FrameReader:
             )
 
 
-Reader = ArrayReader | FrameReader  # what frames (time, y, x) are read with, wherever they are
+@dataclass(frozen=True)
+class ChosenFrames:
+    """Some frames of an array (time, y, x), as an array of their own."""
+
+    reader: ArrayReader | FrameReader
+    numbers: Sequence[int]  # of the frames, increasing
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Of the array."""
+        return len(self.numbers), *self.reader.shape[1:]
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of the samples."""
+        return self.reader.dtype
+
+    @property
+    def chunks(self) -> tuple[int, ...]:
+        """Samples to read at a time."""
+        return self.reader.chunks
+
+    def read(self, *ranges: tuple[int, int], out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """A block, as `ArrayReader.read` gives it."""
+        times, *within = ranges or ((0, len(self.numbers)),)
+        numbers = np.asarray(self.numbers[slice(*times)], int)
+        parts = np.split(numbers, np.flatnonzero(np.diff(numbers) > 1) + 1)
+        found = [self.reader.read((p[0], p[-1] + 1), *within) for p in parts if len(p)]
+        found = found or [self.reader.read((0, 0), *within)]
+        return np.concatenate(found, out=out)
+
+
+# what frames (time, y, x) are read with, wherever they are
+Reader = ArrayReader | FrameReader | ChosenFrames

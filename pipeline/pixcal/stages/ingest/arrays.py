@@ -19,7 +19,7 @@ from pixcal.storage.artefact import Build, Manifest, damaged_files, digest, file
 from pixcal.storage.cube import ArrayWriter, create_array, create_group
 from pixcal.storage.cube_place import cubes_of
 from pixcal.storage.fits_in import FrameFile, SampleFormat
-from pixcal.storage.fits_rows import BAND
+from pixcal.storage.fits_rows import BAND, FACTS
 from pixcal.storage.folder import DISK_FULL
 from pixcal.storage.frame_reader import Columns, described
 from pixcal.storage.frames import tabulate
@@ -60,7 +60,7 @@ def finish(writer: ArrayWriter) -> dict[str, Any]:
 class Writers:
     """What an array of frames is written to."""
 
-    catalogue: ArrayWriter  # (time, band, 2): what `pixcal.storage.fits_rows.read_rows` returns
+    catalogue: ArrayWriter  # (time, band, fact): what `pixcal.storage.fits_rows.read_rows` returns
     samples: ArrayWriter | None  # (time, y, x) in ADU, where they are copied
     shape: tuple[int, ...]  # shape, dtype: of the frames
     dtype: str
@@ -72,11 +72,11 @@ class Writers:
         """Create the arrays, or reopen them."""
         store = made.folder / "catalogue.zarr"
         _create_groups(store, array)
-        facts = (-(-shape[1] // BAND), 2)
+        facts = (-(-shape[1] // BAND), len(FACTS))
         catalogue = create_array(
             store / array, (shape[0], *facts), "f8",
             dims=("time", "band", "fact"), chunks=(FRAMES_A_PIECE, *facts),
-            attrs={"fact": ["CRC-32C of the bytes", "largest sample, adu"]},
+            attrs={"fact": list(FACTS.values())},
         )  # fmt: skip
         samples = create(made.cubes, array, shape, dtype) if copied else None
         return cls(catalogue, samples, tuple(shape), str(dtype))

@@ -28,11 +28,12 @@ from pixcal.model.config import to_plain
 from pixcal.model.errors import DamagedError, InputError, RemoteError
 from pixcal.model.options import Ingest
 from pixcal.stages.ingest.arrays import FRAMES_A_PIECE, Writers, find_kept, take_over
+from pixcal.stages.ingest.cut_frames import cut_from, cut_warning
 from pixcal.storage.artefact import Build, Manifest, read_manifest, write_json, write_manifest
 from pixcal.storage.cube import CHUNK, ArrayReader
 from pixcal.storage.cube_place import base_of, chosen_base, cubes_of
 from pixcal.storage.fits_in import FrameFile
-from pixcal.storage.fits_rows import BAND, read_rows, unpack, unpack_bytes
+from pixcal.storage.fits_rows import BAND, by_fact, read_rows, unpack, unpack_bytes
 from pixcal.storage.folder import transit_bytes
 from pixcal.storage.formats import STAGES
 from pixcal.storage.frame_reader import describe
@@ -90,8 +91,8 @@ def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manif
                 for array, frames in tables.items()
             }
             _fill(made, {a: f for a, f in tables.items() if a not in known}, copied, runtime)
-            _close(made, described, sources, tables, copied, facts)
-            made.summary["warnings"] = warnings
+            cut = _close(made, described, sources, tables, copied, facts)
+            made.summary["warnings"] = warnings + cut
 
         make(out, STAGE, plain, inputs, body, cubes=base, keep=keep)
         return _place(out, description.parent)
@@ -388,10 +389,11 @@ def _close(
     tables: Mapping[str, Sequence[Frame]],
     copied: Mapping[str, bool],
     facts: Mapping[str, dict[str, Any]],
-) -> None:
+) -> list[str]:
     """Check that nothing is missing or was changed meanwhile, and write the tables.
 
-    The ``facts`` are those of the arrays that were taken over.
+    The ``facts`` are those of the arrays that were taken over. Returns what to say of frames that
+    were cut off.
     """
     try:
         for files in sources.values():
@@ -409,14 +411,18 @@ def _close(
         made.discard()
         raise
     write_json(made.folder / "acquisition.json", to_plain(described))
-    listed, places = {}, {}
+    listed, places, warnings = {}, {}, []
     for array, frames in tables.items():
-        catalogue = ArrayReader(made.folder / "catalogue.zarr" / array).read()
-        largest = np.fmax.reduce(catalogue[..., 1], axis=1)
+        found = by_fact(ArrayReader(made.folder / "catalogue.zarr" / array).read())
+        largest = np.fmax.reduce(found["largest"], axis=1)
+        cut = cut_from(array, found, frames[0].file.shape[1])
+        warnings += cut_warning(array, frames, cut, found)
         listed[array] = columns(frames) | {
-            "largest_adu": [float(v) if np.isfinite(v) else None for v in largest]
+            "largest_adu": [float(v) if np.isfinite(v) else None for v in largest],
+            "cut_from_row": cut,
         }
         places[array] = None if copied[array] else describe(_files(frames))
     write_json(made.folder / "frames.json", listed)
     write_json(made.folder / "files.json", places)
     made.summary["arrays"] = arrays
+    return warnings

@@ -16,7 +16,7 @@ from pixcal.stages.reduce.flat_survey import FlatSurvey, code_step, of_several_l
 from pixcal.storage.artefact import read_json, read_manifest
 from pixcal.storage.cube import ArrayReader
 from pixcal.storage.cube_place import cubes_of
-from pixcal.storage.frame_reader import FrameReader, Reader
+from pixcal.storage.frame_reader import ChosenFrames, FrameReader, Reader
 from pixcal.storage.place import Local, Place
 from pixcal.storage.stage import read_acquisition
 
@@ -40,9 +40,28 @@ class Ingested:
         return read_acquisition(self.folder.parent).detector
 
     @cached_property
+    def _catalogue(self) -> dict[str, dict[str, list[Any]]]:
+        catalogue: dict[str, dict[str, list[Any]]] = read_json(self.folder / "frames.json")
+        return catalogue
+
+    @cached_property
+    def _whole(self) -> dict[str, list[int]]:
+        """Numbers of the frames that were not cut off."""
+        return {
+            name: [
+                n
+                for n, cut in enumerate(table.get("cut_from_row", [None] * len(table["time_s"])))
+                if cut is None
+            ]
+            for name, table in self._catalogue.items()
+        }
+
+    @cached_property
     def _listed(self) -> dict[str, dict[str, list[Any]]]:
-        listed: dict[str, dict[str, list[Any]]] = read_json(self.folder / "frames.json")
-        return listed
+        return {
+            name: {key: [column[n] for n in self._whole[name]] for key, column in table.items()}
+            for name, table in self._catalogue.items()
+        }
 
     @cached_property
     def tables(self) -> dict[str, dict[str, list[Any]]]:
@@ -85,19 +104,28 @@ class Ingested:
 
     @cached_property
     def arrays(self) -> Mapping[str, Reader]:
-        """A reader of each array: of its cube, or of the FITS files.
+        """A reader of each array, without frames that were cut off.
 
         Raises
         ------
         InputError
             If the files are not there any more.
         """
+        return {
+            name: reader
+            if len(self._whole[name]) == reader.shape[0]
+            else ChosenFrames(reader, self._whole[name])
+            for name, reader in self._readers().items()
+        }
+
+    def _readers(self) -> Mapping[str, ArrayReader | FrameReader]:
+        """A reader of all frames of each array: of its cube, or of the FITS files."""
         manifest = read_manifest(self.folder)
         if manifest is None or manifest.format == 1:
-            return {name: ArrayReader(self.raw / name) for name in self._listed}
-        readers: dict[str, Reader] = {}
+            return {name: ArrayReader(self.raw / name) for name in self._catalogue}
+        readers: dict[str, ArrayReader | FrameReader] = {}
         places = read_json(self.folder / "files.json")
-        for name, table in self._listed.items():
+        for name, table in self._catalogue.items():
             if places[name] is None:
                 readers[name] = ArrayReader(self.raw / name)
                 continue

@@ -1,0 +1,69 @@
+"""Frames whose transfer was cut off: one value, zero mostly, from some row to the end."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from pixcal.model.arrays import F64
+from pixcal.storage.fits_rows import BAND
+from pixcal.storage.frames import Frame
+
+_NAMED = 3
+
+
+def cut_from(array: str, facts: Mapping[str, F64], rows: int) -> list[int | None]:
+    """First row without samples of each frame, None where all rows have them.
+
+    Noise makes an exactly constant last row unlikely. Where most frames have one, or nearly, it is
+    no mark: rows without light on a camera whose noise is cut off at zero or below a code. Nor are
+    rows that saturate.
+
+    Parameters
+    ----------
+    array : ``bias``, ``dark``, ``flat``, ``fringes/<set>``
+    facts : `pixcal.storage.fits_rows.FACTS` by name, (time, band)
+    rows : of a frame
+    """
+    share = facts["share"][:, -1]
+    if np.quantile(share, 0.5, method="lower") >= 0.5:
+        return [None] * len(share)
+    largest, level = np.fmax.reduce(facts["largest"], axis=1), facts["last"][:, -1]
+    usual = np.median(largest)
+    # Flats of a ladder saturate one and all; of others, most frames reach the end of the converter.
+    full = (level == largest) & ((level >= usual) if array == "flat" else (level == usual))
+    cut = (share == 1) & ~full
+    return [
+        _first_row(facts["last"][n], facts["constant"][n], rows) if cut[n] else None
+        for n in range(len(share))
+    ]
+
+
+def _first_row(last: F64, constant: F64, rows: int) -> int:
+    """Where the last rows of one value begin, by the last sample and such rows of each band."""
+    first = rows
+    for band in range(len(last) - 1, -1, -1):
+        if not np.array_equal(last[band], last[-1], equal_nan=True):
+            break
+        first -= int(constant[band])
+        if first > band * BAND:
+            break
+    return first
+
+
+def cut_warning(
+    array: str, frames: Sequence[Frame], first: Sequence[int | None], facts: Mapping[str, F64]
+) -> list[str]:
+    """What to say of the frames of an array, given what `cut_from` was given and returned."""
+    found = [
+        f"{frame.file.source.name}{f' [{frame.plane}]' * (frame.file.shape[0] > 1)} "
+        f"(all samples {value:g} from row {row} on)"
+        for frame, row, value in zip(frames, first, facts["last"][:, -1], strict=True)
+        if row is not None
+    ]
+    if not found:
+        return []
+    more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+    return [
+        f"{array}: incomplete frames are left out ({len(found)} of {len(frames)}): "
+        f"{', '.join(found[:_NAMED])}{more}; frames.json lists them (cut_from_row)"
+    ]
