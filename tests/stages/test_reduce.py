@@ -488,6 +488,18 @@ def test_a_pixel_that_is_saturated_without_light_is_hot(tmp_path: Path) -> None:
     assert read(tmp_path, "calibration.zarr/mask")[3, 4] & PixelFlag.HOT
 
 
+def test_pixels_that_differ_are_not_noisy_under_dark_signal(tmp_path: Path) -> None:
+    camera = Camera(14)
+    camera.read = READ * camera.rng.lognormal(0, 0.2, SHAPE)
+    camera.dark = np.full(SHAPE, READ**2 / 4)
+    kinds = {
+        "bias": (camera.take(20, 0), [0.0] * 20),
+        "dark": (np.concatenate([camera.take(10, 1), camera.take(10, 8)]), [1.0] * 10 + [8.0] * 10),
+    }
+    found = small(tmp_path, kinds)
+    assert found["flags"]["noisy"] < 3e-4 * camera.dark.size
+
+
 def test_fringes_alone_are_reduced_with_warnings(tmp_path: Path) -> None:
     camera = Camera(2, SMALL)
     found = small(tmp_path, {"fringes/a": (camera.fringes(5), [None] * 5)})

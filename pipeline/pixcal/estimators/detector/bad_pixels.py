@@ -7,7 +7,7 @@ the frames can do: on a perfect detector fewer than one pixel in 10⁵ is flagge
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.special import chdtri, polygamma
+from scipy.special import chdtri
 
 from pixcal.estimators.detector.calibration import MIN_RUNGS, Rung
 from pixcal.kernels.robust import lit, median_and_sigma
@@ -154,8 +154,8 @@ def noisy_factor(least: float, variance: F64, dof: int, quantum: float) -> float
     known = variance[variance > 0]
     if dof < _SPREAD_DOF or not known.size or np.median(known) < quantum**2:
         return least
-    seen = median_and_sigma(np.log(known))[1] ** 2 - float(polygamma(1, dof / 2))
-    return max(least, float(np.exp(_POPULATION * np.sqrt(max(seen, 0.0)) / 2)))
+    # With the scatter of the variances by chance, which takes pixels as far.
+    return max(least, float(np.exp(_POPULATION * median_and_sigma(np.log(known))[1] / 2)))
 
 
 def nonlinear(rungs: Sequence[Rung], levels: F64, limit: float) -> Mask:

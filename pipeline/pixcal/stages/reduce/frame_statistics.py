@@ -199,20 +199,22 @@ def _measure_dark(job: Measuring, column: _Column, combined: Sequence[Combined])
         combined[least].variance - charges[least] / job.gain, len(job.dark[least].frames) - 1
     )
     read = max(read if read > 0 else job.read_noise**2, SHEPPARD * job.quantum**2)
-    pooled = np.zeros_like(line.bias)
     dofs = [np.where(np.isfinite(c.variance), c.kept - 1, 0.0) for c in combined]
     dof = np.sum(dofs, axis=0)
-    for group, found, weight, charge in zip(job.dark, combined, dofs, charges, strict=True):
-        share = weight / np.maximum(dof, 1)
-        variance = share * np.nan_to_num(found.variance)
-        pooled += variance
-        # Long exposures would outweigh the others by their shot noise.
-        maps["dark_variance"] += variance * read / (read + charge / job.gain)
+    # Of a variance less the shot noise of the dark signal, which adds to its error.
+    shots = [charge / job.gain for charge in charges]
+    weights = [n * (read / (read + shot)) ** 2 for n, shot in zip(dofs, shots, strict=True)]
+    weight = np.sum(weights, axis=0)
+    pooled = np.zeros_like(line.bias)
+    for group, found, n, w, shot in zip(job.dark, combined, dofs, weights, shots, strict=True):
+        variance, share = np.nan_to_num(found.variance), w / np.where(weight > 0, weight, 1)
+        pooled += n / np.maximum(dof, 1) * variance
+        maps["dark_variance"] += share * (variance - shot)
         maps["kurtosis"] += share * np.nan_to_num(found.excess_kurtosis)
         maps["outliers"] += found.seen - found.kept
         if group == job.read_series:
-            maps["read_variance"] = found.variance - charge / job.gain
-    maps["dark_dof"] = dof
+            maps["read_variance"] = found.variance - shot
+    maps["dark_dof"] = np.rint(weight)
     missing = ~np.isfinite(line.bias) | ~np.isfinite(line.rate)
     maps["flags"][missing] += int(PixelFlag.NO_DATA)
     maps["flags"][line.bias >= job.full] += int(PixelFlag.HOT)
