@@ -84,6 +84,21 @@ def test_stitches_are_red_and_white_noise_is_not() -> None:
     assert redness(stitched) > 10
 
 
+@pytest.mark.parametrize("steps", [0.0, 3e-3])
+def test_curvature_of_stitched_offsets_is_no_more_than_chance(steps: float) -> None:
+    """What steps between a few large blocks give to a parabola lies within what is drawn."""
+    sizes = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        true = white(seed)
+        (rows, columns), start = rng.integers(20, 60, 2), rng.integers(0, 60)
+        y, x = (np.arange(SHAPE[0]) + start) // rows, (np.arange(SHAPE[1]) + start) // columns
+        true += steps * rng.standard_normal((9, 9))[y][:, x]
+        found = true_offsets(true, np.zeros(SHAPE), plane())
+        sizes.append((fit_terms(true, found.terms) / found.scatter)[3:6])
+    assert 0.7 < np.sqrt(np.mean(np.square(sizes))) < 1.6
+
+
 def test_bad_pixels_do_not_matter() -> None:
     true = white(7)
     holes = true.copy()

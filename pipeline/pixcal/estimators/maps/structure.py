@@ -10,6 +10,7 @@ from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import C128, F64, Mask
 
 DEGREE = 3  # of a smooth surface
+_BEYOND = 7  # degree up to which polynomials tell how red true offsets are
 PERIODS = (2, 3, 4, 5, 6, 8)  # of rows and columns: those of readout circuits
 AROUND = 5  # pixels along the side of a pixel's surroundings
 _CLIP = 6.0
@@ -140,9 +141,24 @@ def true_offsets(delta: F64, sigma: F64, psi: F64) -> OffsetModel:
     variance = float(np.nanvar(rest))
     noise = float(np.nanmedian(sigma[np.isfinite(delta)] ** 2))
     true = variance * max(0.0, 1 - noise / max(variance, 1e-300))
-    scatter = np.sqrt(true / (terms**2).sum(axis=(1, 2)))
-    # The polynomials took most of what is alike over large blocks: they scatter by more than the
-    # rest is red by. Of white maps the factor is one.
-    scatter[: len(bending)] *= redness(rest)
+    squares = np.full(len(terms), true)
+    if true:
+        squares[: len(bending)] += variance * _steps_at_large(rest)
+    scatter = np.sqrt(squares / (terms**2).sum(axis=(1, 2)))
     kept = np.nan_to_num(rest * np.sqrt(true / max(variance, 1e-300)))
     return OffsetModel(kept, terms, scatter)
+
+
+def _steps_at_large(rest: F64) -> F64:
+    """Power of smooth terms (term,) by steps in a map without them, over that of a white map.
+
+    A step (stitched blocks, halves of a mask) has a share in every polynomial, whose square falls
+    as one over the square of the degree. The degrees from which nothing was taken tell its size.
+    """
+    degree = np.array([n for n in range(_BEYOND + 1) for _ in range(n + 1)])
+    terms = legendre(rest.shape, _BEYOND)
+    low, high = degree <= DEGREE, degree > DEGREE
+    squares = fit_terms(rest, terms)[high] ** 2 * (terms[high] ** 2).sum(axis=(1, 2))
+    beyond, law = squares / np.nanvar(rest) - 1, degree[high] ** -2.0
+    size = max(float(beyond @ law / (law @ law)), 0.0)
+    return np.asarray(size / np.maximum(degree[low], 1) ** 2.0)
