@@ -111,7 +111,7 @@ def test_what_moved_is_brought_back() -> None:
     charge = (SCENE * RNG.uniform(0.9, 1.1, SCENE.shape)).astype(np.float32)
     changed = charge + moved_charge(charge, STRONG * boundary_shifts(effect.falloff_px))
     assert np.abs(changed - charge).max() > 200
-    np.testing.assert_allclose(effect.restored(changed), charge, atol=0.1)
+    np.testing.assert_allclose(effect.undo_samples(changed), charge, atol=0.1)
 
 
 def test_charge_moves_over_the_edges_of_a_window(make_effect_bench: Callable[..., Bench]) -> None:

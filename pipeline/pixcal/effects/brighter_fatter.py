@@ -78,26 +78,11 @@ class BrighterFatter(Effect):
         moved = moved_charge(wide, self._shifts, self.along_y)
         return charge + moved[inside, inside]
 
-    def restored(self, charge: F32) -> F32:
-        """Charge as it would be with boundaries that stay.
-
-        Parameters
-        ----------
-        charge : (y, x) float32
-            e-, with the effect.
-
-        Returns
-        -------
-        (y, x) float32
-            e-; the same sum.
-        """
+    def undo_samples(self, charge: F32) -> F32:
         found = charge
         for _ in range(_TURNS):
             found = charge - moved_charge(found, self._shifts, self.along_y)
         return found
-
-    def undo_samples(self, charge: F32) -> F32:
-        return np.stack([self.restored(frame) for frame in charge])
 
     @property
     def undo_halo(self) -> int:

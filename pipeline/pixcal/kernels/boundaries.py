@@ -50,52 +50,65 @@ def area_changes(falloff_px: float) -> F64:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _push(charge: Any, shifts: Any, along_x: bool, out: Any) -> None:
-    """Mean shift of the boundaries after each pixel, of a frame with a margin of `REACH`."""
-    ny, nx = out.shape
-    high, wide = shifts.shape
+def _push(charge: Any, shifts: Any, along_x: bool, wide: Any, out: Any) -> None:
+    """Mean shift of the boundaries after each pixel of a frame; ``wide`` is scratch."""
+    ny, nx = charge.shape
+    for y in range(ny + 2 * REACH):
+        wide[y, REACH : nx + REACH] = charge[min(max(y - REACH, 0), ny - 1)]
+        wide[y, :REACH] = wide[y, REACH]
+        wide[y, nx + REACH :] = wide[y, nx + REACH - 1]
+    high, wide_by = shifts.shape
     for y in range(ny):
-        for x in range(nx):
-            out[y, x] = 0
+        out[y] = 0
         for i in range(high):
-            for j in range(wide):
+            for j in range(wide_by):
                 s = np.float32(0.5 * shifts[i, j])
                 dy, dx = (i, j + 1) if along_x else (j + 1, i)
+                row = wide[y + dy, dx : dx + nx]
                 for x in range(nx):
-                    out[y, x] += s * charge[y + dy, x + dx]
+                    out[y, x] += s * row[x]
 
 
-def _pushes(charge: F32, shifts: F64) -> tuple[F32, F32]:
-    """Mean shift of the boundaries to the right of and below each pixel (y, x)."""
-    around = np.pad(charge, REACH, "edge")
-    push_x, push_y = np.empty_like(charge), np.empty_like(charge)
-    _push(around, shifts, True, push_x)
-    _push(around, shifts, False, push_y)
-    return push_x, push_y
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _move(charge: Any, shifts: Any, along_y: Any, out: Any) -> None:
+    """What pixels of frames (t, y, x) gain, added to ``out``."""
+    frames, ny, nx = charge.shape
+    wide = np.empty((ny + 2 * REACH, nx + 2 * REACH), np.float32)
+    push = np.empty((ny, nx), np.float32)
+    half = np.float32(0.5)
+    for t in range(frames):
+        q, gain = charge[t], out[t]
+        _push(q, shifts, True, wide, push)
+        for y in range(ny):
+            for x in range(nx - 1):
+                flow = half * (q[y, x] + q[y, x + 1]) * push[y, x]
+                gain[y, x + 1] -= flow
+                gain[y, x] += flow
+        _push(q, shifts, False, wide, push)
+        for y in range(ny - 1):
+            for x in range(nx):
+                flow = half * (q[y, x] + q[y + 1, x]) * push[y, x] * along_y
+                gain[y + 1, x] -= flow
+                gain[y, x] += flow
 
 
 def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0) -> F32:
-    """What each pixel gains, (y, x) e-; its sum is zero.
+    """What each pixel of a frame (y, x), or of frames (t, y, x), gains, e-; its sum is zero.
 
     Within `REACH` of the first and last row it is right only if these are edges of the window.
 
     Parameters
     ----------
-    charge : (y, x) float32
+    charge : (y, x) or (t, y, x) float32
         e-, as if boundaries stayed. Beyond the edges it goes on as it is at
         them; through the edges nothing moves.
     shifts : from `boundary_shifts`, times the shift by an electron (px)
     along_y : shift of the boundaries between rows over that of those between columns
     """
     charge = np.ascontiguousarray(charge, np.float32)
-    push_x, push_y = _pushes(charge, shifts)
-    half, out = np.float32(0.5), np.zeros_like(charge)
-    flow = half * (charge[:, :-1] + charge[:, 1:]) * push_x[:, :-1]
-    out[:, 1:] -= flow
-    out[:, :-1] += flow
-    flow = half * (charge[:-1] + charge[1:]) * (push_y[:-1] * np.float32(along_y))
-    out[1:] -= flow
-    out[:-1] += flow
+    out = np.zeros_like(charge)
+    ny, nx = charge.shape[-2:]
+    _move(charge.reshape(-1, ny, nx), shifts, np.float32(along_y), out.reshape(-1, ny, nx))
     return out
 
 
@@ -104,8 +117,13 @@ def boundary_pushes(charge: F32, shifts: F64) -> tuple[F32, F32]:
 
     The charge is in e-; shifts are as in `moved_charge`.
     """
-    x, y = zip(*(_pushes(frame, shifts) for frame in charge), strict=True)
-    return np.stack(x), np.stack(y)
+    ny, nx = charge.shape[1:]
+    wide = np.empty((ny + 2 * REACH, nx + 2 * REACH), np.float32)
+    push_x, push_y = np.empty_like(charge), np.empty_like(charge)
+    for frame, right, below in zip(charge, push_x, push_y, strict=True):
+        _push(frame, shifts, True, wide, right)
+        _push(frame, shifts, False, wide, below)
+    return push_x, push_y
 
 
 def shared_noise(
@@ -129,55 +147,68 @@ def shared_noise(
     axes : factors of the shifts of boundaries between columns and between rows
     """
     out = np.zeros_like(charge)
-    (dy, dx), (_, ny, nx) = step, charge.shape
-    rows = _between(ny, dy)
-    columns = _between(nx, dx)
-    if rows.start < rows.stop and columns.start < columns.stop:
-        v, u = _moved(rows, dy), _moved(columns, dx)
-        gain = _gain(charge, pushes, shifts, (rows, columns), (dy, dx), axes)
-        back = _gain(charge, pushes, shifts, (v, u), (-dy, -dx), axes)
-        out[:, rows, columns] = gain * charge[:, v, u] + back * charge[:, rows, columns]
+    dy, dx = step
+    there, back = _slopes(shifts, dy, dx, axes), _slopes(shifts, -dy, -dx, axes)
+    _share(charge, *pushes, there, back, dy, dx, out)
     return out
 
 
-def _between(size: int, step: int) -> slice:
-    return slice(REACH + max(0, -step), size - REACH - max(0, step))
+def _slopes(shifts: F64, dy: int, dx: int, axes: tuple[float, float]) -> F32:
+    """What a pixel gains through each of its boundaries by the charge of another.
 
+    Through those to the right, to the left, below and above: of each the factor of the two pixels'
+    charge beside it, and that of its own shift, which the neighbour across it widens the flux of.
+    """
 
-def _moved(part: slice, by: int) -> slice:
-    return slice(part.start + by, part.stop + by)
-
-
-def _gain(
-    q: F32,
-    pushes: tuple[F32, F32],
-    shifts: F64,
-    part: tuple[slice, slice],
-    step: tuple[int, int],
-    axes: tuple[float, float],
-) -> F32:
-    """Derivative of what pixels gain by the charge of the one at a step from each."""
-
-    def slope(y: int, x: int, axis: int) -> np.float32:
+    def slope(y: int, x: int, axis: int) -> float:
         i, j = y + REACH, x + REACH - 1
         inside = 0 <= i < shifts.shape[0] and 0 <= j < shifts.shape[1]
-        return np.float32(0.25 * axes[axis] * shifts[i, j] if inside else 0)
+        return 0.25 * axes[axis] * shifts[i, j] if inside else 0.0
 
-    (dy, dx), (rows, columns) = step, part
-    above, left = _moved(rows, -1), _moved(columns, -1)
-    here = q[:, rows, columns]
-    total: F32 = slope(dy, dx, 0) * (here + q[:, rows, _moved(columns, 1)])
-    total -= slope(dy, dx + 1, 0) * (here + q[:, rows, left])
-    total += slope(dx, dy, 1) * (here + q[:, _moved(rows, 1), columns])
-    total -= slope(dx, dy + 1, 1) * (here + q[:, above, columns])
-    across, along = (np.float32(0.5 * factor) for factor in axes)
-    # The neighbour across a boundary also widens what the shift of the boundary takes.
-    if (dy, dx) == (0, 1):
-        total += across * pushes[0][:, rows, columns]
-    elif (dy, dx) == (0, -1):
-        total -= across * pushes[0][:, rows, left]
-    elif (dy, dx) == (1, 0):
-        total += along * pushes[1][:, rows, columns]
-    elif (dy, dx) == (-1, 0):
-        total -= along * pushes[1][:, above, columns]
-    return total
+    by_shift = slope(dy, dx, 0), -slope(dy, dx + 1, 0), slope(dx, dy, 1), -slope(dx, dy + 1, 1)
+    sides = (0, 1), (0, -1), (1, 0), (-1, 0)
+    signs = axes[0] / 2, -axes[0] / 2, axes[1] / 2, -axes[1] / 2
+    by_charge = (n if (dy, dx) == side else 0.0 for n, side in zip(signs, sides, strict=True))
+    return np.array([by_shift, tuple(by_charge)], np.float32)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _gain(
+    q: Any, push_x: Any, push_y: Any, y: int, left: int, right: int, slopes: Any, out: Any
+) -> None:
+    """Derivative of what pixels of a row gain by the charge of the one that the slopes are of."""
+    # Views, whose indices are never negative: only then is the loop vectorised.
+    here, above, below = q[y, left:right], q[y - 1, left:right], q[y + 1, left:right]
+    before, after = q[y, left - 1 : right - 1], q[y, left + 1 : right + 1]
+    push_right, push_left = push_x[y, left:right], push_x[y, left - 1 : right - 1]
+    push_below, push_above = push_y[y, left:right], push_y[y - 1, left:right]
+    (s_right, s_left, s_below, s_above), (c_right, c_left, c_below, c_above) = slopes
+    for x in range(right - left):
+        out[x] = (
+            s_right * (here[x] + after[x])
+            + s_left * (here[x] + before[x])
+            + s_below * (here[x] + below[x])
+            + s_above * (here[x] + above[x])
+            + c_right * push_right[x]
+            + c_left * push_left[x]
+            + c_below * push_below[x]
+            + c_above * push_above[x]
+        )
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _share(
+    charge: Any, push_x: Any, push_y: Any, there: Any, back: Any, dy: int, dx: int, out: Any
+) -> None:
+    frames, ny, nx = charge.shape
+    left, right = REACH + max(0, -dx), nx - REACH - max(0, dx)
+    one, other = np.empty((2, max(0, right - left)), np.float32)
+    for t in range(frames):
+        q, across, along = charge[t], push_x[t], push_y[t]
+        for y in range(REACH + max(0, -dy), ny - REACH - max(0, dy)):
+            _gain(q, across, along, y, left, right, there, one)
+            _gain(q, across, along, y + dy, left + dx, right + dx, back, other)
+            here, partner = q[y, left:right], q[y + dy, left + dx : right + dx]
+            row = out[t, y, left:right]
+            for x in range(right - left):
+                row[x] = one[x] * partner[x] + other[x] * here[x]

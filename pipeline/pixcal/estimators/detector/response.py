@@ -84,7 +84,7 @@ def _signal_of(evidence: Evidence, level_e: float, every: Sequence[F64]) -> Dist
         level = charge = evidence.level(fringes, signal)
         for size, shifts in zip(moves, every, strict=True):
             if size:
-                charge = charge + np.stack([moved_charge(frame, size * shifts) for frame in level])
+                charge = charge + moved_charge(level, size * shifts)
         factor = np.polyval(np.array([*powers[::-1], 1], np.float32), charge / np.float32(level_e))
         return np.asarray((charge * factor - level) / flat)
 

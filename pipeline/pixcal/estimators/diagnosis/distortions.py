@@ -17,6 +17,7 @@ from pixcal.estimators.diagnosis.evidence import FringeEvidence
 from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
+from pixcal.kernels.two_way import left_over
 from pixcal.model.arrays import F32, F64, Mask
 
 Distortion = Callable[[FringeEvidence, F32, F64], F32]
@@ -81,16 +82,11 @@ class TwoWay:
 
         Zero where a sample has no weight.
         """
-        rest = np.where(self.weight > 0, change, np.float32(0))
+        inverse = np.ascontiguousarray(np.moveaxis(self.pixel_inverse, 0, -1), np.float32)
         covariance = self.frame_covariance.astype(np.float32)
-        for _ in range(_TURNS):
-            of_frames = (self.weight * rest) @ self.of_place.T
-            rest -= np.einsum("tij,tj->ti", covariance, of_frames) @ self.of_place
-            of_pixels = self.of_time @ (self.weight * rest)
-            share = np.einsum("nij,jn->in", self.pixel_inverse, of_pixels).astype(np.float32)
-            rest -= self.of_time.T @ share
-        rest[self.weight == 0] = 0
-        return rest
+        return left_over(
+            change, self.weight, self.of_place, covariance, self.of_time, inverse, _TURNS
+        )
 
     def taken_by_pixels(self) -> F32:
         """Share (t, n) of the variance that the free pixels take off the residuals."""

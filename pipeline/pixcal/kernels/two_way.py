@@ -1,0 +1,96 @@
+"""What is left of a table of frames by pixels where each frame and each pixel is free.
+
+A frame is free to have some functions of place, a pixel some functions of time. The table is
+projected, with its weights, onto what frames leave and onto what pixels leave, in turns.
+"""
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from pixcal.model.arrays import F32
+
+_PIXELS = 2048  # of a frame that are worked on together: they stay in the cache
+
+
+def left_over(
+    table: F32, weight: F32, of_place: F32, covariance: F32, of_time: F32, inverse: F32, turns: int
+) -> F32:
+    """What the freedom leaves of a table (t, n); zero where a sample has no weight.
+
+    Parameters
+    ----------
+    table, weight : (t, n) float32
+        The weight is one over the variance, or zero.
+    of_place, covariance : (j, n), (t, j, j) float32
+        Functions that frames are free to have, and the covariance of each frame's share of them.
+    of_time, inverse : (k, t), (k, k, n) float32
+        Functions that pixels are free to have, and each pixel's inverse normal matrix.
+    turns : int
+    """
+    rest = np.where(weight > 0, table, np.float32(0))
+    _project(rest, weight, of_place, covariance, of_time, inverse, turns)
+    rest[weight == 0] = 0
+    return rest
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})  # type: ignore[untyped-decorator]
+def _project(
+    rest: Any, weight: Any, of_place: Any, covariance: Any, of_time: Any, inverse: Any, turns: int
+) -> None:
+    (frames, pixels), free, functions = rest.shape, len(of_place), len(of_time)
+    sums, share = (
+        np.zeros((functions, pixels), np.float32),
+        np.zeros((functions, pixels), np.float32),
+    )
+    dots, size = np.zeros(free, np.float32), np.zeros(free, np.float32)
+    for _ in range(turns):
+        sums[:] = 0
+        for t in range(frames):
+            dots[:] = 0
+            for first in range(0, pixels, _PIXELS):
+                part = slice(first, first + _PIXELS)
+                row, own = rest[t, part], weight[t, part]
+                for i in range(functions):
+                    _subtract(row, of_time[i, t], share[i, part])
+                for j in range(free):
+                    dots[j] += _dot(of_place[j, part], own, row)
+            for i in range(free):
+                size[i] = 0
+                for j in range(free):
+                    size[i] += covariance[t, i, j] * dots[j]
+            for first in range(0, pixels, _PIXELS):
+                part = slice(first, first + _PIXELS)
+                row, own = rest[t, part], weight[t, part]
+                for j in range(free):
+                    _subtract(row, size[j], of_place[j, part])
+                for i in range(functions):
+                    _add_weighted(sums[i, part], of_time[i, t], own, row)
+        for i in range(functions):
+            share[i] = 0
+            for k in range(functions):
+                share[i] += inverse[i, k] * sums[k]
+    for t in range(frames):
+        for i in range(functions):
+            _subtract(rest[t], of_time[i, t], share[i])
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})  # type: ignore[untyped-decorator]
+def _dot(a: Any, weight: Any, b: Any) -> Any:
+    total = np.float32(0)
+    for x in range(len(a)):
+        total += a[x] * weight[x] * b[x]
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})  # type: ignore[untyped-decorator]
+def _subtract(row: Any, times: Any, what: Any) -> None:
+    for x in range(len(row)):
+        row[x] -= times * what[x]
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})  # type: ignore[untyped-decorator]
+def _add_weighted(sums: Any, times: Any, weight: Any, row: Any) -> None:
+    for x in range(len(sums)):
+        sums[x] += times * weight[x] * row[x]
