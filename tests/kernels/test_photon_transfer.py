@@ -272,3 +272,24 @@ def test_partial_blocks_are_blocks_if_they_are_large_enough() -> None:
     blocks = pair(np.random.default_rng(9), np.full((17, 35), 1e4))
     # 16 and 1 rows, 16, 16 and 3 columns; all pixels but one are degrees of freedom.
     np.testing.assert_array_equal(blocks[:, 0], [255, 255, 47, 0, 0, 0])
+
+
+@pytest.mark.parametrize("above", [3e3, 1e4])
+@pytest.mark.parametrize("levels", [11, 16])
+def test_a_second_amplifier_for_bright_pixels_leaves_the_gain(above: float, levels: int) -> None:
+    rng, pixels = np.random.default_rng(levels), 2e5
+    level = np.geomspace(400, 4e4, levels)
+    pulls = []
+    for _ in range(20):
+        variance = READ_ADU**2 + level / GAIN + np.where(level > above, 30.0**2, 0.0)
+        variance = variance * rng.chisquare(pixels, levels) / pixels
+        sums = np.zeros((N_BINS, 3))
+        sums[:levels] = pixels * np.stack([np.ones(levels), level, variance], axis=1)
+        fitted = fit_gain(sums, (READ_ADU**2, 0.1), np.inf)
+        assert fitted is not None
+        assert fitted.step
+        assert fitted.levels[1] < above
+        assert fitted.error < 0.01 * GAIN
+        pulls.append((fitted.gain - GAIN) / fitted.error)
+    assert np.std(pulls) < 1.3
+    assert abs(np.mean(pulls)) < 4 / np.sqrt(len(pulls))

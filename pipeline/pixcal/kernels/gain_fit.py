@@ -6,12 +6,17 @@ proportion to the level, bends the curve. How far is not known beforehand: c_1 t
 c_0, are normal numbers of a common size, and the size is zero or any below one. The average over
 the sizes, each with the weight of its evidence (MacKay 1992, *Neural Computation* 4, 415), is the
 gain; what remains unknown of the curve is in its error.
+
+A camera that reads bright pixels with another amplifier (dual gain) has a step in the curve, which
+no such term takes. Points that leave the curve by far more than their noise are therefore fitted up
+to lower levels too, and the gain is that of the range that tells it best.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtrc
 
 from pixcal.model.arrays import F64
 
@@ -25,6 +30,8 @@ _CURVED = 0.05  # chance of a straight line below which the curve bends
 # points more than terms, and range of levels, that tell a curve from points off a line
 _SPARE, _RANGE = 3, 3.0
 _ITERATIONS = 5
+_OFF_CURVE = 1e-6  # chance of a misfit beyond which a curve may have a step
+_SHORTER = 1.5  # factor between the ranges that are tried then
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,9 @@ class GainFit:
     neighbours: tuple[tuple[int, int], ...] = ()
     # whether noise is common to pixels however far apart: the lamp does not light all at once
     uneven: bool = False
+    # chance of points as far off the curve
+    chance: float = 1.0
+    step: bool = False  # whether the curve has a step above the levels used, as of a dual gain
 
 
 def fit_gain(
@@ -68,6 +78,25 @@ def fit_gain(
     straight : fit a line only: within few flats the level changes from place to place, as the
         amplifiers do
     """
+    whole = _fit_range(sums, read_variance, highest, level_error, straight)
+    if whole is None or straight or whole.chance > _OFF_CURVE:
+        return whole
+    best, top = whole, whole.levels[1] / _SHORTER
+    while np.count_nonzero((sums[:, 1] > 0) & (sums[:, 1] <= top * sums[:, 0])) >= _SPARE:
+        found = _fit_range(sums, read_variance, top, level_error, straight)
+        if found is not None and found.chance > _OFF_CURVE and found.error < best.error:
+            best = replace(found, step=True)
+        top /= _SHORTER
+    return best
+
+
+def _fit_range(
+    sums: F64,
+    read_variance: tuple[float, float],
+    highest: float,
+    level_error: float,
+    straight: bool,
+) -> GainFit | None:
     dof = sums[:, 0]
     with np.errstate(invalid="ignore", divide="ignore"):
         level, variance = sums[:, 1] / dof, sums[:, 2] / dof
@@ -104,13 +133,15 @@ def fit_gain(
         chi2 = max(1.0, float(rest / max(freedom[-1], 1)))
     scatter = share @ [one[1][1, 1] + (one[0][1] - slope) ** 2 for one in found]
     of_zero = [one[1][0, 0] + (one[0][0] - mean[0]) ** 2 for one in found]
+    misfit, free = float(weight @ (shot - expected) ** 2), max(float(share @ freedom), 1.0)
     return GainFit(
         1 / slope,
         math.sqrt(scatter) / slope**2,
-        float(weight @ (shot - expected) ** 2 / max(share @ freedom, 1)),
+        misfit / free,
         (float(level.min()), top),
         (read_variance[0] + float(mean[0]), math.sqrt(share @ of_zero)),
         float(mean[2:].sum() / slope) if share[0] < _CURVED else 0.0,
+        chance=float(chdtrc(free, misfit)),
     )
 
 

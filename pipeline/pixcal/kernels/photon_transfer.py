@@ -154,7 +154,8 @@ def bin_pairs(blocks: F64) -> F64:
     dof, level, *_ = blocks.T
     bins = np.minimum(2 * np.sqrt(np.maximum(level, 0)), N_BINS - 1).astype(int)
     sums = (np.bincount(bins, w, N_BINS) for w in (dof, *(dof * v for v in blocks.T[1:])))
-    return np.stack(list(sums), axis=1)
+    # Of no blocks numpy counts in whole numbers.
+    return np.stack(list(sums), axis=1).astype(float)
 
 
 def neighbour_noise(frames: F32, lags: Sequence[tuple[int, int]]) -> float:

@@ -60,6 +60,12 @@ def _of_gain(fit: GainFit, summary: Summary, used: float) -> list[str]:
             "nonlinear response, amplifiers of different gain, a lamp that flickers, or charge "
             "shared by neighbours"
         )
+    if fit.step:
+        found.append(
+            f"the photon-transfer curve is not smooth above {fit.levels[1]:.0f} ADU, as of a "
+            "camera that reads bright pixels at another gain (dual gain, HDR): the gain is that "
+            "below; gain and noise of brighter pixels are not measured"
+        )
     if fit.neighbours:
         lags = ", ".join(f"({y}, {x})" for y, x in fit.neighbours)
         found.append(
