@@ -47,11 +47,8 @@ def test_without_noise_of_lines_nothing_is_taken() -> None:
 
 
 def test_a_saturated_level_beside_row_noise_adds_nothing() -> None:
-    rng, shape = np.random.default_rng(3), (4, 64, 64)
-    frames = rng.normal(0, 3, shape) + rng.normal(0, 3, (4, 64, 1))
-    noise, frames = LineNoise(), frames.astype(np.float32)
-    noise.add(frames, dark_pair_sums(frames, 4.0, 1.0), 4.0, 1.0)
+    dark, noise = frames(np.random.default_rng(3), DARKS, 0.0, "row"), LineNoise()
+    noise.add(dark, dark_pair_sums(dark, READ, 0.0), READ, 0.0)
     assert noise.lines == ("row",)
-    nothing = np.full(shape, np.nan, np.float32)
-    sums = flat_pair_sums(nothing, np.full(4, np.nan, np.float32), 1.0, 4.0, 1.0, noise)
-    assert not sums.any()
+    full = np.full((2, *SHAPE), np.nan, np.float32)
+    assert not flat_pair_sums(full, np.full(2, np.nan), GAIN, READ, 0.0, noise).any()
