@@ -11,7 +11,7 @@ to the fifth harmonic, so that a nonlinear response cannot pass for noise; and o
 particle hits neighbours together.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +21,8 @@ from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence, Stack
 from pixcal.kernels.boundaries import REACH, boundary_pushes, shared_noise
 from pixcal.kernels.line_means import without_line_means
 from pixcal.kernels.normal_matrix import inverse_normal
-from pixcal.model.arrays import F32, F64, Mask
+from pixcal.kernels.pair_sums import pair_sums
+from pixcal.model.arrays import F32, F64
 
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows and columns from a pixel to its neighbours
 
@@ -39,10 +40,11 @@ class _Noise:
     residual: F32  # zero where a sample is not to be used
     variance: F32
     charge: F32  # mean charge
-    # covariance (t, pair) that was taken off the residuals of pairs of pixels with the frames
-    taken: Callable[[Mask, Mask], F32]
+    # (t, j, j), (j, y, x): functions of place that the frames were free to have, and the covariance
+    # of their shares
+    covariance: F32
+    of_place: F32
     kept: float  # share of the covariance that is left where each pixel was fitted
-    good: Mask
 
 
 @dataclass(frozen=True)
@@ -79,12 +81,16 @@ def _shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
         pushes = boundary_pushes(noise.charge, shifts)
         for d, step in enumerate(DIRECTIONS):
             at = [2 * d, 2 * d + 1, n - 2, n - 1]
-            shared = [
-                shared_noise(noise.charge, pushes, shifts, step, axes) for axes in ((1, 0), (0, 1))
-            ]
-            more, more_right = _sums(noise, np.stack(shared), *step)
-            normal[np.ix_(at, at)] += more
-            right[at] += more_right
+            shared = (
+                shared_noise(noise.charge, pushes, shifts, step, (1, 0)),
+                shared_noise(noise.charge, pushes, shifts, step, (0, 1)),
+            )
+            more, more_right = pair_sums(
+                noise.residual, noise.variance, noise.charge, shared, noise.covariance,
+                noise.of_place, step, REACH,
+            )  # fmt: skip
+            normal[np.ix_(at, at)] += noise.kept**2 * more
+            right[at] += noise.kept * more_right
     if not normal[-1, -1]:
         return None
     alike = np.eye(n)[:, :-1]
@@ -96,28 +102,6 @@ def _shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
         covariance[-2:] @ right,
         covariance[-2:, -2:],
     )
-
-
-def _sums(noise: _Noise, shared: F32, dy: int, dx: int) -> tuple[F64, F64]:
-    """Normal matrix and right-hand side for (constant, in proportion, boundaries) of a pair.
-
-    The boundaries are two terms, ``shared`` (2, t, y, x).
-    """
-    one = np.zeros_like(noise.good)
-    ny, nx = one.shape
-    m = REACH
-    one[m + max(0, -dy) : ny - m - max(0, dy), m + max(0, -dx) : nx - m - max(0, dx)] = True
-    one &= noise.good & np.roll(noise.good, (-dy, -dx), axis=(0, 1))
-    y, x = np.nonzero(one)
-    here, there = (slice(None), y, x), (slice(None), y + dy, x + dx)
-    product = noise.residual[here] * noise.residual[there]
-    both = noise.variance[here] * noise.variance[there]
-    weight = np.where(product != 0, 1 / both, np.float32(0)).ravel()
-    charge = noise.charge[here] + noise.charge[there]
-    terms = np.stack([np.ones_like(charge), charge, *(own[here] for own in shared)]).reshape(4, -1)
-    product += noise.taken(one, np.roll(one, (dy, dx), axis=(0, 1)))
-    normal, right = (terms * weight) @ terms.T, (terms * weight) @ product.ravel()
-    return noise.kept**2 * normal.astype(float), noise.kept * right.astype(float)
 
 
 def _noises(evidence: Evidence) -> Iterator[_Noise]:
@@ -137,18 +121,16 @@ def _of_fringes(fringes: FringeEvidence, evidence: Evidence) -> Iterator[_Noise]
     left[np.abs(left) * np.sqrt(freedom.weight) > _CLIP] = 0
     # Shot noise and what moves it are those of the charge, before the flat is divided out.
     flat = evidence.flat.astype(np.float32)
+    of_place = np.zeros((len(freedom.of_place), *good.shape), np.float32)
+    of_place[:, good] = freedom.of_place
+    covariance = freedom.frame_covariance.astype(np.float32)
     for first in range(0, count, BLOCK):
         frames = slice(first, min(first + BLOCK, count))
-
-        def taken(one: Mask, other: Mask, frames: slice = frames) -> F32:
-            pairs = one[good], other[good]
-            return freedom.taken_by_frames(frames, *pairs) * flat[one] * flat[other]
-
         residual = np.zeros(fringes.electrons[frames].shape, np.float32)
         residual[:, good] = left[frames]
         charge = np.maximum(np.nan_to_num(fringes.model[frames]), 0) * flat
         variance = fringes.variance[frames] * flat**2
-        yield _Noise(residual * flat, variance, charge, taken, kept, good)
+        yield _Noise(residual * flat, variance, charge, covariance[frames], of_place * flat, kept)
 
 
 def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[_Noise]:
@@ -169,10 +151,8 @@ def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[_Noise]:
     residual = freedom.left_over(noise.reshape(weight.shape))
     residual[np.abs(residual) * np.sqrt(weight) > _CLIP] = 0
 
-    def taken(one: Mask, other: Mask) -> F32:
-        return freedom.taken_by_frames(slice(None), one.ravel(), other.ravel())
-
     yield _Noise(
-        residual.reshape(frames.shape), variance, np.broadcast_to(charge, frames.shape), taken,
-        1 - 1 / len(frames), good,
+        residual.reshape(frames.shape), variance.astype(np.float32),
+        np.broadcast_to(charge, frames.shape), freedom.frame_covariance.astype(np.float32),
+        freedom.of_place.reshape(1, *good.shape), 1 - 1 / len(frames),
     )  # fmt: skip

@@ -18,7 +18,7 @@ from pixcal.estimators.fringe_fit.fringes import grid
 from pixcal.kernels.normal_matrix import inverse_normal, symmetric
 from pixcal.kernels.significance import SIGNIFICANT, sigmas_of_chi2
 from pixcal.kernels.two_way import left_over
-from pixcal.model.arrays import F32, F64, Mask
+from pixcal.model.arrays import F32, F64
 
 Distortion = Callable[[FringeEvidence, F32, F64], F32]
 
@@ -94,17 +94,6 @@ class TwoWay:
         products = (self.of_time[:, None] * self.of_time).reshape(k * k, count)
         inverse = self.pixel_inverse.reshape(-1, k * k).astype(np.float32)
         return np.asarray(products.T @ inverse.T * self.weight)
-
-    def taken_by_frames(self, frames: slice, one: Mask, other: Mask) -> F32:
-        """Covariance (t, pair) that the free frames take off residuals of pairs of pixels.
-
-        These are some of the n pixels, and as many others, in the same order.
-        """
-        a, b = self.of_place[:, one], self.of_place[:, other]
-        pairs = (a[:, None] * b[None]).reshape(len(a) ** 2, -1)
-        covariance = self.frame_covariance[frames].astype(np.float32)
-        taken: F32 = covariance.reshape(len(covariance), -1) @ pairs
-        return taken
 
 
 class Freedom(TwoWay):
