@@ -59,7 +59,7 @@ def without_cut_off(found: Combined, frames: int, step: float) -> tuple[Combined
 
     def excess(noise: float) -> float:
         table = _of_cut_off(_LEVELS * noise, noise, step)
-        return float(np.mean(_variance_at(mean, variance / frames, *table)) - sample**2)
+        return float(np.mean(variance_at(mean, variance / frames, *table)) - sample**2)
 
     low, high = (end * sample for end in _RANGE)
     if not excess(low) < 0 < excess(high):
@@ -78,11 +78,11 @@ def without_cut_off(found: Combined, frames: int, step: float) -> tuple[Combined
         mean=np.where(above, found.mean, np.interp(likely, means, _LEVELS * noise)),
         variance=np.where(above, 1.0, whole / seen) * found.variance,
     )
-    expected = _variance_at(found.mean, found.variance / frames, means, variances)
+    expected = variance_at(found.mean, found.variance / frames, means, variances)
     return corrected, whole / float(np.nanmean(np.where(above, whole, expected)))
 
 
-def _variance_at(mean: F64, error: F64, means: F64, variances: F64) -> F64:
+def variance_at(mean: F64, error: F64, means: F64, variances: F64) -> F64:
     """Variances of samples of some means with errors (variances), free of a bias by these."""
     bend = np.gradient(np.gradient(variances, means), means)
     at = np.interp(mean, means, variances)

@@ -83,6 +83,13 @@ class Summary:
             noise = gain * self.read_noise[0]
         return max(noise, gain * ROUNDING_ADU * self.step)
 
+    def noise_measured_e(self, noise: Measure | None, gain: float) -> Measure | None:
+        """A noise (ADU) and its error in e-, by the measured gain, else by the one that is used."""
+        if noise is None:
+            return None
+        own, error = (gain, 0.0) if self.gain is None else (self.gain.gain, self.gain.error)
+        return own * noise[0], math.hypot(own * noise[1], error * noise[0])
+
     def noise_before_rounding_e(self, gain: float) -> float:
         """Read noise (e-) of the amplifier: measured, else declared.
 

@@ -41,11 +41,13 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
             "not linear; no pixel is flagged for it"
         )
     noise = summary.declared.read_noise_e
-    if summary.before_rounding is not None:
-        value, error = (gain * v for v in summary.before_rounding)
+    measured = summary.noise_measured_e(summary.before_rounding, gain)
+    if measured is not None and summary.before_rounding is not None:
+        value, error = measured
         if abs(value - noise) > max(3 * error, 0.1 * noise):
             found.append(
-                f"the read noise is {value:.4g} ± {error:.2g} e-, not the {noise:g} of "
+                f"the read noise is {value:.4g} ± {error:.2g} e- "
+                f"({summary.before_rounding[0]:.4g} ADU), not the {noise:g} of "
                 "detector.read_noise_e: the measured one is used"
             )
     return found

@@ -71,7 +71,7 @@ def characterise(
     halves = read_halves(made, source, summary, top, middle, runtime)
     note = "" if facts["gain_e_per_adu"]["measured"] is not None else "declared, not measured"
     found: Json = {"conversion_gain": _figure("conversion gain", "e-/ADU", gain, note)}
-    noise = _read_noise(found, facts, gain[0], source.quantum)
+    noise = _read_noise(found, summary, gain[0], source.quantum)
     _row_noise(found, dark, gain[0])
     if top is not None:
         _full_well(found, gain, top, reached, noise)
@@ -113,26 +113,23 @@ def _gain(facts: Json) -> tuple[float, float | None]:
     return entry["measured"], entry["error"]
 
 
-def _read_noise(found: Json, facts: Json, gain: float, step: float) -> Measure | None:
+def _read_noise(found: Json, summary: Summary, gain: float, step: float) -> Measure | None:
     """Read noise with and without rounding to steps (ADU), in e-; returned with it, in ADU."""
-    entry = facts["read_noise_e"]
-    scale = gain / facts["gain_e_per_adu"]["used"]
-    whole = entry["with_rounding"]
+    whole, own = summary.read_noise, summary.before_rounding
     if whole is None:
         return None
-    error, rounding = scale * (entry["error"] or 0.0), step * gain / math.sqrt(12)
-    whole *= scale
     steps = "ADU" if step == 1 else f"steps of {step:g} ADU"
-    note = f"rounding to {steps} adds {rounding:.3g} e-"
-    own = None if entry["measured"] is None else scale * entry["measured"]
+    note = f"rounding to {steps} adds {step * gain / math.sqrt(12):.3g} e-"
     if own is None:
         note += "; too coarse to measure the noise without it"
-    found["read_noise_with_rounding"] = _figure(
-        "read noise with rounding", "e-", (whole, error), note
-    )
-    if own is not None:
-        found["read_noise"] = _figure("read noise without rounding", "e-", (own, error))
-    return whole / gain, error / gain
+    for name, title, noise, said in (
+        ("read_noise_with_rounding", "read noise with rounding", whole, note),
+        ("read_noise", "read noise without rounding", own, ""),
+    ):
+        if noise is not None:
+            electrons = gain * noise[0], gain * noise[1]
+            found[name] = _figure(title, "e-", electrons, said)
+    return whole
 
 
 def _row_noise(found: Json, dark: F64, gain: float) -> None:

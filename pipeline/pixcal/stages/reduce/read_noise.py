@@ -5,11 +5,13 @@ import math
 import numpy as np
 
 from pixcal.estimators.detector.emva import Measure
+from pixcal.estimators.detector.missing_codes import missing_codes, noise_before_missing_codes
 from pixcal.estimators.detector.pair_noise import lost_in_blocks
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.kernels.rounding import SHEPPARD, noise_before_rounding
 from pixcal.model.arrays import F64
 from pixcal.stages.reduce.calibration import on_grid
+from pixcal.stages.reduce.exposures import Group
 from pixcal.stages.reduce.flat_survey import middle_rows
 from pixcal.stages.reduce.frame_statistics import Measuring
 from pixcal.storage.place import Place
@@ -82,8 +84,20 @@ def _before_rounding(
     means = bias + rate * job.read_series.exptime
     frames, step = len(job.read_series.frames), job.quantum
     in_steps = variance[0] / step**2, variance[1] / step**2
-    found = noise_before_rounding(*in_steps, means[np.isfinite(means)] / step, frames)
+    levels, counts = means[np.isfinite(means)] / step, _code_counts(job.read_series, job)
+    found = noise_before_rounding(*in_steps, levels, frames)
+    if len(missing_codes(counts)):
+        found = noise_before_missing_codes(*in_steps, levels, frames, counts) or found
     return found and (step * found[0], step * found[1])
+
+
+def _code_counts(series: Group, job: Measuring) -> F64:
+    """How often each code, in steps, came up in the middle rows of a series."""
+    reader = job.frames[series.array]
+    rows = (middle_rows(reader, n, n + 1).ravel() for n in series.frames)
+    codes = [(np.maximum(own, 0) // job.quantum).astype(int) for own in rows]
+    size = 1 + max(int(own.max()) for own in codes)
+    return np.asarray(sum(np.bincount(own, minlength=size) for own in codes), float)
 
 
 def bias_wander(job: Measuring) -> float:

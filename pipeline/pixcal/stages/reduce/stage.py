@@ -304,7 +304,8 @@ def _dark_lines(mask: ArrayReader, shape: tuple[int, int]) -> list[str]:
 def _report_noise(
     summary: Summary, config: Config, gain: float, bounds: Bounds
 ) -> dict[str, dict[str, Any]]:
-    fitted, noise, total = summary.gain, summary.before_rounding, summary.read_noise
+    fitted, noise = summary.gain, summary.noise_measured_e(summary.before_rounding, gain)
+    total = summary.noise_measured_e(summary.read_noise, gain)
     return {
         "gain_e_per_adu": {
             "declared": summary.declared.gain_e_per_adu,
@@ -318,9 +319,9 @@ def _report_noise(
         },
         "read_noise_e": {
             "declared": summary.declared.read_noise_e,
-            "measured": gain * noise[0] if noise else None,
-            "error": gain * noise[1] if noise else None,
-            "with_rounding": gain * total[0] if total else None,
+            "measured": noise[0] if noise else None,
+            "error": noise[1] if noise else None,
+            "with_rounding": total[0] if total else None,
             "before_rounding": summary.noise_before_rounding_e(gain),
             "used": bounds.read_noise,
         },

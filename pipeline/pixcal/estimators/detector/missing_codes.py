@@ -1,0 +1,89 @@
+"""Read noise of a converter that leaves codes out: what they add to noise and to mean levels.
+
+A sample whose code is missing gets the next one there is. Noise of a few codes then depends on
+where the level lies; it is found from what a converter with these codes makes of it, pixel by
+pixel. Which neighbour stands in for a missing code the counts of all samples tell. All in codes.
+"""
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.optimize import brentq
+from scipy.special import ndtr
+
+from pixcal.estimators.detector.cut_off import variance_at
+from pixcal.model.arrays import F64, I64
+
+POPULATED = 20.0  # counts on both sides from which a code without any is missing
+_NEAR = 4  # codes on either side that are looked at
+_FINE = 16  # levels a code
+_REACH = 8.0  # of the noise
+_LEAST = 0.5  # noise: below it a wide code is all there is
+_MOST = 500  # range of levels that is looked at
+_STANDS_IN = (0.5, -0.5, 0.0)  # the next code, the one before, either: thresholds off the middle
+
+
+def missing_codes(counts: F64) -> I64:
+    """Codes that never come up though some just below and just above do.
+
+    Parameters
+    ----------
+    counts : (n,) float64
+        Of codes 0 to n - 1.
+    """
+    padded = np.pad(counts, _NEAR)
+    beside = sliding_window_view(padded, _NEAR).max(axis=1)
+    below, above = beside[: len(counts)], beside[_NEAR + 1 :]
+    return np.flatnonzero((counts == 0) & (np.minimum(below, above) > POPULATED))
+
+
+def noise_before_missing_codes(
+    variance: float, error: float, means: F64, frames: int, counts: F64
+) -> tuple[float, float] | None:
+    """Noise that has some variance, on average over pixels, once it is converted; and its error.
+
+    None where no noise does.
+
+    Parameters
+    ----------
+    variance, error : of a sample, on average over the pixels, and its standard error
+    means : (n,) mean samples of pixels like these, over so many ``frames``
+    counts : (code,) how often each code came up
+    """
+    low, high = np.quantile(means, [0.005, 0.995])
+    margin = _REACH * np.sqrt(variance) + 2
+    if high - low + 2 * margin > _MOST:
+        return None
+    means = means[(means >= low) & (means <= high)]
+    codes = np.arange(int(low - margin), int(high + margin) + 1)
+    codes = codes[~np.isin(codes, missing_codes(counts))]
+    level = np.arange(low - 2, high + 2, 1 / _FINE)
+    best: tuple[float, float, float] | None = None
+    for side in _STANDS_IN:
+        gaps = np.diff(codes)
+        begins = (codes[1:] + codes[:-1]) / 2 - side * (gaps - 1)
+
+        def reached(sigma: float, begins: F64 = begins) -> F64:
+            return np.asarray(ndtr((level[:, None] - begins) / sigma))
+
+        def moments(sigma: float, gaps: I64 = gaps) -> tuple[F64, F64]:
+            chance, first = reached(sigma), float(codes[0])
+            mean = first + chance @ gaps
+            return mean, first**2 + chance @ np.diff(codes**2.0) - mean**2
+
+        def excess(sigma: float) -> float:
+            seen = variance_at(means, np.full(means.shape, variance / frames), *moments(sigma))
+            return float(seen.mean()) - variance
+
+        least, most = _LEAST, float(np.sqrt(variance)) + 1
+        if not excess(least) < 0 < excess(most):
+            continue
+        sigma = float(brentq(excess, least, most, xtol=1e-4))
+        slope = (excess(1.01 * sigma) - excess(sigma)) / (0.01 * sigma)
+        at = np.interp(means, moments(sigma)[0], level)
+        share = np.bincount(np.rint((at - level[0]) * _FINE).astype(int), minlength=len(level))
+        chance = -share @ np.diff(reached(sigma), prepend=1.0, append=0.0)
+        seen = np.where(codes < len(counts), counts[np.minimum(codes, len(counts) - 1)], 0.0)
+        misfit = float(np.sum((seen / seen.sum() - chance / chance.sum()) ** 2))
+        if slope > 0 and (best is None or misfit < best[0]):
+            best = misfit, sigma, error / slope
+    return best and best[1:]
