@@ -21,10 +21,10 @@ from pixcal.model.bench import Bench
 from pixcal.model.errors import InputError
 from pixcal.simulation.effect import Effect
 from pixcal.stages import ingest, reduce
+from pixcal.stages.diagnose.comparison import Trial, differing, shrinkage
 from pixcal.stages.diagnose.inquiry import REFERENCES
 from pixcal.stages.diagnose.look import look_at
 from pixcal.stages.diagnose.search import CONFIRM
-from pixcal.stages.diagnose.shrinkage import Trial, differing, shrinkage
 from pixcal.stages.diagnose.trial import Trials
 from pixcal.storage.artefact import read_json
 

@@ -159,12 +159,12 @@ def _failures(wrong: Sequence[Plain]) -> str:
             case["way"] or "nothing",
             "" if case["times"] is None else f"{case['times']:.1f}",
             ", ".join(_claimed(one) for one in case["claims"]) or case["verdict"],
-            "; ".join(f"{one['statistic']} ({one['place']})" for one in case["worst"][:1]),
-            case["why"],
+            # The verdict is in the answer already.
+            "; ".join(why for why in case["why"].split("; ") if not why.startswith("verdict")),
         )
         for case in wrong
     ]
-    header = ("case", "part", "in the data", "× threshold", "answer", "worst", "why")
+    header = ("case", "part", "in the data", "× threshold", "answer", "why")
     return "Answered wrong:\n\n" + _table(header, rows)
 
 
