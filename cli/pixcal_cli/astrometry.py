@@ -37,7 +37,7 @@ def _show(result: Mapping[str, Any], rows: Sequence[Sequence[str]]) -> None:
     bound = next(iter(axes.values()))["photon_bound"]
     click.echo(
         f"  {t['diameter_m']:g} m, {t['focal_length_m']:g} m, {t['wavelength_nm']:g} nm: "
-        f"{t['uas_per_px'] / 1e3:.3g} mas a pixel, {t['px_per_lambda_over_d']:.3g} px in λ/D; "
+        f"{t['uas_per_px'] / 1e3:.3g} mas/px, {t['px_per_lambda_over_d']:.3g} px in λ/D; "
         f"photon noise alone {bound['px']:.3g} px, {bound['uas']:.3g} µas"
     )
     header = ("error of a centroid", "along", "perfect grid", "measured maps", "gain")

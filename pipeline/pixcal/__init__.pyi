@@ -314,7 +314,7 @@ def fit(
     Raises
     ------
     InputError
-        If the run was not reduced, or holds no fringes that can be fitted; with a diagnosis, if there is none.
+        If the run was not reduced, was not diagnosed (for ``with_diagnosis``), or holds no fringes that can be fitted.
     """
 
 def ingest(

@@ -65,7 +65,7 @@ def test_what_is_printed(
     assert invoke(["astrometry", str(tmp_path), "--quiet"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"astrometry: {tmp_path / 'astrometry'} (written)"
-    assert "7 mas a pixel" in lines[1]
+    assert "7 mas/px" in lines[1]
     assert " ".join(lines[2].split()) == (
         "error of a centroid along perfect grid measured maps gain"
     )

@@ -13,10 +13,9 @@ from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
-from pixcal.stages.diagnose.comparison import Comparison
+from pixcal.stages.diagnose.comparison import MIN_LOGLIK_GAIN, Comparison, differing, shrinkage
 from pixcal.stages.diagnose.rejection import MIN_LOGLIK_GAIN_WEAK, doubtful
 from pixcal.stages.diagnose.search import CONFIRM, MAX_CAUSES, SCREEN, Search
-from pixcal.stages.diagnose.shrinkage import MIN_LOGLIK_GAIN, differing, shrinkage
 
 KEYS: tuple[Key, ...] = (
     ("harmonics", "a"),

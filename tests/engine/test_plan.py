@@ -61,8 +61,8 @@ def test_fewer_workers_than_asked_for_are_told_once(capsys: pytest.CaptureFixtur
         assert make_plan("half of it", MIB, MIB, runtime).workers == 1
     told = capsys.readouterr().err
     assert told == (
-        f"half of it: 1 of 3 workers in the {2 * BASE_BYTES // MIB + 3} MiB of --memory; "
-        f"{4 * BASE_BYTES // MIB + 4} MiB for all\n"
+        f"half of it: --memory of {2 * BASE_BYTES // MIB + 3} MiB allows 1 of 3 workers; "
+        f"all need {4 * BASE_BYTES // MIB + 4} MiB\n"
     )
     make_plan("the other half", MIB, MIB, Runtime("processes", 3, runtime.memory))
     make_plan("all of it", MIB, MIB, Runtime("threads", 3, runtime.memory, quiet=False))

@@ -7,7 +7,7 @@ from scipy.stats import kstest, norm
 from pixcal.estimators.diagnosis.expectation import Reference, expect_nominal, expect_with, scaled
 from pixcal.estimators.diagnosis.gap import CHANCE, compare, flagged, log_likelihood, remaining
 from pixcal.estimators.diagnosis.test_statistics import Curve, Key, known_statistics
-from pixcal.stages.diagnose.shrinkage import MIN_LOGLIK_GAIN
+from pixcal.stages.diagnose.comparison import MIN_LOGLIK_GAIN
 
 LINEAR: Key = ("harmonics", "a")
 POWER: Key = ("contrast_of_frames", "a")

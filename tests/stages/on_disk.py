@@ -26,5 +26,5 @@ def evidence_on_disk(raw: Raw, folder: Path) -> Evidence:
         made.summary.update(arrays=facts, warnings=[])
     reduce.run(folder, raw.reduction, runtime)
     if raw.acquisition.frames.fringes:
-        fit.run(folder, fit.Config(model="paraxial"), runtime, products=False)
+        fit.run(folder, fit.Config(model="paraxial"), runtime)
     return load_evidence(folder)

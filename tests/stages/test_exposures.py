@@ -58,7 +58,7 @@ def test_darks_of_two_times_are_enough_without_bias() -> None:
         ({"bias": [0.0], "dark": [1.0], "flat": [None]}, "dark signal is not removed"),
         ({"bias": [0.0], "flat": [1.0, None]}, "1 of 2 flat frames have no EXPTIME"),
         ({"bias": [0.0], "dark": [1.0], "fringes__a": [None, 1.0]}, "a: 1 of 2 frames have no EXP"),
-        ({"bias": [None], "dark": [None], "fringes__a": [None]}, "electrons an exposure"),
+        ({"bias": [None], "dark": [None], "fringes__a": [None]}, "electrons per exposure"),
     ],
 )
 def test_what_is_missing_is_said(times: dict[str, list[float | None]], sentence: str) -> None:

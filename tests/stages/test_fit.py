@@ -145,14 +145,12 @@ def test_up_to_date_work_is_skipped_and_another_model_sweeps_no_more(fitted, tmp
     assert (again / "sweep" / "manifest.json").stat().st_mtime_ns == swept
 
 
-def test_a_fit_without_products_publishes_them_when_asked(fitted, tmp_path):
+def test_products_that_were_removed_are_published_again(fitted, tmp_path):
     _, run, _ = fitted
     again = tmp_path / "run"
     shutil.copytree(run, again)
-    for part in ("fit", "products"):
-        shutil.rmtree(again / part)
-    first = fit.run(again, fit.Config(), Runtime(), products=False)
-    assert not (again / "products").exists()
+    first = fit.run(again, fit.Config(), Runtime())
+    shutil.rmtree(again / "products")
     assert fit.run(again, fit.Config(), Runtime()) == first
     for name in ("delta_x.fits", "delta_y.fits"):
         assert (again / "products" / name).read_bytes() == (run / "products" / name).read_bytes()

@@ -201,11 +201,11 @@ def test_what_must_have_been_run(tmp_path: Path) -> None:
         require(tmp_path, "fit")
     with build(tmp_path, "fit", 2, CONFIG, INPUTS):
         pass
-    with pytest.raises(InputError, match=r"format fit/2, this pixcal reads fit/1"):
+    with pytest.raises(InputError, match=r"format fit/2; this version of pixcal reads fit/1"):
         require(tmp_path, "fit")
     complete(tmp_path)
     (tmp_path / "fit").rename(tmp_path / "allan")
-    with pytest.raises(InputError, match=r"format fit/1, this pixcal reads allan/1"):
+    with pytest.raises(InputError, match=r"format fit/1; this version of pixcal reads allan/1"):
         require(tmp_path, "allan")
 
 

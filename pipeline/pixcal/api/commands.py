@@ -92,8 +92,8 @@ fit = function_of(
     of.Fit,
     "fit",
     _step("fit"),
-    "the run was not reduced, or holds no fringes that can be fitted; with a diagnosis, if there "
-    "is none",
+    "the run was not reduced, was not diagnosed (for ``with_diagnosis``), or holds no fringes that "
+    "can be fitted",
 )
 allan = function_of(
     of.Allan,

@@ -27,7 +27,6 @@ from distributed.comm import CommClosedError
 from pixcal.engine.parcel import Job, RemoteTask, abandon, pack, versions
 from pixcal.model.errors import ClusterError, InputError
 
-CONNECT = "10s"
 AHEAD = 4  # tasks handed to the scheduler for each thread: it takes a while to hear that one ended
 # tasks handed over however few threads there are: a cluster that grows does so by demand
 MIN_AHEAD = 32
@@ -75,20 +74,11 @@ def run_on_cluster(
     at_once: int,
     quiet: bool,
 ) -> None:
-    """Do tasks on a cluster.
+    """Do tasks on a cluster, ``at_once`` at a time in one worker process (0: one a thread).
 
-    Raises InputError if no scheduler answers there, or workers lack files or versions; or as a task
-    raised it. Raises ClusterError if the scheduler is lost, or workers die again and again at the
-    same task.
-
-    Parameters
-    ----------
-    address : of the scheduler, ``tcp://…`` or ``tls://…``
-    function, items : called with each item; both are pickled
-    ended : gets the number and the result of each task
-    label : what the dashboard calls the tasks
-    at_once : tasks that one worker process may do at the same time; 0 for as many as it has threads
-    quiet : print nothing
+    ``ended`` gets the number and the result of each. Raises InputError if no scheduler answers at
+    the address, or workers lack files or versions; ClusterError if the scheduler is lost, or
+    workers die again and again at the same task.
     """
     if not items:
         return
@@ -124,7 +114,7 @@ def _connect(address: str, *, quiet: bool) -> Iterator[Client]:
     disabled, log.disabled = log.disabled, True
     try:
         try:
-            client = Client(address, timeout=CONNECT, set_as_default=False, name="pixcal")
+            client = Client(address, timeout="10s", set_as_default=False, name="pixcal")
         except (OSError, TimeoutError, ValueError) as error:
             raise InputError(
                 f"--cluster {address}: no Dask scheduler answers there ({_first_line(error)}); "

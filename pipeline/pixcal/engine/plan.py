@@ -51,8 +51,8 @@ def make_plan(what: str, bytes_per_task: int, shared_bytes: int, runtime: Runtim
     if workers < runtime.n_workers and not runtime.quiet:
         all_of_them = Plan(bytes_per_task, shared_bytes, runtime.n_workers).total
         _tell(
-            f"{what}: {workers} of {runtime.n_workers} workers in the {runtime.memory >> 20} MiB "
-            f"of --memory; {-(-all_of_them >> 20)} MiB for all"
+            f"{what}: --memory of {runtime.memory >> 20} MiB allows {workers} of "
+            f"{runtime.n_workers} workers; all need {-(-all_of_them >> 20)} MiB"
         )
     return plan
 

@@ -100,17 +100,10 @@ def run_tasks(
     label: str,
     done: Callable[[int, R], None] | None = None,
 ) -> list[R]:
-    """Apply a function to every item, in parallel, with progress.
+    """Apply a function to every item, in parallel, with progress; results in their order.
 
-    Returns results in the order of the items.
-
-    Parameters
-    ----------
-    function : called with one item; must not depend on the order of the items
-    items : one for each task
-    label : what is being done, for the progress line
-    done : called in this process with (number of the item, result) as each task ends, e.g. to note
-        it in a journal.
+    It must not depend on that order. ``done`` is called in this process with the number and the
+    result of each item as its task ends, e.g. to note it in a journal.
     """
     results: dict[int, R] = {}
     times = (TimeElapsedColumn(), "left", TimeRemainingColumn())

@@ -126,8 +126,7 @@ class Acquisition:
 def load_acquisition(path: Path) -> Acquisition:
     """Read an acquisition description.
 
-    ``path``: the directory, or the YAML file itself. Raises InputError if it is missing or any key
-    is unknown, missing or out of range.
+    ``path``: the directory, or the YAML file itself.
     """
     file = path / "acquisition.yaml" if path.is_dir() else path
     if not file.exists():

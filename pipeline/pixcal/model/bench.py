@@ -303,10 +303,7 @@ class Bench:
 
 
 def load_bench(path: Path) -> Bench:
-    """Read a bench file.
-
-    Raises InputError if it is missing or any key is unknown, missing or out of range.
-    """
+    """Read a bench file."""
     if not path.is_file():
         raise InputError(f"{path}: not found; give a bench file such as configs/demo.yaml")
     return parse(Bench, read_yaml(path), str(path))

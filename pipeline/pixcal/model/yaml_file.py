@@ -70,10 +70,7 @@ _StrictLoader.add_constructor("tag:yaml.org,2002:map", _StrictLoader.construct_s
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read a YAML mapping, refusing tags, aliases, duplicate keys and oversized files.
-
-    Raises InputError if the file is missing, too large, not UTF-8, not YAML, or not a mapping.
-    """
+    """Read a YAML mapping, refusing tags, aliases, duplicate keys and oversized files."""
     try:
         if path.stat().st_size > MAX_CONFIG_BYTES:
             raise InputError(f"{path}: larger than {MAX_CONFIG_BYTES} bytes; not a configuration")

@@ -81,11 +81,11 @@ def _facts(view: AstrometryView) -> str:
     bound = view.first["photon_bound"]
     return (
         f"{t['diameter_m']:g} m telescope, {t['focal_length_m']:g} m focal length, "
-        f"{t['wavelength_nm']:g} nm: {t['uas_per_px'] / 1e3:.3g} mas a pixel, "
+        f"{t['wavelength_nm']:g} nm: {t['uas_per_px'] / 1e3:.3g} mas/px, "
         f"{t['px_per_lambda_over_d']:.3g} px in λ/D\n"
         f"{s['number']} stars, {s['positions']} positions each, {s['window_px']} × "
         f"{s['window_px']} px fitted; photon noise alone {bound['px']:.3g} px, "
-        f"{bound['uas']:.3g} µas a position\n"
+        f"{bound['uas']:.3g} µas per position\n"
         f"pixels of the simulated detector: {view.result['detector']['pixels']}"
     )
 
@@ -98,19 +98,18 @@ def _floors(view: AstrometryView) -> dict[str, float]:
 
 def _against_electrons(axes: Axes, view: AstrometryView) -> None:
     electrons, photons = view.photons
-    axes.loglog(electrons, photons, color=GREY, linewidth=1, ls="--", label="photon noise alone")
+    axes.loglog(electrons, photons, color=GREY, lw=1, ls="--", label="photon noise alone")
     for grid, floor in _floors(view).items():
         axes.loglog(
-            electrons, np.hypot(floor, photons), color=COLOURS[grid], linewidth=1.6,
-            label=LABELS[grid],
-        )  # fmt: skip
+            electrons, np.hypot(floor, photons), color=COLOURS[grid], lw=1.6, label=LABELS[grid]
+        )
         errors = view.first["photons"][grid]
         if errors["px"] is not None:
             axes.errorbar(
                 view.result["stars"]["electrons"], errors["px"], yerr=errors["err_px"], fmt="o",
-                color=COLOURS[grid], markersize=5,
+                color=COLOURS[grid], ms=5,
             )  # fmt: skip
-    axes.axhline(view.target_px, color=GREEN, linewidth=1, label=f"target, {view.target_px:g} px")
+    axes.axhline(view.target_px, color=GREEN, lw=1, label=f"target, {view.target_px:g} px")
     lowest = min([view.target_px, *(f for f in _floors(view).values() if f > 0)])
     axes.set_ylim(0.3 * lowest, 20 * float(photons[0]))
     axes.set_xlim(electrons[0], electrons[-1])
@@ -131,15 +130,15 @@ def _against_positions(axes: Axes, view: AstrometryView) -> None:
             continue
         axes.errorbar(
             positions[known], px[known], yerr=error[known], fmt="o-", color=COLOURS[grid],
-            markersize=4, linewidth=1, label=label,
+            ms=4, lw=1, label=label,
         )  # fmt: skip
         first = np.flatnonzero(known)[0]
         axes.plot(
             positions, px[first] * np.sqrt(positions[first] / positions), color=COLOURS[grid],
-            linewidth=0.8, ls=":",
+            lw=0.8, ls=":",
         )  # fmt: skip
         values += px[known].tolist()
-    axes.axhline(view.target_px, color=GREEN, linewidth=1)
+    axes.axhline(view.target_px, color=GREEN, lw=1)
     axes.set_xscale("log", base=2)
     axes.set_yscale("log")
     axes.set_xticks(positions, [f"{n:g}" for n in positions])

@@ -87,25 +87,25 @@ def _precision(axes: Axes, result: Mapping[str, Any]) -> None:
         # Sets are often alike: the later ones are thinner, so that none is hidden.
         before = len(sets) - 1 - order
         bound = line.median / np.sqrt(frames)
-        axes.plot(frames, bound, color=colour, linewidth=2.0 + 3.0 * before, label=line.label)
+        axes.plot(frames, bound, color=colour, lw=2.0 + 3.0 * before, label=line.label)
         if line.spread:
             worst = line.worst / np.sqrt(frames)
-            axes.fill_between(frames, bound, worst, color=colour, alpha=0.18, linewidth=0)
+            axes.fill_between(frames, bound, worst, color=colour, alpha=0.18, lw=0)
         reached = line.median / np.sqrt(line.planned)
-        axes.plot(line.planned, reached, "o", color=colour, markersize=8 + 3 * before)
+        axes.plot(line.planned, reached, "o", color=colour, ms=8 + 3 * before)
     for line, colour, style in zip(joined, (INK, GREY), ("-", "--"), strict=False):
         axes.plot(
-            frames, line.median / np.sqrt(frames), color=colour, ls=style, linewidth=1.4,
+            frames, line.median / np.sqrt(frames), color=colour, ls=style, lw=1.4,
             label=f"{line.label}, frames of all sets",
         )  # fmt: skip
     if wanted:
-        axes.axhline(wanted, color=RED, linewidth=1.2)
+        axes.axhline(wanted, color=RED, lw=1.2)
         text = f"wanted {number(wanted)} px"
         note(axes, text, (frames[0], wanted), (4, 4), color=RED, fontsize=10)
         for line in (*sets, *joined):
             axes.plot((line.median / wanted) ** 2, wanted, "s", color=RED)
     if given:
-        axes.axvline(given, color=RED, linewidth=1.2)
+        axes.axvline(given, color=RED, lw=1.2)
         note(
             axes, f"{number(given)} frames of each set", (given, 0.02), (-5, 0), ha="right",
             xycoords=("data", "axes fraction"), color=RED, fontsize=10,

@@ -81,9 +81,9 @@ def _against(axes: Axes, view: ComponentView) -> None:
         norm=LogNorm(1, max(2, int(view.picture.max()))), interpolation="nearest",
     )  # fmt: skip
     line, slope = np.array([-end, end]), view.facts["slope"]
-    axes.plot(line, line, color=GREY, ls="--", linewidth=1, label="equal")
+    axes.plot(line, line, color=GREY, ls="--", lw=1, label="equal")
     if slope is not None:
-        axes.plot(line, slope * line, color=RED, linewidth=1.3, label=f"slope {slope:.3f}")
+        axes.plot(line, slope * line, color=RED, lw=1.3, label=f"slope {slope:.3f}")
     axes.set(
         xlim=(-end, end), ylim=(-end, end), title=f"{symbol}: pixels",
         xlabel=f"{symbol} in 1 ({unit.label})", ylabel=f"{symbol} in 2 ({unit.label})",
@@ -103,9 +103,9 @@ def _scales(axes: Axes, view: ComponentView) -> None:
     expected, difference = line("expected_px"), line("difference_px")
     spread = expected * 2 * np.array([s["ratio_error"] for s in scales])
     low, high = np.maximum(expected - spread, 0), expected + spread
-    axes.fill_between(at, low, high, color=BAND, linewidth=0)
-    axes.plot(at, expected, color=GREEN, linewidth=1.5, label="difference expected from noise, ±2σ")
-    axes.plot(at, difference, "o-", color=BLUE, markersize=6, linewidth=1.2, label="difference")
+    axes.fill_between(at, low, high, color=BAND, lw=0)
+    axes.plot(at, expected, color=GREEN, lw=1.5, label="difference expected from noise, ±2σ")
+    axes.plot(at, difference, "o-", color=BLUE, ms=6, lw=1.2, label="difference")
     common = line("px", "common")
     seen = np.array(
         [s["common"]["variance_px2"] > 2 * s["common"]["variance_error_px2"] for s in scales], bool
@@ -113,7 +113,7 @@ def _scales(axes: Axes, view: ComponentView) -> None:
     beyond = np.array([s["significance"] > 3 for s in scales], bool)
     # Upper limits as arrows, where nothing is significant.
     top = line("upper_px", "common")[~seen]
-    axes.plot(at[~seen], top, marker=r"$\downarrow$", color=INK, markersize=11, ls="none")
+    axes.plot(at[~seen], top, marker=r"$\downarrow$", color=INK, ms=11, ls="none")
     for which, key, marker, colour, label in (
         (seen, "common", "s", INK, "common"),
         (beyond, "beyond_noise", "D", RED, "difference beyond noise"),
@@ -121,7 +121,7 @@ def _scales(axes: Axes, view: ComponentView) -> None:
         if which.any():
             axes.errorbar(
                 at[which], line("px", key)[which], line("error_px", key)[which], fmt=marker,
-                color=colour, markersize=6, label=label,
+                color=colour, ms=6, label=label,
             )  # fmt: skip
     axes.set_yscale("log")
     _round_off(axes, np.concatenate([expected, common[seen], difference]))
@@ -148,9 +148,9 @@ def _places(figure: SubFigure, axes: Axes, view: ComponentView) -> None:
     )
     for y, x in scattered:
         corner = x * side - 0.5, y * side - 0.5
-        axes.add_patch(Rectangle(corner, side, side, fill=False, edgecolor=INK, linewidth=1.1))
+        axes.add_patch(Rectangle(corner, side, side, fill=False, ec=INK, lw=1.1))
     for y, x in view.far[:MARKED]:
-        axes.plot(x, y, "o", color=INK, markersize=5, fillstyle="none", markeredgewidth=0.9)
+        axes.plot(x, y, "o", color=INK, ms=5, fillstyle="none", mew=0.9)
     axes.set(xlabel="x (px)", ylabel="y (px)", xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5))
     notes = [f"blocks of {side} px"]
     if view.far:
@@ -169,9 +169,9 @@ def _profile(axes: Axes, profile: tuple[F64, F64], label: str, view: ComponentVi
     unit = unit_for([np.median(known)] if len(known) else [], "px")
     at = np.arange(len(mean))
     band = 2 * error * unit.factor
-    axes.fill_between(at, -band, band, color=BAND, linewidth=0, label="noise, ±2σ")
+    axes.fill_between(at, -band, band, color=BAND, lw=0, label="noise, ±2σ")
     width = 1.0 if len(at) <= LINES else 0.5
-    axes.plot(at, mean * unit.factor, color=BLUE, linewidth=width, label="2 − 1")
+    axes.plot(at, mean * unit.factor, color=BLUE, lw=width, label="2 − 1")
     low, high = limits([mean * unit.factor, band, -band], 0.0)
     axes.set(xlim=(-0.5, len(at) - 0.5), ylim=(low, high + 0.25 * (high - low)))
     finish(axes, xlabel=label, ylabel=f"mean Δ{SYMBOLS[view.name]}\n({unit.label})")

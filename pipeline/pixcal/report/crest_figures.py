@@ -16,7 +16,6 @@ from pixcal.model.arrays import F64, I64, Indices, Mask
 from pixcal.report.colours import BLUE, GREY, INK, RED, SEQUENTIAL
 from pixcal.report.drawing import WIDE, draw_blocks, finish, new_figure, note
 
-SHOWN_PATHS = 4  # paths of each end (paper, figure 16)
 LONG_TITLE = 10  # points, so that numbers of many digits stay within their panel
 CREST, VALLEY = RED, BLUE
 
@@ -93,7 +92,7 @@ def outermost(k: I64) -> tuple[I64, I64]:
     """
     paths, number = np.unique(k, return_counts=True)
     long = paths[number >= 0.5 * number.max()]
-    shown = min(SHOWN_PATHS, max(1, len(long) // 2))
+    shown = min(4, max(1, len(long) // 2))  # paper, figure 16
     return long[:shown], long[-shown:]
 
 
@@ -111,17 +110,16 @@ def _stretched(axes: Axes, view: CrestView, paths: I64, title: str) -> None:
     for number, (k, on) in enumerate(chosen.items()):
         at = across[on] - (across[on].mean() if len(on) else 0.0) + number * spacing
         axes.errorbar(
-            at, along[on], xerr=view.sigma_px[on], fmt="o", color=_colour(k), markersize=3,
-            linewidth=0.8,
-        )  # fmt: skip
-        axes.plot(at - view.residual_px[on], along[on], color=INK, linewidth=0.8)
+            at, along[on], xerr=view.sigma_px[on], fmt="o", color=_colour(k), ms=3, lw=0.8
+        )
+        axes.plot(at - view.residual_px[on], along[on], color=INK, lw=0.8)
     axes.set_xticks([n * spacing for n in range(len(chosen))], [str(k) for k in chosen])
     axes.set(xlabel="k", ylabel="along (px)", title=title)
     length = 10.0 ** np.floor(np.log10(max(0.6 * spacing, 1e-9)))
     low, high = axes.get_ylim()
     foot = low - 0.09 * (high - low)
     left = axes.get_xlim()[0]
-    axes.plot([left, left + length], [foot, foot], color=INK, linewidth=3, solid_capstyle="butt")
+    axes.plot([left, left + length], [foot, foot], color=INK, lw=3, solid_capstyle="butt")
     note(axes, f"{length:.3g} px", (left + length, foot), (5, 0), va="center", fontsize=8)
     finish(axes, grid=False)
 
@@ -129,13 +127,13 @@ def _stretched(axes: Axes, view: CrestView, paths: I64, title: str) -> None:
 def _whole(axes: Axes, view: CrestView, paths: I64) -> None:
     """The outermost paths over the whole frame, and the fibres before it."""
     ny, nx = view.frame
-    axes.add_patch(Rectangle((-0.5, -0.5), nx, ny, fill=False, edgecolor=GREY, linewidth=1))
+    axes.add_patch(Rectangle((-0.5, -0.5), nx, ny, fill=False, ec=GREY, lw=1))
     x, y = view.arrays["x"], view.arrays["y"]
     for k in paths:
         on = view.on(k)
-        axes.plot(x[on], y[on], ".-", color=_colour(int(k)), markersize=3, linewidth=0.7)
+        axes.plot(x[on], y[on], ".-", color=_colour(int(k)), ms=3, lw=0.7)
     for (x, y), label in zip(view.fibres, ("A", "B"), strict=True):
-        axes.plot(x, y, "+", color=INK, markersize=9)
+        axes.plot(x, y, "+", color=INK, ms=9)
         note(axes, f"$s_{label}$", (x, y), (4, 4), color=INK)
     title = f"{view.name}: outermost paths, fibres"
     finish(
@@ -148,13 +146,10 @@ def _extract(axes: Axes, view: CrestView, extract: Extract, title: str) -> None:
     draw_blocks(axes, extract.image / 1e3, 1, extract.start, cmap="gray")
     x, y, every = (view.arrays[name] for name in ("x", "y", "k"))
     for k in np.unique(every):
-        axes.plot(x[view.on(k)], y[view.on(k)], color=_colour(int(k)), linewidth=1.2)
+        axes.plot(x[view.on(k)], y[view.on(k)], color=_colour(int(k)), lw=1.2)
     for odd, label in ((0, "crest"), (1, "valley")):
         on = every % 2 == odd
-        axes.plot(
-            x[on], y[on], "o", color=_colour(odd), markersize=6, markeredgecolor="white",
-            markeredgewidth=0.8, label=label,
-        )  # fmt: skip
+        axes.plot(x[on], y[on], "o", color=_colour(odd), ms=6, mec="white", mew=0.8, label=label)
     axes.set(
         xlabel="x (px)", ylabel="y (px)", title=title, xlim=(x0 - 0.5, x0 + nx - 0.5),
         ylim=(y0 - 0.5, y0 + ny - 0.5),
@@ -168,7 +163,7 @@ def _pulls(axes: Axes, view: CrestView) -> None:
     edges = np.linspace(-5, 5, int(np.clip(np.sqrt(len(pull)), 10, 60)) + 1)
     axes.hist(pull, edges.tolist(), density=True, color=BLUE, alpha=0.35)
     at = np.linspace(-5, 5, 201)
-    axes.plot(at, np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi), color=INK, linewidth=1)
+    axes.plot(at, np.exp(-(at**2) / 2) / np.sqrt(2 * np.pi), color=INK, lw=1)
     title = f"{view.used.sum()} points, error {np.median(view.sigma_px):.1e} px"
     finish(axes, xlabel="residual / error", ylabel="density", title=title)
     axes.title.set_fontsize(LONG_TITLE)
@@ -189,8 +184,8 @@ def _map(figure: SubFigure, axes: Axes, view: CrestView, *, by_ratio: bool) -> N
     )
     if by_ratio:
         trace = 1e6 * (arrays["valley_ratio"] / middle - 1)
-        axes.plot(arrays["distance"], trace, color="white", linewidth=1, ls="--")
-    axes.plot(distance, at, "x", color=RED, markersize=9, markeredgewidth=2)
+        axes.plot(arrays["distance"], trace, color="white", lw=1, ls="--")
+    axes.plot(distance, at, "x", color=RED, ms=9, mew=2)
     axes.set(xlabel="D (mm)", ylabel=label, ylim=(values[0], values[-1]))
     axes.set_title("cost per point, others " + ("refitted" if by_ratio else "held"))
     figure.colorbar(drawn, ax=axes, pad=0.02).minorticks_off()
@@ -199,8 +194,8 @@ def _map(figure: SubFigure, axes: Axes, view: CrestView, *, by_ratio: bool) -> N
 def _valley(axes: Axes, view: CrestView) -> None:
     """Cost along the bottom of the valley, above its least."""
     above = view.arrays["valley_cost"] - view.arrays["valley_cost"].min()
-    axes.plot(view.arrays["distance"], above, ".-", color=BLUE, linewidth=1)
-    axes.axvline(view.best[0], color=RED, linewidth=1)
+    axes.plot(view.arrays["distance"], above, ".-", color=BLUE, lw=1)
+    axes.axvline(view.best[0], color=RED, lw=1)
     axes.set_yscale("symlog", linthresh=1.0)
     axes.set_ylim(0, 1.3 * max(1.0, float(above.max())))
     error = view.distance_sigma

@@ -29,11 +29,11 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
     level, variance, error = level[shown], variance[shown], error[shown]
     line = level / curve["gain"] + curve["read_variance"]
     figure, ((left, right),) = axes_grid((WIDE, 3.9), 1, 2, width_ratios=[1.1, 1])
-    style = {"fmt": "o", "color": BLUE, "markersize": 3.5, "elinewidth": 1}
+    style = {"fmt": "o", "color": BLUE, "ms": 3.5, "elinewidth": 1}
     left.errorbar(level, variance, error, **style, label="pairs of flats")
     at = np.geomspace(level.min(), level.max(), 200)
     left.plot(
-        at, at / curve["gain"] + curve["read_variance"], color=INK, linewidth=1.2,
+        at, at / curve["gain"] + curve["read_variance"], color=INK, lw=1.2,
         label=f"{curve['gain']:.4g} e⁻/ADU",
     )  # fmt: skip
     if curve["read_variance"] > 0:
@@ -42,13 +42,13 @@ def photon_transfer(curve: Curves, saturation: float | None) -> Figure:
     low, high = left.get_xlim()
     plain_ticks(left.xaxis, low, high, most=5)
     right.errorbar(level, variance / line, error / line, **style)
-    right.axhline(1, color=INK, linewidth=1.2)
+    right.axhline(1, color=INK, lw=1.2)
     right.set_ylabel("variance over the line")
     right.margins(y=0.15)
     right.locator_params(axis="x", nbins=6)
     for axes in (left, right):
         if saturation is not None:
-            axes.axvline(saturation, color=RED, ls="--", linewidth=1, label="saturation")
+            axes.axvline(saturation, color=RED, ls="--", lw=1, label="saturation")
         finish(axes, xlabel="level (ADU)")
     # Empty room above the rising points, for the legend.
     left.set_ylim(top=4 * left.get_ylim()[1])
@@ -73,8 +73,8 @@ def nonuniformity(patterns: Mapping[str, Curves]) -> Figure:
         spectrum.set_ylabel(f"{name} ({unit})")
         for axes, along, axis, colour in zip(profiles, *AXES, strict=True):
             part = curves[along]
-            axes.plot(part["at"], part["profile"], color=colour, linewidth=0.8)
-            axes.axhline(0, color=INK, linewidth=0.8)
+            axes.plot(part["at"], part["profile"], color=colour, lw=0.8)
+            axes.axhline(0, color=INK, lw=0.8)
             axes.margins(x=0.01)
             axes.locator_params(nbins=5)
             finish(axes, xlabel=f"{axis} (px)", ylabel=f"mean of {along} ({unit})")
@@ -91,7 +91,7 @@ def _spectra(axes: Axes, curves: Curves) -> None:
         style: Any = {"color": colour, "zorder": 3 - middle / (1 + middle)}
         axes.plot(part["frequency"], part["amplitude"], lw=0.9, label=f"along {along}", **style)
         if part["noise"] > 0:
-            axes.axhline(part["noise"], color=colour, ls="--", linewidth=1)
+            axes.axhline(part["noise"], color=colour, ls="--", lw=1)
     axes.set(xlim=(0, 0.5), xlabel="frequency (cycles/px)")
     if any(peaks):
         axes.set_yscale("log")
@@ -111,14 +111,14 @@ def linearity(levels: Sequence[Mapping[str, Any]]) -> Figure:
     used = [v for v in levels if v.get("deviation_percent") is not None]
     left_out = [v for v in levels if v.get("deviation_percent") is None]
     figure, ((axes,),) = axes_grid((WIDE, 3.2), left=1.0)
-    axes.axhline(0, color=INK, linewidth=1, ls="--")
+    axes.axhline(0, color=INK, lw=1, ls="--")
     axes.plot(
         [v["level_e"] / 1e3 for v in used],
         [v["deviation_percent"] for v in used],
-        "o-", color=BLUE, linewidth=1.2, markersize=6,
+        "o-", color=BLUE, lw=1.2, ms=6,
     )  # fmt: skip
     for level in left_out:
-        axes.axvline(level["level_e"] / 1e3, color=INK, ls=":", linewidth=1)
+        axes.axvline(level["level_e"] / 1e3, color=INK, ls=":", lw=1)
     axes.margins(y=0.25)
     finish(axes, xlabel="level (10³ e⁻)", ylabel="deviation (%)")
     return figure

@@ -92,7 +92,7 @@ def _bars(axes: Axes, bars: Sequence[Bar], *, with_after: bool) -> None:
         for y, bar in zip(at, bars, strict=True):
             low, high = bar.interval or (0.0, bar.after)
             if bar.interval:
-                axes.plot([100 * low, 100 * high], [y + shift] * 2, color=INK, linewidth=1.6)
+                axes.plot([100 * low, 100 * high], [y + shift] * 2, color=INK, lw=1.6)
             _share(axes, max(bar.after, high), y + shift, bar.after)
     axes.set_yticks(at, _domain_names(bars))
     axes.set_xlim(0, 118 * max([1e-9, *(max(b.before, b.after) for b in bars)]))
@@ -113,14 +113,11 @@ def _share_axes(axes: Axes, rows: int) -> None:
 def _causes(axes: Axes, causes: Sequence[Closed]) -> None:
     for y, cause in enumerate(causes):
         low, high = (100 * v for v in cause.interval)
-        axes.plot([low, high], [y, y], color=BLUE, linewidth=3, solid_capstyle="butt")
+        axes.plot([low, high], [y, y], color=BLUE, lw=3, solid_capstyle="butt")
     rows = range(len(causes))
+    axes.plot([100 * c.alone for c in causes], rows, "o", color=BLUE, ms=8, label="gap closed")
     axes.plot(
-        [100 * c.alone for c in causes], rows, "o", color=BLUE, markersize=8,
-        label="gap closed",
-    )  # fmt: skip
-    axes.plot(
-        [100 * c.over_rest for c in causes], rows, "D", color=INK, markersize=7, fillstyle="none",
+        [100 * c.over_rest for c in causes], rows, "D", color=INK, ms=7, fillstyle="none",
         label="unique share",
     )  # fmt: skip
     axes.set_yticks(rows, _cause_names(causes))
@@ -149,10 +146,8 @@ def _room(names: Sequence[str]) -> float:
 def curves_figure(curves: Sequence[Mapping[str, Any]], *, with_effects: bool = True) -> Figure:
     """Statistics side by side: above the values, below their deviations from the simulations.
 
-    Parameters
-    ----------
-    curves : up to three entries of ``curves.json``
-    with_effects : False where no effect was found: then that curve is the nominal one
+    Of up to three entries of ``curves.json``. Where no effect was found, the curve with effects is
+    the nominal one and is not drawn.
     """
     named = [places(c) for c in curves if _is_named(c)]
     # room for the longest of the names that are written upwards, inches
@@ -190,7 +185,7 @@ def _panel(top: Axes, below: Axes, curve: Mapping[str, Any], with_effects: bool)
         sigmas = _numbers(curve["z" if key == "nominal" else "z_after"])
         _deviations(below, x + side * BESIDE * named, sigmas, colour, named)
     top.plot(
-        x, measured * scale.factor, "o" if named else "o-", color=INK, markersize=5, linewidth=1,
+        x, measured * scale.factor, "o" if named else "o-", color=INK, ms=5, lw=1,
         label=ORDER[0], zorder=5,
     )  # fmt: skip
     _value_axis(top, curve, drawn * scale.factor, scale)
@@ -215,14 +210,14 @@ def _simulated(
     if named:
         errors = [band["value"] - low, high - band["value"]]
         axes.errorbar(
-            x, band["value"], errors, fmt="s", color=colour, markersize=5, elinewidth=2.4,
+            x, band["value"], errors, fmt="s", color=colour, ms=5, elinewidth=2.4,
             alpha=0.8, label=label,
         )  # fmt: skip
         return
-    axes.fill_between(x, low, high, color=colour, alpha=0.25, linewidth=0)
+    axes.fill_between(x, low, high, color=colour, alpha=0.25, lw=0)
     # The nominal curve shows below one that lies on it.
     width = 3.0 if colour == RED else 1.4
-    axes.plot(x, band["value"], color=colour, linewidth=width, label=label)
+    axes.plot(x, band["value"], color=colour, lw=width, label=label)
 
 
 def _deviations(axes: Axes, x: F64, sigmas: F64, colour: str, named: bool) -> None:
@@ -230,7 +225,7 @@ def _deviations(axes: Axes, x: F64, sigmas: F64, colour: str, named: bool) -> No
         axes.bar(x, sigmas, 0.32, color=colour, alpha=0.75)
     else:
         size = 6 if colour == RED else 3.5
-        axes.plot(x, sigmas, "o-", color=colour, markersize=size, linewidth=size / 3)
+        axes.plot(x, sigmas, "o-", color=colour, ms=size, lw=size / 3)
 
 
 def _value_axis(axes: Axes, curve: Mapping[str, Any], values: F64, scale: Unit) -> None:
@@ -241,7 +236,7 @@ def _value_axis(axes: Axes, curve: Mapping[str, Any], values: F64, scale: Unit) 
             axes.set_ylim(good.min() / 2, good.max() * 2)
             plain_ticks(axes.yaxis, good.min() / 2, good.max() * 2)
     else:
-        axes.axhline(0, color=GREY, linewidth=0.8)
+        axes.axhline(0, color=GREY, lw=0.8)
     quantity = str(curve["quantity"])
     label = f"{quantity} ({scale.label})" if scale.label else quantity
     axes.margins(x=0.06)
@@ -251,8 +246,8 @@ def _value_axis(axes: Axes, curve: Mapping[str, Any], values: F64, scale: Unit) 
 def _sigma_axis(axes: Axes, sigmas: Sequence[F64]) -> None:
     finite = np.concatenate(sigmas)
     top = 1.15 * max(QUIET, float(np.max(np.abs(finite[np.isfinite(finite)]), initial=0.0)))
-    axes.axhspan(-2, 2, color=BAND, linewidth=0, zorder=0)
-    axes.axhline(0, color=GREY, linewidth=0.8)
+    axes.axhspan(-2, 2, color=BAND, lw=0, zorder=0)
+    axes.axhline(0, color=GREY, lw=0.8)
     finish(axes, ylim=(-top, top))
 
 

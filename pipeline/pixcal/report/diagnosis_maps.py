@@ -15,7 +15,6 @@ from pixcal.report.drawing import TITLE, WIDE, axes_grid
 
 CELLS = "cell of 4 × 4"  # `x_label` of curves whose values are cells of the window
 ASIDE = 3.0  # standard deviations below which a map is not worth looking at
-MAX_MAPS = 3  # maps side by side
 LARGEST = 12.0  # standard deviations at which colours end
 # least side of a window in the picture, share of the detector's: real ones would be dots
 SMALLEST = 0.17
@@ -48,15 +47,12 @@ def panels(
 ) -> list[DeviationMap]:
     """Maps with a notable deviation, the largest first.
 
-    Parameters
-    ----------
-    shape : rows and columns of the detector's window
-    places : windows with ``domains``, of ``diagnosis.json``; of a small detector none
-    curves : of ``curves.json``; those by cells are maps
+    By the windows in ``places`` of ``diagnosis.json`` (none for a small detector), else by the
+    cells of those ``curves`` that have them. ``shape`` is the detector's window (y, x).
     """
     maps = _of_windows(places) if places else _of_cells(shape, curves)
     maps = [panel for panel in maps if panel.largest > ASIDE]
-    return sorted(maps, key=lambda panel: -panel.largest)[:MAX_MAPS]
+    return sorted(maps, key=lambda panel: -panel.largest)[:3]
 
 
 def _of_windows(places: Sequence[Mapping[str, Any]]) -> list[DeviationMap]:
@@ -114,14 +110,12 @@ def _draw(
     axes: Axes, shape: tuple[int, int], panel: DeviationMap, scale: Normalize, *, after: bool
 ) -> None:
     ny, nx = shape
-    axes.add_patch(Rectangle((0, 0), nx, ny, fill=False, edgecolor=GREY, linewidth=1))
+    axes.add_patch(Rectangle((0, 0), nx, ny, fill=False, ec=GREY, lw=1))
     for spot in panel.spots:
         (low, left), (high, wide) = _shown(spot, shape)
         sigma = spot.sigmas[after]
         colour = DIVERGING(scale(sigma))
-        axes.add_patch(
-            Rectangle((left, low), wide, high, facecolor=colour, edgecolor="white", linewidth=1)
-        )
+        axes.add_patch(Rectangle((left, low), wide, high, fc=colour, ec="white", lw=1))
         dark = abs(scale(sigma) - 0.5) > 0.33
         axes.text(
             left + wide / 2, low + high / 2, f"{sigma:.1f}".replace("-", "−"), ha="center",

@@ -209,7 +209,7 @@ def finish(axes: Axes, *, grid: bool = True, legend: str = "", **settings: Any) 
         axes.legend(fontsize=9, framealpha=0.9, loc=legend)
     axes.spines[["top", "right"]].set_visible(False)
     if grid:
-        axes.grid(True, color="#d9dee5", linewidth=0.7)
+        axes.grid(True, color="#d9dee5", lw=0.7)
         axes.set_axisbelow(True)
     axes.tick_params(colors=INK)
 

@@ -34,13 +34,9 @@ MEANS_DRAWN = 800  # most means of a profile that are drawn one by one
 def offsets(
     name: str, delta: MapSummary, sigma: MapSummary, start: tuple[int, int] = (0, 0)
 ) -> Figure:
-    """A map of offsets with the means of its columns below and of its rows beside it.
+    """A map of offsets (px) with the means of its columns below and of its rows beside it.
 
-    Parameters
-    ----------
-    name : ``delta_x`` and so on
-    delta, sigma : offsets and their errors, px
-    start : first row and column, where it is a part of the map
+    Of a part of a map, ``start`` is its first row and column.
     """
     width, height = fit_box(delta.shape, 5.7, 5.4)
     total = height + 3.45
@@ -99,15 +95,15 @@ def _profile(
         axes.plot(*((values, at) if upright else (at, values)), **drawing)
 
     if len(at) <= MEANS_DRAWN:
-        fill(at, -chance, chance, color=BAND, linewidth=0, label="independent offsets, ±2σ")
+        fill(at, -chance, chance, color=BAND, lw=0, label="independent offsets, ±2σ")
         ends, label = (mean - noise, mean + noise), "error, ±1σ"
-        fill(at, *ends, color=BLUE, alpha=0.35, linewidth=0, label=label)
-        line(mean, color=BLUE, linewidth=1.1 if len(at) <= 400 else 0.6, label="mean")
+        fill(at, *ends, color=BLUE, alpha=0.35, lw=0, label=label)
+        line(mean, color=BLUE, lw=1.1 if len(at) <= 400 else 0.6, label="mean")
     else:
         low, middle, high = _nearby(mean)
-        fill(at, low, high, color=BAR, linewidth=0, label="lowest to highest nearby")
-        line(middle, color=BLUE, linewidth=1.0, label="mean of those nearby")
-        drawing = {"color": INK, "linewidth": 1.0, "ls": "--"}
+        fill(at, low, high, color=BAR, lw=0, label="lowest to highest nearby")
+        line(middle, color=BLUE, lw=1.0, label="mean of those nearby")
+        drawing = {"color": INK, "lw": 1.0, "ls": "--"}
         line(-chance, **drawing, label="independent offsets, ±2σ")
         line(chance, **drawing)
     (axes.set_xlim if upright else axes.set_ylim)(*limits([mean, -chance, chance]))
@@ -152,17 +148,17 @@ def _histogram(axes: Axes, offset: MapContents, unit: Unit, colour: str) -> None
     bins = int(np.clip(np.sqrt(len(values)) / 1.5, 15, 120))
     edges = np.linspace(middle - 6 * spread, middle + 6 * spread, bins + 1)
     count, _ = np.histogram(values, edges)
-    axes.stairs(count, edges, color=colour, linewidth=1.5, label=f"{symbol}, pixels")
+    axes.stairs(count, edges, color=colour, lw=1.5, label=f"{symbol}, pixels")
     at = np.linspace(edges[0], edges[-1], 400)
     top = len(values) * (edges[1] - edges[0]) / (np.sqrt(2 * np.pi) * spread)
     normal = top * np.exp(-(((at - middle) / spread) ** 2) / 2)
     axes.plot(
-        at, np.maximum(normal, 0.1), color=colour, linewidth=1.0,
+        at, np.maximum(normal, 0.1), color=colour, lw=1.0,
         ls="--", label=f"normal, σ = {spread:.3g} (robust)",
     )  # fmt: skip
     if np.isfinite(noise) and noise > 0:
         axes.axvspan(
-            middle - noise, middle + noise, color=colour, alpha=0.25, linewidth=0,
+            middle - noise, middle + noise, color=colour, alpha=0.25, lw=0,
             label=f"noise, ±1σ = ±{noise:.3g}",
         )  # fmt: skip
 
@@ -170,10 +166,7 @@ def _histogram(axes: Axes, offset: MapContents, unit: Unit, colour: str) -> None
 def power(maps: Sequence[MapContents], vectors: Mapping[str, tuple[float, float]]) -> Figure:
     """Power spectra of maps: means over rings, and cuts along the axes.
 
-    Parameters
-    ----------
-    maps : with spectra
-    vectors : fringe vector (kx, ky), rad/px, of each set
+    ``vectors`` are the fringe vectors (kx, ky), rad/px, by set.
     """
     figure, ((axes,),) = axes_grid((WIDE, 4.0), left=1.0)
     for offset, colour in zip(maps, LINES, strict=False):
@@ -182,7 +175,7 @@ def power(maps: Sequence[MapContents], vectors: Mapping[str, tuple[float, float]
     for vector in vectors.values():
         for order in (1, 2):
             f = folded(np.array([order * v / (2 * np.pi) for v in vector]))
-            axes.axvline(float(np.hypot(*f)), color=GREY, ls=":", linewidth=1)
+            axes.axvline(float(np.hypot(*f)), color=GREY, ls=":", lw=1)
     axes.set_yscale("log")
     axes.set_ylim(top=30 * axes.get_ylim()[1])  # room for the legend
     axes.set_xlim(0, 0.5)
@@ -199,9 +192,9 @@ def _spectrum_lines(axes: Axes, symbol: str, spectrum: Spectrum, colour: str) ->
         (fx, spectrum.power[my // 2], "-", "along fx (means of columns)"),
         (fy, spectrum.power[:, mx // 2], "--", "along fy (means of rows)"),
     ):
-        drawing: Any = {"color": colour, "linewidth": 0.8, "alpha": 0.7, "ls": style}
+        drawing: Any = {"color": colour, "lw": 0.8, "alpha": 0.7, "ls": style}
         axes.plot(f[f > 0], cut[f > 0], label=f"{symbol} {label}", **drawing)
-    axes.plot(*spectrum.radial(), color=colour, linewidth=2, label=f"{symbol}, mean over rings")
+    axes.plot(*spectrum.radial(), color=colour, lw=2, label=f"{symbol}, mean over rings")
     if spectrum.white > 0:
         label = f"{symbol}, white noise of σ"
-        axes.axhline(spectrum.white, color=colour, ls=(0, (6, 3)), linewidth=1.6, label=label)
+        axes.axhline(spectrum.white, color=colour, ls=(0, (6, 3)), lw=1.6, label=label)

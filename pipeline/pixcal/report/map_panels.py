@@ -99,11 +99,7 @@ _BAR = _image(np.arange(LEVELS, dtype=np.uint8)[:, None], BAR_COLOURS)
 def map_panel(title: str, label: str, summary: MapSummary, factor: float = 1.0) -> Panel:
     """A map whose colours span its values.
 
-    Parameters
-    ----------
-    title, label : what it is; quantity and unit of the colours
-    summary : the map
-    factor : what values are multiplied by to be in the unit of ``label``
+    ``factor`` takes values to the unit of ``label``, which names quantity and unit.
     """
     image = summary.image * factor
     scale = span_scale(image)
@@ -165,10 +161,7 @@ def spectra(
 ) -> tuple[list[Panel], Legend]:
     """Power spectra over that of white noise, the fringe frequencies marked.
 
-    Parameters
-    ----------
-    maps : with spectra
-    vectors : fringe vector (kx, ky), rad/px, of each set
+    ``vectors`` are the fringe vectors (kx, ky), rad/px, by set.
     """
     panels = [_spectrum(SYMBOLS[m.name], m.spectrum, vectors) for m in maps if m.spectrum]
     return panels, [(MARKS[n % len(MARKS)], f"set {name}") for n, name in enumerate(vectors)]

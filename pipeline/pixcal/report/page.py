@@ -44,7 +44,6 @@ FIGURES = (
     | vars(diagnosis_figures) | vars(diagnosis_maps)
 )  # fmt: skip
 DATA = vars(tables) | vars(diagnosis) | vars(diagnosis_maps)
-FILTERS = vars(verdict) | vars(diagnosis_words) | vars(tables)
 
 
 def render(contents: Contents) -> str:
@@ -82,7 +81,7 @@ def _fill(template: str, contents: Contents, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= FILTERS
+    environment.filters |= vars(verdict) | vars(diagnosis_words) | vars(tables)
     environment.globals |= {
         "draw": _draw, "figures": FIGURES, "panels": vars(map_panels), "data": DATA,
         "NAMES": text.NAMES,

@@ -30,7 +30,6 @@ Facts = Mapping[str, Any]
 ALLAN_COLUMNS = ("frames", "seconds", "adev_px", "adev_lo_px", "adev_hi_px", "white_expected_px")
 PHASE_BINS = 24
 TURN = ("0", "π", "2π")  # labels of a phase axis
-POINTS = 6000  # most frames that are drawn one by one; of longer runs, every n-th
 
 
 def temporal(sets: Sequence[SetContents]) -> Figure:
@@ -42,11 +41,11 @@ def temporal(sets: Sequence[SetContents]) -> Figure:
         between=0.5,
     )  # fmt: skip
     for column, fringes in zip(grid.T, sets, strict=True):
-        step = -(-len(fringes.series.time) // POINTS)
+        step = -(-len(fringes.series.time) // 6000)  # of longer runs, every n-th frame
         time, clock = _clock(fringes.series.time[::step])
         for axes, (label, values) in zip(column, _parameters(fringes, moving), strict=False):
             size = float(np.clip(70 / np.sqrt(max(len(time), 1)), 1.2, 4.5))
-            drawing: Any = {"markersize": size, "markeredgewidth": 0}
+            drawing: Any = {"ms": size, "mew": 0}
             axes.plot(time, values[::step], "o", color=BLUE, **drawing)
             finish(axes, ylabel=label, ylim=limits([values], 0.0))
         for axes in column[: rows - 1]:
@@ -83,9 +82,9 @@ def _phases(axes: Axes, phi: F64) -> None:
     count, edges = np.histogram(finite, PHASE_BINS, range=(0, 2 * np.pi))
     mean = len(finite) / PHASE_BINS
     chance = 2 * np.sqrt(mean)
-    axes.axhspan(mean - chance, mean + chance, color=GREY, alpha=0.25, linewidth=0)
-    axes.stairs(count, edges, fill=True, color=BAR, edgecolor=BLUE)
-    axes.axhline(mean, color=INK, linewidth=1, ls="--")
+    axes.axhspan(mean - chance, mean + chance, color=GREY, alpha=0.25, lw=0)
+    axes.stairs(count, edges, fill=True, color=BAR, ec=BLUE)
+    axes.axhline(mean, color=INK, lw=1, ls="--")
     axes.set(xlim=(0, 2 * np.pi), xticks=[0, np.pi, 2 * np.pi], xticklabels=TURN)
     finish(axes, xlabel="φ (rad)", ylabel="frames\nper bin")
 
@@ -121,7 +120,7 @@ def _histogram(axes: Axes, fringes: SetContents, colour: str) -> tuple[float, fl
     count, _ = np.histogram(values, edges)
     outside = int((values > high).sum())
     label = f"{fringes.name}: pixels" + (f", {outside} beyond {high:.2f}" if outside else "")
-    axes.stairs(count, edges, color=colour, linewidth=1.5, label=label)
+    axes.stairs(count, edges, color=colour, lw=1.5, label=label)
     at = np.linspace(max(low, 1e-6), high, 500)
     per_bin = len(values) * (edges[1] - edges[0])
     for scale, style, name in (
@@ -129,7 +128,7 @@ def _histogram(axes: Axes, fringes: SetContents, colour: str) -> tuple[float, fl
         (noise, "-", f"the same × {noise:.4f}"),
     ):
         law = per_bin / scale * _reduced_chi2_density(at / scale, freedom)
-        axes.plot(at, law, color=colour, linewidth=1.0, ls=style, label=name)
+        axes.plot(at, law, color=colour, lw=1.0, ls=style, label=name)
     return low, high, max(float(count.max()), 1.0)
 
 
@@ -155,7 +154,7 @@ def allan_figure(sets: Mapping[str, tuple[Facts, Facts]]) -> Figure:
     for n, (name, curve) in enumerate(curves.items()):
         drawing: Any = {"color": LINES[n % len(LINES)], "aside": 1.012 ** (n - (len(sets) - 1) / 2)}
         _allan_lines(axes, below, name, *sets[name], curve, unit, **drawing)
-    below.axhline(1, color=GREY, linewidth=1.5)
+    below.axhline(1, color=GREY, lw=1.5)
     axes.set(xscale="log", yscale="log")
     axes.xaxis.set_minor_locator(NullLocator())
     plain_ticks(axes.yaxis, *axes.get_ylim())
@@ -177,14 +176,14 @@ def _allan_lines(
     frames, adev, white = curve["frames"], curve["adev_px"], curve["white_expected_px"]
     low, high = curve["adev_lo_px"], curve["adev_hi_px"]
     bars = np.nan_to_num(np.abs(np.stack([adev - low, high - adev])))
-    drawing: Any = {"fmt": "o", "color": color, "elinewidth": 1.3, "capsize": 3, "markersize": 6}
+    drawing: Any = {"fmt": "o", "color": color, "elinewidth": 1.3, "capsize": 3, "ms": 6}
     label = f"{name}: measured"
     if (slope := measured.get("slope")) is not None:
         label += f", slope {with_error(slope, measured.get('slope_err'))}"
     at = frames * aside
     axes.errorbar(at, adev * unit.factor, bars * unit.factor, zorder=3, label=label, **drawing)
     below.errorbar(at, adev / white, bars / white, **drawing)
-    law: dict[str, Any] = {"color": color, "linewidth": 1.5}
+    law: dict[str, Any] = {"color": color, "lw": 1.5}
     first = color == LINES[0]  # the legend says once what styles of lines mean
     axes.plot(frames, white * unit.factor, label="square-root law from σ" if first else None, **law)
     if facts.get("crb_median_px"):
@@ -194,7 +193,7 @@ def _allan_lines(
         below.plot(frames, bound / white, **law)
     if knee := measured.get("knee_frames"):
         for each in (axes, below):
-            each.axvline(knee, color=color, ls=":", linewidth=1.4)
+            each.axvline(knee, color=color, ls=":", lw=1.4)
         axes.annotate(
             f" knee: {knee:.0f} frames", (knee, 0.04), xycoords=("data", "axes fraction"),
             fontsize=10, color=color,

@@ -19,7 +19,6 @@ SHOWN_PIXELS = 400  # most blocks along the longer side of a map on the page
 SAMPLE = 1_000_000  # most pixels of a histogram
 BAND_ROWS = 128  # rows read at a time: one row of chunks
 SEGMENT = 256  # longest side of the windows whose power spectra are averaged
-SEGMENTS_A_SIDE = 6  # most windows along each axis
 DETAIL = 96  # side of the window that is shown pixel by pixel when the whole map cannot be
 
 
@@ -139,12 +138,9 @@ def bands(source: Source, side: int = 1) -> Iterator[tuple[int, NDArray[Any]]]:
 
 
 def summarise(source: Source, most: int = SHOWN_PIXELS) -> MapSummary:
-    """Reduce a map to what is shown of it.
+    """Reduce a map, whose values that are not finite count as masked, to what is shown of it.
 
-    Parameters
-    ----------
-    source : values that are not finite count as masked
-    most : blocks along the longer side of the image
+    The image has at most ``most`` blocks along its longer side.
     """
     ny, nx = source.shape
     side = block_side((ny, nx), most)
@@ -259,7 +255,7 @@ def _taper(n: int) -> F64:
 
 
 def _starts(size: int, window: int) -> list[int]:
-    number = min(SEGMENTS_A_SIDE, -(-size // window))
+    number = min(6, -(-size // window))
     return [round(v) for v in np.linspace(0, size - window, number)]
 
 

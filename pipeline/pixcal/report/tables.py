@@ -56,7 +56,7 @@ def allan(measured: Sequence[SetContents]) -> Table:
         knee = "none" if knee is None else f"{number(round(knee))} frames"
         batches = number(a.get("n_batches")), number(a.get("batch_frames")), number(gaps)
         rows.append([s.name, with_error(a.get("slope"), a.get("slope_err")), knee, *batches])
-    header = ["set", "slope", "knee", "batches", "frames a batch", "gaps"]
+    header = ["set", "slope", "knee", "batches", "frames per batch", "gaps"]
     return Table("Allan deviation in numbers", header, rows)
 
 

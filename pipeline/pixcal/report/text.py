@@ -134,14 +134,10 @@ def chance(p: float) -> str:
     return "< 10⁻¹²" if p <= 1e-12 else number(float(p), 2)
 
 
-# difference of the shares of the gap closed by a cause and by its law alone that is shown
-LAW_DIFFERS = 0.02
-
-
 def share_by_law(cause: Mapping[str, Any]) -> float | None:
     """Share of the gap closed by the law of a cause, where it differs from that of the cause."""
     share: float = cause.get("gap_closed_by_law", cause["gap_closed"])
-    return share if abs(share - cause["gap_closed"]) > LAW_DIFFERS else None
+    return share if abs(share - cause["gap_closed"]) > 0.02 else None
 
 
 def date_of_mjd(mjd: float) -> str:

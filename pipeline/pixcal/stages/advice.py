@@ -15,9 +15,6 @@ from pixcal.storage.stage import require
 
 Json = Mapping[str, Any]
 
-_HEADER = ("effect", "size", "effect on the offsets", "action")
-# in the place of `on_map` where a diagnosis has none
-NOT_MEASURED = {"rms_px": 0.0, "max_px": 0.0, "action": "not measured"}
 MATTERS = 0.3  # share of SIGMA from which an error that SIGMA does not hold limits a map
 
 
@@ -45,7 +42,7 @@ def advice(run_dir: Path) -> Advice:
         (c["effect"], size_of(c), moved_by(c, sigma), _action(c, correction, shapes, bool(sigma)))
         for c in causes
     )
-    rows = (_HEADER, *rows) if rows else ()
+    rows = (("effect", "size", "effect on the offsets", "action"), *rows) if rows else ()
     if not sigma:
         rows = tuple((*row[:2], *row[3:]) for row in rows)
     settled = all(_settled(c, correction, bool(sigma)) for c in causes)
@@ -96,18 +93,13 @@ def _sigma(fit: Json, correction: Json | None) -> dict[str, float]:
     return {name: sigma for name, sigma in each.items() if sigma and math.isfinite(sigma)}
 
 
-def _on_map(cause: Json) -> Json:
-    measured: Json = cause.get("on_map", NOT_MEASURED)
-    return measured
-
-
 def _as_what(diagnosis: Json | None, correction: Json | None, it_needs: str) -> str:
     if diagnosis is None:
         return " as fitted. No diagnosis was made, so biases are unknown"
     if correction is not None and correction["outputs"]:
         freed = [e["effect"] for e in correction["effects"] if e["treatment"] in CORRECTED]
         return f", corrected for {' and '.join(freed)}"
-    if any(_on_map(c)["action"] == "corrected" for c in diagnosis["causes"]):
+    if any(c["on_map"]["action"] == "corrected" for c in diagnosis["causes"]):
         return " as fitted, NOT corrected for the effects below"
     if unknown := _unknown(diagnosis):
         return f" as fitted. What {' and '.join(unknown)} does to the offsets is not known"
@@ -117,8 +109,8 @@ def _as_what(diagnosis: Json | None, correction: Json | None, it_needs: str) -> 
 def _unknown(diagnosis: Json | None) -> list[str]:
     """Causes that are neither absorbed nor corrected: their change of the maps is unknown."""
     causes = (diagnosis or {}).get("causes", ())
-    left = [c for c in causes if _on_map(c)["action"] == "fix the bench"]
-    return [c["effect"] for c in left if not _on_map(c)["rms_px"]]
+    left = [c for c in causes if c["on_map"]["action"] == "fix the bench"]
+    return [c["effect"] for c in left if not c["on_map"]["rms_px"]]
 
 
 def limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json | None) -> str:
@@ -127,9 +119,9 @@ def limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json |
     least = min(sigma.values(), default=math.nan)
     noise = ", ".join(f"{number(s, 2)} px ({name})" for name, s in sigma.items())
     biases = {
-        cause["effect"]: _on_map(cause)["rms_px"]
+        cause["effect"]: cause["on_map"]["rms_px"]
         for cause in (diagnosis or {}).get("causes", ())
-        if not (made and _on_map(cause)["action"] == "corrected")
+        if not (made and cause["on_map"]["action"] == "corrected")
     }
     largest = max(biases, key=lambda name: biases[name], default="")
     if biases.get(largest, 0.0) > MATTERS * least:
@@ -153,7 +145,7 @@ def limit(sigma: Mapping[str, float], diagnosis: Json | None, correction: Json |
 
 def moved_by(cause: Json, sigma: Mapping[str, float]) -> str:
     """Change of the offsets, against the error of the best set's median pixel."""
-    rms, most = _on_map(cause)["rms_px"], _on_map(cause)["max_px"]
+    rms, most = cause["on_map"]["rms_px"], cause["on_map"]["max_px"]
     if not rms or not sigma:
         return "not known" if _unknown({"causes": [cause]}) else "none"
     in_sigma = number(rms / min(sigma.values()), 2)
@@ -168,7 +160,7 @@ def _treated(cause: Json, correction: Json | None) -> Json | None:
 
 def _settled(cause: Json, correction: Json | None, with_maps: bool) -> bool:
     """Whether nothing remains to be done about an effect."""
-    action, treated = _on_map(cause)["action"], _treated(cause, correction)
+    action, treated = cause["on_map"]["action"], _treated(cause, correction)
     done = not with_maps or (treated is not None and treated["treatment"] in CORRECTED)
     return bool(action == "unaffected" or (action == "corrected" and done))
 
@@ -177,7 +169,7 @@ def _action(
     cause: Json, correction: Json | None, shapes: tuple[str, Mapping[str, str]], with_maps: bool
 ) -> str:
     """How an effect was treated, or what to do about it."""
-    action, treated = _on_map(cause)["action"], _treated(cause, correction)
+    action, treated = cause["on_map"]["action"], _treated(cause, correction)
     # An effect of the user's own is not known here.
     kind = known_effects().get(cause["effect"])
     why = treated["why"] if treated else treatment_of_kind(kind, *shapes)[1] if kind else ""

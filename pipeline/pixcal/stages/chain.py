@@ -65,5 +65,5 @@ def run(
         if refused is not None:
             note(f"corrected: not possible, use the maps as fitted: {refused}")
     with step("report", out / "report"):
-        report.run(out, report.Config(), runtime)
+        report.run(out, options.Report(), runtime)
     return Done(fringes, diagnosed)

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from pixcal.engine.run import Runtime
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.config import to_plain
+from pixcal.model.options import Sweep
 from pixcal.stages import reduce
 from pixcal.stages.fit.fringe_set import fit_sets
 from pixcal.stages.fit.maps import write_offsets
-from pixcal.stages.fit.sweep import Config as Sweep
 from pixcal.stages.fit.sweep import sweep_sets
 from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.reduce.stage import reduce_frames

@@ -14,7 +14,7 @@ from pixcal.engine.plan import within_memory
 from pixcal.engine.run import Runtime, run_tasks
 from pixcal.estimators.diagnosis.gap import CHANCE, sigmas_among, sigmas_of
 from pixcal.model.config import result_options
-from pixcal.model.options import Report
+from pixcal.model.options import Report as Config
 from pixcal.report.contents import (
     DETECTOR_MAPS,
     Contents,
@@ -46,24 +46,20 @@ from pixcal.storage.folder import INDEX
 from pixcal.storage.formats import STAGES
 from pixcal.storage.stage import make, require, working
 
-# stages whose artefacts are read
-SHOWN_STAGES = ("ingest", "reduce", "sweep", "fit", "allan", "diagnose", "corrected")
 FIGURE_BYTES = 192 << 20  # Matplotlib, one figure and the page
 
 STAGE = STAGES["report"]
-Config = Report
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Write ``RUN/report/report.html`` and ``RUN/products/report.html``.
 
     Only ``RUN/reduce`` must be there; what the later stages would add is marked as not measured.
-    Raises InputError if reduce has not been run, or an artefact cannot be read.
     """
     with working(run_dir, "reduce"):
         manifests = {
             stage: require(run_dir, stage)
-            for stage in SHOWN_STAGES
+            for stage in ("ingest", "reduce", "sweep", "fit", "allan", "diagnose", "corrected")
             if (run_dir / stage / MANIFEST).exists()
         }
         inputs = {stage: manifest.key for stage, manifest in manifests.items()}

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from pixcal import __version__
 from pixcal.model.code import code_digest
@@ -47,7 +47,8 @@ from pixcal.storage.manifest import (
     write_manifest,
     write_whole,
 )
-from pixcal.storage.place import Local, Place
+from pixcal.storage.memory import MemoryBuild
+from pixcal.storage.place import Place
 from pixcal.storage.writeback import flush_file
 
 __all__ = [
@@ -73,28 +74,6 @@ __all__ = [
 ]
 
 _KEY_IN_NAME = 16
-
-
-class Workspace(Protocol):
-    """Where a stage writes: a `Build`, or a `pixcal.storage.memory.MemoryBuild`."""
-
-    @property
-    def folder(self) -> Local:
-        """Of what it makes."""
-
-    @property
-    def cubes(self) -> Place:
-        """Of its cubes."""
-
-    @property
-    def scratch(self) -> Local:
-        """Of what only the stage itself needs."""
-
-    def journal(self) -> set[str]:
-        """Steps noted as done."""
-
-    def note(self, step: str) -> None:
-        """Note a step as done."""
 
 
 @dataclass
@@ -141,6 +120,9 @@ class Build:
         """Note a step as done. Call it when all that the step wrote is in place."""
         with (self.folder / JOURNAL).open("a", encoding="utf-8") as file:
             file.write("\n" + json.dumps({"done": step, "boot": boot()}) + "\n")
+
+
+Workspace = Build | MemoryBuild  # where a stage writes
 
 
 def artefact_key(stage: str, format: int, config: dict[str, Any], inputs: dict[str, str]) -> str:

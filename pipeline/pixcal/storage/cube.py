@@ -28,8 +28,14 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec
 
 from pixcal.model.errors import DamagedError
-from pixcal.storage.folder import INDEX, File, open_folder, read_file
-from pixcal.storage.links import copy_files, link_files
+from pixcal.storage.folder import (
+    INDEX,
+    File,
+    copy_files,
+    link_files,
+    open_folder,
+    read_file,
+)
 from pixcal.storage.memory import MemoryArray, MemoryPath
 from pixcal.storage.place import Place, UrlPath
 from pixcal.storage.read_ahead import AHEAD, ReadAhead
@@ -74,6 +80,18 @@ def create_array(
     metadata = _array_metadata(shape, chunks, dtype.str, fill_value, tuple(dims), text)
     _write_metadata(path, metadata)
     return ArrayWriter(path, shape, chunks, dtype, fill_value, metadata)
+
+
+def create_map(
+    path: Place, shape: Sequence[int], chunks: Sequence[int], *, units: str = "", number: int = 0
+) -> "ArrayWriter":
+    """Create a map (y, x) of float32, or several (batch, y, x); NaN where nothing is written."""
+    many = (number,) * (number > 0)
+    dims = ("batch", "y", "x")[-2 - len(many) :]
+    return create_array(
+        path, (*many, *shape), "<f4", dims=dims, chunks=(*many, *chunks), fill_value=np.nan,
+        attrs={"units": units} if units else None,
+    )  # fmt: skip
 
 
 # Kept: arrays are many and alike, and zarr-python takes a millisecond for each.
@@ -335,14 +353,9 @@ class ArrayReader:
         return math.prod(_grid(self.shape, self.chunks))
 
     def read_chunk(self, index: Sequence[int], out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """One whole chunk (edge chunks too, padded with the fill value).
+        """One whole chunk (edge chunks too, padded with the fill value), decoded into ``out``.
 
         Raises DamagedError naming the chunk's file when it is missing, cut or altered.
-
-        Parameters
-        ----------
-        index : position in the grid of chunks
-        out : buffer of shape ``chunks`` to decode into
         """
         if self._memory is not None:
             return self._memory.chunk(index)
@@ -390,10 +403,7 @@ class ArrayReader:
     def read(self, *ranges: tuple[int, int], out: NDArray[Any] | None = None) -> NDArray[Any]:
         """A block, given one (start, stop) for each axis; fastest when it follows the chunks.
 
-        Parameters
-        ----------
-        *ranges : start and stop along each axis; missing trailing axes are taken whole
-        out : buffer of the block's shape
+        Missing trailing axes are taken whole.
         """
         full = [(0, n) for n in self.shape]
         full[: len(ranges)] = [(max(0, a), min(b, n)) for (a, b), (_, n) in zip(ranges, full)]  # noqa: B905

@@ -41,15 +41,10 @@ def base_of(artefact: Path) -> Place | None:
 
 
 def chosen_base(named: StrPath | None, run: Path, like: Path) -> Place | None:
-    """The folder for all cubes that the user wants.
+    """The folder for all cubes that the user wants; None: cubes stay in the artefacts.
 
-    None: cubes stay in the artefacts.
-
-    Parameters
-    ----------
-    named : a path or URL; the run directory itself to keep cubes in the artefacts; None for the
-        same as another artefact
-    like : that artefact
+    ``named`` is a path or URL, the run directory itself to keep cubes in the artefacts, or None for
+    the same as the artefact ``like``.
     """
     if named is None:
         return base_of(like)
@@ -66,10 +61,7 @@ def settled(artefact: Path, run: Path, base: Place | None) -> bool:
 
 
 def settle(artefact: Path, run: Path, base: Place | None) -> None:
-    """Make the folder for the cubes of an artefact in the making, unless it has one already.
-
-    Raises InputError if nothing can be written there.
-    """
+    """Make the folder for the cubes of an artefact in the making, unless it has one already."""
     if base is None or _read(artefact) is not None:
         return
     place = base / f"{artefact.name}-{secrets.token_hex(4)}"
@@ -118,7 +110,7 @@ def _read(artefact: Local) -> Mapping[str, Any] | None:
 
 def _damaged(file: Local, reason: str) -> DamagedError:
     error = DamagedError(f"{file}: damaged{reason}", file)
-    error.advice = "give --cubes again (--cubes RUN: inside RUN) to write them anew"
+    error.advice = "give --cubes again to write the cubes anew (--cubes RUN keeps them in RUN)"
     return error
 
 

@@ -12,9 +12,6 @@ from typing import Any
 
 from astropy.io import fits
 
-_EXPOSURE_KEYS = ("EXPTIME", "EXPOSURE")
-_TEMPERATURE_KEYS = ("CCD-TEMP", "DET-TEMP", "TEMPERAT", "CCDTEMP", "TEMP")
-_ABSOLUTE_ZERO_C = -273.15
 _MJD_EPOCH = datetime(1858, 11, 17, tzinfo=UTC)
 _SECONDS_A_DAY = 86400.0
 
@@ -91,7 +88,7 @@ def number(header: Header, key: str, default: float | None = None) -> float | No
 
 def exposure_s(headers: tuple[Header, ...]) -> float | None:
     """Exposure time (s) from EXPTIME, else EXPOSURE."""
-    for key in _EXPOSURE_KEYS:
+    for key in ("EXPTIME", "EXPOSURE"):
         for header in headers:
             time = number(header, key)
             if time is not None and time >= 0:
@@ -101,13 +98,13 @@ def exposure_s(headers: tuple[Header, ...]) -> float | None:
 
 def temperature_c(headers: tuple[Header, ...]) -> float | None:
     """Temperature in degrees Celsius; in kelvin in the header where its comment says so."""
-    for key in _TEMPERATURE_KEYS:
+    for key in ("CCD-TEMP", "DET-TEMP", "TEMPERAT", "CCDTEMP", "TEMP"):
         for header in headers:
             degrees = number(header, key)
             if degrees is not None:
                 comment = header.comment(key).lower()
                 kelvin = "[k]" in comment or "kelvin" in comment
-                return degrees + _ABSOLUTE_ZERO_C if kelvin else degrees
+                return degrees + -273.15 if kelvin else degrees
     return None
 
 

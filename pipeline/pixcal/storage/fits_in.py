@@ -32,8 +32,6 @@ Container = Literal["plain", "gzip", "tiles", "picture"]
 _Stream = io.BufferedReader | gzip.GzipFile
 
 _BLOCK = 2880
-_MAX_HEADER = 400 * _BLOCK
-_GZIP_MAGIC = b"\x1f\x8b"
 
 # FITS 4.0, section 5.2.5 and table 11: the offsets that make signed integers of unsigned ones.
 _EXACT = {
@@ -107,7 +105,7 @@ def inspect(source: SourceFile) -> FrameFile:
     """
     with source.open() as handle:
         try:
-            packed = handle.read(2) == _GZIP_MAGIC
+            packed = handle.read(2) == b"\x1f\x8b"
             handle.seek(0)
             if not packed:
                 return _inspect_stream(source, io.BufferedReader(handle), "plain")
@@ -210,7 +208,7 @@ def _read_header(stream: _Stream, first: bytes) -> Header | None:
         block = stream.read(_BLOCK)
         if not text and not block.startswith(first):
             return None
-        if len(block) < _BLOCK or len(text) > _MAX_HEADER:
+        if len(block) < _BLOCK or len(text) > 400 * _BLOCK:
             raise ValueError("header cut short or damaged; copy it again, or remove it")
         text += block
         if any(block[n : n + 80].rstrip(b" \0") == b"END" for n in range(0, _BLOCK, 80)):

@@ -20,7 +20,6 @@ Cards = Mapping[str, Any]  # header keywords: a value, or (value, comment)
 
 BLOCK = 2880
 COMPRESSED = ".fits.fz"
-_SIGN = np.uint16(0x8000)
 
 
 @dataclass(frozen=True)
@@ -59,18 +58,11 @@ class FrameWriter:
         return self.data_at + -(-self.data_bytes // BLOCK) * BLOCK
 
     def write_rows(self, row: int, data: NDArray[Any], plane: int = 0) -> None:
-        """Write some whole rows of one plane; different rows may be written at the same time.
-
-        Parameters
-        ----------
-        row : the first of them
-        data : (rows, x) of the file's type
-        plane : frame of a cube
-        """
+        """Write whole rows (rows, x) of a plane; different ones may be written at the same time."""
         ny, nx = self.shape[-2:]
         if data.dtype != self.dtype or data.shape[1] != nx or row + data.shape[0] > ny:
             raise ValueError(f"{self.path}: {data.dtype} {data.shape} at row {row} does not fit")
-        stored = data ^ _SIGN if self.dtype == "uint16" else data
+        stored = data ^ np.uint16(0x8000) if self.dtype == "uint16" else data  # as BZERO does
         body = stored.astype(stored.dtype.newbyteorder(">"), order="C").data.cast("B")
         at = self.data_at + (plane * ny + row) * nx * data.itemsize
         with aside_of(self.path).open("r+b", buffering=0) as file:

@@ -41,7 +41,6 @@ def by_fact(catalogue: F64) -> dict[str, F64]:
 
 
 _PIECE = 1 << 20
-_TILE_PIECE = 8 << 20
 
 
 def bands(rows: tuple[int, int]) -> list[tuple[int, int]]:
@@ -143,13 +142,7 @@ def _scale(raw: NDArray[Any], coding: SampleFormat) -> F32:
 def unpack(file: FrameFile, target: Path) -> FrameFile:
     """Write the image of a compressed file as bare big-endian samples, reading the file once.
 
-    Returns the same image in the scratch file, in the container ``plain``. Raises InputError naming
-    the compressed file when it is damaged, cut short, or was changed.
-
-    Parameters
-    ----------
-    file : a file in any container but ``plain``
-    target : scratch file to make
+    Returns the same image in the scratch file, in the container ``plain``.
     """
     with file.source.open() as handle, target.open("wb") as out:
         if file.container == "picture":
@@ -200,7 +193,7 @@ def _tiles_at_once(file: FrameFile) -> tuple[int, int]:
     """(planes, rows) decoded at once: whole tiles, some MiB of them."""
     planes, rows = file.tile
     tile_bytes = planes * rows * file.shape[2] * file.coding.stored.itemsize
-    rows *= max(1, _TILE_PIECE // tile_bytes)
+    rows *= max(1, 8 << 20 // tile_bytes)
     # Of small frames several: astropy looks at the header again for each piece.
     return planes * max(1, rows // file.shape[1]), rows
 

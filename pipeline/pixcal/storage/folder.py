@@ -1,12 +1,13 @@
-"""Whole files of a folder, many at a time: of this machine, or at a URL."""
+"""Whole files of a folder, many at a time: of this machine, or at a URL; linked or copied."""
 
 import errno
 import os
+import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from pixcal.storage import writeback
 from pixcal.storage.memory import MemoryPath
@@ -24,32 +25,7 @@ MANY_FILES = 250  # that are not flushed one by one
 File = tuple[str, Sequence[bytes]]
 
 
-class Folder(Protocol):
-    """Files by their names below a folder."""
-
-    def write(self, files: Iterable[File], *, durable: bool = False) -> None:
-        """Write files, or replace them: each is there whole or not at all.
-
-        Parameters
-        ----------
-        files : taken a few at a time
-        durable : they are on the disk when this returns, not on their way to it
-        """
-
-    def ends(self, names: Sequence[str]) -> Iterator[tuple[int, bytes]]:
-        """Size and last four bytes (fewer, if there are no more) of each file.
-
-        Raises OSError with the ``filename``, if one is not there.
-        """
-
-    def children(self) -> list[str]:
-        """Names of the files and folders directly in it; none if it is not there."""
-
-    def remove(self, names: Sequence[str]) -> None:
-        """Remove those of the files that are there, and folders that are empty then."""
-
-
-def open_folder(place: Place) -> Folder:
+def open_folder(place: Place) -> "LocalFolder | UrlFolder":
     """The files of a folder."""
     assert not isinstance(place, MemoryPath)  # It holds arrays, not files of their chunks.
     return UrlFolder(place) if isinstance(place, UrlPath) else LocalFolder(place)
@@ -67,6 +43,10 @@ class LocalFolder:
     path: Path
 
     def write(self, files: Iterable[File], *, durable: bool = False) -> None:
+        """Write files, or replace them, a few at a time: each is there whole or not at all.
+
+        ``durable``: they are on the disk when this returns, not on their way to it.
+        """
         written = []
         for name, content in files:
             file = self.path / name
@@ -90,6 +70,10 @@ class LocalFolder:
                 writeback.begin(file)
 
     def ends(self, names: Sequence[str]) -> Iterator[tuple[int, bytes]]:
+        """Size and last four bytes (fewer, if there are no more) of each file.
+
+        Raises OSError with the ``filename``, if one is not there.
+        """
         for name in names:
             with (self.path / name).open("rb") as handle:
                 size = os.fstat(handle.fileno()).st_size
@@ -97,9 +81,11 @@ class LocalFolder:
                 yield size, handle.read(4)
 
     def children(self) -> list[str]:
+        """Names of the files and folders directly in it; none if it is not there."""
         return sorted(f.name for f in self.path.iterdir()) if self.path.is_dir() else []
 
     def remove(self, names: Sequence[str]) -> None:
+        """Remove those of the files that are there, and folders that are empty then."""
         files = [self.path / name for name in names]
         for file in files:
             file.unlink(missing_ok=True)
@@ -144,12 +130,8 @@ def flush(folder: Path) -> None:
 def read_file(path: str, size: int, later: str | None = None) -> bytes:
     """Content of a file of this machine, but no more than a byte above its expected size.
 
-    Raises OSError if it is not there.
-
-    Parameters
-    ----------
-    size : bytes expected
-    later : a file that will be asked for soon: the disk fetches it meanwhile
+    The disk fetches the file ``later``, which will be asked for soon, meanwhile. Raises OSError if
+    the file is not there.
     """
     if later is not None:
         with suppress(OSError):
@@ -170,7 +152,10 @@ def read_file(path: str, size: int, later: str | None = None) -> bytes:
 
 @dataclass(frozen=True)
 class UrlFolder:
-    """A folder at a URL. An object store puts an object in place when all of it has arrived."""
+    """A folder at a URL, with the methods of `LocalFolder`.
+
+    An object store puts an object in place when all of it has arrived.
+    """
 
     path: UrlPath
 
@@ -253,3 +238,42 @@ def _batches(files: Iterable[File]) -> Iterator[dict[str, bytes]]:
             batch = {}
     if batch:
         yield batch
+
+
+def link_files(source: Path, target: Path) -> None:
+    """Give every file below a folder a second name below another; copy where there are no links.
+
+    What is in the target already stays, so that a call that was cut short can be repeated; hidden
+    files (those half written) are left out. Linked files share their bytes: replace them, as
+    `pixcal.storage.cube` does, and never write into them.
+    """
+    for folder, _, names in os.walk(source):
+        there = target / Path(folder).relative_to(source)
+        there.mkdir(parents=True, exist_ok=True)
+        for name in names:
+            if not name.startswith(".") and not (there / name).exists():
+                _link(Path(folder, name), there / name)
+
+
+def _link(file: Path, target: Path) -> None:
+    try:
+        target.hardlink_to(file)
+    except OSError:
+        # Not on this file system, not across two of them, or too many names already.
+        with written_aside(target, durable=True) as aside:
+            shutil.copyfile(file, aside)
+
+
+def copy_files(source: Place, target: Place, names: Sequence[str]) -> None:
+    """Copy files of a folder to another, either of which may be at a URL.
+
+    Inside one store the store copies, and what is there already stays; else all come by here.
+    Raises OSError if a file is not there.
+    """
+    if isinstance(source, UrlPath) and isinstance(target, UrlPath):
+        inside = UrlFolder(target).copy(source, names)
+    else:
+        inside = False
+    if not inside:
+        contents = ((name, [(source / name).read_bytes()]) for name in names)
+        open_folder(target).write(contents, durable=True)

@@ -59,13 +59,8 @@ def described(columns: Columns, number: int, folder: Path, frame: Sequence[int])
 class FrameReader:
     """Reads blocks of an array (time, y, x) from FITS files, checking every band of rows.
 
-    Parameters
-    ----------
-    folder : of the acquisition
-    columns : what `describe` returned
-    table : columns ``file`` and ``plane`` of the frames, in their order
-    shape, dtype : of the array
-    checksums : (time, band) of the bytes of each band
+    ``columns`` is what `describe` returned. ``table`` has the columns ``file`` and ``plane`` of the
+    frames in their order, ``checksums`` (time, band) those of the bytes of each band.
     """
 
     def __init__(
@@ -95,10 +90,7 @@ class FrameReader:
         return FrameReader, self._made_of
 
     def read(self, *ranges: tuple[int, int], out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """A block, as `ArrayReader.read` gives it; fastest in bands of 128 rows of all columns.
-
-        Raises InputError naming the file that is gone, or is not as it was ingested.
-        """
+        """A block, as `ArrayReader.read` gives it; fastest in bands of 128 rows of all columns."""
         full = [(0, n) for n in self.shape]
         full[: len(ranges)] = [(max(0, a), min(b, n)) for (a, b), n in zip(ranges, self.shape)]  # noqa: B905
         (t0, t1), (y0, y1), (x0, x1) = full

@@ -14,11 +14,7 @@ from pixcal.storage.sources import HEADERS, SourceFile
 
 
 def inspect(source: SourceFile) -> FrameFile:
-    """Read what a file says of its frames, and hold it against the file's length.
-
-    Raises InputError naming the file: of no format that is known, damaged, or of frames that cannot
-    be used.
-    """
+    """Read what a file says of its frames, and hold it against the file's length."""
     with source.open() as handle:
         start = handle.read(8)
     if is_picture(start):

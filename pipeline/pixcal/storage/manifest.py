@@ -26,7 +26,6 @@ SCRATCH = "scratch"
 DAMAGE = "damage.json"
 # in an artefact that is complete but not yet on the disk: the run of the machine that made it
 UNFLUSHED = "unflushed"
-_NOT_LISTED = (MANIFEST, JOURNAL, DAMAGE, UNFLUSHED)
 
 
 @cache
@@ -132,7 +131,7 @@ def read_manifest(folder: Local) -> Manifest | None:
             raise DamagedError(f"{path}: altered since it was written", path)
         return Manifest(**data)
     except (AttributeError, TypeError) as error:
-        raise DamagedError(f"{path}: not a manifest that this pixcal reads", path) from error
+        raise DamagedError(f"{path}: not a manifest that this version reads", path) from error
 
 
 def list_files(folder: Path) -> dict[str, str]:
@@ -147,7 +146,7 @@ def _listed(folder: Path) -> Iterator[str]:
             folders.clear()  # of an array: its chunks
         if here == Path():
             folders[:] = [name for name in folders if name != SCRATCH]
-            names = [name for name in names if name not in _NOT_LISTED]
+            names = [name for name in names if name not in (MANIFEST, JOURNAL, DAMAGE, UNFLUSHED)]
         yield from ((here / name).as_posix() for name in names if not name.startswith("."))
 
 

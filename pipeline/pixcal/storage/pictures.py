@@ -19,7 +19,6 @@ from pixcal.storage.fits_in import FrameFile, SampleFormat
 from pixcal.storage.sources import SourceFile
 
 # PNG; TIFF and BigTIFF in both byte orders.
-_MAGIC = (b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # modes of Pillow that hold one sample a pixel, and how `unpack_picture` writes them
 _CODINGS = {
     "L": SampleFormat(8),
@@ -33,14 +32,11 @@ _CODINGS = {
 
 def is_picture(start: bytes) -> bool:
     """Whether a file that begins so is TIFF or PNG."""
-    return start.startswith(_MAGIC)
+    return start.startswith((b"\x89PNG\r\n\x1a\n", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"))
 
 
 def inspect_picture(source: SourceFile) -> FrameFile:
-    """Frames of a TIFF or PNG file: a page each, all of one size.
-
-    Raises InputError naming the file: damaged, in colour, or of pages that differ.
-    """
+    """Frames of a TIFF or PNG file: a page each, all of one size."""
     with _opened(source.path) as picture:
         pages = getattr(picture, "n_frames", 1)
         kinds = set()
@@ -75,10 +71,7 @@ def inspect_picture(source: SourceFile) -> FrameFile:
 
 
 def unpack_picture(file: FrameFile, out: BinaryIO) -> None:
-    """Write the pages of a file as the big-endian samples of a FITS cube.
-
-    Raises InputError naming the file when it is damaged or cut short.
-    """
+    """Write the pages of a file as the big-endian samples of a FITS cube."""
     with _opened(file.source.path) as picture:
         for page in range(file.shape[0]):
             picture.seek(page)

@@ -59,7 +59,7 @@ class FitsMap:
                     raise ValueError("altered: its checksum does not match")
         except (OSError, LookupError, TypeError, ValueError) as error:
             reason = " ".join(str(error).split())
-            message = f"{path}: not a map that this pixcal reads ({reason})"
+            message = f"{path}: not a map that this version reads ({reason})"
             raise DamagedError(message, path) from error
         return found
 
@@ -228,5 +228,5 @@ def read_map(path: Path) -> tuple[F32, F32, U8, dict[str, Any]]:
             sigma = np.array(hdus["SIGMA"].data, dtype=np.float32)
             mask = np.array(hdus["MASK"].data, dtype=np.uint8)
     except _NOT_A_MAP as error:
-        raise DamagedError(f"{path}: not a map that this pixcal reads ({error})", path) from error
+        raise DamagedError(f"{path}: not a map that this version reads ({error})", path) from error
     return data, sigma, mask, header

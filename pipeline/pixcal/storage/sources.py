@@ -22,7 +22,6 @@ from pixcal.storage.artefact import digest
 
 HEADERS = "headers.csv"
 KEYWORDS = ("EXPTIME", "MJD-OBS", "DATE-OBS", "CCD-TEMP")
-_NUMBERS = ("EXPTIME", "MJD-OBS", "CCD-TEMP")
 
 Header = tuple[tuple[str, str | float], ...]  # keywords and values
 
@@ -30,13 +29,8 @@ Header = tuple[tuple[str, str | float], ...]  # keywords and values
 def read_headers(folder: Path, names: Iterable[str]) -> dict[str, Header]:
     """Headers of files by their names; empty where there is no ``headers.csv``.
 
-    Raises InputError naming the line that has no such file, no value that can be used, or names a
-    file again.
-
-    Parameters
-    ----------
-    folder : of the acquisition
-    names : all files of the acquisition, relative to it
+    Raises InputError naming the line that matches none of the ``names`` of the acquisition, names a
+    file again, or has no value that can be used.
     """
     path = folder / HEADERS
     if not path.exists():
@@ -73,7 +67,7 @@ def _cards(place: str, row: dict[str, str | None]) -> Iterable[tuple[str, str | 
         text = (row.get(key) or "").strip()
         if not text:
             continue
-        if key not in _NUMBERS:
+        if key not in ("EXPTIME", "MJD-OBS", "CCD-TEMP"):
             yield key, text
             continue
         try:
@@ -145,14 +139,9 @@ def fingerprint(sources: Sequence[SourceFile]) -> str:
 def find_sources(frames: Frames, description: Path) -> dict[str, tuple[SourceFile, ...]]:
     """Files of each array of an acquisition, by the array's name (``fringes/<set>`` for a set).
 
-    Returns sorted by name; kinds without globs are absent. Raises InputError if a glob leaves the
-    folder or matches nothing, a file is empty or unreadable, or one file is listed twice under two
-    names or for two kinds.
-
-    Parameters
-    ----------
-    frames : globs of each kind
-    description : the ``acquisition.yaml`` that they are relative to
+    Kinds without globs are absent. Raises InputError if a glob leaves the folder or matches
+    nothing, a file is empty or unreadable, or one file is listed twice under two names or for two
+    kinds.
     """
     found: dict[str, tuple[SourceFile, ...]] = {}
     seen: dict[tuple[int, int], tuple[str, str]] = {}

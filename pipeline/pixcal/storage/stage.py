@@ -41,7 +41,7 @@ def require(run: Path, name: str) -> Manifest:
         raise InputError(f"{folder}: not there yet; run '{command}' first")
     if manifest.stage != name or manifest.format not in (stage.format, *stage.earlier):
         raise InputError(
-            f"{folder}: format {manifest.stage}/{manifest.format}, this pixcal reads "
+            f"{folder}: format {manifest.stage}/{manifest.format}; this version of pixcal reads "
             f"{name}/{stage.format}; run '{command}' again"
         )
     return manifest

@@ -19,11 +19,7 @@ from pixcal.storage.folder import written_aside
 
 
 def read_table(path: Path) -> Table:
-    """Read a table.
-
-    Raises InputError if the file is not there or holds no table that astropy knows by its name or
-    contents.
-    """
+    """Read a table."""
     try:
         if path.suffix.lower() in (".csv", ".ecsv", ".txt", ".dat"):
             kind = {".csv": "ascii.csv", ".ecsv": "ascii.ecsv"}.get(path.suffix.lower(), "ascii")
@@ -39,10 +35,7 @@ def read_table(path: Path) -> Table:
 
 
 def column(table: Table, name: str, path: Path, option: str) -> F64:
-    """Numbers of a column; NaN where it is masked.
-
-    Raises InputError if there is no such column, or it holds no numbers.
-    """
+    """Numbers of a column; NaN where it is masked."""
     if name not in table.colnames:
         raise InputError(
             f"{option}: {path} has no column {name!r}; its columns are {', '.join(table.colnames)}"
@@ -55,10 +48,7 @@ def column(table: Table, name: str, path: Path, option: str) -> F64:
 
 
 def write_table(table: Table, path: Path, *, overwrite: bool) -> None:
-    """Write a table in the format that the file's name ends in.
-
-    Raises InputError if the file is there and not to be replaced, or its name says no format.
-    """
+    """Write a table in the format that the file's name ends in."""
     if path.exists() and not overwrite:
         raise InputError(f"{path}: exists; choose another --out, or add --overwrite")
     kinds = {".csv": "ascii.csv", ".ecsv": "ascii.ecsv", ".fits": "fits", ".vot": "votable"}

@@ -119,12 +119,9 @@ def frames_of(
 
     Parameters
     ----------
-    parts : iterable of Evidence
-        Of the same pixels, with different frames; each is needed only once.
-    steps_in : callable
-        Steps (dy, dx) of the couplings in a window of some rows and columns.
-    known : sequence of Coupling
-        By which the charge collected follows from what is read.
+    parts : of the same pixels, with different frames; each is needed only once
+    steps_in : steps (dy, dx) of the couplings in a window of some rows and columns
+    known : by which the charge collected follows from what is read
     """
     noise: list[Products | None] = []
     first: Evidence | None = None
@@ -145,10 +142,8 @@ def dense_kernel(parts: Iterable[Evidence], start: Sequence[Coupling]) -> Dense 
 
     Parameters
     ----------
-    parts : iterable of Evidence
-        Of the same pixels, with different frames.
-    start : sequence of Coupling
-        As found: they give the period and any coupling beyond `WITHIN`.
+    parts : of the same pixels, with different frames
+    start : as found: they give the period and any coupling beyond `WITHIN`
     """
     far = {(c.dy, c.dx) for c in start} | {(-c.dy, -c.dx) for c in start}
     rows, columns = (lcm(*(getattr(c, n) for c in start)) for n in ("every_rows", "every_columns"))

@@ -119,10 +119,8 @@ def _shares(right: F64, normal: F64, read: float) -> tuple[F64, F64]:
 
     Parameters
     ----------
-    right, normal : (link, term, class), (link, sum, class) float64
-        As in `Products`.
-    read : float
-        Variance without light, which the constant may well reach.
+    right, normal : (link, term, class) float64 as in `Products`
+    read : variance without light, which the constant may well reach
     """
     links, _, count = right.shape
     free = range(2, TERMS)

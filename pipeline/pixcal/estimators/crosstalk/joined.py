@@ -41,12 +41,8 @@ def measure(evidence: Evidence) -> Kernel | None:
     """Couplings of an acquisition; None where it has neither light nor dark signal to tell.
 
     Those that stand out say whether there are any, and of what period; then all within two pixels
-    are measured together, and those that are there are told.
-
-    Raises
-    ------
-    InputError
-        If so many stand out that it is no kernel.
+    are measured together, and those that are there are told. Raises InputError if so many stand out
+    that it is no kernel.
     """
     shape = (evidence.good.shape[0], evidence.good.shape[1])
     every = links(shape)

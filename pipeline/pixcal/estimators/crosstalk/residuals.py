@@ -128,10 +128,9 @@ def _noise(rest: F32, charge: F32, read: F32, kept: F32, of_time: F32, of_place:
     Parameters
     ----------
     rest, charge : (t, y, x) float32
-    read, kept : (y, x) float32
-        Variance without light; variance of the shot noise over the charge.
-    of_time, of_place : (k, t) float32, (j, pixel) float32
-        Functions of time that a pixel is free to have, and of place that a frame is.
+    read, kept : (y, x) float32 variance without light; variance of the shot noise over the charge
+    of_time, of_place : (k, t) float32 functions of time that a pixel is free to have, and of place
+        that a frame is
     """
     shot = charge * kept
     variance = shot + read

@@ -52,18 +52,10 @@ def choose(measured: MeasuredLinks, pattern: Callable[[PixelClasses], float]) ->
     """Take what stands out.
 
     First the links that do, at any period; then the one period that serves all of them and the maps
-    best, the shortest that is good enough.
-
-    Parameters
-    ----------
-    pattern : callable
-        Fall in chi-square of the maps where pixels of each class of a period have a visibility of
-        their own (`pixcal.estimators.crosstalk.pattern.visibility_pattern`).
-
-    Raises
-    ------
-    InputError
-        If so many of them are far apart that it is no kernel.
+    best, the shortest that is good enough. ``pattern``: fall in chi-square of the maps where pixels
+    of each class of a period have a visibility of their own
+    (`pixcal.estimators.crosstalk.pattern.visibility_pattern`). Raises InputError if so many of them
+    are far apart that it is no kernel.
     """
     looks = len(measured.links) * sum(3 * n * m for n, m in periods(measured.shape))
     critical = _critical(looks)

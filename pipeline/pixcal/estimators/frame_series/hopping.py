@@ -62,12 +62,10 @@ def find_hopping(
 
     Parameters
     ----------
-    values : sequence of (t,) float64
-    times_s : sequence of (t,) float64
-    slopes : sequence of float
-        Of the bases, 1/s; to begin with, like the others.
-    size, rate : float
-        1/s.
+    values : (t,) float64
+    times_s : (t,) float64
+    slopes : of the bases, 1/s; to begin with, like the others
+    size, rate : 1/s
     """
     series = zip(values, times_s, slopes, strict=True)
     every = [_begun(*one, size, rate) for one in series]

@@ -91,10 +91,9 @@ class RowSums:
 
         Parameters
         ----------
-        other : (t, 3) float64
-            Parameters of the light in the frames inside, as in `FringeEvidence.g`.
-        factors : (y, 3) float64, optional
-            Of these parameters in each row.
+        other : (t, 3) float64 parameters of the light in the frames inside, as in
+            `FringeEvidence.g`
+        factors : (y, 3) float64 of these parameters in each row
         """
         g = self.found.g[self.inside]
         own = (other - g @ (np.linalg.pinv(g) @ other))[:, None]

@@ -212,11 +212,9 @@ def assemble(
 
     Parameters
     ----------
-    parts : callable
-        Of a series, the covariance (m, t - 1, 2, 2) of its modes for unit sizes; the sizes are
-        common to all sets and come first in the result, three of the noise of each set after them.
-    known : callable, optional
-        Of a series, shapes (t, 2, q) whose coefficients are common to all sets; they come first.
+    parts : of a series, the covariance (m, t - 1, 2, 2) of its modes for unit sizes; the sizes are
+        common to all sets and come first in the result, three of the noise of each set after them
+    known : of a series, shapes (t, 2, q) whose coefficients are common to all sets; they come first
     """
     shared = [np.asarray(parts(s)) for s in every]
     shapes = [np.zeros((len(s), 2, 0)) if known is None else known(s) for s in every]

@@ -22,10 +22,9 @@ def combine_sets(
 
     Parameters
     ----------
-    axes : sequence of (float, float)
-        Unit vector (x, y) of each set's fringe axis.
-    delta, sigma : (s, ...) float64
-        Projections and their 1-sigma errors, px; a set that is NaN at a pixel does not count there.
+    axes : unit vector (x, y) of each set's fringe axis
+    delta, sigma : (s, ...) float64 projections and their 1-sigma errors, px; a set that is NaN at a
+        pixel does not count there
 
     Returns
     -------

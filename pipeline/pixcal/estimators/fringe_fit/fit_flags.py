@@ -29,15 +29,11 @@ def fit_flags(
 
     Parameters
     ----------
-    mask : (y, x) uint8
-        Flags of the reduction.
-    iota, alpha, sigma, chi2, count : (y, x) float32
-        Maps of the sweep: mean and amplitude (e-), error of the phase (rad), reduced chi-square,
-        samples.
-    noise : float
-        Usual reduced chi-square: where the noise model is off by a factor, all pixels are.
-    chi2_limit : float
-        Reduced chi-square, over ``noise``, above which a pixel does not fit.
+    mask : (y, x) uint8 flags of the reduction
+    iota, alpha, sigma, chi2, count : (y, x) float32 maps of the sweep: mean and amplitude (e-),
+        error of the phase (rad), reduced chi-square, samples
+    noise : usual reduced chi-square: where the noise model is off by a factor, all pixels are
+    chi2_limit : reduced chi-square, over ``noise``, above which a pixel does not fit
     """
     flags = mask.copy()
     flags[count == 0] |= np.uint8(PixelFlag.NO_DATA)

@@ -77,22 +77,15 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
     """Fringe vector (kx, ky), rad/px, of a tile, from maps with fringes of any amplitude and phase.
 
     The highest peak of the summed power spectra, refined on the continuous spectrum; its sign is
-    that of the nominal vector.
+    that of the nominal vector. Raises InputError if no peak stands out: the frames hold no fringes,
+    or fewer than `MIN_FRINGES`; if fringes are nominally narrower than `SHORTEST_PX`, or lie across
+    the nominal ones.
 
     Parameters
     ----------
-    maps : (n, y, x) float64
-        Maps without their mean light (ratios to the mean map).
-    good : (y, x) bool
-        Pixels to use.
-    nominal : (float, float)
-        Fringe vector of the bench's nominal geometry, rad/px.
-
-    Raises
-    ------
-    InputError
-        If no peak stands out: the frames hold no fringes, or fewer than `MIN_FRINGES`; if fringes
-        are nominally narrower than `SHORTEST_PX`, or lie across the nominal ones.
+    maps : (n, y, x) float64 maps without their mean light (ratios to the mean map)
+    good : (y, x) bool pixels to use
+    nominal : fringe vector of the bench's nominal geometry, rad/px
     """
     if max(map(abs, nominal)) * SHORTEST_PX > 2 * np.pi:
         raise InputError(

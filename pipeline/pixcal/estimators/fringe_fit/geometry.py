@@ -40,12 +40,10 @@ def tile_plane(
 
     Parameters
     ----------
-    phase, sigma, ratio : (y, x) float32
-        Phase relative to the carrier and its error, rad; iota / alpha.
-    slope : (float, float)
-        Of the phase along x and y, rad/px, so near that no turn is missed over the tile.
-    centre : (float, float)
-        Of the tile, (y, x) in pixels of the window.
+    phase, sigma, ratio : (y, x) float32 phase relative to the carrier and its error, rad; iota /
+        alpha
+    slope : of the phase along x and y, rad/px, so near that no turn is missed over the tile
+    centre : of the tile, (y, x) in pixels of the window
     """
     picked = np.flatnonzero(good)
     if not len(picked):

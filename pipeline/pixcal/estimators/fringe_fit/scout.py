@@ -65,14 +65,10 @@ class Scout:
 
     Parameters
     ----------
-    tiles : sequence of Tile
-        The first is the one whose fringe vector is sought.
-    nominal : (float, float)
-        Nominal fringe vector (kx, ky), rad/px.
-    reference : (float, float)
-        Point (y, x) at which the frame parameters hold.
-    each : callable
-        Does what is to be done for every tile: as `in_turn`, or several at a time.
+    tiles : the first is the one whose fringe vector is sought
+    nominal : nominal fringe vector (kx, ky), rad/px
+    reference : point (y, x) at which the frame parameters hold
+    each : does what is to be done for every tile: as `in_turn`, or several at a time
     """
 
     tiles: Sequence[Tile]
@@ -91,15 +87,8 @@ class Scout:
     def prime(self, codes: Sequence[U16]) -> FrameParameters:
         """Learn the pixels of the tiles from frames spread over the run; parameters of these.
 
-        Parameters
-        ----------
-        codes : sequence of (t, y, x) arrays
-            The same frames for each tile.
-
-        Raises
-        ------
-        InputError
-            If there are too few frames or good pixels, no fringes, or the phase does not change.
+        ``codes``: (t, y, x) the same frames for each tile. Raises InputError if there are too few
+        frames or good pixels, no fringes, or the phase does not change.
         """
         n_frames = codes[0].shape[0]
         if n_frames < MIN_FRAMES:

@@ -57,15 +57,11 @@ def sweep_tile(
 
     Parameters
     ----------
-    blocks : iterable of (t, y, x) arrays
-        Stored codes in the order of time; together as many frames as ``frames`` holds. The first
-        ``prime`` frames are held until the start model is made from them.
-    k : (float, float)
-        Carrier (kx, ky), rad/px.
-    prime : int
-        From `frames_to_prime`.
-    bound_pixels : int
-        Pixels for which to work out the Cramér-Rao bound.
+    blocks : (t, y, x) stored codes in the order of time; together as many frames as ``frames``
+        holds. The first ``prime`` frames are held until the start model is made from them.
+    k : carrier (kx, ky), rad/px
+    prime : from `frames_to_prime`
+    bound_pixels : pixels for which to work out the Cramér-Rao bound
     """
     held: list[U16] = []
     sums: PixelSums | None = None

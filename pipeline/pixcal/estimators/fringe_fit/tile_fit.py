@@ -61,12 +61,9 @@ class PixelSums:
 
     Parameters
     ----------
-    tile, coding, frames
-        As in `accumulate`.
-    model : (3, y, x) float32
-        Start model.
-    ranges : sequence of (int, int)
-        First frame and the one after the last of each batch; empty for a gap.
+    tile, coding, frames : as in `accumulate`
+    model : (3, y, x) float32 start model
+    ranges : first frame and the one after the last of each batch; empty for a gap
 
     Attributes
     ----------
@@ -155,14 +152,10 @@ def accumulate(
 
     Parameters
     ----------
-    blocks : sequence of (t, y, x) arrays
-        Stored codes; together as many frames as ``frames`` holds.
-    theta : (3, y, x) float32
-        Start model.
-    sums : (N_SUMS, y, x) float64, optional
-        Sums to add to.
-    variance : (read, shot), optional
-        Instead of the tile's own.
+    blocks : (t, y, x) stored codes; together as many frames as ``frames`` holds
+    theta : (3, y, x) float32 start model
+    sums : (N_SUMS, y, x) float64 sums to add to
+    variance : (read, shot) instead of the tile's own
     """
     sums = np.zeros((N_SUMS, *tile.shape)) if sums is None else sums
     read, shot = variance or (tile.read, tile.shot)
@@ -194,12 +187,9 @@ def start_model(
 
     Parameters
     ----------
-    tile, blocks, coding, frames
-        As in `accumulate`.
-    k : (float, float)
-        Fringe vector near the tile, rad/px.
-    start : (3, y, x) float64, optional
-        The pixels as they are known; else from an unweighted fit.
+    tile, blocks, coding, frames : as in `accumulate`
+    k : fringe vector near the tile, rad/px
+    start : (3, y, x) float64 the pixels as they are known; else from an unweighted fit
     """
     theta = _unweighted_pixels(tile, blocks, coding, frames) if start is None else start
     iota = theta[0]

@@ -135,12 +135,10 @@ def sum_row(
 
     Parameters
     ----------
-    phase, sigma : (y, x) float32
-        Phases relative to the carrier and their errors, rad.
-    batches : (batch, y, x) float32
-        Phases of the batches relative to the whole run's, rad; NaN in gaps.
-    plane : TilePlane
-        Smooth phase of the tile.
+    phase, sigma : (y, x) float32 phases relative to the carrier and their errors, rad
+    batches : (batch, y, x) float32 phases of the batches relative to the whole run's, rad; NaN in
+        gaps
+    plane : smooth phase of the tile
     """
     shape = (phase.shape[0], phase.shape[1])
     modes = local_modes(carrier, plane, shape)

@@ -1,5 +1,6 @@
 """Body of the command ``pixcal allan``."""
 
-from pixcal.stages.allan.stage import STAGE, Config, run
+from pixcal.model.options import Allan as Config
+from pixcal.stages.allan.stage import STAGE, run
 
 __all__ = ["STAGE", "Config", "run"]

@@ -20,7 +20,6 @@ from pixcal.storage.cube import ArrayReader
 
 # a task takes so many of the fit's chunks, one above the other: one file of each length
 TILES_HIGH = 4
-DIFFERENCES = 32  # differences in time whose products show what pixels share
 # levels of the quantiles that describe the noise over a region
 NOISE_LEVELS = (np.arange(64) + 0.5) / 64
 
@@ -100,7 +99,7 @@ def _sums_task(
         counts += np.isfinite(series).sum(axis=1)
         for number, m in enumerate(lengths):
             # Missing batches and pixels without errors are NaN both, and add nothing.
-            steps = np.nan_to_num(disjoint_differences(series, m, DIFFERENCES) / noise)
+            steps = np.nan_to_num(disjoint_differences(series, m, 32) / noise)
             grams[number] = grams[number] + steps @ steps.T
     return counts, grams
 

@@ -33,7 +33,8 @@ from pixcal.kernels.allan import allan_deviation, averaging_lengths
 from pixcal.model.arrays import F32, F64
 from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
-from pixcal.model.options import Allan, Region
+from pixcal.model.options import Allan as Config
+from pixcal.model.options import Region
 from pixcal.stages.allan.batches import (
     TILES_HIGH,
     Batches,
@@ -44,23 +45,19 @@ from pixcal.stages.allan.batches import (
     sums_of_region,
 )
 from pixcal.storage.artefact import Build, Manifest, read_json, write_json
-from pixcal.storage.cube import ArrayWriter, create_array, create_group, write_array
+from pixcal.storage.cube import ArrayWriter, create_array, create_group, create_map, write_array
 from pixcal.storage.formats import STAGES
 from pixcal.storage.stage import make, working
 
 STAGE = STAGES["allan"]
 SCHEMA = "pixcal/allan/1"
-MIN_BATCHES = 3
 COUNT_BYTES = 64 << 20  # of the digits of all values of a map (`quantiles_of_parts`)
-
-Config = Allan
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Measure how the error of the offset maps falls with the number of frames.
 
-    Reads ``RUN/fit``; makes ``RUN/allan`` and the product ``allan.json``. Raises InputError if the
-    fit has not been run, or a region is not inside the window.
+    Reads ``RUN/fit``; makes ``RUN/allan`` and the product ``allan.json``.
     """
     with working(run_dir, "fit") as inputs:
         facts = read_json(run_dir / "fit" / "fit.json")["sets"]
@@ -137,14 +134,11 @@ def _write_maps(
     create_group(folder)
     (cy, cx), shape = batches.chunks, batches.window
     chunks = (TILES_HIGH * cy, cx)
-    options: dict[str, Any] = {"fill_value": np.nan, "attrs": {"units": "pixel"}}
     adev = create_array(
         folder / "adev", (len(lengths), *shape), "<f4", dims=("length", "y", "x"),
-        chunks=(1, *chunks), **options,
+        chunks=(1, *chunks), fill_value=np.nan, attrs={"units": "pixel"},
     )  # fmt: skip
-    expected = create_array(
-        folder / "expected", shape, "<f4", dims=("y", "x"), chunks=chunks, **options
-    )
+    expected = create_map(folder / "expected", shape, chunks, units="pixel")
     done = made.journal()
     squares = batches.tiles((0, shape[0], 0, shape[1]), TILES_HIGH)
     steps = {square: f"{name}:{square[0][0]},{square[1][0]}" for square in squares}
@@ -207,7 +201,7 @@ def _measure_region(
     runs = [np.convolve(present, np.ones(2 * m, int), "valid") for m in lengths]
     usable = [n for n, m in enumerate(lengths) if np.isin(2 * m, runs[n])]
     quantiles, pixels = quantiles_of_region(folder / "adev", region, usable)
-    if filled < MIN_BATCHES or not quantiles:
+    if filled < 3 or not quantiles:
         reason = f"{filled} of {batches.n} batches have data: too few for an Allan deviation"
         return _as_json(batches, [], NO_CURVE, [], [reason]) | common | {"pixels": 0}
     chosen = [lengths[n] for n in quantiles]

@@ -18,7 +18,7 @@ from pixcal.estimators.star_centroids.centroids import Star
 from pixcal.model.arrays import C128, F64
 from pixcal.stages.astrometry.detector import PixelPositions
 from pixcal.stages.astrometry.stars import MAX_LOST
-from pixcal.storage.cube import ArrayWriter, create_array, create_group
+from pixcal.storage.cube import ArrayWriter, create_group, create_map
 
 TILE = 512  # side of a task's part of the map, about, px
 SHOWN = 96  # most blocks along the longer side of the pictures of the whole detector
@@ -63,14 +63,9 @@ def error_maps(folder: Path, detector: PixelPositions, star: Star, runtime: Runt
     ny, nx = detector.shape
     side, block = tile_side(detector.shape)
     create_group(folder)
-    writers = [
-        create_array(
-            folder / f"{grid}_{component.name}", (ny, nx), "<f4", dims=("y", "x"),
-            chunks=(min(side, ny), min(side, nx)), fill_value=np.nan, attrs={"units": "pixel"},
-        )
-        for grid in GRIDS
-        for component in detector.components
-    ]  # fmt: skip
+    chunks = min(side, ny), min(side, nx)
+    names = [f"{grid}_{component.name}" for grid in GRIDS for component in detector.components]
+    writers = [create_map(folder / name, (ny, nx), chunks, units="pixel") for name in names]
     corners = list(product(range(0, ny, side), range(0, nx, side)))
     task = partial(_tile, detector, star, writers, side, block)
     parts = run_tasks(task, corners, runtime, label="error maps")

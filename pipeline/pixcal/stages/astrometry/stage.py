@@ -30,7 +30,7 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F64
 from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
-from pixcal.model.options import Astrometry
+from pixcal.model.options import Astrometry as Config
 from pixcal.report.astrometry_figures import AstrometryView, astrometry_figure
 from pixcal.report.drawing import png
 from pixcal.stages.astrometry.detector import (
@@ -71,15 +71,13 @@ _BYTES_PER_FITTED_MODE = 28
 _BYTES_PER_WINDOW_PIXEL = 200
 
 STAGE = STAGES["astrometry"]
-Config = Astrometry
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Compare centroids on a perfect grid with centroids on the measured maps.
 
     Reads the maps in ``RUN/products``; makes ``RUN/astrometry`` and the products
-    ``astrometry.json`` and ``astrometry.png``. Raises InputError if fit has not been run, the maps
-    are too small for a star, or the truth is not that of this detector.
+    ``astrometry.json`` and ``astrometry.png``.
     """
     with working(run_dir, "fit") as inputs:
         acquisition = read_acquisition(run_dir)

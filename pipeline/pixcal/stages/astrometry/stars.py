@@ -17,7 +17,6 @@ from pixcal.stages.astrometry.detector import PixelPositions, generator
 FULL_WELL_E = 50_000.0  # where the acquisition declares none (paper, table 1)
 WINDOW = 4.0  # half of the default window, in lambda / D: three dark rings
 SAMPLINGS = (0.4, 40.0)  # pixels in lambda / D that the table of the pattern is made for
-MICROARCSECONDS = 180 / np.pi * 3600e6
 BATCH = 16  # stars of a task
 # a place is not used where masked pixels would tell more than so much of the position
 MAX_LOST = 0.1
@@ -53,7 +52,7 @@ class Telescope:
     @property
     def uas_per_px(self) -> float:
         """Plate scale, µas."""
-        return self.pitch_um * 1e-6 / self.focal_length_m * MICROARCSECONDS
+        return self.pitch_um * 1e-6 / self.focal_length_m * 180 / np.pi * 3600e6
 
     def psf(self, window: int | None) -> tuple[Psf, int]:
         """The pattern in its pixels, and half of the window's side, px."""

@@ -17,7 +17,6 @@ from pixcal.model.arrays import F64
 from pixcal.stages.astrometry.stars import KINDS
 
 TARGET_PX = 5e-5  # what a mission to Earth-like planets needs (paper, section 1)
-RESAMPLES = 300
 GRIDS = ("perfect", "measured")
 SEEN = 2.0  # a mean square is significant when it is so many of its errors above zero
 
@@ -59,7 +58,7 @@ def compare(perfect: F64, measured: F64, noise: F64, rng: np.random.Generator) -
     good = np.isfinite(perfect) & np.isfinite(measured)
     sums = np.stack([np.where(good, c, 0.0).sum(axis=1) for c in columns] + [good.sum(axis=1)])
     rms, stars = _roots(sums.sum(axis=1)), sums.shape[1]
-    picks = (np.bincount(rng.integers(0, stars, stars), minlength=stars) for _ in range(RESAMPLES))
+    picks = (np.bincount(rng.integers(0, stars, stars), minlength=stars) for _ in range(300))
     again = np.array([_roots(sums @ pick) for pick in picks])
     # Squares: their errors are meaningful where the root of one does not exist.
     square_error = np.std(again[:, 3])

@@ -1,5 +1,6 @@
 """``pixcal budget``: frames and hours needed for a given precision."""
 
-from pixcal.stages.budget.stage import Config, run
+from pixcal.model.options import Budget as Config
+from pixcal.stages.budget.stage import run
 
 __all__ = ["Config", "run"]

@@ -23,7 +23,7 @@ from pixcal.estimators.fringe_fit.fringes import HONEST_FRINGES
 from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
-from pixcal.model.options import Budget
+from pixcal.model.options import Budget as Config
 from pixcal.report.budget_figures import budget_figure
 from pixcal.report.drawing import png
 from pixcal.stages.budget.expected import (
@@ -45,12 +45,9 @@ from pixcal.stages.budget.levers import levers
 from pixcal.storage.artefact import digest, write_json, write_whole
 
 SCHEMA = "pixcal/budget/1"
-PRECISION_PX = 5e-5  # what the paper asks for (section 1)
-SAMPLE_BYTES = 2  # of a sample as a camera writes it
 MARGIN = 4.0  # standard deviations that the brightest fringe should keep below the end of the range
 DOMINANT = 1.5  # a factor of the frames below this does not limit a set: photons do
 
-Config = Budget
 # frames of each set -> variances (px²) of the median and of the worst pixel
 Reach = Callable[[Shares], tuple[float, float]]
 
@@ -58,12 +55,7 @@ Reach = Callable[[Shares], tuple[float, float]]
 def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, Any]:
     """Work out the budget of a bench: the contents of ``budget.json``.
 
-    Raises InputError if the bench cannot be read, has no fringes, or its phases determine nothing.
-
-    Parameters
-    ----------
-    bench_file : as ``pixcal simulate`` takes it
-    out : directory for ``budget.json`` and ``budget.png``
+    It is written to a directory ``out``, with ``budget.png``.
     """
     bench = load_bench(bench_file)
     own_effects(bench, str(bench_file))
@@ -81,7 +73,7 @@ def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, 
             )
     precision = config.precision_px
     if precision is None and config.frames is None:
-        precision = PRECISION_PX
+        precision = 5e-5  # what the paper asks for (section 1)
     result = {
         "schema": SCHEMA,
         "pixcal": __version__,
@@ -109,7 +101,7 @@ def _budget(
         if precision is None:
             return None
         n = frames_needed(variance, precision)
-        size = n * d.shape[0] * d.shape[1] * SAMPLE_BYTES
+        size = n * d.shape[0] * d.shape[1] * 2  # two bytes a sample
         return {"frames": n, "hours": n * f.period_s / 3600, "bytes": size}
 
     def facts(reach: Reach, one: Shares, planned: Shares, given: Shares | None) -> dict[str, Any]:

@@ -26,7 +26,6 @@ from scipy.special import ndtri
 from pixcal.kernels.normal_matrix import inverse_normal
 from pixcal.model.arrays import F64
 
-RCOND = 1e-8  # modes of the two sides that are alike to this (in their squares) count as one
 SEEN = 5.0  # sigma at which a covariance is a signal that a line can be drawn through
 # relative error of the maps' own errors that a difference is allowed before it counts
 SIGMA_ACCURACY = 0.02
@@ -74,7 +73,8 @@ class Projection:
     @classmethod
     def of(cls, pixels: Grouping) -> "Projection":
         """From blocks of one pixel; the first two values are the maps."""
-        inverse = inverse_normal(pixels.products[2:, 2:], RCOND)
+        # Modes of the two sides that are alike to 1e-8 (in their squares) count as one.
+        inverse = inverse_normal(pixels.products[2:, 2:], 1e-8)
         return cls(np.hstack([np.eye(2), -pixels.products[:2, 2:] @ inverse]), inverse)
 
     def difference(self, values: F64) -> tuple[F64, F64, F64]:

@@ -20,7 +20,7 @@ from pixcal import __version__
 from pixcal.engine.run import Runtime
 from pixcal.model.config import result_options
 from pixcal.model.errors import InputError
-from pixcal.model.options import Compare
+from pixcal.model.options import Compare as Config
 from pixcal.report.compare_figures import ComponentView, PairView, compare_figure
 from pixcal.report.drawing import png
 from pixcal.stages.compare.agreement import VarianceEstimate, three_cornered_hat
@@ -47,19 +47,11 @@ FEWEST = 50  # pixels in common that are needed
 PARALLEL_DEG = 10.0  # axes of single sets that differ by more have nothing in common
 NOTED_DEG = 0.5  # from here on it is said that the axes differ
 
-Config = Compare
-
 
 def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Manifest:
     """Compare the maps of two runs or more, or of two parts of one.
 
-    Raises InputError if a run has not been fitted, the windows differ, the runs have no component
-    in common, or the directory is not one that a comparison may write to.
-
-    Parameters
-    ----------
-    runs : fitted runs of windows of the same shape, whose pixels are taken to be the same
-    out : directory for ``compare.json`` and the pictures
+    Their windows have the same shape, and their pixels are taken to be the same.
     """
     if out.exists():
         if not out.is_dir():

@@ -36,8 +36,15 @@ from pixcal.stages.correct.uncertainty import parameter_variance, task_bytes
 from pixcal.stages.evidence import Part
 from pixcal.stages.fit.sweep import BATCH_MAPS
 from pixcal.storage.artefact import read_json, write_json
-from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
-from pixcal.storage.links import link_files
+from pixcal.storage.cube import (
+    ArrayReader,
+    ArrayWriter,
+    create_array,
+    create_group,
+    create_map,
+    write_array,
+)
+from pixcal.storage.folder import link_files
 
 SAME = ("chi2", "mask", "g", "dk", "time")  # arrays of a sweep that stay
 
@@ -80,15 +87,9 @@ def _create(
     target: Path, swept: Swept, names: Sequence[str], number: int = 0
 ) -> dict[str, ArrayWriter]:
     """Writers of maps (y, x), or of several at a time (number, y, x)."""
-    (cy, cx), shape = swept.source.signal.chunks[1:], swept.source.shape
-    many = (number,) * (number > 0)
-    return {
-        name: create_array(
-            target / name, (*many, *shape), "<f4", dims=("batch", "y", "x")[-2 - len(many) :],
-            chunks=(*many, cy, cx), fill_value=np.nan,
-        )
-        for name in names
-    }  # fmt: skip
+    source = swept.source
+    chunks = source.signal.chunks[1:]
+    return {n: create_map(target / n, source.shape, chunks, number=number) for n in names}
 
 
 def _finish(writers: dict[str, ArrayWriter]) -> None:

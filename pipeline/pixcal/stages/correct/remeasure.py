@@ -19,7 +19,6 @@ from pixcal.stages.reduce.ingested import Ingested
 from pixcal.stages.treatment import Treatment, Treatments
 
 SAMPLES = 5_000_000  # of each fringe set that are in memory at a time
-MAX_PARTS = 4  # times that many at most
 
 
 def remeasured(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatments:
@@ -65,7 +64,7 @@ def _parts(run_dir: Path, runtime: Runtime) -> Iterator[Evidence]:
     if not counts:
         return
     frames = max(1, SAMPLES // pixels)
-    number = min(MAX_PARTS, -(-min(counts) // frames))
+    number = min(4, -(-min(counts) // frames))
     samples = min(frames, min(counts)) * pixels
     held = EVIDENCE_BYTES * samples * len(counts)
     make_plan("remeasuring effects", ESTIMATE_BYTES * samples, held, runtime)

@@ -19,8 +19,9 @@ import numpy as np
 from pixcal import __version__
 from pixcal.engine.run import Runtime
 from pixcal.model.acquisition import Acquisition
-from pixcal.model.errors import DamagedError, InputError
-from pixcal.model.options import Fit
+from pixcal.model.errors import InputError
+from pixcal.model.options import Fit as Config
+from pixcal.model.options import Sweep
 from pixcal.stages import fit
 from pixcal.stages.correct.correct_maps import correct_sweep
 from pixcal.stages.correct.gain import Maps, measure_gain, worsened
@@ -31,8 +32,7 @@ from pixcal.stages.correct.sweep_to_correct import Swept
 from pixcal.stages.correct.uncertainty import parameter_errors
 from pixcal.stages.fit.fringe_set import FittedSet, describe, fit_set
 from pixcal.stages.fit.maps import Totals, write_maps
-from pixcal.stages.fit.products import header_of, publish_maps
-from pixcal.stages.fit.sweep import Config as SweepConfig
+from pixcal.stages.fit.products import header_of, publish_maps, published
 from pixcal.stages.fit.sweep import load_run, sweep_set
 from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduce.ingested import Ingested
@@ -42,12 +42,10 @@ from pixcal.storage.artefact import Build, Manifest, read_json, write_json
 from pixcal.storage.cube import create_group
 from pixcal.storage.formats import STAGES
 from pixcal.storage.lock import lock
-from pixcal.storage.products import Card, is_whole
+from pixcal.storage.products import Card
 from pixcal.storage.stage import make, require
 
 Json = dict[str, Any]
-
-Config = Fit
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
@@ -55,10 +53,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 
     Makes ``RUN/fit`` where it is not up to date, ``RUN/corrected``, and the products
     ``delta_x_corrected.fits``, ``delta_y_corrected.fits`` (or ``delta_fringe_corrected.fits``) and
-    ``correction.json``. Raises InputError if the run was not diagnosed, or not as it is reduced
-    now; if the correction makes a map worse, by its periodic patterns or the agreement of sets
-    along one axis; if an effect that was found is of the user's own and its file was not given, or
-    its correction fails.
+    ``correction.json``.
     """
     diagnosed = require(run_dir, "diagnose")
     if diagnosed.inputs["reduce"] != require(run_dir, "reduce").key:
@@ -83,9 +78,10 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     acquisition = load_run(run_dir)
     with lock(run_dir):
         body = partial(_correct, run_dir, plan, acquisition, runtime)
-        publish, published = partial(_publish, run_dir), partial(_published, run_dir)
+        there = partial(published, run_dir, "corrected", "correction.json", SUFFIX)
+        publish = partial(_publish, run_dir)
         return make(
-            run_dir, STAGES["corrected"], plain, inputs, body, publish=publish, published=published
+            run_dir, STAGES["corrected"], plain, inputs, body, publish=publish, published=there
         )
 
 
@@ -182,7 +178,7 @@ def _swept_sets(
         folder = group / name
         if plan.on_samples:
             source = RestoredSet(reduced / name, plan.on_samples, calibration, exptime_s)
-            nominal, config = nominal_vector(acquisition, name), SweepConfig(**of_fit.config)
+            nominal, config = nominal_vector(acquisition, name), Sweep(**of_fit.config)
             facts[name] = sweep_set(again, source, name, nominal, config, runtime)
             folder = made.scratch / "sweep.zarr" / name
         sets[name] = Swept(
@@ -216,18 +212,6 @@ def _of_set(fitted: FittedSet, totals: Totals, gain: Json, before: Json, plan: T
         "chi2_reduced": {"before": before["chi2_reduced"], "after": after["chi2_reduced"]},
         "fit": after,
     }
-
-
-def _published(run_dir: Path) -> bool:
-    """Whether the products are there, unaltered, and are those of the present artefact."""
-    try:
-        product = read_json(run_dir / "products" / "correction.json")
-        same = product == read_json(run_dir / "corrected" / "correction.json")
-    except DamagedError:
-        return False
-    return same and all(
-        is_whole(run_dir / "products" / f"{name}{SUFFIX}.fits") for name in product["outputs"]
-    )
 
 
 def _publish(run_dir: Path) -> None:

@@ -23,7 +23,6 @@ from pixcal.stages.fit.scouting import scout_tiles
 PIXEL_BYTES = 500
 EFFECT_BYTES = 40  # for each effect,
 SLOPE_BYTES = 24  # and for each parameter whose slope is taken
-TILES = 9  # tiles, spread over the window, that represent all of it
 
 
 def moved(effect: Effect, errors: Mapping[str, float]) -> list[Effect]:
@@ -56,7 +55,7 @@ def parameter_errors(swept: Swept, runtime: Runtime) -> dict[str, float | None]:
 
     None where no errors are given.
     """
-    tiles = scout_tiles(swept.source.grid, TILES)
+    tiles = scout_tiles(swept.source.grid, 9)  # spread over the window
     runtime = within_memory("errors of the parameters", task_bytes(swept), 0, runtime)
     total = np.sum(run_tasks(partial(_tile, swept), tiles, runtime, label="parameters"), axis=0)
     return {

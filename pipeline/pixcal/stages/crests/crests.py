@@ -35,7 +35,6 @@ MIN_COVERAGE = 0.5  # share of a window's pixels that must be there and good
 MIN_POINTS = 12  # fewest windows with fringes: as many again as the geometry has parameters
 # a vector farther from the nominal one, as a share of it, is not the fringes' but the beam's
 MAX_AWAY = 0.5
-MAX_DEGREE = 5  # of the polynomial that follows the phase
 SEED_PIXELS = 256  # side of the patch where the fringe vector is first sought
 # passes over the first frame: curvature left by the second moves points by some 1e-6 rad
 SETTLING = 2
@@ -211,7 +210,7 @@ def _plus(before: F64, powers: list[tuple[int, int]], values: NDArray[Any]) -> F
 
 def _highest_degree(windows: Windows, number: int) -> int:
     """Of a polynomial that the windows determine."""
-    degree = min(MAX_DEGREE, max(1, min(windows.shape) - 1))
+    degree = min(5, max(1, min(windows.shape) - 1))
     while degree > 1 and 0.75 * (degree + 1) * (degree + 2) > number:
         degree -= 1
     return degree

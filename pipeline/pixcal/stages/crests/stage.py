@@ -26,7 +26,7 @@ from pixcal.kernels.optics import paraxial_vector
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
-from pixcal.model.options import Crests
+from pixcal.model.options import Crests as Config
 from pixcal.report.crest_figures import CrestView, Extract, crest_figure, outermost
 from pixcal.report.drawing import png
 from pixcal.stages.crests.crest_fit import (
@@ -56,15 +56,12 @@ FIGURE_BYTES = 128 << 20  # Matplotlib and one figure
 
 Range = tuple[int, int]
 
-Config = Crests
-
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Locate the fibres from crests and valleys, and compare them with the fit.
 
     Reads ``RUN/reduce`` and, where it is there, ``RUN/fit``; makes ``RUN/crests`` and the products
-    ``crests.json`` and ``crests-<set>.png``. Raises InputError if reduce has not been run, or a set
-    has no fringes or too few; the set is named.
+    ``crests.json`` and ``crests-<set>.png``.
     """
     acquisition = load_run(run_dir)
     if not acquisition.frames.fringes:

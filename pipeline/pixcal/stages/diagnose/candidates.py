@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from pixcal.simulation.effect import Effect, Estimate
-from pixcal.stages.diagnose.shrinkage import Trial
+from pixcal.stages.diagnose.comparison import Trial
 from pixcal.stages.diagnose.trial import Effects
 
 NEARLY_ALL = 0.9  # share of its significance from which a candidate is not scaled down

@@ -1,7 +1,7 @@
-"""Simulated benches compared with the held-out frames."""
+"""Simulated benches compared with the held-out frames, and how far the gap shrinks by effects."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from pixcal.estimators.diagnosis.expectation import (
 )
 from pixcal.estimators.diagnosis.gap import (
     CHANCE,
+    Difference,
+    Gap,
     compare,
     flagged,
     likelier,
@@ -21,8 +23,68 @@ from pixcal.estimators.diagnosis.gap import (
 )
 from pixcal.estimators.diagnosis.test_statistics import Key
 from pixcal.model.arrays import F64
-from pixcal.stages.diagnose.shrinkage import Trial, differing
 from pixcal.stages.diagnose.trial import Curves, Effects
+
+MIN_LOGLIK_GAIN = 5.0  # by which an effect must raise the log-likelihood of unseen data
+DRAWS = 200
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A bench held against the data."""
+
+    effects: Effects
+    expected: Expectation
+    log_likelihood: float
+
+
+@dataclass(frozen=True)
+class Shrinkage:
+    """How far the gap shrinks, with its interval (5 to 95 %)."""
+
+    before: Mapping[Key, Difference]  # before, after: differences of the curves
+    after: Mapping[Key, Difference]
+    where: set[Key]  # curves that make up the gap
+    gap: Gap
+    interval: tuple[float, float]
+
+
+def shrinkage(data: Mapping[Key, F64], nominal: Trial, other: Trial, where: set[Key]) -> Shrinkage:
+    """The gap with some effects, against the nominal bench's.
+
+    The interval comes from expectations shifted by their own scatter, of all curves: what opens
+    where there was no gap counts too.
+    """
+    before = compare(data, nominal.expected)
+    after = compare(data, other.expected)
+    gap = remaining(before, after, where)
+    rng = np.random.default_rng(17)
+    draws = []
+    for _ in range(DRAWS):
+        expected = other.expected
+        mean = {
+            k: m + np.sqrt(expected.variance[k]) * rng.standard_normal(len(m))
+            for k, m in expected.mean.items()
+        }
+        doubled = {k: 2 * expected.variance[k] for k in mean}
+        moved = replace(expected, mean=mean, variance=doubled)
+        draws.append(remaining(before, compare(data, moved), where).total if where else 0.0)
+    low, high = np.quantile(draws, (0.05, 0.95))
+    return Shrinkage(
+        before, after, where, gap, (min(float(low), gap.total), max(float(high), gap.total))
+    )
+
+
+def differing(nominal: Trial, final: Trial, data: Mapping[Key, F64]) -> set[Key]:
+    """Curves that make up the gap: those that differ, and those by which causes were told."""
+    where = flagged(compare(data, nominal.expected))
+    if not final.effects:
+        return where
+    gains = likelier(data, nominal.expected, final.expected)
+    where |= {key for key, gain in gains.items() if gain > MIN_LOGLIK_GAIN / 2}
+    # A cause that many curves tell a little each is still told by the one that does it best.
+    return where or {max(gains, key=lambda key: gains[key])}
+
 
 # relative error of an effect's law: a second cause needs evidence that another law of the first
 # would not produce
@@ -30,13 +92,7 @@ LAW_ERROR = 0.25
 
 
 class Comparison:
-    """Likelihoods and residual gaps of simulated benches.
-
-    Parameters
-    ----------
-    reference : of the nominal bench
-    data : test statistics of the held-out frames, on the scales of the reference
-    """
+    """Likelihoods and residual gaps of simulated benches, on the scales of the nominal one."""
 
     def __init__(self, reference: Reference, data: Mapping[Key, F64]) -> None:
         self.reference, self.data = reference, data
@@ -45,12 +101,10 @@ class Comparison:
     def trial(
         self, effects: Effects, curves: Sequence[Curves], significance: float = np.inf
     ) -> Trial:
-        """A bench with some effects, from its simulations.
+        """A bench with some effects, from the curves of its simulations.
 
-        Parameters
-        ----------
-        curves : of the simulations
-        significance : of the added effect, sigma: its strength has a relative error of one over it
+        The strength of the added effect has a relative error of one over its ``significance``,
+        sigma.
         """
         error = 1 / max(significance, 1.0)
         return self._trial(effects, expect_with(self.reference, curves, error))

@@ -19,7 +19,6 @@ from pixcal.stages.diagnose.nominal import SetTruth
 from pixcal.stages.diagnose.parts import Half, Table, groups
 
 _LIFTED = 8.0  # read noise that the level without light is lifted to
-_LEAST_NOISE = 0.5  # of real numbers (ADU)
 
 
 def bench_of(
@@ -30,10 +29,7 @@ def bench_of(
     sets: Sequence[SetTruth],
     dtypes: Mapping[str, np.dtype[Any]],
 ) -> Bench:
-    """What effects ask a bench for; its own pixels and light are replaced by `Measured`.
-
-    Raises InputError if the light goes beyond what a converter of 16 bits can give.
-    """
+    """What effects ask a bench for; its own pixels and light are replaced by `Measured`."""
     d = acquisition.detector
     listed = [f"fringes/{s.name}" for s in acquisition.frames.fringes]
     table = tables[listed[0]] if listed else next(iter(tables.values()))
@@ -70,13 +66,10 @@ def bench_of(
 def pedestal_of(
     evidence: Sequence[Evidence], dtypes: Mapping[str, np.dtype[Any]], step: int
 ) -> int:
-    """Steps (ADU) that lift the noise without light above zero, where samples may be negative.
-
-    Raises InputError if samples are real numbers with less noise than whole numbers can show.
-    """
+    """Steps (ADU) that lift the noise without light above zero, where samples may be negative."""
     low = min(float(np.min(e.bias[e.good], initial=0.0)) for e in evidence)
     noise = max(e.read_noise / e.gain for e in evidence)
-    if all(dtype.kind == "f" for dtype in dtypes.values()) and noise < _LEAST_NOISE:
+    if all(dtype.kind == "f" for dtype in dtypes.values()) and noise < 0.5:
         raise InputError(
             f"the frames hold real numbers with a read noise of {noise:.2g}, but simulated samples "
             "are whole numbers; multiply all frames so that the noise is 1 or more, and divide "

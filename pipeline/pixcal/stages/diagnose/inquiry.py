@@ -53,15 +53,10 @@ def inquire(
     scratch: Path,
     runtime: Runtime,
 ) -> Inquiry:
-    """Look at a reduced run, simulate its nominal bench, and search for causes.
+    """Look at a reduced run, simulate its nominal bench, and search for causes among ``kinds``.
 
-    Raises InputError if the frames cannot be fitted or the nominal bench not be simulated.
-
-    Parameters
-    ----------
-    kinds : the candidates by name
-    base : that the nominal bench has from the start
-    scratch : keeps simulations: an inquiry that was stopped goes on with them
+    The nominal bench has the effects of ``base`` from the start. Simulations are kept in
+    ``scratch``: an inquiry that was stopped goes on with them.
     """
     candidates: dict[str, Candidate] = {}
     signatures: tuple[Signature, ...] = ()

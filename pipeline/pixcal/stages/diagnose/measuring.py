@@ -51,15 +51,8 @@ def nominal_bench(
 ) -> NominalBench:
     """The nominal bench that was measured by several parts of an acquisition.
 
-    Raises InputError if the light goes beyond what a converter of 16 bits can give.
-
-    Parameters
-    ----------
-    tables : of all frames
-    evidence : of the same pixels, e.g. two halves of the frames.
-    halves : the frames of each
-    whole : rows and columns of the detector's window
-    dtypes : of the samples of each array
+    The ``evidence`` is of the same pixels, from the frames of each of the ``halves``; tables and
+    types are those of all frames, ``whole`` is the detector's window (y, x).
     """
     one = evidence[0]
     good = np.all([e.good for e in evidence], axis=0)

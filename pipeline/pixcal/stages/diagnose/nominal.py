@@ -144,8 +144,6 @@ class NominalBench:
     ) -> Raw:
         """Frames of a half of the acquisition, from this bench with some effects.
 
-        Raises InputError if an effect and the bench do not go together.
-
         Parameters
         ----------
         seed : of everything random; the same seed gives the same noise with other effects

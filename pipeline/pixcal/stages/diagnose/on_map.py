@@ -17,13 +17,8 @@ from pixcal.stages.treatment import fitted_shapes, treatment_of
 def on_map(effect: Effect, fits: Iterable[FittedSet], run_dir: Path) -> dict[str, Any]:
     """Rms and maximum (px) of the change of the offsets by an effect, and what is to be done.
 
-    The change is that of undoing the effect on the maps of the fit, without the modes that the fit
-    removes. It is zero where the free parameters of the fit take the effect up.
-
-    Parameters
-    ----------
-    fits : maps of every fringe set and window
-    run_dir : whose fit tells the shape of the fringes that was fitted
+    The change is that of undoing the effect on the maps of every fringe set and window, without the
+    modes that the fit removes. It is zero where the free parameters of the fit take the effect up.
     """
     action = treatment_of(effect, *fitted_shapes(run_dir)).action
     square, count, most = 0.0, 0, 0.0

@@ -79,15 +79,7 @@ def select(tables: Mapping[str, Table], half: Half) -> dict[str, Table]:
 
 
 def evidence_of(raw: Raw, part: Part, window: tuple[int, int]) -> Evidence:
-    """Reduce and fit a part, with straight fringes: what it tells.
-
-    Raises InputError if the part cannot be reduced or fitted.
-
-    Parameters
-    ----------
-    part : rows and columns of the window that the frames hold
-    window : rows and columns of the whole window
-    """
+    """Reduce and fit a part of a window, with straight fringes: what it tells."""
     run = run_in_memory(raw.acquisition, raw.arrays, raw.tables, raw.reduction)
     found = evidence.evidence_of(run)
     origin = (part[0][0], part[1][0])

@@ -19,12 +19,8 @@ def missing_frames(
 ) -> dict[str, str]:
     """Kinds of frames that are of use and that an acquisition does not have, each in words.
 
-    By kind, as in `Effect.frames_needed`.
-
-    Parameters
-    ----------
-    tables : as in ``frames.json``
-    steps : step of each set's phase, rad; zero where the phases are random
+    By kind, as in `Effect.frames_needed`. ``steps`` are those of each set's phase, rad; zero where
+    the phases are random.
     """
     axes = _axes([s.baseline_mm for s in acquisition.frames.fringes])
     missing = {}

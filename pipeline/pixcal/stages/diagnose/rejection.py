@@ -4,8 +4,7 @@ from collections.abc import Mapping
 
 from pixcal.kernels.significance import SIGNIFICANT
 from pixcal.stages.diagnose.candidates import Candidate
-from pixcal.stages.diagnose.comparison import LAW_ERROR, Comparison
-from pixcal.stages.diagnose.shrinkage import MIN_LOGLIK_GAIN, Trial
+from pixcal.stages.diagnose.comparison import LAW_ERROR, MIN_LOGLIK_GAIN, Comparison, Trial
 
 # least rise of the log-likelihood of the held-out frames by a candidate of weak significance
 MIN_LOGLIK_GAIN_WEAK = 12.0
@@ -41,13 +40,7 @@ def too_little(gain: float, candidate: Candidate) -> str:
 def redundant(
     comparison: Comparison, current: Trial, without: Mapping[str, Trial]
 ) -> Rejection | None:
-    """A cause without which the held-out frames are about as likely.
-
-    Parameters
-    ----------
-    current : the bench with all causes
-    without : the bench with all causes but one, by its name
-    """
+    """A cause without which the held-out frames are about as likely as with all causes."""
     gains = {
         name: comparison.allowing_for_laws(current, trial).log_likelihood
         - comparison.allowing_for_laws(trial, trial).log_likelihood

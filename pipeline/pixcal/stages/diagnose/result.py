@@ -18,9 +18,9 @@ from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place
 from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
+from pixcal.stages.diagnose.comparison import Shrinkage, Trial, differing, shrinkage
 from pixcal.stages.diagnose.frames_used import FramesUsed
 from pixcal.stages.diagnose.recommended_frames import recommend_frames
-from pixcal.stages.diagnose.shrinkage import Shrinkage, Trial, differing, shrinkage
 
 SCHEMA = "pixcal/diagnosis/1"
 EXPLAINED = 0.15  # share of the gap that may be left where it is called explained,
@@ -42,11 +42,8 @@ def describe(
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The product, and every curve as measured, nominal and with the effects found.
 
-    Parameters
-    ----------
-    data : curves of the unseen frames, on the reference's scales
-    measured : the same in their own units
-    places : how far windows are off by themselves, `by_domain`
+    ``data`` are the curves of the held-out frames on the reference's scales, ``measured`` in their
+    own units; ``places`` says how far windows are off by themselves, `by_domain`.
     """
     where = differing(found.nominal, found.final, data)
     final = shrinkage(data, found.nominal, found.final, where)

@@ -24,7 +24,7 @@ from pixcal.stages.diagnose.candidates import (
     SearchResult,
     likeliest,
 )
-from pixcal.stages.diagnose.comparison import Comparison
+from pixcal.stages.diagnose.comparison import MIN_LOGLIK_GAIN, Comparison, Trial
 from pixcal.stages.diagnose.rejection import (
     MIN_LOGLIK_GAIN_WEAK,
     doubtful,
@@ -33,7 +33,6 @@ from pixcal.stages.diagnose.rejection import (
     similar_to,
     too_little,
 )
-from pixcal.stages.diagnose.shrinkage import MIN_LOGLIK_GAIN, Trial
 from pixcal.stages.diagnose.trial import Curves, Effects
 
 # significance that an estimate needs where there is a gap, instead of `SIGNIFICANT`,

@@ -15,7 +15,7 @@ from pixcal.engine.run import Runtime
 from pixcal.model.bench import load_bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
-from pixcal.model.options import Diagnose
+from pixcal.model.options import Diagnose as Config
 from pixcal.simulation.effect import Effect
 from pixcal.stages.diagnose.inquiry import inquire, places
 from pixcal.stages.diagnose.on_map import on_map
@@ -26,15 +26,10 @@ from pixcal.storage.formats import STAGES
 from pixcal.storage.stage import make, require, working
 
 STAGE = STAGES["diagnose"]
-Config = Diagnose
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Diagnose a reduced run: make ``RUN/diagnose`` and the product ``diagnosis.json``.
-
-    Raises InputError if the run was not reduced, a name of an effect is unknown, or the frames
-    cannot be fitted.
-    """
+    """Diagnose a reduced run: make ``RUN/diagnose`` and the product ``diagnosis.json``."""
     require(run_dir, "reduce")
     known = known_effects(config.own)
     kinds = _kinds(config, known)

@@ -85,13 +85,7 @@ def split(tables: Mapping[str, Table], pixels: int, full_flats: Sequence[int] = 
     """Blocks in turn (`TURN`) of every array and exposure time.
 
     Of long fringe sets the blocks are parts, `SAMPLES` in each half; without fringes as many of all
-    frames together.
-
-    Parameters
-    ----------
-    tables : as in ``frames.json``
-    pixels : of a window
-    full_flats : flats whose pixels are full; left out unless all are
+    frames together. Flats whose pixels are full are left out unless all are.
     """
     learn, test = {}, {}
     every = {name: _groups(name, table, full_flats) for name, table in tables.items()}

@@ -87,14 +87,7 @@ def fit_sets(
     acquisition: Acquisition,
     model: str,
 ) -> list[FittedSet]:
-    """Fit the shape of the fringes of every set, see `fit_set`.
-
-    Parameters
-    ----------
-    sweep : folder of ``sweep.zarr``
-    reduced : ``reduced.zarr``
-    facts : summaries of the sweep, by name of the set
-    """
+    """Fit the shape of the fringes of every set, see `fit_set`."""
     return [
         fit_set(
             sweep / "sweep.zarr" / name, ReducedSet(reduced / name), facts[name], acquisition,
@@ -112,16 +105,9 @@ def fit_set(
     name: str,
     model: str,
 ) -> FittedSet:
-    """Fit the shape of a set's fringes.
+    """Fit the shape of a set's fringes: of the ``model`` of this name, or ``auto``.
 
-    Raises InputError if no pixel of the set can be fitted.
-
-    Parameters
-    ----------
-    swept : ``sweep.zarr/<set name>``
-    facts : summary of the set's sweep
-    name : of the set
-    model : a shape's name, or ``auto``
+    ``facts`` is the summary of the set's sweep.
     """
     rows = ArrayReader(swept / "sums").read()
     tiles = TileSums.of_rows(rows.reshape(-1, rows.shape[-1]))
@@ -214,13 +200,7 @@ def _fit_shape(
 
 
 def describe(fitted: FittedSet, masked: int, sigma_px: float) -> dict[str, Any]:
-    """What ``fit.json`` says of a set.
-
-    Parameters
-    ----------
-    masked : pixels without a value
-    sigma_px : median error of the others
-    """
+    """What ``fit.json`` says of a set; ``sigma_px`` is the median error of pixels not masked."""
     source, facts, shape, fit = fitted.source, fitted.facts, fitted.shape, fitted.fit
     ny, nx = source.shape
     kx, ky = fitted.vector

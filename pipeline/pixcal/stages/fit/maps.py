@@ -27,9 +27,10 @@ from pixcal.storage.cube import (
     CachedReader,
     create_array,
     create_group,
+    create_map,
     write_array,
 )
-from pixcal.storage.links import link_files
+from pixcal.storage.folder import link_files
 from pixcal.storage.place import Local
 
 SAME_AS_SWEPT = ("iota", "alpha", "chi2", "mask")  # maps of a set that are those of its sweep
@@ -58,13 +59,7 @@ class Totals:
 
 
 def write_maps(group: Path, fitted: list[FittedSet], runtime: Runtime) -> Totals:
-    """Write ``fit.zarr``: the maps of each set, and those that all sets give together.
-
-    Parameters
-    ----------
-    group : ``fit.zarr``
-    fitted : all of the same window
-    """
+    """Write ``fit.zarr``: the maps of each set, and those that all sets give together."""
     source = fitted[0].source
     ny, nx = source.shape
     both = axes_span_plane([axis(f.shape, ny / 2, nx / 2) for f in fitted])
@@ -119,11 +114,8 @@ def write_offsets(group: Local, fitted: list[FittedSet]) -> None:
 
 def _map_writer(place: Local, fitted: FittedSet, batches: int = 0) -> ArrayWriter:
     """A map (y, x) in pixels, or one for each batch."""
-    many = (batches,) * (batches > 0)
-    return create_array(
-        place, (*many, *fitted.source.shape), "<f4", dims=("batch", "y", "x")[-2 - len(many) :],
-        chunks=(*many, *fitted.source.map_chunks), fill_value=np.nan, attrs={"units": "pixel"},
-    )  # fmt: skip
+    source = fitted.source
+    return create_map(place, source.shape, source.map_chunks, units="pixel", number=batches)
 
 
 @dataclass(frozen=True)

@@ -12,16 +12,15 @@ from pixcal.storage.fits_facts import date_of
 from pixcal.storage.products import Card, is_whole, write_map
 
 
-def published(run_dir: Path) -> bool:
-    """Whether the products are there, unaltered, and are those of the present fit."""
+def published(run_dir: Path, stage: str = "fit", facts: str = "fit.json", suffix: str = "") -> bool:
+    """Whether a stage's products are there, unaltered, and are those of its present artefact."""
+    products = run_dir / "products"
     try:
-        product = read_json(run_dir / "products" / "fit.json")
-        same = product == read_json(run_dir / "fit" / "fit.json")
+        product = read_json(products / facts)
+        same = product == read_json(run_dir / stage / facts)
     except DamagedError:
         return False
-    return same and all(
-        is_whole(run_dir / "products" / f"{name}.fits") for name in product["outputs"]
-    )
+    return same and all(is_whole(products / f"{name}{suffix}.fits") for name in product["outputs"])
 
 
 def publish(run_dir: Path) -> None:
@@ -34,13 +33,7 @@ def publish(run_dir: Path) -> None:
 
 
 def header_of(run_dir: Path, result: dict[str, Any], key: str) -> tuple[list[Card], list[str]]:
-    """Cards and HISTORY lines of the maps of a fit.
-
-    Parameters
-    ----------
-    result : as in ``fit.json``
-    key : of the artefact that holds the maps
-    """
+    """Cards and HISTORY lines of the maps of a fit, from its ``fit.json``."""
     models = {facts["model"] for facts in result["sets"].values()}
     cards = [
         *_detector_cards(run_dir),
@@ -101,15 +94,7 @@ def publish_maps(
     history: list[str],
     suffix: str = "",
 ) -> None:
-    """Write the maps that the sets give together, and remove those of another fit.
-
-    Parameters
-    ----------
-    group : ``fit.zarr``, or another that `pixcal.stages.fit.maps.write_maps` wrote
-    outputs : their names
-    cards, history : of their headers
-    suffix : of the names of the products
-    """
+    """Write the maps of ``fit.zarr`` or the like as FITS, and remove those of another fit."""
     for name in outputs:
         delta, sigma, mask = (
             ArrayReader(group / array) for array in (name, f"{name}_sigma", "mask")

@@ -56,14 +56,7 @@ def scout_set(
 ) -> None:
     """Find the frame parameters of a set and write them, and ``scout.json`` last.
 
-    Raises InputError if the set has too few frames or good pixels, or no fringes that can be
-    fitted.
-
-    Parameters
-    ----------
-    nominal : nominal fringe vector (kx, ky), rad/px
-    folder : ``sweep.zarr/<set name>``
-    name : of the set
+    ``nominal`` is the nominal fringe vector (kx, ky), rad/px.
     """
     n_tiles = source.grid[0] * source.grid[1]
     chunk_bytes = int(np.prod(source.signal.chunks)) * source.signal.dtype.itemsize

@@ -6,7 +6,7 @@ from pathlib import Path
 from pixcal import __version__
 from pixcal.engine.run import Runtime
 from pixcal.model.config import result_options
-from pixcal.model.options import Fit
+from pixcal.model.options import Fit as Config
 from pixcal.stages.fit import sweep
 from pixcal.stages.fit.fringe_set import describe, fit_sets
 from pixcal.stages.fit.maps import write_maps
@@ -16,16 +16,13 @@ from pixcal.storage.artefact import Build, Manifest, write_json
 from pixcal.storage.formats import STAGES
 from pixcal.storage.stage import make, require, working
 
-Config = Fit
 
-
-def run(run_dir: Path, config: Config, runtime: Runtime, *, products: bool = True) -> Manifest:
+def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Fit every fringe set of a run and write the offset maps.
 
     Reads ``RUN/reduce``; makes ``RUN/sweep`` (when it is not up to date) and ``RUN/fit``, and
     writes the products ``delta_x.fits``, ``delta_y.fits`` (with one fringe axis:
-    ``delta_fringe.fits``) and ``fit.json``, unless ``products`` is false. Raises InputError if
-    reduce has not been run, or the frames hold no fringes that can be fitted.
+    ``delta_fringe.fits``) and ``fit.json``.
     """
     with working(run_dir, "reduce"):
         swept = sweep.run(run_dir, config, runtime)
@@ -36,7 +33,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime, *, products: bool = Tru
             result_options(config),
             {"sweep": swept.key},
             body,
-            publish=lambda: publish(run_dir) if products else None,
+            publish=lambda: publish(run_dir),
             published=lambda: published(run_dir),
         )
 

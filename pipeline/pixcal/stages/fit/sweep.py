@@ -26,7 +26,7 @@ from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, Mask
 from pixcal.model.config import result_options
 from pixcal.model.errors import DamagedError, InputError
-from pixcal.model.options import Sweep
+from pixcal.model.options import Sweep as Config
 from pixcal.stages.fit.scouting import CACHE_BYTES, read_frames, scout_set
 from pixcal.stages.fitted_shape import nominal_vector
 from pixcal.stages.reduced_set import STRIP, ReducedSet
@@ -38,7 +38,14 @@ from pixcal.storage.artefact import (
     read_json,
     write_json,
 )
-from pixcal.storage.cube import ArrayReader, ArrayWriter, create_array, create_group, write_array
+from pixcal.storage.cube import (
+    ArrayReader,
+    ArrayWriter,
+    create_array,
+    create_group,
+    create_map,
+    write_array,
+)
 from pixcal.storage.formats import STAGES
 from pixcal.storage.place import Local
 from pixcal.storage.stage import make, read_acquisition, require
@@ -54,9 +61,6 @@ DIGITS = {"batch_phase": 10, "batch_sigma": 8, "batch_delta": 12}
 TABLES = ("tiles", "sums")  # of a row of numbers for each tile
 
 
-Config = Sweep
-
-
 def load_run(run_dir: Path) -> Acquisition:
     """Acquisition of a run that must have been reduced."""
     require(run_dir, "reduce")
@@ -64,10 +68,7 @@ def load_run(run_dir: Path) -> Acquisition:
 
 
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Sweep every fringe set of a run (the caller holds the run's lock).
-
-    Raises InputError if there are no fringe sets, or a set has no fringes to fit; the set is named.
-    """
+    """Sweep every fringe set of a run (the caller holds the run's lock)."""
     acquisition = load_run(run_dir)
     if not acquisition.frames.fringes:
         raise InputError(f"{run_dir}: the acquisition lists no fringes; fit needs frames.fringes")
@@ -90,10 +91,7 @@ def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
 def sweep_sets(
     made: Workspace, reduced: Local, acquisition: Acquisition, config: Config, runtime: Runtime
 ) -> dict[str, dict[str, Any]]:
-    """Sweep every set of ``reduced.zarr`` into ``sweep.zarr``; their summaries by name.
-
-    Raises InputError if a set has no fringes that can be fitted; it is named.
-    """
+    """Sweep every set of ``reduced.zarr`` into ``sweep.zarr``; their summaries by name."""
     create_group(made.folder / "sweep.zarr")
     sets = {}
     for name in (listed.name for listed in acquisition.frames.fringes):
@@ -129,10 +127,7 @@ def sweep_set(
     config: Config,
     runtime: Runtime,
 ) -> dict[str, Any]:
-    """Sweep one set into ``sweep.zarr/<set name>`` of a build; returns its summary.
-
-    Raises InputError if the set has no fringes that can be fitted.
-    """
+    """Sweep one set into ``sweep.zarr/<set name>`` of a build; returns its summary."""
     folder = made.folder / "sweep.zarr" / name
     create_group(folder)
     done, scouted = made.journal(), folder / "scout.json"
@@ -189,20 +184,14 @@ def _create_maps(folder: Local, source: ReducedSet, n_batches: int) -> dict[str,
     (ny, nx), (cy, cx) = source.shape, source.map_chunks
     units = {"iota": "electron", "alpha": "electron", "phase": "radian", "sigma": "radian"}
     writers = {
-        name: create_array(
-            folder / name, (ny, nx), "<f4", dims=("y", "x"), chunks=(cy, cx), fill_value=np.nan,
-            attrs={"units": units.get(name, "1")},
-        )
+        name: create_map(folder / name, (ny, nx), (cy, cx), units=units.get(name, "1"))
         for name in MAPS
-    }  # fmt: skip
+    }
     writers["mask"] = create_array(
         folder / "mask", (ny, nx), "u1", dims=("y", "x"), chunks=(cy, cx)
     )
     for name in BATCH_MAPS if n_batches else ():
-        writers[name] = create_array(
-            folder / name, (n_batches, ny, nx), "<f4", dims=("batch", "y", "x"),
-            chunks=(n_batches, cy, cx), fill_value=np.nan,
-        )  # fmt: skip
+        writers[name] = create_map(folder / name, (ny, nx), (cy, cx), number=n_batches)
     width = 1 + _bound_pixels(source) + _chi2_pixels(source)
     for name, numbers in zip(TABLES, (width, TileSums.width(n_batches)), strict=True):
         writers[name] = create_array(

@@ -1,5 +1,6 @@
 """From FITS frames to checksummed cubes."""
 
-from pixcal.stages.ingest.stage import Config, run
+from pixcal.model.options import Ingest as Config
+from pixcal.stages.ingest.stage import run
 
 __all__ = ["Config", "run"]

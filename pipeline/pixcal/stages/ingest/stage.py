@@ -26,7 +26,7 @@ from pixcal.model.acquisition import Acquisition, load_acquisition
 from pixcal.model.arrays import F64
 from pixcal.model.config import to_plain
 from pixcal.model.errors import DamagedError, InputError, RemoteError
-from pixcal.model.options import Ingest
+from pixcal.model.options import Ingest as Config
 from pixcal.stages.ingest.arrays import FRAMES_A_PIECE, Writers, find_kept, take_over
 from pixcal.stages.ingest.cut_frames import cut_from, cut_warning
 from pixcal.storage.artefact import Build, Manifest, read_manifest, write_json, write_manifest
@@ -51,9 +51,6 @@ _BAND_ROWS = (512, 384, 256, 128)
 _DTYPES = tuple(map(np.dtype, ("u1", "i1", "u2", "i2", "u4", "i4", "f4")))
 _FILES_A_TASK = 32
 _BYTES_A_FRAME = 4096
-
-
-Config = Ingest
 
 
 def run(acquisition: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:

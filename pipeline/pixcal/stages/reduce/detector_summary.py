@@ -132,8 +132,8 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     if job.flat and not medians.response > _LIT * medians.response_error:
         if not math.isfinite(medians.response):
             raise InputError(
-                f"frames.flat: all flats are saturated (at {job.saturation:.0f} ADU); take them "
-                "again with less light, or list none"
+                f"frames.flat: all flats are saturated (at {job.saturation:.0f} ADU); record "
+                "them again with less light, or list none"
             )
         raise InputError(
             f"frames.flat: the flats hold no light ({levels.max():.2g} ADU above the bias); take "

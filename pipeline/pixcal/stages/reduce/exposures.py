@@ -65,7 +65,7 @@ def group_exposures(tables: Mapping[str, Mapping[str, Sequence[Any]]]) -> Exposu
     if "dark" in times and all(t is None for t in exposed):
         # The exposure is the unit of time, the same for all but the bias frames.
         times |= {name: [1.0] * len(times[name]) for name in ["dark", *lit]}
-        unit = ", and dark_rate is in electrons an exposure" if "bias" in times else ""
+        unit = ", and dark_rate is in electrons per exposure" if "bias" in times else ""
         found.warnings.append(
             "no frame has EXPTIME: darks are assumed to have the same exposure time as the "
             f"others{unit}"

@@ -38,10 +38,7 @@ class Target:
         return self.final.with_name(f".{self.final.name}.partial")
 
     def up_to_date(self, key: str) -> Manifest | None:
-        """Manifest of what was made with this key and is whole, if it is.
-
-        Raises InputError if something else is in the way.
-        """
+        """Manifest of what was made with this key and is whole, if it is."""
         folder, place = self.final, f"{self.option} {self.final}"
         if not folder.exists():
             return None

@@ -28,7 +28,7 @@ from pixcal.model.arrays import U16
 from pixcal.model.bench import Bench, load_bench
 from pixcal.model.config import to_plain
 from pixcal.model.errors import InputError
-from pixcal.model.options import Simulate
+from pixcal.model.options import Simulate as Config
 from pixcal.model.yaml_file import to_yaml
 from pixcal.simulation.exposure import Camera
 from pixcal.simulation.recording import Recording, recordings
@@ -54,8 +54,6 @@ _BYTES_PER_COMPRESSED_SAMPLE = 10
 
 _MJD_EPOCH = datetime(1858, 11, 17)
 
-Config = Simulate
-
 
 class Exposes(Protocol):
     """Some rows of a bench, as `Camera`."""
@@ -74,8 +72,7 @@ def run(bench: Path, out: Path, config: Config, runtime: Runtime) -> Manifest:
     """Simulate a bench (schema ``pixcal/bench/1``).
 
     The directory appears when it is complete. The key of its manifest is a digest, so that it tells
-    nothing of the truth. Raises InputError if the bench file is wrong, or a directory holds what
-    simulate did not put there.
+    nothing of the truth.
     """
     plan = load_bench(bench)
     there = Target.of(out, "--out", STAGE)

@@ -21,7 +21,6 @@ Effects = tuple[Effect, ...]
 
 # maps that are told; read noise and gain of a simulated detector are the same in all pixels
 TRUTH_MAPS = tuple(f for f in fields(DetectorMaps) if f.name not in ("read_noise", "adu_per_e"))
-TRUTH_SCHEMA = "pixcal/truth/1"
 
 
 def row_blocks(bench: Bench) -> list[Rows]:
@@ -48,7 +47,7 @@ def write_truth(
     for writer in maps:
         writer.finish()
     sets = {s.folder: _set_truth(bench, effects, s) for s in recorded if s.kind == "fringes"}
-    write_json(folder / "truth.json", {"schema": TRUTH_SCHEMA, "sets": sets})
+    write_json(folder / "truth.json", {"schema": "pixcal/truth/1", "sets": sets})
 
 
 def _write_maps(bench: Bench, effects: Effects, writers: list[FrameWriter], rows: Rows) -> None:
