@@ -42,6 +42,8 @@ def test_missing_samples_do_not_count_in_the_median() -> None:
     assert np.isnan(deviation[2, 3])
     good = np.isfinite(frames).any(axis=0)
     np.testing.assert_allclose(median[good], np.nanmedian(frames[:, good], axis=0), rtol=1e-6)
+    off = np.nanmedian(np.abs(frames - median)[:, good], axis=0)
+    np.testing.assert_allclose(deviation[good], off, rtol=1e-5, atol=1e-6)
 
 
 def test_without_outliers_it_is_the_plain_mean_variance_and_kurtosis() -> None:

@@ -20,7 +20,11 @@ import numpy as np
 from numba import njit
 
 from pixcal.kernels.bilinear import FAST
-from pixcal.kernels.robust import clipped_variance_factor, median_of_columns
+from pixcal.kernels.robust import (
+    clipped_variance_factor,
+    deviation_of_sorted,
+    median_of_columns,
+)
 from pixcal.model.arrays import F32, F64
 
 BLOCK = 16  # pixels along each side of a block
@@ -136,8 +140,8 @@ def pair_statistics(
     _ratios(*pair, 1 / gain, read_noise**2, ratios)
     centre, spread = np.empty((2, blocks), np.float32)
     few = np.isfinite(ratios).sum(axis=0) < _MIN_PIXELS
-    median_of_columns(ratios.copy(), centre)
-    median_of_columns(np.abs(ratios - centre), spread)
+    median_of_columns(ratios, centre)
+    deviation_of_sorted(ratios, centre, spread)
     centre[few] = np.nan
     out = np.zeros((blocks, COLUMNS))
     spread *= np.float32(_SIGMA_OF_MAD)

@@ -84,6 +84,51 @@ def median_of_columns(rows: Any, out: Any) -> None:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def deviation_of_sorted(rows: Any, median: Any, out: Any) -> None:
+    """Median of the absolute deviations of columns that `median_of_columns` sorted.
+
+    Deviations rise from the median on to either side. So the smaller ones of the first on one side
+    and the last on the other, and so on, are the lower half of them all (Batcher's bitonic merge).
+    """
+    n, columns = rows.shape
+    half = n // 2
+    least = np.full(columns, np.inf, np.float32)
+    for x in range(columns):
+        out[x] = 0
+    for i in range(half):
+        left, right = rows[half - 1 - i], rows[n - 1 - i]
+        for x in range(columns):
+            a, b = abs(left[x] - median[x]), abs(right[x] - median[x])
+            low, high = (a, b) if a < b else (b, a)
+            out[x] = max(out[x], low)
+            least[x] = min(least[x], high)
+    for x in range(columns):
+        if rows[n - 1, x] == np.inf:
+            out[x] = _deviation_of_some(rows[:, x], median[x])
+        elif n == 2 * half:
+            out[x] = 0.5 * (out[x] + least[x])
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _deviation_of_some(column: Any, median: float) -> float:
+    # Of the values before the first infinite one; NaN without any.
+    count = 0
+    while count < column.size and column[count] < np.inf:
+        count += 1
+    low, high = (count - 1) // 2, (count - 1) // 2 + 1
+    last = before = np.nan
+    for _ in range(count // 2 + 1 if count else 0):
+        before = last
+        if high == count or (low >= 0 and median - column[low] <= column[high] - median):
+            last = abs(column[low] - median)
+            low -= 1
+        else:
+            last = abs(column[high] - median)
+            high += 1
+    return last if count % 2 else 0.5 * (before + last)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _median_and_deviation(frames: Any, median: Any, deviation: Any) -> None:
     rows = np.empty((frames.shape[0], frames.shape[2]), np.float32)
     for y in range(frames.shape[1]):
@@ -92,10 +137,7 @@ def _median_and_deviation(frames: Any, median: Any, deviation: Any) -> None:
             for x in range(frames.shape[2]):
                 rows[t, x] = frames[t, y, x]
         median_of_columns(rows, median[y])
-        for t in range(frames.shape[0]):
-            for x in range(frames.shape[2]):
-                rows[t, x] = abs(frames[t, y, x] - median[y, x])
-        median_of_columns(rows, deviation[y])
+        deviation_of_sorted(rows, median[y], deviation[y])
 
 
 def median_and_deviation(frames: F32) -> tuple[F32, F32]:
