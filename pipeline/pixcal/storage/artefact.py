@@ -9,9 +9,8 @@ same code to the letter. Unfinished builds with other keys are removed when one 
 An artefact may be complete before it is on the disk (`unflushed`). Until then it holds a mark with
 the boot of the machine; after another boot, as after a power failure, it is damaged.
 
-The manifest is sealed, and holds a digest of every other file but the chunks of arrays, which have
-checksums of their own. What turns out to be damaged is noted in the artefact
-(`pixcal.storage.lock`): it is not up to date from then on, and its stage makes it again.
+What turns out to be damaged (`pixcal.storage.manifest`) is noted in the artefact: it is not up to
+date from then on, and its stage makes it again.
 """
 
 import json

@@ -1,13 +1,6 @@
 """Stability: Allan deviation of the offset maps over batches of frames (paper, section 4.3).
 
-``allan.json`` holds ``schema``, ``pixcal`` and, for each fringe set under ``sets``, the curve of
-the window's median pixel: the lists ``frames``, ``seconds``, ``adev_px``, its one-sigma error
-``adev_err_px`` and limits ``adev_lo_px``, ``adev_hi_px``, and ``white_expected_px`` (what the
-errors of the fit let expect of white noise); ``slope`` with ``slope_err`` of the white part;
-``knee_frames`` (null when none); ``pixels``; ``n_batches``, of them ``gaps`` without data;
-``batch_frames``, ``batch_seconds``; ``region`` (null: the window, else [y0, y1, x0, x1]);
-``warnings`` (sentences); and under ``regions`` the same curve for each rectangle asked for, by its
-name ``y0:y1,x0:x1``.
+``docs/reference/products.md`` describes ``allan.json``, what the stage leaves for each set.
 """
 
 from collections.abc import Sequence
