@@ -47,10 +47,7 @@ class DaskWorker:
 
 
 def workers_of(address: str, *, quiet: bool) -> list[DaskWorker]:
-    """The workers that a cluster has now, at least one: it is waited for.
-
-    Raises InputError if no scheduler answers at the address.
-    """
+    """The workers that a cluster has now, at least one: it is waited for."""
     with _connect(address, quiet=quiet) as client:
         workers = client.scheduler_info(n_workers=-1)["workers"]
         if not workers and not quiet:

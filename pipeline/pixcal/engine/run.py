@@ -85,10 +85,7 @@ def one_blas_thread() -> AbstractContextManager[Any]:
 
 @lru_cache(maxsize=1)
 def _libraries(modules: int) -> ThreadpoolController:
-    """Libraries with threads that are loaded; to look for them takes milliseconds.
-
-    ``modules``: modules imported by now: more may have brought more libraries.
-    """
+    """Libraries with threads, once for as many imported modules: to look for them takes time."""
     return ThreadpoolController()
 
 

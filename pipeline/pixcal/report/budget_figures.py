@@ -38,10 +38,7 @@ class PrecisionLine:
 
 
 def budget_figure(result: Mapping[str, Any]) -> Figure:
-    """Precision against frames on the left, time with each change of the bench on the right.
-
-    ``result``: contents of ``budget.json``.
-    """
+    """Of ``budget.json``: precision against frames, and time with each change of the bench."""
     figure = new_figure(WIDE, 4.9)
     left, right = figure.subplots(1, 2, width_ratios=[1.25, 1])
     _precision(left, result)

@@ -164,10 +164,7 @@ def _histogram(axes: Axes, offset: MapContents, unit: Unit, colour: str) -> None
 
 
 def power(maps: Sequence[MapContents], vectors: Mapping[str, tuple[float, float]]) -> Figure:
-    """Power spectra of maps: means over rings, and cuts along the axes.
-
-    ``vectors`` are the fringe vectors (kx, ky), rad/px, by set.
-    """
+    """Power spectra of maps: means over rings, cuts, and the fringe vectors (rad/px) by set."""
     figure, ((axes,),) = axes_grid((WIDE, 4.0), left=1.0)
     for offset, colour in zip(maps, LINES, strict=False):
         assert offset.spectrum is not None

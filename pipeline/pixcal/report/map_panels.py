@@ -159,10 +159,7 @@ def calibration(maps: Sequence[tuple[str, str, MapSummary]]) -> list[Panel]:
 def spectra(
     maps: Sequence[MapContents], vectors: Mapping[str, tuple[float, float]]
 ) -> tuple[list[Panel], Legend]:
-    """Power spectra over that of white noise, the fringe frequencies marked.
-
-    ``vectors`` are the fringe vectors (kx, ky), rad/px, by set.
-    """
+    """Power spectra over that of white noise, with marks at the fringe vectors (rad/px)."""
     panels = [_spectrum(SYMBOLS[m.name], m.spectrum, vectors) for m in maps if m.spectrum]
     return panels, [(MARKS[n % len(MARKS)], f"set {name}") for n, name in enumerate(vectors)]
 

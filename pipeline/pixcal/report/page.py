@@ -47,11 +47,7 @@ DATA = vars(tables) | vars(diagnosis) | vars(diagnosis_maps)
 
 
 def render(contents: Contents) -> str:
-    """Draw all figures and write the page.
-
-    ``contents``: what there is; sections say what is missing. Returns HTML without any reference to
-    something outside it.
-    """
+    """Draw all figures and write the page: HTML without any reference to something outside it."""
     what = "pixel offsets" if contents.has_fringes else "detector"
     name = contents.acquisition["detector"].get("name")
     return _fill(

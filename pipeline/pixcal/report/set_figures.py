@@ -138,10 +138,7 @@ def allan(sets: Sequence[SetContents]) -> Figure:
 
 
 def allan_figure(sets: Mapping[str, tuple[Facts, Facts]]) -> Figure:
-    """Allan deviations against averaging length, and their ratios to the square-root law.
-
-    ``sets``: entries in ``allan.json`` and, for the Cramér-Rao bound, in ``fit.json``, by set.
-    """
+    """Allan deviations and their ratios to the square-root law, of ``allan.json``."""
     figure, ((axes,), (below,)) = axes_grid(
         (WIDE, 6.2), 2, 1, top=0.65, between=0.2, sharex=True, height_ratios=[3, 1.1]
     )

@@ -401,10 +401,7 @@ class ArrayReader:
         return ahead.read(file, following)
 
     def read(self, *ranges: tuple[int, int], out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """A block, given one (start, stop) for each axis; fastest when it follows the chunks.
-
-        Missing trailing axes are taken whole.
-        """
+        """A block, given (start, stop) of the first axes; fastest when it follows the chunks."""
         full = [(0, n) for n in self.shape]
         full[: len(ranges)] = [(max(0, a), min(b, n)) for (a, b), (_, n) in zip(ranges, full)]  # noqa: B905
         shape = tuple(b - a for a, b in full)

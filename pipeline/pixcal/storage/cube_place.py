@@ -26,10 +26,7 @@ log = logging.getLogger(__name__)
 
 
 def cubes_of(artefact: Local) -> Place:
-    """The folder in which an artefact keeps its cubes (``raw.zarr``, ``reduced.zarr``).
-
-    Raises DamagedError if the artefact's ``cubes.json`` cannot be understood.
-    """
+    """The folder of an artefact's cubes; DamagedError if ``cubes.json`` cannot be understood."""
     pointer = _read(artefact)
     return artefact if pointer is None else parse_place(pointer["place"])
 

@@ -35,10 +35,7 @@ class FrameWriter:
     def create(
         cls, path: Path, shape: tuple[int, ...], dtype: str, cards: Cards | None = None
     ) -> "FrameWriter":
-        """Write the header and take the room on the disk.
-
-        Raises OSError if the folder cannot be written, or the disk has no room for the file.
-        """
+        """Write the header and take the room on the disk; OSError where there is none."""
         header = _header(shape, dtype, cards or {}).tostring(padding=True).encode("ascii")
         writer = cls(path, shape, dtype, len(header))
         with aside_of(path).open("wb") as file:

@@ -140,10 +140,7 @@ def _scale(raw: NDArray[Any], coding: SampleFormat) -> F32:
 
 
 def unpack(file: FrameFile, target: Path) -> FrameFile:
-    """Write the image of a compressed file as bare big-endian samples, reading the file once.
-
-    Returns the same image in the scratch file, in the container ``plain``.
-    """
+    """Write a compressed file's image as bare big-endian samples; that as a file to be read."""
     with file.source.open() as handle, target.open("wb") as out:
         if file.container == "picture":
             unpack_picture(file, out)

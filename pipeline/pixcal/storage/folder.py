@@ -98,10 +98,7 @@ class LocalFolder:
 
 @contextmanager
 def written_aside(path: Path, *, durable: bool = False) -> Iterator[Path]:
-    """Another name to write a file under; it takes its own when the block ends.
-
-    ``durable``: it is on the disk then, not on its way to it.
-    """
+    """Another name to write a file under; it takes its own, on disk if ``durable``, at the end."""
     aside = aside_of(path)
     yield aside
     if durable:

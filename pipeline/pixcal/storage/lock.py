@@ -108,10 +108,7 @@ def lock(run: Path) -> Iterator[None]:
 
 @contextmanager
 def flushed_last(run: Path) -> Iterator[None]:
-    """Complete artefacts of a run as they are made; all are on the disk when the block ends.
-
-    Raises OSError if something could not be written to the disk.
-    """
+    """Complete artefacts of a run as they are made; all are on the disk when the block ends."""
     try:
         with unflushed():
             yield

@@ -59,10 +59,7 @@ def digest(*parts: Any) -> str:
 
 
 def file_digest(path: Local) -> str:
-    """SHA-256 (hex, 32 characters) of a file.
-
-    Raises DamagedError if it cannot be read.
-    """
+    """SHA-256 (hex, 32 characters) of a file; DamagedError if it cannot be read."""
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()[:32]
@@ -90,10 +87,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 
 def read_json(path: Local) -> Any:
-    """Read JSON that pixcal wrote.
-
-    Raises DamagedError if the file is missing or does not parse.
-    """
+    """Read JSON that pixcal wrote; DamagedError if the file is missing or does not parse."""
     return _read(path)[1]
 
 
@@ -116,11 +110,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def read_manifest(folder: Local) -> Manifest | None:
-    """Manifest of an artefact, or None when there is no artefact.
-
-    Raises DamagedError if it does not parse, or was altered (those of earlier versions have no
-    seal).
-    """
+    """Manifest of an artefact, None where there is none; DamagedError if it was altered."""
     path = folder / MANIFEST
     if not path.exists():
         return None

@@ -54,10 +54,7 @@ class MemoryPath:
         return found
 
     def read_bytes(self) -> bytes:
-        """Content of a file.
-
-        Raises FileNotFoundError if it is not there.
-        """
+        """Content of a file; FileNotFoundError if it is not there."""
         found = self._kept.get(self.at)
         if not isinstance(found, bytes):
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))

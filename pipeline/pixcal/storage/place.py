@@ -110,11 +110,7 @@ def explained(url: str) -> Iterator[None]:
 
 
 def parse_place(text: str) -> Place:
-    """The folder that a user means: a path, absolute from now on, or a URL.
-
-    Raises InputError if it is neither; or holds a password, which would end up in files and
-    messages.
-    """
+    """The folder that a user means: a path, absolute from now on, or a URL without password."""
     scheme, is_url, rest = text.partition("://")
     if not is_url:
         if not text or re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", text):

@@ -38,11 +38,7 @@ class FitsMap:
 
     @classmethod
     def open(cls, path: Path, extension: str | int = 0) -> "FitsMap":
-        """Read where the image is, and check that all of it is there and unaltered.
-
-        Raises DamagedError if the file is missing, cut, altered (where it has a checksum), or holds
-        no such image.
-        """
+        """Read where an image is; DamagedError if it is not there, or not whole and unaltered."""
         try:
             with fits.open(path, memmap=True) as hdus:
                 hdu: Any = hdus[extension]
@@ -215,10 +211,7 @@ def _checked(path: Path) -> Iterator[fits.HDUList]:
 
 
 def read_map(path: Path) -> tuple[F32, F32, U8, dict[str, Any]]:
-    """Read a map written by `write_map`: data, sigma, mask, primary header.
-
-    Raises DamagedError if the file is missing, cut or altered.
-    """
+    """Read a map of `write_map`: data, sigma, mask, primary header; DamagedError if altered."""
     try:
         with _checked(path) as hdus:
             header = {

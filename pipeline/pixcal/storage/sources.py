@@ -94,10 +94,7 @@ class SourceFile:
     header: Header = ()  # what `headers.csv` says of it
 
     def open(self) -> io.FileIO:
-        """Open the file for unbuffered reading, if it is still the one that was found.
-
-        Raises InputError if it is gone, cannot be read, or was changed.
-        """
+        """Open the file for unbuffered reading; InputError if it is not the one that was found."""
         try:
             handle = io.FileIO(self.path)
         except OSError as error:

@@ -19,11 +19,7 @@ from pixcal.storage.place import Local, Place
 
 
 def require(run: Path, name: str) -> Manifest:
-    """Manifest of a stage that must have been run.
-
-    Raises InputError if the stage has not been run, or its format is another one. Raises
-    DamagedError if the artefact is damaged.
-    """
+    """Manifest of a stage that must have been run; InputError if not, or in another format."""
     if not run.is_dir():
         raise InputError(f"{run}: no such run directory; make one with 'pixcal ingest'")
     stage, folder = STAGES[name], run / name
@@ -63,10 +59,7 @@ def _without_fringes(run: Path) -> bool:
 
 @contextmanager
 def working(run: Path, *needed: str) -> Iterator[dict[str, str]]:
-    """Hold a run in which some stages must have been run; gives the keys of their artefacts.
-
-    Raises InputError as of `require` and `pixcal.storage.lock.lock`.
-    """
+    """Hold a run in which some stages must have been run; gives the keys of their artefacts."""
     for name in needed:
         require(run, name)
     with lock(run):

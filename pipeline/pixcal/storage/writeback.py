@@ -61,10 +61,7 @@ def begin(file: Path) -> None:
 
 
 def wait() -> None:
-    """Wait for all files that were begun.
-
-    Raises OSError if one of them could not be written.
-    """
+    """Wait for all files that were begun; OSError if one of them could not be written."""
     _writeback().wait()
 
 

@@ -53,10 +53,7 @@ Reach = Callable[[Shares], tuple[float, float]]
 
 
 def run(bench_file: Path, config: Config, out: Path | None = None) -> dict[str, Any]:
-    """Work out the budget of a bench: the contents of ``budget.json``.
-
-    It is written to a directory ``out``, with ``budget.png``.
-    """
+    """Work out the budget of a bench; ``budget.json`` and ``budget.png`` go to ``out``."""
     bench = load_bench(bench_file)
     own_effects(bench, str(bench_file))
     if not bench.frames.fringes:

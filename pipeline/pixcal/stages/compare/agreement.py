@@ -103,10 +103,7 @@ class VarianceEstimate(NamedTuple):
     error: float
 
     def facts(self) -> dict[str, float]:
-        """As rms (px; zero where the variance is not positive) with its error, and as variance.
-
-        ``upper_px`` is the upper limit of the rms, 95 %.
-        """
+        """As rms (px; zero at the least) with its error and 95 % upper limit, and as variance."""
         positive = max(self.variance, 0.0)
         rms = math.sqrt(positive)
         return {

@@ -49,10 +49,7 @@ NOTED_DEG = 0.5  # from here on it is said that the axes differ
 
 
 def run(runs: Sequence[Path], out: Path, config: Config, runtime: Runtime) -> Manifest:
-    """Compare the maps of two runs or more, or of two parts of one.
-
-    Their windows have the same shape, and their pixels are taken to be the same.
-    """
+    """Compare maps of the same pixels, of two runs or more or of two parts of one."""
     if out.exists():
         if not out.is_dir():
             raise InputError(f"--out {out}: is a file; choose another directory")

@@ -51,10 +51,7 @@ def _add(plain: Any, path: Sequence[str], step: float) -> None:
 
 
 def parameter_errors(swept: Swept, runtime: Runtime) -> dict[str, float | None]:
-    """Rms error (px) of the offsets of a set from the errors of each effect's parameters.
-
-    None where no errors are given.
-    """
+    """Rms error (px) of a set's offsets by the parameters of each effect; None without errors."""
     tiles = scout_tiles(swept.source.grid, 9)  # spread over the window
     runtime = within_memory("errors of the parameters", task_bytes(swept), 0, runtime)
     total = np.sum(run_tasks(partial(_tile, swept), tiles, runtime, label="parameters"), axis=0)

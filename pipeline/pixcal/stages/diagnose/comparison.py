@@ -136,10 +136,7 @@ class Comparison:
         return bool(flagged(compare(self.data, trial.expected)))
 
     def residual(self, trial: Trial, where: set[Key]) -> float:
-        """Fraction of the gap that a bench leaves.
-
-        ``where``: test statistics that make up the gap.
-        """
+        """Fraction of the gap, in the test statistics ``where``, that a bench leaves."""
         before = compare(self.data, self.nominal.expected)
         return remaining(before, compare(self.data, trial.expected), where).total
 

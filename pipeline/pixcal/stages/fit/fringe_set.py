@@ -105,10 +105,7 @@ def fit_set(
     name: str,
     model: str,
 ) -> FittedSet:
-    """Fit the shape of a set's fringes: of the ``model`` of this name, or ``auto``.
-
-    ``facts`` is the summary of the set's sweep.
-    """
+    """Fit the shape of a set's fringes, of this ``model`` or ``auto``, to its sweep."""
     rows = ArrayReader(swept / "sums").read()
     tiles = TileSums.of_rows(rows.reshape(-1, rows.shape[-1]))
     if not any(np.isfinite(p.sigma) for p in tiles.planes):

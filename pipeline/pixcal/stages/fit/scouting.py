@@ -54,10 +54,7 @@ def scout_tiles(grid: tuple[int, int], number: int) -> list[tuple[int, int]]:
 def scout_set(
     source: ReducedSet, nominal: tuple[float, float], folder: Local, runtime: Runtime, name: str
 ) -> None:
-    """Find the frame parameters of a set and write them, and ``scout.json`` last.
-
-    ``nominal`` is the nominal fringe vector (kx, ky), rad/px.
-    """
+    """Find the frame parameters of a set, near the nominal vector (rad/px), and write them."""
     n_tiles = source.grid[0] * source.grid[1]
     chunk_bytes = int(np.prod(source.signal.chunks)) * source.signal.dtype.itemsize
     tile_bytes = source.n_blocks * chunk_bytes
