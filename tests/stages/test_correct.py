@@ -84,7 +84,8 @@ def with_calibration(run: Path, bench: Any, reseal: Callable[..., None]) -> Path
             run / "reduce" / "calibration.zarr" / name, value.astype(np.float32),
             dims=("y", "x"), chunks=(128, 128),
         )  # fmt: skip
-    times = {f"fringes/{name}": {"exptime_s": [0.02] * bench.frames} for name in bench.sets}
+    columns = {"exptime_s": [0.02] * bench.frames, "time_s": [*range(bench.frames)]}
+    times = {f"fringes/{name}": columns for name in bench.sets}
     write_json(run / "ingest" / "frames.json", times)
     reseal(run / "ingest", run / "reduce")
     return run
