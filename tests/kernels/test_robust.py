@@ -3,9 +3,15 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 from scipy.stats import kurtosis
 
-from pixcal.kernels.robust import Combination, clipped_variance_factor, median_and_deviation
+from pixcal.kernels.robust import (
+    Combination,
+    clipped_variance_factor,
+    median_and_deviation,
+    median_around,
+)
 
 F32 = NDArray[np.float32]
 
@@ -168,3 +174,9 @@ def test_a_single_frame_is_its_own_mean_without_a_variance() -> None:
 def test_no_frames_have_no_result() -> None:
     with pytest.raises(ValueError, match="no frames"):
         Combination(clip=4, lamp=False, quantum=0).result()
+
+
+def test_medians_around_pixels_are_those_of_scipy() -> None:
+    values = np.random.default_rng(16).standard_normal((17, 23)).astype(np.float32)
+    expected = median_filter(values, 5, mode="reflect")
+    np.testing.assert_array_equal(median_around(values, 5), expected)

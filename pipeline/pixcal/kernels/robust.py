@@ -129,6 +129,26 @@ def _deviation_of_some(column: Any, median: float) -> float:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _medians_around(wide: F32, side: int, out: F32) -> None:
+    rows = np.empty((side * side, out.shape[1]), np.float32)
+    for y in range(out.shape[0]):
+        for n in range(side * side):
+            for x in range(out.shape[1]):
+                rows[n, x] = wide[y + n // side, x + n % side]
+        median_of_columns(rows, out[y])
+
+
+def median_around(values: NDArray[Any], side: int) -> F32:
+    """Median (y, x) of a square about each pixel, its side odd; beyond the edges a map is mirrored.
+
+    NaN are not counted.
+    """
+    out = np.empty(values.shape, np.float32)
+    _medians_around(np.pad(values.astype(np.float32), side // 2, "symmetric"), side, out)
+    return out
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _median_and_deviation(frames: Any, median: Any, deviation: Any) -> None:
     rows = np.empty((frames.shape[0], frames.shape[2]), np.float32)
     for y in range(frames.shape[1]):

@@ -10,37 +10,103 @@ from pixcal.model.arrays import F32, F64, Indices, Mask
 _FAST = {"reassoc", "contract", "nsz", "arcp"}
 
 
-@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
-def calm_residuals(rest: F32, variance: F32, good: Mask, limit: float) -> tuple[F32, F32]:
-    """Residuals (t, y, x) over their noise, and as they are; zero for outliers and NaN."""
-    calm, kept = np.empty_like(rest), np.empty_like(rest)
-    most, zero = np.float32(limit), np.float32(0)
-    for t in range(rest.shape[0]):
-        for y in range(rest.shape[1]):
-            for x in range(rest.shape[2]):
-                size = rest[t, y, x] / np.sqrt(variance[t, y, x])
-                # False of NaN.
-                here = good[y, x] & (np.abs(size) <= most)
-                calm[t, y, x] = size if here else zero
-                kept[t, y, x] = rest[t, y, x] if here else zero
-    return calm, kept
+def calm_residuals(
+    samples: F32, model: F32, shot: F32, read: F32, good: Mask, most: float, limits: F64
+) -> tuple[F32, F32, F64, F64]:
+    """Residuals over their noise and as they are, and what else one sweep over them gives.
+
+    Parameters
+    ----------
+    samples, model : (t, y, x) float32
+    shot, read : (y, x) float32
+        The variance of a sample is ``shot * max(model, 0) + read``.
+    good : (y, x) bool
+    most : float
+        Standard deviations beyond which a residual is an outlier.
+    limits : (n,) float64
+        Standard deviations beyond which residuals are counted, ascending.
+
+    Returns
+    -------
+    calm, kept : (t, y, x) float32
+        Zero for outliers, for NaN and in pixels that are not good.
+    variance : (t,) float64
+        Mean over the good pixels.
+    beyond : (2, n) float64
+        How many residuals of good pixels are below and above each limit.
+    """
+    # Not in compiled code, where large arrays come without huge pages: that takes as long again.
+    calm, kept = np.empty_like(samples), np.empty_like(samples)
+    variance, beyond = np.zeros(len(samples)), np.zeros((2, len(limits)))
+    _calm(samples, model, shot, read, good, most, limits, calm, kept, variance, beyond)
+    return calm, kept, variance / max(int(np.count_nonzero(good)), 1), beyond
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def count_beyond(rest: F32, variance: F32, good: Mask, limits: F64) -> tuple[F64, F64]:
-    """How many residuals of good pixels are below and above ascending limits (n,), in sigmas."""
-    below, above = np.zeros(len(limits)), np.zeros(len(limits))
+def _calm(
+    samples: F32, model: F32, shot: F32, read: F32, good: Mask, most: float, limits: F64,
+    calm: F32, kept: F32, variance: F64, beyond: F64,
+) -> None:  # fmt: skip
+    square, least = np.float32(most**2), np.float32(limits[0] ** 2)
+    for t in range(samples.shape[0]):
+        for y in range(samples.shape[1]):
+            total, found = _calm_row(
+                samples[t, y], model[t, y], shot[y], read[y], good[y], square, least,
+                calm[t, y], kept[t, y],
+            )  # fmt: skip
+            variance[t] += total
+            if found > 0:
+                for x in range(samples.shape[2]):
+                    if good[y, x]:
+                        one = samples[t, y, x] - model[t, y, x]
+                        noise = shot[y, x] * max(model[t, y, x], np.float32(0)) + read[y, x]
+                        _count(one, noise, limits, beyond)
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")  # type: ignore[untyped-decorator]
+def _calm_row(
+    samples: F32, model: F32, shot: F32, read: F32, good: Mask, square: float, least: float,
+    calm: F32, kept: F32,
+) -> tuple[np.float32, np.float32]:  # fmt: skip
+    """Sum of the variances of a row, and how many residuals are to be counted."""
+    zero, one = np.float32(0), np.float32(1)
+    total = found = zero
+    # Choices instead of conditions that are joined: of these the compiler makes vectors.
+    for x in range(samples.size):
+        rest = samples[x] - model[x]
+        variance = shot[x] * max(model[x], zero) + read[x]
+        weight = one if good[x] else zero
+        # Both are false of NaN.
+        here = rest * rest < square * variance
+        far = one if rest * rest > least * variance else zero
+        size = rest / np.sqrt(variance) if here else zero
+        value = rest if here else zero
+        calm[x] = size if good[x] else zero
+        kept[x] = value if good[x] else zero
+        total += variance if good[x] else zero
+        found += far * weight
+    return total, found
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _count(rest: float, variance: float, limits: F64, beyond: F64) -> None:
+    for n in range(len(limits)):
+        if rest * rest > limits[n] ** 2 * variance:
+            beyond[int(rest > 0), n] += 1
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def count_beyond(rest: F32, variance: F32, good: Mask, limits: F64) -> F64:
+    """How many residuals of good pixels are below and above (2, n) ascending limits, in sigmas."""
+    beyond = np.zeros((2, len(limits)))
     least = np.float32(limits[0] ** 2)
     for t in range(rest.shape[0]):
         for y in range(rest.shape[1]):
             for x in range(rest.shape[2]):
                 one = rest[t, y, x]
                 if one * one > least * variance[t, y, x] and good[y, x]:
-                    for n in range(len(limits)):
-                        if one * one > limits[n] ** 2 * variance[t, y, x]:
-                            below[n] += one < 0
-                            above[n] += one > 0
-    return below, above
+                    _count(one, variance[t, y, x], limits, beyond)
+    return beyond
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -61,6 +127,17 @@ def level_sums(
                     sums[n, 0] += 1
                     sums[n, 1] += values[t, y, x]
                     sums[n, 2] += np.float64(squared[t, y, x]) ** 2
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def count_remainders(codes: Any, good: Mask, divisor: int) -> Indices:
+    """How often whole numbers (t, y, x) of good pixels have each remainder on division by 2ⁿ."""
+    count = np.zeros(divisor, np.int64)
+    for t in range(codes.shape[0]):
+        for y in range(codes.shape[1]):
+            for x in range(codes.shape[2]):
+                count[codes[t, y, x] & (divisor - 1)] += good[y, x]
+    return count
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -94,7 +171,7 @@ def frame_means(values: Any, good: Mask) -> F64:
     return means
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) -> F64:
     """Sums of the products of samples with those some rows and columns on, by the first row.
 
@@ -114,15 +191,39 @@ def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) 
     """
     sums = np.zeros((len(steps), values.shape[1]))
     for t in range(0, values.shape[0], every):
-        for n in range(len(steps)):
-            dy, dx = steps[n]
-            here, there, width = max(0, -dx), max(0, dx), values.shape[2] - abs(dx)
-            for y in range(values.shape[1] - dy):
-                weight = pairs[n, y]
-                one = values[t, y, here : here + width]
-                other = values[t, y + dy, there : there + width]
-                line = np.float32(0)
-                for x in range(width):
-                    line += weight[x] * one[x] * other[x]
-                sums[n, y] += np.float64(line)
+        _add_products(values[t], pairs, steps, sums)
     return sums
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def products_by_level(
+    values: F32, level: F32, middle: float, pairs: F32, steps: Indices, every: int = 1
+) -> F64:
+    """The same (2, step, y) of pairs that are both above the ``middle`` of ``level``, both not."""
+    sums = np.zeros((2, len(steps), values.shape[1]))
+    above, below = np.empty_like(values[0]), np.empty_like(values[0])
+    zero = np.float32(0)
+    for t in range(0, values.shape[0], every):
+        for y in range(values.shape[1]):
+            for x in range(values.shape[2]):
+                one, high = values[t, y, x], level[t, y, x] > middle
+                above[y, x] = one if high else zero
+                below[y, x] = zero if high else one
+        _add_products(above, pairs, steps, sums[0])
+        _add_products(below, pairs, steps, sums[1])
+    return sums
+
+
+@njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
+def _add_products(frame: F32, pairs: F32, steps: Indices, sums: F64) -> None:
+    for n in range(len(steps)):
+        dy, dx = steps[n]
+        here, there, width = max(0, -dx), max(0, dx), frame.shape[1] - abs(dx)
+        for y in range(frame.shape[0] - dy):
+            weight = pairs[n, y]
+            one = frame[y, here : here + width]
+            other = frame[y + dy, there : there + width]
+            line = np.float32(0)
+            for x in range(width):
+                line += weight[x] * one[x] * other[x]
+            sums[n, y] += np.float64(line)

@@ -179,7 +179,7 @@ class Evidence:
         """Whether the read noise spans so much of a code that means of dark samples are right."""
         return self.amplifier_noise > DITHER * self.gain * self.step_adu
 
-    @property
+    @cached_property
     def ladder(self) -> tuple[Stack, ...]:
         """Flats by exposure time, without those that are saturated in part."""
         return tuple(s for s in self.of_kind("flat") if self._saturated(s) < SATURATED)

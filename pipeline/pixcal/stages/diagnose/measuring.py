@@ -10,11 +10,11 @@ from scipy.ndimage import maximum_filter
 from pixcal.estimators.detector.amplifiers import relative_gain
 from pixcal.estimators.detector.pixel_read_noise import PixelNoise
 from pixcal.estimators.diagnosis.evidence import Evidence, FringeEvidence
+from pixcal.estimators.diagnosis.test_statistics.look import Look
 from pixcal.estimators.maps.structure import flattened, smooth_surface
 from pixcal.kernels.processes import ramp_step
 from pixcal.kernels.robust import median_and_sigma
 from pixcal.kernels.rounding import level_before_rounding
-from pixcal.kernels.sample_sums import calm_residuals, pixel_moments
 from pixcal.kernels.scene import DetectorMaps
 from pixcal.model.acquisition import Acquisition
 from pixcal.model.arrays import F32, F64, Indices, Mask
@@ -35,7 +35,6 @@ HOT = 40.0  # robust standard deviations of the dark current beyond which a pixe
 # pixels around a hot one that may have got some of its charge: at most a share of `SHARED`
 HOT_REACH = 2
 SHARED = 0.1
-WILD = 8.0  # standard deviations beyond which a residual is left out
 NO_TEST = 10.0  # reduced chi-square of the photon transfer beyond which its gain is not believed
 CORE = 5.0  # robust standard deviations within which the scatter of the dark signal may be noise
 
@@ -303,8 +302,4 @@ def _gain(evidence: Sequence[Evidence], flat: F64, good: Mask, with_flats: bool)
 
 def _noise_ratios(one: Evidence) -> list[F64]:
     """Mean squares (y, x) of residuals over what shot and read noise give, of each fringe set."""
-    found = []
-    for f in one.fringes.values():
-        calm, _ = calm_residuals(f.residual, f.variance, f.good, WILD)
-        found.append(pixel_moments(calm)[0])
-    return found
+    return [Look(fringes, one).moments[0] for fringes in one.fringes.values()]

@@ -21,6 +21,11 @@ BANDS = 4  # of the spectrum, from the size of the window to two pixels
 
 def differences(evidence: Evidence, stack: Stack) -> F32:
     """Differences (t, y, x) of frames 0 and 1, 2 and 3, ..., over their noise; outliers zero."""
+    own = "differences", stack.kind, int(stack.frame[0])
+    return evidence.once(*own, make=lambda: _differences(evidence, stack))
+
+
+def _differences(evidence: Evidence, stack: Stack) -> F32:
     light = stack.adu - evidence.bias.astype(np.float32)
     good = evidence.good
     if stack.kind == "flat":

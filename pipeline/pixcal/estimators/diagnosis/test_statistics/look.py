@@ -17,13 +17,16 @@ from pixcal.estimators.maps.structure import (
 )
 from pixcal.kernels.sample_sums import (
     calm_residuals,
+    count_remainders,
     level_sums,
     neighbour_products,
     pixel_moments,
+    products_by_level,
 )
 from pixcal.model.arrays import F32, F64, Indices, Mask
 
 WILD = 8.0  # standard deviations beyond which a residual counts as an outlier and no more
+OUTLIERS = (5.0, 7.0, 10.0)  # standard deviations beyond which residuals are counted
 
 
 @dataclass(frozen=True)
@@ -39,9 +42,11 @@ class Look:
         return self.found.good
 
     @cached_property
-    def _calm(self) -> tuple[F32, F32]:
-        calm, kept = calm_residuals(self.found.residual, self.found.variance, self.good, WILD)
-        return calm, kept
+    def _calm(self) -> tuple[F32, F32, F64, F64]:
+        found, maps = self.found, (self.found.shot_factor, self.found.read_variance)
+        shot, read = (noise.astype(np.float32) for noise in maps)
+        limits = np.array(OUTLIERS)
+        return calm_residuals(found.electrons, found.model, shot, read, self.good, WILD, limits)
 
     @property
     def residual(self) -> F32:
@@ -53,6 +58,16 @@ class Look:
         """The same residuals, e-, as (t, pixel) of all pixels."""
         return self._calm[1].reshape(len(self.residual), -1)
 
+    @property
+    def variance(self) -> F64:
+        """Mean variance (t,) of the good samples of each frame, e-², that the noise model gives."""
+        return self._calm[2]
+
+    @property
+    def outliers(self) -> F64:
+        """How many residuals (2, n) are below and above `OUTLIERS`, sigmas."""
+        return self._calm[3]
+
     @cached_property
     def theta(self) -> F32:
         """Maps (3, pixel) of all pixels as the fit has them; zero in those that are not good."""
@@ -63,7 +78,7 @@ class Look:
     def by_level(self) -> tuple[F64, F64]:
         """Mean residual (e-) and mean square over the noise, in bins of the level (bin,)."""
         model = self.found.model
-        some = model[:: max(1, len(model) // 40)][:, self.good]
+        some = model[:: max(1, len(model) // 40), self.good][:, ::SPARSE]
         low, high = (float(level) for level in np.quantile(some, (0.005, 0.995)))
         sums = np.zeros((LEVELS, 3))
         step = max(high - low, 1e-9) / LEVELS
@@ -96,8 +111,9 @@ class Look:
         codes: NDArray[Any] = self.found.adu
         if codes.dtype.kind not in "iu":
             return None
-        some = codes[:: max(1, len(codes) // 100)][:, self.good]
-        return np.bincount((some & (CODES - 1)).ravel(), minlength=CODES)
+        every = max(1, len(codes) // 100)
+        count: Indices = count_remainders(codes[::every], self.good, CODES)
+        return count
 
     @cached_property
     def psi(self) -> F64:
@@ -165,6 +181,7 @@ CELLS = 4  # cells of the window along each side
 # rows and columns to a neighbour
 STEPS = ((0, 1), (1, 0), (1, 1), (1, -1), (0, 2), (2, 0), (0, 3), (3, 0), (0, 4), (4, 0))
 MAX_FRAMES = 120  # frames for statistics of pairs of pixels
+SPARSE = 7  # one of so many pixels tells the range of the levels
 
 
 def neighbour_sums(
@@ -174,14 +191,30 @@ def neighbour_sums(
 
     Their sums (step, y) by the row of the first pixel, and of how many pairs.
     """
+    pairs, count = _pairs(good, steps)
+    sums = neighbour_products(values, pairs, np.array(steps), every)
+    return sums, count * len(range(0, len(values), every))
+
+
+def neighbour_sums_by_level(
+    values: F32, level: F32, good: Mask, steps: Sequence[tuple[int, int]], every: int = 1
+) -> tuple[F64, F64]:
+    """The same, (2, step, y), of products of samples above the median level, and of those below."""
+    pairs, count = _pairs(good, steps)
+    middle = float(np.median(level[:: 4 * every, good][:, ::SPARSE]))
+    sums = products_by_level(values, level, np.float32(middle), pairs, np.array(steps), every)
+    return sums, count * len(range(0, len(values), every))
+
+
+def _pairs(good: Mask, steps: Sequence[tuple[int, int]]) -> tuple[F32, F64]:
+    """Pairs of good pixels (step, y, x), by the place of the first, and their number (step, y)."""
     ny, nx = good.shape
     pairs = np.zeros((len(steps), ny, nx), np.float32)
     for own, (dy, dx) in zip(pairs, steps, strict=True):
         here = (slice(0, ny - dy), slice(max(0, -dx), nx - max(0, dx)))
         there = (slice(dy, ny), slice(max(0, dx), nx + min(0, dx)))
         own[: ny - dy, : nx - abs(dx)] = good[here] & good[there]
-    sums = neighbour_products(values, pairs, np.array(steps), every)
-    return sums, pairs.sum(axis=2, dtype=float) * len(range(0, len(values), every))
+    return pairs, pairs.sum(axis=2, dtype=float)
 
 
 def by_cell(values: F64, good: Mask) -> F64 | None:

@@ -10,15 +10,15 @@ from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statis
 from pixcal.estimators.diagnosis.test_statistics.look import (
     CELLS,
     LEVELS,
+    OUTLIERS,
     STEPS,
     Look,
     by_cell,
-    neighbour_sums,
+    neighbour_sums_by_level,
 )
 from pixcal.kernels.sample_sums import count_beyond
 from pixcal.model.arrays import F32, F64, Mask
 
-OUTLIERS = (5.0, 7.0, 10.0)
 MIN_DARKS = 5
 CUT_OFF = 1e-3  # share of samples at code zero from which noise is cut off
 QUANTILES = (0.5, 0.9, 0.99, 0.999)
@@ -96,14 +96,10 @@ def neighbours_by_row(look: Look) -> Curve:
 @statistic("noise", "correlation of neighbours, bright minus dark", "correlation", x="neighbour")
 def neighbours_by_level(look: Look) -> Curve:
     """Covariance over shot noise in bright samples less that in dark ones."""
-    keep = slice(None, None, look.thinned)
-    rest, model = look.residual[keep], look.found.model[keep]
-    bright = (model > np.median(model[::4, look.good])).astype(np.float32)
-    one, other = (
-        _mean_product(*neighbour_sums(rest * part, look.good, STEPS[:4]))
-        for part in (bright, 1 - bright)
+    (bright, dark), count = neighbour_sums_by_level(
+        look.residual, look.found.model, look.good, STEPS[:4], look.thinned
     )
-    return Curve(np.arange(4.0), 2 * (one - other))
+    return Curve(np.arange(4.0), 2 * _mean_product(bright - dark, count))
 
 
 def _mean_product(sums: F64, count: F64) -> F64:
@@ -164,8 +160,7 @@ def _calm(frames: F32, good: Mask) -> F32:
 def outliers(look: Look) -> Curve:
     """Residuals of good pixels beyond 5, 7 and 10 sigma: twice the root of their number."""
     limits = np.array(OUTLIERS)
-    count = count_beyond(look.found.residual, look.found.variance, look.good, limits)
-    return Curve(np.concatenate([-limits, limits]), 2 * np.sqrt(np.concatenate(count)))
+    return Curve(np.concatenate([-limits, limits]), 2 * np.sqrt(look.outliers.ravel()))
 
 
 @statistic(

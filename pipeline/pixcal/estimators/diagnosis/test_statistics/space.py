@@ -32,7 +32,7 @@ SAME = 0.98  # cosine of the angle below which two sets measure along the same a
 def alike(looks: Sequence[Look]) -> Curve | None:
     """Correlation of the maps of each pair of sets."""
     values = [
-        _correlation(flattened(one.maps[name]), flattened(other.maps[name]))
+        _correlation(one.flat_maps[name], other.flat_maps[name])
         for one, other in combinations(looks, 2)
         for name in ("contrast", "light")
     ]

@@ -66,7 +66,7 @@ def frames_before(look: Look) -> Curve:
     By pixels: the coefficient of the other frame's model, after what the pixel's own fit absorbs.
     """
     g, theta = look.found.g, look.theta
-    noise = np.sqrt(frame_means(look.found.variance, look.good))[:, None]
+    noise = np.sqrt(look.variance)[:, None]
     basis = np.linalg.qr(g)[0]
     along = noise * (look.residual.reshape(len(g), -1) @ theta.T)
     square = (theta @ theta.T).astype(float)
