@@ -192,6 +192,7 @@ def test_arrays_give_the_maps_of_the_same_frames_in_files(acquired: Any) -> None
     assert not list(found.path.glob(".frames-*"))
 
 
+@pytest.mark.long
 def test_the_type_of_the_samples_does_not_matter(acquired: Any) -> None:
     bench, run = acquired
     found, kinds = arrays_of(run), {"vertical": np.int64, "horizontal": np.float64}
@@ -214,6 +215,7 @@ def test_which_fibre_is_called_a_does_not_matter(acquired: Any) -> None:
         np.testing.assert_allclose(found.delta, run.maps[name].delta, atol=0.02 * sigma.max())
 
 
+@pytest.mark.long
 def test_a_temporary_run_goes_with_the_last_reference(acquired: Any) -> None:
     bench, run = acquired
     only = {"frames": {"vertical": arrays_of(run)["vertical"]}}
@@ -295,6 +297,7 @@ def test_an_option_out_of_range_is_named(
         call(acquired[1])
 
 
+@pytest.mark.long
 def test_the_other_commands_give_their_tables(
     acquired: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

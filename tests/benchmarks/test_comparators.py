@@ -252,6 +252,7 @@ def test_each_method_reaches_a_bound_that_it_cannot_beat(
     assert k == pytest.approx(2 * np.pi / 5)
 
 
+@pytest.mark.long
 def test_a_method_in_a_process_of_its_own(
     task: tuple[measure.Task, SimpleNamespace], tmp_path: Path
 ) -> None:

@@ -9,6 +9,7 @@ import pytest
 from pixcal_cli.main import invoke
 
 
+@pytest.mark.long
 def test_an_examination_from_beginning_to_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -132,6 +132,7 @@ def test_help_loads_no_heavy_library() -> None:
     assert not loaded & {"numpy", "dask", "zarr", "numba", "astropy", "scipy", "matplotlib"}
 
 
+@pytest.mark.long
 def test_a_run_loads_no_library_that_few_runs_need() -> None:
     loaded = loaded_with("pixcal.stages.chain")
     assert "pixcal.stages.chain" in loaded

@@ -44,6 +44,7 @@ def test_what_is_printed(run: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert capsys.readouterr().out == text.replace("(written)", "(up to date)")
 
 
+@pytest.mark.long
 def test_three_runs(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = []
     for name in ("one", "two", "three"):

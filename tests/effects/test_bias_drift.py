@@ -156,7 +156,7 @@ def test_a_walk_is_found(
     assert found.significance > 5
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("count", [{"bias": 29}, {"bias": 29, "dark": 11}])
 def test_what_a_walk_explains_as_well_is_no_ramp(
     acquired: Callable[..., Evidence], count: dict[str, int]
@@ -222,6 +222,7 @@ def test_row_and_column_noise_is_not_taken_for_it(
     assert both.significance > 5
 
 
+@pytest.mark.long
 def test_light_that_changes_is_not_taken_for_it(acquired: Callable[..., Evidence]) -> None:
     found = BiasDrift.estimate(acquired(None, {"intensity_noise": {"rms": 0.02}}))
     assert found is not None
@@ -263,6 +264,7 @@ def test_evidence_tells_when_each_part_began(
 RUN = {"jitter_rms": 0.0, "ramp_e_h": 0.0, "walk_e_h": 0.0, "settle_e": 0.0}
 
 
+@pytest.mark.long
 def test_a_walk_of_the_fringe_runs_alone_is_found(acquired: Callable[..., Evidence]) -> None:
     """The mean light moves, the fringe amplitude does not, and bias frames know nothing of it."""
     evidence = acquired(None, {"bias_drift": RUN | {"run_walk_e_h": 600.0}})
@@ -282,6 +284,7 @@ def test_a_walk_of_the_fringe_runs_alone_is_found(acquired: Callable[..., Eviden
     }
 
 
+@pytest.mark.long
 def test_a_ramp_that_begins_anew_with_each_run_is_found(
     acquired: Callable[..., Evidence],
 ) -> None:
@@ -295,6 +298,7 @@ def test_a_ramp_that_begins_anew_with_each_run_is_found(
     assert abs(found.effect.run_ramp_e_h + 4000) < 4 * error
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("other", ["intensity_noise", "contrast_noise"])
 def test_light_that_changes_is_no_drift_of_the_runs(
     acquired: Callable[..., Evidence], other: str
@@ -354,6 +358,7 @@ def test_offsets_of_bias_and_dark_frames_are_replayed_as_they_were(
         np.testing.assert_allclose(on - plain, wanted, atol=1.0)
 
 
+@pytest.mark.long
 def test_the_level_of_an_offset_shows_in_the_shot_noise_it_lacks(
     acquired: Callable[..., Evidence],
 ) -> None:

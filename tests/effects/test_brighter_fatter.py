@@ -156,7 +156,7 @@ def test_frames_lose_contrast_with_their_level(make_effect_bench: Callable[..., 
     assert losses[1] / losses[0] == pytest.approx(4, rel=0.1)
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("size", [2.0e-7, 2.0e-8])
 def test_its_size_is_found(acquired: Callable[..., Evidence], size: float) -> None:
     found = BrighterFatter.estimate(acquired(None, {"brighter_fatter": {"shift_px_per_e": size}}))

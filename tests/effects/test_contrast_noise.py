@@ -63,7 +63,7 @@ def test_polarisation_goes_either_way_slowly_and_never_beyond_all_the_light(
     assert clipped.max() == pytest.approx(1 / 0.95)
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("vibration", [0.05, 0.015, 0.2])
 def test_a_vibration_is_found(acquired: Acquired, vibration: float) -> None:
     found = ContrastNoise.estimate(acquired(None, contrast(vibration_rad=vibration)))
@@ -75,6 +75,7 @@ def test_a_vibration_is_found(acquired: Acquired, vibration: float) -> None:
     assert found.effect.polarisation == 0
 
 
+@pytest.mark.long
 def test_a_slow_change_is_found_beside_a_vibration(acquired: Acquired) -> None:
     truth = {"vibration_rad": 0.05, "polarisation": 0.004, "polarisation_s": 1.5}
     found = ContrastNoise.estimate(acquired(None, contrast(**truth)))
@@ -112,6 +113,7 @@ def test_what_looks_like_it_is_not_taken_for_it(acquired: Acquired, alike: dict[
     assert found.significance < 4
 
 
+@pytest.mark.long
 def test_random_changes_are_drawn_once_for_all_acquisitions_of_the_same_frames(
     acquired: Acquired,
 ) -> None:

@@ -82,7 +82,7 @@ def test_charge_stops_at_the_full_well(make_effect_bench: Callable[..., Bench]) 
     assert np.count_nonzero(frames > 1380) > 20
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize(("rate", "charge"), [(2_000.0, 70.0), (20_000.0, 120.0)])
 def test_rate_and_charge_are_found(
     acquired: Callable[..., Evidence], rate: float, charge: float
@@ -123,6 +123,7 @@ def test_without_darks_and_fringes_nothing_is_said(acquired: Callable[..., Evide
     assert CosmicHits.estimate(replace(acquired(), fringes={}, stacks=())) is None
 
 
+@pytest.mark.long
 def test_without_an_exposure_time_frames_last_as_long_as_they_are_apart(
     acquired: Callable[..., Evidence],
 ) -> None:

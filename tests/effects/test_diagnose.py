@@ -75,6 +75,7 @@ def diagnosed(run: Path, **options: Any) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.long
 def test_an_effect_is_found_and_closes_the_gap(with_lag: Path) -> None:
     found = diagnosed(with_lag, only=FEW)
     assert found["schema"] == "pixcal/diagnosis/1"
@@ -133,6 +134,7 @@ def test_other_random_numbers_of_the_simulations_change_no_more_than_the_interva
         assert max(first[0], second[0]) <= min(first[1], second[1])
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("few_references")
 def test_a_run_that_was_stopped_goes_on(
     with_lag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -245,6 +247,7 @@ def test_a_part_of_a_large_detector_is_enough_without_fringes(
     assert look.measured.keys() <= again.keys()
 
 
+@pytest.mark.long
 def test_a_corner_without_light_is_left_out(
     reduced: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -509,6 +512,7 @@ def test_what_an_effect_takes_from_the_fringes_is_not_taken_twice(
         assert contrast == pytest.approx(without[name][1], rel=2e-3)
 
 
+@pytest.mark.long
 def test_every_acquisition_is_held_against_random_numbers_of_its_own(
     reduced: Callable[..., Path],
 ) -> None:
@@ -529,6 +533,7 @@ def test_every_acquisition_is_held_against_random_numbers_of_its_own(
     assert abs(np.corrcoef(one, another)[0, 1]) < 5 / np.sqrt(one.size)
 
 
+@pytest.mark.long
 def test_windows_are_exposed_together(
     reduced: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

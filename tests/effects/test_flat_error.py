@@ -77,7 +77,7 @@ CROSSED = {"parent": "crossed"}
 """Other ghosts move mean light and fringes alike, as a flat does; their phase tells."""
 
 
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("other", ["ipc", "nonlinearity", "ghost_fringes", "straylight"])
 def test_others_are_not_taken_for_it(acquired: Callable[..., Evidence], other: str) -> None:
     found = FlatError.estimate(acquired(None, {other: CROSSED if other == "ghost_fringes" else {}}))

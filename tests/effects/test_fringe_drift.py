@@ -52,7 +52,7 @@ def test_what_is_not_random_is_told_for_a_fit_that_holds_the_vector(
     np.testing.assert_allclose(effect.vector_change(time), change, atol=1e-18)
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize(
     "parameters",
     [
@@ -88,7 +88,7 @@ def test_errors_mean_something(acquired: Acquired) -> None:
     assert 5e-5 < found.errors["ramp[0]"] < 3e-4
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize(
     "alike",
     [

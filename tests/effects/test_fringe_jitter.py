@@ -62,7 +62,7 @@ def test_frames_turn_about_the_middle_of_the_window(make_effect_bench: Benches) 
     np.testing.assert_allclose(edge, 0.95 * 45_000 / 1.95 * np.abs(change) * 33, rtol=0.15)
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("rms", [(6e-6, 4e-6), (2.5e-5, 2.5e-5), (3e-4, 1e-4)])
 def test_its_size_is_found(acquired: Acquired, rms: tuple[float, float]) -> None:
     found = FringeJitter.estimate(acquired(None, {"fringe_jitter": {"rms": list(rms)}}))
@@ -75,6 +75,7 @@ def test_its_size_is_found(acquired: Acquired, rms: tuple[float, float]) -> None
     assert found.significance > 4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("size", "hz", "folded"), [((6e-6, 8e-6), 1.7, 1.7), ((3e-5, 1e-5), 20.3, abs(20.3 - 3 / 0.14))]
 )
@@ -94,7 +95,7 @@ def test_a_vibration_is_found_folded_below_half_the_frame_rate(
         assert abs(found.effect.rms[axis]) < 4 * found.errors[f"rms[{axis}]"]
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize(
     "alike",
     [

@@ -94,7 +94,7 @@ def test_frames_hold_it(make_effect_bench: Callable[..., Bench]) -> None:
             assert wave == pytest.approx(expected, abs=0.003)
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("parent", "share", "in_flats"),
     [

@@ -86,7 +86,7 @@ def found_near(foot: tuple[float, float], evidence: Evidence, limit: float) -> E
     return found
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("foot", [(18.0, 18.0), (-9.0, 4.0)])
 def test_the_foot_is_found(acquired: Callable[..., Evidence], foot: tuple[float, float]) -> None:
     evidence = acquired(WINDOW, {"hyperbolic_fringes": {"foot_mm": list(foot)}})

@@ -45,6 +45,7 @@ def raw(tmp_path_factory: pytest.TempPathFactory, make_effect_bench: Callable[..
     return take(ingested, read_acquisition(run), half, part, reduce.Config())
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("sweep", [Sweep(), NO_BATCHES], ids=["with batches", "without"])
 def test_frames_in_memory_are_reduced_and_fitted_as_those_in_files(
     raw: Raw, sweep: Sweep, tmp_path: Path

@@ -40,7 +40,7 @@ def test_the_factor_is_the_same_for_mean_and_fringe_and_has_the_size_given(
     assert (x[1:] @ x[:-1]) / (x @ x) == pytest.approx(step, abs=4 / np.sqrt(len(x)))
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("rms", [0.002, 1e-4, 0.02])
 def test_its_size_is_found(acquired: Callable[..., Evidence], rms: float) -> None:
     found = IntensityNoise.estimate(acquired(None, {"intensity_noise": {"rms": rms}}))
@@ -63,6 +63,7 @@ def test_a_line_is_the_mean_of_a_sine_over_the_exposure(
         )
 
 
+@pytest.mark.long
 def test_a_line_is_found_folded_below_half_the_frame_rate(
     acquired: Callable[..., Evidence],
 ) -> None:
@@ -78,6 +79,7 @@ def test_a_line_is_found_folded_below_half_the_frame_rate(
     assert found.significance > 20
 
 
+@pytest.mark.long
 def test_a_correlation_is_found(acquired: Callable[..., Evidence]) -> None:
     found = IntensityNoise.estimate(
         acquired(None, {"intensity_noise": {"rms": 0.01, "correlation_s": 1.4}})
@@ -92,7 +94,7 @@ def test_nothing_is_found_where_there_is_nothing(acquired: Callable[..., Evidenc
     assert found is None or found.significance < 4
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize(
     "alike",
     [
@@ -141,7 +143,7 @@ def test_what_frames_did_is_replayed(
                 )
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("shares", [(0.0, 0.0), (0.05, 0.01)])
 def test_ambient_light_is_told_from_a_change_of_contrast(
     acquired: Callable[..., Evidence], shares: tuple[float, float]
@@ -156,7 +158,7 @@ def test_ambient_light_is_told_from_a_change_of_contrast(
     assert any(found.effect.ambient) == any(shares)
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize(("separate", "recognised"), [(8e-4, True), (5e-3, False), (0.0, False)])
 def test_fibres_that_change_separately_move_the_contrast_by_a_little(
     acquired: Callable[..., Evidence], separate: float, recognised: bool

@@ -271,7 +271,7 @@ def test_level_dependent_shares_are_undone_too() -> None:
 # Measurement.
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize(
     "truth",
     [Ipc(), Ipc().scaled(0.3), Ipc.nearest(0.005)],
@@ -290,6 +290,7 @@ def test_a_kernel_is_found_with_its_period_and_nothing_else(acquired: Acquired, 
     assert "hot pixels" in found.why
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("longest", [7, 10_000])
 def test_products_of_neighbours_are_the_same_in_pieces_of_any_length(
     acquired: Acquired, monkeypatch: pytest.MonkeyPatch, longest: int

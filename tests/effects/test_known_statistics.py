@@ -119,6 +119,7 @@ def test_a_reference_needs_what_all_simulations_have(plain: Evidence) -> None:
     assert set(known.on_scale(whole)) == set(part)
 
 
+@pytest.mark.long
 def test_frames_that_were_looked_at_are_freed(acquired: Callable[..., Evidence]) -> None:
     """At once, not by the garbage collector: a diagnosis looks at hundreds of them."""
     few = {f"frames.fringes.{n}.count": 60 for n in (0, 1)}

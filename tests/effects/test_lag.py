@@ -120,7 +120,7 @@ def test_frames_are_restored(make_effect_bench: Callable[..., Bench], lag: Lag) 
     np.testing.assert_allclose(lag.restored(made), plain, atol=3)
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("truth", [Lag(), Lag(2e-4, 0.0, 0.1), Lag(0.005, 1.5, 0.1)])
 def test_its_share_is_found(acquired: Callable[..., Evidence], truth: Lag) -> None:
     parameters = {"share": truth.share, "decay_frames": truth.decay_frames, "spread": truth.spread}

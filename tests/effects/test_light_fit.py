@@ -47,7 +47,7 @@ def stray(evidence: Evidence) -> Straylight:
     return with_numbers(start, {key: 2e-3 * rng.standard_normal() for key in keys})
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("case", ["straylight", "hyperbolic_fringes"])
 def test_they_are_right_on_average_and_scatter_by_their_errors(
     acquired: Callable[..., Evidence], case: str
@@ -66,7 +66,7 @@ def test_they_are_right_on_average_and_scatter_by_their_errors(
     assert (each**2).mean() == pytest.approx(1, abs=4 * np.sqrt(2 / each.size) + 0.1)
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [Straylight, HyperbolicFringes])
 def test_of_nothing_they_say_what_chance_says(
     acquired: Callable[..., Evidence], kind: type[Effect]

@@ -176,6 +176,7 @@ def test_a_knee_is_measured_to_a_hundredth_of_its_size(acquired: Callable[..., E
     assert rest.std() < 12.0
 
 
+@pytest.mark.long
 def test_a_response_that_one_set_denies_is_refused(
     acquired: Callable[..., Evidence], bent: tuple[Evidence, Estimate]
 ) -> None:
@@ -231,6 +232,7 @@ def test_flats_tell_where_there_are_no_fringes(acquired: Callable[..., Evidence]
     assert Nonlinearity.estimate(replace(evidence, stacks=two)) is None
 
 
+@pytest.mark.long
 def test_moving_boundaries_are_not_taken_for_it(acquired: Callable[..., Evidence]) -> None:
     found = Nonlinearity.estimate(acquired(None, {"brighter_fatter": {"shift_px_per_e": 1e-6}}))
     assert found is not None

@@ -102,7 +102,7 @@ def test_codes_beside_saturation_are_not_wide() -> None:
     assert whole < 4 < clipped
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize(
     "given",
     [
@@ -164,6 +164,7 @@ def test_where_a_bit_leaves_several_codes_out_its_weight_is_told(step: float) ->
         assert over @ (bits - off) == pytest.approx(0, abs=4 * error + 0.03)
 
 
+@pytest.mark.long
 def test_wrong_bits_are_found_where_only_shot_noise_spans_a_step(
     acquired: Callable[..., Evidence],
 ) -> None:

@@ -112,7 +112,7 @@ def test_rows_are_turned_by_a_share_of_the_last_step(
     np.testing.assert_array_equal(on[0], plain[0])
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("share", [SETTLING, tuple(np.linspace(0.01, -0.01, 9)), RINGING])
 @pytest.mark.parametrize("origin", [None, 0.0])
 def test_a_modulator_that_settles_is_found(
@@ -138,6 +138,7 @@ def test_phases_that_stand_still_settle_nothing(acquired: Callable[..., Evidence
     assert found.significance < 4
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "shutter",
     [

@@ -77,7 +77,7 @@ def each(plain: dict[str, Any]) -> dict[str, float]:
     return found
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES)
 def test_its_parameters_follow_from_its_forward_model(
     case: str, run_with: Callable[[str], Path]

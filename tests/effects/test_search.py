@@ -429,6 +429,7 @@ def test_a_cause_beyond_the_most_is_told_that_no_more_were_sought() -> None:
     assert "the search stops after" in found.candidates[left_out].reason
 
 
+@pytest.mark.long
 def test_an_effect_that_was_hinted_at_and_not_taken_is_told_so() -> None:
     """Seeds differ in how much likelier the unseen frames get: some lie between the two marks."""
     reasons = {}

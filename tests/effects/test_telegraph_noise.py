@@ -84,6 +84,7 @@ def test_share_amplitude_and_time_are_found(
     assert found.significance > 5
 
 
+@pytest.mark.long
 def test_strong_jumps_show_in_fringes_alone(acquired: Callable[..., Evidence]) -> None:
     # With so few bias frames the noisy pixels were not left out of the fit.
     few = {"frames.bias": 4, "frames.darks": []}
@@ -123,6 +124,7 @@ def test_pixels_that_are_only_noisier_are_not_taken_for_it(
         assert found.details["noisy"] > 100
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("other", [{"cosmic_hits": {"rate_cm2_s": 30_000.0}}, {"row_noise": {}}])
 def test_what_looks_like_it_is_not_taken_for_it(
     acquired: Callable[..., Evidence], other: dict[str, dict[str, float]]

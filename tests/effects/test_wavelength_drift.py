@@ -66,6 +66,7 @@ def test_ramp_walk_and_hops_do_what_they_say(make_effect_bench: Benches) -> None
     assert abs(number - expected) < 4 * np.sqrt(expected)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ramp", [2e-3, 1e-2])
 def test_a_ramp_is_found(acquired: Acquired, ramp: float) -> None:
     found = WavelengthDrift.estimate(acquired(None, drift(ramp=ramp)))
@@ -84,7 +85,7 @@ def test_a_walk_is_found(acquired: Acquired) -> None:
     assert found.significance > 5
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize(("hop", "rate"), [(3e-4, 250.0), (3e-5, 400.0), (6e-5, 250.0)])
 def test_hops_are_found(acquired: Acquired, hop: float, rate: float) -> None:
     found = WavelengthDrift.estimate(acquired(None, drift(hop=hop, hops_per_h=rate)))
@@ -105,6 +106,7 @@ def test_beside_a_walk_the_error_of_hops_is_honest(acquired: Acquired) -> None:
     assert abs(found.effect.hops_per_h - rate) < 4 * found.errors["hops_per_h"] < 3 * rate
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "alike",
     [
@@ -120,6 +122,7 @@ def test_what_looks_like_it_is_not_taken_for_it(acquired: Acquired, alike: dict[
     assert found.significance < 4
 
 
+@pytest.mark.long
 def test_with_one_direction_of_fringes_what_exceeds_the_motion_across_counts(
     acquired: Acquired,
 ) -> None:

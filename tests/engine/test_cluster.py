@@ -350,6 +350,7 @@ def test_a_task_that_kills_every_worker_ends_the_run(cluster: Any, tmp_path: Pat
     assert run_tasks(abs, [-1], cluster.runtime, label="again") == [1]
 
 
+@pytest.mark.long
 def test_processes_that_are_killed_are_replaced(tmp_path: Path) -> None:
     runtime = Runtime("processes", 2)
     noted: list[int] = []

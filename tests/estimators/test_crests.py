@@ -107,6 +107,7 @@ def errors(paths: CrestPaths, geometry: Geometry) -> F64:
     return np.asarray(off - np.average(off, weights=paths.sigma**-2.0))
 
 
+@pytest.mark.long
 def test_without_noise_the_fibres_are_found_to_numerical_precision() -> None:
     shape = (1181, 1303)
     truth = fibres(shape, 9.6, offset=(5.0, -3.0), tilt=0.01)
@@ -159,6 +160,7 @@ def test_crests_are_bright_and_valleys_dark() -> None:
     assert np.corrcoef(paths.k, across)[0, 1] > 0.999
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("pitch", [WIDE_PITCH, 4.4e-3])
 def test_errors_are_honest(pitch: float) -> None:
     """Pulls over 36 frames: with a wide window all is free, else the truth is drawn from the

@@ -26,6 +26,7 @@ def times(series: list[np.ndarray]) -> list[np.ndarray]:
     return [STEP_S * np.arange(len(one)) for one in series]
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("slope", [0.0, 0.02])
 @pytest.mark.parametrize(("size", "rate"), [(2.5, 0.2), (6.0, 0.5), (40.0, 1.5)])
 def test_size_and_rate_are_found_within_their_errors(

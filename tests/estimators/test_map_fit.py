@@ -23,6 +23,7 @@ def offsets(rng: np.random.Generator, field: int) -> F64:
     return delta
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("field", [0, 25, 40])
 def test_curvature_by_chance_is_not_significant(field: int) -> None:
     """Few fields tell little of how they scatter: the errors may be low by half."""

@@ -90,7 +90,7 @@ WHITE_CASES: dict[str, tuple[int, int, dict[str, Any]]] = {
 }  # fmt: skip
 
 
-@pytest.mark.quick(2)
+@pytest.mark.long
 @pytest.mark.parametrize("name", WHITE_CASES)
 def test_white_noise_is_found_white(name: str) -> None:
     n, pixels, options = WHITE_CASES[name]
@@ -113,6 +113,7 @@ def test_white_noise_is_found_white(name: str) -> None:
     assert sum(c.knee is not None for c in found) <= 0.02 * RUNS
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("n", [24, 101])
 def test_a_single_pixel(n: int) -> None:
     lengths = np.array(averaging_lengths(n))

@@ -35,7 +35,7 @@ def jumping(
     return series
 
 
-@pytest.mark.quick(1)
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("amplitude", "switching_s"), [(1.0, 0.8), (1.5, 0.8), (3.0, 0.4), (10.0, 1.5)]
 )
@@ -51,6 +51,7 @@ def test_pixels_that_hardly_stand_out_tell_share_amplitude_and_time(
     assert found.switching_decades == 0
 
 
+@pytest.mark.long
 def test_of_stays_longer_than_the_frames_no_more_is_said() -> None:
     found = find_telegraph(jumping(np.random.default_rng(9), 0.03, 2.0, 40.0))
     assert found is not None
@@ -74,6 +75,7 @@ def test_the_likelihood_is_that_of_all_classes_even_where_numbers_underflow() ->
     np.testing.assert_allclose(of_class.sum(axis=1), 1)
 
 
+@pytest.mark.long
 def test_times_that_differ_from_pixel_to_pixel_are_told() -> None:
     found = find_telegraph(jumping(np.random.default_rng(9), 0.03, 8.0, 1.2, 1.5, (60, 60)))
     assert found is not None

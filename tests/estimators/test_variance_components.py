@@ -151,6 +151,7 @@ def test_what_is_not_there_comes_out_normal() -> None:
     assert 0.5 < np.std(found) < 1.2
 
 
+@pytest.mark.long
 def test_two_parts_together_are_as_rare_as_they_should_be() -> None:
     rng = np.random.default_rng(8)
     chances = []

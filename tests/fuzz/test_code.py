@@ -54,6 +54,7 @@ def unpickles(text: str) -> bool:
     return any(name.split(".")[0] in ("pickle", "cloudpickle") for name in named(ast.parse(text)))
 
 
+@pytest.mark.quick(60)
 @pytest.mark.parametrize("file", FILES, ids=lambda file: str(file.relative_to(ROOT)))
 def test_what_is_read_is_never_run(file: Path) -> None:
     text = file.read_text(encoding="utf-8")

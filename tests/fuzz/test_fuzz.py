@@ -22,6 +22,7 @@ CASES = {"markup": 2, "own-effects": 30}
 """Cases of a kind in the short version, where not a fortieth of those of the long one."""
 
 
+@pytest.mark.quick(12)
 @pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS)
 def test_bad_input_is_refused_in_one_line_or_told_truly(kind: Kind) -> None:
     found: Counter[str] = Counter()

@@ -138,6 +138,7 @@ def places(data: Any, at: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     return [at, *inner] if at else inner
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cls", [Acquisition, Bench])
 @settings(max_examples=200)
 @given(data=st.data(), value=junk)

@@ -54,6 +54,7 @@ def test_sweep_block_is_the_weighted_sum_of_every_pixel(moving):
     np.testing.assert_array_equal(sums[10], wanted[10])
 
 
+@pytest.mark.long
 def test_blocks_add_up():
     g, dk, theta, read, shot, codes = case(moving=True)
     f = np.float32

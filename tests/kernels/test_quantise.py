@@ -34,6 +34,7 @@ def convert(
     return codes, saturated, lost, total
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("dtype", ["u1", "i2", "u2", "i4", "f4"])
 def test_codes_are_electrons_to_half_a_step(dtype: str) -> None:
     rng = np.random.default_rng(0)

@@ -49,7 +49,7 @@ def colours_of(panel: map_panels.Panel) -> set[Any]:
     return {c for _, c in picture_of(panel).getcolors(1 << 24) or ()}
 
 
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("shape", SIZES)
 def test_maps_of_any_size_become_pictures(shape: tuple[int, int]) -> None:
     delta, sigma = a_map(shape), a_map(shape, 4e-4, 1e-5)

@@ -169,6 +169,7 @@ def test_a_seed_gives_the_same_samples_again_and_another_one_others() -> None:
         assert (cube != other[name]).any()
 
 
+@pytest.mark.quick(12)
 @pytest.mark.parametrize("one", LAWS, ids=CASES)
 def test_every_law_shows_and_weakly_less_than_strongly(one: Law) -> None:
     case = f"{one.effect}/{one.name}"

@@ -6,6 +6,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import pytest
+
 ROOT = Path(__file__).parents[2]
 BENCH = sorted((ROOT / "bench/second_bench").rglob("*.py"))
 PIXCAL = sorted(
@@ -35,10 +37,12 @@ def test_the_bench_imports_nothing_of_pixcal() -> None:
         assert "__import__" not in file.read_text(encoding="utf-8"), file
 
 
+@pytest.mark.long
 def test_pixcal_imports_nothing_of_the_bench() -> None:
     assert [file for file in PIXCAL if "second_bench" in set(imported(file))] == []
 
 
+@pytest.mark.long
 def test_no_module_of_pixcal_is_loaded_with_the_bench() -> None:
     told = "import sys, second_bench.__main__, second_bench.camera; print(*sorted(sys.modules))"
     loaded = subprocess.run(

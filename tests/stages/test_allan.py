@@ -184,6 +184,7 @@ def test_results_do_not_depend_on_the_tiling(tmp_path: Path, chunks: tuple[int, 
     np.testing.assert_array_equal(first, second)
 
 
+@pytest.mark.long
 def test_results_do_not_depend_on_the_runtime(tmp_path: Path, cluster: Runtime) -> None:
     maps = noise(25)
     texts = set()

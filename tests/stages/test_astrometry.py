@@ -229,6 +229,7 @@ def test_perfect_maps_leave_photon_noise_alone(tmp_path: Path) -> None:
         )
 
 
+@pytest.mark.long
 def test_maps_of_noise_are_told_from_maps_that_help(tmp_path: Path) -> None:
     nothing = make_run(tmp_path / "nothing", offsets(4, 1e-3), 1e-3)
     astrometry.run(nothing, Config(stars=60, positions=3), SYNC)
@@ -257,6 +258,7 @@ HYPERBOLIC = {
 }  # fmt: skip
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("exact", [False, True])
 def test_modes_of_the_bench_are_no_errors_of_the_maps(
     case: Path, tmp_path: Path, exact: bool
@@ -381,6 +383,7 @@ def test_the_same_bits_however_it_runs(case: Path, tmp_path: Path, runtime: Runt
     assert found[0] == found[1]
 
 
+@pytest.mark.long
 def test_it_is_made_once_and_again_when_maps_change(
     case: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -405,6 +408,7 @@ def test_it_is_made_once_and_again_when_maps_change(
     assert astrometry.run(run, config, SYNC).key != first.key
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("truth", [False, True])
 def test_one_fringe_axis(tmp_path: Path, truth: bool) -> None:
     """Along that axis only; what lies across it is not known and said to be missing."""
@@ -511,6 +515,7 @@ def test_blocks_fill_the_parts() -> None:
         assert -(-max(shape) // block) <= 96
 
 
+@pytest.mark.long
 def test_undersampled_and_oversampled_telescopes(case: Path, tmp_path: Path) -> None:
     """Fewer pixels a star, more of their scatter: the floor follows."""
     floors = []

@@ -97,6 +97,7 @@ def test_the_parts_of_the_self_check() -> None:
     assert draw_examination(100, 6, "small", "own") != examination
 
 
+@pytest.mark.long
 def test_half_of_the_cases_are_of_the_second_bench() -> None:
     variations, laws, _ = catalogue()
     examination = draw_examination(200, 5, "small")
@@ -138,6 +139,7 @@ def test_what_is_no_case_is_not_told_to_the_second_bench(
         second_offsets(SecondCase(case, 1, 0.5), LAYOUTS["tiny"])
 
 
+@pytest.mark.long
 def test_laws_whose_package_is_missing_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     real = importlib.util.find_spec
     monkeypatch.setattr(

@@ -112,6 +112,7 @@ def bench_batches(result):
     return facts["frames"] // facts["batch_frames"]
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "runtime", [Runtime("sync"), Runtime("threads", workers=3), Runtime("processes", workers=2)]
 )
@@ -310,6 +311,7 @@ def remask(run, name, mask):
     write_array(group / "mask", mask, dims=("y", "x"), chunks=(128, 128))
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("shape", "masked"),
     [

@@ -236,6 +236,7 @@ def test_up_to_date_is_skipped(
     np.testing.assert_array_equal(read(tmp_path / "run"), noise((70, 67, 131)))
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("name", ["f{}.fits", "f{}.fits.gz"])
 @pytest.mark.parametrize("copy", [False, True])
 def test_resumed_after_a_kill(

@@ -9,7 +9,7 @@ from pixcal.estimators.diagnosis.gap import flagged
 from pixcal.model.errors import InputError
 
 
-@pytest.mark.quick(2)
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     "detector",
     [

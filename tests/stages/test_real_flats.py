@@ -55,6 +55,7 @@ def test_levels_of_one_exposure_time_are_told_apart(tmp_path: Path) -> None:
     assert report["linearity"] is None
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize(
     ("lamp", "quadratic", "told"),
     [(0.0, 0.0, True), (0.0, -0.05, True), (0.05, 0.0, False)],

@@ -367,6 +367,7 @@ class Killed(BaseException):
     pass
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("survived", [1, 3, 5])
 def test_a_run_that_was_cut_short_goes_on(
     bench: tuple[Path, Camera, Any],
@@ -710,6 +711,7 @@ def esis_files() -> dict[str, tuple[Path, Path]]:
     }
 
 
+@pytest.mark.long
 def test_real_frames_give_the_gain_and_noise_of_their_camera(tmp_path: Path) -> None:
     for kind, files in esis_files().items():
         (tmp_path / "acq" / kind).mkdir(parents=True)

@@ -95,6 +95,7 @@ def runtime(request: pytest.FixtureRequest) -> Runtime:
     return Runtime(request.param, workers=2)
 
 
+@pytest.mark.long
 def test_results_are_those_of_a_run_at_home(
     night: Path, local: Path, bucket: Any, tmp_path: Path, runtime: Runtime
 ) -> None:
@@ -154,6 +155,7 @@ def test_others_open_the_url(far: Path, local: Path) -> None:
 RAW, SIGNAL = "raw.zarr/fringes/vertical", "reduced.zarr/vertical/signal"
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("damage", ["missing", "altered"])
 @pytest.mark.parametrize("file", ["c/1/0/1", "zarr.json"])
 @pytest.mark.parametrize(("stage", "array"), [("ingest", RAW), ("reduce", SIGNAL)])
@@ -233,6 +235,7 @@ def test_an_end_that_is_cut_short_loses_no_work(
     same_but_for_the_cubes(bucket, run, local, "ingest")
 
 
+@pytest.mark.long
 def test_a_reduction_cut_short_goes_on(
     ingested: Path, local: Path, store: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -252,6 +255,7 @@ def test_a_reduction_cut_short_goes_on(
 # Where cubes are put
 
 
+@pytest.mark.long
 def test_where_cubes_are_is_remembered(
     night: Path, far: Path, store: Any, ingested: Path, tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -272,6 +276,7 @@ def test_where_cubes_are_is_remembered(
     assert not [key for key in store.keys() if key.startswith(first)]  # noqa: SIM118
 
 
+@pytest.mark.long
 def test_cubes_are_moved_without_the_frames(
     night: Path, local: Path, bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -288,6 +293,7 @@ def test_cubes_are_moved_without_the_frames(
     assert not list((tmp_path / "z").rglob("*"))
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("damaged", [False, True])
 def test_arrays_of_unchanged_files_are_copied_in_the_store(
     night: Path, bucket: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damaged: bool
@@ -342,7 +348,7 @@ def shell(*args: str, **env: str | None) -> subprocess.CompletedProcess[str]:
 NO_CREDENTIALS = {"AWS_ACCESS_KEY_ID": None, "AWS_SECRET_ACCESS_KEY": None}
 
 
-@pytest.mark.quick(2)
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("place", "env", "says"),
     [
@@ -377,6 +383,7 @@ def test_a_missing_package_is_told_with_what_installs_it(night: Path, tmp_path: 
     assert "pip install 'pixcal[s3]'" in found.stderr
 
 
+@pytest.mark.long
 def test_a_store_that_vanishes_is_told_and_the_run_resumed(
     ingested: Path, local: Path, store: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

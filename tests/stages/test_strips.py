@@ -51,6 +51,7 @@ def copied(acquisition: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[
     return contents(run)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
 @pytest.mark.parametrize("cluster", ["threads", "processes"])
 def test_neither_source_nor_width_matters(

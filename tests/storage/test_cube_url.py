@@ -74,6 +74,7 @@ def put(path: UrlPath, content: bytes | None) -> None:
         system.pipe_file(name, content)
 
 
+@pytest.mark.quick(1)
 @pytest.mark.parametrize("batch", [1, 10**9])
 def test_the_objects_are_the_files_of_a_local_cube(
     place: UrlPath, tmp_path: Path, batch: int, monkeypatch: pytest.MonkeyPatch
@@ -161,6 +162,7 @@ def test_an_array_left_unfinished_is_taken_up_again(place: UrlPath) -> None:
     np.testing.assert_array_equal(ArrayReader(place / "a").read(), cube())
 
 
+@pytest.mark.long
 def test_writers_and_readers_travel_to_other_processes(bucket: Any) -> None:
     place = UrlPath(f"{bucket.url}/prefix")
     writer = create_array(place / "a", SHAPE, "u2", chunks=CHUNKS)
@@ -265,6 +267,7 @@ def test_what_nobody_asks_for_is_let_go(long_cube: tuple[ArrayReader, NDArray[An
 # Copies and removal
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("source", "target"), ["ss", "sm", "sl", "ls", "ms"])
 def test_chunks_are_taken_from_any_place_to_any_other(
     bucket: Any, tmp_path: Path, source: str, target: str
