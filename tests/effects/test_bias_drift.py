@@ -358,6 +358,17 @@ def test_offsets_of_bias_and_dark_frames_are_replayed_as_they_were(
         np.testing.assert_allclose(on - plain, wanted, atol=1.0)
 
 
+@pytest.mark.parametrize("jitter", [0.0, 20.0])
+def test_the_jitter_of_a_replay_is_that_of_the_fringes(
+    acquired: Callable[..., Evidence], jitter: float
+) -> None:
+    """Not what few bias frames passed for jitter."""
+    truth = RUN | {"jitter_rms": jitter, "run_walk_e_h": 600.0}
+    again = BiasDrift(**RUN | {"jitter_rms": 90.0}).replayed(acquired(None, {"bias_drift": truth}))
+    assert again is not None
+    assert again.jitter_rms == pytest.approx(jitter, rel=0.15, abs=3)
+
+
 @pytest.mark.long
 def test_the_level_of_an_offset_shows_in_the_shot_noise_it_lacks(
     acquired: Callable[..., Evidence],

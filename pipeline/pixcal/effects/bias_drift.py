@@ -145,12 +145,15 @@ class BiasDrift(Effect):
         return offset
 
     def replayed(self, evidence: Evidence) -> Self | None:
-        """As in `Effect.replayed`: slow offsets of fringes, all offsets of bias and dark frames."""
+        """As in `Effect.replayed`: slow offsets of fringes, all offsets of bias and dark frames.
+
+        The jitter is that of the fringes: of few bias frames a walk may pass for some.
+        """
         light = light_of(evidence)
-        lit = [] if light is None else fringe_courses(light)
+        lit, jitter = ([], self.jitter_rms) if light is None else fringe_courses(light)
         tracks = [_with_level(Track.of(name, time, e), evidence) for name, time, e in lit]
         tracks += [Track.of(name, time, e) for name, time, e in dark_courses(evidence)]
-        return replace(self, tracks=tuple(tracks)) if tracks else None
+        return replace(self, tracks=tuple(tracks), jitter_rms=jitter) if tracks else None
 
     def undo(self, maps: FringeMaps) -> FringeMaps | None:
         """As in `Effect.undo`: the mean offset of a replayed run is no light."""

@@ -17,11 +17,14 @@ Course = tuple[str, F64, F64]
 """Fringe set or e.g. ``bias frames``; times (t,) from its first frame, s; offsets (t,), e-."""
 
 
-def fringe_courses(light: FrameLight) -> list[Course]:
-    """Slow offsets of every set: the part of (B, log A/B) that moves the first and not A."""
+def fringe_courses(light: FrameLight) -> tuple[list[Course], float]:
+    """Slow offsets of every set: the part of (B, log A/B) that moves the first and not A.
+
+    Then what is left of it from frame to frame, e- rms over all sets.
+    """
     light = replace(light, dark=())
     drifts, every = ("offset_walk", "offset_smooth"), (*LIGHT_PARTS, "offset_smooth")
-    found = []
+    found, jitter = [], []
     for series in light.sets:
         modes = replace(light, sets=(series,)).modes(every)
         size = np.maximum(estimate_components(modes).size, 0.0)
@@ -32,7 +35,8 @@ def fringe_courses(light: FrameLight) -> list[Course]:
         offset = series.walk_modes.series(_wiener(parts, drift[:, :, 0], modes.values[:n]))
         some = np.unique(np.linspace(0, n, min(KNOTS, n + 1)).astype(int))
         found.append((series.name, series.time_s[some], offset[some]))
-    return found
+        jitter.append(size[every.index("offset")])
+    return found, float(np.sqrt(np.mean(jitter)))
 
 
 def dark_courses(evidence: Evidence) -> list[Course]:
