@@ -211,6 +211,7 @@ def write_diagnose(run: Path, verdict: str = "explained", effects: tuple[str, ..
         "gain_over_rest": 0.97, "p_value": 1e-30, "sigmas": 30.0, "why": NASTY,
         "given_away_by": [{"statistic": "contrast_by_step", "set": "one"}],
         "not_told_apart_from": [], "would_decide": [],
+        "on_map": {"rms_px": 0.0, "max_px": 0.0, "action": "not measured"},
     }  # fmt: skip
     facts = {
         "schema": "pixcal/diagnosis/1", "verdict": verdict, "statistics": 1, "candidates": [],
