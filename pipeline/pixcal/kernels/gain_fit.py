@@ -13,7 +13,8 @@ to lower levels too, and the gain is that of the range that tells it best.
 """
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import chdtrc
@@ -47,8 +48,9 @@ class GainFit:
     # slope at the highest level (variance over level) relative to that at zero, less one; zero
     # where a straight line fits
     curved: float = 0.0
-    # lags whose covariances were added to the variance: see `photon_transfer.add_neighbours`
-    neighbours: tuple[tuple[int, int], ...] = ()
+    # lags whose covariances were added to the variance, with the significance of each: see
+    # `photon_transfer.add_neighbours`
+    neighbours: Mapping[tuple[int, int], float] = field(default_factory=dict)
     # whether noise is common to pixels however far apart: the lamp does not light all at once
     uneven: bool = False
     # chance of points as far off the curve

@@ -39,8 +39,8 @@ LAGS = np.array(
 # of the sums: degrees of freedom, level, variance and the covariance of each of `LAGS`
 COLUMNS = 3 + len(LAGS)
 
-# errors beyond which neighbours share noise, and beyond which others do where some do
-_SHARED, _ALSO = 4.0, 2.0
+# errors beyond which neighbours share noise, and beyond which others may where some do
+SHARED, _ALSO = 4.0, 2.0
 _EVERYWHERE = 0.5  # least covariance at any lag over the largest of noise that is not of neighbours
 # least share of a block's pixels, along each axis, that have a neighbour at a lag in it
 _PAIRED = 1 - REACH / BLOCK
@@ -178,20 +178,21 @@ def neighbour_noise(frames: F32, lags: Sequence[tuple[int, int]]) -> float:
     return total * len(frames) / (len(frames) - 1)
 
 
-def add_neighbours(lit: F64, dark: F64) -> tuple[F64, list[tuple[int, int]]]:
+def add_neighbours(lit: F64, dark: F64) -> tuple[F64, dict[tuple[int, int], float]]:
     """Noise with that which neighbours share, (N_BINS, 3), and the lags (y, x) it came from.
 
     Covariances beyond those without light are added to the variance of the pixel itself, twice for
     the two neighbours, where they are significant over all levels. Where any is, less is needed of
     the others: a kernel that reaches the nearest pixels reaches those on the diagonal a little, and
-    in twelve lags a little adds up. The lag is (0, 0) alone where all pixels share noise. ``lit``
-    and ``dark`` are from `bin_pairs`, of flats and of frames without light.
+    in twelve lags a little adds up. Each lag comes with its significance: one below `SHARED` may
+    be there by chance. The lag is (0, 0) alone where all pixels share noise. ``lit`` and ``dark``
+    are from `bin_pairs`, of flats and of frames without light.
     """
     sums = lit[:, :3].copy()
     used = np.flatnonzero((lit[:, 0] > 0) & (lit[:, 1] > 0))
     without = dark.sum(axis=0)
     if not len(used) or not without[0] > 0:
-        return sums, []
+        return sums, {}
     dof, level, variance, *_ = (lit[used] / np.maximum(lit[used, :1], 1)).T
     dof = lit[used, 0]
     beyond = lit[used, 3:] / dof[:, None] - without[3:] / without[0]
@@ -201,10 +202,11 @@ def add_neighbours(lit: F64, dark: F64) -> tuple[F64, list[tuple[int, int]]]:
         weight.sum() * without[2] / without[0] / math.sqrt(without[0]),
     )
     shared = weight @ beyond
-    if shared.min() > _EVERYWHERE * shared.max() and shared.min() > _SHARED * error:
-        return sums, [(0, 0)]
+    if shared.min() > _EVERYWHERE * shared.max() and shared.min() > SHARED * error:
+        return sums, {(0, 0): float(shared.min() / error)}
     errors = np.abs(shared) * _PAIRED / error
-    significant = errors > (_ALSO if (errors > _SHARED).any() else _SHARED)
+    significant = errors > (_ALSO if (errors > SHARED).any() else SHARED)
     sums[used, 2] += dof * 2 * beyond[:, significant].sum(axis=1)
     sums[used] /= 1 + 2 * significant.sum() / _PAIRED**2
-    return sums, [(int(y), int(x)) for y, x in LAGS[significant]]
+    lags = LAGS[significant].tolist()
+    return sums, {(y, x): float(e) for (y, x), e in zip(lags, errors[significant], strict=True)}

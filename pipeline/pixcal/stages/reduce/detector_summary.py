@@ -200,12 +200,12 @@ def _gain(
     )
     if fitted is None or not fitted.error < _GAIN_ERROR * fitted.gain:
         return None
-    everywhere = added == [(0, 0)]
+    everywhere = (0, 0) in added
     at_zero, of_zero = fitted.read_variance
     return replace(
         fitted,
         read_variance=(at_zero + lost, of_zero),
-        neighbours=() if everywhere else tuple(added),
+        neighbours={} if everywhere else added,
         uneven=everywhere,
     )
 

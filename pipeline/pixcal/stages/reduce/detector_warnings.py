@@ -1,6 +1,7 @@
 """Sentences on a detector that is not as it should be, or was declared otherwise than measured."""
 
 from pixcal.kernels.gain_fit import GainFit
+from pixcal.kernels.photon_transfer import SHARED
 from pixcal.stages.reduce.detector_summary import Summary
 
 _NO_LINE = 10.0  # reduced chi-square of a photon-transfer curve that is no line
@@ -68,8 +69,9 @@ def _of_gain(fit: GainFit, summary: Summary, used: float) -> list[str]:
             "camera that reads bright pixels at another gain (dual gain, HDR): the gain is that "
             "below; gain and noise of brighter pixels are not measured"
         )
-    if fit.neighbours:
-        lags = ", ".join(f"({y}, {x})" for y, x in fit.neighbours)
+    clear = [lag for lag, sigmas in fit.neighbours.items() if sigmas > SHARED]
+    if clear:
+        lags = ", ".join(f"({y}, {x})" for y, x in clear)
         found.append(
             "crosstalk: the noise of neighbours in the flats is correlated at (rows, columns) "
             f"{lags}; the gain includes it"
