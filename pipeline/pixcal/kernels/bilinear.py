@@ -199,16 +199,12 @@ def frame_sums(
 
     Parameters
     ----------
-    codes : (t, p) float32
-        Stored samples of p pixels; of other types it would be compiled again.
+    codes : (t, p) stored samples of p pixels; of other types it would be compiled again
     g, dk : (t, 3), (t, 2) float32, current frame parameters; sums are of the residual to them
-    y, x : (p,) float32
-        Pixel coordinates relative to the point where ``g`` holds, px.
+    y, x : (p,) pixel coordinates relative to the point where ``g`` holds, px
     theta, read, shot : (3, p), (p,), (p,) float32, as in `sweep_block`
-    normal : (t, 15) float64
-        Added to: upper triangle, by row, for (g0, g1, g2, dkx, dky).
-    right : (t, 5) float64
-        Added to: right-hand sides.
+    normal : (t, 15) added to: upper triangle, by row, for (g0, g1, g2, dkx, dky)
+    right : (t, 5) added to: right-hand sides
     """
     s, o, f = np.float32(scale), np.float32(offset), np.float32(fill)
     n = codes.shape[1]
@@ -417,17 +413,12 @@ def sweep_batches(
 
     Parameters
     ----------
-    codes, scale, offset, fill, g, dk, y0, x0, theta, read, shot
-        As in `sweep_block`.
-    stops : (n,) int64
-        Frames of the block at which its sums are cut; the last is their number.
-    closes : (n,) int64
-        Batch that ends there; `GAP` where frames of none do, `GOES_ON` where none does.
-    part, total : (y, N_SUMS, x) float64
-        Sums of the batch at hand, and of all that have ended; added to.
-    turn, sigma : (batch, y, x) float32
-        Written: phase of a batch relative to the start model and its error, rad; NaN where it
-        does not give all three unknowns.
+    codes, scale, offset, fill, g, dk, y0, x0, theta, read, shot : as in `sweep_block`
+    stops : (n,) frames of the block at which its sums are cut; the last is their number
+    closes : (n,) batch that ends there; `GAP` where frames of none do, `GOES_ON` where none does
+    part, total : (y, N_SUMS, x) sums of the batch at hand, and of all that have ended; added to
+    turn, sigma : (batch, y, x) written: phase of a batch relative to the start model and its error,
+        rad; NaN where it does not give all three unknowns
     """
     moving = np.any(dk != 0)
     p = np.zeros((N_SUMS, codes.shape[2]), np.float32)

@@ -99,9 +99,8 @@ def moved_charge(charge: F32, shifts: F64, along_y: float = 1.0) -> F32:
 
     Parameters
     ----------
-    charge : (y, x) or (t, y, x) float32
-        e-, as if boundaries stayed. Beyond the edges it goes on as it is at
-        them; through the edges nothing moves.
+    charge : (y, x) or (t, y, x) e-, as if boundaries stayed. Beyond the edges it goes on as it is
+        at them; through the edges nothing moves.
     shifts : from `boundary_shifts`, times the shift by an electron (px)
     along_y : shift of the boundaries between rows over that of those between columns
     """
@@ -139,8 +138,7 @@ def shared_noise(
 
     Parameters
     ----------
-    charge : (t, y, x) float32
-        Mean charge, e-.
+    charge : (t, y, x) mean charge, e-
     pushes : from `boundary_pushes`
     shifts : as in `moved_charge`
     step : rows and columns

@@ -18,10 +18,8 @@ def follows(numbers: Indices, steps: int = 1) -> Mask:
 
     Parameters
     ----------
-    numbers : (t,) int
-        Of the frames, ascending.
-    steps : int
-        Negative: whether the frame so many steps after was taken so many frames after.
+    numbers : (t,) of the frames, ascending
+    steps : negative: whether the frame so many steps after was taken so many frames after
     """
     return np.asarray(numbers - np.roll(numbers, steps) == steps)
 

@@ -17,9 +17,8 @@ def without_line_means(noise: F32, used: Mask) -> F32:
 
     Parameters
     ----------
-    noise : (t, y, x) float32
-    used : (y, x) bool
-        Pixels of which means are taken.
+    noise : (t, y, x)
+    used : (y, x) pixels of which means are taken
     """
     weight = used.astype(np.float32)
     found = noise * weight

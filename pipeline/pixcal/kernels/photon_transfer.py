@@ -117,21 +117,17 @@ def pair_statistics(
 ) -> F64:
     """Level and noise of the blocks of a pair of frames.
 
+    Returns (block, COLUMNS): degrees of freedom, level (ADU), variance of one sample (ADU²) without
+    outliers, corrected for the clipping, and covariance (ADU²) of pixels apart by each of `LAGS`.
+    All zero for blocks of fewer than 32 pixels.
+
     Parameters
     ----------
-    first, second : (y, x) float32
-        Frames of the same scene, made equally bright, ADU above bias
-        and dark; NaN is not used.
+    first, second : (y, x) frames of the same scene, made equally bright, ADU above bias and dark;
+        NaN is not used
     gain, read_noise : rough guess, e-/ADU and ADU, only to tell outliers from noise where the level
         changes within a block
     quantum : step of the samples, ADU
-
-    Returns
-    -------
-    (block, COLUMNS) float64
-        Degrees of freedom, level (ADU), variance of one sample (ADU²) without outliers, corrected
-        for the clipping, and covariance (ADU²) of pixels apart by each of `LAGS`. All zero for
-        blocks of fewer than 32 pixels.
     """
     rows, columns = (-(-n // BLOCK) for n in first.shape)
     blocks = rows * columns

@@ -17,14 +17,11 @@ def calm_residuals(
 
     Parameters
     ----------
-    samples, model : (t, y, x) float32
-    shot, read : (y, x) float32
-        The variance of a sample is ``shot * max(model, 0) + read``.
-    good : (y, x) bool
-    most : float
-        Standard deviations beyond which a residual is an outlier.
-    limits : (n,) float64
-        Standard deviations beyond which residuals are counted, ascending.
+    samples, model : (t, y, x)
+    shot, read : (y, x) the variance of a sample is ``shot * max(model, 0) + read``
+    good : (y, x)
+    most : standard deviations beyond which a residual is an outlier
+    limits : (n,) standard deviations beyond which residuals are counted, ascending
 
     Returns
     -------
@@ -173,21 +170,11 @@ def frame_means(values: Any, good: Mask) -> F64:
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def neighbour_products(values: F32, pairs: F32, steps: Indices, every: int = 1) -> F64:
-    """Sums of the products of samples with those some rows and columns on, by the first row.
+    """Sums (step, y) of the products of samples with those some steps on, by their first row.
 
-    Parameters
-    ----------
-    values : (t, y, x) float32
-    pairs : (step, y, x) float32
-        Weight of each pair, by the place of its first row and of its
-        column that is further left; those beyond the edges are not looked at.
-    steps : (step, 2) int
-        Rows down (not negative) and columns to the right.
-    every : only every so many frames
-
-    Returns
-    -------
-    (step, y) float64
+    ``pairs``: (step, y, x) weight of each pair, by the place of its first row and of its column
+    that is further left; those beyond the edges are not looked at. ``steps``: (step, 2) rows down
+    (not negative) and columns to the right. Only ``every`` so many frames are used.
     """
     sums = np.zeros((len(steps), values.shape[1]))
     for t in range(0, values.shape[0], every):

@@ -21,8 +21,7 @@ def add_tracks(charge: F32, tracks: F64, sigma: float, first_row: int) -> None:
 
     Parameters
     ----------
-    charge : (y, x) float32
-        e-, changed in place.
+    charge : (y, x) e-, changed in place
     tracks : (n, 5) row and column where a track begins, its length along each (px), its charge (e-)
     sigma : width of the blur, px
     first_row : of the frame, among those that the tracks are counted in

@@ -10,15 +10,11 @@ def left_behind(charge: F32, share: F32, begins: F32, weights: F32, normal: F32)
 
     Parameters
     ----------
-    charge : (y, x) float32
-        e-.
-    share : (y, x) float32
-        Chance of an electron, on the mean.
-    begins, weights : (band,) float32
-        Where bands of the charge begin (e-), and the chance in each
-        over the mean one.
-    normal : (y, x) float32
-        Standard normals; zero for the mean.
+    charge : (y, x) e-
+    share : (y, x) chance of an electron, on the mean
+    begins, weights : (band,) where bands of the charge begin (e-), and the chance in each over the
+        mean one
+    normal : (y, x) standard normals; zero for the mean
     """
     ends = (*begins[1:], np.float32(np.inf))
     mean = np.zeros_like(charge)

@@ -21,13 +21,11 @@ def left_over(
 
     Parameters
     ----------
-    table, weight : (t, n) float32
-        The weight is one over the variance, or zero.
-    of_place, covariance : (j, n), (t, j, j) float32
-        Functions that frames are free to have, and the covariance of each frame's share of them.
-    of_time, inverse : (k, t), (k, k, n) float32
-        Functions that pixels are free to have, and each pixel's inverse normal matrix.
-    turns : int
+    table, weight : (t, n) the weight is one over the variance, or zero
+    of_place, covariance : (j, n), (t, j, j) functions that frames are free to have, and the
+        covariance of each frame's share of them
+    of_time, inverse : (k, t), (k, k, n) functions that pixels are free to have, and each pixel's
+        inverse normal matrix
     """
     rest = np.where(weight > 0, table, np.float32(0))
     _project(rest, weight, of_place, covariance, of_time, inverse, turns)

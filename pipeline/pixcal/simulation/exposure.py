@@ -37,10 +37,8 @@ class Camera:
 
     Parameters
     ----------
-    rows : tuple of int
-        First row of the window and the one after the last; any rows give the same samples.
-    noise : bool
-        False: no shot noise and no read noise.
+    rows : first row of the window and the one after the last; any rows give the same samples
+    noise : False: no shot noise and no read noise
     """
 
     def __init__(

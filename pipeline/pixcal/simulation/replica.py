@@ -103,16 +103,11 @@ class Replica:
 
         Parameters
         ----------
-        of : str or int
-            Name of a fringe set, or number of a stack.
-        models : sequence of ForwardModel
-            What acts on them; refused where a model and the bench do not go together.
-        noise : bool
-            With shot and read noise.
-        seed : int
-            Of all that is random.
-        most : int, optional
-            Frames.
+        of : name of a fringe set, or number of a stack
+        models : what acts on them; refused where a model and the bench do not go together
+        noise : with shot and read noise
+        seed : of all that is random
+        most : frames
         """
         detector = replace(self._bench.detector, seed=seed)
         bench = replace(self._bench, seed=seed, detector=detector)
@@ -251,14 +246,10 @@ def plain_bench(
 
     Parameters
     ----------
-    evidence : Evidence
-        Tells bias, laser and distance.
-    detector : SimulatedDetector
-        The rest of the detector; its bias is not used.
-    times_s : (float, float)
-        Exposure time and period.
-    sets : sequence of (str, (float, float), int, float)
-        Name, baseline (mm), frames and brightest fringe (e-) of each fringe set.
+    evidence : tells bias, laser and distance
+    detector : the rest of the detector; its bias is not used
+    times_s : exposure time and period
+    sets : name, baseline (mm), frames and brightest fringe (e-) of each fringe set
     """
     exposure, period = times_s
     bias = float(np.clip(np.median(evidence.bias), 0, detector.top_adu - 1))

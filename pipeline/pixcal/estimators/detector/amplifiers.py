@@ -20,18 +20,9 @@ SMOOTH = 2  # degree of what the lamp does beside the steps
 def relative_gain(flat: F64, noise: F64, good: Mask) -> F64:
     """Gain (y, x) of every pixel's amplifier over that of the whole detector.
 
-    Parameters
-    ----------
-    flat : (y, x) float64
-        Relative response as flats show it, counted with one gain.
-    noise : (y, x) float64
-        Mean square of samples about their mean over what shot and read noise give by that gain.
-    good : (y, x) bool
-
-    Returns
-    -------
-    (y, x) float64
-        Mean 1; exactly 1 where no boundary was found.
+    Its mean is 1; exactly 1 where no boundary was found. ``flat``: (y, x) relative response as
+    flats show it, counted with one gain. ``noise``: (y, x) mean square of samples about their mean
+    over what shot and read noise give by that gain.
     """
     log_gain = np.zeros(flat.shape)
     used = good & (flat > 0) & (noise > 0)

@@ -39,12 +39,11 @@ def hot(rate: F64, error: F64, sigma: float, limit: float) -> Mask:
 
     Parameters
     ----------
-    rate, error : (y, x) float64
-        Dark signal of each pixel and its standard error (ADU/s), from a border of blocks on.
-    sigma : float
-        Robust spread of the detector's dark signals (ADU/s); that of the neighbours may be larger.
-    limit : float
-        In units of ``sigma``.
+    rate, error : (y, x) dark signal of each pixel and its standard error (ADU/s), from a border of
+        blocks on
+    sigma : robust spread of the detector's dark signals (ADU/s); that of the neighbours may be
+        larger
+    limit : in units of ``sigma``
     """
     median, upper = _around(rate)
     excess, spread = rate - median, np.fmax(np.fmax(sigma, error), (upper - median) / _QUARTILE)
@@ -56,13 +55,10 @@ def dead(flat: F64, error: F64, low: float, high: float, floor: float) -> Mask:
 
     Parameters
     ----------
-    flat, error : (y, x) float64
-        Relative response and its standard error, from a border of blocks on.
-    low, high : float
-        Limits in units of the median of the pixel's block, and of the upper quartile of those in it
-        above ``floor``: beside a dark edge most may see no light.
-    floor : float
-        Lowest response at all.
+    flat, error : (y, x) relative response and its standard error, from a border of blocks on
+    low, high : limits in units of the median of the pixel's block, and of the upper quartile of
+        those in it above ``floor``: beside a dark edge most may see no light
+    floor : lowest response at all
     """
     median, upper = _around(flat)[0], _around(np.where(flat < floor, np.nan, flat))[1]
     below = (flat < low * median) & (median - flat > _SIGNIFICANT * error)
@@ -112,16 +108,11 @@ def noisy(
 
     Parameters
     ----------
-    variance, dof : (y, x) float64
-        Temporal variance (ADU²) and its degrees of freedom.
-    expected : (y, x) float64
-        Variance of a usual pixel with the same dark signal (ADU²).
-    kurtosis : (y, x) float64
-        Excess kurtosis; NaN when unknown.
-    outliers : (y, x) float64
-        Samples out of the limits.
-    factor : float
-        Of the standard deviation.
+    variance, dof : (y, x) temporal variance (ADU²) and its degrees of freedom
+    expected : (y, x) variance of a usual pixel with the same dark signal (ADU²)
+    kurtosis : (y, x) excess kurtosis; NaN when unknown
+    outliers : (y, x) samples out of the limits
+    factor : of the standard deviation
     """
     ratio = variance / expected
     dofs, which = np.unique(dof, return_inverse=True)
@@ -142,14 +133,10 @@ def noisy_factor(least: float, variance: F64, dof: int, quantum: float) -> float
 
     Parameters
     ----------
-    least : float
-        The factor at least.
-    variance : float64 array
-        Temporal variance of pixels without light (ADU²).
-    dof : int
-        Its degrees of freedom; few do not tell how pixels differ.
-    quantum : float
-        Step of the samples (ADU): noise below it depends on the place between two codes.
+    least : the factor at least
+    variance : temporal variance of pixels without light (ADU²)
+    dof : its degrees of freedom; few do not tell how pixels differ
+    quantum : step of the samples (ADU): noise below it depends on the place between two codes
     """
     known = variance[variance > 0]
     if dof < _SPREAD_DOF or not known.size or np.median(known) < quantum**2:
@@ -168,12 +155,9 @@ def nonlinear(rungs: Sequence[Rung], levels: F64, limit: float) -> Mask:
 
     Parameters
     ----------
-    rungs : sequence of Rung
-        Any number; with fewer than three for a pixel it is not flagged.
-    levels : (rung,) float64
-        Of the tile, as `step_levels` gives them.
-    limit : float
-        Largest relative change of the share.
+    rungs : any number; with fewer than three for a pixel it is not flagged
+    levels : (rung,) of the tile, as `step_levels` gives them
+    limit : largest relative change of the share
     """
     shape = rungs[0].signal.shape
     if len(rungs) < MIN_RUNGS:
@@ -221,10 +205,9 @@ def _curve(powers: F64, products: F64, values: F64, usable: Mask) -> F64:
 
     Parameters
     ----------
-    powers, products : (n, power), (n, power * power) float64
-        Of the places, and products of each two.
-    values : (n,) float64
-    usable : (n,) bool
+    powers, products : (n, power), (n, power * power) of the places, and products of each two
+    values : (n,)
+    usable : (n,)
     """
     terms = np.zeros(powers.shape[1])
     kept = usable

@@ -44,19 +44,9 @@ class DarkLine:
 def dark_line(means: Sequence[F64], counts: Sequence[F64], exptimes: Sequence[float]) -> DarkLine:
     """Straight line through combined dark frames (bias frames are the shortest ones).
 
-    Parameters
-    ----------
-    means : sequence of (y, x) float64
-        Combined frames (ADU), NaN where there is no sample.
-    counts : sequence of (y, x) float64
-        Samples in each.
-    exptimes : sequence of float
-        Exposure times (s).
-
-    Returns
-    -------
-    DarkLine
-        Bias NaN where a pixel has no sample, rate NaN where one exposure time of two is missing.
+    ``means``: (y, x) each, ADU, NaN where there is no sample; ``counts``: samples in each;
+    ``exptimes``: s. The bias is NaN where a pixel has no sample, the rate where one exposure time
+    of two is missing.
     """
     times = np.asarray(exptimes, float)[:, None, None]
     signal = np.stack(means)
@@ -116,22 +106,12 @@ def step_levels(rungs: Sequence[Rung]) -> F64:
 
 
 def relative_response(rungs: Sequence[Rung], levels: F64) -> tuple[F64, F64]:
-    """Signal of flats over that of the tile, from all steps at which a pixel is not saturated.
+    """Signal (y, x) of flats over that of the tile, and its error; NaN where no step can be used.
 
     All charge over all light: the weights that photon noise asks for. The light is that of the
-    levels, since a lamp may change between exposures. Its illumination stays in the response; it
-    changes the mean intensity of a pixel, never its offset.
-
-    Parameters
-    ----------
-    rungs : sequence of Rung
-    levels : (rung,) float64
-        Of the tile, as `step_levels` gives them; a step whose level is NaN is not used.
-
-    Returns
-    -------
-    response, error : (y, x) float64
-        NaN where no step can be used.
+    ``levels`` (rung,) of `step_levels`, since a lamp may change between exposures; one that is NaN
+    is not used. The lamp's illumination stays in the response; it changes the mean intensity of a
+    pixel, never its offset.
     """
     charge = variance = light = np.zeros(rungs[0].signal.shape)
     for rung, level in zip(rungs, levels, strict=True):
@@ -154,12 +134,9 @@ def unsaturated(
 
     Parameters
     ----------
-    rungs : sequence of Rung
-        Of the same pixels, in any order.
-    levels : (rung,) float64
-        As `step_levels` gives them.
-    dark_variance : float
-        Of a usual sample without light (ADU²): the dimmest levels may show little else.
+    rungs : of the same pixels, in any order
+    levels : (rung,) as `step_levels` gives them
+    dark_variance : of a usual sample without light (ADU²): the dimmest levels may show little else
     """
     seen = lit(np.fmax.reduce([rung.signal for rung in rungs]))
     full, least, most = np.zeros(len(rungs), np.bool_), np.inf, 0.0
@@ -199,17 +176,8 @@ class Linearity:
 def linearity(exptimes: F64, levels: F64, used: Mask) -> Linearity | None:
     """Line through the levels of a ladder of flats that makes the relative distances least.
 
-    Parameters
-    ----------
-    exptimes, levels : (rung,) float64
-        Seconds; ADU above bias and dark.
-    used : (rung,) bool
-        Levels to fit, those without saturation.
-
-    Returns
-    -------
-    Linearity or None
-        None with fewer than `MIN_RUNGS` levels.
+    ``exptimes, levels``: (rung,) s, and ADU above bias and dark; ``used``: (rung,) those without
+    saturation. None with fewer than `MIN_RUNGS` levels.
     """
     used = used & (levels > 0)
     if used.sum() < MIN_RUNGS:

@@ -273,13 +273,10 @@ def code_widths(
 
     Parameters
     ----------
-    counts : (n,) float64
-    noise : float
-        Least noise of a sample, in codes.
-    first : float
-        Code from which the noise is at least that.
-    last : float
-        Code at which samples saturate.
+    counts : (n,)
+    noise : least noise of a sample, in codes
+    first : code from which the noise is at least that
+    last : code at which samples saturate
     """
     half = int(np.clip(noise / 2, _MIN_HALF, _MAX_HALF))
     if noise < MIN_NOISE or len(counts) < 2 * _CALM:

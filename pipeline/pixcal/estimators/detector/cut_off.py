@@ -30,12 +30,8 @@ def without_cut_off(found: Combined, frames: int, step: float) -> tuple[Combined
 
     Parameters
     ----------
-    found : Combined
-        Of some pixels, ADU.
-    frames : int
-        How many were combined.
-    step : float
-        Of the samples (ADU).
+    found : of some pixels, ADU
+    step : of the samples (ADU)
 
     Returns
     -------

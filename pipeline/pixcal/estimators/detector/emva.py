@@ -40,10 +40,8 @@ def nonuniformity(a: F64, b: F64, lost: int) -> Nonuniformity:
 
     Parameters
     ----------
-    a, b : (y, x) float64
-        Averages of as many frames, in any unit, as `without_gaps` gives them.
-    lost : int
-        Pixels that are bad.
+    a, b : (y, x) averages of as many frames, in any unit, as `without_gaps` gives them
+    lost : pixels that are bad
     """
     ny, nx = a.shape
     dofs = np.array([ny - 1, nx - 1, max((ny - 1) * (nx - 1) - lost, 1)], float)
@@ -85,15 +83,7 @@ def _root(variance: float, error: float) -> Measure:
 def alternation(a: F64, b: F64, *, axis: int) -> Measure:
     """By how much every second row (axis 0) or column (axis 1) is higher than those between.
 
-    Parameters
-    ----------
-    a, b
-        As for `nonuniformity`.
-
-    Returns
-    -------
-    (float, float)
-        Amplitude at the Nyquist frequency, twice; the error is by the scatter of the other lines.
+    Twice the amplitude at the Nyquist frequency; the error is by the scatter of the other lines.
     """
     means = (a.mean(axis=1 - axis) + b.mean(axis=1 - axis)) / 2
     # Slow structure differs little between neighbours; only pairs of lines are compared.
@@ -108,15 +98,7 @@ def alternation(a: F64, b: F64, *, axis: int) -> Measure:
 
 
 def without_trend(values: F64, good: Mask) -> F64:
-    """A flat field over its mean, less one, less the quadratic polynomial of an uneven lamp.
-
-    Parameters
-    ----------
-    values : (y, x) float64
-        Signal above bias and dark.
-    good : (y, x) bool
-        Pixels to use.
-    """
+    """Signal (y, x) above bias and dark over a surface of second degree through the good pixels."""
     powers = [np.linspace(-1, 1, n)[:, None] ** np.arange(5) for n in values.shape]
     relative = np.where(good, values / values[good].mean(), 0.0)
     # Sums of x^m y^n over the good pixels are products with these matrices.
@@ -145,10 +127,8 @@ def spectrogram(a: F64, b: F64, *, axis: int) -> Spectrogram:
 
     Parameters
     ----------
-    a, b : (y, x) float64
-        As for `nonuniformity`.
-    axis : {0, 1}
-        Along which the Fourier transform is taken.
+    a, b : (y, x) as for `nonuniformity`
+    axis : {0, 1} along which the Fourier transform is taken
     """
     n = a.shape[axis]
     scale = 1 / math.sqrt(n)
@@ -160,19 +140,10 @@ def spectrogram(a: F64, b: F64, *, axis: int) -> Spectrogram:
 
 
 def transfer_points(sums: F64, most: int = 60) -> F64:
-    """Photon-transfer curve from sums over pairs of frames.
+    """Photon-transfer curve (point, 3): level (ADU), variance of a sample (ADU²) and its error.
 
-    Parameters
-    ----------
-    sums : (bin, 3 or more) float64
-        Degrees of freedom; the same times level; times variance: see `photon_transfer.bin_pairs`.
-    most : int
-        Most points: neighbouring bins are put together.
-
-    Returns
-    -------
-    (point, 3) float64
-        Level (ADU), variance of a sample (ADU²) and its error.
+    ``sums``: (bin, 3 or more) of `photon_transfer.bin_pairs`; neighbouring bins are put together
+    until there are ``most`` points.
     """
     filled = sums[sums[:, 0] > 0]
     if not len(filled):
@@ -186,16 +157,8 @@ def transfer_points(sums: F64, most: int = 60) -> F64:
 def saturation(points: F64) -> Measure | None:
     """Level (ADU) of the photon-transfer curve's maximum, if the variance falls beyond it.
 
-    Parameters
-    ----------
-    points : (point, 3) float64
-        Of `transfer_points`.
-
-    Returns
-    -------
-    (float, float) or None
-        With half of the way to the level where the variance has fallen as its error. None where
-        the curve rises to its end: saturation was not reached.
+    ``points``: (point, 3) of `transfer_points`. The error is half of the way to the level where the
+    variance has fallen. None where the curve rises to its end: saturation was not reached.
     """
     if len(points) < 2:
         return None
@@ -221,14 +184,7 @@ def full_level(points: F64) -> float:
 def dynamic_range(full_well: Measure, read_noise: Measure) -> tuple[float, float, float]:
     """Saturation over the least signal that can be seen (signal-to-noise ratio of one).
 
-    Parameters
-    ----------
-    full_well, read_noise : (float, float)
-        With errors (e-).
-
-    Returns
-    -------
-    ratio, error, decibels : float
+    Of values with errors (e-): the ratio, its error, and decibels.
     """
     # Signal whose shot noise and read noise together equal it: n² = n + σ².
     root = math.sqrt(read_noise[0] ** 2 + 0.25)
@@ -241,17 +197,7 @@ def dynamic_range(full_well: Measure, read_noise: Measure) -> tuple[float, float
 def dark_slope(times: F64, means: F64) -> Measure | None:
     """Dark signal (per second) from the means of frames, with the scatter between them.
 
-    Parameters
-    ----------
-    times : (frame,) float64
-        Exposure times (s).
-    means : (frame,) float64
-        Mean signal of each frame.
-
-    Returns
-    -------
-    (float, float) or None
-        None with fewer than three frames or a single exposure time.
+    ``times``: (frame,) s. None with fewer than three frames or a single exposure time.
     """
     if len(times) < 3:
         return None

@@ -186,17 +186,10 @@ def _agree(found: Ladder, curve: TransferCurve) -> bool:
 
 
 def ladder_response(evidence: Evidence, level_e: float) -> tuple[F64, F64] | None:
-    """Relative deviations of the response from a straight line, by a ladder of flats.
+    """Relative deviations of the response from a straight line at a level, by a ladder of flats.
 
-    Parameters
-    ----------
-    level_e : float
-        Where the deviations are given, e-.
-
-    Returns
-    -------
-    sizes, covariance : (2,), (2, 2) float64
-        From the first and the second power of the level; None without a ladder.
+    Sizes (2,) of the first and the second power of the level, and covariance; None without a
+    ladder.
     """
     found = ladder(evidence)
     if found is None:

@@ -94,19 +94,13 @@ def common_lag(
 ) -> CommonLag | None:
     """Lag by the contrast of frames against the step of the phase since those before.
 
+    Returns None where the frames do not tell.
+
     Parameters
     ----------
-    frames : sequence of (t, 3) float64
-        (B, A cos phi, A sin phi) of the frames of each fringe set.
-    numbers : sequence of (t,) int
-        Of these frames in their set.
-    undone : callable
-        Frames without a lag of a share and a decay, and the shares that come out later.
-
-    Returns
-    -------
-    CommonLag or None
-        None where the frames do not tell.
+    frames : (t, 3) (B, A cos phi, A sin phi) of the frames of each fringe set
+    numbers : (t,) of these frames in their set
+    undone : frames without a lag of a share and a decay, and the shares that come out later
     """
     found = CommonLag(0.0, 0.0, 0.0, 0.0, 0.0)
     for _ in range(ROUNDS):

@@ -23,13 +23,7 @@ _STANDS_IN = (0.5, -0.5, 0.0)  # the next code, the one before, either: threshol
 
 
 def missing_codes(counts: F64) -> I64:
-    """Codes that never come up though some just below and just above do.
-
-    Parameters
-    ----------
-    counts : (n,) float64
-        Of codes 0 to n - 1.
-    """
+    """Codes that never come up in ``counts`` (code,) though some just below and just above do."""
     padded = np.pad(counts, _NEAR)
     beside = sliding_window_view(padded, _NEAR).max(axis=1)
     below, above = beside[: len(counts)], beside[_NEAR + 1 :]

@@ -60,15 +60,8 @@ class SharedCharge:
 def shared_charge(evidence: Evidence, shifts: F64) -> SharedCharge | None:
     """Size of the brighter-fatter effect from the covariance of neighbours.
 
-    Parameters
-    ----------
-    shifts : float64 array
-        `pixcal.kernels.boundaries.boundary_shifts`, of size one.
-
-    Returns
-    -------
-    SharedCharge or None
-        None where there are neither fringe frames nor flats.
+    ``shifts``: `pixcal.kernels.boundaries.boundary_shifts`, of size one. None where there are
+    neither fringe frames nor flats.
     """
     given = shifts.shape, shifts.tobytes()
     return evidence.once("shared_charge", *given, make=lambda: _shared_charge(evidence, shifts))

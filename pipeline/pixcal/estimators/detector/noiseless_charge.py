@@ -14,23 +14,13 @@ _CLIP = 25.0  # squares of residuals, over their variance, that are left to part
 def missing_noise(
     evidence: Evidence, added: Callable[[FringeEvidence, F32], F32]
 ) -> tuple[float, float]:
-    """Part of the shot noise of an added charge that the residuals lack.
+    """Part of the shot noise of an added charge that the residuals lack, with its error.
 
-    Squared residuals are fitted by weighted least squares with the expected variance, a constant
-    and the added charge. So a gain or a read noise that is off does not pass for it: only the
-    frames before tell how much was added to samples of the same level.
-
-    Parameters
-    ----------
-    evidence : Evidence
-        With fringes.
-    added : callable
-        Added charge (t, y, x), e-, of a fringe set and its signal (t, y, x), e- before the flat.
-
-    Returns
-    -------
-    part, error : float
-        Zero where every added electron came by its own chance, one where none did.
+    Zero where every added electron came by its own chance, one where none did. Squared residuals
+    are fitted by weighted least squares with the expected variance, a constant and the added
+    charge. So a gain or a read noise that is off does not pass for it: only the frames before tell
+    how much was added to samples of the same level. ``added``: charge (t, y, x), e-, added to a
+    fringe set of some signal (t, y, x), e- before the flat.
     """
     flat = evidence.flat.astype(np.float32)
 
@@ -42,20 +32,10 @@ def missing_noise(
 
 
 def noiseless_level(evidence: Evidence, fringes: FringeEvidence) -> tuple[float, float]:
-    """Constant part of the signal of a fringe set that has no shot noise: an offset.
+    """Constant part (e-, before the flat) of a signal that has no shot noise: an offset; its error.
 
     Squared residuals are fitted with the expected variance, times a gain, less a constant. The read
     noise is that of the bias frames.
-
-    Parameters
-    ----------
-    fringes : FringeEvidence
-        One of its sets.
-
-    Returns
-    -------
-    level, error : float
-        e-, before the flat.
     """
     return _last_of(evidence, [fringes], lambda _, v: [v, -np.ones_like(v)])
 

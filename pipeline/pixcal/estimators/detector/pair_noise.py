@@ -33,12 +33,7 @@ _NO_BLOCKS = np.zeros((0, COLUMNS))
 def shared_by_lines(dark: F64) -> dict[str, Measure]:
     """Variance in time that all pixels of a row, or of a column, share, with its error (ADU²).
 
-    Zero where it is not significant.
-
-    Parameters
-    ----------
-    dark : (N_BINS, COLUMNS) float64
-        Sums over pairs of frames without light, as `bin_pairs` gives them.
+    ``dark``: (N_BINS, COLUMNS) sums of `bin_pairs`. Zero where it is not significant.
     """
     total = dark.sum(axis=0)
     if not total[0]:
@@ -71,12 +66,9 @@ def dark_pair_sums(
 
     Parameters
     ----------
-    frames : (t, y, x) float32
-        Less their common level (ADU); NaN where a sample is not to be used.
-    read_noise, quantum : float
-        As of `pair_statistics`.
-    without : tuple of str
-        Lines whose common noise is taken off.
+    frames : (t, y, x) less their common level (ADU); NaN where a sample is not to be used
+    read_noise, quantum : as of `pair_statistics`
+    without : lines whose common noise is taken off
     """
     pairs = zip(frames[::2], frames[1::2], strict=False)
     blocks = [_blocks(*pair, np.inf, read_noise, quantum, without) for pair in pairs]
@@ -95,14 +87,10 @@ def flat_pair_sums(
 
     Parameters
     ----------
-    frames : (t, y, x) float32
-        ADU above bias and dark.
-    levels : (t,) float32
-        Their common levels, in any unit; pairs that differ too much are not used.
-    gain, read_noise, quantum : float
-        As of `pair_statistics`.
-    line_noise : LineNoise
-        Of these pixels.
+    frames : (t, y, x) ADU above bias and dark
+    levels : (t,) their common levels, in any unit; pairs that differ too much are not used
+    gain, read_noise, quantum : as of `pair_statistics`
+    line_noise : of these pixels
     """
     blocks = [_NO_BLOCKS]
     for n in range(0, len(frames) - 1, 2):

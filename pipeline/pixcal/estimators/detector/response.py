@@ -41,16 +41,11 @@ def fit_response(
 
     Parameters
     ----------
-    evidence : Evidence
-        With fringes.
-    level_e : float
-        Electrons for which u is one.
-    powers : int
-        Terms of the relative response 1 + c_1 u + c_2 u² + ...
-    shifts : float64 array
-        `pixcal.kernels.boundaries.boundary_shifts`, of size one.
-    known_shift : (float, float), optional
-        Shift by an electron (px) and its variance as they are known from the noise of neighbours.
+    level_e : electrons for which u is one
+    powers : terms of the relative response 1 + c_1 u + c_2 u² + ...
+    shifts : `pixcal.kernels.boundaries.boundary_shifts`, of size one
+    known_shift : shift by an electron (px) and its variance as they are known from the noise of
+        neighbours
 
     Returns
     -------
@@ -104,12 +99,8 @@ def fit_curve(
 
     Parameters
     ----------
-    evidence : Evidence
-        With fringes.
-    response : callable
-        Signal (t, y, x) of a charge of that shape, e-.
-    knots_e : (n,) float64
-        Levels, rising, e-, the first zero, where there is no departure.
+    response : signal (t, y, x) of a charge of that shape, e-
+    knots_e : (n,) levels, rising, e-, the first zero, where there is no departure
 
     Returns
     -------
@@ -163,15 +154,10 @@ def boundaries_alone(
 
     Parameters
     ----------
-    evidence : Evidence
-        With fringes.
-    level_e, powers
-        Of the response that may be beside them, as of `fit_response`.
-    otherwise_px : float
-        Falloff where the harmonics do not tell it; one of `FALLOFFS_PX`.
-    by_axis : bool
-        Boundaries between rows may move by another shift than those between columns: fringes across
-        each tell of it.
+    level_e, powers : of the response that may be beside them, as of `fit_response`
+    otherwise_px : falloff where the harmonics do not tell it; one of `FALLOFFS_PX`
+    by_axis : boundaries between rows may move by another shift than those between columns: fringes
+        across each tell of it
     """
     sums = _sums_by_axis(evidence, level_e, powers)
     if len(sums) < 2 or not by_axis:
@@ -224,12 +210,9 @@ def boundaries_beside(
 
     Parameters
     ----------
-    evidence, level_e, powers
-        As of `boundaries_alone`.
-    falloff_px : float
-        One of `FALLOFFS_PX`.
-    known : (float, float), optional
-        Mean shift by an electron (px) and its variance, as the noise of neighbours has it.
+    evidence, level_e, powers : as of `boundaries_alone`
+    falloff_px : one of `FALLOFFS_PX`
+    known : mean shift by an electron (px) and its variance, as the noise of neighbours has it
     """
     sums = _sums_by_axis(evidence, level_e, powers)
     normal, right = _joint(sums, powers, powers + FALLOFFS_PX.index(falloff_px))

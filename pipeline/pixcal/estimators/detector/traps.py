@@ -62,10 +62,7 @@ class LossFit:
 
     Parameters
     ----------
-    evidence : Evidence
-        With fringes.
-    level_e : float
-        Full scale of the bands of the response, e-.
+    level_e : full scale of the bands of the response, e-
     """
 
     def __init__(self, evidence: Evidence, level_e: float) -> None:
@@ -76,12 +73,9 @@ class LossFit:
 
         Parameters
         ----------
-        lost : callable
-            Charge (t, n), e-, that frames lose, from the parameters and the charge of the frames.
-        start : (p,) float64
-            Parameters, none of them zero: derivatives are taken by a share of each.
-        rounds : int
-            Steps at most.
+        lost : charge (t, n), e-, that frames lose, from the parameters and the charge of the frames
+        start : (p,) parameters, none of them zero: derivatives are taken by a share of each
+        rounds : steps at most
         """
         value = np.array(start, float)
         rests = self._rests(lost, value)
@@ -113,17 +107,13 @@ class LossFit:
     ) -> tuple[FittedLoss | None, FittedLoss | None]:
         """Shares of bands of the level, and traps that fill up, if they explain more.
 
+        Returns None where the share is the same in all bands; where traps explain no more.
+
         Parameters
         ----------
-        banded, trapped : callable
-            As of `fit`: from a share of each band; from these, what traps keep and what they hold.
-        share, full : float
-            That stays on the mean, and of full scale, e-.
-
-        Returns
-        -------
-        bands, traps : FittedLoss or None
-            None where the share is the same in all bands; where traps explain no more.
+        banded, trapped : as of `fit`: from a share of each band; from these, what traps keep and
+            what they hold
+        share, full : that stays on the mean, and of full scale, e-
         """
         even = np.full(len(BANDS), share)
         self.weigh(banded, even)

@@ -176,11 +176,9 @@ class SetDeviations(_Deviations):
 
         Parameters
         ----------
-        samples : (t, y, x) float32
-            e-, as reduced.
-        constant, relative : (y, x) float64
-            What bias and darks that changed with them take off every frame, e-; and by how much the
-            flats did, relative.
+        samples : (t, y, x) e-, as reduced
+        constant, relative : (y, x) what bias and darks that changed with them take off every frame,
+            e-; and by how much the flats did, relative
         """
         found, good = self.found, self.good
         changed = np.take(samples.reshape(len(samples), -1), np.flatnonzero(good), axis=1)

@@ -42,14 +42,11 @@ class TwoWay:
 
     Parameters
     ----------
-    weight : (t, n) float32
-        One over the variance; zero where a sample has no weight.
-    of_time : (k, t) float32
-        The functions of time that a pixel is free to have.
-    of_place : (j, n) float32
-        The functions of place that a frame is free to have.
-    slopes : (t, p, j) float64, optional
-        Shares of the functions of place in each parameter of a frame, where these are fewer.
+    weight : (t, n) one over the variance; zero where a sample has no weight
+    of_time : (k, t) the functions of time that a pixel is free to have
+    of_place : (j, n) the functions of place that a frame is free to have
+    slopes : (t, p, j) shares of the functions of place in each parameter of a frame, where these
+        are fewer
     """
 
     def __init__(self, weight: F32, of_time: F32, of_place: F32, slopes: F64 | None = None) -> None:
@@ -104,10 +101,8 @@ class Freedom(TwoWay):
 
     Parameters
     ----------
-    harmonics : int
-        Highest harmonic of the phase that a pixel is free to have.
-    margin : int
-        Pixels along the edges that are left out.
+    harmonics : highest harmonic of the phase that a pixel is free to have
+    margin : pixels along the edges that are left out
 
     Attributes
     ----------
@@ -180,14 +175,11 @@ def fit_distortions(
 
     Parameters
     ----------
-    distortion : callable
-        From a set, its signal (t, y, x) without distortion and the sizes, what is added to the
-        signal (t, y, x). Derivatives are the changes by sizes of one.
-    margin : int
-        Pixels along the edges that are not used.
-    prior : (float64 array, float64 array), optional
-        Values of the sizes that are known otherwise, and their information (inverse variance; zero
-        of those that are not known).
+    distortion : from a set, its signal (t, y, x) without distortion and the sizes, what is added to
+        the signal (t, y, x). Derivatives are the changes by sizes of one.
+    margin : pixels along the edges that are not used
+    prior : (float64 array, float64 array) values of the sizes that are known otherwise, and their
+        information (inverse variance; zero of those that are not known)
     """
     fits = [_SetFit(fringes, distortion, count, margin) for fringes in sets]
     known, information = (np.zeros(count), np.zeros(count)) if prior is None else prior

@@ -227,12 +227,9 @@ def free_frames(
 
     Parameters
     ----------
-    codes : (t, y, x) uint16 or float32
-        Samples as they are stored, or in electrons.
-    g, dk : (t, 3), (t, 2) float64
-        Start, at the middle of the part.
-    theta, read_variance, shot_factor, good
-        As in `FringeEvidence`.
+    codes : (t, y, x) samples as they are stored, or in electrons
+    g, dk : (t, 3), (t, 2) start, at the middle of the part
+    theta, read_variance, shot_factor, good : as in `FringeEvidence`
     """
     n, used = len(g), np.flatnonzero(good)
     y, x = np.broadcast_arrays(*grid((good.shape[0], good.shape[1])))

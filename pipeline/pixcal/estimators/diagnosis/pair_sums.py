@@ -75,12 +75,10 @@ def taken_by_fit(place: F32, covariance: F64, of_time: F32, good: Mask) -> F64:
 
     Parameters
     ----------
-    place : (j, n) float32
-        Functions of place that a frame is free to have, over the noise of the n good pixels.
-    covariance : (j, j) float64
-        Of their shares in a frame: mean over the frames.
-    of_time : (k, t) float32
-        Orthonormal functions of time that a pixel is free to have.
+    place : (j, n) functions of place that a frame is free to have, over the noise of the n good
+        pixels
+    covariance : (j, j) of their shares in a frame: mean over the frames
+    of_time : (k, t) orthonormal functions of time that a pixel is free to have
     """
     count, shape = of_time.shape[1], good.shape
     size, axes = np.linalg.eigh(covariance)

@@ -108,18 +108,14 @@ def _median_covariance(logs: F64, n_levels: int) -> F64:
 def shared_noise(grams: Sequence[F64], pixels: int) -> F64:
     """One over the number of pixels that are independent of each other, for each length.
 
+    Returns (length,): 1 / ``pixels`` where nothing is shared, 1 where all pixels move as one.
+
     Parameters
     ----------
-    grams : sequence of (difference, difference) float64
-        For each length, sums over pixels of the products of `disjoint_differences`, each pixel in
-        units of its own noise; rows of zeros for differences that are missing.
-    pixels : int
-        How many pixels were summed.
-
-    Returns
-    -------
-    (length,) float64
-        1 / ``pixels`` where nothing is shared, 1 where all pixels move as one.
+    grams : (difference, difference) for each length, sums over pixels of the products of
+        `disjoint_differences`, each pixel in units of its own noise; rows of zeros for differences
+        that are missing
+    pixels : how many pixels were summed
 
     Notes
     -----
@@ -173,16 +169,12 @@ def fit_curve(
 
     Parameters
     ----------
-    lengths : sequence of int
-        Averaging lengths, batches.
-    median, spread : (length,) float64
-        Median over pixels of the estimates (px), and half of the central 68 % of their logarithm.
-    pixels : int
-        Number of pixels; a single one keeps its plain estimate, as `allantools` gives it.
-    shared : (length,) float64
-        From `shared_noise`.
-    white : White
-        Simulated for the same gaps, lengths and noise levels.
+    lengths : averaging lengths, batches
+    median, spread : (length,) median over pixels of the estimates (px), and half of the central 68
+        % of their logarithm
+    pixels : number of pixels; a single one keeps its plain estimate, as `allantools` gives it
+    shared : (length,) from `shared_noise`
+    white : simulated for the same gaps, lengths and noise levels
 
     Notes
     -----

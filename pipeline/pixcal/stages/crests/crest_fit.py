@@ -192,6 +192,8 @@ def cost_map(
 ) -> F64:
     """Cost of equation 7 over distance and baseline, or over distance and their ratio (figure 17).
 
+    Returns (d, s): sum of ``(residual / sigma)²``, priors of the parameters fitted again included.
+
     Parameters
     ----------
     fit : the minimum, whose errors, outliers and priors are taken over; priors of distance and
@@ -200,11 +202,6 @@ def cost_map(
         in the detector's plane
     refit : whether centre, direction and tilt of the baseline are fitted again at each place, as
         the phase always is; else they are those of the minimum
-
-    Returns
-    -------
-    (d, s) float64
-        Sum of ``(residual / sigma)²``, priors of the parameters fitted again included.
     """
     few = _thinned(paths, fit)
     lengths = np.multiply.outer(distance if ratio else np.ones_like(distance), second)

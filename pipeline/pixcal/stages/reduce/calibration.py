@@ -77,14 +77,10 @@ def on_grid(
 
     Parameters
     ----------
-    folder : Place
-        Where the maps are.
-    shape : (int, int)
-        Of the detector's window (y, x).
-    names : sequence of str
-        Of `STATISTICS`.
-    light : float64 array, optional
-        Of each tile, which its response is multiplied by.
+    folder : where the maps are
+    shape : of the detector's window (y, x)
+    names : of `STATISTICS`
+    light : of each tile, which its response is multiplied by
     """
     reader = ArrayReader(folder / "maps")
     stride = int(np.ceil(np.sqrt(shape[0] * shape[1] / _SAMPLES)))
@@ -103,17 +99,7 @@ def on_grid(
 
 
 def usual(job: Measuring, folder: Place, light: F64) -> Usual:
-    """Medians of the maps that `measure` wrote.
-
-    Parameters
-    ----------
-    job : Measuring
-        What they were measured with.
-    folder : Place
-        As of `on_grid`.
-    light : float64 array
-        Of each tile over that of the detector.
-    """
+    """Medians of the maps that `measure` wrote; ``light`` is of each tile over the detector's."""
     names = ("response", "response_error", "dark_rate", "dark_variance", "dark_dof", "bias")
     response, error, rate, variance, dof, bias = on_grid(folder, job.shape, names, light)
     freedom = int(np.median(dof))
@@ -159,11 +145,8 @@ def calibration_writers(folder: Place, shape: tuple[int, int]) -> dict[str, Arra
 def finish(job: Finishing, strip: Strip) -> F64:
     """Write the calibration maps of `STRIP` columns.
 
-    Returns
-    -------
-    (column, 4) float64
-        Over the good pixels: least and largest flat, largest bias (ADU) and dark signal (e-/s);
-        infinite of the other sign when there is none.
+    Returns (column, 4) over the good pixels: least and largest flat, largest bias (ADU) and dark
+    signal (e-/s); infinite of the other sign when there is none.
     """
     rows, columns = span(job.shape, strip)
     block = ArrayReader(job.statistics / "maps").read((0, len(STATISTICS)), rows, columns)

@@ -74,12 +74,8 @@ def strip_width(readers: Iterable[Reader], need: Callable[[int], int], runtime: 
 
     Parameters
     ----------
-    readers : iterable of Reader
-        Of the frames. Cubes at URLs are read column by column, ahead of time.
-    need : callable
-        Bytes of a task, given the number of columns.
-    runtime : Runtime
-        How to run.
+    readers : of the frames. Cubes at URLs are read column by column, ahead of time.
+    need : bytes of a task, given the number of columns
     """
     width = 1
     for reader in readers:
@@ -116,18 +112,12 @@ def run_noted(
 
     Parameters
     ----------
-    made : Workspace
-        Whose journal to use.
-    task : callable
-        Given the strips to read one after the other. All that it leaves is written when it returns.
-    todo : sequence of (int, int)
-        Columns.
-    width : int
-        Columns to read at a time, from `strip_width`.
-    runtime : Runtime
-        How to run.
-    label : str
-        Name of the task in the journal, and for the progress.
+    made : whose journal to use
+    task : given the strips to read one after the other. All that it leaves is written when it
+        returns.
+    todo : columns
+    width : columns to read at a time, from `strip_width`
+    label : name of the task in the journal, and for the progress
     """
     journal = made.journal()
     # Those whose maps share a chunk are noted together.

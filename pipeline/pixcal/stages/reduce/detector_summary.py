@@ -60,13 +60,7 @@ class Summary:
     linearity: Linearity | None  # of the usable rungs
 
     def gain_to_use(self, choice: str) -> float:
-        """Gain (e-/ADU), ``declared`` or ``measured``.
-
-        Raises
-        ------
-        InputError
-            If it is to be the measured one and there is none.
-        """
+        """Gain (e-/ADU), ``declared`` or ``measured``; InputError if there is no measured one."""
         if choice == "declared":
             return self.declared.gain_e_per_adu
         if self.gain is None:
@@ -103,22 +97,7 @@ class Summary:
 
 
 def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
-    """Put the statistics of all columns together.
-
-    Parameters
-    ----------
-    job : Measuring
-        What they were measured with.
-    folder : Place
-        Where they are.
-    declared : Detector
-        What its owner says.
-
-    Raises
-    ------
-    InputError
-        If the flats hold no light.
-    """
+    """Put the statistics of all columns together; InputError if the flats hold no light."""
     tables = ArrayReader(folder / "levels").read()
     levels, usable = _rungs(tables, job)
     sums = pair_sums(folder, job)

@@ -14,11 +14,8 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
 
     Parameters
     ----------
-    summary : Summary
-    gain : float
-        That is used (e-/ADU).
-    saturation : float or None
-        Where flats were found to saturate (ADU), if it was not declared.
+    gain : that is used (e-/ADU)
+    saturation : where flats were found to saturate (ADU), if it was not declared
     """
     found = []
     if saturation is not None:

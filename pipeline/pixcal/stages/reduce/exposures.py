@@ -51,13 +51,7 @@ class Exposures:
 
 
 def group_exposures(tables: Mapping[str, Mapping[str, Sequence[Any]]]) -> Exposures:
-    """Group frames by exposure time.
-
-    Parameters
-    ----------
-    tables : mapping
-        Contents of ``RUN/ingest/frames.json``.
-    """
+    """Group frames of ``RUN/ingest/frames.json`` by exposure time."""
     times = {name: list(table["exptime_s"]) for name, table in tables.items()}
     lit = [name for name in times if name not in ("bias", "dark")]
     exposed = [t for name in ["dark", *lit] for t in times.get(name, [])]

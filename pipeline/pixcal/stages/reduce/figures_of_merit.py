@@ -45,21 +45,8 @@ def characterise(
 ) -> Json:
     """Figures of merit, by name; their curves go to ``figures_of_merit.json``.
 
-    Parameters
-    ----------
-    made : Build
-        With ``calibration.zarr`` and the statistics of the frames.
-    source : Ingested
-    job : Measuring
-    summary : Summary
-    facts : dict
-        What ``reduce.json`` says so far.
-    runtime : Runtime
-
-    Returns
-    -------
-    dict
-        For each figure ``title``, ``unit``, ``value``, ``error`` (null where unknown), ``note``.
+    Each has ``title``, ``unit``, ``value``, ``error`` (null where unknown) and ``note``. ``facts``:
+    what ``reduce.json`` says so far.
     """
     gain = _gain(facts)
     dark, lit = pair_sums(made.scratch / "statistics", job)

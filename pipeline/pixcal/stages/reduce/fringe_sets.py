@@ -50,29 +50,10 @@ def write_set(
     share: float,
     runtime: Runtime,
 ) -> dict[str, Any]:
-    """Write the dataset of a fringe set.
+    """Write the dataset of a fringe set; returns what ``reduce.json`` says of it.
 
-    Parameters
-    ----------
-    made : Workspace
-        With ``calibration.zarr``, and scratch for the counts.
-    source : Ingested
-        With the raw frames.
-    name : str
-        Of the array, ``fringes/<set>``.
-    gain : float
-        To use (e-/ADU).
-    bounds : Bounds
-        Extremes of the calibration.
-    share : float
-        Of the variance that the stored precision may cost.
-    runtime : Runtime
-        How to run.
-
-    Returns
-    -------
-    dict
-        What ``reduce.json`` says of the set.
+    ``name``: of the array, ``fringes/<set>``; ``gain``: e-/ADU; ``share``: of the variance that the
+    stored precision may cost.
     """
     fringes = FringeSet(
         name=name.partition("/")[2],
@@ -160,18 +141,10 @@ def share_at_mean(found: dict[str, Any], bounds: Bounds) -> float | None:
 
 
 def set_warnings(name: str, found: dict[str, Any], declared: bool, share: float) -> list[str]:
-    """Sentences on what is odd about a set.
+    """What to say of a fringe set, as `write_set` returns it.
 
-    Parameters
-    ----------
-    name : str
-        Of the set.
-    found : dict
-        As `write_set` returns it.
-    declared : bool
-        Whether the saturation level is.
-    share : float
-        Of the variance that the stored precision may cost.
+    ``declared``: whether the saturation level is; ``share``: of the variance that the stored
+    precision may cost.
     """
     warnings = []
     cost = found["quantisation"]["share_of_variance_dark"]

@@ -106,10 +106,7 @@ class Ingested:
     def arrays(self) -> Mapping[str, Reader]:
         """A reader of each array, without frames that were cut off.
 
-        Raises
-        ------
-        InputError
-            If the files are not there any more.
+        Raises InputError if the files are not there any more.
         """
         return {
             name: reader
@@ -151,13 +148,7 @@ class Ingested:
 
     @cached_property
     def shape(self) -> tuple[int, int]:
-        """Size (y, x) of the frames.
-
-        Raises
-        ------
-        InputError
-            If arrays have frames of different sizes.
-        """
+        """Size (y, x) of the frames; InputError if arrays have frames of different sizes."""
         shapes = {name: (a.shape[1], a.shape[2]) for name, a in self.arrays.items()}
         first, (ny, nx) = next(iter(shapes.items()))
         for name, shape in shapes.items():

@@ -59,24 +59,8 @@ Config = Reduce
 def run(run_dir: Path, config: Config, runtime: Runtime) -> Manifest:
     """Make ``RUN/reduce`` from ``RUN/ingest``, unless it is up to date.
 
-    Parameters
-    ----------
-    run_dir : Path
-        The run directory.
-    config : Config
-        Options.
-    runtime : Runtime
-        How to run.
-
-    Returns
-    -------
-    Manifest
-        Its ``summary`` holds the gain, the counts of flags and the ``warnings``.
-
-    Raises
-    ------
-    InputError
-        If the frames have not been ingested, or the gain is to be measured and cannot be.
+    The ``summary`` of its manifest holds gain, counts of flags and ``warnings``. Raises InputError
+    if the gain is to be measured and cannot be.
     """
     with working(run_dir, "ingest") as inputs:
         base = chosen_base(config.cubes, run_dir, run_dir / "ingest")
@@ -109,13 +93,7 @@ class Reduction:
 
 
 def reduce_frames(made: Workspace, source: Ingested, config: Config, runtime: Runtime) -> Reduction:
-    """Write ``calibration.zarr`` and ``reduced.zarr``.
-
-    Raises
-    ------
-    InputError
-        If the gain is to be measured and cannot be.
-    """
+    """Write ``calibration.zarr`` and ``reduced.zarr``; InputError if the gain cannot be told."""
     if config.gain == "measured" and len(source.tables.get("flat", {}).get("file", ())) < 2:
         raise InputError(
             "gain: 'measured' needs two flat frames or more; list them under frames.flat of "
