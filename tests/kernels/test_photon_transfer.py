@@ -297,3 +297,21 @@ def test_a_second_amplifier_for_bright_pixels_leaves_the_gain(above: float, leve
         pulls.append((fitted.gain - GAIN) / fitted.error)
     assert np.std(pulls) < 1.3
     assert abs(np.mean(pulls)) < 4 / np.sqrt(len(pulls))
+
+
+@pytest.mark.parametrize("seed", [21, 22, 23])
+def test_amplifiers_of_different_gain_are_in_the_error_of_the_gain(seed: int) -> None:
+    """Their points lie on two curves; the gain is that between them."""
+    rng = np.random.default_rng(seed)
+    apart = np.repeat([0.97, 1.03], 256).astype(np.float32)
+    sums = np.zeros((N_BINS, 3))
+    for level in np.linspace(500, 40_000, 9):
+        first, second = (apart * frame(rng, np.full((512, 512), level)) for _ in range(2))
+        blocks = pair_statistics(first, second, gain=1.5, read_noise=3.0, quantum=1.0)
+        sums += bin_pairs(blocks)[:, :3]
+    variance = READ_ADU**2 + 1 / 12
+    fitted = fit_gain(sums, (variance, 0.01 * variance), np.inf)
+    assert fitted is not None
+    assert fitted.chi2_reduced > 10
+    assert fitted.gain == pytest.approx(GAIN, abs=3 * fitted.error)
+    assert fitted.error < 0.02 * GAIN

@@ -57,6 +57,8 @@ class Summary:
     # converter does not saturate
     usable: Mask
     full: Mask
+    transfer: F64  # (point, 3) photon-transfer curve: see `emva.transfer_points`
+    well: Measure | None  # level of its maximum (ADU above bias), if the flats go beyond
     linearity: Linearity | None  # of the usable rungs
 
     def gain_to_use(self, choice: str) -> float:
@@ -102,7 +104,7 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
     levels, usable = _rungs(tables, job)
     sums = pair_sums(folder, job)
     # Pixels that are full saturate the flats though no sample of the converter does.
-    points = transfer_points(sums[1])
+    points = transfer_points(add_neighbours(sums[1], sums[0])[0])
     well = saturation(points)
     full = usable & (levels > (sum(well) if well else math.inf))
     usable &= ~full
@@ -135,7 +137,7 @@ def summarise(job: Measuring, folder: Place, declared: Detector) -> Summary:
         noise, own = of_variance(gain.read_variance, job.quantum)
     return Summary(
         declared, job.quantum or 1.0, medians, light, noise, own, gain, levels, usable, full,
-        straight,
+        points, well, straight,
     )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from pixcal.kernels.gain_fit import GainFit
 from pixcal.kernels.photon_transfer import SHARED
 from pixcal.stages.reduce.detector_summary import Summary
 
-_NO_LINE = 10.0  # reduced chi-square of a photon-transfer curve that is no line
+_ROUGH = 10.0  # reduced chi-square of a photon-transfer curve that is not smooth
 _LINEARITY = 0.02
 _OF_STEP = 0.1  # relative distance of a gain declared for a step of the converter
 
@@ -27,10 +27,10 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
     if summary.gain is not None:
         found += _of_gain(summary.gain, summary, gain)
     if summary.full.any():
-        levels = summary.levels[summary.full]
+        assert summary.well is not None
         found.append(
-            f"flats from {levels.min():.0f} ADU above bias on fill the wells: {len(levels)} of "
-            f"{len(summary.levels)} levels are left out of gain and linearity"
+            f"the wells are full at {summary.well[0]:.0f} ADU above bias: {summary.full.sum()} of "
+            f"{len(summary.levels)} levels of flats are brighter and left out of gain and linearity"
         )
     if summary.linearity is not None and summary.linearity.max_deviation > _LINEARITY:
         found.append(
@@ -53,12 +53,12 @@ def detector_warnings(summary: Summary, gain: float, saturation: float | None) -
 
 def _of_gain(fit: GainFit, summary: Summary, used: float) -> list[str]:
     found, declared, step = [], summary.declared.gain_e_per_adu, summary.step
-    if fit.chi2_reduced > _NO_LINE:
+    if fit.chi2_reduced > _ROUGH:
         found.append(
-            "the photon-transfer curve is not a straight line (reduced chi-square "
-            f"{fit.chi2_reduced:.3g}): do not rely on the measured gain; possible causes: a "
-            "nonlinear response, amplifiers of different gain, a lamp that flickers, or charge "
-            "shared by neighbours"
+            "the points of the photon-transfer curve are farther off a smooth curve than their "
+            f"noise (reduced chi-square {fit.chi2_reduced:.3g}); the error of the gain, "
+            f"{100 * fit.error / fit.gain:.2g} %, includes it; possible causes: amplifiers of "
+            "different gain, codes that are missing, or a lamp that flickers"
         )
     if fit.step:
         found.append(

@@ -18,14 +18,11 @@ from pixcal.estimators.detector.emva import (
     dark_slope,
     dynamic_range,
     nonuniformity,
-    saturation,
     spectrogram,
-    transfer_points,
     without_gaps,
     without_trend,
 )
 from pixcal.estimators.detector.pair_noise import shared_by_lines
-from pixcal.kernels.photon_transfer import add_neighbours
 from pixcal.model.arrays import F64, Mask
 from pixcal.stages.reduce.detector_summary import Summary, pair_sums
 from pixcal.stages.reduce.frame_statistics import Measuring
@@ -49,10 +46,9 @@ def characterise(
     what ``reduce.json`` says so far.
     """
     gain = _gain(facts)
-    dark, lit = pair_sums(made.scratch / "statistics", job)
-    points = transfer_points(add_neighbours(lit, dark)[0])
+    dark, _ = pair_sums(made.scratch / "statistics", job)
     clipped = (source.detector.saturation_adu or source.saturation_found) is not None
-    top, reached = _top(points, summary, job, clipped)
+    top, reached = _top(summary, job, clipped)
     top = top if job.dark else None  # levels above an unknown bias say nothing
     middle = middle_of(source.shape)
     halves = read_halves(made, source, summary, top, middle, runtime)
@@ -65,7 +61,7 @@ def characterise(
     if facts["linearity"] is not None:
         departure = facts["linearity"]["max_deviation_percent"], _lamp_error(source)
         found["linearity_error"] = _figure("linearity error, largest", "%", departure)
-    curves: Json = {"photon_transfer": _listed(points.T, ("level", "variance", "error"))}
+    curves: Json = {"photon_transfer": _listed(summary.transfer.T, ("level", "variance", "error"))}
     curves["photon_transfer"] |= {"gain": gain[0], "read_variance": (noise or (0.0,))[0] ** 2}
     if halves.dark is not None:
         electrons = halves.dark * gain[0]
@@ -138,14 +134,12 @@ def _lamp_error(source: Ingested) -> float | None:
     return 100 * math.sqrt(float(np.mean(ratios))) if ratios else None
 
 
-def _top(
-    points: F64, summary: Summary, job: Measuring, clipped: bool
-) -> tuple[Measure | None, bool]:
+def _top(summary: Summary, job: Measuring, clipped: bool) -> tuple[Measure | None, bool]:
     """Saturation above bias (ADU) with its error, or the highest level, and whether it is one.
 
     ``clipped`` tells whether samples end at a code, and not the wells.
     """
-    peak, end = saturation(points), job.saturation - summary.usual.bias
+    peak, end = summary.well, job.saturation - summary.usual.bias
     if peak is not None and (not clipped or peak[0] + 2 * peak[1] < _WELL * end):
         return peak, True
     if not len(summary.levels) or not summary.usable.any():
