@@ -242,8 +242,10 @@ class BiasDrift(Effect):
             "walk_e_h": walk * per_hour,
         }
         errors = {
-            "jitter_rms": jitter_error, "ramp_e_h": slope_error, "walk_e_h": walk_error * per_hour
-        }  # fmt: skip
+            "jitter_rms": jitter_error,
+            "ramp_e_h": slope_error,
+            "walk_e_h": walk_error * per_hour,
+        }
         values["settle_e"] = 0.0
         if best:
             own = float(np.sqrt(found.shape_covariance((1,))[1, 1]))

@@ -91,7 +91,7 @@ class GhostFringes(Effect):
     )
     beat_rad_px: tuple[float, float] = quantity(
         (0.35, 0.2), unit="rad/px", low=-np.pi, high=np.pi, doc="beat vector along x and y"
-    )  # fmt: skip
+    )
     phase_rad: float = quantity(
         0.0,
         unit="rad",
@@ -142,9 +142,10 @@ class GhostFringes(Effect):
         mean, fringe = self._factors(name, rows, columns)
         z = (light.alpha_cos + 1j * light.alpha_sin) * fringe
         return LightMaps(
-            light.iota * mean.astype(np.float32), z.imag.astype(np.float32),
+            light.iota * mean.astype(np.float32),
+            z.imag.astype(np.float32),
             z.real.astype(np.float32),
-        )  # fmt: skip
+        )
 
     def predict(self, maps: FringeMaps) -> FringeMaps:
         return self._times(maps, 1)
@@ -178,8 +179,10 @@ class GhostFringes(Effect):
         errors: dict[str, float] = {}
         for n, one in enumerate(found.waves):
             waves.append(_wave(one, middle))
-            for key, error in (("static", one.errors[0]), ("forward", one.errors[1]),
-                               ("backward", one.errors[2])):  # fmt: skip
+            for key, error in (
+                ("static", one.errors[0]),
+                ("forward", one.errors[1])("backward", one.errors[2]),
+            ):
                 errors |= {f"waves[{n}].{key}[{part}]": error for part in (0, 1)}
             errors |= {f"waves[{n}].beat_rad_px[{axis}]": one.errors[3 + axis] for axis in (0, 1)}
         law, tied, left = _law(found.waves, middle)
@@ -206,8 +209,10 @@ def _wave(found: WaveFit, middle: tuple[float, float]) -> GhostWave:
     return GhostWave(
         (float(np.clip(qx, -np.pi, np.pi)), float(np.clip(qy, -np.pi, np.pi))),
         found.set,
-        _pair(static.conjugate()), _pair(forward), _pair(backward),
-    )  # fmt: skip
+        _pair(static.conjugate()),
+        _pair(forward),
+        _pair(backward),
+    )
 
 
 def _pair(value: complex) -> tuple[float, float]:

@@ -57,9 +57,11 @@ class IntensityNoise(Effect):
         (), low=0, high=0.9, doc="share of the light of each set that does not follow the laser"
     )
     separate: float = quantity(
-        0.0, low=0, high=0.1, doc="relative rms of the contrast, white, if the powers of the two "
-        "fibres vary separately"
-    )  # fmt: skip
+        0.0,
+        low=0,
+        high=0.1,
+        doc="relative rms of the contrast, white, if the powers of the two fibres vary separately",
+    )
     tracks: tuple[Track, ...] = quantity(
         (), doc="measured relative change of each frame, by fringe set"
     )

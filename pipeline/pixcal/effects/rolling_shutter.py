@@ -204,14 +204,16 @@ class RollingShutter(Effect):
         law = "phase error of the rows in proportion to the phase step, with any profile"
         settling = Estimate(
             cls(
-                0.0, settling=tuple(float(v) for v in np.clip(settled.share, -1, 1)),
-                of_step="last" if settled.way < 0 else "next", origin_rad=settled.origin_rad,
+                0.0,
+                settling=tuple(float(v) for v in np.clip(settled.share, -1, 1)),
+                of_step="last" if settled.way < 0 else "next",
+                origin_rad=settled.origin_rad,
             ),
             {f"settling[{n}]": float(e) for n, e in enumerate(settled.error)},
             settled.significance,
             f"the phase of the rows depends on the step {which} frame",
             law=law,
-        )  # fmt: skip
+        )
         mixed = cls._mixed(sets) if sets else settling
         return max(mixed, settling, key=lambda e: e.significance)
 

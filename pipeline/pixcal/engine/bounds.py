@@ -27,10 +27,8 @@ class Bound:
 
     @contextmanager
     def kept(self) -> Iterator[None]:
-        """Context whose work is ended by `Exceeded` once it uses more.
-
-        That shows between two steps of the interpreter: a compiled kernel still comes to its end.
-        """
+        """Context whose work is ended by `Exceeded` once it uses more."""
+        # That shows between two steps of the interpreter: a compiled kernel still comes to its end.
         thread, done, lock = threading.get_ident(), threading.Event(), threading.Lock()
         clock = time.pthread_getcpuclockid(thread)
         last = time.clock_gettime(clock) + self.seconds

@@ -138,10 +138,8 @@ def _announce(dashboard: str, quiet: bool) -> None:
 
 @contextmanager
 def _witness(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
-    """A file in the run directory, while it is worked on: who does not see it has another disk.
-
-    A directory of the same name on the worker's own disk would do for all other checks.
-    """
+    """A file in the run directory, while it is worked on: who does not see it has another disk."""
+    # A directory of the same name on the worker's own disk would do for all other checks.
     ups = (up for path in paths for up in path.parents)
     runs = (up for up in ups if all((up / name).exists() for name in HELD))
     run = next(runs, None)

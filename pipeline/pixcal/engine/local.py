@@ -41,10 +41,7 @@ def run_in_threads(
 def run_in_processes(
     function: Callable[[Any], Any], items: Sequence[Any], workers: int, ended: Ended
 ) -> None:
-    """Do the tasks in processes; those that a killed one had in hand are done again.
-
-    Raises ClusterError if processes die again and again at the same tasks.
-    """
+    """Do the tasks in processes, again if one is killed; ClusterError if that goes on and on."""
     packed = pack(function)
     job = Job(packed.data, packed.paths)
     left = dict(enumerate(items))

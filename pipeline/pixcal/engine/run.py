@@ -72,11 +72,9 @@ class Runtime(Running):
 
 
 def one_blas_thread() -> AbstractContextManager[Any]:
-    """Context in which BLAS does not start threads of its own.
-
-    Tasks already fill the cores; and the last bits of a product must not depend on how many
-    threads shared it.
-    """
+    """Context in which BLAS does not start threads of its own."""
+    # Tasks already fill the cores; and the last bits of a product must not depend on how many
+    # threads shared it.
     limits: AbstractContextManager[Any] = _libraries(len(sys.modules)).limit(
         limits=1, user_api="blas"
     )

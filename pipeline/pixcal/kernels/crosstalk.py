@@ -144,11 +144,9 @@ def uncouple_fringes(
 
 
 def _inverse(data: F64, forward: Callable[[F64], F64]) -> F64:
-    """By fixed point: what is left over is given back.
-
-    Each step shrinks the rest by the shares that leave a pixel: for a tenth, some 15 steps to the
-    last digit.
-    """
+    """By fixed point: what is left over is given back."""
+    # Each step shrinks the rest by the shares that leave a pixel: for a tenth, some 15 steps to the
+    # last digit.
     found = data.copy()
     size = float(np.max(np.abs(data), initial=0.0))
     for _ in range(STEPS):

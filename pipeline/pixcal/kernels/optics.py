@@ -80,10 +80,8 @@ def paraxial_vector(geometry: Geometry) -> tuple[float, float]:
 
 
 def paraxial_phase(x: ArrayLike, y: ArrayLike, geometry: Geometry) -> F64:
-    """Phase of straight fringes (paper, eq. 4), zero at the foot of the fibres' centre.
-
-    As `phase`; the tilt of the baseline is left out, as in the paper.
-    """
+    """Phase of straight fringes (paper, eq. 4), zero at the foot of the fibres' centre."""
+    # As `phase`; the tilt of the baseline is left out, as in the paper.
     kx, ky = paraxial_vector(geometry)
     xs, ys = np.asarray(x, float), np.asarray(y, float)
     result: F64 = kx * (xs - geometry.centre_x / geometry.pitch) + ky * (

@@ -32,11 +32,9 @@ class Scale:
 
 
 def choose_scale(low: float, high: float, smallest_variance: float, share: float) -> Scale:
-    """Coarsest step that covers a range (e-) and adds less than a share of the variance (e-²).
-
-    Steps are powers of two where one will do, so that integers stay what they were, and offsets
-    whole steps. Where the range needs a coarser step than the noise allows, the range wins.
-    """
+    """Coarsest step that covers a range (e-) and adds less than a share of the variance (e-²)."""
+    # Steps are powers of two where one will do, so that integers stay what they were, and offsets
+    # whole steps. Where the range needs a coarser step than the noise allows, the range wins.
     span = max(high - low, 1e-6)
     # Two codes in reserve: the offset is rounded down, the ends are rounded.
     needed = span / (FILL - 3)

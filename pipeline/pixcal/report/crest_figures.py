@@ -86,10 +86,8 @@ def crest_figure(view: CrestView) -> Figure:
 
 
 def outermost(k: I64) -> tuple[I64, I64]:
-    """Numbers of the paths to show, of the first and of the last.
-
-    Paths through a corner of a turned frame are too short to show their shape.
-    """
+    """Numbers of the paths to show, of the first and of the last."""
+    # Paths through a corner of a turned frame are too short to show their shape.
     paths, number = np.unique(k, return_counts=True)
     long = paths[number >= 0.5 * number.max()]
     shown = min(4, max(1, len(long) // 2))  # paper, figure 16

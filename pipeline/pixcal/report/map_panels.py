@@ -201,10 +201,8 @@ def folded(frequency: F64) -> F64:
 
 
 def flags(masks: Mapping[str, FlagSummary]) -> tuple[list[Panel], Legend]:
-    """Maps of flags; those that are the same are drawn once.
-
-    Pixel by pixel each flag has its colour; of larger maps the share of masked pixels is shown.
-    """
+    """Maps of flags; those that are the same are drawn once."""
+    # Pixel by pixel each flag has its colour; of larger maps the share of masked pixels is shown.
     most = 100 * max(float(s.share.max()) for s in masks.values()) or 1.0
     merged: dict[tuple[bytes, tuple[int, ...]], tuple[list[str], FlagSummary]] = {}
     for title, summary in masks.items():

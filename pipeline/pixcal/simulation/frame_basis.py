@@ -36,8 +36,10 @@ class FrameBasis:
         self.every = every
         self._made: dict[tuple[Strength, float | None], list[F64]] = {}
         self._number = {id(w.series): n for n, w in enumerate(every)}
-        own = {steady: [v for s in strengths if s.steady == steady for v in self._extremes(s)]
-               for steady in (False, True)}  # fmt: skip
+        own = {
+            steady: [v for s in strengths if s.steady == steady for v in self._extremes(s)]
+            for steady in (False, True)
+        }
         roots = [np.diag(np.diag(w.series.noise) ** -0.5) for w in every]
 
         def whole(values: Sequence[F64], steady: bool) -> F64:

@@ -172,9 +172,11 @@ class FrameChanges:
         """Series of the kinds that a model changes when it is strong."""
         strong = _heard(start)
         return [
-            w for every in self._every if any(v.changes(strong, 1).any() for v in every)
+            w
+            for every in self._every
+            if any(v.changes(strong, 1).any() for v in every)
             for w in every
-        ]  # fmt: skip
+        ]
 
     def line(self, of: Strength) -> Line | None:
         """The strongest line of the series that a strength changes."""

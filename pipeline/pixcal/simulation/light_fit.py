@@ -133,9 +133,10 @@ class _Lit:
             shared,
             gauge_terms(found),
             LightMaps(*(np.pad(m, ((0, 0), (x0, 0)), "edge").astype(np.float32) for m in plain)),
-            DetectorMaps(nothing, nothing, one, nothing, nothing, nothing, one,
-                         nothing.astype(np.uint8)),
-        )  # fmt: skip
+            DetectorMaps(
+                nothing, nothing, one, nothing, nothing, nothing, one, nothing.astype(np.uint8)
+            ),
+        )
 
     def change(self, model: ForwardModel) -> F64:
         """What a model does to the maps (3, y, x)."""

@@ -78,10 +78,8 @@ def score(kind: type[ForwardModel], evidence: Evidence) -> Scored | None:
 def score_again(
     model: ForwardModel, way: Way, evidence: Evidence, template: Template | None = None
 ) -> float:
-    """Significance of an effect in other frames, with the parameters that it has.
-
-    Its template is made anew where it is not of these pixels.
-    """
+    """Significance of an effect in other frames, with the parameters that it has."""
+    # Its template is made anew where it is not of these pixels.
     changes = _changes(evidence)
     fit = _Fit(changes, way, ())
     if template is None or not changes.fits(template):

@@ -96,11 +96,9 @@ class Build:
         discard(self.folder, self.folder.parents[1])
 
     def journal(self) -> set[str]:
-        """Steps noted as done by an earlier, interrupted build.
-
-        Only those of this run of the machine: after a power failure nobody knows what reached the
-        disk.
-        """
+        """Steps noted as done by an earlier, interrupted build."""
+        # Only those of this run of the machine: after a power failure nobody knows what reached the
+        # disk.
         path = self.folder / JOURNAL
         if not path.exists():
             return set()
@@ -198,10 +196,8 @@ _later: ContextVar[bool] = ContextVar("_later", default=False)
 
 @contextmanager
 def unflushed() -> Iterator[None]:
-    """Complete artefacts before they are on the disk; `settle_flush` ends that for each.
-
-    The disk goes on with one while the next is being made.
-    """
+    """Complete artefacts before they are on the disk; `settle_flush` ends that for each."""
+    # The disk goes on with one while the next is being made.
     token = _later.set(True)
     try:
         yield

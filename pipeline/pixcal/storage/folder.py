@@ -70,10 +70,7 @@ class LocalFolder:
                 writeback.begin(file)
 
     def ends(self, names: Sequence[str]) -> Iterator[tuple[int, bytes]]:
-        """Size and last four bytes (fewer, if there are no more) of each file.
-
-        Raises OSError with the ``filename``, if one is not there.
-        """
+        """Size and last four bytes (or fewer) of each file; OSError with ``filename``."""
         for name in names:
             with (self.path / name).open("rb") as handle:
                 size = os.fstat(handle.fileno()).st_size

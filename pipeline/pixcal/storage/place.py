@@ -44,10 +44,8 @@ class UrlPath:
         return UrlPath(self.url.rpartition("/")[0])
 
     def filesystem(self) -> tuple[Any, str]:
-        """File system of fsspec that the URL belongs to, and its path there.
-
-        fsspec keeps its file systems, one for each thread and process that asks.
-        """
+        """File system of fsspec that the URL belongs to, and its path there."""
+        # fsspec keeps its file systems, one for each thread and process that asks.
         from fsspec.core import url_to_fs  # here: cubes of this machine do without
 
         with explained(self.url):

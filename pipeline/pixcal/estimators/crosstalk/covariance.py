@@ -227,10 +227,8 @@ def _add_normal_sums(w0: F32, w1: F32, w2: F32, w3: F32, w4: F32, links: Any, no
 
 
 def _variance(part: Residuals) -> tuple[F64, F64]:
-    """Sums of the variance of single pixels against shot noise, a constant and its square.
-
-    The modes' own squares are what the residuals were robbed of.
-    """
+    """Sums of the variance of single pixels against shot noise, a constant and its square."""
+    # The modes' own squares are what the residuals were robbed of.
     terms = np.stack([part.shot * part.one, part.one**2, part.shot**2]).reshape(3, -1)
     some = terms.reshape(3, *part.one.shape)[:, ::STRIDE].reshape(3, -1)
     robbed = (part.modes**2).sum(axis=0).ravel()

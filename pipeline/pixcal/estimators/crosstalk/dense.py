@@ -82,8 +82,9 @@ class CouplingFrames:
         """
         every = tuple(
             coupling_of(classes, *divmod(u, 2), step)
-            for step in self.steps for u in range(2 * classes.count)
-        )  # fmt: skip
+            for step in self.steps
+            for u in range(2 * classes.count)
+        )
         if len(every) > MAX_SHARES:
             return None
         shrinkage = ShareShrinkage.of(self.steps, classes.count)

@@ -85,10 +85,8 @@ class MeasuredLinks:
             yield classes, Information(normal, right)
 
     def of_period(self, classes: PixelClasses) -> Information:
-        """All links for one period, hot pixels taken at their word where they agree.
-
-        A hot pixel that is alone in its class counts where the noise says the same.
-        """
+        """All links for one period, hot pixels taken at their word where they agree."""
+        # A hot pixel that is alone in its class counts where the noise says the same.
         normal, right = self._of_noise(*(sums_of(sums, classes) for sums in self._sums))
         if self.hot is not None:
             shown = self.hot.by_class(classes, self.links)

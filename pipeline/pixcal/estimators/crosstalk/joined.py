@@ -74,10 +74,8 @@ def measure(evidence: Evidence) -> Kernel | None:
 
 
 def _level(frames: CouplingFrames, dense: Dense, found: Choice) -> tuple[float, float]:
-    """By how much (1/ke-) shares fall with the signal, zero if they may not, and its error.
-
-    Shares that rise may be brighter-fatter; those that fall cannot.
-    """
+    """By how much (1/ke-) shares fall with the signal, zero if they may not, and its error."""
+    # Shares that rise may be brighter-fatter; those that fall cannot.
     per_ke, error = 0.0, np.inf
     if frames.hot is None:
         return per_ke, error
@@ -121,11 +119,9 @@ def _told(dense: Dense, about: Kernel) -> Kernel:
 
 
 def _plain(dense: Dense) -> tuple[F64, list[Coupling]]:
-    """Basis (share, number) of the significant couplings of a kernel, and these couplings.
-
-    Where noise alone tells, it tells the sum of the shares there and back: a pair of pixels whose
-    sum is significant has both, even if neither is by itself.
-    """
+    """Basis (share, number) of the significant couplings of a kernel, and these couplings."""
+    # Where noise alone tells, it tells the sum of the shares there and back: a pair of pixels whose
+    # sum is significant has both, even if neither is by itself.
     columns: list[F64] = []
     couplings: list[Coupling] = []
     steps = dict.fromkeys((c.dy, c.dx) for c in dense.couplings)

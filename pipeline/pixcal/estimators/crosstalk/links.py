@@ -80,10 +80,8 @@ def periods(shape: Place, longest: int = MAX_PERIOD) -> list[Place]:
 
 
 def class_sums(values: F64, first: Place) -> Iterator[tuple[PixelClasses, F64]]:
-    """Sums (..., class) of maps (..., y, x) over the pixels of each class, for every period.
-
-    Rows first, then columns of those sums: the cost is that of the row periods.
-    """
+    """Sums (..., class) of maps (..., y, x) over the pixels of each class, for every period."""
+    # Rows first, then columns of those sums: the cost is that of the row periods.
     wanted = periods((values.shape[-2], values.shape[-1]))
     by_rows: dict[int, F64] = {}
     for n in sorted({n for n, _ in wanted}, reverse=True):

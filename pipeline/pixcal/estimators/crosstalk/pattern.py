@@ -150,10 +150,12 @@ def _offsets(found: Sequence[_Pattern], gram: F64) -> tuple[F64, F64]:
     ]
     normal = sum(
         weight[a, b] * slopes[a] @ gram @ slopes[b].T
-        for a in range(len(found)) for b in range(len(found))
-    )  # fmt: skip
+        for a in range(len(found))
+        for b in range(len(found))
+    )
     right = sum(
         weight[a, b] * slopes[a] @ found[b].delta
-        for a in range(len(found)) for b in range(len(found))
-    )  # fmt: skip
+        for a in range(len(found))
+        for b in range(len(found))
+    )
     return np.asarray(normal), np.asarray(right)

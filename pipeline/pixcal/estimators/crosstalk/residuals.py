@@ -89,10 +89,9 @@ def _of_stack(stack: Stack, evidence: Evidence, known: Sequence[Coupling], kept:
 
 
 def _of_fringes(found: FringeEvidence, known: Sequence[Coupling], kept: F32) -> Residuals:
-    """Fringe frames less the fit, as they were before they were divided by the flat.
-
-    A curved response makes second and third harmonics of the fringes, not the same for all pixels.
-    """
+    """Fringe frames less the fit, as they were before they were divided by the flat."""
+    # A curved response makes second and third harmonics of the fringes, not the same for all
+    # pixels.
     at = _spread(len(found.g), found.good.size)
     flat = 1 / found.shot_factor
     theta = filled(np.where(found.good, found.theta, np.nan) * flat, found.k)

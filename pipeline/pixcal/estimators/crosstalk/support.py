@@ -94,10 +94,8 @@ def _period(
 
 
 def _directions(classes: PixelClasses) -> F64:
-    """Numbers that shares may be made of, (u, direction): each has some shares alike.
-
-    There, back and both, of each class of every period that divides the one at hand.
-    """
+    """Numbers that shares may be made of, (u, direction): each has some shares alike."""
+    # There, back and both, of each class of every period that divides the one at hand.
     every = []
     for coarse in classes.divisors():
         groups = (coarse.groups_of(classes) == np.arange(coarse.count)[:, None]).astype(float)

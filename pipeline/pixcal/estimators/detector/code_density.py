@@ -116,9 +116,11 @@ def _period(codes: I64, there: Mask) -> float:
 
 def _highest(power: Callable[[float], float], start: float, width: float) -> float:
     found = minimize_scalar(
-        lambda f: -power(f), bounds=(start - width, start + width), method="bounded",
+        lambda f: -power(f),
+        bounds=(start - width, start + width),
+        method="bounded",
         options={"xatol": 1e-6 * width},
-    )  # fmt: skip
+    )
     return float(found.x)
 
 
@@ -310,10 +312,7 @@ def code_widths(
 
 
 def _carried_over(counts: F64) -> Mask:
-    """Codes that never come, and the one before, where a bit weighs some codes too little.
-
-    One or more, just below a multiple of `CARRY`, among codes that do come.
-    """
+    """Codes below a multiple of `CARRY` that never come among some that do, and the one before."""
     gap = np.zeros(len(counts), bool)
     around = uniform_filter1d(counts, 2 * _MAX_HALF + 1)
     for first in range(CARRY, len(counts), CARRY):

@@ -71,11 +71,9 @@ def level_before(stack: Stack, evidence: Evidence) -> float:
 
 
 def flicker(evidence: Evidence) -> tuple[float, float]:
-    """Relative change of the lamp from frame to frame, rms, and the degrees of freedom it has.
-
-    The first frame of a series may lack a share of its charge, and have one of the frame before:
-    of pairs, what their steps have in common by the levels of both is left out.
-    """
+    """Relative change of the lamp from frame to frame, rms, and the degrees of freedom it has."""
+    # The first frame of a series may lack a share of its charge, and have one of the frame before:
+    # of pairs, what their steps have in common by the levels of both is left out.
     steps: list[float] = []
     firsts: list[float] = []
     before: list[float] = []

@@ -195,10 +195,8 @@ def lag_of_flats(evidence: Evidence) -> LagOfFlats | None:
 
 
 def _fit_steps(lacking: F64, step: F64, error: F64, flat: Mask) -> tuple[float, float, float]:
-    """Share of what first frames lack, its error, and the chi-square of the steps.
-
-    The lamp's flicker is that which the fit leaves: before it, lag passes for flicker too.
-    """
+    """Share of what first frames lack, its error, and the chi-square of the steps."""
+    # The lamp's flicker is that which the fit leaves: before it, lag passes for flicker too.
     design = np.stack([-lacking, np.ones_like(step)])
     scale = np.ones_like(step)
     for _ in range(ROUNDS):

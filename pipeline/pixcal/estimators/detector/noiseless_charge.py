@@ -45,10 +45,7 @@ def _last_of(
     sets: Iterable[FringeEvidence],
     terms: Callable[[FringeEvidence, F32], list[F32]],
 ) -> tuple[float, float]:
-    """The last of some terms of the squared residuals, and its error.
-
-    Terms (t, n) of the good pixels of a set and their variance, e-², before the flat.
-    """
+    """The last of some terms (t, n) of squared residuals, e-² before the flat, and its error."""
     normal: F64 | float = 0.0
     right: F64 | float = 0.0
     for fringes in sets:

@@ -75,10 +75,7 @@ def uneven_pixels(fringes: FringeEvidence) -> tuple[float, float] | None:
 def _squares_of_shares(
     fringes: FringeEvidence, freedom: Freedom, weighted: F32, steps: Sequence[int]
 ) -> list[tuple[float, float]]:
-    """Mean square, above noise, of the pixels' shares of an earlier frame, and its error.
-
-    One for each number of steps back, from the residuals (t, n) times their weights.
-    """
+    """Mean square, above noise, of pixels' shares of the frames some steps back, with errors."""
     others = np.zeros((len(steps), *fringes.g.T.shape), np.float32)
     for other, step in zip(others, steps, strict=True):
         other[:] = np.roll(fringes.g, step, axis=0).T

@@ -68,10 +68,7 @@ def fit_response(
 
 
 def _signal_of(evidence: Evidence, level_e: float, every: Sequence[F64]) -> Distortion:
-    """What boundaries that move and then a bent response add to a signal.
-
-    Sizes are those of the powers, then of the shifts of boundaries.
-    """
+    """What moving boundaries (last sizes) and then a bent response (first) add to a signal."""
     flat = evidence.flat.astype(np.float32)
 
     def distortion(fringes: FringeEvidence, signal: F32, sizes: F64) -> F32:

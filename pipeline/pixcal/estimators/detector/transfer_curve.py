@@ -71,10 +71,8 @@ def _transfer_curve(evidence: Evidence) -> TransferCurve | None:
 
 
 def shared_steps(evidence: Evidence) -> Mask:
-    """Which of `STEPS` count: where flats told the gain, only those found to share noise.
-
-    The others would add nothing but their own noise.
-    """
+    """Which of `STEPS` count: where flats told the gain, only those found to share noise."""
+    # The others would add nothing but their own noise.
     if np.isnan(evidence.photon_transfer[0]):
         return np.ones(len(STEPS), np.bool_)
     counted = {(0, 0), *evidence.neighbours, *((-y, -x) for y, x in evidence.neighbours)}

@@ -75,10 +75,7 @@ class TwoWay:
         return turned @ inverse_normal(self._slopes @ normal @ turned, 1e-7) @ self._slopes
 
     def left_over(self, change: F32) -> F32:
-        """What the freedom leaves of a change (t, n) of the samples.
-
-        Zero where a sample has no weight.
-        """
+        """What the freedom leaves of a change (t, n) of the samples; 0 where one has no weight."""
         inverse = np.ascontiguousarray(np.moveaxis(self.pixel_inverse, 0, -1), np.float32)
         covariance = self.frame_covariance.astype(np.float32)
         return left_over(

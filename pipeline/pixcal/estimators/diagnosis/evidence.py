@@ -89,10 +89,8 @@ class FringeEvidence:
 
     @cached_property
     def halves(self) -> tuple[tuple[F64, F64], tuple[F64, F64]]:
-        """``free`` and ``free_covariance`` of each half of the pixels, taken by stripes of rows.
-
-        The bench is common to both, the noise of the samples is not, that of whole rows included.
-        """
+        """``free`` and ``free_covariance`` of each half of the pixels, taken by stripes of rows."""
+        # The bench is common to both, the noise of the samples is not, that of whole rows included.
         own = stripes(self.good.shape)
         codes = np.where(np.isnan(self.electrons), np.float32(NO_SAMPLE), self.electrons)
         one, other = (
@@ -162,10 +160,7 @@ class Evidence:
         return signal * self.flat.astype(np.float32) + dark.astype(np.float32)
 
     def dark_noise(self, stack: Stack) -> tuple[F32, F32]:
-        """Darks (t, y, x) less the median of each pixel and of each frame, and their sigma, e-.
-
-        NaN in pixels with flags.
-        """
+        """Darks (t, y, x), less medians of pixels and frames, and sigma, e-; NaN if flagged."""
         rest = (stack.adu - np.median(stack.adu, axis=0)) * self.gain
         rest = np.where(self.good, rest, np.nan)
         rest -= np.nanmedian(rest, axis=(1, 2), keepdims=True) if self.good.any() else 0
@@ -204,10 +199,8 @@ class Evidence:
 
 
 def stripes(shape: tuple[int, ...]) -> Mask:
-    """One half of a window by stripes of rows (columns if rows are few), to broadcast to (y, x).
-
-    The sequence of Thue and Morse: it has no period that a fringe could fall in with.
-    """
+    """One half of a window by stripes of rows (columns if rows are few), to broadcast to (y, x)."""
+    # The sequence of Thue and Morse: it has no period that a fringe could fall in with.
     axis = 0 if shape[0] >= 2 * STRIPE else 1
     half = np.bitwise_count(np.arange(shape[axis]) // STRIPE) % 2 == 0
     return np.expand_dims(half, 1 - axis)

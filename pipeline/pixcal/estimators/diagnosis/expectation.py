@@ -132,10 +132,8 @@ def expect_with(
 
 
 def _usual_scatter(pairs: Mapping[Key, tuple[F64, F64]], nominal: Expectation) -> float:
-    """Variance of changes that are chance alone, over the noise: that of most curves.
-
-    Effects that move the light change the noise of every sample a little, and so all curves.
-    """
+    """Variance of changes that are chance alone, over the noise: that of most curves."""
+    # Effects that move the light change the noise of every sample a little, and so all curves.
     sizes = [
         float(np.mean((own - same) ** 2 / nominal.noise[key])) for key, (own, same) in pairs.items()
     ]

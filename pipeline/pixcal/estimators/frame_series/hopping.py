@@ -55,9 +55,8 @@ class _Series:
 
 
 def find_hopping(
-    values: Sequence[F64], times_s: Sequence[F64], slopes: Sequence[float], size: float,
-    rate: float,
-) -> Hopping:  # fmt: skip
+    values: Sequence[F64], times_s: Sequence[F64], slopes: Sequence[float], size: float, rate: float
+) -> Hopping:
     """Hops of a common size and rate in several series.
 
     Parameters

@@ -97,10 +97,7 @@ class LineNoise:
 
 
 def fit_lines(spectra: Sequence[LineSpectrum], shapes: Sequence[F64]) -> LineNoise:
-    """Sizes of kinds of noise by their spectra: least squares, weights by what is found.
-
-    The shapes (m, n) of each spectrum are the power of unit sizes.
-    """
+    """Least-squares sizes of kinds of noise; ``shapes`` (m, n): their unit powers by spectrum."""
     power = np.concatenate([s.power for s in spectra])
     shape = np.concatenate(list(shapes), axis=1)
     ends = np.cumsum([len(s.power) for s in spectra])[:-1]

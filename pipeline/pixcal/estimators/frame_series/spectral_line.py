@@ -94,10 +94,8 @@ def _without_line(every: Sequence[FrameSeries], line: Line) -> tuple[FrameSeries
 
 
 def _spectrum(s: FrameSeries, level: F64, channels: Sequence[int], grid: F64) -> tuple[F64, F64]:
-    """Power (f, channel) in units of the level, and the level, both at frequencies ``grid``.
-
-    Made white by its modes first: a walk or a ramp would leak all over the spectrum.
-    """
+    """Power (f, channel) in units of the level, and the level, both at frequencies ``grid``."""
+    # Made white by its modes first: a walk or a ramp would leak all over the spectrum.
     n, basis = len(s), s.walk_modes
     level = level[:, list(channels)]
     place = s.frame - s.frame[0]

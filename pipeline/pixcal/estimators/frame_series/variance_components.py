@@ -60,10 +60,8 @@ class Components:
     modes: Modes  # that it is of
 
     def above(self, part: int) -> float:
-        """1-sigma error of a size, upwards: where the likelihood has fallen by exp(-1/2).
-
-        A walk shows in few modes: a small one found in them may well be a large one.
-        """
+        """1-sigma error of a size, upwards: where the likelihood has fallen by exp(-1/2)."""
+        # A walk shows in few modes: a small one found in them may well be a large one.
         sizes = self.size.copy()
         sizes[part] = value = max(float(sizes[part]), 0.0)
         top = _State(self.modes, sizes).likelihood

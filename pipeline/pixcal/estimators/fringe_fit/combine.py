@@ -57,10 +57,7 @@ def combine_sets(
 def combine_parallel(
     axes: Sequence[tuple[float, float]], delta: F64, sigma: F64
 ) -> tuple[F64, F64, F64]:
-    """Weighted mean of sets whose axes are the same; arguments and results as `combine_sets`.
-
-    The sign of each set follows the first axis.
-    """
+    """As `combine_sets`, of sets along one axis; the sign of each set follows the first."""
     a = np.asarray(axes, float)
     sign = np.sign(a @ a[0]).reshape(-1, *([1] * (delta.ndim - 1)))
     return weighted_mean(sign * delta, sigma)

@@ -122,10 +122,8 @@ def find_fringe_vector(maps: F64, good: Mask, nominal: tuple[float, float]) -> t
 
 
 def _peak(light: F64, nominal: tuple[float, float]) -> F64 | None:
-    """Highest peak (kx, ky), rad/px, of the spectra of maps (n, y, x); None if none stands out.
-
-    Nominal positions are good to some 10 %: the peak there wins unless it is no peak at all.
-    """
+    """Highest peak (kx, ky), rad/px, of the spectra of maps (n, y, x); None if none stands out."""
+    # Nominal positions are good to some 10 %: the peak there wins unless it is no peak at all.
     shape = light.shape[1:]
     size = [2 * n for n in shape]
     power = (np.abs(np.fft.fft2(light, s=size)) ** 2).sum(axis=0)
@@ -165,10 +163,7 @@ def _refined(light: F64, start: F64) -> F64:
 
 @lru_cache(maxsize=8)
 def polynomial_basis(shape: tuple[int, int], degree: int, step: int = 1) -> F64:
-    """Terms x^i y^j, i + j up to ``degree``, on coordinates scaled to ±1: (y * x, terms).
-
-    Of every ``step``-th pixel.
-    """
+    """Terms x^i y^j, i + j up to ``degree``, on ±1, of every ``step``-th pixel: (y * x, terms)."""
     y, x = grid(shape)
     y, x = y / max(1.0, shape[0] / 2), x / max(1.0, shape[1] / 2)
     terms = [x**i * y**j for n in range(degree + 1) for i in range(n, -1, -1) for j in (n - i,)]

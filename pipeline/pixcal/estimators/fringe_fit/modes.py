@@ -58,10 +58,7 @@ class ModeBasis:
         return modes, phase
 
     def sums(self, tiles: TileSums) -> tuple[F64, F64, float]:
-        """Normal matrix (mode, mode), right-hand sides (mode, 1 + batch) and weighted square.
-
-        Of the phases less the shape's.
-        """
+        """Normal matrix, right-hand sides (mode, 1 + batch), square, of phases less the shape's."""
         size = len(self.names)
         normal, rights = np.zeros((size, size)), np.zeros((size, tiles.right.shape[2]))
         square = 0.0

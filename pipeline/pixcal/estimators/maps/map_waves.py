@@ -259,8 +259,9 @@ def _fitted(
             slope = np.tensordot(turned, signals[own], 1)
             signals[size], signals[size + 1] = x * slope, y * slope
             model = np.tensordot(six[own], signals[own], 1)
-            parts.append(MapPart.of(signals if turn else signals[:size], m.data - model, m.free,
-                                    m.good))  # fmt: skip
+            parts.append(
+                MapPart.of(signals if turn else signals[:size], m.data - model, m.free, m.good)
+            )
         fit = fit_maps(parts)
         six = six + fit.values[:size]
         if turn:

@@ -75,10 +75,9 @@ def ring_power(power: F64) -> Ring:
 
 
 def _sum_of_ring(data: F64, template: F64) -> tuple[float, float, float]:
-    """Variance of the waves from all of the ring's power, its error by noise, modes in the ring.
-
-    Waves fill the ring unevenly; their sum does not mind. The modes k and -k of a real map are one.
-    """
+    """Variance of the waves from all of the ring's power, its error by noise, modes in the ring."""
+    # Waves fill the ring unevenly; their sum does not mind. The modes k and -k of a real map are
+    # one.
     inside = template > EDGE * template.max()
     white, noise = float(data[~inside].mean()), float(data[~inside].var())
     power, share = float((data[inside] - white).sum()), float(template[inside].sum())

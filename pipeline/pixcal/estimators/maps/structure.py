@@ -157,11 +157,9 @@ def true_offsets(delta: F64, sigma: F64, psi: F64) -> OffsetModel:
 
 
 def _steps_at_large(rest: F64) -> F64:
-    """Power of smooth terms (term,) by steps in a map without them, over that of a white map.
-
-    A step (stitched blocks, halves of a mask) has a share in every polynomial, whose square falls
-    as one over the square of the degree. The degrees from which nothing was taken tell its size.
-    """
+    """Power of smooth terms (term,) by steps in a map without them, over that of a white map."""
+    # A step (stitched blocks, halves of a mask) has a share in every polynomial, whose square falls
+    # as one over the square of the degree. The degrees from which nothing was taken tell its size.
     degree = np.array([n for n in range(_BEYOND + 1) for _ in range(n + 1)])
     terms = legendre(rest.shape, _BEYOND)
     low, high = degree <= DEGREE, degree > DEGREE

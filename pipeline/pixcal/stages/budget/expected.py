@@ -264,11 +264,9 @@ def brightest_allowed(bench: Bench) -> float | None:
 
 
 def bias_frames_needed(errors: WeightErrors, variance: float) -> int:
-    """Bias frames whose noise costs less than `NEGLIGIBLE` of the fringe frames.
-
-    A pixel's bias is absorbed by its iota; what is left is that the weights take a wrong level and,
-    where each pixel's read noise is measured from the same frames, a wrong read noise.
-    """
+    """Bias frames whose noise costs less than `NEGLIGIBLE` of the fringe frames."""
+    # A pixel's bias is absorbed by its iota; what is left is that the weights take a wrong level
+    # and, where each pixel's read noise is measured from the same frames, a wrong read noise.
     n = 2
     while errors.offset * (variance / n + 2 * variance**2 / (n - 1)) > NEGLIGIBLE:
         n += 1

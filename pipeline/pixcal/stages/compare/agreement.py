@@ -226,11 +226,9 @@ def strongest_period(difference: F64, sigma: F64) -> Period | None:
 def three_cornered_hat(
     pairs: Sequence[tuple[int, int]], excess: Sequence[VarianceEstimate]
 ) -> list[VarianceEstimate]:
-    """Own errors of three or more maps, from the differences of all pairs.
-
-    A difference's variance beyond noise (`Part.beyond_noise`) is the sum of those of its maps (Gray
-    and Allan 1974).
-    """
+    """Own errors of three or more maps, from the differences of all pairs."""
+    # A difference's variance beyond noise (`Part.beyond_noise`) is the sum of those of its maps
+    # (Gray and Allan 1974).
     values, errors = np.array(excess).T
     design = np.zeros((len(pairs), 1 + max(map(max, pairs))))
     np.put_along_axis(design, np.array(pairs), 1 / np.maximum(errors, 1e-300)[:, None], axis=1)

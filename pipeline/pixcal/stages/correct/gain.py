@@ -86,11 +86,9 @@ def measure_gain(maps: Maps, runtime: Runtime) -> dict[str, Any]:
 
 
 def worsened(sets: Mapping[str, Any], pairs: Sequence[Mapping[str, Any]]) -> str:
-    """Where the corrected maps are worse than those before; empty where they are not.
-
-    A wrong correction leaves a periodic pattern in a map, or makes sets disagree that measure the
-    same offsets.
-    """
+    """Where the corrected maps are worse than those before; empty where they are not."""
+    # A wrong correction leaves a periodic pattern in a map, or makes sets disagree that measure the
+    # same offsets.
     for name, facts in sets.items():
         for lines in ("rows", "columns"):
             own = facts[lines]
@@ -210,10 +208,7 @@ def _described(
 
 
 def _patterns(profile: F64, chance: float) -> dict[str, Any] | None:
-    """Rms of what repeats every `PERIOD` rows (px), before and after, and of offsets that do not.
-
-    None where the window is too small.
-    """
+    """Rms (px) of what repeats every `PERIOD` rows, and by chance; None in a small window."""
     if profile.shape[1] < 3 * PERIOD:
         return None
     before, after = map(repeating, profile[:2] / np.where(profile[2] > 0, profile[2], np.nan))
@@ -221,11 +216,9 @@ def _patterns(profile: F64, chance: float) -> dict[str, Any] | None:
 
 
 def repeating(profile: F64) -> float | None:
-    """Rms of what repeats every `PERIOD` places of a profile; NaN are left out.
-
-    What changes slowly is taken off first: the mean over a period about each place, which is that
-    of any pattern that repeats.
-    """
+    """Rms of what repeats every `PERIOD` places of a profile; NaN are left out."""
+    # What changes slowly is taken off first: the mean over a period about each place, which is that
+    # of any pattern that repeats.
     half = PERIOD // 2
     kernel = np.ones(PERIOD + 1)
     kernel[[0, -1]] = 0.5

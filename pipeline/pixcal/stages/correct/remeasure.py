@@ -22,15 +22,15 @@ SAMPLES = 5_000_000  # of each fringe set that are in memory at a time
 
 
 def remeasured(run_dir: Path, plan: Treatments, runtime: Runtime) -> Treatments:
-    """The same treatments, with effects on maps remeasured on all frames where possible.
-
-    Where the memory does not suffice, effects stay as the diagnosis found them.
-    """
+    """The same treatments, with effects on maps remeasured on all frames where possible."""
+    # Where the memory does not suffice, effects stay as the diagnosis found them.
     chosen = [
-        t for t in plan.every
-        if t.how == "corrected on maps" and t.origin == "diagnosis"
+        t
+        for t in plan.every
+        if t.how == "corrected on maps"
+        and t.origin == "diagnosis"
         and type(t.effect).measured_again is not Effect.measured_again
-    ]  # fmt: skip
+    ]
     if not chosen:
         return plan
     try:

@@ -138,10 +138,7 @@ def maps_of(swept: Swept, part: Part) -> tuple[FringeMaps, Mask, Mask]:
 
 
 def free_of_samples(swept: Swept, part: Part) -> tuple[FringeMaps, Mask]:
-    """Parameters that a fit of a part would give without the effects on samples.
-
-    With them pixels (y, x) that have an offset.
-    """
+    """Maps of a part as a fit gives them without effects on samples; pixels (y, x) with offset."""
     maps, good, _ = maps_of(replace(swept, folder=swept.raw or swept.folder), part)
     for effect in swept.samples:
         maps = undone_on_samples(effect, maps) or maps
@@ -168,10 +165,8 @@ def padded(values: NDArray[Any], swept: Swept, part: Part, fill: float = np.nan)
 
 
 def corrected(maps: FringeMaps, effects: Sequence[Effect]) -> tuple[FringeMaps, list[F64]]:
-    """Maps corrected for effects, and the change (y, x) of the phase by each, rad.
-
-    An effect that does not return finite maps of the same pixels is refused.
-    """
+    """Maps corrected for effects, and the change (y, x) of the phase by each, rad."""
+    # An effect that does not return finite maps of the same pixels is refused.
     steps = []
     for effect in effects:
         after = effect.undo(maps)

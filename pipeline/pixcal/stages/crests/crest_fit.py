@@ -103,11 +103,9 @@ def relative_phase(paths: CrestPaths, geometry: Geometry) -> F64:
 
 
 def fit_crests(paths: CrestPaths, start: Geometry, prior: Prior | None = None) -> CrestFit:
-    """Weighted least squares of equation 7 over fibre positions and phase.
-
-    Far starts converge (tested: 10 mm of distance, 18 mm of offset, 5 % of the baseline). Without a
-    prior nothing is known: only a large window determines all six parameters.
-    """
+    """Weighted least squares of equation 7 over fibre positions and phase."""
+    # Far starts converge (tested: 10 mm of distance, 18 mm of offset, 5 % of the baseline). Without
+    # a prior nothing is known: only a large window determines all six parameters.
     prior = Prior.none(start) if prior is None else prior
     unknown, number = 1 + int(np.isinf(prior.sigma).sum()), len(np.unique(paths.k))
     if len(paths) <= unknown or number < 3:
@@ -210,10 +208,8 @@ def cost_map(
 
 
 def valley(paths: CrestPaths, fit: CrestFit, distance: F64) -> tuple[F64, F64]:
-    """Best ratio B / D and its cost, (d,), with the distance (d,) mm held (figure 17, right).
-
-    The other parameters are fitted again, with the priors that `cost_map` takes.
-    """
+    """Best ratio B / D and its cost, (d,), with the distance (d,) mm held (figure 17, right)."""
+    # The other parameters are fitted again, with the priors that `cost_map` takes.
     few = _thinned(paths, fit)
     cost, length = np.array([_least_cost(few, fit, d, None, True) for d in distance]).T
     return length / distance, cost
@@ -246,11 +242,9 @@ def _least_cost(
 
 
 def falls_then_rises(cost: F64) -> bool:
-    """Whether a curve (or every row of a map) falls to one minimum and rises after it.
-
-    A map whose rows do, and whose valley does, has one minimum. Counting the low places of a
-    sampled map would not tell: a valley narrower than the samples shows many.
-    """
+    """Whether a curve (or every row of a map) falls to one minimum and rises after it."""
+    # A map whose rows do, and whose valley does, has one minimum. Counting the low places of a
+    # sampled map would not tell: a valley narrower than the samples shows many.
     steps = np.diff(np.atleast_2d(cost), axis=1)
     # What the fits at each place leave undone.
     steps[np.abs(steps) < 1e-5 * np.atleast_2d(cost)[:, 1:]] = 0

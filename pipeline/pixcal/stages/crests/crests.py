@@ -223,11 +223,9 @@ def _brightened(windows: Windows, light: F64, sigma: F64, carrier: CrestCarrier)
 
 
 def _follow(windows: Windows, phase: F64, sigma: F64, carrier: CrestCarrier) -> F64:
-    """Polynomial through the phases of the windows, numbered outwards from the middle.
-
-    Each time the known region grows by a third, the polynomial through it fixes the
-    cycle of the phases beyond: gaps are bridged, and single bad windows have no effect.
-    """
+    """Polynomial through the phases of the windows, numbered outwards from the middle."""
+    # Each time the known region grows by a third, the polynomial through it fixes the cycle of the
+    # phases beyond: gaps are bridged, and single bad windows have no effect.
     use = np.isfinite(sigma)
     y, x = carrier.scaled(*(c[use] for c in windows.centres))
     measured, precision = phase[use], 1 / sigma[use]

@@ -30,10 +30,8 @@ class Candidate:
 
     @property
     def in_maps_alone(self) -> bool:
-        """Whether it shows in static maps alone, whose pattern all frames have in common.
-
-        What offsets look like by chance is then the same in the held-out frames.
-        """
+        """Whether it shows in static maps alone, whose pattern all frames have in common."""
+        # What offsets look like by chance is then the same in the held-out frames.
         return self.estimate is not None and self.estimate.effect.domains == ("space",)
 
     @property

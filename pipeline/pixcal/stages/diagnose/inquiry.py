@@ -180,10 +180,7 @@ def _needs(kind: type[Effect], facts: FramesUsed) -> str:
 
 
 def _replayed(candidate: Candidate, unseen: Evidence) -> Effect | None:
-    """The effect as measured, whatever its law; None where its law says all.
-
-    In full, or as the unseen frames have it one by one.
-    """
+    """The effect as measured, in full or frame by frame; None where its law says all."""
     found = candidate.estimate
     if found is None or found.refused or found.significance < SIGNIFICANT:
         return None
@@ -203,10 +200,8 @@ def _again(candidate: Candidate) -> Again | None:
 def weakly_seen(
     candidates: Mapping[str, Candidate], kinds: Mapping[str, type[Effect]], *, slow: bool = True
 ) -> tuple[Signature, ...]:
-    """Candidates seen in the fitted frames; a slow one only if it is weak and none is stronger.
-
-    Flats and darks tell by themselves what slow estimates look for in fringes.
-    """
+    """Candidates seen in the fitted frames; a slow one only if it is weak and none is stronger."""
+    # Flats and darks tell by themselves what slow estimates look for in fringes.
     seen = {n: c.estimate for n, c in candidates.items() if c.estimate is not None}
     most = max((e.significance for e in seen.values()), default=0.0)
     # By name: the order of candidates is none of curves.

@@ -123,10 +123,7 @@ def _acquisition(run_dir: Path, ingested: Ingested) -> Acquisition:
 
 
 def _memory(half: Half, pixels: int, runtime: Runtime) -> tuple[Runtime, Runtime, bool]:
-    """As many workers as fit the memory: of simulations, and of estimates; whether one fits beside.
-
-    That is an estimate beside simulations, here.
-    """
+    """Workers that fit the memory, of simulations, of estimates; if one of these fits beside."""
     largest, evidence = _samples(half, pixels)
     frames = sum(len(frames) for name, frames in half.items() if "/" not in name)
     held = EVIDENCE_BYTES * evidence + CALIBRATION_BYTES * pixels * frames

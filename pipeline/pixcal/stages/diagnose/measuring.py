@@ -133,10 +133,8 @@ def _bias_before_rounding(evidence: Sequence[Evidence], dtypes: Mapping[str, np.
 
 
 def _response_of_fringes(evidence: Sequence[Evidence]) -> F32:
-    """Response as the light of the fringes shows it, where there are no flats.
-
-    Its scatter is lessened by what is noise, for the simulation adds its own.
-    """
+    """Response as the light of the fringes shows it, where there are no flats."""
+    # Its scatter is lessened by what is noise, for the simulation adds its own.
     parts = []
     for one in evidence:
         for found in one.fringes.values():

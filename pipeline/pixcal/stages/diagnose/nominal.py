@@ -154,9 +154,10 @@ class NominalBench:
         own_seed = seed + SEEDS_APART * window
         undone = IntensityBeforeEffects(effects if fitted else (), self.bench.detector)
         detector = replace(
-            self.bench.detector, seed=own_seed,
+            self.bench.detector,
+            seed=own_seed,
             saturation_adu=min(self.bench.detector.top_adu + self.pedestal, TOP_ADU),
-        )  # fmt: skip
+        )
         bench = replace(self.bench, seed=seed, detector=detector)
         for effect in effects:
             effect.check(bench)
@@ -193,11 +194,9 @@ class NominalBench:
     def _of_measured_k(
         self, measured: Measured, bench: Bench, effects: Sequence[Effect]
     ) -> Measured:
-        """The bench whose fringe vectors are those that were measured when effects have acted.
-
-        So is the phase that all pixels have in common: with fringes that lie elsewhere, the noise
-        of the same seed would be another one.
-        """
+        """The bench whose fringe vectors are those that were measured when effects have acted."""
+        # So is the phase that all pixels have in common: with fringes that lie elsewhere, the noise
+        # of the same seed would be another one.
         rows = (0, bench.detector.shape[0])
         before, after = Camera(bench, rows, [measured]), Camera(bench, rows, [measured, *effects])
         sets = list(measured.sets)

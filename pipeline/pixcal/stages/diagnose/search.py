@@ -122,10 +122,8 @@ class Search:
         causes: Accepted,
         candidates: Mapping[str, Candidate],
     ) -> tuple[dict[str, float], Effect | None, str]:
-        """Gain of every candidate, and effect and name of the best that gains enough.
-
-        A replay takes the place of the law where it fits better.
-        """
+        """Gain of every candidate, and effect and name of the best that gains enough."""
+        # A replay takes the place of the law where it fits better.
         gains = {name: law.gain for name, law in laws.items()}
         enough = {n: g for n, g in gains.items() if g >= needed_gain(candidates[n])}
         if gains and not enough:
@@ -148,10 +146,8 @@ class Search:
     def _best(
         self, gains: dict[str, float], causes: Accepted, candidates: Mapping[str, Candidate]
     ) -> str:
-        """The candidate that gains most; among equals, the one that does so by its law.
-
-        A curve measured at many levels can imitate another effect.
-        """
+        """The candidate that gains most; among equals, the one that does so by its law."""
+        # A curve measured at many levels can imitate another effect.
         most = max(gains.values())
         equals = {n: g for n, g in gains.items() if g >= (1 - AS_GOOD) * most}
         if len(equals) > 1:
@@ -227,10 +223,8 @@ class Search:
         simulations: int,
         label: str,
     ) -> list[Addition]:
-        """Variants added to the causes; log-likelihoods allow for other laws of these.
-
-        Candidates none of whose variants can be simulated are no longer among the remaining.
-        """
+        """Variants added to the causes; log-likelihoods allow for other laws of these."""
+        # Candidates none of whose variants can be simulated are no longer among the remaining.
         start = self.comparison.allowing_for_laws(
             self._start(causes.bench, simulations), causes.current
         )
@@ -266,10 +260,8 @@ class Search:
         return curves if isinstance(curves, str) else self.comparison.trial(effects, curves)
 
     def _start(self, effects: Effects, simulations: int = CONFIRM) -> Trial:
-        """A bench with some effects; the nominal one without any, or if they are refused.
-
-        What has been simulated with more effects is hardly ever refused with fewer.
-        """
+        """A bench with some effects; the nominal one without any, or if they are refused."""
+        # What has been simulated with more effects is hardly ever refused with fewer.
         nominal = self.comparison.nominal
         trial = self._confirmed(effects, simulations) if effects else nominal
         return nominal if isinstance(trial, str) else trial

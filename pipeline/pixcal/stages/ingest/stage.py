@@ -157,10 +157,7 @@ def _check(
     known: Mapping[str, list[FrameFile]],
     runtime: Runtime,
 ) -> tuple[dict[str, list[Frame]], list[str]]:
-    """Headers of all files, checked: the table of frames of each array, and warnings.
-
-    Only those of arrays that are not ``known`` are read.
-    """
+    """Headers of the files of arrays not ``known``: table of frames of each array, warnings."""
     unknown = {array: files for array, files in sources.items() if array not in known}
     listed = [source for files in unknown.values() for source in files]
     batches = [listed[n : n + _FILES_A_TASK] for n in range(0, len(listed), _FILES_A_TASK)]
@@ -279,10 +276,8 @@ class _Piece:
 def _pieces(
     array: str, frames: Sequence[Frame], writers: Writers, rows: int, scratch: Path
 ) -> Iterator[_Piece]:
-    """Tasks of an array: a block of frames each.
-
-    Compressed files can only be read whole: blocks that share one are one task.
-    """
+    """Tasks of an array: a block of frames each."""
+    # Compressed files can only be read whole: blocks that share one are one task.
     borders = [0]
     for t in range(0, len(frames), CHUNK[0] if writers.samples else FRAMES_A_PIECE):
         if t and (frames[t].plane == 0 or frames[t].file.container == "plain"):

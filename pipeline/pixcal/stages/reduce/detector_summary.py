@@ -87,10 +87,8 @@ class Summary:
         return own * noise[0], math.hypot(own * noise[1], error * noise[0])
 
     def noise_before_rounding_e(self, gain: float) -> float:
-        """Read noise (e-) of the amplifier: measured, else declared.
-
-        Where samples of one code alone say that it is far below a step, no more than that.
-        """
+        """Read noise (e-) of the amplifier: measured, else declared."""
+        # Where samples of one code alone say that it is far below a step, no more than that.
         if self.before_rounding is not None:
             return gain * self.before_rounding[0]
         if self.read_noise is None:

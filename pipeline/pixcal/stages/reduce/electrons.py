@@ -164,9 +164,10 @@ class _Column:
     def __init__(self, job: Converting, index: Index, maps: dict[str, NDArray[Any]]) -> None:
         self.job, self.index, self.maps = job, index, maps
         self.coefficients = coefficients(
-            job.scale, job.fringes.gain,
+            job.scale,
+            job.fringes.gain,
             *(self.maps[name] for name in ("bias", "dark_rate", "flat")),
-        )  # fmt: skip
+        )
         self.saturated = np.zeros(self.maps["flat"].shape, np.uint32)
         self.lost = np.zeros_like(self.saturated)
         self.codes = np.empty((CHUNK[0], *self.lost.shape), np.uint16)

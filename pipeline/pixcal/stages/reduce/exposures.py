@@ -41,10 +41,7 @@ class Exposures:
 
     @property
     def read_series(self) -> Group | None:
-        """Frames whose noise is the read noise: bias, else the longest series of darks.
-
-        None when it has a single frame.
-        """
+        """Frames whose noise is the read noise: bias, else the longest darks; None if single."""
         series = [group for group in self.dark if group.array == "bias"] or self.dark
         longest = max(series, key=lambda group: len(group.frames), default=None)
         return longest if longest is not None and len(longest.frames) > 1 else None

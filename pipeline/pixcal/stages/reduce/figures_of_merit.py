@@ -257,9 +257,11 @@ def _dark_means(source: Ingested, middle: Window, good: Mask) -> tuple[F64, F64]
 def _temperature(tables: Mapping[str, Mapping[str, Any]]) -> str:
     """At what temperature the frames without light were taken, if their headers say."""
     told = [
-        t for kind in ("dark", "bias") for t in tables.get(kind, {}).get("temperature_c", ())
+        t
+        for kind in ("dark", "bias")
+        for t in tables.get(kind, {}).get("temperature_c", ())
         if t is not None
-    ]  # fmt: skip
+    ]
     if not told:
         return "temperature not in the headers"
     low, high = min(told), max(told)

@@ -104,10 +104,7 @@ class Ingested:
 
     @cached_property
     def arrays(self) -> Mapping[str, Reader]:
-        """A reader of each array, without frames that were cut off.
-
-        Raises InputError if the files are not there any more.
-        """
+        """A reader of each array without frames that were cut off; InputError if files are gone."""
         return {
             name: reader
             if len(self._whole[name]) == reader.shape[0]
@@ -161,10 +158,8 @@ class Ingested:
 
     @cached_property
     def quantum(self) -> float:
-        """Step of the calibration frames (ADU), 0 where any are real numbers.
-
-        Cameras of 12 bits that write 16 count in steps of 16.
-        """
+        """Step of the calibration frames (ADU), 0 where any are real numbers."""
+        # Cameras of 12 bits that write 16 count in steps of 16.
         names = {group.array for group in (*self.exposures.dark, *self.exposures.flat)}
         if not all(map(self._is_integer, names)):
             return 0.0

@@ -44,10 +44,7 @@ def dark_charge(folder: Place, job: Measuring) -> float:
 def read_noise(
     dark: F64, shot: float, folder: Place, job: Measuring
 ) -> tuple[Measure | None, Measure | None]:
-    """Noise without light (ADU), less shot noise of a variance (ADU²), with and without rounding.
-
-    Both with their errors.
-    """
+    """Noise without light (ADU), less a shot variance (ADU²), with and without rounding."""
     whole = _read_variance(dark)
     if whole is None:
         return None, None

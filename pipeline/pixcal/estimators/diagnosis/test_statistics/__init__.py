@@ -7,9 +7,9 @@ acquisition of the same size, whatever made it.
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -73,6 +73,32 @@ def statistic(
             measure.__name__, title, domain, quantity, unit, x, kind, of_set, together, floor,
             measure,
         )  # fmt: skip
+
+    return mark
+
+
+def family(
+    name: str, members: Sequence[tuple[str, ...]], *texts: str, **options: Any
+) -> Callable[[Callable[[Any, Any], Curve | None]], tuple[Statistic, ...]]:
+    """Mark a function of a word and data as a statistic for each of some words.
+
+    Name, texts and options are as of `statistic`; ``{0}`` in them is the word, ``{1}`` and so on
+    are those beside it in ``members``. An option may be a mapping by the word.
+    """
+
+    def filled(text: Any, words: tuple[str, ...]) -> Any:
+        if isinstance(text, Mapping):
+            return text[words[0]]
+        return text.format(*words) if isinstance(text, str) else text
+
+    def mark(measure: Callable[[Any, Any], Curve | None]) -> tuple[Statistic, ...]:
+        made = []
+        for words in members:
+            own = {key: filled(option, words) for key, option in options.items()}
+            one = statistic(*(filled(text, words) for text in texts), **own)(measure)
+            own_name = filled(name, words)
+            made.append(replace(one, name=own_name, measure=partial(measure, words[0])))
+        return tuple(made)
 
     return mark
 

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
-from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
+from pixcal.estimators.diagnosis.test_statistics import Curve, family, statistic
 from pixcal.estimators.diagnosis.test_statistics.look import STEPS, neighbour_sums
 from pixcal.kernels.line_means import without_line_means
 from pixcal.model.arrays import F32, F64, Mask
@@ -59,34 +59,6 @@ def _neighbours(rest: Iterable[F32], good: Mask) -> F64:
         square += float((steps.astype(float) ** 2).sum())
         count += len(steps) * np.count_nonzero(good)
     return np.asarray(total / np.maximum(pairs, 1) / (square / max(count, 1)))
-
-
-def _neighbours_of(kind: str) -> Statistic:
-    def measured(evidence: Evidence) -> Curve | None:
-        stacks = _stacks(evidence, kind)
-        if not stacks:
-            return None
-        value = _neighbours((differences(evidence, s) for s in stacks), evidence.good)
-        return Curve(np.arange(float(len(STEPS))), value)
-
-    measured.__name__ = f"{kind}_neighbours"
-    title = f"correlation of neighbours in {kind} frames"
-    return statistic("noise", title, "correlation", x="neighbour", sets=False)(measured)
-
-
-def _lines_of(kind: str) -> Statistic:
-    def measured(evidence: Evidence) -> Curve | None:
-        stacks = _stacks(evidence, kind)
-        if not stacks:
-            return None
-        rest = np.concatenate([differences(evidence, s) for s in stacks])
-        value = [one for axis in (2, 1) for one in _repeats(rest, evidence.good, axis)]
-        return Curve(np.arange(float(len(value))), np.array(value))
-
-    measured.__name__ = f"{kind}_line_repeats"
-    title = f"correlated row and column noise in {kind} frames"
-    x = "distance: rows, then columns"
-    return statistic("noise", title, "correlation", x=x, sets=False)(measured)
 
 
 def _repeats(rest: F32, good: Mask, axis: int) -> F64:
@@ -143,5 +115,31 @@ def bias_change(evidence: Evidence) -> Curve | None:
     return Curve(np.arange(BANDS + 2.0), np.concatenate([bands, ends]))
 
 
-NEIGHBOURS = tuple(_neighbours_of(kind) for kind in ("bias", "dark", "flat"))
-LINES = tuple(_lines_of(kind) for kind in ("bias", "dark", "flat"))
+KINDS = (("bias",), ("dark",), ("flat",))
+
+
+@family(
+    "{0}_neighbours", KINDS, "noise", "correlation of neighbours in {0} frames", "correlation",
+    x="neighbour", sets=False,
+)  # fmt: skip
+def neighbours(kind: str, evidence: Evidence) -> Curve | None:
+    """Of the differences of two frames."""
+    stacks = _stacks(evidence, kind)
+    if not stacks:
+        return None
+    value = _neighbours((differences(evidence, s) for s in stacks), evidence.good)
+    return Curve(np.arange(float(len(STEPS))), value)
+
+
+@family(
+    "{0}_line_repeats", KINDS, "noise", "correlated row and column noise in {0} frames",
+    "correlation", x="distance: rows, then columns", sets=False,
+)  # fmt: skip
+def line_repeats(kind: str, evidence: Evidence) -> Curve | None:
+    """Correlation of the means of lines some lines apart."""
+    stacks = _stacks(evidence, kind)
+    if not stacks:
+        return None
+    rest = np.concatenate([differences(evidence, s) for s in stacks])
+    value = [one for axis in (2, 1) for one in _repeats(rest, evidence.good, axis)]
+    return Curve(np.arange(float(len(value))), np.array(value))

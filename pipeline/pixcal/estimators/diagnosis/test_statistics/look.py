@@ -104,10 +104,7 @@ class Look:
 
     @cached_property
     def remainders(self) -> Indices | None:
-        """How often codes of good pixels have each remainder on division by `CODES`.
-
-        None where what the camera wrote is not whole numbers.
-        """
+        """How often codes of good pixels have each remainder mod `CODES`; None for real numbers."""
         codes: NDArray[Any] = self.found.adu
         if codes.dtype.kind not in "iu":
             return None

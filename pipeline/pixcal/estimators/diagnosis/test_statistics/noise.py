@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
+from pixcal.estimators.diagnosis.test_statistics import Curve, family, statistic
 from pixcal.estimators.diagnosis.test_statistics.look import (
     CELLS,
     LEVELS,
@@ -108,10 +108,7 @@ def _mean_product(sums: F64, count: F64) -> F64:
 
 
 def _line_power(rest: F32, good: Mask) -> F64:
-    """Mean square of the means of rows and of columns over that of white noise: (2,).
-
-    Of residuals (t, y, x) that are zero in pixels that are not good.
-    """
+    """Mean square (2,) of means of rows and columns over white noise's; bad pixels are zero."""
     squares = float(np.einsum("tyx,tyx->t", rest, rest).mean(dtype=float)) / good.sum()
     out = []
     for axis in (2, 1):
@@ -126,24 +123,6 @@ def _line_power(rest: F32, good: Mask) -> F64:
 def lines(look: Look) -> Curve:
     """Of the fringe frames' residuals."""
     return Curve(np.arange(2.0), _line_power(look.residual, look.good))
-
-
-def _lines_of(kind: str) -> Statistic:
-    def measured(evidence: Evidence) -> Curve | None:
-        stacks = [s for s in evidence.of_kind(kind) if len(s.adu) >= 3]
-        if not stacks or not evidence.dithered:
-            return None
-        values, weights = [], []
-        for stack in stacks:
-            rest = _calm(stack.adu, evidence.good)
-            values.append(_line_power(rest, evidence.good))
-            weights.append(len(rest))
-        return Curve(np.arange(2.0), np.average(values, axis=0, weights=weights))
-
-    measured.__name__ = f"lines_of_{kind}"
-    title = f"row and column noise in {kind} frames"
-    quantity = "noise / white noise"
-    return statistic("noise", title, quantity, x="rows, columns", power=True, sets=False)(measured)
 
 
 def _calm(frames: F32, good: Mask) -> F32:
@@ -277,4 +256,15 @@ def hot_neighbours(evidence: Evidence) -> Curve | None:
     return Curve(np.arange(4.0), np.array(value))
 
 
-LINES = tuple(_lines_of(kind) for kind in ("bias", "dark"))
+@family(
+    "lines_of_{0}", (("bias",), ("dark",)), "noise", "row and column noise in {0} frames",
+    "noise / white noise", x="rows, columns", power=True, sets=False,
+)  # fmt: skip
+def lines_of_stacks(kind: str, evidence: Evidence) -> Curve | None:
+    """Of frames without light."""
+    stacks = [s for s in evidence.of_kind(kind) if len(s.adu) >= 3]
+    if not stacks or not evidence.dithered:
+        return None
+    rests = [_calm(stack.adu, evidence.good) for stack in stacks]
+    values = [_line_power(rest, evidence.good) for rest in rests]
+    return Curve(np.arange(2.0), np.average(values, axis=0, weights=list(map(len, rests))))

@@ -1,12 +1,11 @@
 """Statistics in space: structure of the maps, and how far fringe sets agree on them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 
-from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
+from pixcal.estimators.diagnosis.test_statistics import Curve, family, statistic
 from pixcal.estimators.diagnosis.test_statistics.look import CELLS, Look, by_cell
 from pixcal.estimators.maps.structure import (
     PERIODS,
@@ -17,7 +16,7 @@ from pixcal.estimators.maps.structure import (
     redness,
     repeats,
 )
-from pixcal.model.arrays import F64
+from pixcal.model.arrays import F64, Mask
 
 SAME = 0.98  # cosine of the angle below which two sets measure along the same axis
 
@@ -65,132 +64,124 @@ def apart(looks: Sequence[Look]) -> Curve | None:
     return Curve(np.arange(len(values), dtype=float), np.array(values)) if values else None
 
 
-UNITS = {"offset": "px", "contrast": "", "light": ""}
-QUANTITIES = {"offset": "offset", "contrast": "relative contrast", "light": "relative level"}
-LINES = {0: "rows", 1: "columns"}
-VARIATION = {
-    "offset": "curvature",
-    "contrast": "large-scale variation",
-    "light": "large-scale variation",
-}
+# name, what it is, unit, what its low orders are
+MAPS = (
+    ("offset", "offset", "px", "curvature"),
+    ("contrast", "relative contrast", "", "large-scale variation"),
+    ("light", "relative level", "", "large-scale variation"),
+)
 BINS = 6
-IRRELEVANT = {"offset": 1e-6}  # px; standard deviation of harmonics, a fiftieth of what stars need
+# px; standard deviation of harmonics, a fiftieth of what stars need
+IRRELEVANT = {"offset": 1e-6, "contrast": 0.0, "light": 0.0}
 FLOOR = 0.3  # least standard deviation of a term over the one that the map's own scatter gives
 
 
-def _power(name: str, title: str, x: str) -> Callable[[Callable[[Any], Curve | None]], Statistic]:
-    """Mark a function of mean squares of a map."""
-    quantity = f"{QUANTITIES[name]}, rms"
-    return statistic("space", title, quantity, unit=UNITS[name], x=x, power=True)
+# each with the axis of the lines
+AXES = {"rows": 0, "columns": 1}
+MAP_LINES = tuple((f"{m[0]}_{lines}", *m, lines) for m in MAPS for lines in AXES)
 
 
-def _repeats(name: str, axis: int) -> Statistic:
-    def measured(look: Look) -> Curve:
-        size = np.abs(repeats(look.maps_beside_fringes[name], axis))
-        return Curve(np.array(PERIODS, float), size)
-
-    measured.__name__ = f"{name}_{LINES[axis]}_repeat"
-    title = f"{name}: periodic pattern of {LINES[axis]}"
-    x = f"period, {LINES[axis]}"
-    return statistic("space", title, QUANTITIES[name], unit=UNITS[name], x=x)(measured)
-
-
-def _profile(name: str, axis: int) -> Statistic:
-    def measured(look: Look) -> Curve:
-        along = profile(look.maps_beside_fringes[name], axis)
-        power = np.abs(np.fft.rfft(along)[1:]) ** 2 * 2 / len(along) ** 2
-        return _binned(np.arange(1, len(power) + 1) / len(along), power)
-
-    measured.__name__ = f"{name}_{LINES[axis]}"
-    title = f"{name}: profile of {LINES[axis]}"
-    return _power(name, title, "cycles a pixel")(measured)
+@family(
+    "{0}_repeat", MAP_LINES, "space", "{1}: periodic pattern of {5}", "{2}", unit="{3}",
+    x="period, {5}",
+)  # fmt: skip
+def repeats_of_lines(of: str, look: Look) -> Curve:
+    """Size of what repeats after some rows or columns."""
+    name, lines = of.split("_")
+    size = np.abs(repeats(look.maps_beside_fringes[name], AXES[lines]))
+    return Curve(np.array(PERIODS, float), size)
 
 
-def _fringes(name: str) -> Statistic:
-    def measured(look: Look) -> Curve:
-        sizes = fit_terms(look.flat_maps[name], look.fringe_terms)
-        return Curve(np.array([1.0, 1.25, 2.0, 2.25]), sizes)
-
-    measured.__name__ = f"{name}_fringes"
-    title = f"{name}: residual fringes, first and second harmonic"
-    return statistic(
-        "space",
-        title,
-        QUANTITIES[name],
-        unit=UNITS[name],
-        x="harmonic (cosine, sine)",
-        floor=IRRELEVANT.get(name, 0.0),
-    )(measured)
+@family(
+    "{0}", MAP_LINES, "space", "{1}: profile of {5}", "{2}, rms", unit="{3}", x="cycles a pixel",
+    power=True,
+)  # fmt: skip
+def profiles_of_lines(of: str, look: Look) -> Curve:
+    """Power of the means of rows or columns."""
+    name, lines = of.split("_")
+    along = profile(look.maps_beside_fringes[name], AXES[lines])
+    power = np.abs(np.fft.rfft(along)[1:]) ** 2 * 2 / len(along) ** 2
+    return _binned(np.arange(1, len(power) + 1) / len(along), power)
 
 
-def _low_orders(name: str) -> Statistic:
-    def measured(look: Look) -> Curve:
-        """Over what a map as red as this one has by chance."""
-        values = look.maps[name]
-        terms = legendre(values.shape, 4 if name == "contrast" else 3)
-        size = fit_terms(values, terms)
-        rest = values - np.tensordot(size, terms, 1)
-        good = np.isfinite(rest)
-        variance = float(np.nanvar(rest)) * redness(rest)
-        error = np.sqrt(variance / (terms[:, good] ** 2).sum(axis=1))
-        # Two Gaussian beams make a contrast that bends in any direction, but no more than that.
-        first = 3 if name != "contrast" else 6
-        return Curve(np.arange(first, len(terms), dtype=float), (size / error)[first:])
-
-    measured.__name__ = f"{name}_bending"
-    title = f"{name}: {VARIATION[name]}"
-    # Of light, whose surface is taken off, nothing is left but what outliers do to it.
-    return statistic("space", title, "coefficient", unit="σ", x="Legendre term", floor=FLOOR)(
-        measured
-    )
+@family(
+    "{0}_fringes", MAPS, "space", "{0}: residual fringes, first and second harmonic", "{1}",
+    unit="{2}", x="harmonic (cosine, sine)", floor=IRRELEVANT,
+)  # fmt: skip
+def residual_fringes(name: str, look: Look) -> Curve:
+    """Amplitudes of the fringes left in a map."""
+    sizes = fit_terms(look.flat_maps[name], look.fringe_terms)
+    return Curve(np.array([1.0, 1.25, 2.0, 2.25]), sizes)
 
 
-def _scales(name: str) -> Statistic:
-    def measured(look: Look) -> Curve:
-        values = np.nan_to_num(look.maps_beside_fringes[name])
-        power = np.abs(np.fft.rfft2(values)) ** 2 / values.size**2
-        fy = np.fft.fftfreq(values.shape[0])[:, None]
-        fx = np.fft.rfftfreq(values.shape[1])[None, :]
-        radius = np.hypot(fy, fx)
-        # Rows, columns and their means have statistics of their own.
-        apart = (np.abs(fy) > 1.5 / values.shape[0]) & (np.abs(fx) > 1.5 / values.shape[1])
-        return _binned(radius[apart], power[apart] * values.size, 0.5)
-
-    measured.__name__ = f"{name}_scales"
-    title = f"{name}: power by spatial frequency"
-    return _power(name, title, "cycles a pixel")(measured)
-
-
-def _peak(name: str) -> Statistic:
-    def measured(look: Look) -> Curve:
-        values = np.nan_to_num(look.maps_beside_fringes[name])
-        power = np.abs(np.fft.rfft2(values)) ** 2
-        fy = np.fft.fftfreq(values.shape[0])[:, None]
-        fx = np.fft.rfftfreq(values.shape[1])[None, :]
-        apart = (np.abs(fy) > 1.5 / values.shape[0]) & (np.abs(fx) > 1.5 / values.shape[1])
-        at = np.unravel_index(int(np.argmax(np.where(apart, power, 0))), power.shape)
-        highest = float(power[at]) / values.size**2 * 4
-        return Curve(np.array([float(np.hypot(fy[at[0], 0], fx[0, at[1]]))]), np.array([highest]))
-
-    measured.__name__ = f"{name}_peak"
-    title = f"{name}: strongest isolated spatial frequency"
-    return _power(name, title, "cycles a pixel")(measured)
+# Of light, whose surface is taken off, nothing is left but what outliers do to it.
+@family(
+    "{0}_bending", MAPS, "space", "{0}: {3}", "coefficient", unit="σ", x="Legendre term",
+    floor=FLOOR,
+)  # fmt: skip
+def low_orders(name: str, look: Look) -> Curve:
+    """Legendre terms, over what a map as red as this one has by chance."""
+    values = look.maps[name]
+    terms = legendre(values.shape, 4 if name == "contrast" else 3)
+    size = fit_terms(values, terms)
+    rest = values - np.tensordot(size, terms, 1)
+    good = np.isfinite(rest)
+    variance = float(np.nanvar(rest)) * redness(rest)
+    error = np.sqrt(variance / (terms[:, good] ** 2).sum(axis=1))
+    # Two Gaussian beams make a contrast that bends in any direction, but no more than that.
+    first = 3 if name != "contrast" else 6
+    return Curve(np.arange(first, len(terms), dtype=float), (size / error)[first:])
 
 
-def _by_place(name: str) -> Statistic:
-    def measured(look: Look) -> Curve | None:
-        squares = look.maps_beside_fringes[name] ** 2
-        cells = by_cell(squares, np.isfinite(squares))
-        return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
+def _power_beside_lines(values: F64) -> tuple[F64, F64, F64, Mask]:
+    """Power (y, x) of a map's Fourier transform, its frequencies, and which are used."""
+    # Rows, columns and their means have statistics of their own.
+    power = np.abs(np.fft.rfft2(np.nan_to_num(values))) ** 2
+    fy = np.fft.fftfreq(values.shape[0])[:, None]
+    fx = np.fft.rfftfreq(values.shape[1])[None, :]
+    apart = (np.abs(fy) > 1.5 / values.shape[0]) & (np.abs(fx) > 1.5 / values.shape[1])
+    return power, fy, fx, apart
 
-    measured.__name__ = f"{name}_by_place"
-    title = f"{name}: power by position"
-    return _power(name, title, "cell of 4 × 4")(measured)
+
+@family(
+    "{0}_scales", MAPS, "space", "{0}: power by spatial frequency", "{1}, rms", unit="{2}",
+    x="cycles a pixel", power=True,
+)  # fmt: skip
+def scales(name: str, look: Look) -> Curve:
+    """Power in bins of spatial frequency."""
+    values = look.maps_beside_fringes[name]
+    power, fy, fx, apart = _power_beside_lines(values)
+    power = power / values.size**2
+    return _binned(np.hypot(fy, fx)[apart], power[apart] * values.size)
 
 
-def _binned(frequency: F64, power: F64, highest: float = 0.5) -> Curve:
+@family(
+    "{0}_peak", MAPS, "space", "{0}: strongest isolated spatial frequency", "{1}, rms", unit="{2}",
+    x="cycles a pixel", power=True,
+)  # fmt: skip
+def peak(name: str, look: Look) -> Curve:
+    """Highest power of a single frequency."""
+    values = look.maps_beside_fringes[name]
+    power, fy, fx, apart = _power_beside_lines(values)
+    at = np.unravel_index(int(np.argmax(np.where(apart, power, 0))), power.shape)
+    highest = float(power[at]) / values.size**2 * 4
+    return Curve(np.array([float(np.hypot(fy[at[0], 0], fx[0, at[1]]))]), np.array([highest]))
+
+
+@family(
+    "{0}_by_place", MAPS, "space", "{0}: power by position", "{1}, rms", unit="{2}",
+    x="cell of 4 × 4", power=True,
+)  # fmt: skip
+def by_place(name: str, look: Look) -> Curve | None:
+    """Mean square in cells of the window."""
+    squares = look.maps_beside_fringes[name] ** 2
+    cells = by_cell(squares, np.isfinite(squares))
+    return None if cells is None else Curve(np.arange(float(CELLS**2)), cells)
+
+
+def _binned(frequency: F64, power: F64) -> Curve:
     """Mean power in `BINS` bins of frequency, each twice as wide as the one before."""
-    edges = highest * 2.0 ** np.arange(-BINS + 1, 1)
+    edges = 0.5 * 2.0 ** np.arange(-BINS + 1, 1)
     number = np.searchsorted(edges, frequency)
     middle, value = [], []
     for n in range(BINS):
@@ -199,18 +190,3 @@ def _binned(frequency: F64, power: F64, highest: float = 0.5) -> Curve:
             middle.append(float(frequency[inside].mean()))
             value.append(float(power[inside].mean()))
     return Curve(np.array(middle), np.array(value))
-
-
-_OF_AXIS: tuple[Callable[[str, int], Statistic], ...] = (_repeats, _profile)
-_OF_MAP: tuple[Callable[[str], Statistic], ...] = (
-    _fringes,
-    _low_orders,
-    _scales,
-    _peak,
-    _by_place,
-)
-
-STATISTICS = tuple(
-    [make(name, axis) for make in _OF_AXIS for name in UNITS for axis in LINES]
-    + [make(name) for make in _OF_MAP for name in UNITS]
-)

@@ -12,36 +12,29 @@ from pixcal.estimators.detector.flat_ladder import (
     light_of,
 )
 from pixcal.estimators.diagnosis.evidence import Evidence
-from pixcal.estimators.diagnosis.test_statistics import Curve, Statistic, statistic
+from pixcal.estimators.diagnosis.test_statistics import Curve, family, statistic
 from pixcal.estimators.diagnosis.test_statistics.look import Look
 from pixcal.kernels.frame_order import follows
 from pixcal.kernels.sample_sums import frame_means
 from pixcal.model.arrays import F64
 
-SERIES = {
-    "intensity": ("intensity", "relative intensity, rms", ""),
-    "contrast": ("contrast", "relative contrast, rms", ""),
-    "turn_along": ("fringe vector, along", "change of phase, rms", "rad"),
-    "turn_across": ("fringe vector, across", "change of phase, rms", "rad"),
-}
+SERIES = (
+    ("intensity", "intensity", "relative intensity, rms", ""),
+    ("contrast", "contrast", "relative contrast, rms", ""),
+    ("turn_along", "fringe vector, along", "change of phase, rms", "rad"),
+    ("turn_across", "fringe vector, across", "change of phase, rms", "rad"),
+)
+STACKS = (
+    ("bias", "level, rms", "e-"),
+    ("dark", "level, rms", "e-"),
+    ("flat", "relative intensity, rms", ""),
+)
+MIN_FRAMES = 8
 LAGS = (1, 2, 3, -1, -2)
 BATCHES = 8
 # smallest singular value, of the largest, of shapes that a sequence of phases can tell apart: a
 # ramp of equal steps, or four of them, cannot tell all
 DISTINCT = 0.05
-
-
-def _spectrum(name: str) -> Statistic:
-    title, quantity, unit = SERIES[name]
-
-    def measured(look: Look) -> Curve:
-        return power_of(look.frames[name])
-
-    measured.__name__ = f"{name}_of_frames"
-    return statistic(
-        "time", f"{title}: spectrum over the frames", quantity, unit=unit, x="cycles a frame",
-        power=True,
-    )(measured)  # fmt: skip
 
 
 def power_of(series: F64) -> Curve:
@@ -81,9 +74,11 @@ def frames_before(look: Look) -> Curve:
 
 
 @statistic(
-    "time", "contrast against the phase step from earlier frames", "slope of the contrast",
+    "time",
+    "contrast against the phase step from earlier frames",
+    "slope of the contrast",
     x="frames before",
-)  # fmt: skip
+)
 def contrast_by_step(look: Look) -> Curve:
     """Slope of the contrast against the cosine of the step."""
     contrast, phi = look.frames["contrast"], look.found.phi
@@ -142,39 +137,13 @@ def allan_of_batches(look: Look) -> Curve | None:
     return Curve(np.array([1.0, 2.0, 4.0]), np.array(out))
 
 
-def _of_stacks(kind: str) -> Statistic:
-    def measured(evidence: Evidence) -> Curve | None:
-        every = evidence.ladder if kind == "flat" else evidence.of_kind(kind)
-        stacks = [s for s in every if len(s.adu) >= MIN_FRAMES]
-        if not stacks:
-            return None
-        values = []
-        for stack in stacks:
-            means = frame_means(stack.adu, evidence.good) * evidence.gain
-            light = float(means.mean() - evidence.gain * evidence.bias[evidence.good].mean())
-            scale = light if kind == "flat" and light > 0 else 1.0
-            values.append(power_of(means / scale).value[:3])
-        shortest = min(map(len, values))
-        value = np.mean([v[:shortest] for v in values], axis=0)
-        return Curve(np.arange(shortest, dtype=float), value)
-
-    measured.__name__ = f"{kind}_of_frames"
-    return statistic(
-        "time", f"mean of {kind} frames: spectrum",
-        "relative intensity, rms" if kind == "flat" else "level, rms",
-        unit="" if kind == "flat" else "e-", x="bin of frequency", power=True, sets=False,
-    )(measured)  # fmt: skip
-
-
 @statistic(
     "time", "first flat of each level against the next ones", "relative intensity", sets=False
 )
 def first_flats(evidence: Evidence) -> Curve | None:
-    """Relative change: mean over the levels, and slope against the rise from the frame before.
-
-    A lamp that flickers changes each level by itself. Lag changes the first frame by a share of the
-    rise, which is large only where the ladder begins.
-    """
+    """Relative change: mean over the levels, and slope against the rise from the frame before."""
+    # A lamp that flickers changes each level by itself. Lag changes the first frame by a share of
+    # the rise, which is large only where the ladder begins.
     stacks = [s for s in evidence.ladder if len(s.adu) > 1]
     every = [light_of(evidence, s) for s in stacks]
     if flicker(evidence)[1] < FLICKER_KNOWN or min(light.mean() for light in every) <= 0:
@@ -185,9 +154,33 @@ def first_flats(evidence: Evidence) -> Curve | None:
     return Curve(np.arange(2.0), np.array([steps.mean(), steps @ lacking / (lacking @ lacking)]))
 
 
-MIN_FRAMES = 8
-SPECTRA = tuple(_spectrum(name) for name in SERIES)
-STACKS = tuple(_of_stacks(kind) for kind in ("bias", "dark", "flat"))
+@family(
+    "{0}_of_frames", SERIES, "time", "{1}: spectrum over the frames", "{2}", unit="{3}",
+    x="cycles a frame", power=True,
+)  # fmt: skip
+def series_of_frames(name: str, look: Look) -> Curve:
+    """Mean squares of a parameter of the frames."""
+    return power_of(look.frames[name])
+
+
+@family(
+    "{0}_of_frames", STACKS, "time", "mean of {0} frames: spectrum", "{1}", unit="{2}",
+    x="bin of frequency", power=True, sets=False,
+)  # fmt: skip
+def means_of_frames(kind: str, evidence: Evidence) -> Curve | None:
+    """Mean squares of the means of calibration frames; of flats, over their light."""
+    every = evidence.ladder if kind == "flat" else evidence.of_kind(kind)
+    values = []
+    for stack in (s for s in every if len(s.adu) >= MIN_FRAMES):
+        means = frame_means(stack.adu, evidence.good) * evidence.gain
+        light = float(means.mean() - evidence.gain * evidence.bias[evidence.good].mean())
+        scale = light if kind == "flat" and light > 0 else 1.0
+        values.append(power_of(means / scale).value[:3])
+    if not values:
+        return None
+    shortest = min(map(len, values))
+    value = np.mean([v[:shortest] for v in values], axis=0)
+    return Curve(np.arange(shortest, dtype=float), value)
 
 
 @statistic("time", "trend of the bias level", "change of level", unit="e-", sets=False)
