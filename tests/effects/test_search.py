@@ -13,7 +13,13 @@ from pixcal.estimators.diagnosis.test_statistics.signature import signature_key
 from pixcal.model.config import quantity
 from pixcal.simulation.effect import Effect, Estimate, Stage
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
-from pixcal.stages.diagnose.comparison import MIN_LOGLIK_GAIN, Comparison, differing, shrinkage
+from pixcal.stages.diagnose.comparison import (
+    MIN_LOGLIK_GAIN,
+    Comparison,
+    differing,
+    gap_interval,
+    shrinkage,
+)
 from pixcal.stages.diagnose.rejection import MIN_LOGLIK_GAIN_WEAK, doubtful
 from pixcal.stages.diagnose.search import CONFIRM, MAX_CAUSES, SCREEN, Search
 
@@ -479,7 +485,7 @@ def test_what_opens_elsewhere_widens_the_interval_of_what_is_left() -> None:
     opened = flagged(told.after) - where
     assert opened
     assert told.gap.total > 0.2
-    assert told.interval[0] > 0.5 * told.gap.total
+    assert gap_interval(data, told, trial)[0] > 0.5 * told.gap.total
 
 
 def test_where_fewer_effects_are_refused_all_stay(monkeypatch: pytest.MonkeyPatch) -> None:

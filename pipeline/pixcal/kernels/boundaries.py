@@ -49,24 +49,28 @@ def area_changes(falloff_px: float) -> F64:
     return area
 
 
+# Loops, where a slice could be assigned: that takes seconds to compile.
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _push(charge: Any, shifts: Any, along_x: bool, wide: Any, out: Any) -> None:
-    """Mean shift of the boundaries after each pixel of a frame; ``wide`` is scratch."""
+def _push(charge: Any, shifts: Any, wide: Any, right: Any, below: Any) -> None:
+    """Mean shift of the boundaries on two sides of each pixel of a frame; ``wide`` is scratch."""
     ny, nx = charge.shape
     for y in range(ny + 2 * REACH):
-        wide[y, REACH : nx + REACH] = charge[min(max(y - REACH, 0), ny - 1)]
-        wide[y, :REACH] = wide[y, REACH]
-        wide[y, nx + REACH :] = wide[y, nx + REACH - 1]
+        inside = charge[min(max(y - REACH, 0), ny - 1)]
+        for x in range(nx + 2 * REACH):
+            wide[y, x] = inside[min(max(x - REACH, 0), nx - 1)]
     high, wide_by = shifts.shape
-    for y in range(ny):
-        out[y] = 0
-        for i in range(high):
-            for j in range(wide_by):
-                s = np.float32(0.5 * shifts[i, j])
-                dy, dx = (i, j + 1) if along_x else (j + 1, i)
-                row = wide[y + dy, dx : dx + nx]
-                for x in range(nx):
-                    out[y, x] += s * row[x]
+    for axis in range(2):
+        for y in range(ny):
+            out = below[y] if axis else right[y]
+            for x in range(nx):
+                out[x] = 0
+            for i in range(high):
+                for j in range(wide_by):
+                    s = np.float32(0.5 * shifts[i, j])
+                    dy, dx = (j + 1, i) if axis else (i, j + 1)
+                    row = wide[y + dy, dx : dx + nx]
+                    for x in range(nx):
+                        out[x] += s * row[x]
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -74,20 +78,19 @@ def _move(charge: Any, shifts: Any, along_y: Any, out: Any) -> None:
     """What pixels of frames (t, y, x) gain, added to ``out``."""
     frames, ny, nx = charge.shape
     wide = np.empty((ny + 2 * REACH, nx + 2 * REACH), np.float32)
-    push = np.empty((ny, nx), np.float32)
+    right, below = np.empty((ny, nx), np.float32), np.empty((ny, nx), np.float32)
     half = np.float32(0.5)
     for t in range(frames):
         q, gain = charge[t], out[t]
-        _push(q, shifts, True, wide, push)
+        _push(q, shifts, wide, right, below)
         for y in range(ny):
             for x in range(nx - 1):
-                flow = half * (q[y, x] + q[y, x + 1]) * push[y, x]
+                flow = half * (q[y, x] + q[y, x + 1]) * right[y, x]
                 gain[y, x + 1] -= flow
                 gain[y, x] += flow
-        _push(q, shifts, False, wide, push)
         for y in range(ny - 1):
             for x in range(nx):
-                flow = half * (q[y, x] + q[y + 1, x]) * push[y, x] * along_y
+                flow = half * (q[y, x] + q[y + 1, x]) * below[y, x] * along_y
                 gain[y + 1, x] -= flow
                 gain[y, x] += flow
 
@@ -118,10 +121,9 @@ def boundary_pushes(charge: F32, shifts: F64) -> tuple[F32, F32]:
     """
     ny, nx = charge.shape[1:]
     wide = np.empty((ny + 2 * REACH, nx + 2 * REACH), np.float32)
-    push_x, push_y = np.empty_like(charge), np.empty_like(charge)
+    push_x, push_y = np.empty(charge.shape, np.float32), np.empty(charge.shape, np.float32)
     for frame, right, below in zip(charge, push_x, push_y, strict=True):
-        _push(frame, shifts, True, wide, right)
-        _push(frame, shifts, False, wide, below)
+        _push(frame, shifts, wide, right, below)
     return push_x, push_y
 
 

@@ -38,11 +38,10 @@ def _project(
     rest: Any, weight: Any, of_place: Any, covariance: Any, of_time: Any, inverse: Any, turns: int
 ) -> None:
     (frames, pixels), free, functions = rest.shape, len(of_place), len(of_time)
-    sums, share = (
-        np.zeros((functions, pixels), np.float32),
-        np.zeros((functions, pixels), np.float32),
-    )
+    sums = np.zeros((functions, pixels), np.float32)
+    share = np.zeros((functions, pixels), np.float32)
     dots, size = np.zeros(free, np.float32), np.zeros(free, np.float32)
+    one = np.float32(1)
     for _ in range(turns):
         sums[:] = 0
         for t in range(frames):
@@ -68,7 +67,7 @@ def _project(
         for i in range(functions):
             share[i] = 0
             for k in range(functions):
-                share[i] += inverse[i, k] * sums[k]
+                _add_weighted(share[i], one, inverse[i, k], sums[k])
     for t in range(frames):
         for i in range(functions):
             _subtract(rest[t], of_time[i, t], share[i])

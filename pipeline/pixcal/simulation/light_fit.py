@@ -21,6 +21,7 @@ from pixcal.estimators.maps.map_fit import (
     polynomial,
 )
 from pixcal.kernels.crosstalk import filled
+from pixcal.kernels.robust import median
 from pixcal.kernels.scene import DetectorMaps, LightMaps
 from pixcal.kernels.significance import sigmas_of_chi2
 from pixcal.model.arrays import C128, F64, Mask
@@ -39,6 +40,9 @@ SEEN, STEP, LONGER, MOST = 1e-4, 1e-3, 3, 1e3
 # chi-square, and share of all of it, by which a start of more numbers must explain more
 APART, MODEL = 25.0, 0.02
 STRAIGHT = 0.02  # part of a step's change by which derivatives may fail to tell it
+# of its largest signal in any kind of map, below which an effect is not in one: logarithms and rad
+# have much the same noise, so that as little says nothing
+LEAST = 0.01
 UNTOLD = 1e-8  # share of a signal's square that is left where smooth surfaces take all of it
 # of what an effect must do to a map, as much has to be there; where it shows by so many errors
 AGREED, SHOWN = 0.5, 2.0
@@ -170,9 +174,10 @@ def _phasor(light: LightMaps) -> C128:
 def _bent(turn: C128) -> F64:
     """Phase (y, x) less its mean and slopes, rad: a fit has them free, and they may be large."""
     for axis in (0, 1):
-        steps = np.diff(np.unwrap(np.angle(turn), axis=axis), axis=axis)
+        one, other = turn.swapaxes(0, axis)[:-1], turn.swapaxes(0, axis)[1:]
+        step = median(np.angle(other * one.conj()).ravel())
         place = np.expand_dims(np.arange(turn.shape[axis]), 1 - axis)
-        turn = turn * np.exp(-1j * float(np.median(steps)) * place)
+        turn = turn * np.exp(-1j * step * place)
     return np.asarray(np.angle(turn * np.exp(-1j * np.angle(turn.mean()))))
 
 
@@ -258,7 +263,7 @@ def _least_squares(
     parts = []
     whole, left = np.zeros((2, len(signals[0])))
     for one, data, own in zip(lit, rest, signals, strict=True):
-        for kind in (k for k in kinds if own[:, k].any()):
+        for kind in (k for k in kinds if _shows(own, k)):
             free = np.concatenate([polynomial(one.good.shape, degree), one.gauge])
             parts.append(MapPart.of(own[:, kind], data[kind], free, one.good))
             whole += (own[:, kind][:, one.good] ** 2).sum(axis=1)
@@ -272,6 +277,12 @@ def _least_squares(
     found.values[told] = fit.values / size
     found.covariance[np.ix_(told, told)] = fit.covariance / np.outer(size, size)
     return replace(found, gain=fit.gain)
+
+
+def _shows(signals: F64, kind: int) -> bool:
+    """Whether signals (n, 3, y, x) show in a kind of map at all."""
+    largest = np.abs(signals).max(axis=(2, 3))
+    return bool((largest[:, kind] > LEAST * largest.max(axis=1)).any())
 
 
 def _gain(

@@ -136,7 +136,7 @@ def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[_Noise]:
     light = np.where(good, np.maximum(charge - dark, 0), 0)
     if not light.any():
         return
-    variance = np.broadcast_to(charge + np.float32(evidence.read_noise**2), frames.shape)
+    variance = np.repeat((charge + np.float32(evidence.read_noise**2))[None], len(frames), 0)
     weight = np.where(good, 1 / variance, np.float32(0)).reshape(len(frames), -1)
     level = np.ones((1, len(frames)), np.float32)
     freedom = TwoWay(weight, level, light.reshape(1, -1).astype(np.float32))
@@ -146,6 +146,6 @@ def _of_flats(stack: Stack, evidence: Evidence) -> Iterator[_Noise]:
 
     yield _Noise(
         residual.reshape(frames.shape), variance.astype(np.float32),
-        np.broadcast_to(charge, frames.shape), freedom.frame_covariance.astype(np.float32),
+        np.repeat(charge[None], len(frames), 0), freedom.frame_covariance.astype(np.float32),
         freedom.of_place.reshape(1, *good.shape), 1 - 1 / len(frames),
     )  # fmt: skip

@@ -81,9 +81,8 @@ def fit_maps(parts: Sequence[MapPart]) -> MapFit:
     for part, rest, variance in zip(parts, left, variances, strict=True):
         pulls = part.signals * (rest / variance)[:, None]
         for own, block in zip(meat, part.blocks, strict=True):
-            scores = np.zeros((block.max(initial=0) + 1, n))
-            np.add.at(scores, block, pulls)
-            own += scores.T @ scores
+            scores = np.stack([np.bincount(block, pull) for pull in pulls.T])
+            own += scores @ scores.T
     inside = np.einsum("ij,sjk,ki->si", covariance, meat, covariance)
     more = max(1.0, *map(float, np.mean(inside / np.diag(covariance), axis=1)))
     return MapFit(values, np.asarray(covariance * more), float(values @ normal @ values) / more)

@@ -40,39 +40,42 @@ class Trial:
 
 @dataclass(frozen=True)
 class Shrinkage:
-    """How far the gap shrinks, with its interval (5 to 95 %)."""
+    """How far the gap shrinks."""
 
     before: Mapping[Key, Difference]  # before, after: differences of the curves
     after: Mapping[Key, Difference]
     where: set[Key]  # curves that make up the gap
     gap: Gap
-    interval: tuple[float, float]
 
 
 def shrinkage(data: Mapping[Key, F64], nominal: Trial, other: Trial, where: set[Key]) -> Shrinkage:
-    """The gap with some effects, against the nominal bench's.
-
-    The interval comes from expectations shifted by their own scatter, of all curves: what opens
-    where there was no gap counts too.
-    """
+    """The gap with some effects, against the nominal bench's."""
     before = compare(data, nominal.expected)
     after = compare(data, other.expected)
-    gap = remaining(before, after, where)
-    rng = np.random.default_rng(17)
+    return Shrinkage(before, after, where, remaining(before, after, where))
+
+
+def gap_interval(data: Mapping[Key, F64], shrunk: Shrinkage, other: Trial) -> tuple[float, float]:
+    """Interval (5 to 95 %) of the gap that some effects leave.
+
+    From expectations shifted by their own scatter, of all curves: what opens where there was no gap
+    counts too.
+    """
+    total = shrunk.gap.total
+    if not shrunk.where:
+        return min(0.0, total), total
+    expected, rng = other.expected, np.random.default_rng(17)
+    error = np.sqrt(np.concatenate([expected.variance[key] for key in expected.mean]))
+    ends = np.cumsum([len(mean) for mean in expected.mean.values()])[:-1]
+    wider = replace(expected, variance={k: 2 * own for k, own in expected.variance.items()})
     draws = []
     for _ in range(DRAWS):
-        expected = other.expected
-        mean = {
-            k: m + np.sqrt(expected.variance[k]) * rng.standard_normal(len(m))
-            for k, m in expected.mean.items()
-        }
-        doubled = {k: 2 * expected.variance[k] for k in mean}
-        moved = replace(expected, mean=mean, variance=doubled)
-        draws.append(remaining(before, compare(data, moved), where).total if where else 0.0)
+        shifts = np.split(error * rng.standard_normal(len(error)), ends)
+        mean = {k: m + own for (k, m), own in zip(expected.mean.items(), shifts, strict=True)}
+        after = compare(data, replace(wider, mean=mean))
+        draws.append(remaining(shrunk.before, after, shrunk.where).total)
     low, high = np.quantile(draws, (0.05, 0.95))
-    return Shrinkage(
-        before, after, where, gap, (min(float(low), gap.total), max(float(high), gap.total))
-    )
+    return min(float(low), total), max(float(high), total)
 
 
 def differing(nominal: Trial, final: Trial, data: Mapping[Key, F64]) -> set[Key]:

@@ -18,7 +18,13 @@ from pixcal.model.config import to_plain
 from pixcal.report.curve_places import place
 from pixcal.simulation.effect import DOMAINS
 from pixcal.stages.diagnose.candidates import Candidate, SearchResult
-from pixcal.stages.diagnose.comparison import Shrinkage, Trial, differing, shrinkage
+from pixcal.stages.diagnose.comparison import (
+    Shrinkage,
+    Trial,
+    differing,
+    gap_interval,
+    shrinkage,
+)
 from pixcal.stages.diagnose.frames_used import FramesUsed
 from pixcal.stages.diagnose.recommended_frames import recommend_frames
 
@@ -59,7 +65,7 @@ def describe(
         "gap": {
             "total": 1.0 if where else 0.0,
             "after": _rounded(final.gap.total),
-            "interval": [_rounded(v) for v in final.interval],
+            "interval": [_rounded(v) for v in gap_interval(data, final, found.final)],
             "domains": {
                 domain: [_rounded(v) for v in final.gap.of_domain(domain)] for domain in DOMAINS
             },
@@ -121,7 +127,8 @@ def _cause(
     estimate = candidate.estimate
     assert estimate is not None
     effect = next(e for e in found.final.effects if e.name == name)
-    alone = shrinkage(data, found.nominal, candidate.alone or found.final, where)
+    by_itself = candidate.alone or found.final
+    alone = shrinkage(data, found.nominal, by_itself, where)
     without = shrinkage(data, found.nominal, found.without[name], where)
     gain = found.final.log_likelihood - found.without[name].log_likelihood
     by_law = alone
@@ -150,7 +157,7 @@ def _cause(
         "strengths": list(effect.strengths),
         "law": estimate.law,
         "gap_closed": _closed(alone.gap.total),
-        "gap_closed_interval": [_closed(v) for v in reversed(alone.interval)],
+        "gap_closed_interval": [_closed(v) for v in reversed(gap_interval(data, alone, by_itself))],
         "gap_closed_by_law": _closed(by_law.gap.total),
         "gain_over_rest": _rounded(without.gap.total - final.gap.total),
         "p_value": float(np.clip(chance, MIN_P_VALUE, 1.0)),
