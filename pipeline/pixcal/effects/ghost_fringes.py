@@ -179,10 +179,7 @@ class GhostFringes(Effect):
         errors: dict[str, float] = {}
         for n, one in enumerate(found.waves):
             waves.append(_wave(one, middle))
-            for key, error in (
-                ("static", one.errors[0]),
-                ("forward", one.errors[1])("backward", one.errors[2]),
-            ):
+            for key, error in zip(("static", "forward", "backward"), one.errors, strict=False):
                 errors |= {f"waves[{n}].{key}[{part}]": error for part in (0, 1)}
             errors |= {f"waves[{n}].beat_rad_px[{axis}]": one.errors[3 + axis] for axis in (0, 1)}
         law, tied, left = _law(found.waves, middle)

@@ -69,8 +69,9 @@ def statistic(
     def mark(measure: Callable[[Any], Curve | None]) -> Statistic:
         kind = "power" if power else "linear"
         of_set = sets and not together
+        name = getattr(measure, "__name__", "")
         return Statistic(
-            measure.__name__, title, domain, quantity, unit, x, kind, of_set, together, floor,
+            name, title, domain, quantity, unit, x, kind, of_set, together, floor,
             measure,
         )  # fmt: skip
 
@@ -95,9 +96,8 @@ def family(
         made = []
         for words in members:
             own = {key: filled(option, words) for key, option in options.items()}
-            one = statistic(*(filled(text, words) for text in texts), **own)(measure)
-            own_name = filled(name, words)
-            made.append(replace(one, name=own_name, measure=partial(measure, words[0])))
+            one = statistic(*(filled(text, words) for text in texts), **own)
+            made.append(replace(one(partial(measure, words[0])), name=filled(name, words)))
         return tuple(made)
 
     return mark

@@ -136,10 +136,10 @@ def low_orders(name: str, look: Look) -> Curve:
 def _power_beside_lines(values: F64) -> tuple[F64, F64, F64, Mask]:
     """Power (y, x) of a map's Fourier transform, its frequencies, and which are used."""
     # Rows, columns and their means have statistics of their own.
-    power = np.abs(np.fft.rfft2(np.nan_to_num(values))) ** 2
-    fy = np.fft.fftfreq(values.shape[0])[:, None]
-    fx = np.fft.rfftfreq(values.shape[1])[None, :]
-    apart = (np.abs(fy) > 1.5 / values.shape[0]) & (np.abs(fx) > 1.5 / values.shape[1])
+    power: F64 = np.abs(np.fft.rfft2(np.nan_to_num(values))) ** 2
+    fy = np.fft.fftfreq(values.shape[0]).astype(float)[:, None]
+    fx = np.fft.rfftfreq(values.shape[1]).astype(float)[None, :]
+    apart: Mask = (np.abs(fy) > 1.5 / values.shape[0]) & (np.abs(fx) > 1.5 / values.shape[1])
     return power, fy, fx, apart
 
 
