@@ -10,7 +10,11 @@ import pytest
 from pixcal.effects.lag import Lag
 from pixcal.estimators.detector.frame_lag import lag_of_flats
 from pixcal.estimators.diagnosis.evidence import Evidence, Stack
+from pixcal.kernels.normals import Key, pixel_normals
+from pixcal.kernels.scene import Rows
+from pixcal.model.arrays import F32
 from pixcal.model.bench import Bench
+from pixcal.simulation import exposure
 from pixcal.simulation.exposure import Camera, frames_of
 from pixcal.simulation.recording import Recording, recordings
 
@@ -92,17 +96,18 @@ def test_noise_is_drawn_once_for_a_frame_wherever_one_begins(
     make_effect_bench: Callable[..., Bench], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench, lag = make_effect_bench(SMALL), Lag(0.05, 1.5, 0.1)
-    drawn: list[tuple[int, ...]] = []
-    rng = Recording.pixel_rng
+    fringes = of_kind(bench, "fringes")
+    drawn: list[tuple[Key, int]] = []
 
-    def counted(recording: Recording, effect: str, *key: int) -> np.random.Generator:
-        drawn.append(key)
-        return rng(recording, effect, *key)
+    def counted(key: Key, frame: int, rows: Rows, columns: int) -> F32:
+        drawn.append((key, frame))
+        return pixel_normals(key, frame, rows, columns)
 
-    monkeypatch.setattr(Recording, "pixel_rng", counted)
-    for _ in Camera(bench, (5, 18), [lag]).expose(of_kind(bench, "fringes"), range(20, 35)):
+    monkeypatch.setattr(exposure, "pixel_normals", counted)
+    for _ in Camera(bench, (5, 18), [lag]).expose(fringes, range(20, 35)):
         pass
-    assert sorted(drawn) == [(frame, 0) for frame in range(20 - lag.frames_back, 35)]
+    own = sorted(frame for key, frame in drawn if key == fringes.effect_key(lag.name))
+    assert own == list(range(20 - lag.frames_back, 35))
 
 
 FULL = Lag(0.03, 0.0, 0.0, (2.0, 1.2, 0.8, 0.3), 40_000.0, (0.6, 0.3, 0.1))

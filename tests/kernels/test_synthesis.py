@@ -1,4 +1,4 @@
-"""Noise: exact in distribution, the same however it is cut; samples: the closed forms."""
+"""Shot noise: exact in distribution; samples: the closed forms."""
 
 from itertools import pairwise
 
@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from pixcal.kernels import synthesis
-from pixcal.kernels.synthesis import BLOCK_ROWS, EXACT_BELOW, Stream, block_normals, generator
+from pixcal.kernels.synthesis import EXACT_BELOW, Stream, generator, pixel_key
 
 SHAPE = (130, 211)
 
@@ -30,39 +30,20 @@ def test_a_key_always_gives_the_same_numbers_and_no_other_key_does() -> None:
     assert len({tuple(numbers) for numbers in first}) == len(keys)
 
 
+def test_pixels_of_each_purpose_have_a_key_of_their_own() -> None:
+    keys = [(1, Stream.NOISE, 0, 1), (2, Stream.NOISE, 0, 1), (1, Stream.EFFECT, 0, 1)]
+    keys += [(1, Stream.NOISE, 1, 0), (1, Stream.NOISE, 0), (1 << 40, Stream.NOISE, 0, 1)]
+    found = [pixel_key(*key) for key in keys]
+    assert found == [pixel_key(*key) for key in keys]
+    assert len(set(found)) == len(keys)
+    assert all(0 <= word < 1 << 32 for key in found for word in key)
+
+
 def test_compiled_normals_are_those_of_numpy() -> None:
     out = np.empty((17, 31), np.float32)
     synthesis.fill_normal(generator(5, Stream.NOISE, 1), out)
     expected = generator(5, Stream.NOISE, 1).standard_normal((17, 31))
     assert np.array_equal(out, expected.astype(np.float32))
-
-
-def test_normals_are_normal_and_independent() -> None:
-    frames = np.array([block_normals((0, 200), 301, 7, (3, 0, n)) for n in range(12)])
-    shot, read = frames[:, 0], frames[:, 1]
-    n = shot.size
-    assert abs(shot.mean()) < 4 / np.sqrt(n)
-    assert shot.var() == pytest.approx(1, abs=4 * np.sqrt(2 / n))
-    assert stats.skew(shot, axis=None) == pytest.approx(0, abs=4 * np.sqrt(6 / n))
-    assert stats.kurtosis(shot, axis=None) == pytest.approx(0, abs=4 * np.sqrt(24 / n))
-    assert stats.kstest(shot.ravel()[::3], "norm").pvalue > 1e-4
-    pairs = {
-        "columns": (shot[..., 1:], shot[..., :-1]),
-        "rows": (shot[:, 1:], shot[:, :-1]),
-        "blocks": (shot[:, BLOCK_ROWS:], shot[:, :-BLOCK_ROWS]),
-        "frames": (shot[1:], shot[:-1]),
-        "shot and read noise": (shot, read),
-        "shot and the read noise before": (shot[1:], read[:-1]),
-    }
-    for name, (one, other) in pairs.items():
-        assert abs((one * other).mean()) < 4 / np.sqrt(one.size), name
-
-
-@pytest.mark.parametrize("rows", [(0, 1), (3, 67), (63, 65), (64, 128), (100, 131), (127, 131)])
-def test_normals_do_not_depend_on_the_rows_asked_for(rows: tuple[int, int]) -> None:
-    whole = block_normals((0, 131), 53, 7, (3, 1, 2))
-    for part, all_rows in zip(block_normals(rows, 53, 7, (3, 1, 2)), whole, strict=True):
-        assert np.array_equal(part, all_rows[rows[0] : rows[1]])
 
 
 @pytest.mark.parametrize("mean", [0.01, 0.1, 1.0, 3.7, 11.0, 15.99])

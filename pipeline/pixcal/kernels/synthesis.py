@@ -5,12 +5,9 @@ can act between any two: `illuminate` (light and pixel response: mean electrons)
 (charge: dark current, shot noise, full well), `amplify` (gain, bias, read noise), `convert`
 (codes).
 
-Random numbers come from `numpy.random.Generator` (PCG64), one for each (purpose, place): noise for
-each frame and block of `BLOCK_ROWS` rows of the window, maps of the chip for each tile of it. So
-nothing depends on how the work is cut or who does it.
-
-Measured on one core (AMD EPYC, Zen 5), 64 x 8320 samples: 3 to 4 ns a normal when the generator is
-called in compiled code (8 through NumPy), 0.5 ns for shot noise out of it, 9 ns a sample in all.
+Random numbers are keyed by (purpose, place): noise of pixels by `pixcal.kernels.normals`, all else
+by a `numpy.random.Generator` (PCG64) each, such as maps of the chip for each tile of it. So nothing
+depends on how the work is cut or who does it.
 """
 
 import math
@@ -22,9 +19,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pixcal.kernels.normals import Key
 from pixcal.model.arrays import F32, U16
 
-# Rows of the window that share a noise generator. Another number would be other noise.
+# Rows of the window that are simulated at a time.
 BLOCK_ROWS = 64
 # mean (e-) below which the Poisson quantile is found by summing the distribution
 EXACT_BELOW = 16.0
@@ -48,6 +46,12 @@ class Stream(IntEnum):
 def generator(seed: int, stream: Stream, *key: int) -> np.random.Generator:
     """The random generator of one purpose and place; the same whoever asks, in whatever order."""
     return np.random.Generator(np.random.PCG64(_Seed.of(seed, int(stream), *key)))
+
+
+def pixel_key(seed: int, stream: Stream, *key: int) -> Key:
+    """The same for normals of pixels (`pixcal.kernels.normals`)."""
+    word = int(_Seed.of(seed, int(stream), *key).words[0])
+    return word >> 32, word & 0xFFFFFFFF
 
 
 class _Seed(np.random.SeedSequence):
@@ -107,7 +111,7 @@ def illuminate(
             out[i, j] = b * iota[i, j] + alpha_sin[i, j] * c + alpha_cos[i, j] * s
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True, error_model="numpy")  # type: ignore[untyped-decorator]
 def collect(light: F32, dark: F32, normal: F32, shot: bool, full_well: float, out: F32) -> None:
     """Charge ``out`` of each pixel, (y, x) e-, clipped at the full well; whole with shot noise.
 
@@ -145,7 +149,7 @@ def _poisson_expansion(mean: np.float32, w: np.float32) -> np.float32:
     first = -w * (np.float32(1 / 36) + w2 * np.float32(1 / 72))
     second = np.float32(-8 / 405) + w2 * (np.float32(7 / 810) + w2 * np.float32(1 / 270))
     rest = np.float32(1 / 3) + w2 * np.float32(1 / 6) + first / root + second / mean
-    return math.floor(mean + root * w + rest)  # type: ignore[return-value]
+    return np.float32(np.floor(mean + root * w + rest))
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -188,26 +192,9 @@ def convert(adu: F32, step: int, top: int, out: U16) -> None:
             out[i, j] = np.uint16(code * step)
 
 
-def block_normals(
-    rows: tuple[int, int], columns: int, seed: int, key: tuple[int, ...], count: int = 2
-) -> list[F32]:
-    """Standard normals for some rows of the window, whichever blocks they lie in.
-
-    ``count`` independent arrays (y, x) for shot noise, read noise, ...; the key is kind, sequence
-    and frame.
-    """
-    first, last = rows
-    begin, end = first // BLOCK_ROWS, -(-last // BLOCK_ROWS)
-    blocks = np.empty((count, (end - begin) * BLOCK_ROWS, columns), np.float32)
-    for block in range(begin, end):
-        rng = generator(seed, Stream.NOISE, *key, block)
-        at = (block - begin) * BLOCK_ROWS
-        for array in blocks:
-            fill_normal(rng, array[at : at + BLOCK_ROWS])
-    skip = first - begin * BLOCK_ROWS
-    return [array[skip : skip + last - first] for array in blocks]
-
-
 def turns(angles: NDArray[Any]) -> F32:
     """cos and sin of angles (rad) as `illuminate` takes them, shape (2, n)."""
-    return np.stack([np.cos(angles), np.sin(angles)]).astype(np.float32)
+    found = np.empty((2, len(angles)), np.float32)
+    np.cos(angles, out=found[0])
+    np.sin(angles, out=found[1])
+    return found

@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from pixcal.kernels import synthesis
+from pixcal.kernels.normals import Key, pixel_normals
 from pixcal.kernels.scene import (
     FrameStates,
     LightMaps,
@@ -166,6 +167,7 @@ class _Chain:
         self._charges = _Latest[tuple[int, int]](2 * max(back, default=1))
         self._kept_normals = _Latest[tuple[int, str]](sum(back))
         self._margins: dict[int, tuple[LightMaps, F32]] = {}
+        self._noise: tuple[int, F32] | None = None
         self._samples = np.empty(self.dark.shape, np.uint16)
 
     @cached_property
@@ -243,16 +245,7 @@ class _Chain:
         key = (frame, effect)
         if key in self._kept_normals:
             return self._kept_normals[key]
-        first, last = self.camera.rows
-        begin, end = first // BLOCK_ROWS, -(-last // BLOCK_ROWS)
-        width = self.camera.bench.detector.shape[1]
-        out = np.empty(((end - begin) * BLOCK_ROWS, width), np.float32)
-        for block in range(begin, end):
-            at = (block - begin) * BLOCK_ROWS
-            rng = self.recording.pixel_rng(effect, frame, block)
-            synthesis.fill_normal(rng, out[at : at + BLOCK_ROWS])
-        skip = first - begin * BLOCK_ROWS
-        drawn = out[skip : skip + last - first]
+        drawn: F32 = self._drawn(self.recording.effect_key(effect), frame)[0]
         if keep:
             self._kept_normals.keep(key, drawn)
         return drawn
@@ -276,18 +269,17 @@ class _Chain:
             adu = effect.readout(adu, _Shot(self, frame, at))
         return adu
 
-    def _normals(self, frame: int) -> list[F32]:
-        """Shot and read noise of a frame; made once for both."""
+    def _normals(self, frame: int) -> F32:
+        """Standard normals (2, y, x) of shot and read noise of a frame; made once for both."""
         if not self.camera.noise:
-            nothing = np.zeros_like(self.dark)
-            return [nothing, nothing]
-        if getattr(self, "_drawn", (-1, []))[0] != frame:
-            width = self.camera.bench.detector.shape[1]
-            drawn = synthesis.block_normals(
-                self.camera.rows, width, self.recording.pixel_seed, (*self.recording.key, frame)
-            )
-            self._drawn: tuple[int, list[F32]] = (frame, drawn)
-        return self._drawn[1]
+            return np.zeros((2, *self.dark.shape), np.float32)
+        if self._noise is None or self._noise[0] != frame:
+            self._noise = frame, self._drawn(self.recording.noise_key, frame)
+        return self._noise[1]
+
+    def _drawn(self, key: Key, frame: int) -> F32:
+        """Two arrays of standard normals (2, y, x) on the rows at hand."""
+        return pixel_normals(key, frame, self.camera.rows, self.dark.shape[1])
 
 
 def states_of(recording: Recording, effects: Sequence[ForwardModel]) -> FrameStates:

@@ -1,12 +1,13 @@
 """What a bench records: sequences of frames, in order of time."""
 
-import zlib
 from dataclasses import dataclass
+from zlib import crc32
 
 import numpy as np
 
+from pixcal.kernels.normals import Key
 from pixcal.kernels.scene import electrons_per_unit
-from pixcal.kernels.synthesis import Stream, generator
+from pixcal.kernels.synthesis import Stream, generator, pixel_key
 from pixcal.model.bench import Bench
 
 KINDS = ("bias", "dark", "flat", "fringes")
@@ -43,18 +44,26 @@ class Recording:
         """Random numbers of an effect, the same whoever asks, in whatever order."""
         return self._rng(self.bench.seed, effect, *key)
 
+    def pixel_rng(self, effect: str, *key: int) -> np.random.Generator:
+        """As `rng`, of what differs from pixel to pixel."""
+        return self._rng(self._pixel_seed, effect, *key)
+
     @property
-    def pixel_seed(self) -> int:
+    def noise_key(self) -> Key:
+        """Key of the normals of shot and read noise."""
+        return pixel_key(self._pixel_seed, Stream.NOISE, *self.key)
+
+    def effect_key(self, effect: str) -> Key:
+        """Key of the normals of an effect."""
+        return pixel_key(self._pixel_seed, Stream.EFFECT, crc32(effect.encode()), *self.key)
+
+    @property
+    def _pixel_seed(self) -> int:
         """Seed of what differs from pixel to pixel, and so from window to window."""
         return self.bench.seed + SEEDS_APART * self.window
 
-    def pixel_rng(self, effect: str, *key: int) -> np.random.Generator:
-        """As `rng`, of what differs from pixel to pixel."""
-        return self._rng(self.pixel_seed, effect, *key)
-
     def _rng(self, seed: int, effect: str, *key: int) -> np.random.Generator:
-        name = zlib.crc32(effect.encode())
-        return generator(seed, Stream.EFFECT, name, *self.key, *key)
+        return generator(seed, Stream.EFFECT, crc32(effect.encode()), *self.key, *key)
 
 
 def recordings(bench: Bench) -> list[Recording]:

@@ -24,7 +24,7 @@ TRUTH_MAPS = tuple(f for f in fields(DetectorMaps) if f.name not in ("read_noise
 
 
 def row_blocks(bench: Bench) -> list[Rows]:
-    """The window's rows, in the blocks that share their noise generator."""
+    """The window's rows, in blocks that are simulated at a time."""
     ny, step = bench.detector.shape[0], synthesis.BLOCK_ROWS
     return [(row, min(row + step, ny)) for row in range(0, ny, step)]
 
