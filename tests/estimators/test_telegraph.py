@@ -8,7 +8,7 @@ from scipy.special import logsumexp
 
 from pixcal.estimators.detector.telegraph.classes import Mixture
 from pixcal.estimators.detector.telegraph.find import find_telegraph
-from pixcal.estimators.detector.telegraph.moments import Series
+from pixcal.estimators.detector.telegraph.moments import QUIET, Series, moments_of, thinned
 
 PERIOD_S = 0.14
 
@@ -82,3 +82,19 @@ def test_times_that_differ_from_pixel_to_pixel_are_told() -> None:
     assert found.switching_decades > 1
     assert abs(found.switching_s - 1.2) < 4 * found.switching_error
     assert abs(found.share - 0.03) < 4 * found.share_error
+
+
+def test_quiet_pixels_stand_for_those_left_out() -> None:
+    """Sums over the pixels stay right, and no noisy pixel is left out."""
+    rng = np.random.default_rng(12)
+    n, jumping_pixels = 6 * QUIET, 200
+    noise = rng.standard_normal((16, n))
+    noise[:, :jumping_pixels] += 20 * rng.choice([-1.0, 1.0], (16, jumping_pixels))
+    whole = moments_of(Series(noise, np.arange(16), np.arange(n), 1.0, PERIOD_S))
+    assert whole is not None
+    (some,) = thinned([whole])
+    assert len(some.pixel) < 1.2 * QUIET
+    assert set(range(jumping_pixels)) <= set(some.pixel.tolist())
+    assert some.stands_for.sum() == pytest.approx(n)
+    error = np.sqrt(2 / 15 * n * n / QUIET)
+    assert abs(some.stands_for @ some.variance - whole.variance.sum()) < 4 * error

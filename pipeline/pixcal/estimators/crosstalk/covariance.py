@@ -43,10 +43,13 @@ NORMALS = 14
 
 @dataclass(frozen=True)
 class Products:
-    """Sums over frames for each link and pixel (zero where the partner is out of the window)."""
+    """Sums over frames for each link and pixel (zero where the partner is out of the window).
 
-    right: F64  # (link, 5, y, x) products of residuals with each of the `TERMS`; charge in 10⁴ e-
-    normal: F64  # (link, 14, y, x) of the terms with each other, in the order of `NORMAL`
+    In single precision: of sixty links they are over four thousand bytes a pixel.
+    """
+
+    right: F32  # (link, 5, y, x) products of residuals with each of the `TERMS`; charge in 10⁴ e-
+    normal: F32  # (link, 14, y, x) of the terms with each other, in the order of `NORMAL`
     # shot, shot_error: variance of a pixel over what its charge gives, as measured: 1 for the
     # right gain
     shot: float
@@ -63,8 +66,8 @@ def products(
     """
     ny, nx = evidence.good.shape
     steps = np.array(links, int).reshape(-1, 2)
-    right = np.zeros((len(links), TERMS, ny, nx))
-    normal = np.zeros((len(links), NORMALS, ny, nx))
+    right = np.zeros((len(links), TERMS, ny, nx), np.float32)
+    normal = np.zeros((len(links), NORMALS, ny, nx), np.float32)
     line, line_right = np.zeros((3, 3)), np.zeros(3)
     brightest = 0.0
     for parts in _gathered(all_residuals(evidence, known)):
@@ -150,7 +153,7 @@ def _multiply_up(factor: F32, charge: F32, one: F32, first: int, powers: F32) ->
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _add_pixels(sums: F32, y: int, first: int, out: F64) -> None:
+def _add_pixels(sums: F32, y: int, first: int, out: F32) -> None:
     """Add sums (pixel, link, n) of pixels of a row, from a column on, to all (link, n, y, x)."""
     count = min(len(sums), out.shape[3] - first)
     for n in range(out.shape[0]):
@@ -160,7 +163,7 @@ def _add_pixels(sums: F32, y: int, first: int, out: F64) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
-def _add_right_sums(e0: F32, e1: F32, e2: F32, links: Any, right: F64) -> None:
+def _add_right_sums(e0: F32, e1: F32, e2: F32, links: Any, right: F32) -> None:
     """Add to the sums (link, 5, y, x), of powers of the charge times residuals (y, x, t)."""
     ny, nx, nt = e0.shape
     sums = np.empty((_COLUMNS, len(links), 5), np.float32)
@@ -187,7 +190,7 @@ def _add_right_sums(e0: F32, e1: F32, e2: F32, links: Any, right: F64) -> None:
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST)  # type: ignore[untyped-decorator]
-def _add_normal_sums(w0: F32, w1: F32, w2: F32, w3: F32, w4: F32, links: Any, normal: F64) -> None:
+def _add_normal_sums(w0: F32, w1: F32, w2: F32, w3: F32, w4: F32, links: Any, normal: F32) -> None:
     """Add to the sums (link, 14, y, x), of powers of the charge over the variance (y, x, t)."""
     ny, nx, nt = w0.shape
     sums = np.empty((_COLUMNS, len(links), NORMALS), np.float32)

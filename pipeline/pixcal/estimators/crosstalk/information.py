@@ -13,7 +13,7 @@ from pixcal.estimators.crosstalk.covariance import NORMAL, TERMS, Products
 from pixcal.estimators.crosstalk.hot_pixels import HotPixels
 from pixcal.estimators.crosstalk.links import PixelClasses, Place, class_sums, sums_of
 from pixcal.estimators.crosstalk.residuals import UNIT
-from pixcal.model.arrays import F64, Mask
+from pixcal.model.arrays import F32, F64, Mask
 
 # how large the covariance of neighbours over the square of their charge may well be, 1/e-
 BRIGHTER_FATTER = 1e-6
@@ -68,9 +68,9 @@ class MeasuredLinks:
         return replace(self, products=products, hot=hot, links=tuple(self.links[n] for n in at))
 
     @property
-    def _sums(self) -> tuple[F64, F64]:
+    def _sums(self) -> tuple[F32, F32]:
         if self.products is None:
-            none = np.zeros((len(self.links), 0, *self.shape))
+            none = np.zeros((len(self.links), 0, *self.shape), np.float32)
             return none, none
         return self.products.right, self.products.normal
 

@@ -10,6 +10,7 @@ from pixcal.estimators.crosstalk.dense import CouplingFrames, Dense, frames_of, 
 from pixcal.estimators.crosstalk.links import links
 from pixcal.estimators.crosstalk.pattern import visibility_pattern
 from pixcal.estimators.crosstalk.support import Choice, choose
+from pixcal.estimators.diagnosis.central_crop import central_crop
 from pixcal.estimators.diagnosis.evidence import Evidence
 from pixcal.kernels.crosstalk import Coupling
 from pixcal.model.arrays import F64
@@ -19,6 +20,8 @@ LEVEL_STEPS = 10  # steps of a level dependence
 CERTAIN = 5.0  # sigmas beyond which a level dependence is taken
 # sigmas beyond which a coupling is told of: of a hundred that are none, one in twenty kernels
 THERE = 3.5
+# pixels of flats that are looked at: the sums of pairs up to `links.REACH` apart fill 600 MB
+MOST_PIXELS = 1 << 17
 ALIKE = 0.05  # chance from which shares of all classes are taken to be one
 
 
@@ -44,6 +47,8 @@ def measure(evidence: Evidence) -> Kernel | None:
     are measured together, and those that are there are told. Raises InputError if so many stand out
     that it is no kernel.
     """
+    if not evidence.fringes:
+        evidence = central_crop(evidence, MOST_PIXELS)
     shape = (evidence.good.shape[0], evidence.good.shape[1])
     every = links(shape)
     frames = frames_of([evidence], lambda _: every) if every else None

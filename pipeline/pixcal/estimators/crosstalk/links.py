@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixcal.kernels.crosstalk import Coupling
-from pixcal.model.arrays import F64, Indices
+from pixcal.model.arrays import F32, F64, Indices
 
 Place = tuple[int, int]
 
@@ -79,16 +79,16 @@ def periods(shape: Place, longest: int = MAX_PERIOD) -> list[Place]:
     return sorted(both, key=lambda p: (p[0] * p[1], p))
 
 
-def class_sums(values: F64, first: Place) -> Iterator[tuple[PixelClasses, F64]]:
+def class_sums(values: F32 | F64, first: Place) -> Iterator[tuple[PixelClasses, F64]]:
     """Sums (..., class) of maps (..., y, x) over the pixels of each class, for every period."""
     # Rows first, then columns of those sums: the cost is that of the row periods.
     wanted = periods((values.shape[-2], values.shape[-1]))
-    by_rows: dict[int, F64] = {}
+    by_rows: dict[int, F32 | F64] = {}
     for n in sorted({n for n, _ in wanted}, reverse=True):
         # Of a multiple's sums there are few.
         multiple = next((sums for longer, sums in by_rows.items() if longer % n == 0), None)
         source, start = (values, first[0]) if multiple is None else (multiple, 0)
-        sums = [source[..., (a - start) % n :: n, :].sum(-2) for a in range(n)]
+        sums = [source[..., (a - start) % n :: n, :].sum(-2, dtype=float) for a in range(n)]
         by_rows[n] = np.stack(sums, -2)
     for n, m in wanted:
         rows = by_rows[n]
@@ -96,10 +96,10 @@ def class_sums(values: F64, first: Place) -> Iterator[tuple[PixelClasses, F64]]:
         yield PixelClasses(n, m, first), both.reshape(*both.shape[:-2], n * m)
 
 
-def sums_of(values: F64, classes: PixelClasses) -> F64:
+def sums_of(values: F32 | F64, classes: PixelClasses) -> F64:
     """Sums (..., class) of maps (..., y, x) over the pixels of each class."""
     (n, m), (y, x) = (classes.rows, classes.columns), classes.first
     return np.stack(
-        [values[..., (a - y) % n :: n, (b - x) % m :: m].sum((-2, -1))
+        [values[..., (a - y) % n :: n, (b - x) % m :: m].sum((-2, -1), dtype=float)
          for a in range(n) for b in range(m)], -1
     )  # fmt: skip

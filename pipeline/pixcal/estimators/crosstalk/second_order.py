@@ -23,7 +23,7 @@ def to_first_order(
     are the first row and column of the arrays in the window.
     """
     shape = (found.right.shape[-2], found.right.shape[-1])
-    right = found.right / found.shot
+    right = found.right / np.float32(found.shot)
     kept = 1 - outflow(couplings, shape, first)
     third = _third_pixels(couplings, shape, first)
     for n, step in enumerate(links):

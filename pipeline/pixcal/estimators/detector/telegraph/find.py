@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pixcal.estimators.detector.telegraph.classes import Stays
-from pixcal.estimators.detector.telegraph.moments import Moments, Series, moments_of, signs
+from pixcal.estimators.detector.telegraph.moments import Moments, Series, moments_of, signs, thinned
 from pixcal.estimators.detector.telegraph.population import (
     Population,
     find_population,
@@ -47,6 +47,7 @@ def find_telegraph(series: Sequence[Series]) -> Telegraph | None:
     if not parts:
         return None
     flat_top, staying, noisy = signs(parts)
+    parts = thinned(parts)
     even = _of_stays(parts, 0.0)
     found = even
     if even.stays.mean_s > 0:

@@ -16,6 +16,7 @@ from pixcal.model.arrays import F64, Indices
 
 NOISY = 3.0  # excess of the variance, in its own sigmas, from which a pixel's noise is looked at
 LAGS = 1, 4  # frames apart whose products tell how long pixels stay, and how widely that differs
+QUIET = 1 << 14  # pixels of usual noise that tell what noise is usual
 _OUTLIER = 5.0
 _MIN_FRAMES = 8
 
@@ -46,11 +47,12 @@ class Moments:
     sigma: float
     period_s: float
     frames: int  # that most pixels have
+    stands_for: F64  # (n,) pixels, of those of which some were left out: see `thinned`
 
     def of(self, pixels: Indices) -> "Moments":
         """Of some pixels (ascending) alone."""
         own = np.isin(self.pixel, pixels)
-        names = ("pixel", "count", "variance", "kurtosis", "products")
+        names = ("pixel", "count", "variance", "kurtosis", "products", "stands_for")
         return replace(self, **{name: getattr(self, name)[..., own] for name in names})
 
     @property
@@ -98,7 +100,25 @@ def moments_of(series: Series) -> Moments | None:
         series.sigma * float(np.sqrt(centre)),
         series.period_s if np.isfinite(series.period_s) and series.period_s > 0 else 1.0,
         int(np.median(n)),
+        np.ones(np.count_nonzero(used)),
     )
+
+
+def thinned(parts: Sequence[Moments]) -> list[Moments]:
+    """All pixels that are noisy in any series, and of the others as many as `QUIET` by chance.
+
+    Each of these stands for several in sums over the pixels, which stay right on average (Horvitz
+    and Thompson 1952, JASA 47, 663).
+    """
+    pixels = np.unique(np.concatenate([m.pixel for m in parts]))
+    noisy = np.unique(np.concatenate([m.pixel[m.excess > 0] for m in parts]))
+    quiet = np.setdiff1d(pixels, noisy, assume_unique=True)
+    if len(quiet) <= QUIET:
+        return [*parts]
+    chosen = np.random.default_rng(0).choice(quiet, QUIET, replace=False)
+    kept, each = np.sort(np.concatenate([noisy, chosen])), len(quiet) / QUIET
+    some = [m.of(kept) for m in parts]
+    return [replace(m, stands_for=np.where(np.isin(m.pixel, noisy), 1.0, each)) for m in some]
 
 
 def signs(parts: Sequence[Moments]) -> tuple[float, float, int]:

@@ -52,6 +52,9 @@ def find_population(parts: Sequence[Moments], stays: Stays) -> Population:
     """Of how many pixels, and how strong, for stays in a level."""
     pixels = np.unique(np.concatenate([m.pixel for m in parts]))
     unit = min(m.sigma for m in parts)
+    stands_for = np.ones(len(pixels))
+    for m in parts:
+        stands_for[np.searchsorted(pixels, m.pixel)] = m.stands_for
     # One after the other: each is large.
     classes = (AmplitudeClasses.of(m, unit, stays) for m in parts)
     mixture = Mixture.of(joined(pixels, parts, classes))
@@ -65,7 +68,7 @@ def find_population(parts: Sequence[Moments], stays: Stays) -> Population:
 
     def cost(p: F64) -> float:
         far = float(np.sum(p[2:] ** 2)) / (2 * _USUAL**2)
-        return far - float(mixture.log_likelihood(weights(p)).sum())
+        return far - float(stands_for @ mixture.log_likelihood(weights(p)))
 
     def lowest(start: F64) -> F64:
         options = {"xatol": 1e-3, "fatol": 1e-3}
@@ -162,6 +165,7 @@ def _rest(
         at = np.searchsorted(few, m.pixel)
         expected = np.einsum("nk,nk->n", of_class[at], one.expected(lag))
         left = chance[at] * (m.products[lag] + 1 / m.count - chance[at] * expected)
+        left *= m.stands_for
         total += float(left.sum())
         square += float(left @ left)
     return total, square**0.5
